@@ -1,0 +1,3 @@
+"""DeepAccident devkit."""
+
+__version__ = "0.1.0"

@@ -1,0 +1,94 @@
+"""The devkit's own exceptions: every error a caller can mend derives from `DeepAccidentError`.
+
+Each kind is also the built-in kind that a caller would expect (`ValueError`, `KeyError`, …) and is built from one
+sentence that names the file, the line and the remedy. One argument only: an exception with more does not survive
+the pickling on its way out of a worker process.
+"""
+
+
+class DeepAccidentError(Exception):
+    """Base of all errors raised on purpose by the devkit."""
+
+    def __str__(self) -> str:
+        """Return the sentence itself (`KeyError` would show its repr)."""
+        return str(self.args[0]) if self.args else ""
+
+
+class ReleaseError(DeepAccidentError, ValueError):
+    """Something in the release on disk is not as its format says."""
+
+
+class DatarootError(ReleaseError, FileNotFoundError):
+    """The folder given does not exist or holds no release."""
+
+
+class VersionError(ReleaseError):
+    """The version asked for is unknown or is not under this folder."""
+
+
+class MissingFileError(ReleaseError, FileNotFoundError):
+    """A file of the release is not there: an archive that was not unpacked, or a partial mirror."""
+
+
+class LabelError(ReleaseError):
+    """A label file cannot be read."""
+
+
+class MetaError(ReleaseError):
+    """A meta file cannot be read."""
+
+
+class CalibError(ReleaseError):
+    """A calibration file cannot be read, or holds something else than calibration."""
+
+
+class SensorFileError(ReleaseError):
+    """An image, a point cloud or a BEV camera array cannot be read."""
+
+
+class SplitFileError(ReleaseError):
+    """A split file cannot be read, or puts a scenario into two splits."""
+
+
+class BrokenReleaseError(ReleaseError):
+    """Indexing found broken scenarios; the message lists every one of them."""
+
+
+class IndexStoreError(DeepAccidentError, OSError):
+    """The index cannot be written or read where it should lie."""
+
+
+class LookupFailedError(DeepAccidentError, KeyError):
+    """A table, token, field or channel that does not exist was asked for."""
+
+
+class TokenError(LookupFailedError):
+    """No row has this token."""
+
+
+class TableError(LookupFailedError):
+    """No table has this name."""
+
+
+class FieldError(LookupFailedError):
+    """The table has no such field."""
+
+
+class ChoiceError(DeepAccidentError, ValueError):
+    """An argument is not one of the values it can take (a frame, a channel, a layout, …)."""
+
+
+class NotAvailableError(DeepAccidentError, LookupError):
+    """The call needs something that this release does not have (labels, an agent, split files)."""
+
+
+class GeometryError(DeepAccidentError, ValueError):
+    """An array is no valid transform, box or point set."""
+
+
+class ConfigError(DeepAccidentError, ValueError):
+    """A configuration cannot be carried out."""
+
+
+class MissingExtraError(DeepAccidentError, ImportError):
+    """An optional dependency is needed and not installed."""

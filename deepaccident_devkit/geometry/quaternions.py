@@ -1,0 +1,67 @@
+"""Unit quaternions (w, x, y, z) over arrays; pyquaternion serves the public API, one at a time."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from deepaccident_devkit.arrays import FloatArray, as_floats
+
+
+def from_yaw(yaw: ArrayLike) -> FloatArray:
+    """Rotations about z: angles (…), radians → quaternions (…, 4)."""
+    half = as_floats(yaw) / 2
+    result = np.zeros((*half.shape, 4))
+    result[..., 0], result[..., 3] = np.cos(half), np.sin(half)
+    return result
+
+
+def from_matrix(rotation: ArrayLike) -> FloatArray:
+    """Rotation matrices (…, 3, 3) → unit quaternions (…, 4) with w ≥ 0.
+
+    Of the four ways to read a quaternion off a matrix, each row takes the one that divides by its largest component.
+    """
+    m = as_floats(rotation)
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    four_squares = np.stack([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz], axis=-1)
+    wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    xy, xz, yz = m[..., 1, 0] + m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0], m[..., 2, 1] + m[..., 1, 2]
+    s = four_squares
+    candidates = np.stack(
+        [
+            np.stack([s[..., 0], wx, wy, wz], axis=-1),
+            np.stack([wx, s[..., 1], xy, xz], axis=-1),
+            np.stack([wy, xy, s[..., 2], yz], axis=-1),
+            np.stack([wz, xz, yz, s[..., 3]], axis=-1),
+        ],
+        axis=-2,
+    )
+    best = np.argmax(four_squares, axis=-1)
+    chosen = np.take_along_axis(candidates, best[..., None, None], axis=-2)[..., 0, :]
+    chosen = chosen / np.linalg.norm(chosen, axis=-1, keepdims=True)
+    return as_floats(np.where(chosen[..., :1] < 0, -chosen, chosen))
+
+
+def to_matrix(quaternion: ArrayLike) -> FloatArray:
+    """Unit quaternions (…, 4) → rotation matrices (…, 3, 3)."""
+    q = as_floats(quaternion)
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def left_multiplier(quaternion: ArrayLike) -> FloatArray:
+    """The matrices L (…, 4, 4) with L @ r = q ⊗ r, so that rotating many quaternions is one product."""
+    q = as_floats(quaternion)
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def yaw_of(quaternion: ArrayLike) -> FloatArray:
+    """Heading of the rotated x axis about z, radians in (−π, π], of quaternions (…, 4)."""
+    q = as_floats(quaternion)
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    return np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))

@@ -1,0 +1,41 @@
+"""The files of a release on disk, exactly as they are: a reader and a writer for each kind.
+
+Readers convert CARLA's left-handed values to the devkit's right-handed ones unless called with `raw=True`.
+"""
+
+from deepaccident_devkit.release.bev_camera import BevImage, read_bev, write_bev
+from deepaccident_devkit.release.calib import Calib, Calibs, read_calib, read_calibs, write_calib
+from deepaccident_devkit.release.images import read_image, write_image
+from deepaccident_devkit.release.labels import Labels, read_label, read_labels, write_label
+from deepaccident_devkit.release.layout import ReleaseLayout, ScenarioFolder, find_release
+from deepaccident_devkit.release.lidar import read_lidar, write_lidar
+from deepaccident_devkit.release.meta import Collision, Meta, read_meta, write_meta
+from deepaccident_devkit.release.split_files import read_split_file, write_split_file
+
+__all__ = [
+    "BevImage",
+    "Calib",
+    "Calibs",
+    "Collision",
+    "Labels",
+    "Meta",
+    "ReleaseLayout",
+    "ScenarioFolder",
+    "find_release",
+    "read_bev",
+    "read_calib",
+    "read_calibs",
+    "read_image",
+    "read_label",
+    "read_labels",
+    "read_lidar",
+    "read_meta",
+    "read_split_file",
+    "write_bev",
+    "write_calib",
+    "write_image",
+    "write_label",
+    "write_lidar",
+    "write_meta",
+    "write_split_file",
+]

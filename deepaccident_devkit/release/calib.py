@@ -1,0 +1,187 @@
+"""`calib/*.pkl`: the poses and cameras of one agent at one frame (format.md, calib)."""
+
+import pickle
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, overload
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, FloatArray, readonly
+from deepaccident_devkit.errors import CalibError, MissingFileError
+from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.geometry import SE3, handedness
+from deepaccident_devkit.geometry.se3 import rigid_fault
+from deepaccident_devkit.release._unpickle import UNPICKLE_FAULTS, load_arrays
+from deepaccident_devkit.taxonomy import CAMERAS
+
+_EGO_KEYS = ("lidar_to_ego", "ego_to_world")
+_CAMERA_KEYS = tuple(f"lidar_to_{camera}" for camera in CAMERAS)
+_INTRINSIC_KEYS = tuple(f"intrinsic_{camera}" for camera in CAMERAS)
+KEYS: dict[str, tuple[int, int]] = {
+    **dict.fromkeys((*_EGO_KEYS, *_CAMERA_KEYS), (4, 4)),
+    **dict.fromkeys(_INTRINSIC_KEYS, (3, 3)),
+}
+"""Every key of a calib file and the shape of its array."""
+_REMEDY = "restore the file from its archive"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Calibs:
+    """The calibration of F frames, right-handed, cameras optical; arrays are read-only.
+
+    Attributes:
+        ego_from_lidar: (F, 4, 4) float64.
+        world_from_ego: (F, 4, 4) float64.
+        camera_from_lidar: (F, 6, 4, 4) float64, in the order of `taxonomy.CAMERAS`.
+        intrinsic: (F, 6, 3, 3) float64, K = [[f, 0, cx], [0, f, cy], [0, 0, 1]], pixels.
+    """
+
+    ego_from_lidar: FloatArray
+    world_from_ego: FloatArray
+    camera_from_lidar: FloatArray
+    intrinsic: FloatArray
+
+    def __post_init__(self) -> None:
+        """Freeze the arrays."""
+        for name in ("ego_from_lidar", "world_from_ego", "camera_from_lidar", "intrinsic"):
+            object.__setattr__(self, name, readonly(getattr(self, name)))
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.world_from_ego)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Calib:
+    """The calibration of one agent at one frame, right-handed.
+
+    Attributes:
+        ego_from_lidar: the LiDAR's pose on the agent.
+        world_from_ego: the agent's pose.
+        camera_from_lidar: camera channel → LiDAR frame to the camera's optical frame.
+        intrinsic: camera channel → K (3, 3), pixels.
+    """
+
+    ego_from_lidar: SE3
+    world_from_ego: SE3
+    camera_from_lidar: Mapping[str, SE3]
+    intrinsic: Mapping[str, FloatArray]
+
+
+@overload
+def read_calib(path: Path, *, raw: Literal[False] = False) -> Calib: ...
+@overload
+def read_calib(path: Path, *, raw: Literal[True]) -> dict[str, AnyArray]: ...
+def read_calib(path: Path, *, raw: bool = False) -> Calib | dict[str, AnyArray]:
+    """The calibration in one file.
+
+    Args:
+        path: the file.
+        raw: return the file's own dict instead: left-handed matrices, cameras with x depth, y right, z up.
+
+    Raises:
+        MissingFileError: there is no such file.
+        CalibError: it is damaged, lacks a key, holds an array of a wrong shape, NaN or a transform that is not rigid,
+            or asks for anything but numpy arrays to be made (nothing of such a file is run).
+    """
+    arrays = _read_raw(path)
+    if raw:
+        return arrays
+    calibs = _converted([arrays])
+    return Calib(
+        ego_from_lidar=SE3(calibs.ego_from_lidar[0]),
+        world_from_ego=SE3(calibs.world_from_ego[0]),
+        camera_from_lidar={name: SE3(calibs.camera_from_lidar[0, k]) for k, name in enumerate(CAMERAS)},
+        intrinsic={name: readonly(calibs.intrinsic[0, k]) for k, name in enumerate(CAMERAS)},
+    )
+
+
+def read_calibs(paths: Sequence[Path]) -> Calibs:
+    """The calibrations of several files as stacked arrays; raises as `read_calib` does."""
+    return _converted([_read_raw(path) for path in paths])
+
+
+def write_calib(path: Path, calib: Calib) -> None:
+    """Write one calibration with CARLA's signs and axes, so that old numpy versions can read it too."""
+    raw: dict[str, AnyArray] = {
+        "lidar_to_ego": handedness.flip_pose(calib.ego_from_lidar.matrix),
+        "ego_to_world": handedness.flip_pose(calib.world_from_ego.matrix),
+    }
+    for camera in CAMERAS:
+        raw[f"lidar_to_{camera}"] = handedness.camera_from_lidar_to_raw(calib.camera_from_lidar[camera].matrix)
+        raw[f"intrinsic_{camera}"] = handedness.intrinsic_to_raw(calib.intrinsic[camera])
+    raw = {key: np.ascontiguousarray(array) + 0.0 for key, array in raw.items()}  # + 0.0: no negative zeros
+    # Protocol 3 names globals in plain text. numpy 2 writes its new private path, which numpy 1 (the reference needs
+    # numpy < 1.20) does not have; numpy 2 still reads the old one.
+    content = pickle.dumps(raw, protocol=3)
+    write_bytes(path, content.replace(b"cnumpy._core.multiarray\n", b"cnumpy.core.multiarray\n"))
+
+
+def _read_raw(path: Path) -> dict[str, AnyArray]:
+    try:
+        with path.open("rb", buffering=0) as file:
+            content = file.readall()
+    except FileNotFoundError:
+        raise MissingFileError(f"{path}: no such file; unpack the archive that holds it") from None
+    try:
+        loaded = load_arrays(content)
+    except UNPICKLE_FAULTS as error:
+        detail = "the file is empty" if not content else str(error)
+        raise CalibError(f"{path}: not a readable calibration ({detail}); {_REMEDY}") from error
+    return _checked_raw(path, loaded)
+
+
+def _checked_raw(path: Path, loaded: Any) -> dict[str, AnyArray]:
+    if not isinstance(loaded, dict):
+        raise CalibError(f"{path}: expected a dict of arrays, found {type(loaded).__name__}; {_REMEDY}")
+    missing = [key for key in KEYS if key not in loaded]
+    if missing:
+        raise CalibError(f"{path}: lacks {', '.join(missing)}; {_REMEDY}")
+    for key, shape in KEYS.items():
+        array = loaded[key]
+        if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype.kind not in "fiu":
+            found = f"{array.shape} of {array.dtype}" if isinstance(array, np.ndarray) else type(array).__name__
+            raise CalibError(f"{path}: {key}: expected numbers of shape {shape}, found {found}; {_REMEDY}")
+    faults = _value_faults(loaded)
+    if faults:
+        raise CalibError(f"{path}: {faults[0]}; {_REMEDY}")
+    return loaded
+
+
+def _value_faults(raw: Mapping[str, AnyArray]) -> list[str]:
+    """What is wrong with the numbers, checked for all transforms of a file at once; named only on failure."""
+    keys = (*_EGO_KEYS, *_CAMERA_KEYS)
+    poses = np.array([raw[key] for key in keys], dtype=np.float64)
+    intrinsics = np.array([raw[key] for key in _INTRINSIC_KEYS], dtype=np.float64)
+    faults = [
+        f"{key}: holds NaN or infinity"
+        for key, array in zip(_INTRINSIC_KEYS, intrinsics, strict=True)
+        if not np.isfinite(array).all()
+    ]
+    turns = poses[:, :3, :3]
+    off = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max()
+    determinants = (np.cross(turns[:, 0], turns[:, 1]) * turns[:, 2]).sum(axis=1)
+    suspicious = not (off < _WELL_RIGID and (determinants > 0).all() and np.isfinite(poses).all())
+    if suspicious or not (poses[:, 3] == _LAST_ROW).all():
+        faults += [f"{key}: {fault}" for key, pose in zip(keys, poses, strict=True) if (fault := rigid_fault(pose))]
+    return faults
+
+
+_WELL_RIGID = 1e-4
+_LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def _converted(files: Sequence[Mapping[str, AnyArray]]) -> Calibs:
+    def stacked(keys: Sequence[str], shape: tuple[int, int]) -> FloatArray:
+        rows = [file[key] for file in files for key in keys]
+        return np.array(rows, dtype=np.float64).reshape(len(files), len(keys), *shape)
+
+    ego = handedness.flip_pose(stacked(_EGO_KEYS, (4, 4)))
+    return Calibs(
+        ego_from_lidar=ego[:, 0],
+        world_from_ego=ego[:, 1],
+        camera_from_lidar=handedness.camera_from_lidar(stacked(_CAMERA_KEYS, (4, 4))),
+        intrinsic=handedness.intrinsic(stacked(_INTRINSIC_KEYS, (3, 3))),
+    )

@@ -1,0 +1,43 @@
+"""`Camera_*/*.jpg`: the camera images."""
+
+from pathlib import Path
+
+import numpy as np
+
+from deepaccident_devkit.arrays import ByteArray
+from deepaccident_devkit.errors import MissingFileError, SensorFileError
+from deepaccident_devkit.files import write_bytes
+
+JPEG_QUALITY = 90
+
+
+def read_image(path: Path, *, raw: bool = False) -> ByteArray:
+    """An image as (H, W, 3) uint8, RGB.
+
+    Args:
+        path: the file.
+        raw: return the pixels in the file's own mode, without conversion to RGB: (H, W) for a grey image.
+
+    Raises:
+        MissingFileError: there is no such file.
+        SensorFileError: it is truncated or no image. (Pillow says so where OpenCV returns a half-grey picture.)
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            return np.array(image if raw else image.convert("RGB"))
+    except FileNotFoundError:
+        raise MissingFileError(f"{path}: no such file; unpack the archive that holds this camera") from None
+    except (OSError, UnidentifiedImageError, SyntaxError, ValueError) as error:
+        raise SensorFileError(f"{path}: not a readable image ({error}); restore the file from its archive") from error
+
+
+def write_image(path: Path, image: ByteArray) -> None:
+    """Write an RGB image (H, W, 3) uint8 as JPEG."""
+    import cv2
+
+    done, encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    if not done:
+        raise SensorFileError(f"{path}: an image of shape {image.shape} cannot be encoded as JPEG")
+    write_bytes(path, encoded.tobytes())

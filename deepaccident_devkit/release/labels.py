@@ -1,0 +1,331 @@
+"""`label/*.txt`: the boxes that one agent annotated at one frame (format.md, label).
+
+Files are parsed in bulk: the bodies of many files are joined and go through Arrow's CSV reader in one call. What that
+call does not take (CRLF, blanks at line ends, one-token lines, faults) is tidied or named file by file.
+"""
+
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, readonly
+from deepaccident_devkit.errors import LabelError, MissingFileError
+from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.geometry import Boxes, handedness, quaternions
+from deepaccident_devkit.taxonomy import CATEGORIES
+
+FIELDS = ("class", "x", "y", "z", "l", "w", "h", "yaw", "vx", "vy", "id", "num_lidar_pts", "camera_visible")
+"""The 13 fields of a box line, in order."""
+_FINITE_FIELDS = FIELDS[1:8]
+_FLOAT_FIELDS = FIELDS[1:10]
+_INTEGER_FIELDS = ("id", "num_lidar_pts")
+_HEADER = ("speed_x", "speed_y")
+_FILES_A_CALL = 2000
+_NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
+_INTEGER = re.compile(r"[+-]?\d+", re.ASCII)
+_REMEDY = "restore the file from its archive, or leave the scenario out with on_error='skip'"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Labels:
+    """The N boxes of F label files, file after file; arrays are read-only.
+
+    Right-handed (x forward, y left, yaw counter-clockwise) unless read with `raw=True`, then as the files say
+    (y right, yaw clockwise).
+
+    Attributes:
+        raw: whether the values are the files' own.
+        num_boxes: (F,) int64, boxes of each file.
+        agent_velocity: (F, 2) float64, m/s, the recording agent's velocity in the world frame.
+        category: (N,) int8, index into `taxonomy.CATEGORIES`.
+        center: (N, 3) float64, metres, box centre in the agent's LiDAR frame.
+        size: (N, 3) float64, full length, width, height, metres.
+        yaw: (N,) float64, radians about z in the LiDAR frame.
+        velocity: (N, 2) float64, m/s, as the label says; NaN where the label's is NaN or infinite. Its frame is
+            doubtful (format.md): the LiDAR's by its author's word, the world's for the agent's own row.
+        actor_id: (N,) int64; −100 the recording agent, −1 untracked, from 20000 on parked.
+        num_lidar_pts: (N,) int64.
+        camera_visible: (N,) bool.
+    """
+
+    raw: bool
+    num_boxes: IntArray
+    agent_velocity: FloatArray
+    category: AnyArray
+    center: FloatArray
+    size: FloatArray
+    yaw: FloatArray
+    velocity: FloatArray
+    actor_id: IntArray
+    num_lidar_pts: IntArray
+    camera_visible: BoolArray
+
+    def __post_init__(self) -> None:
+        """Freeze the arrays."""
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                object.__setattr__(self, field.name, readonly(value))
+
+    def __len__(self) -> int:
+        """Number of boxes."""
+        return len(self.center)
+
+    def boxes(self) -> Boxes:
+        """The boxes in the LiDAR frame, with the label's velocity; right-handed, whatever `raw` was."""
+        sign = handedness.flip_yaw if self.raw else np.asarray
+        center, velocity = self.center, self.velocity
+        if self.raw:
+            center, velocity = handedness.flip_points(center), handedness.flip_vectors2(velocity)
+        return Boxes(
+            frame="lidar",
+            center=center,
+            size=self.size,
+            rotation=quaternions.from_yaw(sign(self.yaw)),
+            velocity=np.column_stack([velocity, np.zeros(len(self))]),
+            category=self.category,
+            actor_id=self.actor_id,
+            num_lidar_pts=self.num_lidar_pts,
+            camera_visible=self.camera_visible,
+            row=np.concatenate([np.arange(count) for count in self.num_boxes] or [np.zeros(0)]),
+        )
+
+
+def read_label(path: Path, *, raw: bool = False) -> Labels:
+    """One label file; see `read_labels`."""
+    return read_labels([path], raw=raw)
+
+
+def read_labels(paths: Sequence[Path], *, raw: bool = False) -> Labels:
+    """The boxes of several label files.
+
+    Lines with one token or none are skipped, blanks at line ends and CRLF are read, a file with only line 1 is valid.
+
+    Args:
+        paths: the files.
+        raw: keep CARLA's left-handed values.
+
+    Raises:
+        MissingFileError: a file is not there.
+        LabelError: a file is truncated or a line has another number of fields, a word where a number belongs, an
+            unknown class, NaN or infinity in a position, size or yaw; the message names file and line.
+    """
+    parts = [_parse_files(paths[start : start + _FILES_A_CALL]) for start in range(0, len(paths), _FILES_A_CALL)]
+    parts = parts or [_columns_of(_parse_body(b""), _parse_header(b""), np.zeros(0, dtype=np.int64))]
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    if not raw:
+        columns["agent_velocity"] = handedness.flip_vectors2(columns["agent_velocity"])
+        columns["center"] = handedness.flip_points(columns["center"])
+        columns["velocity"] = handedness.flip_vectors2(columns["velocity"])
+        columns["yaw"] = handedness.flip_yaw(columns["yaw"])
+    return Labels(raw=raw, **columns)
+
+
+def write_label(path: Path, labels: Labels) -> None:
+    """Write one file's boxes with CARLA's signs; reading it back gives equal values.
+
+    Raises:
+        LabelError: `labels` are not those of one file.
+    """
+    if len(labels.num_boxes) != 1:
+        raise LabelError(f"{path}: expected the labels of one file, found {len(labels.num_boxes)}")
+    flip = 1.0 if labels.raw else -1.0
+    signs = np.array([1, flip, 1, 1, 1, 1, flip, 1, flip])
+    numbers = np.column_stack([labels.center, labels.size, labels.yaw, labels.velocity]) * signs + 0.0
+    speed = labels.agent_velocity[0] * (1.0, flip) + 0.0  # + 0.0: no negative zeros
+    lines = [_words(speed.tolist())]
+    rows = zip(
+        labels.category.tolist(),
+        numbers.tolist(),
+        labels.actor_id.tolist(),
+        labels.num_lidar_pts.tolist(),
+        labels.camera_visible.tolist(),
+        strict=True,
+    )
+    lines += [f"{CATEGORIES[code]} {_words(row)} {actor} {points} {seen}" for code, row, actor, points, seen in rows]
+    write_bytes(path, ("\n".join(lines) + "\n").encode("ascii"))
+
+
+def _words(numbers: Iterable[float]) -> str:
+    return " ".join(map(repr, numbers))
+
+
+def _parse_files(paths: Sequence[Path]) -> dict[str, AnyArray]:
+    contents = [_content(path) for path in paths]
+    parsed = _parse_joined(contents)
+    if parsed is None:
+        parsed = _parse_joined([_tidied(content) for content in contents])
+    if parsed is None or _has_fault(parsed):
+        raise _first_fault(paths, contents)
+    return parsed
+
+
+def _content(path: Path) -> bytes:
+    try:
+        with path.open("rb", buffering=0) as file:
+            content = file.readall()
+    except FileNotFoundError:
+        raise MissingFileError(f"{path}: no such file; unpack the archive that holds it") from None
+    return content if content.endswith(b"\n") else content + b"\n"
+
+
+def _parse_joined(contents: Sequence[bytes]) -> dict[str, AnyArray] | None:
+    """Parse files that end in a line end; None where they need tidying or hold a fault."""
+    from pyarrow import ArrowInvalid
+
+    split = [content.partition(b"\n") for content in contents]
+    num_boxes = np.array([body.count(b"\n") for _, _, body in split], dtype=np.int64)
+    header = b"\n".join([line for line, _, _ in split]) + b"\n"
+    body = b"".join([body for _, _, body in split])
+    if b"\r" in body or b"\r" in header:
+        return None
+    try:
+        header_table, body_table = _parse_header(header), _parse_body(body)
+    except ArrowInvalid:
+        return None
+    # blank lines vanish silently, so counts are compared
+    if header_table.num_rows != len(contents) or body_table.num_rows != num_boxes.sum():
+        return None
+    return _columns_of(body_table, header_table, num_boxes)
+
+
+def _parse_header(header: bytes) -> Any:
+    import pyarrow as pa
+
+    return _parse_csv(header, _HEADER, dict.fromkeys(_HEADER, pa.float64()))
+
+
+def _parse_body(body: bytes) -> Any:
+    import pyarrow as pa
+
+    types = {
+        "class": pa.dictionary(pa.int32(), pa.string()),
+        **dict.fromkeys(_FLOAT_FIELDS, pa.float64()),
+        **dict.fromkeys(_INTEGER_FIELDS, pa.int64()),
+        "camera_visible": pa.bool_(),
+    }
+    return _parse_csv(body, FIELDS, types)
+
+
+def _parse_csv(content: bytes, names: Sequence[str], types: dict[str, Any]) -> Any:
+    import pyarrow as pa
+    from pyarrow import csv
+
+    if not content.strip():
+        return pa.table({name: pa.array([], type=types[name]) for name in names})
+    return csv.read_csv(
+        pa.BufferReader(content),
+        # workers share the cores, so each parses on one
+        read_options=csv.ReadOptions(column_names=list(names), use_threads=False, block_size=len(content) + 1),
+        parse_options=csv.ParseOptions(delimiter=" ", quote_char=False, double_quote=False),
+        convert_options=csv.ConvertOptions(
+            column_types=types, null_values=[], true_values=["True"], false_values=["False"]
+        ),
+    )
+
+
+def _columns_of(body: Any, header: Any, num_boxes: IntArray) -> dict[str, AnyArray]:
+    def numbers(table: Any, names: Sequence[str]) -> FloatArray:
+        return np.column_stack([table[name].to_numpy() for name in names])
+
+    velocity = numbers(body, ("vx", "vy"))
+    velocity[~np.isfinite(velocity)] = np.nan
+    return {
+        "num_boxes": num_boxes,
+        "agent_velocity": numbers(header, _HEADER),
+        "category": _category_codes(body["class"]),
+        "center": numbers(body, ("x", "y", "z")),
+        "size": numbers(body, ("l", "w", "h")),
+        "yaw": body["yaw"].to_numpy(),
+        "velocity": velocity,
+        "actor_id": body["id"].to_numpy(),
+        "num_lidar_pts": body["num_lidar_pts"].to_numpy(),
+        "camera_visible": body["camera_visible"].to_numpy(),
+    }
+
+
+def _category_codes(column: Any) -> AnyArray:
+    """Codes of class names; −1 for an unknown one."""
+    known = {name: code for code, name in enumerate(CATEGORIES)}
+    combined = column.combine_chunks()
+    codes = [known.get(name, -1) for name in combined.dictionary.to_pylist()]
+    taken: AnyArray = np.take(np.array(codes, dtype=np.int8), combined.indices.to_numpy())
+    return taken
+
+
+def _has_fault(columns: dict[str, AnyArray]) -> bool:
+    values_good = all(np.isfinite(columns[name]).all() for name in ("center", "size", "yaw"))
+    return not values_good or bool((columns["category"] < 0).any())
+
+
+def _tidied(content: bytes) -> bytes:
+    """The same label without blank lines, one-token lines, CRLF and superfluous blanks."""
+    words = [line.split() for line in content.splitlines()]
+    return b"".join([b" ".join(line) + b"\n" for line in words if len(line) > 1]) or b"\n"
+
+
+def _first_fault(paths: Sequence[Path], contents: Sequence[bytes]) -> LabelError:
+    """Walk the lines to name the first one that is wrong."""
+    for path, content in zip(paths, contents, strict=True):
+        header_seen = False
+        for number, line in enumerate(content.splitlines(), start=1):
+            words = line.decode("utf-8", errors="replace").split()
+            if len(words) < 2:
+                continue
+            fault = _line_fault(words) if header_seen else _header_fault(words)
+            if fault:
+                return LabelError(f"{path}:{number}: {fault}; {_REMEDY}")
+            header_seen = True
+        if not header_seen:
+            return LabelError(f"{path}:1: expected '<speed_x> <speed_y>', found an empty file; {_REMEDY}")
+    odd = [path for path, content in zip(paths, contents, strict=True) if _parse_joined([_tidied(content)]) is None]
+    return LabelError(f"{(odd or paths)[0]}: cannot be parsed, though each line looks right; {_REMEDY}")
+
+
+def _header_fault(words: Sequence[str]) -> str | None:
+    if len(words) != len(_HEADER):
+        return f"expected '<speed_x> <speed_y>', found {len(words)} fields: '{_shortened(words)}'"
+    return next((f"{word!r} is no number" for word in words if _number(word) is None), None)
+
+
+def _line_fault(words: Sequence[str]) -> str | None:
+    if len(words) != len(FIELDS):
+        return f"expected {len(FIELDS)} fields, found {len(words)}: '{_shortened(words)}'"
+    return next(
+        (fault for fault in (_field_fault(name, word) for name, word in zip(FIELDS, words, strict=True)) if fault), None
+    )
+
+
+def _field_fault(name: str, word: str) -> str | None:
+    expected = None
+    if name == "class" and word not in CATEGORIES:
+        expected = f"one of {', '.join(CATEGORIES)}"
+    elif name == "camera_visible" and word not in ("True", "False"):
+        expected = "True or False"
+    elif name in _INTEGER_FIELDS and not _is_integer(word):
+        expected = "an integer"
+    elif name in _FLOAT_FIELDS:
+        number = _number(word)
+        if number is None:
+            expected = "a number"
+        elif name in _FINITE_FIELDS and not math.isfinite(number):
+            expected = "a finite number"
+    return expected and f"{name} is {word!r}, expected {expected}"
+
+
+def _number(word: str) -> float | None:
+    return float(word) if _NUMBER.fullmatch(word) else None
+
+
+def _is_integer(word: str) -> bool:
+    return _INTEGER.fullmatch(word) is not None and -(2**63) <= int(word) < 2**63
+
+
+def _shortened(words: Sequence[str]) -> str:
+    text = " ".join(words)
+    return text if len(text) <= 60 else text[:57] + "…"

@@ -1,0 +1,191 @@
+"""Where the files of a release lie, in either layout (format.md, tree)."""
+
+import os
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from deepaccident_devkit.errors import DatarootError, VersionError
+from deepaccident_devkit.taxonomy import (
+    AGENTS,
+    CHANNEL_FORMAT,
+    MINI_SPLITS,
+    SPLITS,
+    VERSIONS,
+    AgentName,
+)
+
+MINI_FOLDER = "DeepAccident_mini"
+SPLIT_FOLDERS = SPLITS
+SPLIT_FILE_FOLDER = "split_txt_files"
+_SCENARIO_TYPE = re.compile(r"type\d+_subtype\d+_(accident|normal)")
+_FRAME_FILE = re.compile(r"_(\d{3,})\.\w+")
+
+
+@dataclass(frozen=True, slots=True)
+class ScenarioFolder:
+    """Where one scenario's files lie.
+
+    Attributes:
+        root: the release's folder.
+        folder: the folder of layout B below the root that holds the scenario (`train`, …); empty in layout A.
+        scenario_type: such as `type1_subtype1_accident`.
+        name: such as `Town03_type001_subtype0001_scenario00024`.
+        agents: the agents that have a calib folder, in the order of `taxonomy.AGENTS`.
+    """
+
+    root: Path
+    folder: str
+    scenario_type: str
+    name: str
+    agents: tuple[AgentName, ...]
+
+    @property
+    def token(self) -> str:
+        """The scenario's token: a name alone occurs in several types."""
+        return f"{self.scenario_type}/{self.name}"
+
+    @property
+    def meta_path(self) -> Path:
+        """The scenario's meta file."""
+        return self.root / self.folder / self.scenario_type / "meta" / f"{self.name}.txt"
+
+    def kind_folder(self, agent: str, kind: str) -> Path:
+        """The folder of one kind of file (`label`, `calib` or a channel) of one agent."""
+        return self.root / self.folder / self.scenario_type / agent / kind / self.name
+
+    def file(self, agent: str, kind: str, frame: int, ending: str) -> Path:
+        """One frame's file of a kind."""
+        return self.kind_folder(agent, kind) / f"{self.name}_{frame:03d}.{ending}"
+
+    def label_path(self, agent: str, frame: int) -> Path:
+        """One frame's label file."""
+        return self.file(agent, "label", frame, "txt")
+
+    def calib_path(self, agent: str, frame: int) -> Path:
+        """One frame's calib file."""
+        return self.file(agent, "calib", frame, "pkl")
+
+    def channel_path(self, agent: str, channel: str, frame: int) -> Path:
+        """One frame's image or array of a sensor channel."""
+        return self.file(agent, channel, frame, CHANNEL_FORMAT[channel])
+
+
+@dataclass(frozen=True, slots=True)
+class ReleaseLayout:
+    """What lies under a dataroot, as far as folder names tell.
+
+    Attributes:
+        root: the dataroot.
+        version: `v1` or `v1-mini`.
+        layout: `A` (scenario types in the root), `B` (split folders) or `A+B`.
+        scenarios: in the order of their tokens; a scenario that stands in two split folders occurs twice.
+        split_files: split name → its file, where there is one.
+    """
+
+    root: Path
+    version: str
+    layout: str
+    scenarios: tuple[ScenarioFolder, ...]
+    split_files: Mapping[str, Path] = field(default_factory=dict)
+
+
+def find_release(root: Path, version: str = "v1") -> ReleaseLayout:
+    """Find the scenarios under `root` by listing folders; opens no file.
+
+    Raises:
+        DatarootError: the folder is missing or holds no release.
+        VersionError: the version is unknown or not under this folder.
+    """
+    if version not in VERSIONS:
+        raise VersionError(f"unknown version {version!r}; known are {', '.join(VERSIONS)}")
+    if not root.is_dir():
+        state = "is a file" if root.is_file() else "does not exist"
+        raise DatarootError(f"{root}: {state}; give the folder that the release was unpacked into as dataroot")
+    folders = _folders_of(root, version)
+    scenarios = [scenario for folder in folders for scenario in _scenarios_in(root, folder)]
+    if not scenarios:
+        raise DatarootError(
+            f"{root}: no scenario found; expected <scenario_type>/<agent>/calib/<scenario>/*.pkl below it, or below "
+            f"its folders {', '.join((*SPLIT_FOLDERS, MINI_FOLDER))} "
+            "(unpack the calib archives, or make a small release with: deepaccident synth OUT)"
+        )
+    return ReleaseLayout(
+        root=root,
+        version=version,
+        layout="+".join(sorted({"B" if folder else "A" for folder in folders})),
+        scenarios=tuple(sorted(scenarios, key=lambda scenario: (scenario.token, scenario.folder))),
+        split_files=_split_files(root),
+    )
+
+
+def frame_numbers(folder: Path, ending: str) -> tuple[list[int], list[str]]:
+    """The frame numbers of a folder's files, ascending, and the names that end so but carry no frame number.
+
+    A folder that is not there has none.
+    """
+    frames, odd = [], []
+    try:
+        names = [entry.name for entry in os.scandir(folder)]
+    except FileNotFoundError:
+        return [], []
+    for name in names:
+        if not name.endswith(f".{ending}") or name.startswith("."):
+            continue
+        prefix_length = len(folder.name)
+        match = _FRAME_FILE.fullmatch(name[prefix_length:]) if name.startswith(folder.name) else None
+        if match:
+            frames.append(int(match[1]))
+        else:
+            odd.append(name)
+    return sorted(frames), sorted(odd)
+
+
+def _folders_of(root: Path, version: str) -> list[str]:
+    """The folders below the root, `""` for the root itself, that hold scenario types of this version."""
+    flat = [""] if _scenario_types(root) else []
+    split = [name for name in SPLIT_FOLDERS if _scenario_types(root / name)]
+    mini = [MINI_FOLDER] if _scenario_types(root / MINI_FOLDER) else []
+    root_is_mini = root.resolve().name == MINI_FOLDER
+    if version == "v1":
+        return flat + split or mini
+    if root_is_mini and flat:
+        return flat
+    if not mini and (flat or split):
+        raise VersionError(f"{root}: holds no mini release (folder {MINI_FOLDER}); open it with version='v1'")
+    return mini
+
+
+def _scenario_types(folder: Path) -> list[str]:
+    if not folder.is_dir():
+        return []
+    return sorted(entry.name for entry in os.scandir(folder) if _SCENARIO_TYPE.fullmatch(entry.name) and entry.is_dir())
+
+
+def _scenarios_in(root: Path, folder: str) -> Iterator[ScenarioFolder]:
+    for scenario_type in _scenario_types(root / folder):
+        agents_of: dict[str, list[AgentName]] = {}
+        for agent in AGENTS:
+            for name in _subfolders(root / folder / scenario_type / agent / "calib"):
+                agents_of.setdefault(name, []).append(agent)
+        for name, agents in agents_of.items():
+            yield ScenarioFolder(root, folder, scenario_type, name, tuple(agents))
+
+
+def _subfolders(folder: Path) -> list[str]:
+    try:
+        return [entry.name for entry in os.scandir(folder) if entry.is_dir() and not entry.name.startswith(".")]
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+
+
+def _split_files(root: Path) -> dict[str, Path]:
+    found = {}
+    for split in (*SPLITS, *MINI_SPLITS):
+        for folder in (root, root / SPLIT_FILE_FOLDER):
+            path = folder / f"{split}.txt"
+            if path.is_file():
+                found[split] = path
+                break
+    return found

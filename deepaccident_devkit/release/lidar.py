@@ -1,0 +1,46 @@
+"""`lidar01/*.npz`: one point cloud a file (format.md, lidar01)."""
+
+from pathlib import Path
+from typing import Literal, overload
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from deepaccident_devkit.arrays import AnyArray, checked
+from deepaccident_devkit.errors import SensorFileError
+from deepaccident_devkit.geometry import LidarPointCloud
+from deepaccident_devkit.geometry.handedness import flip_points
+from deepaccident_devkit.release.npz import read_npz, write_npz
+
+
+@overload
+def read_lidar(path: Path, *, raw: Literal[False] = False) -> LidarPointCloud: ...
+@overload
+def read_lidar(path: Path, *, raw: Literal[True]) -> AnyArray: ...
+def read_lidar(path: Path, *, raw: bool = False) -> LidarPointCloud | AnyArray:
+    """A point cloud in its LiDAR frame, right-handed, metres.
+
+    Args:
+        path: the file.
+        raw: return the file's own array (N, 4) instead: x, y **right**, z, intensity, in the file's float type.
+
+    Raises:
+        MissingFileError: there is no such file.
+        SensorFileError: the archive cannot be read or its array is not (N, 4) of floats.
+    """
+    data = read_npz(path)
+    if data.ndim != 2 or data.shape[1] != 4 or data.dtype.kind != "f":
+        raise SensorFileError(
+            f"{path}: expected points (N, 4) of floats, found shape {data.shape} of {data.dtype}; "
+            "restore the file from its archive"
+        )
+    if raw:
+        return data
+    return LidarPointCloud(flip_points(data[:, :3]), data[:, 3].astype(np.float32), "lidar")
+
+
+def write_lidar(path: Path, xyz: ArrayLike, intensity: ArrayLike) -> None:
+    """Write points (N, 3) of the right-handed LiDAR frame, metres, and their intensity (N,), as float32."""
+    points = flip_points(checked("xyz", xyz, (None, 3)))
+    values = checked("intensity", intensity, (len(points),))
+    write_npz(path, np.column_stack([points, values]).astype(np.float32))

@@ -1,0 +1,215 @@
+"""`meta/<scenario>.txt`: how a scenario was set up and how it ended (format.md, meta)."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, overload
+
+from deepaccident_devkit.errors import MetaError, MissingFileError
+from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.taxonomy import META_AGENTS, TIMES_OF_DAY, UNTRACKED_ID, AgentName
+
+_FIRST_LINE = "<weather+time> <id1> <class1> <id2> <class2> <impact> <spawn relation> <contact side> <frames>"
+_REMEDY = "restore the file from its archive"
+_SHORT_NAMES = {name: short for short, name in META_AGENTS.items()}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Collision:
+    """The collision that ended a scenario.
+
+    Attributes:
+        ids: actor ids of the pair.
+        classes: their category names (`pedestrian` is possible).
+        impact: the simulator's impulse of the contact.
+        spawn_relation: as meta names it, such as `same`.
+        contact_side: as meta names it, such as `front_side`.
+        agents: which agents the pair are, None for a road user that records nothing; None if meta does not say.
+    """
+
+    ids: tuple[int, int]
+    classes: tuple[str, str]
+    impact: float
+    spawn_relation: str
+    contact_side: str
+    agents: tuple[AgentName | None, AgentName | None] | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Meta:
+    """What a meta file says; None where the file lacks the line.
+
+    Attributes:
+        weather: such as `HardRain`.
+        time_of_day: `Noon`, `Sunset` or `Night`.
+        collision: None if the scenario ended without one.
+        simulated_frames: the recorded ones and 10 of warm-up.
+        agent_ids: actor ids of ego, ego_behind, other, other_behind.
+        road_type: `four-way junction` or `three-way junction`.
+        spawn_side: where the other vehicle comes from: `left`, `right` or `opposite…`.
+        ego_direction: `straight`, `left` or `right`.
+        other_direction: likewise.
+    """
+
+    weather: str
+    time_of_day: str | None
+    collision: Collision | None
+    simulated_frames: int
+    agent_ids: tuple[int, int, int, int] | None = None
+    road_type: str | None = None
+    spawn_side: str | None = None
+    ego_direction: str | None = None
+    other_direction: str | None = None
+
+
+@overload
+def read_meta(path: Path, *, raw: Literal[False] = False) -> Meta: ...
+@overload
+def read_meta(path: Path, *, raw: Literal[True]) -> tuple[str, ...]: ...
+def read_meta(path: Path, *, raw: bool = False) -> Meta | tuple[str, ...]:
+    """What a meta file says.
+
+    Args:
+        path: the file.
+        raw: return its lines as they are, without line ends.
+
+    Raises:
+        MissingFileError: there is no such file.
+        MetaError: the first line has not nine words or a word where a number belongs, or another line's ids are
+            no numbers.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        raise MissingFileError(f"{path}: no such file; unpack the meta folder of this scenario type") from None
+    except UnicodeDecodeError as error:
+        raise MetaError(f"{path}: not a text file ({error.reason}); {_REMEDY}") from error
+    if raw:
+        return tuple(lines)
+    filled = [(number, line.strip()) for number, line in enumerate(lines, start=1) if line.strip()]
+    if not filled:
+        raise MetaError(f"{path}:1: expected '{_FIRST_LINE}', found an empty file; {_REMEDY}")
+    entries = _entries(path, filled[1:])
+    return _parse(path, filled[0], entries)
+
+
+def write_meta(path: Path, meta: Meta) -> None:
+    """Write a meta file as the release's generator does; lines 2 on begin with a blank."""
+    collision = meta.collision
+    words: list[object] = [meta.weather + (meta.time_of_day or "")]
+    if collision is None:
+        words += [UNTRACKED_ID] * 7
+    else:
+        (id1, id2), (class1, class2) = collision.ids, collision.classes
+        words += [id1, class1, id2, class2, collision.impact, collision.spawn_relation, collision.contact_side]
+    lines = [" ".join(map(str, [*words, meta.simulated_frames]))]
+    agents = (collision and collision.agents) or (None, None)
+    entries = {
+        "colliding agents": " ".join(_SHORT_NAMES[agent] for agent in agents),
+        "agents id": meta.agent_ids and " ".join(map(str, meta.agent_ids)),
+        "road_type": meta.road_type,
+        "another_vehicle_spawn_side": meta.spawn_side,
+        "ego_vehicle_direction": meta.ego_direction,
+        "other_vehicle_direction": meta.other_direction,
+    }
+    lines += [f" {key}: {value}" for key, value in entries.items() if value is not None]
+    write_bytes(path, ("\n".join(lines) + "\n").encode())
+
+
+def _entries(path: Path, lines: Sequence[tuple[int, str]]) -> dict[str, tuple[int, str]]:
+    """Key → (line number, value) of the lines after the first."""
+    entries = {}
+    for number, line in lines:
+        key, colon, value = line.partition(":")
+        if not colon:
+            raise MetaError(f"{path}:{number}: expected '<key>: <value>', found '{line}'; {_REMEDY}")
+        entries[key.strip()] = (number, value.strip())
+    return entries
+
+
+def _parse(path: Path, first: tuple[int, str], entries: dict[str, tuple[int, str]]) -> Meta:
+    number, line = first
+    words = line.split()
+    if len(words) != 9:
+        raise MetaError(f"{path}:{number}: expected 9 words '{_FIRST_LINE}', found {len(words)}: '{line}'; {_REMEDY}")
+    where = f"{path}:{number}"
+    weather, time_of_day = _weather_and_time(words[0])
+    return Meta(
+        weather=weather,
+        time_of_day=time_of_day,
+        collision=_collision(where, words, _colliding_agents(path, entries)),
+        simulated_frames=_integer(where, "simulated frames", words[8]),
+        agent_ids=_agent_ids(path, entries),
+        road_type=_text(entries, "road_type"),
+        spawn_side=_text(entries, "another_vehicle_spawn_side"),
+        ego_direction=_text(entries, "ego_vehicle_direction"),
+        other_direction=_text(entries, "other_vehicle_direction"),
+    )
+
+
+def _weather_and_time(word: str) -> tuple[str, str | None]:
+    for time_of_day in TIMES_OF_DAY:
+        if word.endswith(time_of_day) and word != time_of_day:
+            return word.removesuffix(time_of_day), time_of_day
+    return word, None
+
+
+def _collision(
+    where: str, words: Sequence[str], agents: tuple[AgentName | None, AgentName | None] | None
+) -> Collision | None:
+    ids = (_integer(where, "first id", words[1]), _integer(where, "second id", words[3]))
+    if UNTRACKED_ID in ids:
+        return None
+    return Collision(
+        ids=ids,
+        classes=(words[2], words[4]),
+        impact=_finite(where, "impact", words[5]),
+        spawn_relation=words[6],
+        contact_side=words[7],
+        agents=agents,
+    )
+
+
+def _colliding_agents(
+    path: Path, entries: dict[str, tuple[int, str]]
+) -> tuple[AgentName | None, AgentName | None] | None:
+    if "colliding agents" not in entries:
+        return None
+    number, value = entries["colliding agents"]
+    names = value.split()
+    if len(names) != 2 or not set(names) <= set(META_AGENTS):
+        raise MetaError(f"{path}:{number}: expected two of {', '.join(META_AGENTS)}, found '{value}'; {_REMEDY}")
+    return META_AGENTS[names[0]], META_AGENTS[names[1]]
+
+
+def _agent_ids(path: Path, entries: dict[str, tuple[int, str]]) -> tuple[int, int, int, int] | None:
+    if "agents id" not in entries:
+        return None
+    number, value = entries["agents id"]
+    ids = [_integer(f"{path}:{number}", "agent's id", word) for word in value.split()]
+    if len(ids) != 4:
+        raise MetaError(f"{path}:{number}: expected four agents' ids, found '{value}'; {_REMEDY}")
+    return ids[0], ids[1], ids[2], ids[3]
+
+
+def _text(entries: dict[str, tuple[int, str]], key: str) -> str | None:
+    _, value = entries.get(key, (0, ""))
+    return value or None
+
+
+def _integer(where: str, what: str, word: str) -> int:
+    try:
+        return int(word)
+    except ValueError:
+        raise MetaError(f"{where}: {what}: expected an integer, found '{word}'; {_REMEDY}") from None
+
+
+def _finite(where: str, what: str, word: str) -> float:
+    try:
+        value = float(word)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise MetaError(f"{where}: {what}: expected a finite number, found '{word}'; {_REMEDY}")
+    return value

@@ -1,0 +1,49 @@
+"""`train.txt`, `val.txt`, …: which scenario belongs to which split (format.md, tree)."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal, overload
+
+from deepaccident_devkit.errors import MissingFileError, SplitFileError
+from deepaccident_devkit.files import write_bytes
+
+
+@overload
+def read_split_file(path: Path, *, raw: Literal[False] = False) -> list[str]: ...
+@overload
+def read_split_file(path: Path, *, raw: Literal[True]) -> list[tuple[str, ...]]: ...
+def read_split_file(path: Path, *, raw: bool = False) -> list[str] | list[tuple[str, ...]]:
+    """The scenarios of a split file, in its order, each once, as tokens `<scenario_type>/<scenario>`.
+
+    Blank lines, blanks at line ends and CRLF are read.
+
+    Args:
+        path: the file.
+        raw: return the words of every non-blank line instead, repeated lines included.
+
+    Raises:
+        MissingFileError: there is no such file.
+        SplitFileError: a line has not two words, or the file is no text.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        raise MissingFileError(f"{path}: no such file") from None
+    except UnicodeDecodeError as error:
+        raise SplitFileError(f"{path}: not a text file ({error.reason}); restore it from the release") from error
+    words = [(number, tuple(line.split())) for number, line in enumerate(lines, start=1) if line.strip()]
+    for number, line_words in words:
+        if len(line_words) != 2:
+            raise SplitFileError(
+                f"{path}:{number}: expected '<scenario_type> <scenario>', found '{' '.join(line_words)}'; "
+                "mend or remove the line"
+            )
+    if raw:
+        return [line_words for _, line_words in words]
+    return list(dict.fromkeys("/".join(line_words) for _, line_words in words))
+
+
+def write_split_file(path: Path, scenario_tokens: Sequence[str]) -> None:
+    """Write scenario tokens, one line each."""
+    lines = [f"{scenario_type} {name}\n" for scenario_type, name in (token.split("/") for token in scenario_tokens)]
+    write_bytes(path, "".join(lines).encode())

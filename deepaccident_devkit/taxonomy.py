@@ -1,0 +1,84 @@
+"""Names and numbers of the dataset: agents, channels, categories, splits (format.md, evaluation.md 0)."""
+
+from typing import Final, Literal
+
+AgentName = Literal["ego_vehicle", "ego_vehicle_behind", "other_vehicle", "other_vehicle_behind", "infrastructure"]
+Frame = Literal["world", "ego", "lidar"]
+OnError = Literal["raise", "skip"]
+Layout = Literal["A", "B"]
+
+AGENTS: Final[tuple[AgentName, ...]] = (
+    "ego_vehicle",
+    "ego_vehicle_behind",
+    "other_vehicle",
+    "other_vehicle_behind",
+    "infrastructure",
+)
+INFRASTRUCTURE: Final = "infrastructure"
+VEHICLE_AGENTS: Final[tuple[AgentName, ...]] = AGENTS[:4]
+"""The agents that are vehicles, in the order of meta's `agents id:` line."""
+
+META_AGENTS: Final[dict[str, AgentName | None]] = {
+    "ego": "ego_vehicle",
+    "ego_behind": "ego_vehicle_behind",
+    "other": "other_vehicle",
+    "other_behind": "other_vehicle_behind",
+    "none": None,
+}
+"""Meta's short names of the agents → the folder names used everywhere else; `none` is a third road user."""
+
+CAMERAS: Final = (
+    "Camera_Front",
+    "Camera_FrontLeft",
+    "Camera_FrontRight",
+    "Camera_Back",
+    "Camera_BackLeft",
+    "Camera_BackRight",
+)
+LIDAR: Final = "lidar01"
+BEV_CAMERA: Final = "BEV_instance_camera"
+CHANNELS: Final = (*CAMERAS, LIDAR, BEV_CAMERA)
+MODALITIES: Final = ("camera", "lidar", "bev")
+CHANNEL_MODALITY: Final[dict[str, str]] = {
+    **dict.fromkeys(CAMERAS, "camera"),
+    LIDAR: "lidar",
+    BEV_CAMERA: "bev",
+}
+CHANNEL_FORMAT: Final[dict[str, str]] = {**dict.fromkeys(CAMERAS, "jpg"), LIDAR: "npz", BEV_CAMERA: "npz"}
+"""Channel → ending of its files."""
+
+CATEGORIES: Final = ("car", "truck", "van", "cyclist", "motorcycle", "pedestrian")
+"""Class names; the position is the class index of the released evaluation (evaluation.md 0)."""
+
+SMALL_CATEGORIES: Final = ("cyclist", "motorcycle", "pedestrian")
+"""The classes for which fewer LiDAR points are asked (evaluation.md f)."""
+
+OWN_ACTOR_ID: Final = -100
+"""Label id of the recording agent itself."""
+UNTRACKED_ID: Final = -1
+"""Label id of an actor that is too far away to be tracked, and meta's word for "nobody"."""
+STATIC_ACTOR_ID: Final = 20000
+"""Ids from here on are parked vehicles."""
+
+FRAME_PERIOD: Final = 0.1
+"""Seconds between two recorded frames."""
+WARM_UP_FRAMES: Final = 10
+"""Meta counts simulated frames: the recorded ones and this many before them."""
+
+BEV_SHAPE: Final = (1200, 1200)
+BEV_RESOLUTION: Final = 0.1
+"""Metres a pixel of the BEV instance camera, which covers ±60 m."""
+
+VERSIONS: Final = ("v1", "v1-mini")
+SPLITS: Final = ("train", "val", "test")
+MINI_SPLITS: Final = ("train_mini", "val_mini")
+"""Subsets of train and val (not the mini release)."""
+EXPECTED_SCENARIOS: Final[dict[str, int]] = {"train": 483, "val": 104, "test": 104}
+EXPECTED_MINI_SCENARIOS: Final = 20
+
+TIMES_OF_DAY: Final = ("Noon", "Sunset", "Night")
+
+
+def frame_timestamp(frame_index: int) -> float:
+    """Seconds since the first recorded frame of frame number `frame_index` (counted from 1)."""
+    return (frame_index - 1) / 10
