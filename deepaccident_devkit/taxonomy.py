@@ -44,6 +44,7 @@ CHANNEL_MODALITY: Final[dict[str, str]] = {
     LIDAR: "lidar",
     BEV_CAMERA: "bev",
 }
+FILE_FORMATS: Final = ("jpg", "npz")
 CHANNEL_FORMAT: Final[dict[str, str]] = {**dict.fromkeys(CAMERAS, "jpg"), LIDAR: "npz", BEV_CAMERA: "npz"}
 """Channel → ending of its files."""
 

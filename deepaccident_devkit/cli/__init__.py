@@ -1,0 +1,38 @@
+"""The command line: `deepaccident <verb>`, one module a verb.
+
+A verb parses, makes one library call and prints. Exit status: 0 good, 1 findings, 2 error.
+"""
+
+import logging
+import sys
+
+import click
+
+from deepaccident_devkit._version import __version__
+from deepaccident_devkit.cli.demo import demo
+from deepaccident_devkit.cli.index import index
+from deepaccident_devkit.cli.info import info
+from deepaccident_devkit.cli.synth import synth
+from deepaccident_devkit.errors import DeepAccidentError
+
+_ERROR_STATUS = 2
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(__version__, prog_name="deepaccident")
+def deepaccident() -> None:
+    """Tools for the DeepAccident V2X accident dataset."""
+
+
+for verb in (demo, synth, index, info):
+    deepaccident.add_command(verb)
+
+
+def main() -> None:
+    """Run the command line; errors that the user can mend become one message and exit status 2."""
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    try:
+        deepaccident()
+    except DeepAccidentError as error:
+        click.echo(f"error: {error}", err=True)
+        sys.exit(_ERROR_STATUS)

@@ -1,0 +1,64 @@
+"""`deepaccident demo`: everything once, on a small synthetic release."""
+
+from pathlib import Path
+
+import click
+
+from deepaccident_devkit.deepaccident import DeepAccident
+from deepaccident_devkit.overview import overview
+from deepaccident_devkit.render import detached_figure
+from deepaccident_devkit.synth import SynthConfig, make_release
+
+_RELEASE = SynthConfig(scenarios=2, frames=40, image_size=(320, 180))
+_SECONDS_BEFORE = 1.0
+
+
+@click.command()
+@click.argument("out", type=click.Path(path_type=Path), default="deepaccident_demo")
+@click.option("--workers", type=click.IntRange(min=1), help="Processes to use.")
+def demo(out: Path, workers: int | None) -> None:
+    """Make a small synthetic release in OUT, index it, print its tables, draw its accident."""
+    root = out / "release"
+    if root.is_dir():
+        click.echo(f"using the release that is in {root}")
+    else:
+        click.echo(f"making an accident and its normal twin, {_RELEASE.frames} frames, five agents …")
+        make_release(root, _RELEASE, workers=workers or 2, progress=True)
+    release = DeepAccident("v1", root, workers=workers)
+    click.echo(f"\n{overview(release).to_text()}\n")
+    for path in draw_accident(release, out):
+        click.echo(f"drawn: {path}")
+    click.echo(_what_next(out, root))
+
+
+def draw_accident(release: DeepAccident, out: Path) -> list[Path]:
+    """Draw the first accident: the five agents a second before the impact and at it, and the ego's six cameras.
+
+    Returns:
+        The pictures written.
+    """
+    accident = next(scenario for scenario in release.scenario if scenario["collision"])
+    impact = release.get("frame", accident["last_frame_token"])
+    before = release.frame[release.getind("frame", impact) - round(_SECONDS_BEFORE * 10)]
+    ego = release.samples_of(before)[0]
+    drawings = {
+        "five_agents_1s_before.png": ((20.0, 6.5), release.render_frame, before),
+        "five_agents_impact.png": ((20.0, 6.5), release.render_frame, impact),
+        "ego_cameras_1s_before.png": ((16.0, 5.5), release.render_sample, ego),
+    }
+    paths = []
+    for name, (size, render, record) in drawings.items():
+        figure = render(record, fig=detached_figure(size))
+        path = out / name
+        figure.savefig(path, dpi=80)
+        paths.append(path)
+    return paths
+
+
+def _what_next(out: Path, root: Path) -> str:
+    return f"""
+Look at the pictures in {out}{"/" if str(out) != "." else ""}: the colliding pair is red.
+Try next:
+  deepaccident info {root}
+  python -c "from deepaccident_devkit import DeepAccident; DeepAccident(dataroot='{root}').list_scenarios()"
+  deepaccident synth my_release --scenarios 6 --layout B"""

@@ -1,0 +1,427 @@
+"""What the layers above see of a release: its opened tables and the sensor files they name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
+from deepaccident_devkit.errors import ChoiceError, NotAvailableError
+from deepaccident_devkit.geometry import SE3, Box, Boxes, LidarPointCloud
+from deepaccident_devkit.geometry.boxes import trusted_boxes
+from deepaccident_devkit.geometry.se3 import trusted_se3
+from deepaccident_devkit.release import BevImage, read_bev, read_image, read_lidar, read_split_file
+from deepaccident_devkit.tables import Problem, Table, Tables, table_names, visible_ids, visible_mask
+from deepaccident_devkit.taxonomy import (
+    AGENTS,
+    BEV_CAMERA,
+    CAMERAS,
+    CHANNELS,
+    INFRASTRUCTURE,
+    LIDAR,
+    MINI_SPLITS,
+    OWN_ACTOR_ID,
+    SPLITS,
+    Frame,
+)
+
+if TYPE_CHECKING:
+    from deepaccident_devkit.tables import records
+
+RowArgument = str | Mapping[str, Any]
+"""How a row is named wherever the API takes one: by its token, or by its record."""
+Visible = Literal["camera", "released"]
+VelocitySource = Literal["derived", "label"]
+
+
+class Dataset:
+    """One release: its tables, boxes, poses and sensor files.
+
+    Attributes:
+        dataroot: the release's folder.
+        version: `v1` or `v1-mini`.
+        layout: how the release lies on disk: `A`, `B` or `A+B` (format.md).
+        problems: the broken scenarios that were left out (`on_error='skip'`).
+    """
+
+    dataroot: Path
+    version: str
+    layout: str
+    problems: tuple[Problem, ...]
+
+    def __init__(
+        self,
+        *,
+        dataroot: Path,
+        version: str,
+        layout: str,
+        split_files: Mapping[str, Path],
+        tables_folder: Path,
+        problems: tuple[Problem, ...] = (),
+    ) -> None:
+        """Open the tables of an index; raises IndexStoreError if they cannot be read."""
+        self.dataroot = dataroot
+        self.version = version
+        self.layout = layout
+        self.problems = problems
+        self._split_files = dict(split_files)
+        self._tables = Tables(tables_folder)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle paths, not tables: the copy opens the same files again."""
+        return _reopened, (
+            type(self),
+            {
+                "dataroot": self.dataroot,
+                "version": self.version,
+                "layout": self.layout,
+                "split_files": self._split_files,
+                "tables_folder": self.tables_folder,
+                "problems": self.problems,
+            },
+        )
+
+    @property
+    def tables_folder(self) -> Path:
+        """The folder of the index's tables."""
+        return self._tables.folder
+
+    # tables
+
+    @property
+    def table_names(self) -> list[str]:
+        """The names of the tables."""
+        return table_names()
+
+    @property
+    def scenario(self) -> Table[records.ScenarioRecord]:
+        """Recordings."""
+        return self._tables.table("scenario")
+
+    @property
+    def agent(self) -> Table[records.AgentRecord]:
+        """Recorders of each scenario."""
+        return self._tables.table("agent")
+
+    @property
+    def frame(self) -> Table[records.FrameRecord]:
+        """Moments of each scenario."""
+        return self._tables.table("frame")
+
+    @property
+    def sample(self) -> Table[records.SampleRecord]:
+        """Agents at moments."""
+        return self._tables.table("sample")
+
+    @property
+    def sample_data(self) -> Table[records.SampleDataRecord]:
+        """Sensor files."""
+        return self._tables.table("sample_data")
+
+    @property
+    def sensor(self) -> Table[records.SensorRecord]:
+        """Kinds of sensors."""
+        return self._tables.table("sensor")
+
+    @property
+    def calibrated_sensor(self) -> Table[records.CalibratedSensorRecord]:
+        """Sensors on agents."""
+        return self._tables.table("calibrated_sensor")
+
+    @property
+    def ego_pose(self) -> Table[records.EgoPoseRecord]:
+        """Poses of agents."""
+        return self._tables.table("ego_pose")
+
+    @property
+    def instance(self) -> Table[records.InstanceRecord]:
+        """Actors of each scenario."""
+        return self._tables.table("instance")
+
+    @property
+    def annotation(self) -> Table[records.AnnotationRecord]:
+        """Boxes."""
+        return self._tables.table("annotation")
+
+    @property
+    def track(self) -> Table[records.TrackRecord]:
+        """Actors at moments, in world."""
+        return self._tables.table("track")
+
+    @property
+    def category(self) -> Table[records.CategoryRecord]:
+        """Classes of road users."""
+        return self._tables.table("category")
+
+    def get(self, table: str, token: RowArgument) -> dict[str, Any]:
+        """The record of a token, as a fresh dict; raises TableError or TokenError."""
+        record: dict[str, Any] = self._tables.table(table).get(_token(token))
+        return record
+
+    def getind(self, table: str, token: RowArgument) -> int:
+        """The row of a token; raises TableError or TokenError."""
+        return self._tables.table(table).row(_token(token))
+
+    def field2token(self, table: str, field: str, query: Any) -> list[str]:
+        """The tokens of all rows of a table whose field equals `query`; raises TableError or FieldError."""
+        return self._tables.table(table).tokens_where(field, query)
+
+    def arrow(self, table: str) -> Any:
+        """A table as `pyarrow.Table`, without copying; `…_row` columns hold row numbers instead of tokens."""
+        return self._tables.table(table).arrow
+
+    def get_sample(self, scenario: RowArgument, agent: str, frame: int) -> records.SampleRecord:
+        """The sample of an agent at frame number `frame` (from 1) of a scenario; raises TokenError."""
+        return self.sample.get(f"{_token(scenario)}/{agent}/{int(frame):03d}")
+
+    def samples_of(self, frame: RowArgument) -> list[records.SampleRecord]:
+        """The samples of one moment, one for each agent that is there, in the order of `taxonomy.AGENTS`."""
+        row = self.frame.row(_token(frame))
+        record = self.frame[row]
+        scenario_row = self.scenario.row(record["scenario_token"])
+        agents = self._tables.resolver.agents_of(scenario_row).values()
+        return [self.sample[self._tables.resolver.sample_at(agent, record["index"])] for agent in agents]
+
+    def split_scenarios(self, split: str) -> set[str]:
+        """The tokens of this release's scenarios that belong to a split.
+
+        Raises:
+            ChoiceError: no such split.
+            NotAvailableError: nothing says which scenario belongs where: no split file, and no split folders.
+        """
+        if split in MINI_SPLITS:
+            if split not in self._split_files:
+                raise NotAvailableError(f"{self.dataroot}: has no {split}.txt; put the release's split files there")
+            return set(read_split_file(self._split_files[split])) & set(self._tables.resolver.scenario_tokens)
+        if split not in SPLITS:
+            raise ChoiceError(f"split: expected one of {', '.join((*SPLITS, *MINI_SPLITS))}, found {split!r}")
+        known = self._tables.views["scenario"]["split"]
+        if (known < 0).all():
+            raise NotAvailableError(
+                f"{self.dataroot}: the split of its scenarios is unknown: it has neither split files ({split}.txt) nor "
+                f"split folders ({split}/); put the release's split files into it"
+            )
+        return set(self.scenario.tokens_where("split", split))
+
+    # poses
+
+    def world_from(self, sample: RowArgument, frame: str) -> SE3:
+        """The transform to world from a frame of a sample: `world`, `ego`, `lidar` or a channel (optical).
+
+        Raises:
+            TokenError: no such sample.
+            ChoiceError: no such frame.
+        """
+        return self._world_from(self._sample_row(sample), frame)
+
+    # boxes
+
+    def boxes(
+        self,
+        sample: RowArgument,
+        frame: str = "world",
+        visible: Visible | None = None,
+        velocity: VelocitySource = "derived",
+    ) -> Boxes:
+        """The annotated boxes of a sample as arrays; 0 rows if it has no label.
+
+        Args:
+            sample: token or record.
+            frame: frame of the result: `world`, `ego`, `lidar` or a camera channel (then optical axes).
+            visible: None for all; `camera` for those that a camera of this agent sees; `released` for those that any
+                agent at this moment sees by the released rule (evaluation.md f; the agent itself is not among them).
+            velocity: `derived` from world positions at 10 Hz, or the `label`'s own (taken as being in the LiDAR
+                frame, the agent's own in world; format.md says why it is doubtful).
+
+        Raises:
+            TokenError: no such sample.
+            ChoiceError: no such frame, visibility or velocity.
+        """
+        row = self._sample_row(sample)
+        lidar_boxes = self._lidar_boxes(row, velocity)
+        if visible is not None:
+            lidar_boxes = lidar_boxes.select(self._visible(row, lidar_boxes, visible))
+        if frame == "lidar":
+            return lidar_boxes
+        target_from_lidar = self._world_from(row, "lidar")
+        if frame != "world":
+            target_from_lidar = self._world_from(row, frame).inverse() @ target_from_lidar
+        return lidar_boxes.transform(target_from_lidar, frame)
+
+    def get_boxes(
+        self,
+        sample: RowArgument,
+        frame: str = "world",
+        visible: Visible | None = None,
+        velocity: VelocitySource = "derived",
+    ) -> list[Box]:
+        """The annotated boxes of a sample, one object each, with their tokens; arguments as of `boxes`."""
+        row = self._sample_row(sample)
+        boxes = self.boxes(sample, frame, visible, velocity)
+        first = self._annotation_slice(row).start
+        annotations = self._tables.views["annotation"]["instance_row"]
+        tokens = self._tables.resolver.token_makers
+        result = []
+        for index, label_row in enumerate(boxes.row.tolist()):
+            instance = annotations.item(first + label_row)
+            instance_token = tokens["instance"](instance) if instance >= 0 else None
+            result.append(Box(boxes.select([index]), tokens["annotation"](first + label_row), instance_token))
+        return result
+
+    # sensor data
+
+    def get_sample_data_path(self, sample_data: RowArgument) -> Path:
+        """The path of a sensor file, whether it is there or not; raises TokenError."""
+        return self.dataroot / self._tables.resolver.filename(self.sample_data.row(_token(sample_data)))
+
+    def get_sample_data(self, sample_data: RowArgument) -> tuple[Path, list[Box], FloatArray | None]:
+        """A sensor file's path, all boxes of its sample in the sensor's frame, and K (3, 3) of a camera.
+
+        Boxes are not tested against the image: those behind a camera are among them.
+
+        Raises:
+            TokenError: no such sensor file.
+        """
+        row = self.sample_data.row(_token(sample_data))
+        sample_row, channel_code = divmod(row, len(CHANNELS))
+        channel = CHANNELS[channel_code]
+        intrinsic = None
+        if channel in CAMERAS:
+            calibrated = self._tables.views["sample_data"]["calibrated_sensor_row"].item(row)
+            intrinsic = self._tables.views["calibrated_sensor"]["camera_intrinsic"][calibrated].reshape(3, 3).copy()
+        sample_token = self._tables.resolver.token("sample", sample_row)
+        boxes = self.get_boxes(sample_token, "lidar" if channel == LIDAR else channel)
+        return self.get_sample_data_path(sample_data), boxes, intrinsic
+
+    def load_image(self, sample_data: RowArgument) -> ByteArray:
+        """A camera's image (H, W, 3) uint8, RGB.
+
+        Raises:
+            TokenError: no such sensor file.
+            ChoiceError: the sensor is no camera.
+            MissingFileError: the image was not downloaded.
+            SensorFileError: it cannot be read.
+        """
+        path = self.get_sample_data_path(sample_data)
+        channel = CHANNELS[self.sample_data.row(_token(sample_data)) % len(CHANNELS)]
+        if channel not in CAMERAS:
+            raise ChoiceError(f"{channel} holds no images; the cameras are {', '.join(CAMERAS)}")
+        return read_image(path)
+
+    def load_point_cloud(self, sample: RowArgument, frame: Frame = "world") -> LidarPointCloud:
+        """A sample's LiDAR points in `world`, `ego` or `lidar`.
+
+        Raises:
+            TokenError: no such sample.
+            ChoiceError: no such frame.
+            MissingFileError: the file was not downloaded.
+            SensorFileError: it cannot be read.
+        """
+        row = self._sample_row(sample)
+        world_from_target = self._world_from(row, frame)
+        cloud = read_lidar(self._channel_path(row, LIDAR))
+        if frame == "lidar":
+            return cloud
+        return cloud.transform(world_from_target.inverse() @ self._world_from(row, "lidar"), frame)
+
+    def load_bev(self, sample: RowArgument) -> BevImage:
+        """What the BEV instance camera of a sample's agent saw; forward is up (see `BevImage`).
+
+        Raises:
+            TokenError: no such sample.
+            MissingFileError: the file was not downloaded.
+            SensorFileError: it cannot be read.
+        """
+        return read_bev(self._channel_path(self._sample_row(sample), BEV_CAMERA))
+
+    # rows and columns beneath
+
+    def _sample_row(self, sample: RowArgument) -> int:
+        return self._tables.resolver.row("sample", _token(sample))
+
+    def _channel_path(self, sample_row: int, channel: str) -> Path:
+        row = sample_row * len(CHANNELS) + CHANNELS.index(channel)
+        return self.dataroot / self._tables.resolver.filename(row)
+
+    def _annotation_slice(self, sample_row: int) -> slice:
+        view = self._tables.views["sample"]
+        first, count = view["first_annotation_row"].item(sample_row), view["num_annotations"].item(sample_row)
+        return slice(max(first, 0), max(first, 0) + count)
+
+    def _lidar_boxes(self, sample_row: int, velocity: VelocitySource) -> Boxes:
+        view, rows = self._tables.views["annotation"], self._annotation_slice(sample_row)
+        columns: dict[str, AnyArray] = {
+            "center": view["translation"][rows],
+            "size": view["size"][rows],
+            "rotation": view["rotation"][rows],
+            "velocity": view["velocity"][rows],
+            "category": view["category"][rows],
+            "actor_id": view["actor_id"][rows],
+            "num_lidar_pts": view["num_lidar_pts"][rows],
+            "camera_visible": view["camera_visible"][rows],
+            "row": np.arange(rows.stop - rows.start),
+        }
+        if velocity == "label":
+            columns["velocity"] = self._label_velocity(sample_row, columns["actor_id"], view["velocity_label"][rows])
+        elif velocity != "derived":
+            raise ChoiceError(f"velocity: expected 'derived' or 'label', found {velocity!r}")
+        return trusted_boxes("lidar", columns)
+
+    def _label_velocity(self, sample_row: int, actor_id: IntArray, velocity_label: FloatArray) -> FloatArray:
+        velocity = np.column_stack([velocity_label, np.zeros(len(velocity_label))])
+        own = actor_id == OWN_ACTOR_ID
+        velocity[own] = self._world_from(sample_row, "lidar").inverse().rotate(velocity[own])
+        return velocity
+
+    def _visible(self, sample_row: int, boxes: Boxes, visible: Visible) -> BoolArray:
+        if visible == "camera":
+            return boxes.camera_visible
+        if visible != "released":
+            raise ChoiceError(f"visible: expected None, 'camera' or 'released', found {visible!r}")
+        masks, ids = [], []
+        for other in self._samples_at_once(sample_row):
+            seen = self._lidar_boxes(other, "derived")
+            pole = AGENTS[self._tables.views["sample"]["agent"].item(other)] == INFRASTRUCTURE
+            masks.append(
+                visible_mask(
+                    seen.center[:, :2], seen.category, seen.num_lidar_pts, seen.camera_visible, infrastructure=pole
+                )
+            )
+            ids.append(seen.actor_id)
+        return np.isin(boxes.actor_id, visible_ids(masks, ids))
+
+    def _samples_at_once(self, sample_row: int) -> list[int]:
+        view = self._tables.views["sample"]
+        resolver, scenario = self._tables.resolver, view["scenario_row"].item(sample_row)
+        index = sample_row - resolver.sample_at(view["agent_row"].item(sample_row), 1) + 1
+        return [resolver.sample_at(agent, index) for agent in resolver.agents_of(scenario).values()]
+
+    def _world_from(self, sample_row: int, frame: str) -> SE3:
+        if frame == "world":
+            return SE3.identity()
+        views = self._tables.views
+        pose = views["ego_pose"]["matrix"][sample_row].reshape(4, 4)
+        if frame == "ego":
+            return trusted_se3(pose.copy())
+        channel = LIDAR if frame == "lidar" else frame
+        if channel not in CHANNELS:
+            raise ChoiceError(f"frame: expected world, ego, lidar or one of {', '.join(CHANNELS)}, found {frame!r}")
+        sample_data_row = sample_row * len(CHANNELS) + CHANNELS.index(channel)
+        calibrated = views["sample_data"]["calibrated_sensor_row"].item(sample_data_row)
+        return trusted_se3(pose @ views["calibrated_sensor"]["matrix"][calibrated].reshape(4, 4))
+
+
+def _reopened(kind: type[Dataset], arguments: dict[str, Any]) -> Dataset:
+    """Undo `Dataset.__reduce__`, without looking for changes on disk."""
+    dataset = kind.__new__(kind)
+    Dataset.__init__(dataset, **arguments)
+    return dataset
+
+
+def _token(row: RowArgument) -> str:
+    """The token of a row named by token or record: said once for the whole API."""
+    token = row if isinstance(row, str) else row["token"]
+    return str(token)

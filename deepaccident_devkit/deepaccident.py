@@ -1,0 +1,102 @@
+"""`DeepAccident`: the facade that binds the functions of the layers below to one release."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from deepaccident_devkit import overview, render, v2x
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.release import find_release
+from deepaccident_devkit.tables import open_index
+from deepaccident_devkit.taxonomy import OnError
+
+
+class DeepAccident(Dataset):
+    """A DeepAccident release: tables, sensor data, boxes and transforms.
+
+    The first call reads all label, calib and meta files and keeps an index of them; later ones open that in
+    milliseconds. Sensor files are only needed when they are asked for. An instance is cheap to pickle, so a torch
+    DataLoader may hold one a worker.
+
+    Examples:
+        >>> da = DeepAccident(version="v1", dataroot="data/DeepAccident")  # doctest: +SKIP
+        >>> da.get_boxes(da.sample[0], frame="ego")  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        version: str = "v1",
+        dataroot: str | os.PathLike[str] = "data/DeepAccident",
+        index_dir: str | os.PathLike[str] | None = None,
+        workers: int | None = None,
+        on_error: OnError = "raise",
+        verbose: bool = True,  # noqa: FBT001, FBT002 - the nuScenes devkit's signature
+    ) -> None:
+        """Open a release, indexing it first where needed.
+
+        Args:
+            version: `v1` (train, val and test, or the flat layout) or `v1-mini`.
+            dataroot: the folder that the release was unpacked into.
+            index_dir: where to keep the index; by default `<dataroot>/.deepaccident`, or the user's cache folder
+                where that cannot be written.
+            workers: processes to index with; None takes what the work is worth.
+            on_error: `raise` lists every broken scenario and raises; `skip` leaves them out and says so.
+            verbose: whether to show a progress bar while indexing.
+
+        Raises:
+            DatarootError: the folder is missing or holds no release.
+            VersionError: the version is unknown or not under this folder.
+            BrokenReleaseError: some scenarios are broken; the message lists them all.
+            IndexStoreError: the index cannot be written.
+        """
+        layout = find_release(Path(dataroot), version)
+        index = open_index(
+            layout,
+            index_dir=None if index_dir is None else Path(index_dir),
+            workers=workers,
+            on_error=on_error,
+            progress=verbose,
+        )
+        super().__init__(
+            dataroot=layout.root,
+            version=version,
+            layout=layout.layout,
+            split_files=layout.split_files,
+            tables_folder=index.tables_folder,
+            problems=index.manifest.problems,
+        )
+
+    transform = v2x.transform
+    render_sample = render.render_sample
+    render_frame = render.render_frame
+    render_sample_data = render.render_sample_data
+    render_bev = render.render_bev
+
+    def list_scenarios(self) -> None:
+        """Print a line for each scenario."""
+        _print(overview.scenario_lines(self))
+
+    def list_agents(self) -> None:
+        """Print in how many scenarios each agent is there."""
+        _print(overview.agent_lines(self))
+
+    def list_categories(self) -> None:
+        """Print each category's index, name and counts."""
+        _print(overview.category_lines(self))
+
+    def list_sample(self, sample: RowArgument) -> None:
+        """Print the files and boxes of a sample; raises TokenError."""
+        _print(overview.sample_lines(self, sample))
+
+    def __repr__(self) -> str:
+        """Version, place and size."""
+        return (
+            f"DeepAccident(version={self.version!r}, dataroot={str(self.dataroot)!r}): {len(self.scenario):,} "
+            f"scenarios, {len(self.sample):,} samples, {len(self.annotation):,} annotations"
+        )
+
+
+def _print(lines: Sequence[str]) -> None:
+    print("\n".join(lines))  # noqa: T201 - what the list_* methods are for

@@ -1,0 +1,198 @@
+"""What a release holds, counted: the texts behind `deepaccident info` and the facade's `list_*` methods."""
+
+import json
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.release.layout import ScenarioFolder
+from deepaccident_devkit.taxonomy import (
+    AGENTS,
+    CHANNELS,
+    EXPECTED_MINI_SCENARIOS,
+    EXPECTED_SCENARIOS,
+    SPLITS,
+)
+
+ATTRIBUTES = (
+    "scenario_type",
+    "town",
+    "weather",
+    "time_of_day",
+    "road_type",
+    "accident_type",
+)
+"""The scenario fields by which an overview counts."""
+_UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Overview:
+    """Counts over one release.
+
+    Attributes:
+        dataroot: its folder.
+        version: `v1` or `v1-mini`.
+        layout: `A`, `B` or `A+B`.
+        index: folder of the index's tables.
+        tables: table → rows.
+        splits: split → scenarios here; `unknown` for those of no known split.
+        expected: split (or the version, for mini) → scenarios of the whole release.
+        agents: agent → scenarios that have it.
+        labelled: agent → scenarios in which it has labels.
+        channels: channel → recordings (scenario and agent) that have a folder of it.
+        recordings: all recordings.
+        attributes: field → value → scenarios.
+        left_out: broken scenarios that were skipped, by token.
+    """
+
+    dataroot: str
+    version: str
+    layout: str
+    index: str
+    tables: Mapping[str, int]
+    splits: Mapping[str, int]
+    expected: Mapping[str, int]
+    agents: Mapping[str, int]
+    labelled: Mapping[str, int]
+    channels: Mapping[str, int]
+    recordings: int
+    attributes: Mapping[str, Mapping[str, int]]
+    left_out: Sequence[str]
+
+    def to_json(self) -> str:
+        """One JSON object."""
+        return json.dumps(asdict(self), indent=2, ensure_ascii=False)
+
+    def to_text(self) -> str:
+        """Some aligned blocks for a terminal."""
+        scenarios = self.tables["scenario"]
+        head = f"DeepAccident {self.version} at {self.dataroot} (layout {self.layout})\nindex: {self.index}"
+        splits = [(name, f"{count} of {self.expected.get(name, 0)}") for name, count in self.splits.items()]
+        if set(self.expected) != set(SPLITS):
+            splits = [(name, str(count)) for name, count in self.splits.items()]
+            splits += [(name, f"{scenarios} of {count}") for name, count in self.expected.items()]
+        blocks = [
+            head,
+            table_text("table", "rows", [(name, f"{rows:,}") for name, rows in self.tables.items()]),
+            table_text("split", "scenarios", splits),
+            table_text(
+                "agent",
+                "scenarios (labelled)",
+                [(name, f"{count} ({self.labelled[name]})") for name, count in self.agents.items()],
+            ),
+            table_text(
+                "sensor",
+                f"recordings of {self.recordings}",
+                [(name, str(count)) for name, count in self.channels.items()],
+            ),
+            *(
+                table_text(field, "scenarios", [(value, str(count)) for value, count in counts.items()])
+                for field, counts in self.attributes.items()
+            ),
+        ]
+        if self.left_out:
+            blocks.append("left out as broken:\n" + "\n".join(f"  {token}" for token in self.left_out))
+        return "\n\n".join(blocks)
+
+
+def overview(dataset: Dataset) -> Overview:
+    """Count what a release holds."""
+    scenarios = dataset.scenario[:]
+    agents = dataset.agent[:]
+    samples = {agent["token"]: dataset.get("sample", agent["first_sample_token"]) for agent in agents}
+    split_counts = Counter(scenario["split"] or _UNKNOWN for scenario in scenarios)
+    mini = dataset.version == "v1-mini"
+    return Overview(
+        dataroot=str(dataset.dataroot),
+        version=dataset.version,
+        layout=dataset.layout,
+        index=str(dataset.tables_folder),
+        tables={name: len(dataset.arrow(name)) for name in dataset.table_names},
+        splits={name: split_counts[name] for name in (*SPLITS, _UNKNOWN) if split_counts[name] or name in SPLITS},
+        expected={dataset.version: EXPECTED_MINI_SCENARIOS} if mini else EXPECTED_SCENARIOS,
+        agents={name: sum(agent["name"] == name for agent in agents) for name in AGENTS},
+        labelled={
+            name: sum(agent["name"] == name and samples[agent["token"]]["labelled"] for agent in agents)
+            for name in AGENTS
+        },
+        channels=_channel_counts(dataset),
+        recordings=len(agents),
+        attributes={
+            field: _counts(scenario[field] for scenario in scenarios)  # type: ignore[literal-required]
+            for field in ATTRIBUTES
+        },
+        left_out=[problem.scenario for problem in dataset.problems],
+    )
+
+
+def scenario_lines(dataset: Dataset) -> list[str]:
+    """A line a scenario: token, frames, split, weather and how it ended."""
+    lines = []
+    for scenario in dataset.scenario:
+        end = "collision" if scenario["collision"] else "no collision"
+        weather = f"{scenario['weather'] or _UNKNOWN} {scenario['time_of_day'] or ''}".strip()
+        split = scenario["split"] or "split unknown"
+        lines.append(f"{scenario['token']}  {scenario['num_frames']} frames  {split}  {weather}  {end}")
+    return lines
+
+
+def agent_lines(dataset: Dataset) -> list[str]:
+    """A line an agent name: in how many scenarios it is there."""
+    counts = Counter(agent["name"] for agent in dataset.agent)
+    return [f"{name}  {counts[name]} scenarios" for name in AGENTS]
+
+
+def category_lines(dataset: Dataset) -> list[str]:
+    """A line a category: index, name, instances, annotations."""
+    annotations = Counter(dataset.arrow("annotation")["category"].combine_chunks().to_pylist())
+    instances = Counter(dataset.arrow("instance")["category"].combine_chunks().to_pylist())
+    return [
+        f"{record['index']}  {record['name']}  {instances[record['name']]:,} instances  "
+        f"{annotations[record['name']]:,} annotations"
+        for record in dataset.category
+    ]
+
+
+def sample_lines(dataset: Dataset, sample: RowArgument) -> list[str]:
+    """A sample's files and boxes, a line each."""
+    record = dataset.get("sample", sample)
+    files = [f"{record['token']}/{channel}" for channel in CHANNELS]
+    paths = [dataset.get_sample_data_path(token) for token in files]
+    boxes = dataset.get_boxes(record, "lidar")
+    return [
+        f"sample {record['token']}, t = {record['timestamp']:.1f} s",
+        *(f"  {path}{'' if path.is_file() else '  (not here)'}" for path in paths),
+        *(f"  {box.token}: {box}" for box in boxes),
+    ]
+
+
+def table_text(left: str, right: str, rows: Sequence[tuple[str, str]]) -> str:
+    """Two aligned columns under a heading."""
+    left_width = max(len(word) for word in [left, *(name for name, _ in rows)])
+    right_width = max(len(word) for word in [right, *(value for _, value in rows)])
+    lines = [f"{left:<{left_width}}  {right:>{right_width}}"]
+    lines += [f"{name:<{left_width}}  {value:>{right_width}}" for name, value in rows]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def _counts(values: Iterable[object]) -> dict[str, int]:
+    counts = Counter("none" if value is None else str(value) for value in values)
+    return dict(sorted(counts.items()))
+
+
+def _channel_counts(dataset: Dataset) -> dict[str, int]:
+    """Recordings that have a folder of each channel; tells nothing of the files in it (`validate` does)."""
+    counts = dict.fromkeys(CHANNELS, 0)
+    folders = {
+        scenario["token"]: ScenarioFolder(
+            dataset.dataroot, scenario["folder"], scenario["scenario_type"], scenario["name"], AGENTS
+        )
+        for scenario in dataset.scenario
+    }
+    for agent in dataset.agent:
+        folder = folders[agent["scenario_token"]]
+        for channel in CHANNELS:
+            counts[channel] += folder.kind_folder(agent["name"], channel).is_dir()
+    return counts

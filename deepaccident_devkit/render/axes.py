@@ -1,0 +1,34 @@
+"""Where panels are drawn: on the caller's axes, or on new ones that a notebook shows."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+def axes_or_new(ax: Axes | None, size: tuple[float, float] = (8, 8)) -> Axes:
+    """The axes given, or those of a new pyplot figure (which a notebook displays) of a size in inches."""
+    if ax is not None:
+        return ax
+    from matplotlib import pyplot as plt
+
+    return plt.subplots(figsize=size, layout="constrained")[1]
+
+
+def figure_or_new(fig: Figure | None, size: tuple[float, float]) -> Figure:
+    """The figure given, or a new pyplot one (which a notebook displays) of a size in inches."""
+    if fig is not None:
+        return fig
+    from matplotlib import pyplot as plt
+
+    return plt.figure(figsize=size, layout="constrained")
+
+
+def detached_figure(size: tuple[float, float]) -> Figure:
+    """A figure that pyplot does not know, for files: loops pile none up, and no display is needed."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=size, layout="constrained")

@@ -1,0 +1,270 @@
+"""One scenario's files → the rows of every table, with row keys that count within the scenario."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, FloatArray, IntArray
+from deepaccident_devkit.errors import ReleaseError
+from deepaccident_devkit.release import Calibs, Labels, Meta, ScenarioFolder, read_calibs, read_labels, read_meta
+from deepaccident_devkit.tables import boxes as box_rules
+from deepaccident_devkit.tables.accidents import accident_type
+from deepaccident_devkit.tables.boxes import ScenarioBoxes
+from deepaccident_devkit.tables.columns import NULL_INTEGER
+from deepaccident_devkit.tables.scan import ScenarioScan
+from deepaccident_devkit.tables.sensor_rows import Rows, neighbour_rows, sensor_tables, timestamps
+from deepaccident_devkit.taxonomy import (
+    AGENTS,
+    INFRASTRUCTURE,
+    OWN_ACTOR_ID,
+    TIMES_OF_DAY,
+    UNTRACKED_ID,
+    VEHICLE_AGENTS,
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ScenarioFiles:
+    """The small files of a scenario, read.
+
+    Attributes:
+        scenario: where they lie.
+        scan: which there are.
+        meta: None if the scenario has none.
+        calibs: of every sample, agent by agent.
+        labels: of every labelled sample, agent by agent.
+    """
+
+    scenario: ScenarioFolder
+    scan: ScenarioScan
+    meta: Meta | None
+    calibs: Calibs
+    labels: Labels
+
+    @property
+    def num_samples(self) -> int:
+        """Agents times frames."""
+        return len(self.scan.agents) * self.scan.num_frames
+
+
+def read_scenario(scenario: ScenarioFolder, scan: ScenarioScan) -> tuple[ScenarioFiles | None, list[str]]:
+    """Read a scenario's meta, calib and label files, and say everything that is wrong with them.
+
+    Returns:
+        The files, None if there is a fault; the faults, a sentence each (the first of every kind of file).
+    """
+    faults: list[str] = []
+
+    def attempt(read: Any, *arguments: Any) -> Any:
+        try:
+            return read(*arguments)
+        except ReleaseError as error:
+            faults.append(str(error))
+            return None
+
+    frames = range(1, scan.num_frames + 1)
+    meta = attempt(read_meta, scenario.meta_path) if scenario.meta_path.exists() else None
+    calibs = attempt(read_calibs, [scenario.calib_path(agent, n) for agent in scan.agents for n in frames])
+    labels = attempt(read_labels, [scenario.label_path(agent, n) for agent in scan.labelled for n in frames])
+    if faults:
+        return None, faults
+    return ScenarioFiles(scenario=scenario, scan=scan, meta=meta, calibs=calibs, labels=labels), []
+
+
+def scenario_rows(files: ScenarioFiles) -> dict[str, Rows]:
+    """The rows of every table but `sensor` and `category`, which are the same for all scenarios."""
+    boxes = _scenario_boxes(files)
+    instance_rows, instance_of_box = box_rules.instances(boxes)
+    centers = box_rules.world_centers(boxes)
+    velocities = box_rules.world_velocities(boxes, centers)
+    annotations = _annotation_rows(files, boxes, instance_of_box, velocities)
+    return {
+        "scenario": _scenario_row(files),
+        "agent": _agent_rows(files, boxes),
+        "frame": _frame_rows(files),
+        "sample": _sample_rows(files),
+        **sensor_tables(files.calibs, agents=len(files.scan.agents), frames=files.scan.num_frames),
+        "instance": instance_rows,
+        "annotation": annotations,
+        "track": _track_rows(boxes, annotations, centers, velocities),
+    }
+
+
+def _scenario_boxes(files: ScenarioFiles) -> ScenarioBoxes:
+    labelled = _sample_labelled(files)
+    sample = np.repeat(np.flatnonzero(labelled), files.labels.num_boxes)
+    agent, frame = np.divmod(sample, files.scan.num_frames)
+    actor_of_agent = np.array([_actor_id(files, name) for name in files.scan.agents], dtype=np.int64)
+    label_id = files.labels.actor_id
+    return ScenarioBoxes(
+        labels=files.labels,
+        sample=sample,
+        agent=agent,
+        frame=frame + 1,
+        agent_order=_agent_codes(files)[agent],
+        actor=np.where(label_id == OWN_ACTOR_ID, actor_of_agent[agent], label_id),
+        world_from_lidar=files.calibs.world_from_ego @ files.calibs.ego_from_lidar,
+    )
+
+
+def _scenario_row(files: ScenarioFiles) -> Rows:
+    scenario, meta = files.scenario, files.meta
+    signalized = "_subtype1_" in f"{scenario.scenario_type}_"
+    collision = asdict(meta.collision) if meta and meta.collision else None
+    design = accident_type(meta, signalized=signalized)
+    from_meta = {
+        "weather": meta.weather if meta else None,
+        "road_type": meta.road_type if meta else None,
+        "spawn_side": meta.spawn_side if meta else None,
+        "ego_direction": meta.ego_direction if meta else None,
+        "other_direction": meta.other_direction if meta else None,
+    }
+    return {
+        "name": [scenario.name],
+        "scenario_type": [scenario.scenario_type],
+        "folder": [scenario.folder],
+        "signalized": [signalized],
+        "designed_accident": [scenario.scenario_type.endswith("_accident")],
+        "town": [scenario.name.split("_")[0]],
+        **{name: [word] for name, word in from_meta.items()},
+        "time_of_day": [_time_of_day_code(meta)],
+        "collision": [collision],
+        "accident_type": [NULL_INTEGER if design is None else design],
+        "num_frames": [files.scan.num_frames],
+        "first_frame_row": [0],
+        "last_frame_row": [files.scan.num_frames - 1],
+        "split": [NULL_INTEGER],  # split files may change without the scenario's: filled in when tables are joined
+    }
+
+
+def _agent_rows(files: ScenarioFiles, boxes: ScenarioBoxes) -> Rows:
+    count = len(files.scan.agents)
+    category = np.full(count, NULL_INTEGER)
+    size = np.full((count, 3), np.nan)
+    own = np.flatnonzero(files.labels.actor_id == OWN_ACTOR_ID)[::-1]  # the first own row is written last, and stays
+    category[boxes.agent[own]] = files.labels.category[own]
+    size[boxes.agent[own]] = files.labels.size[own]
+    return {
+        "scenario_row": np.zeros(count),
+        "name": _agent_codes(files),
+        "actor_id": [_actor_id(files, agent) for agent in files.scan.agents],
+        "category": category,
+        "size": size,
+        "is_infrastructure": [agent == INFRASTRUCTURE for agent in files.scan.agents],
+        "first_sample_row": np.arange(count) * files.scan.num_frames,
+    }
+
+
+def _frame_rows(files: ScenarioFiles) -> Rows:
+    count = files.scan.num_frames
+    previous, following = neighbour_rows(count, 1)
+    return {
+        "scenario_row": np.zeros(count),
+        "index": np.arange(1, count + 1),
+        "timestamp": timestamps(count),
+        "time_to_impact": _times_to_impact(files),
+        "prev_row": previous,
+        "next_row": following,
+    }
+
+
+def _sample_rows(files: ScenarioFiles) -> Rows:
+    agents, frames = len(files.scan.agents), files.scan.num_frames
+    labelled = _sample_labelled(files)
+    velocity = np.full((files.num_samples, 2), np.nan)
+    velocity[labelled] = files.labels.agent_velocity
+    num_boxes = np.zeros(files.num_samples, dtype=np.int64)
+    num_boxes[labelled] = files.labels.num_boxes
+    first_box = np.where(num_boxes > 0, np.cumsum(num_boxes) - num_boxes, NULL_INTEGER)
+    previous, following = neighbour_rows(frames, agents)
+    return {
+        "frame_row": np.tile(np.arange(frames), agents),
+        "scenario_row": np.zeros(files.num_samples),
+        "agent_row": np.repeat(np.arange(agents), frames),
+        "agent": np.repeat(_agent_codes(files), frames),
+        "timestamp": np.tile(timestamps(frames), agents),
+        "velocity": velocity,
+        "time_to_end": np.tile(_times_to_end(frames), agents),
+        "time_to_impact": np.tile(_times_to_impact(files), agents),
+        "labelled": labelled,
+        "num_annotations": num_boxes,
+        "first_annotation_row": first_box,
+        "prev_row": previous,
+        "next_row": following,
+    }
+
+
+def _annotation_rows(
+    files: ScenarioFiles, boxes: ScenarioBoxes, instance_of_box: AnyArray, world_velocities: FloatArray
+) -> Rows:
+    labels = files.labels
+    previous, following = box_rules.chains(boxes)
+    return {
+        "sample_row": boxes.sample,
+        "instance_row": instance_of_box,
+        "category": labels.category,
+        "translation": labels.center,
+        "size": labels.size,
+        "rotation": box_rules.box_rotation(boxes),
+        "velocity": box_rules.to_lidar(boxes, world_velocities),
+        "yaw": labels.yaw,
+        "actor_id": labels.actor_id,
+        "num_lidar_pts": labels.num_lidar_pts,
+        "camera_visible": labels.camera_visible,
+        "velocity_label": labels.velocity,
+        "is_collider": np.isin(boxes.actor, _collider_ids(files)),
+        "time_to_impact": _times_to_impact(files)[boxes.frame - 1],
+        "prev_row": previous,
+        "next_row": following,
+    }
+
+
+def _track_rows(boxes: ScenarioBoxes, annotations: Rows, centers: FloatArray, velocities: FloatArray) -> Rows:
+    instance_of_box = annotations["instance_row"]
+    chosen, agents = box_rules.tracks(boxes, instance_of_box)
+    return {
+        "frame_row": boxes.frame[chosen] - 1,
+        "instance_row": instance_of_box[chosen],
+        "scenario_row": np.zeros(len(chosen)),
+        "translation": centers[chosen],
+        "rotation": box_rules.world_rotations(boxes)[chosen],
+        "size": annotations["size"][chosen],
+        "velocity": velocities[chosen],
+        "category": annotations["category"][chosen],
+        "is_collider": annotations["is_collider"][chosen],
+        "agents": agents,
+    }
+
+
+def _sample_labelled(files: ScenarioFiles) -> AnyArray:
+    return np.repeat([agent in files.scan.labelled for agent in files.scan.agents], files.scan.num_frames)
+
+
+def _agent_codes(files: ScenarioFiles) -> IntArray:
+    return np.array([AGENTS.index(agent) for agent in files.scan.agents], dtype=np.int64)
+
+
+def _actor_id(files: ScenarioFiles, agent: str) -> int:
+    if agent == INFRASTRUCTURE or files.meta is None or files.meta.agent_ids is None:
+        return UNTRACKED_ID
+    return files.meta.agent_ids[[*VEHICLE_AGENTS].index(agent)]  # type: ignore[arg-type]
+
+
+def _collider_ids(files: ScenarioFiles) -> Sequence[int]:
+    return files.meta.collision.ids if files.meta and files.meta.collision else ()
+
+
+def _times_to_end(frames: int) -> FloatArray:
+    return np.arange(frames - 1, -1, -1) / 10
+
+
+def _times_to_impact(files: ScenarioFiles) -> FloatArray:
+    """(F,) seconds to the last frame where meta names a collision (the recording ends at it), else NaN."""
+    frames = files.scan.num_frames
+    return _times_to_end(frames) if _collider_ids(files) else np.full(frames, np.nan)
+
+
+def _time_of_day_code(meta: Meta | None) -> int:
+    return TIMES_OF_DAY.index(meta.time_of_day) if meta and meta.time_of_day else NULL_INTEGER

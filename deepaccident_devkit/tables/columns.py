@@ -1,0 +1,121 @@
+"""What a column of a table is: how it is stored in Arrow, how a record shows it, and what it means.
+
+A record's fields are declared once, in `records.py`, as annotated types; everything else (the Arrow schema, the JSON
+Schemas, the records themselves) is derived from there, in `specs.py`, through the classes of this module.
+
+Null is stored twice: as Arrow's null, for whoever reads the table, and as a value beneath it (−1 or NaN) that the
+devkit reads through plain numpy views without looking at a bitmap.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+NULL_INTEGER = -1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Derived:
+    """A field that is made when a record is, and not stored."""
+
+    doc: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Key:
+    """A row of another table: stored as its number, shown as its token."""
+
+    table: str
+    doc: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Number:
+    """One number (or bool) of a numpy type."""
+
+    dtype: str
+    doc: str
+    unit: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Vector:
+    """Some float64 numbers; `shape` (3,) is a list in a record, (3, 3) a list of lists."""
+
+    shape: tuple[int, ...]
+    doc: str
+    unit: str = ""
+
+    @property
+    def length(self) -> int:
+        """Numbers stored a row."""
+        return int(np.prod(self.shape))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Choice:
+    """One of some known words, stored as its position."""
+
+    values: tuple[str, ...]
+    doc: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Subset:
+    """Some of at most eight known words, stored as a bit mask: bit k stands for `values[k]`."""
+
+    values: tuple[str, ...]
+    doc: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Word:
+    """Any text; for small tables only."""
+
+    doc: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Struct:
+    """A record within the record, given by a TypedDict; for small tables only."""
+
+    record: type
+    doc: str
+
+
+Kind = Derived | Key | Number | Vector | Choice | Subset | Word | Struct
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One field of a table's records.
+
+    Attributes:
+        field: its name in records.
+        stored: its name in the Arrow table, None if it is not stored.
+        kind: how it is stored and shown.
+        nullable: whether a record may hold None.
+    """
+
+    field: str
+    stored: str | None
+    kind: Kind
+    nullable: bool
+
+
+@dataclass(frozen=True, slots=True)
+class TableSpec:
+    """A table's name, what a row is, and its columns in order."""
+
+    name: str
+    doc: str
+    columns: tuple[Column, ...]
+
+    @property
+    def stored_columns(self) -> tuple[Column, ...]:
+        """The columns that the Arrow table has."""
+        return tuple(column for column in self.columns if column.stored)
+
+    def column(self, field: str) -> Column | None:
+        """The column of a record's field."""
+        return next((column for column in self.columns if column.field == field), None)

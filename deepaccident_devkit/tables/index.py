@@ -1,0 +1,153 @@
+"""The index of a release: made once from its small files, opened in milliseconds afterwards.
+
+    <index folder>/<version>/
+      manifest.json        what the index was made from, and what is broken
+      tables-<digest>/     one Arrow file a table
+      shards/              one file a scenario, from which the tables are joined
+
+Opening compares the times of folders, meta and split files with the manifest; making it compares every label and
+calib file, and reads only the scenarios that changed. Everything is written under a temporary name and renamed, the
+manifest last, so that a reader sees the old index or the new one.
+"""
+
+import hashlib
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from deepaccident_devkit.errors import BrokenReleaseError, ChoiceError, DatarootError, IndexStoreError
+from deepaccident_devkit.files import is_writable_folder
+from deepaccident_devkit.release import ReleaseLayout
+from deepaccident_devkit.tables.indexing import make_index, scenario_state
+from deepaccident_devkit.tables.manifest import Manifest, Problem, read_manifest
+from deepaccident_devkit.tables.scan import folder_digest
+from deepaccident_devkit.taxonomy import OnError
+
+logger = logging.getLogger(__name__)
+
+INDEX_FOLDER = ".deepaccident"
+_MESSAGES_A_SCENARIO = 5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Index:
+    """An index on disk.
+
+    Attributes:
+        folder: where it lies.
+        manifest: what it was made from.
+    """
+
+    folder: Path
+    manifest: Manifest
+
+    @property
+    def tables_folder(self) -> Path:
+        """The folder with one Arrow file a table."""
+        return self.folder / self.manifest.tables
+
+
+def open_index(
+    layout: ReleaseLayout,
+    *,
+    index_dir: Path | None = None,
+    workers: int | None = None,
+    on_error: OnError = "raise",
+    progress: bool = False,
+    check_files: bool = False,
+) -> Index:
+    """The index of a release, made or brought up to date first where needed.
+
+    Args:
+        layout: the release.
+        index_dir: where indexes are kept; by default in the dataroot, or in the user's cache if that is read-only.
+        workers: processes to read with; see `parallel.run_batch`.
+        on_error: `raise` lists every broken scenario and raises; `skip` leaves them out and logs them.
+        progress: whether to show a progress bar.
+        check_files: compare every label, calib and meta file with the index, not only the folders' times.
+
+    Raises:
+        BrokenReleaseError: some scenarios are broken and `on_error` is `raise`, or all of them are.
+        DatarootError: no scenario has any file.
+        IndexStoreError: the index cannot be written.
+    """
+    if on_error not in ("raise", "skip"):
+        raise ChoiceError(f"on_error: expected 'raise' or 'skip', found {on_error!r}")
+    fingerprint = folder_digest(layout.scenarios, layout.split_files.values())
+    current = [index for index in find_indexes(layout, index_dir) if _is_current(layout, index, fingerprint)]
+    if current and not check_files:
+        index = current[0]
+    else:
+        folder = _writable_folder(layout, index_dir)
+        index = Index(
+            folder=folder,
+            manifest=make_index(layout, folder, fingerprint, workers=workers, progress=progress),
+        )
+    _accept(layout, index, on_error)
+    return index
+
+
+def find_indexes(layout: ReleaseLayout, index_dir: Path | None = None) -> list[Index]:
+    """The release's indexes on disk, up to date or not, the first choice first."""
+    found = [(folder, read_manifest(folder)) for folder in index_folders(layout, index_dir)]
+    return [Index(folder=folder, manifest=manifest) for folder, manifest in found if manifest]
+
+
+def index_folders(layout: ReleaseLayout, index_dir: Path | None = None) -> list[Path]:
+    """Where the release's index may lie, the first choice first."""
+    if index_dir is not None:
+        return [index_dir / layout.version]
+    from platformdirs import user_cache_path
+
+    key = hashlib.blake2b(str(layout.root.resolve()).encode(), digest_size=8).hexdigest()
+    return [layout.root / INDEX_FOLDER / layout.version, user_cache_path("deepaccident_devkit") / key / layout.version]
+
+
+def _writable_folder(layout: ReleaseLayout, index_dir: Path | None) -> Path:
+    folders = index_folders(layout, index_dir)
+    for folder in folders:
+        if is_writable_folder(folder):
+            return folder
+    places = " or ".join(map(str, folders))
+    raise IndexStoreError(f"{places}: no place to write the index; give a writable folder with index_dir=")
+
+
+def _is_current(layout: ReleaseLayout, index: Index, fingerprint: str) -> bool:
+    """Whether nothing was added or removed, and what was broken still is as it was.
+
+    Broken scenarios are looked at file by file: a file mended in place leaves its folder's time alone.
+    """
+    if index.manifest.fingerprint != fingerprint:
+        return False
+    broken = {problem.scenario: problem.digest for problem in index.manifest.problems if problem.digest}
+    return all(
+        scenario_state(scenario) == broken[scenario.token] for scenario in layout.scenarios if scenario.token in broken
+    )
+
+
+def _accept(layout: ReleaseLayout, index: Index, on_error: OnError) -> None:
+    problems = index.manifest.problems
+    if problems and (on_error == "raise" or not index.manifest.tables):
+        raise BrokenReleaseError(_report(layout, problems))
+    if not index.manifest.tables:
+        raise DatarootError(f"{layout.root}: its scenarios hold no calib files; unpack the calib archives")
+    for problem in problems:
+        logger.warning("left out %s: %s", problem.scenario, " | ".join(problem.messages))
+    for notice in index.manifest.notices:
+        logger.warning("%s", notice)
+
+
+def _report(layout: ReleaseLayout, problems: Sequence[Problem]) -> str:
+    total = len({scenario.token for scenario in layout.scenarios})
+    lines = [f"{layout.root}: {len(problems)} of {total} scenarios are broken:"]
+    for problem in problems:
+        shown = problem.messages[:_MESSAGES_A_SCENARIO]
+        lines += [f"  {problem.scenario}", *(f"    {message}" for message in shown)]
+        if len(problem.messages) > len(shown):
+            lines.append(f"    … and {len(problem.messages) - len(shown)} more")
+    good = total - len(problems)
+    lines.append(
+        f"Mend them, or open the other {good} with on_error='skip' (--on-error skip)." if good else "Mend them first."
+    )
+    return "\n".join(lines)

@@ -1,0 +1,147 @@
+"""Making an index: read the scenarios that changed, join all of them, put the result in place."""
+
+import hashlib
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from deepaccident_devkit.errors import IndexStoreError
+from deepaccident_devkit.files import replacing_folder
+from deepaccident_devkit.parallel import run_batch
+from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder
+from deepaccident_devkit.tables.build import read_scenario, scenario_rows
+from deepaccident_devkit.tables.join import join_tables
+from deepaccident_devkit.tables.manifest import SCHEMA_VERSION, Manifest, Problem, write_manifest
+from deepaccident_devkit.tables.scan import scan_scenario, scenario_digest
+from deepaccident_devkit.tables.shards import shard_digest, shard_path, write_shard
+from deepaccident_devkit.tables.split_assignment import SplitAssignment, assign_splits
+
+_SHARDS = "shards"
+_TABLES = "tables-"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outcome:
+    """What became of one scenario.
+
+    Attributes:
+        token: the scenario's.
+        digest: of its files.
+        indexed: whether its shard is there.
+        messages: what is wrong with it, a sentence each; then it has no shard.
+        notices: what was left aside.
+    """
+
+    token: str
+    digest: str
+    indexed: bool
+    messages: tuple[str, ...] = ()
+    notices: tuple[str, ...] = ()
+
+
+def make_index(
+    layout: ReleaseLayout, folder: Path, fingerprint: str, *, workers: int | None = None, progress: bool = False
+) -> Manifest:
+    """Bring the index in `folder` up to date with the release and return its manifest.
+
+    Broken scenarios do not stop it: they are listed in the manifest.
+
+    Raises:
+        IndexStoreError: something cannot be written; the index that was there stays as it was.
+        SplitFileError: a split file is none.
+    """
+    splits = assign_splits(layout)
+    candidates = [scenario for scenario in layout.scenarios if scenario.token not in splits.problems]
+    with _store_errors(folder):
+        outcomes = run_batch(
+            partial(index_scenario, folder / _SHARDS),
+            candidates,
+            workers=workers,
+            label="indexing scenarios",
+            progress=progress,
+        )
+        manifest = Manifest(
+            schema_version=SCHEMA_VERSION,
+            fingerprint=fingerprint,
+            tables=_write_tables(folder, [outcome for outcome in outcomes if outcome.indexed], splits),
+            problems=_problems(outcomes, splits),
+            notices=(*splits.notices, *(notice for outcome in outcomes for notice in outcome.notices)),
+        )
+        write_manifest(folder, manifest)
+        _remove_stale(folder, manifest, {outcome.token for outcome in outcomes if outcome.indexed})
+    return manifest
+
+
+def index_scenario(shards: Path, scenario: ScenarioFolder) -> Outcome:
+    """Write the shard of one scenario, unless it is there and its files are as they were."""
+    digest = scenario_state(scenario)
+    path = shard_path(shards, scenario.token)
+    scan = scan_scenario(scenario)
+    if scan.problems:
+        return Outcome(token=scenario.token, digest=digest, indexed=False, messages=scan.problems, notices=scan.notices)
+    if not scan.agents:
+        notice = f"{scenario.token}: its calib folders hold no files; left out"
+        return Outcome(token=scenario.token, digest=digest, indexed=False, notices=(*scan.notices, notice))
+    if shard_digest(path) != digest:
+        files, faults = read_scenario(scenario, scan)
+        if files is None:
+            return Outcome(
+                token=scenario.token, digest=digest, indexed=False, messages=tuple(faults), notices=scan.notices
+            )
+        write_shard(path, scenario_rows(files), digest)
+    return Outcome(token=scenario.token, digest=digest, indexed=True, notices=scan.notices)
+
+
+def scenario_state(scenario: ScenarioFolder) -> str:
+    """The digest that an `Outcome` of this scenario would have now."""
+    return f"{SCHEMA_VERSION}:{scenario_digest(scenario)}"
+
+
+def _problems(outcomes: Sequence[Outcome], splits: SplitAssignment) -> tuple[Problem, ...]:
+    broken = [
+        Problem(scenario=outcome.token, messages=outcome.messages, digest=outcome.digest)
+        for outcome in outcomes
+        if outcome.messages
+    ]
+    misplaced = [Problem(scenario=token, messages=messages) for token, messages in splits.problems.items()]
+    return tuple(sorted(broken + misplaced, key=lambda problem: problem.scenario))
+
+
+def _write_tables(folder: Path, outcomes: Sequence[Outcome], splits: SplitAssignment) -> str:
+    """Join the shards into a new folder of tables, named by what they were made from; empty if there are none."""
+    if not outcomes:
+        return ""
+    assigned = [splits.split_of.get(outcome.token) for outcome in outcomes]
+    made_from = repr(
+        [(outcome.token, outcome.digest, split) for outcome, split in zip(outcomes, assigned, strict=True)]
+    )
+    name = _TABLES + hashlib.blake2b(made_from.encode(), digest_size=8).hexdigest()
+    if not (folder / name).is_dir():
+        with replacing_folder(folder / name) as temporary:
+            join_tables(temporary, [shard_path(folder / _SHARDS, outcome.token) for outcome in outcomes], assigned)
+    return name
+
+
+def _remove_stale(folder: Path, manifest: Manifest, indexed: set[str]) -> None:
+    """Remove the tables and shards that the manifest no longer stands on; what resists is left to the next time."""
+    with suppress(OSError):
+        for tables in folder.glob(f"{_TABLES}*"):
+            if tables.name != manifest.tables:
+                shutil.rmtree(tables, ignore_errors=True)
+        kept = {shard_path(folder / _SHARDS, token) for token in indexed}
+        for shard in (folder / _SHARDS).glob("*/*.arrow"):
+            if shard not in kept:
+                shard.unlink(missing_ok=True)
+
+
+@contextmanager
+def _store_errors(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, IndexStoreError):
+            raise
+        raise IndexStoreError(f"{folder}: the index cannot be written ({error}); give another index_dir=") from error

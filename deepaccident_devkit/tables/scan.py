@@ -1,0 +1,120 @@
+"""What the file names of a scenario tell: its frames, what is missing, and a digest that changes with any file."""
+
+import hashlib
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from deepaccident_devkit.release import ScenarioFolder
+from deepaccident_devkit.release.layout import frame_numbers
+from deepaccident_devkit.taxonomy import AGENTS, AgentName
+
+_FRAMES_NAMED = 6
+_REMEDY = "unpack its archive again, or leave the scenario out with on_error='skip'"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScenarioScan:
+    """What a scenario's folders hold.
+
+    Attributes:
+        agents: the agents with calib files.
+        labelled: those of them with label files.
+        num_frames: the highest frame number of any of their files.
+        problems: what makes the scenario broken, a sentence each.
+        notices: what was left aside, a sentence each.
+    """
+
+    agents: tuple[AgentName, ...]
+    labelled: tuple[AgentName, ...]
+    num_frames: int
+    problems: tuple[str, ...]
+    notices: tuple[str, ...]
+
+
+def scan_scenario(scenario: ScenarioFolder) -> ScenarioScan:
+    """List a scenario's calib and label folders and check that they hold frames 1 to n for every agent."""
+    frames: dict[tuple[AgentName, str], list[int]] = {}
+    problems, notices = [], []
+    for agent in AGENTS:
+        for kind, ending in (("calib", "pkl"), ("label", "txt")):
+            folder = scenario.kind_folder(agent, kind)
+            frames[agent, kind], odd = frame_numbers(folder, ending)
+            problems += [f"{folder / name}: expected a name {scenario.name}_<NNN>.{ending}; rename it" for name in odd]
+        if frames[agent, "label"] and not frames[agent, "calib"]:
+            notices.append(f"{scenario.token}: {agent} has labels but no calib files and is left out")
+            frames[agent, "label"] = []
+    agents = tuple(agent for agent in AGENTS if frames[agent, "calib"])
+    labelled = tuple(agent for agent in agents if frames[agent, "label"])
+    num_frames = max((found[-1] for found in frames.values() if found), default=0)
+    for agent in agents:
+        for kind in ("calib", "label") if agent in labelled else ("calib",):
+            missing = sorted(set(range(1, num_frames + 1)) - set(frames[agent, kind]))
+            if missing:
+                folder = scenario.kind_folder(agent, kind)
+                problems.append(f"{folder}: lacks frames {_ranges(missing)} of 1 to {num_frames}; {_REMEDY}")
+    return ScenarioScan(
+        agents=agents,
+        labelled=labelled,
+        num_frames=num_frames,
+        problems=tuple(problems),
+        notices=tuple(notices),
+    )
+
+
+def folder_digest(scenarios: Iterable[ScenarioFolder], files: Iterable[Path]) -> str:
+    """A digest of the times of the scenarios' calib and label folders and of some files; opens none of them.
+
+    It changes when a file is added, removed or renamed, not when one is edited in place.
+    """
+    digest = hashlib.blake2b(digest_size=16)
+    for scenario in scenarios:
+        root = os.fspath(scenario.root)
+        base = os.path.join(root, scenario.folder, scenario.scenario_type)  # noqa: PTH118 - 7,000 of them at start
+        digest.update(f"{scenario.folder}/{scenario.token}\n".encode())
+        paths = [f"{base}/{agent}/{kind}/{scenario.name}" for agent in AGENTS for kind in ("calib", "label")]
+        for path in [*paths, f"{base}/meta/{scenario.name}.txt"]:
+            digest.update(_stat_words(path))
+    for file in files:
+        digest.update(file.name.encode() + _stat_words(os.fspath(file)))
+    return digest.hexdigest()
+
+
+def scenario_digest(scenario: ScenarioFolder) -> str:
+    """A digest of name, size and time of every label, calib and meta file of a scenario."""
+    digest = hashlib.blake2b(scenario.token.encode(), digest_size=16)
+    for agent in AGENTS:
+        for kind in ("calib", "label"):
+            folder = scenario.kind_folder(agent, kind)
+            for name in _names(folder):
+                digest.update(f"{agent}/{kind}/{name}".encode() + _stat_words(f"{folder}/{name}"))
+    digest.update(_stat_words(os.fspath(scenario.meta_path)))
+    return digest.hexdigest()
+
+
+def _names(folder: Path) -> list[str]:
+    try:
+        return sorted(os.listdir(folder))  # noqa: PTH208 - names alone
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+
+
+def _stat_words(path: str) -> bytes:
+    try:
+        found = os.stat(path)  # noqa: PTH116 - 7,000 of them at start
+    except OSError:
+        return b" none\n"
+    return f" {found.st_size} {found.st_mtime_ns}\n".encode()
+
+
+def _ranges(numbers: Sequence[int]) -> str:
+    """`3–5, 9`: runs of consecutive numbers, the first few."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and runs[-1][1] == number - 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    words = [f"{first}" if first == last else f"{first}–{last}" for first, last in runs[:_FRAMES_NAMED]]
+    return ", ".join(words) + (" …" if len(runs) > _FRAMES_NAMED else "")

@@ -1,0 +1,58 @@
+"""Which split each scenario belongs to: the split files, else the folder of layout B, else unknown."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import combinations
+
+from deepaccident_devkit.release import ReleaseLayout, read_split_file
+from deepaccident_devkit.taxonomy import MINI_SPLITS, SPLITS
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SplitAssignment:
+    """The splits of a release's scenarios.
+
+    Attributes:
+        split_of: scenario token → split; absent where it is unknown.
+        problems: scenario token → why it has no single place, a sentence each.
+        notices: what is odd but does not hinder, a sentence each.
+    """
+
+    split_of: Mapping[str, str]
+    problems: Mapping[str, tuple[str, ...]]
+    notices: tuple[str, ...]
+
+
+def assign_splits(layout: ReleaseLayout) -> SplitAssignment:
+    """Read the split files and compare them with the folders; raises SplitFileError for a file that is none."""
+    listed = {split: set(read_split_file(path)) for split, path in layout.split_files.items()}
+    tokens = {scenario.token for scenario in layout.scenarios}
+    problems: dict[str, list[str]] = {}
+    for group in (SPLITS, MINI_SPLITS):
+        for first, second in combinations([split for split in group if split in listed], 2):
+            for token in sorted(listed[first] & listed[second] & tokens):
+                files = f"{layout.split_files[first]} and {layout.split_files[second]}"
+                problems.setdefault(token, []).append(f"stands in two splits: {files}; remove it from one")
+    for token, folders in _folders_of(layout).items():
+        if len(folders) > 1:
+            places = " and ".join(str(layout.root / folder) for folder in folders)
+            problems.setdefault(token, []).append(f"stands in two folders: {places}; remove one")
+    in_folder = {scenario.token: scenario.folder for scenario in layout.scenarios if scenario.folder in SPLITS}
+    in_files = {token: split for split in SPLITS for token in listed.get(split, ())}
+    missing = {split: len(set(listed.get(split, ())) - tokens) for split in SPLITS}
+    return SplitAssignment(
+        split_of={token: split for token, split in {**in_folder, **in_files}.items() if token in tokens},
+        problems={token: tuple(messages) for token, messages in problems.items()},
+        notices=tuple(
+            f"{layout.split_files[split]}: lists {count} scenarios that are not in this release"
+            for split, count in missing.items()
+            if count
+        ),
+    )
+
+
+def _folders_of(layout: ReleaseLayout) -> dict[str, list[str]]:
+    folders: dict[str, list[str]] = {}
+    for scenario in layout.scenarios:
+        folders.setdefault(scenario.token, []).append(scenario.folder)
+    return folders

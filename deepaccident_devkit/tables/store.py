@@ -1,0 +1,131 @@
+"""Tables on disk: one Arrow file a table with one uncompressed batch, written by streaming, read memory-mapped."""
+
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from deepaccident_devkit.errors import IndexStoreError
+from deepaccident_devkit.files import replacing
+from deepaccident_devkit.tables.arrow import (
+    Columns,
+    arrow_schema,
+    is_streamable,
+    numpy_dtype,
+    record_batch,
+    views,
+    width,
+)
+from deepaccident_devkit.tables.columns import TableSpec
+
+
+def table_path(folder: Path, table: str) -> Path:
+    """The file of one table."""
+    return folder / f"{table}.arrow"
+
+
+class TableWriter:
+    """Collects a table's rows piece by piece and writes them as one batch.
+
+    Rows of fixed width go to a scratch file a column; the batch is then written from these, memory-mapped, so that
+    a table of any size needs little memory. A context manager: leaving it removes the scratch files.
+    """
+
+    def __init__(self, folder: Path, spec: TableSpec) -> None:
+        """Start writing the table to `folder`, which must exist."""
+        self._folder = folder
+        self._spec = spec
+        self._stack = ExitStack()
+        self._scratch: dict[str, BinaryIO] = {}
+        self._words: dict[str, list[Any]] = {}
+        self.num_rows = 0
+        for name in [column.stored for column in spec.stored_columns if column.stored]:
+            if is_streamable(spec):
+                self._scratch[name] = self._stack.enter_context(self._scratch_path(name).open("wb"))
+            else:
+                self._words[name] = []
+
+    def __enter__(self) -> "TableWriter":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._stack.close()
+        for name in self._scratch:
+            self._scratch_path(name).unlink(missing_ok=True)
+
+    def append(self, columns: Columns) -> None:
+        """Add rows; every stored column must be there, all of one length."""
+        for column in self._spec.stored_columns:
+            name = column.stored or ""
+            if name in self._scratch:
+                np.ascontiguousarray(columns[name], dtype=numpy_dtype(column.kind)).tofile(self._scratch[name])
+            else:
+                self._words[name].extend(columns[name])
+        self.num_rows += len(columns[self._spec.stored_columns[0].stored or ""])
+
+    def finish(self) -> None:
+        """Write the table's file."""
+        import pyarrow as pa
+
+        for file in self._scratch.values():
+            file.flush()
+        columns = {column.stored: self._collected(column.stored or "", column.kind) for column in self._spec_columns()}
+        with (
+            replacing(table_path(self._folder, self._spec.name)) as temporary,
+            pa.OSFile(str(temporary), "wb") as sink,
+            pa.ipc.new_file(sink, arrow_schema(self._spec)) as writer,
+        ):
+            writer.write_batch(record_batch(self._spec, columns))
+
+    def _spec_columns(self) -> Any:
+        return self._spec.stored_columns
+
+    def _scratch_path(self, name: str) -> Path:
+        return self._folder / f".{self._spec.name}.{name}.part"
+
+    def _collected(self, name: str, kind: Any) -> Any:
+        if name not in self._scratch:
+            return self._words[name]
+        shape = (self.num_rows, width(kind)) if width(kind) > 1 else (self.num_rows,)
+        if not self.num_rows:
+            return np.zeros(shape, dtype=numpy_dtype(kind))
+        return np.memmap(self._scratch_path(name), dtype=numpy_dtype(kind), mode="r", shape=shape)
+
+
+def write_table(folder: Path, spec: TableSpec, columns: Columns) -> None:
+    """Write a whole table at once."""
+    with TableWriter(folder, spec) as writer:
+        writer.append(columns)
+        writer.finish()
+
+
+class StoredTable:
+    """A table's file, memory-mapped.
+
+    Attributes:
+        spec: its columns.
+        table: the `pyarrow.Table` over the mapped memory.
+        views: stored column name → view of it (numpy arrays are read-only).
+        num_rows: its length.
+    """
+
+    def __init__(self, folder: Path, spec: TableSpec) -> None:
+        """Map the file; raises IndexStoreError if it cannot be read."""
+        import pyarrow as pa
+
+        path = table_path(folder, spec.name)
+        try:
+            reader = pa.ipc.open_file(pa.memory_map(str(path)))
+            batch = reader.get_batch(0)
+        except (OSError, pa.ArrowInvalid, IndexError) as error:
+            raise IndexStoreError(
+                f"{path}: cannot be read ({error}); remove the index folder to have it remade"
+            ) from error
+        self.spec = spec
+        self.table = pa.Table.from_batches([batch])
+        self.views = views(spec, batch)
+        self.num_rows = int(batch.num_rows)
