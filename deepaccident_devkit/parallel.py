@@ -1,14 +1,15 @@
 """Running batches of independent work: on one process, on a pool of them, or on the caller's own executor."""
 
-import multiprocessing
+from __future__ import annotations
+
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from tqdm.auto import tqdm
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -34,18 +35,24 @@ def run_batch(
         label: text of the progress bar.
         progress: whether to show one.
     """
+    from tqdm.auto import tqdm  # here: with asyncio and multiprocessing, a third of the package's import time
+
     count = _worker_count(workers, len(items))
     with tqdm(total=len(items), desc=label, disable=not progress, unit="") as bar:
         if executor is not None:
             return _on_executor(executor, work, items, bar)
         if count == 1:
             return [_counted(work(item), bar) for item in items]
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(count, mp_context=context) as pool:
+        import multiprocessing
+        from concurrent.futures import ProcessPoolExecutor
+
+        with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
             return _on_executor(pool, work, items, bar)
 
 
 def _worker_count(workers: int | None, items: int) -> int:
+    import multiprocessing
+
     if multiprocessing.current_process().daemon:  # a DataLoader worker may not have children
         return 1
     if workers is not None:
@@ -55,6 +62,8 @@ def _worker_count(workers: int | None, items: int) -> int:
 
 
 def _on_executor(executor: Executor, work: Callable[[Item], Result], items: Sequence[Item], bar: Any) -> list[Result]:
+    from concurrent.futures import as_completed
+
     with _main_module_hidden():
         futures = {executor.submit(work, item): position for position, item in enumerate(items)}
     results: dict[int, Result] = {}

@@ -129,12 +129,21 @@ class Boxes:
     def transform(self, target_from_source: SE3, frame: str) -> Boxes:
         """The same boxes in another frame: centers, rotations and velocities move, sizes stay."""
         turn = target_from_source.rotation
-        multiplier = quaternions.left_multiplier(quaternions.from_matrix(turn))
-        columns = {name: getattr(self, name) for name in _COLUMNS}
-        columns["center"] = self.center @ turn.T + target_from_source.translation
-        columns["rotation"] = self.rotation @ multiplier.T
-        columns["velocity"] = self.velocity @ turn.T
-        return trusted_boxes(frame, columns)
+        turn_transposed = turn.T
+        return trusted_boxes(
+            frame,
+            {
+                "center": self.center @ turn_transposed + target_from_source.translation,
+                "size": self.size,
+                "rotation": self.rotation @ quaternions.single_left_multiplier(turn).T,
+                "velocity": self.velocity @ turn_transposed,
+                "category": self.category,
+                "actor_id": self.actor_id,
+                "num_lidar_pts": self.num_lidar_pts,
+                "camera_visible": self.camera_visible,
+                "row": self.row,
+            },
+        )
 
     def corners(self) -> FloatArray:
         """The eight corners of each box, (N, 8, 3) metres, in the order of `CORNER_SIGNS`."""
@@ -167,7 +176,7 @@ def trusted_boxes(frame: str, columns: dict[str, AnyArray]) -> Boxes:
     put = object.__setattr__
     put(result, "frame", frame)
     for name, array in columns.items():
-        array.flags.writeable = False
+        array.setflags(write=False)
         put(result, name, array)
     return result
 

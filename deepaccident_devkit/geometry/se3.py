@@ -40,7 +40,7 @@ class SE3:
     @classmethod
     def identity(cls) -> SE3:
         """The transform that changes nothing."""
-        return cls(np.eye(4))
+        return trusted_se3(np.eye(4))
 
     @classmethod
     def from_rotation(cls, rotation: ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> SE3:
@@ -79,7 +79,7 @@ class SE3:
         """The rotation as a pyquaternion unit quaternion with w ≥ 0."""
         from pyquaternion import Quaternion
 
-        return Quaternion(quaternions.from_matrix(self.rotation))
+        return Quaternion(*quaternions.single_from_matrix(self.rotation))
 
     @property
     def yaw(self) -> float:
@@ -123,7 +123,7 @@ class SE3:
 def trusted_se3(matrix: FloatArray) -> SE3:
     """An SE3 over a fresh matrix that is rigid by construction, or was checked when it was read."""
     result = object.__new__(SE3)
-    matrix.flags.writeable = False
+    matrix.setflags(write=False)
     object.__setattr__(result, "matrix", matrix)
     return result
 

@@ -12,6 +12,7 @@ from deepaccident_devkit.tables.columns import (
     Choice,
     Column,
     Derived,
+    Items,
     Key,
     Kind,
     Number,
@@ -21,6 +22,7 @@ from deepaccident_devkit.tables.columns import (
     Vector,
     Word,
 )
+from deepaccident_devkit.tables.specs import record_columns
 
 Columns = Mapping[str, Any]
 """Stored column name → array (or list, for words) of one table's rows."""
@@ -86,7 +88,7 @@ def arrow_type(kind: Kind) -> Any:
     if isinstance(kind, Vector):
         return pa.list_(pa.float64(), kind.length)
     if isinstance(kind, Struct):
-        return _collision_type()
+        return _struct_type(kind.record)
     return pa.from_numpy_dtype(numpy_dtype(kind))
 
 
@@ -126,19 +128,15 @@ def unpacked(view: Any) -> Any:
     return view if isinstance(view, np.ndarray) else view.to_pylist()
 
 
-def _collision_type() -> Any:
+def _struct_type(record: type) -> Any:
     import pyarrow as pa
 
-    return pa.struct(
-        [
-            ("ids", pa.list_(pa.int64(), 2)),
-            ("classes", pa.list_(pa.string(), 2)),
-            ("impact", pa.float64()),
-            ("spawn_relation", pa.string()),
-            ("contact_side", pa.string()),
-            ("agents", pa.list_(pa.string(), 2)),
-        ]
-    )
+    def field_type(kind: Kind) -> Any:
+        if isinstance(kind, Items):
+            return pa.list_(pa.int64() if kind.type == "integer" else pa.string(), 2)
+        return arrow_type(kind)
+
+    return pa.struct([(column.field, field_type(column.kind)) for column in record_columns(record)])
 
 
 def _arrow_array(column: Column, values: Any) -> Any:
@@ -177,7 +175,9 @@ def _view(kind: Kind, array: Any) -> Any:
         array = array.indices
     length = len(array)
     if isinstance(kind, Vector):
-        return _buffer(array.values.buffers()[1], np.dtype(np.float64), length * kind.length).reshape(length, kind.length)
+        return _buffer(array.values.buffers()[1], np.dtype(np.float64), length * kind.length).reshape(
+            length, kind.length
+        )
     content = array.buffers()[1]
     if isinstance(kind, Number) and kind.dtype == "bool":
         return BitView(_buffer(content, np.dtype(np.uint8), (length + 7) // 8), length)

@@ -76,6 +76,15 @@ class Word:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Items:
+    """Two values of a JSON type (`integer`, `string`); within structs only."""
+
+    type: str
+    doc: str
+    nullable: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Struct:
     """A record within the record, given by a TypedDict; for small tables only."""
 
@@ -83,7 +92,7 @@ class Struct:
     doc: str
 
 
-Kind = Derived | Key | Number | Vector | Choice | Subset | Word | Struct
+Kind = Derived | Key | Number | Vector | Choice | Subset | Word | Items | Struct
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ manifest last, so that a reader sees the old index or the new one.
 
 import hashlib
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -75,10 +75,9 @@ def open_index(
     if on_error not in ("raise", "skip"):
         raise ChoiceError(f"on_error: expected 'raise' or 'skip', found {on_error!r}")
     fingerprint = folder_digest(layout.scenarios, layout.split_files.values())
-    current = [index for index in find_indexes(layout, index_dir) if _is_current(layout, index, fingerprint)]
-    if current and not check_files:
-        index = current[0]
-    else:
+    found = (index for index in find_indexes(layout, index_dir) if _is_current(layout, index, fingerprint))
+    index = None if check_files else next(found, None)
+    if index is None:
         folder = _writable_folder(layout, index_dir)
         index = Index(
             folder=folder,
@@ -88,24 +87,28 @@ def open_index(
     return index
 
 
-def find_indexes(layout: ReleaseLayout, index_dir: Path | None = None) -> list[Index]:
+def find_indexes(layout: ReleaseLayout, index_dir: Path | None = None) -> Iterator[Index]:
     """The release's indexes on disk, up to date or not, the first choice first."""
-    found = [(folder, read_manifest(folder)) for folder in index_folders(layout, index_dir)]
-    return [Index(folder=folder, manifest=manifest) for folder, manifest in found if manifest]
+    for folder in index_folders(layout, index_dir):
+        manifest = read_manifest(folder)
+        if manifest:
+            yield Index(folder=folder, manifest=manifest)
 
 
-def index_folders(layout: ReleaseLayout, index_dir: Path | None = None) -> list[Path]:
+def index_folders(layout: ReleaseLayout, index_dir: Path | None = None) -> Iterator[Path]:
     """Where the release's index may lie, the first choice first."""
     if index_dir is not None:
-        return [index_dir / layout.version]
+        yield index_dir / layout.version
+        return
+    yield layout.root / INDEX_FOLDER / layout.version
     from platformdirs import user_cache_path
 
     key = hashlib.blake2b(str(layout.root.resolve()).encode(), digest_size=8).hexdigest()
-    return [layout.root / INDEX_FOLDER / layout.version, user_cache_path("deepaccident_devkit") / key / layout.version]
+    yield user_cache_path("deepaccident_devkit") / key / layout.version
 
 
 def _writable_folder(layout: ReleaseLayout, index_dir: Path | None) -> Path:
-    folders = index_folders(layout, index_dir)
+    folders = list(index_folders(layout, index_dir))
     for folder in folders:
         if is_writable_folder(folder):
             return folder

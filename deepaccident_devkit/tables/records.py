@@ -5,21 +5,25 @@
 
 from typing import Annotated, TypedDict
 
-from deepaccident_devkit.tables.columns import Choice, Derived, Key, Number, Struct, Subset, Vector, Word
+from deepaccident_devkit.tables.columns import Choice, Derived, Items, Key, Number, Struct, Subset, Vector, Word
 from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, CHANNELS, FILE_FORMATS, MODALITIES, SPLITS, TIMES_OF_DAY
 
 
 class CollisionRecord(TypedDict):
     """The collision that ended a scenario, as meta names it."""
 
-    ids: Annotated[list[int], Vector(shape=(2,), doc="Actor ids of the pair.")]
-    classes: Annotated[list[str], Word(doc="Category names of the pair.")]
+    ids: Annotated[list[int], Items(type="integer", doc="Actor ids of the pair.")]
+    classes: Annotated[list[str], Items(type="string", doc="Category names of the pair.")]
     impact: Annotated[float, Number(dtype="float64", doc="The simulator's impulse of the contact.")]
     spawn_relation: Annotated[str, Word(doc="Meta's word for where the pair was spawned, such as `same`.")]
     contact_side: Annotated[str, Word(doc="Meta's word for where the contact was, such as `front_side`.")]
     agents: Annotated[
         list[str | None] | None,
-        Word(doc="Which agents the pair are; null for a road user that records nothing, null where meta is silent."),
+        Items(
+            type="string",
+            nullable=True,
+            doc="Which agents the pair are; null for a road user that records nothing, null where meta is silent.",
+        ),
     ]
 
 

@@ -24,13 +24,13 @@ def table_spec(name: str) -> TableSpec:
         raise TableError(f"no table {name!r}; there are {', '.join(table_specs())}") from None
 
 
+def record_columns(record: type) -> tuple[Column, ...]:
+    """The columns that a TypedDict of annotated fields declares."""
+    return tuple(_column(field, hint) for field, hint in get_type_hints(record, include_extras=True).items())
+
+
 def _spec(name: str, record: type) -> TableSpec:
-    hints = get_type_hints(record, include_extras=True)
-    return TableSpec(
-        name=name,
-        doc=" ".join((record.__doc__ or "").split()),
-        columns=tuple(_column(field, hint) for field, hint in hints.items()),
-    )
+    return TableSpec(name=name, doc=" ".join((record.__doc__ or "").split()), columns=record_columns(record))
 
 
 def _column(field: str, hint: Any) -> Column:

@@ -1,0 +1,75 @@
+"""Fixtures that all tests share: one synthetic release a session, made and indexed once."""
+
+import shutil
+from pathlib import Path
+
+import matplotlib as mpl
+import pytest
+from hypothesis import settings
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.synth import SynthConfig, make_release
+
+mpl.use("Agg")
+settings.register_profile("repeatable", deadline=None, derandomize=True, max_examples=50)
+settings.load_profile("repeatable")
+
+DATA = Path(__file__).parent / "data"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--golden",
+        type=Path,
+        default=DATA / "golden",
+        help="folder with inputs and outputs of the released code, for tests/parity",
+    )
+
+
+@pytest.fixture(scope="session")
+def release_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A synthetic release in layout A with all sensors; read-only by agreement. The path has a blank in it."""
+    root = tmp_path_factory.mktemp("synthetic") / "deep accident"
+    config = SynthConfig(scenarios=4, frames=6, image_size=(64, 36), layout="A", seed=3)
+    return make_release(root, config, workers=2)
+
+
+@pytest.fixture(scope="session")
+def release_root_b(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A synthetic release in layout B, labels only; read-only by agreement."""
+    root = tmp_path_factory.mktemp("synthetic") / "layout_b"
+    return make_release(root, SynthConfig(scenarios=6, frames=4, layout="B", seed=4, sensors=False), workers=2)
+
+
+@pytest.fixture(scope="session")
+def da(release_root: Path) -> DeepAccident:
+    """The release of `release_root`, opened."""
+    return DeepAccident("v1", release_root, verbose=False)
+
+
+@pytest.fixture(scope="session")
+def da_b(release_root_b: Path) -> DeepAccident:
+    """The release of `release_root_b`, opened."""
+    return DeepAccident("v1", release_root_b, verbose=False)
+
+
+@pytest.fixture(params=["A", "B"])
+def both_layouts(request: pytest.FixtureRequest) -> DeepAccident:
+    """Each of the two releases in turn."""
+    opened: DeepAccident = request.getfixturevalue("da" if request.param == "A" else "da_b")
+    return opened
+
+
+@pytest.fixture
+def own_release(release_root_b: Path, tmp_path: Path) -> Path:
+    """A copy of the labels-only release that a test may break; without an index."""
+    root = tmp_path / "release"
+    shutil.copytree(release_root_b, root, ignore=shutil.ignore_patterns(".deepaccident"))
+    return root
+
+
+@pytest.fixture(autouse=True)
+def _figures_closed() -> None:
+    from matplotlib import pyplot as plt
+
+    plt.close("all")

@@ -1,0 +1,245 @@
+"""The facade as a user meets it: names, errors, ownership, pickling."""
+
+import multiprocessing
+import pickle
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import deepaccident_devkit
+from deepaccident_devkit import DeepAccident, DeepAccidentError
+from deepaccident_devkit.errors import (
+    ChoiceError,
+    DatarootError,
+    FieldError,
+    MissingFileError,
+    SensorFileError,
+    TableError,
+    TokenError,
+    VersionError,
+)
+from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
+
+
+def test_dataroots_that_are_none(tmp_path: Path, release_root: Path) -> None:
+    with pytest.raises(DatarootError, match=r"nowhere: does not exist; give the folder"):
+        DeepAccident(dataroot=tmp_path / "nowhere")
+    with pytest.raises(DatarootError, match="no scenario found; expected <scenario_type>/<agent>/calib"):
+        DeepAccident(dataroot=tmp_path)
+    with pytest.raises(DatarootError, match="is a file"):
+        DeepAccident(dataroot=release_root / "train.txt")
+    with pytest.raises(VersionError, match="unknown version 'v2'; known are v1, v1-mini"):
+        DeepAccident("v2", release_root)
+    with pytest.raises(VersionError, match="holds no mini release"):
+        DeepAccident("v1-mini", release_root)
+    with pytest.raises(ChoiceError, match="on_error: expected 'raise' or 'skip', found 'ignore'"):
+        DeepAccident(dataroot=release_root, on_error="ignore")  # type: ignore[arg-type]
+
+
+def test_the_mini_release_is_a_version_of_its_own(own_release: Path) -> None:
+    (own_release / "train").rename(own_release / "DeepAccident_mini")
+    (own_release / "train.txt").unlink()
+    whole, mini = (DeepAccident(version, own_release, verbose=False) for version in ("v1", "v1-mini"))
+    assert len(whole.scenario) + len(mini.scenario) == 6
+    assert {scenario["folder"] for scenario in mini.scenario} == {"DeepAccident_mini"}
+    alone = DeepAccident("v1-mini", own_release / "DeepAccident_mini", verbose=False)
+    assert len(alone.scenario) == len(mini.scenario) > 0
+
+
+@pytest.mark.parametrize(
+    ("token", "why"),
+    [
+        ("nonsense", "expected the form <scenario>/<agent>/<NNN>"),
+        ("a/b/ego_vehicle/001", "this release has no scenario 'a/b'"),
+        ("{scenario}/bus/001", "the scenario's agents are ego_vehicle, "),
+        ("{scenario}/ego_vehicle/007", "the scenario's frames are 001 to 006"),
+        ("{scenario}/ego_vehicle/1", "the scenario's frames are 001 to 006"),
+        ("{scenario}/ego_vehicle/+01", "the scenario's frames"),
+    ],
+)
+def test_unknown_sample_tokens(da: DeepAccident, token: str, why: str) -> None:
+    token = token.format(scenario=da.scenario[0]["token"])
+    for call in (lambda: da.get("sample", token), lambda: da.boxes(token), lambda: da.load_point_cloud(token)):
+        with pytest.raises(TokenError, match=why) as raised:
+            call()
+        assert str(raised.value).startswith("table 'sample' has no token")
+
+
+@pytest.mark.parametrize("table", ["scenario", "sample_data", "instance", "annotation", "track", "calibrated_sensor"])
+def test_unknown_tokens_of_other_tables(da: DeepAccident, table: str) -> None:
+    token = getattr(da, table)[0]["token"]
+    for wrong in (f"{token}9", f"{token}/1/1/1/1", token.replace("Town", "Village"), f"{token}/1", ""):
+        with pytest.raises(TokenError, match=f"table '{table}' has no token"):
+            da.get(table, wrong)
+
+
+def test_unknown_tables_fields_channels_and_frames(da: DeepAccident) -> None:
+    sample = da.sample[0]["token"]
+    with pytest.raises(TableError, match="no table 'scene'; there are scenario, agent"):
+        da.get("scene", "x")
+    with pytest.raises(FieldError, match="table 'scenario' has no field 'rain'; it has token, name"):
+        da.field2token("scenario", "rain", 1)
+    with pytest.raises(TokenError, match="the channels are Camera_Front, "):
+        da.load_image(f"{sample}/Camera_Side")
+    with pytest.raises(ChoiceError, match="lidar01 holds no images"):
+        da.load_image(f"{sample}/lidar01")
+    with pytest.raises(ChoiceError, match="frame: expected world, ego, lidar or one of Camera_Front"):
+        da.boxes(sample, "camera")
+    with pytest.raises(ChoiceError, match="visible: expected None, 'camera' or 'released'"):
+        da.boxes(sample, visible="lidar")  # type: ignore[arg-type]
+    with pytest.raises(ChoiceError, match="velocity: expected 'derived' or 'label'"):
+        da.boxes(sample, velocity="mine")  # type: ignore[arg-type]
+    with pytest.raises(ChoiceError, match="split: expected one of train, val, test"):
+        da.split_scenarios("training")
+    other = da.get("frame", da.scenario[1]["first_frame_token"])
+    with pytest.raises(ChoiceError, match="expected two samples of one scenario"):
+        da.transform(sample, da.samples_of(other)[0])
+    with pytest.raises(IndexError, match="table 'sensor' has 8 rows, asked for row 8"):
+        _ = da.sensor[8]
+
+
+def test_missing_and_broken_sensor_files_are_named(own_release: Path) -> None:
+    release = DeepAccident(dataroot=own_release, verbose=False)
+    sample = release.sample[0]["token"]
+    path = release.get_sample_data_path(f"{sample}/Camera_Front")
+    with pytest.raises(MissingFileError, match=rf"{path.name}: no such file; unpack the archive"):
+        release.load_image(f"{sample}/Camera_Front")
+    with pytest.raises(MissingFileError, match="no such file"):
+        release.load_bev(sample)
+    cloud = release.get_sample_data_path(f"{sample}/lidar01")
+    cloud.parent.mkdir(parents=True)
+    cloud.write_bytes(b"")
+    with pytest.raises(SensorFileError, match=rf"{cloud.name}: .*the file is empty.*; restore the file"):
+        release.load_point_cloud(sample)
+
+
+def test_every_error_is_ours_and_also_the_built_in_kind(da: DeepAccident) -> None:
+    with pytest.raises(KeyError, match="table 'sample' has no token"):
+        da.get("sample", "x")
+    with pytest.raises(DeepAccidentError, match="table 'sample' has no token"):
+        da.get("sample", "x")
+
+
+def test_records_are_the_callers(da: DeepAccident) -> None:
+    record = da.get("annotation", da.annotation[0]["token"])
+    expected = list(record["translation"])
+    record["translation"][0] += 100
+    record.clear()
+    assert da.annotation[0]["translation"] == expected
+
+
+def test_arrays_are_read_only_and_the_tables_keep_their_values(da: DeepAccident) -> None:
+    sample = da.sample[0]
+    for frame in ("lidar", "ego", "world"):
+        boxes = da.boxes(sample, frame)
+        for name in ("center", "size", "rotation", "velocity", "actor_id", "camera_visible", "row"):
+            with pytest.raises(ValueError, match="read-only"):
+                getattr(boxes, name)[0] = 0
+    image = da.load_image(f"{sample['token']}/Camera_Front")
+    image[:] = 0  # the caller's own
+    assert da.load_image(f"{sample['token']}/Camera_Front").any()
+
+
+def test_a_pickle_is_small_and_opens_again(da: DeepAccident) -> None:
+    content = pickle.dumps(da)
+    assert len(content) < 2000
+    assert pickle.loads(content).get("sample", da.sample[3]["token"]) == da.sample[3]
+
+
+def _num_boxes(release: DeepAccident, row: int) -> int:
+    return len(release.boxes(release.sample[row]))
+
+
+@pytest.mark.parametrize("method", ["spawn", "fork"])
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_workers_get_their_own_copy(da: DeepAccident, method: str) -> None:
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context(method)) as pool:
+        counts = list(pool.map(_num_boxes, [da] * 3, range(3)))
+    assert counts == [_num_boxes(da, row) for row in range(3)]
+
+
+def test_tables_behave_like_sequences(da: DeepAccident) -> None:
+    assert len(da.scenario) == len(list(da.scenario)) == len(da.scenario[:]) == 4
+    assert da.scenario[-1] == da.scenario[3] == da.scenario[2:][1]
+    assert repr(da.scenario).startswith("<table 'scenario': 4 rows of token, name")
+    assert da.arrow("scenario").num_rows == 4
+
+
+@pytest.mark.parametrize(
+    ("table", "field"),
+    [
+        ("scenario", "weather"),
+        ("scenario", "num_frames"),
+        ("scenario", "designed_accident"),
+        ("scenario", "collision"),
+        ("sample", "agent_token"),
+        ("sample", "prev"),
+        ("annotation", "category"),
+        ("annotation", "actor_id"),
+        ("annotation", "camera_visible"),
+        ("sample_data", "filename"),
+        ("sample_data", "width"),
+        ("agent", "actor_id"),
+    ],
+)
+def test_field2token_agrees_with_the_records(da: DeepAccident, table: str, field: str) -> None:
+    records = getattr(da, table)[:400]
+    for value in {repr(record[field]): record[field] for record in records[:40]}.values():
+        expected = [record["token"] for record in getattr(da, table) if record[field] == value]
+        assert da.field2token(table, field, value) == expected
+    assert da.field2token(table, field, "no such value") == []
+
+
+def test_get_sample_and_samples_of(da: DeepAccident) -> None:
+    scenario = da.scenario[2]
+    samples = da.samples_of(scenario["last_frame_token"])
+    assert [sample["agent"] for sample in samples] == list(AGENTS)
+    assert (
+        samples[1] == da.get_sample(scenario, "ego_vehicle_behind", 6) == da.get_sample(scenario["token"], AGENTS[1], 6)
+    )
+
+
+def test_sensor_data_is_where_it_should_be(da: DeepAccident) -> None:
+    """LiDAR points of a box lie in it in whichever frame, and its centre projects to the same pixel."""
+    for sample in da.samples_of(da.scenario[0]["first_frame_token"]):
+        for frame in ("world", "ego", "lidar"):
+            cloud, boxes = da.load_point_cloud(sample, frame), da.boxes(sample, frame)
+            assert cloud.frame == frame
+            well_hit = boxes.num_lidar_pts > 20
+            assert well_hit.any()
+            counts = boxes.contains(cloud.xyz).sum(axis=1)
+            np.testing.assert_allclose(counts[well_hit], boxes.num_lidar_pts[well_hit], atol=1)
+        image = da.load_image(f"{sample['token']}/{CAMERAS[0]}")
+        assert image.shape == (36, 64, 3)
+        assert da.load_bev(sample).semantic.shape == (1200, 1200)
+
+
+def test_listings_print(da: DeepAccident, capsys: pytest.CaptureFixture[str]) -> None:
+    da.list_scenarios()
+    da.list_agents()
+    da.list_categories()
+    da.list_sample(da.sample[0]["token"])
+    printed = capsys.readouterr().out
+    for word in (
+        da.scenario[0]["token"],
+        "infrastructure  4 scenarios",
+        "0  car  ",
+        "Camera_Front",
+        "Box(car -100, lidar",
+    ):
+        assert word in printed
+
+
+def test_what_the_design_names_is_there() -> None:
+    tables = (
+        "scenario agent frame sample sample_data sensor calibrated_sensor ego_pose instance annotation track category"
+    )
+    look_ups = "get getind field2token arrow get_sample samples_of table_names split_scenarios"
+    listings = "list_scenarios list_agents list_categories list_sample"
+    data = "get_sample_data_path get_sample_data load_image load_point_cloud load_bev get_boxes boxes transform"
+    pictures = "render_sample render_sample_data render_frame render_bev"
+    names = f"{tables} {look_ups} {listings} {data} {pictures}".split()
+    assert [name for name in names if not hasattr(DeepAccident, name)] == []
+    assert deepaccident_devkit.__version__ == "0.1.0"

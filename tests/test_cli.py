@@ -1,0 +1,109 @@
+"""The command line, end to end: the verbs on real folders, their grammar, their errors."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.synth import SynthConfig
+
+
+def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "deepaccident_devkit.cli", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+
+
+def test_synth_index_info_end_to_end(tmp_path: Path) -> None:
+    out = tmp_path / "my release"
+    made = run("synth", out, "--scenarios", 2, "--frames", 3, "--image-size", "64x36", "--layout", "B", "--seed", 7)
+    assert made.returncode == 0, made.stderr
+    assert f"deepaccident info {out}" in made.stdout or "deepaccident info" in made.stdout
+    indexed = run("index", out)
+    assert (indexed.returncode, "2 scenarios, 30 samples" in indexed.stdout) == (0, True)
+    text = run("info", out)
+    assert text.returncode == 0
+    squeezed = " ".join(text.stdout.split())
+    for line in (
+        "layout B",
+        "train 2 of 483",
+        "type1_subtype1_accident 1",
+        "Camera_Front 10",
+    ):
+        assert line in squeezed
+    counts = json.loads(run("info", out, "--json").stdout)
+    assert counts["tables"]["sample"] == 30
+    assert counts["splits"] == {"train": 2, "val": 0, "test": 0}
+    assert counts["agents"]["infrastructure"] == 2
+    release = DeepAccident(dataroot=out)
+    assert release.load_image(release.sample_data[0]).shape == (36, 64, 3)
+
+
+def test_errors_are_one_message_and_status_2(tmp_path: Path) -> None:
+    for verb in ("info", "index"):
+        failed = run(verb, tmp_path / "nowhere")
+        assert failed.returncode == 2
+        assert failed.stderr.startswith(f"error: {tmp_path / 'nowhere'}: does not exist; give the folder")
+        assert "Traceback" not in failed.stderr
+        assert failed.stdout == ""
+
+
+def test_a_broken_release_is_listed_and_may_be_skipped(own_release: Path) -> None:
+    broken = next(own_release.glob("train/*/ego_vehicle/label/*/*_002.txt"))
+    broken.write_text("0 0\ncar 1 2 3 4\n")
+    failed = run("info", own_release)
+    assert failed.returncode == 2
+    assert "1 of 6 scenarios are broken" in failed.stderr
+    assert f"{broken}:2: expected 13 fields, found 5" in failed.stderr
+    skipped = run("info", own_release, "--on-error", "skip")
+    assert skipped.returncode == 0
+    assert "left out as broken:" in skipped.stdout
+    assert "WARNING: left out" in skipped.stderr
+
+
+@pytest.mark.parametrize("verb", ["info", "index"])
+def test_every_verb_on_a_release_has_the_same_grammar(verb: str) -> None:
+    text = CliRunner().invoke(deepaccident, [verb, "--help"]).output
+    assert "DATAROOT" in text
+    for option in ("--version", "--index-dir", "--workers", "--on-error"):
+        assert option in text
+
+
+def test_help_names_the_verbs_and_wrong_usage_is_status_2() -> None:
+    runner = CliRunner()
+    text = runner.invoke(deepaccident, ["--help"]).output
+    for verb in ("demo", "synth", "index", "info"):
+        assert verb in text
+    assert runner.invoke(deepaccident, ["info"]).exit_code == 2
+    assert runner.invoke(deepaccident, ["dance"]).exit_code == 2
+    assert "0.1.0" in runner.invoke(deepaccident, ["--version"]).output
+
+
+def test_index_check_sees_an_edit_that_folder_times_hide(own_release: Path) -> None:
+    run("index", own_release)
+    label = next(own_release.glob("train/*/ego_vehicle/label/*/*_001.txt"))
+    lines = label.read_text().splitlines()
+    label.write_text("\n".join(lines[:-1]) + "\n")
+    before, after = (json.loads(run("info", own_release, "--json").stdout)["tables"]["annotation"] for _ in range(2))
+    assert before == after
+    assert run("index", own_release, "--check").returncode == 0
+    assert json.loads(run("info", own_release, "--json").stdout)["tables"]["annotation"] == before - 1
+
+
+def test_demo_draws_its_accident(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    demo_module = sys.modules["deepaccident_devkit.cli.demo"]  # the package's `demo` is the verb
+    monkeypatch.setattr(demo_module, "_RELEASE", SynthConfig(scenarios=2, frames=12, image_size=(64, 36)))
+    out = tmp_path / "demo"
+    result = CliRunner().invoke(deepaccident, ["demo", str(out)], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    pictures = sorted(path.name for path in out.glob("*.png"))
+    assert pictures == ["ego_cameras_1s_before.png", "five_agents_1s_before.png", "five_agents_impact.png"]
+    assert all((out / name).stat().st_size > 20_000 for name in pictures)
+    assert "annotation" in result.output
+    assert "Try next:" in result.output
+    again = CliRunner().invoke(deepaccident, ["demo", str(out)], catch_exceptions=False)
+    assert "using the release that is in" in again.output

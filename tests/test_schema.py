@@ -1,0 +1,76 @@
+"""schema/ is what the code says, and records are what schema/ says."""
+
+import hashlib
+import importlib.util
+import json
+from pathlib import Path
+from types import ModuleType
+
+import jsonschema
+import pytest
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.tables.arrow import arrow_schema
+from deepaccident_devkit.tables.manifest import SCHEMA_VERSION
+from deepaccident_devkit.tables.specs import table_specs
+
+SCHEMA = Path(__file__).parents[1] / "schema"
+
+
+@pytest.fixture(scope="module")
+def generate() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("generate", SCHEMA / "generate.py")
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_files_are_not_stale(generate: ModuleType) -> None:
+    for name, content in generate.generated_files().items():
+        assert (SCHEMA / name).read_text(encoding="utf-8") == content, f"run python schema/generate.py: {name}"
+
+
+def test_no_file_is_left_over(generate: ModuleType) -> None:
+    assert {path.name for path in SCHEMA.iterdir() if path.is_file()} == {*generate.generated_files(), "generate.py"}
+
+
+@pytest.mark.parametrize("table", list(table_specs()))
+def test_records_are_as_their_schema_says(both_layouts: DeepAccident, table: str) -> None:
+    schema = json.loads((SCHEMA / f"{table}.json").read_text(encoding="utf-8"))
+    jsonschema.Draft202012Validator.check_schema(schema)
+    validator = jsonschema.Draft202012Validator(schema)
+    records = getattr(both_layouts, table)
+    for record in records[:: max(1, len(records) // 40)]:
+        validator.validate(record)
+        assert list(record) == list(schema["properties"])
+
+
+@pytest.mark.parametrize("table", list(table_specs()))
+def test_a_record_with_a_field_missing_is_refused(da: DeepAccident, table: str) -> None:
+    schema = json.loads((SCHEMA / f"{table}.json").read_text(encoding="utf-8"))
+    record = getattr(da, table)[0]
+    del record["token"]
+    with pytest.raises(jsonschema.ValidationError, match="'token' is a required property"):
+        jsonschema.validate(record, schema)
+
+
+def test_the_page_explains_every_table_and_stored_column() -> None:
+    page = (SCHEMA / "README.md").read_text(encoding="utf-8")
+    prose = page.partition("<!-- generated below")[0]
+    for name, spec in table_specs().items():
+        assert name in prose, f"the prose says nothing of {name}"
+        for column in spec.stored_columns:
+            assert f"`{column.stored}`" in page
+
+
+def test_stored_columns_do_not_change_without_a_new_schema_version() -> None:
+    """An index of other columns must not be read: count SCHEMA_VERSION up and write the new digest here."""
+    stored = [
+        (name, field.name, str(field.type), field.nullable)
+        for name, spec in table_specs().items()
+        for field in arrow_schema(spec)
+    ]
+    digest = hashlib.blake2b(repr(stored).encode(), digest_size=8).hexdigest()
+    assert (SCHEMA_VERSION, digest) == (1, "bc121e62e1a52420")

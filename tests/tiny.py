@@ -1,0 +1,101 @@
+"""A release written by hand, without the devkit's writers: raw text, pickles and CARLA's own signs (format.md)."""
+
+import pickle
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+TYPE = "type1_subtype1_accident"
+NAME = "Town03_type001_subtype0001_scenario00024"
+TOKEN = f"{TYPE}/{NAME}"
+AGENTS = ("ego_vehicle", "ego_vehicle_behind", "other_vehicle", "other_vehicle_behind", "infrastructure")
+CAMERA_YAW = {"Front": 0, "FrontLeft": -55, "FrontRight": 55, "Back": 180, "BackLeft": -110, "BackRight": 110}
+META = """HardRainNoon 1223 car 1212 car 6790.168605131015 same front_side 14
+ colliding agents: ego other
+ agents id: 1223 1236 1212 1237
+ road_type: four-way junction
+ another_vehicle_spawn_side: left
+ ego_vehicle_direction: straight
+ other_vehicle_direction: straight
+"""
+
+
+def pose(yaw: float = 0.0, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> np.ndarray:
+    """A left-handed CARLA pose: yaw in degrees, clockwise from above (y is right, so the matrix looks usual)."""
+    c, s = np.cos(np.radians(yaw)), np.sin(np.radians(yaw))
+    return np.array([[c, -s, 0, x], [s, c, 0, y], [0, 0, 1, z], [0, 0, 0, 1.0]])
+
+
+def calib(ego_to_world: np.ndarray, *, height: float) -> dict[str, np.ndarray]:
+    arrays = {"lidar_to_ego": pose(z=height), "ego_to_world": ego_to_world}
+    for name, yaw in CAMERA_YAW.items():
+        camera_to_lidar = pose(yaw, x=2.0 * np.cos(np.radians(yaw)), y=2.0 * np.sin(np.radians(yaw)), z=-0.3)
+        focal = 560.166 if name == "Back" else 1142.5184
+        arrays[f"lidar_to_Camera_{name}"] = np.linalg.inv(camera_to_lidar)
+        arrays[f"intrinsic_Camera_{name}"] = np.array([[800, focal, 0], [450, 0, -focal], [1, 0, 0]], dtype=float)
+    return arrays
+
+
+def lidar_height(agent: str) -> float:
+    """The pole's LiDAR is its ego frame (format.md, calib)."""
+    return 0.0 if agent == "infrastructure" else 1.94
+
+
+def ego_to_world(agent: str, frame: int) -> np.ndarray:
+    """The ego drives at 10 m/s along CARLA's y axis (yaw 90), the others stand."""
+    if agent == "ego_vehicle":
+        return pose(90, x=5.0, y=float(frame), z=0.5)
+    return pose(0, x=-10.0 * AGENTS.index(agent), z=0.5)
+
+
+def label_lines(agent: str, frame: int) -> list[str]:
+    """One car that drives at 2 m/s along world x, standing in the LiDAR frame's coordinates of each agent."""
+    lidar_to_world = ego_to_world(agent, frame) @ pose(z=lidar_height(agent))
+    world = np.array([20.0 + 0.2 * frame, 3.0, 1.3, 1.0])
+    x, y, z, _ = np.linalg.inv(lidar_to_world) @ world
+    yaw = -np.arctan2(lidar_to_world[1, 0], lidar_to_world[0, 0])
+    lines = ["0.0 10.0" if agent == "ego_vehicle" else "0.0 0.0"]
+    if agent != "infrastructure":
+        lines.append("car 0.1 0.0 -1.2 4.5 1.9 1.5 0.0 0.0 10.0 -100 900 False")
+    lines.append(f"van {float(x)!r} {float(y)!r} {float(z)!r} 5.0 2.0 2.2 {float(yaw)!r} 2.0 0.0 1300 12 True")
+    lines.append("pedestrian 30.0 -1.5 -0.9 0.375 0.375 1.86 2.19 0.0 0.0 -1 0 True")
+    return lines
+
+
+def write_tiny_release(
+    root: Path,
+    *,
+    frames: int = 4,
+    agents: Sequence[str] = AGENTS,
+    scenario_type: str = TYPE,
+    name: str = NAME,
+    meta: str | None = META,
+    labelled: bool = True,
+    lines_of: Callable[[str, int], list[str]] = label_lines,
+) -> Path:
+    """Write one scenario (labels, calib, meta) below `root`; the calib as an old numpy would name its modules."""
+    base = root / scenario_type
+    if meta is not None:
+        _write(base / "meta" / f"{name}.txt", meta.encode())
+    for agent in agents:
+        for frame in range(1, frames + 1):
+            stem = f"{name}/{name}_{frame:03d}"
+            _write(
+                base / agent / "calib" / f"{stem}.pkl",
+                old_pickle(calib(ego_to_world(agent, frame), height=lidar_height(agent))),
+            )
+            if labelled:
+                _write(base / agent / "label" / f"{stem}.txt", ("\n".join(lines_of(agent, frame)) + "\n").encode())
+    return root
+
+
+def old_pickle(content: Any) -> bytes:
+    """A pickle that names numpy 1's modules."""
+    return pickle.dumps(content, protocol=2).replace(b"numpy._core.multiarray", b"numpy.core.multiarray")
+
+
+def _write(path: Path, content: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content)

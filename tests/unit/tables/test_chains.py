@@ -1,0 +1,76 @@
+"""Every key points at a row, every chain can be walked, on both layouts."""
+
+import pytest
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.tables.columns import Key
+from deepaccident_devkit.tables.specs import table_specs
+
+KEYS = [
+    (name, column.field, column.kind.table)
+    for name, spec in table_specs().items()
+    for column in spec.columns
+    if isinstance(column.kind, Key)
+]
+CHAINED = [name for name, field, _ in KEYS if field == "next"]
+
+
+@pytest.mark.parametrize(("table", "field", "target"), KEYS)
+def test_every_foreign_key_names_a_row(both_layouts: DeepAccident, table: str, field: str, target: str) -> None:
+    tokens = {record[field] for record in getattr(both_layouts, table)} - {None}
+    assert tokens, "a column of nothing but nulls tests nothing"
+    for token in tokens:
+        assert both_layouts.get(target, token)["token"] == token
+
+
+@pytest.mark.parametrize("table", list(table_specs()))
+def test_tokens_are_unique_and_lead_back_to_their_rows(both_layouts: DeepAccident, table: str) -> None:
+    records = getattr(both_layouts, table)
+    tokens = [record["token"] for record in records]
+    assert len(set(tokens)) == len(tokens) > 0
+    assert [both_layouts.getind(table, token) for token in tokens] == list(range(len(records)))
+
+
+@pytest.mark.parametrize("table", CHAINED)
+def test_chains_reach_every_row_once_and_run_both_ways(both_layouts: DeepAccident, table: str) -> None:
+    records = {record["token"]: record for record in getattr(both_layouts, table)}
+    walked = []
+    for start in [record for record in records.values() if record["prev"] is None]:
+        record = start
+        walked.append(record["token"])
+        while record["next"] is not None:
+            following = records[record["next"]]
+            assert following["prev"] == record["token"]
+            record = following
+            walked.append(record["token"])
+    assert sorted(walked) == sorted(records)
+
+
+def test_annotation_chains_stay_with_one_agent_and_actor(both_layouts: DeepAccident) -> None:
+    for record in both_layouts.annotation:
+        if record["next"] is None:
+            continue
+        following = both_layouts.get("annotation", record["next"])
+        assert following["actor_id"] == record["actor_id"]
+        agent, later_agent = (
+            both_layouts.get("sample", token["sample_token"])["agent_token"] for token in (record, following)
+        )
+        assert agent == later_agent
+
+
+def test_an_instances_first_and_last_annotation_are_by_frame_then_agent(both_layouts: DeepAccident) -> None:
+    order = {}
+    for row, record in enumerate(both_layouts.annotation):
+        if record["instance_token"]:
+            sample = both_layouts.get("sample", record["sample_token"])
+            agent = both_layouts.getind("agent", sample["agent_token"])
+            entry = (sample["timestamp"], agent, row, record["token"])
+            order.setdefault(record["instance_token"], []).append(entry)
+    assert len(order) == len(both_layouts.instance)
+    for instance in both_layouts.instance:
+        entries = sorted(order[instance["token"]])
+        assert instance["num_annotations"] == len(entries)
+        assert (instance["first_annotation_token"], instance["last_annotation_token"]) == (
+            entries[0][-1],
+            entries[-1][-1],
+        )

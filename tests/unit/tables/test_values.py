@@ -1,0 +1,178 @@
+"""The tables' values on a release written by hand: every number here was worked out apart from the devkit."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny
+
+from deepaccident_devkit import DeepAccident
+
+FRAME_2 = f"{tiny.TOKEN}/ego_vehicle/002"
+
+
+@pytest.fixture(scope="module")
+def hand_made(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
+    return DeepAccident("v1", tiny.write_tiny_release(tmp_path_factory.mktemp("hand made")), verbose=False)
+
+
+def test_the_scenario_is_what_its_name_and_meta_say(hand_made: DeepAccident) -> None:
+    scenario = hand_made.get("scenario", tiny.TOKEN)
+    assert scenario["collision"] == {
+        "ids": [1223, 1212],
+        "classes": ["car", "car"],
+        "impact": 6790.168605131015,
+        "spawn_relation": "same",
+        "contact_side": "front_side",
+        "agents": ["ego_vehicle", "other_vehicle"],
+    }
+    expected = {
+        "town": "Town03",
+        "weather": "HardRain",
+        "time_of_day": "Noon",
+        "signalized": True,
+        "designed_accident": True,
+        "accident_type": 1,
+        "num_frames": 4,
+        "split": None,
+        "folder": "",
+        "first_frame_token": f"{tiny.TOKEN}/001",
+        "last_frame_token": f"{tiny.TOKEN}/004",
+    }
+    assert {name: scenario[name] for name in expected} == expected
+
+
+def test_left_handed_values_are_turned_once(hand_made: DeepAccident) -> None:
+    pose = hand_made.get("ego_pose", FRAME_2)
+    assert pose["translation"] == [5.0, -2.0, 0.5]
+    np.testing.assert_allclose(pose["rotation"], [np.sqrt(0.5), 0, 0, -np.sqrt(0.5)], atol=1e-12)
+    assert hand_made.get("sample", FRAME_2)["velocity"] == [0.0, -10.0]
+    own = hand_made.get("annotation", f"{FRAME_2}/0")
+    assert own["velocity_label"] == [0.0, -10.0]
+    assert own["actor_id"] == -100
+    pedestrian = hand_made.get("annotation", f"{FRAME_2}/2")
+    assert (pedestrian["translation"], pedestrian["yaw"]) == ([30.0, 1.5, -0.9], -2.19)
+
+
+def test_world_boxes_are_where_the_car_is_for_every_agent(hand_made: DeepAccident) -> None:
+    for sample in hand_made.samples_of(f"{tiny.TOKEN}/003"):
+        van = next(box for box in hand_made.get_boxes(sample) if box.actor_id == 1300)
+        np.testing.assert_allclose(van.center, [20.6, -3.0, 1.3], atol=1e-9)
+        assert van.yaw == pytest.approx(0.0, abs=1e-9)
+        assert van.token == f"{sample['token']}/{0 if sample['agent'] == 'infrastructure' else 1}"
+        assert van.instance_token == f"{tiny.TOKEN}/actor/1300"
+
+
+@pytest.mark.parametrize("frame", [1, 2, 4])
+def test_velocity_comes_from_world_positions(hand_made: DeepAccident, frame: int) -> None:
+    """Central in the middle, one-sided at the ends; in the LiDAR frame's axes, yawed by −90° in world."""
+    van = hand_made.get("annotation", f"{tiny.TOKEN}/ego_vehicle/{frame:03d}/1")
+    np.testing.assert_allclose(van["velocity"], [0.0, 2.0, 0.0], atol=1e-9)
+    own = hand_made.boxes(f"{tiny.TOKEN}/ego_vehicle/{frame:03d}").velocity[0]
+    np.testing.assert_allclose(own, [0.0, -10.0, 0.0], atol=1e-9)
+
+
+def test_untracked_boxes_have_no_velocity_no_instance_and_no_chain(hand_made: DeepAccident) -> None:
+    untracked = hand_made.get("annotation", f"{FRAME_2}/2")
+    assert np.isnan(untracked["velocity"]).all()
+    assert (untracked["instance_token"], untracked["prev"], untracked["next"]) == (None, None, None)
+
+
+def test_the_labels_own_velocity_can_be_asked_for(hand_made: DeepAccident) -> None:
+    """(vx, −vy) of the label in the LiDAR frame; the agent's own row is in world already."""
+    boxes = hand_made.boxes(FRAME_2, "lidar", velocity="label")
+    np.testing.assert_allclose(boxes.velocity[1], [2.0, 0.0, 0.0])
+    np.testing.assert_allclose(hand_made.boxes(FRAME_2, "world", velocity="label").velocity[0], [0, -10, 0], atol=1e-9)
+
+
+def test_the_colliding_pair_and_the_countdown_are_on_the_annotations(hand_made: DeepAccident) -> None:
+    colliders = {record["token"] for record in hand_made.annotation if record["is_collider"]}
+    rows = {
+        f"{tiny.TOKEN}/{agent}/{frame:03d}/0" for agent in ("ego_vehicle", "other_vehicle") for frame in range(1, 5)
+    }
+    assert colliders == rows
+    for table, token in (("annotation", f"{FRAME_2}/1"), ("sample", FRAME_2), ("frame", f"{tiny.TOKEN}/002")):
+        assert hand_made.get(table, token)["time_to_impact"] == 0.2
+
+
+def test_tracks_take_the_view_from_outside(hand_made: DeepAccident) -> None:
+    van = hand_made.get("track", f"{tiny.TOKEN}/002/actor/1300")
+    assert van["agents"] == list(tiny.AGENTS)
+    np.testing.assert_allclose(van["translation"], [20.4, -3.0, 1.3], atol=1e-9)
+    np.testing.assert_allclose(van["velocity"], [2.0, 0.0, 0.0], atol=1e-9)
+    ego = hand_made.get("track", f"{tiny.TOKEN}/002/actor/1223")
+    assert (ego["agents"], ego["is_collider"]) == (["ego_vehicle"], True)
+
+
+def test_a_track_prefers_another_agents_row_to_the_actors_own(tmp_path: Path) -> None:
+    def lines(agent: str, frame: int) -> list[str]:
+        seen = [] if agent != "other_vehicle" else ["car 25.0 -2.0 -1.2 4.5 1.9 1.5 0.0 0.0 0.0 1223 5 True"]
+        return tiny.label_lines(agent, frame) + seen
+
+    release = DeepAccident("v1", tiny.write_tiny_release(tmp_path, lines_of=lines), verbose=False)
+    ego = release.get("track", f"{tiny.TOKEN}/001/actor/1223")
+    assert ego["agents"] == ["ego_vehicle", "other_vehicle"]
+    np.testing.assert_allclose(ego["translation"], [5.0, 2.0, 1.24], atol=1e-9)
+
+
+def test_cameras_are_optical_and_sit_where_calib_says(hand_made: DeepAccident) -> None:
+    front = hand_made.get("calibrated_sensor", f"{tiny.TOKEN}/ego_vehicle/Camera_Front")
+    np.testing.assert_allclose(front["translation"], [2.0, 0.0, 1.64], atol=1e-12)
+    np.testing.assert_allclose(np.array(front["matrix"])[:3, 2], [1, 0, 0], atol=1e-12)  # looks forward
+    assert front["camera_intrinsic"] == [[1142.5184, 0.0, 800.0], [0.0, 1142.5184, 450.0], [0.0, 0.0, 1.0]]
+    left = hand_made.get("calibrated_sensor", f"{tiny.TOKEN}/ego_vehicle/Camera_FrontLeft")
+    assert left["translation"][1] > 0
+    data = hand_made.get("sample_data", f"{FRAME_2}/Camera_Back")
+    assert (data["width"], data["height"]) == (1600, 900)
+    assert hand_made.get("sample_data", f"{FRAME_2}/lidar01")["width"] is None
+
+
+def test_sensor_data_comes_with_boxes_in_the_sensors_frame(hand_made: DeepAccident, tmp_path: Path) -> None:
+    path, boxes, intrinsic = hand_made.get_sample_data(f"{tiny.TOKEN}/ego_vehicle_behind/001/Camera_Front")
+    assert path == hand_made.dataroot / tiny.TYPE / "ego_vehicle_behind" / "Camera_Front" / tiny.NAME / (
+        f"{tiny.NAME}_001.jpg"
+    )
+    van = next(box for box in boxes if box.actor_id == 1300)
+    # 30.2 m ahead of the agent at x = −10, camera 2 m ahead and 2.14 m up; 3 m to its right
+    np.testing.assert_allclose(van.center, [3.0, 0.84, 28.2], atol=1e-9)
+    assert intrinsic is not None
+    assert intrinsic[0, 0] == 1142.5184
+    _, lidar_boxes, no_intrinsic = hand_made.get_sample_data(f"{FRAME_2}/lidar01")
+    assert no_intrinsic is None
+    assert {box.frame for box in lidar_boxes} == {"lidar"}
+
+
+def test_transform_between_agents_and_times(hand_made: DeepAccident) -> None:
+    behind, later = f"{tiny.TOKEN}/ego_vehicle_behind/001", f"{tiny.TOKEN}/ego_vehicle/004"
+    moved = hand_made.transform(behind, later, "ego", "ego")
+    np.testing.assert_allclose(moved.translation, [15.0, -4.0, 0.0], atol=1e-9)
+    assert moved.yaw == pytest.approx(-np.pi / 2)
+    round_trip = moved @ hand_made.transform(later, behind)
+    np.testing.assert_allclose(round_trip.matrix, np.eye(4), atol=1e-9)
+
+
+def test_visibility(hand_made: DeepAccident) -> None:
+    """The van has 12 points and a camera for all; the pedestrian is untracked, the agent itself never counts."""
+    assert [box.actor_id for box in hand_made.get_boxes(FRAME_2, visible="released")] == [1300]
+    assert [box.actor_id for box in hand_made.get_boxes(FRAME_2, visible="camera")] == [1300, -1]
+
+
+def test_twelve_tables_and_agents_sizes(hand_made: DeepAccident) -> None:
+    agent = hand_made.get("agent", f"{tiny.TOKEN}/ego_vehicle_behind")
+    assert (agent["actor_id"], agent["category"], agent["size"]) == (1236, "car", [4.5, 1.9, 1.5])
+    pole = hand_made.get("agent", f"{tiny.TOKEN}/infrastructure")
+    assert (pole["actor_id"], pole["category"], pole["size"], pole["is_infrastructure"]) == (None, None, None, True)
+    assert len(hand_made.table_names) == 12
+
+
+@pytest.mark.parametrize("own_rows", [0, 2])
+def test_no_or_two_own_rows_are_read(tmp_path: Path, own_rows: int) -> None:
+    def lines(agent: str, frame: int) -> list[str]:
+        given = tiny.label_lines(agent, frame)
+        own = [line for line in given if " -100 " in line]
+        return [line for line in given if " -100 " not in line] + own * own_rows
+
+    release = DeepAccident("v1", tiny.write_tiny_release(tmp_path, lines_of=lines), verbose=False)
+    boxes = release.boxes(FRAME_2, "lidar")
+    assert int((boxes.actor_id == -100).sum()) == own_rows
+    assert np.isfinite(boxes.velocity[boxes.actor_id == -100]).all()
