@@ -5,6 +5,7 @@ call does not take (CRLF, blanks at line ends, one-token lines, faults) is tidie
 """
 
 import math
+import os
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
@@ -25,7 +26,9 @@ _FINITE_FIELDS = FIELDS[1:8]
 _FLOAT_FIELDS = FIELDS[1:10]
 _INTEGER_FIELDS = ("id", "num_lidar_pts")
 _HEADER = ("speed_x", "speed_y")
-_FILES_A_CALL = 2000
+_FILES_A_CALL = 250
+_MOST_THREADS = 4
+_USUAL_SIZE = 1 << 16
 _NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
 _INTEGER = re.compile(r"[+-]?\d+", re.ASCII)
 _REMEDY = "restore the file from its archive, or leave the scenario out with on_error='skip'"
@@ -115,7 +118,7 @@ def read_labels(paths: Sequence[Path], *, raw: bool = False) -> Labels:
         LabelError: a file is truncated or a line has another number of fields, a word where a number belongs, an
             unknown class, NaN or infinity in a position, size or yaw; the message names file and line.
     """
-    parts = [_parse_files(paths[start : start + _FILES_A_CALL]) for start in range(0, len(paths), _FILES_A_CALL)]
+    parts = _parse_batches([paths[start : start + _FILES_A_CALL] for start in range(0, len(paths), _FILES_A_CALL)])
     parts = parts or [_columns_of(_parse_body(b""), _parse_header(b""), np.zeros(0, dtype=np.int64))]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     if not raw:
@@ -155,8 +158,18 @@ def _words(numbers: Iterable[float]) -> str:
     return " ".join(map(repr, numbers))
 
 
-def _parse_files(paths: Sequence[Path]) -> dict[str, AnyArray]:
-    contents = [_content(path) for path in paths]
+def _parse_batches(batches: Sequence[Sequence[Path]]) -> list[dict[str, AnyArray]]:
+    """Parse every batch: where there are several, this thread reads files while others parse what it has read."""
+    if len(batches) < 2:
+        return [_parse_files(batch, [_content(path) for path in batch]) for batch in batches]
+    from concurrent.futures import ThreadPoolExecutor
+
+    with ThreadPoolExecutor(min(_MOST_THREADS, os.cpu_count() or 1)) as pool:
+        parts = [pool.submit(_parse_files, batch, [_content(path) for path in batch]) for batch in batches]
+        return [part.result() for part in parts]
+
+
+def _parse_files(paths: Sequence[Path], contents: Sequence[bytes]) -> dict[str, AnyArray]:
     parsed = _parse_joined(contents)
     if parsed is None:
         parsed = _parse_joined([_tidied(content) for content in contents])
@@ -166,11 +179,17 @@ def _parse_files(paths: Sequence[Path]) -> dict[str, AnyArray]:
 
 
 def _content(path: Path) -> bytes:
+    """A file's bytes, ending in a line end. Plain system calls: `open` would double the time of a small file."""
     try:
-        with path.open("rb", buffering=0) as file:
-            content = file.readall()
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
     except FileNotFoundError:
         raise MissingFileError(f"{path}: no such file; unpack the archive that holds it") from None
+    try:
+        content = os.read(descriptor, _USUAL_SIZE)
+        while more := os.read(descriptor, _USUAL_SIZE):
+            content += more
+    finally:
+        os.close(descriptor)
     return content if content.endswith(b"\n") else content + b"\n"
 
 
@@ -178,10 +197,10 @@ def _parse_joined(contents: Sequence[bytes]) -> dict[str, AnyArray] | None:
     """Parse files that end in a line end; None where they need tidying or hold a fault."""
     from pyarrow import ArrowInvalid
 
-    split = [content.partition(b"\n") for content in contents]
-    num_boxes = np.array([body.count(b"\n") for _, _, body in split], dtype=np.int64)
-    header = b"\n".join([line for line, _, _ in split]) + b"\n"
-    body = b"".join([body for _, _, body in split])
+    body_starts = [content.index(b"\n") + 1 for content in contents]
+    num_boxes = np.array([content.count(b"\n") - 1 for content in contents], dtype=np.int64)
+    header = b"".join([content[:start] for content, start in zip(contents, body_starts, strict=True)])
+    body = b"".join([memoryview(content)[start:] for content, start in zip(contents, body_starts, strict=True)])
     if b"\r" in body or b"\r" in header:
         return None
     try:
@@ -216,7 +235,7 @@ def _parse_csv(content: bytes, names: Sequence[str], types: dict[str, Any]) -> A
     import pyarrow as pa
     from pyarrow import csv
 
-    if not content.strip():
+    if not content or content.isspace():
         return pa.table({name: pa.array([], type=types[name]) for name in names})
     return csv.read_csv(
         pa.BufferReader(content),

@@ -1,0 +1,76 @@
+"""A measured figure, its bound, and the table of them."""
+
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Figure:
+    """One measured number.
+
+    Attributes:
+        name: as in the JSON output.
+        value: measured.
+        unit: of value and bound.
+        bound: what it should not be worse than, None for a figure that only informs.
+        higher_is_better: whether the bound is a lower one.
+    """
+
+    name: str
+    value: float
+    unit: str = ""
+    bound: float | None = None
+    higher_is_better: bool = False
+
+    @property
+    def ratio(self) -> float | None:
+        """How many times better than the bound; below 1 the bound is missed."""
+        if self.bound is None:
+            return None
+        return self.value / self.bound if self.higher_is_better else self.bound / self.value
+
+
+def best_of(repeats: int, work: Callable[[], object]) -> float:
+    """Seconds of the fastest of some runs."""
+    return min(_seconds(work) for _ in range(repeats))
+
+
+@contextmanager
+def one_core() -> Iterator[None]:
+    """Keep this process and its threads on one processor, where the system can (Linux)."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(allowed)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, allowed)
+
+
+def table(figures: Sequence[Figure]) -> str:
+    """The figures as aligned text."""
+    rows = [("figure", "measured", "bound", "times better")]
+    for figure in figures:
+        bound = "" if figure.bound is None else f"{_number(figure.bound)} {figure.unit}"
+        ratio = "" if figure.ratio is None else f"{figure.ratio:.2f}"
+        rows.append((figure.name, f"{_number(figure.value)} {figure.unit}".strip(), bound, ratio))
+    widths = [max(len(row[column]) for row in rows) for column in range(4)]
+    return "\n".join(
+        f"{name:<{widths[0]}}  {value:>{widths[1]}}  {bound:>{widths[2]}}  {ratio:>{widths[3]}}".rstrip()
+        for name, value, bound, ratio in rows
+    )
+
+
+def _seconds(work: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def _number(value: float) -> str:
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"

@@ -1,0 +1,157 @@
+"""The whole release's size: 285k samples and 8.6 M annotations, opened in a new process.
+
+Only tables are written (no label is parsed for them), by the code that joins an index from its scenarios; the folders
+and meta files that opening looks at are there, so that the check for changes is part of the time.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.measure import Figure
+from deepaccident_devkit.geometry.se3 import SE3
+from deepaccident_devkit.release import Calibs, Collision, Labels, Meta, ScenarioFolder, find_release, write_meta
+from deepaccident_devkit.tables.build import ScenarioFiles, scenario_rows
+from deepaccident_devkit.tables.index import INDEX_FOLDER
+from deepaccident_devkit.tables.join import join_tables
+from deepaccident_devkit.tables.manifest import SCHEMA_VERSION, Manifest, write_manifest
+from deepaccident_devkit.tables.scan import ScenarioScan, folder_digest
+from deepaccident_devkit.tables.shards import write_shard
+from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, OWN_ACTOR_ID
+
+SCENARIOS, FRAMES, BOXES = 691, 83, 30
+FIRST_ID = 1000
+PROCESSES = 5
+META = Meta(
+    weather="Clear",
+    time_of_day="Noon",
+    collision=Collision(
+        ids=(FIRST_ID, FIRST_ID + 2),
+        classes=("car", "car"),
+        impact=1.0,
+        spawn_relation="same",
+        contact_side="front_side",
+        agents=("ego_vehicle", "other_vehicle"),
+    ),
+    simulated_frames=FRAMES + 10,
+    agent_ids=(FIRST_ID, FIRST_ID + 1, FIRST_ID + 2, FIRST_ID + 3),
+)
+
+_PROBE = """
+import json, sys, time
+start = time.perf_counter()
+from deepaccident_devkit import DeepAccident
+da = DeepAccident(dataroot=sys.argv[1], verbose=False)
+opened = time.perf_counter() - start
+import random
+source = random.Random(0)
+rows = [source.randrange(len(da.annotation)) for _ in range(2000)]
+tokens = [da.annotation[row]["token"] for row in rows]
+samples = [da.annotation[row]["sample_token"] for row in rows]
+def per_call(call, arguments):
+    times = []
+    for _ in range(3):
+        start = time.perf_counter()
+        for argument in arguments:
+            call(argument)
+        times.append((time.perf_counter() - start) / len(arguments) * 1e6)
+    return min(times)
+figures = {
+    "samples": len(da.sample),
+    "annotations": len(da.annotation),
+    "open_s": opened,
+    "get_us": per_call(lambda token: da.get("annotation", token), tokens),
+    "boxes_us": per_call(lambda token: da.boxes(token, "lidar"), samples),
+    "boxes_world_us": per_call(da.boxes, samples),
+}
+status = dict(line.split(":", 1) for line in open("/proc/self/status"))
+figures["rss_mb"] = int(status["RssAnon"].split()[0]) / 1024
+print(json.dumps(figures))
+"""
+
+
+def measure() -> list[Figure]:
+    with tempfile.TemporaryDirectory(prefix="deepaccident_scale_") as folder:
+        root = write_whole_release(Path(folder))
+        size = sum(path.stat().st_size for path in root.glob(f"{INDEX_FOLDER}/v1/tables-*/*"))
+        runs = [probe(root) for _ in range(PROCESSES + 1)][1:]  # the first compiles and fills the file cache
+    best = {name: min(run[name] for run in runs) for name in runs[0]}
+    bounds = {"open_s": 0.2, "rss_mb": 100, "get_us": 20, "boxes_us": 20}
+    units = {"open_s": "s", "rss_mb": "MB", "get_us": "µs", "boxes_us": "µs", "boxes_world_us": "µs"}
+    figures = [
+        Figure(name=name, value=value, unit=units.get(name, ""), bound=bounds.get(name)) for name, value in best.items()
+    ]
+    return [*figures, Figure(name="tables_mb", value=size / 1e6, unit="MB")]
+
+
+def probe(root: Path) -> dict[str, float]:
+    """Open the release in a new process, as a user does whose installation is compiled."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    done = subprocess.run(
+        [sys.executable, "-c", _PROBE, str(root)], capture_output=True, text=True, check=True, env=environment
+    )
+    figures: dict[str, float] = json.loads(done.stdout)
+    return figures
+
+
+def write_whole_release(root: Path) -> Path:
+    """Folders, meta files and tables of 691 scenarios."""
+    index = root / INDEX_FOLDER / "v1"
+    index.mkdir(parents=True)
+    shards = []
+    files = one_scenario()
+    tables = scenario_rows(files)
+    for number in range(SCENARIOS):
+        name = f"Town03_type001_subtype0001_scenario{number:05d}"
+        scenario = ScenarioFolder(root, "", "type1_subtype1_accident", name, AGENTS)
+        for agent in AGENTS:
+            for kind in ("calib", "label"):
+                scenario.kind_folder(agent, kind).mkdir(parents=True)
+        write_meta(scenario.meta_path, META)
+        shard = index / "shards" / f"{number}.arrow"
+        write_shard(shard, {**tables, "scenario": {**tables["scenario"], "name": [name]}}, "")
+        shards.append(shard)
+    folder = index / "tables-scale"
+    folder.mkdir()
+    join_tables(folder, shards, ["train"] * SCENARIOS)
+    layout = find_release(root)
+    fingerprint = folder_digest(layout.scenarios, layout.split_files.values())
+    write_manifest(index, Manifest(schema_version=SCHEMA_VERSION, fingerprint=fingerprint, tables=folder.name))
+    return root
+
+
+def one_scenario() -> ScenarioFiles:
+    """The contents of one scenario's files: 83 frames, 30 boxes a sample, random values."""
+    source = np.random.default_rng(0)
+    samples = len(AGENTS) * FRAMES
+    count = samples * BOXES
+    agent_of_box = np.repeat(np.arange(len(AGENTS)), FRAMES * BOXES)
+    actor = np.tile(np.arange(BOXES), samples)
+    labels = Labels(
+        raw=False,
+        num_boxes=np.full(samples, BOXES),
+        agent_velocity=source.normal(size=(samples, 2)),
+        category=source.integers(0, 6, count).astype(np.int8),
+        center=source.normal(size=(count, 3)) * 30,
+        size=source.uniform(0.3, 5, size=(count, 3)),
+        yaw=source.uniform(-3, 3, count),
+        velocity=source.normal(size=(count, 2)),
+        actor_id=np.where(actor == agent_of_box, OWN_ACTOR_ID, FIRST_ID + actor),
+        num_lidar_pts=source.integers(0, 300, count),
+        camera_visible=source.random(count) < 0.5,
+    )
+    intrinsic = np.array([[1142.5, 0, 800], [0, 1142.5, 450], [0, 0, 1]])
+    calibs = Calibs(
+        ego_from_lidar=np.tile(np.eye(4), (samples, 1, 1)),
+        world_from_ego=np.array([SE3.from_yaw(0.01 * n, (n, 2.0, 0.0)).matrix for n in range(samples)]),
+        camera_from_lidar=np.tile(np.eye(4), (samples, len(CAMERAS), 1, 1)),
+        intrinsic=np.tile(intrinsic, (samples, len(CAMERAS), 1, 1)),
+    )
+    scan = ScenarioScan(agents=AGENTS, labelled=AGENTS, num_frames=FRAMES, problems=(), notices=())
+    scenario = ScenarioFolder(Path(), "", "type1_subtype1_accident", "Town03", AGENTS)
+    return ScenarioFiles(scenario=scenario, scan=scan, meta=META, calibs=calibs, labels=labels)

@@ -1,0 +1,87 @@
+import numpy as np
+from hypothesis import given
+from numpy.testing import assert_allclose
+from pyquaternion import Quaternion
+from strategies import ANGLES, arrays, boxes, points, poses
+
+from deepaccident_devkit.geometry import SE3, Boxes, quaternions
+from deepaccident_devkit.geometry.boxes import CORNER_SIGNS
+
+
+@given(poses(), poses(), points())
+def test_compose_then_apply_is_apply_twice(a_from_b: SE3, b_from_c: SE3, p_c: np.ndarray) -> None:
+    assert_allclose((a_from_b @ b_from_c).apply(p_c), a_from_b.apply(b_from_c.apply(p_c)), atol=1e-9)
+    assert_allclose(a_from_b @ p_c, a_from_b.apply(p_c), rtol=0)
+
+
+@given(poses(), poses(), poses())
+def test_composing_is_associative(a_from_b: SE3, b_from_c: SE3, c_from_d: SE3) -> None:
+    left, right = (a_from_b @ b_from_c) @ c_from_d, a_from_b @ (b_from_c @ c_from_d)
+    assert_allclose(left.matrix, right.matrix, atol=1e-9)
+
+
+@given(poses(), points())
+def test_the_inverse_undoes(a_from_b: SE3, p_b: np.ndarray) -> None:
+    assert_allclose(a_from_b.inverse().apply(a_from_b.apply(p_b)), p_b, atol=1e-9)
+    assert_allclose((a_from_b @ a_from_b.inverse()).matrix, np.eye(4), atol=1e-9)
+    assert_allclose(a_from_b.inverse().inverse().matrix, a_from_b.matrix, atol=1e-9)
+
+
+@given(poses())
+def test_quaternion_there_and_back(pose: SE3) -> None:
+    quaternion = pose.quaternion
+    assert quaternion.w >= 0
+    assert_allclose(quaternion.norm, 1, atol=1e-12)
+    assert_allclose(quaternion.rotation_matrix, pose.rotation, atol=1e-9)  # pyquaternion's own formula
+    assert_allclose(SE3.from_quaternion(quaternion, pose.translation).matrix, pose.matrix, atol=1e-9)
+
+
+@given(poses(), arrays((3,), 100))
+def test_vectors_turn_and_do_not_move(pose: SE3, vector: np.ndarray) -> None:
+    assert_allclose(pose.rotate(vector), pose.apply(vector) - pose.apply(np.zeros(3)), atol=1e-9)
+
+
+@given(ANGLES, arrays((3,), 100))
+def test_yaw_turns_counter_clockwise(yaw: float, translation: np.ndarray) -> None:
+    moved = SE3.from_yaw(yaw, translation).apply([1.0, 0.0, 0.0])
+    assert_allclose(moved, translation + [np.cos(yaw), np.sin(yaw), 0], atol=1e-9)
+
+
+@given(poses(), poses())
+def test_quaternion_product_is_the_rotations_product(one: SE3, two: SE3) -> None:
+    q, r = (quaternions.from_matrix(pose.rotation) for pose in (one, two))
+    product = quaternions.left_multiplier(q) @ r
+    assert_allclose(quaternions.to_matrix(product), one.rotation @ two.rotation, atol=1e-9)
+    assert_allclose(product, (Quaternion(q) * Quaternion(r)).elements, atol=1e-12)
+    assert_allclose(quaternions.from_matrix(np.stack([one.rotation, two.rotation])), [q, r], rtol=0)
+
+
+@given(poses(), boxes())
+def test_boxes_and_their_corners_move_together(target_from_source: SE3, given_boxes: Boxes) -> None:
+    moved = given_boxes.transform(target_from_source, "world")
+    corners = target_from_source.apply(given_boxes.corners().reshape(-1, 3)).reshape(-1, 8, 3)
+    assert moved.frame == "world"
+    assert_allclose(moved.corners(), corners, atol=1e-8)
+    assert_allclose(moved.velocity, given_boxes.velocity @ target_from_source.rotation.T, atol=1e-9)
+    assert_allclose(np.linalg.norm(moved.rotation, axis=1), np.ones(len(moved)), atol=1e-9)
+    for name in ("size", "category", "actor_id", "num_lidar_pts", "camera_visible", "row"):
+        np.testing.assert_array_equal(getattr(moved, name), getattr(given_boxes, name))
+
+
+@given(poses(), boxes())
+def test_boxes_come_back(target_from_source: SE3, given_boxes: Boxes) -> None:
+    back = given_boxes.transform(target_from_source, "world").transform(target_from_source.inverse(), "lidar")
+    assert_allclose(back.corners(), given_boxes.corners(), atol=1e-8)
+    assert_allclose(back.velocity, given_boxes.velocity, atol=1e-9)
+
+
+@given(boxes(), arrays((30, 3), 1.5))
+def test_points_in_boxes_by_their_own_coordinates(given_boxes: Boxes, unit: np.ndarray) -> None:
+    """Points at a known fraction of a box's half size are in it exactly if all three fractions are below one."""
+    clear_of_the_faces = np.where(np.abs(np.abs(unit) - 1) < 1e-6, 0.5, unit)
+    for index in range(len(given_boxes)):
+        box = given_boxes.select([index])
+        axes = Quaternion(box.rotation[0]).rotation_matrix
+        points = box.center[0] + (clear_of_the_faces * box.size[0] / 2) @ axes.T
+        np.testing.assert_array_equal(box.contains(points)[0], (np.abs(clear_of_the_faces) <= 1).all(axis=1))
+        assert_allclose(box.corners()[0], box.center[0] + (CORNER_SIGNS * box.size[0] / 2) @ axes.T, atol=1e-9)

@@ -1,0 +1,279 @@
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+from strategies import mutations
+
+from deepaccident_devkit.errors import LabelError, MissingFileError
+from deepaccident_devkit.release import Labels, read_label, read_labels, write_label
+
+# format.md's real lines
+HEADER = "0.0034441 -5.6166797"
+PARKED = "car -38.698 -19.789 -0.882 4.181 1.994 1.381 -0.000518 0.0 0.0 20001 0 True"
+OWN = "car -0.0026 -1.4e-05 -1.2216 4.674 1.812 1.442 0.0 0.00344 -5.6167 -100 1394 False"
+WALKER = "pedestrian 21.8 -1.46 -0.84 0.375 0.375 1.86 2.19 0.0 0.0 -1 0 True"
+BEHIND = (
+    "car -13.459459497478285 -0.0037344838527602064 -1.2119891287962656 4.791779518127441 2.163450002670288 "
+    "1.4876600503921509 0.00033209590742323136 -4.587319957896956 -0.016017722274652455 5481 197 True"
+)
+REAL = "\n".join([HEADER, PARKED, OWN, WALKER, BEHIND, ""])
+REMEDY = "; restore the file from its archive, or leave the scenario out with on_error='skip'"
+
+
+@pytest.fixture
+def write(tmp_path: Path):
+    def write_file(text: str | bytes, name: str = "label.txt") -> Path:
+        path = tmp_path / name
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return path
+
+    return write_file
+
+
+def numbers_of(labels: Labels) -> np.ndarray:
+    return np.column_stack([labels.center, labels.size, labels.yaw, labels.velocity])
+
+
+def expected(text: str) -> np.ndarray:
+    rows = [line.split()[1:10] for line in text.splitlines()[1:]]
+    return np.array([[float(word) for word in row] for row in rows])
+
+
+def test_the_real_lines_to_the_bit(write) -> None:
+    labels = read_label(write(REAL), raw=True)
+    assert labels.raw
+    assert_array_equal(labels.num_boxes, [4])
+    assert_array_equal(labels.agent_velocity, [[0.0034441, -5.6166797]])
+    assert_array_equal(numbers_of(labels), expected(REAL))
+    assert_array_equal(labels.category, [0, 0, 5, 0])
+    assert_array_equal(labels.actor_id, [20001, -100, -1, 5481])
+    assert_array_equal(labels.num_lidar_pts, [0, 1394, 0, 197])
+    assert_array_equal(labels.camera_visible, [True, False, True, True])
+
+
+def test_right_handed_means_y_yaw_and_vy_change_their_signs(write) -> None:
+    labels = read_label(write(REAL))
+    assert not labels.raw
+    assert_array_equal(labels.agent_velocity, [[0.0034441, 5.6166797]])
+    assert_array_equal(numbers_of(labels), expected(REAL) * [1, -1, 1, 1, 1, 1, -1, 1, -1])
+
+
+@pytest.mark.parametrize("raw", [False, True])
+def test_boxes_are_right_handed_whatever_raw_was(write, raw: bool) -> None:
+    boxes = read_label(write(REAL), raw=raw).boxes()
+    assert boxes.frame == "lidar"
+    assert_array_equal(boxes.center[3], [-13.459459497478285, 0.0037344838527602064, -1.2119891287962656])
+    assert_array_equal(boxes.velocity[3], [-4.587319957896956, 0.016017722274652455, 0])
+    assert_allclose(boxes.yaw, [0.000518, 0, -2.19, -0.00033209590742323136], atol=1e-15)
+    assert boxes.category_names == ["car", "car", "pedestrian", "car"]
+    assert_array_equal(boxes.row, [0, 1, 2, 3])
+    assert_array_equal(boxes.actor_id, [20001, -100, -1, 5481])
+
+
+def test_every_class_has_its_code(write) -> None:
+    names = ("car", "truck", "van", "cyclist", "motorcycle", "pedestrian")
+    text = "\n".join([HEADER, *(PARKED.replace("car", name) for name in names)])
+    assert_array_equal(read_label(write(text)).category, range(6))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        REAL.rstrip("\n"),
+        REAL.replace("\n", "\r\n"),
+        REAL.replace("\n", "\r"),
+        REAL.replace("\n", "  \n"),
+        REAL.replace("\n", " \r\n"),
+        REAL.replace("\n", "\n\n"),
+        "\n" + REAL,
+        REAL.replace("\n", "\nhidden\n"),
+        REAL + "car",
+        REAL + "\n \n",
+        REAL.replace(" ", "  "),
+        REAL.replace(" ", "\t"),
+        " " + REAL.replace("\n", "\n "),
+    ],
+    ids=["no-final-newline", "crlf", "cr", "blanks", "blanks-crlf", "blank-lines", "blank-first", "one-token-lines"]
+    + ["cut-to-one-token", "blanks-at-end", "double-blanks", "tabs", "leading-blanks"],
+)
+def test_tolerated_forms_read_as_the_clean_file(write, text: str) -> None:
+    clean, odd = read_label(write(REAL, "clean.txt")), write(text)
+    # alone, and where it spoils the fast way for its neighbours
+    for labels in (read_label(odd), read_labels([write(HEADER, "empty.txt"), odd, write(HEADER, "other.txt")])):
+        assert_array_equal(numbers_of(labels), numbers_of(clean))
+        assert_array_equal(labels.actor_id, clean.actor_id)
+        assert_array_equal(labels.camera_visible, clean.camera_visible)
+        assert labels.num_boxes.sum() == 4
+    assert_array_equal(read_label(odd).agent_velocity, clean.agent_velocity)
+
+
+@pytest.mark.parametrize("text", [HEADER, HEADER + "\n", HEADER + "\r\n\r\n", HEADER + "\ncar\n"])
+def test_a_label_of_line_one_alone_is_valid(write, text: str) -> None:
+    labels = read_label(write(text))
+    assert len(labels) == 0
+    assert_array_equal(labels.num_boxes, [0])
+    assert_array_equal(labels.agent_velocity, [[0.0034441, 5.6166797]])
+    assert len(labels.boxes()) == 0
+
+
+def test_several_files_keep_their_order_and_their_counts(write) -> None:
+    paths = [write(REAL, "1"), write("1 2", "2"), write("\n".join(["3 4", WALKER]), "3"), write("5 6\n\n", "4")]
+    labels = read_labels(paths)
+    assert_array_equal(labels.num_boxes, [4, 0, 1, 0])
+    assert_array_equal(labels.agent_velocity, [[0.0034441, 5.6166797], [1, -2], [3, -4], [5, -6]])
+    assert_array_equal(labels.boxes().row, [0, 1, 2, 3, 0])
+    nothing = read_labels([])
+    assert (len(nothing), len(nothing.num_boxes), nothing.agent_velocity.shape) == (0, 0, (0, 2))
+    assert len(nothing.boxes()) == 0
+
+
+def test_more_files_than_go_into_one_call(write) -> None:
+    path = write("\n".join([HEADER, WALKER]))
+    assert_array_equal(read_labels([path] * 4001).num_boxes, np.ones(4001))
+
+
+WORDS = st.one_of(
+    st.floats(allow_nan=False, allow_infinity=False).flatmap(
+        lambda x: st.sampled_from([repr(x), f"{x:.17g}", f"{x:.25e}", f"{x:E}", f"{x:.3e}"])
+    ),
+    st.from_regex(r"-?[0-9]{1,25}(\.[0-9]{0,25})?([eE][+-]?[0-9]{1,2})?", fullmatch=True),
+    st.from_regex(r"-?\.[0-9]{1,25}", fullmatch=True),
+    st.floats(-2.3e-308, 2.3e-308).map(repr),
+    # halfway between two doubles and just beside it; the ends of the range; zeros; blanks of other kinds
+    st.sampled_from(
+        "-0.0 -0 0e5 5e-324 2.4703282292062327208e-324 2.2250738585072011e-308 1.7976931348623157e308 "
+        "9007199254740993 9007199254740992.99999999999999999 9007199254740993.00000000000000001 00012.50 "
+        "0.1000000000000000055511151231257827021181583404541015625 1e23 8.5e22 7.2057594037927933e16".split()
+    ),
+)
+
+
+@given(st.lists(st.lists(WORDS, min_size=9, max_size=9), min_size=1, max_size=8))
+def test_numbers_are_what_float_says_to_the_bit(tmp_path_factory: pytest.TempPathFactory, rows: list) -> None:
+    path = tmp_path_factory.getbasetemp() / "numbers.txt"
+    path.write_text("\n".join(["0 0", *(" ".join(["van", *row, "7", "0", "True"]) for row in rows)]))
+    want = np.array([[float(word) for word in row] for row in rows])
+    assert_array_equal(numbers_of(read_label(path, raw=True)).view(np.int64), want.view(np.int64))
+
+
+@pytest.mark.parametrize("word", ["nan", "NaN", "NAN", "-nan", "inf", "-inf", "Infinity", "1e999"])
+def test_a_velocity_that_is_no_number_is_unknown(write, word: str) -> None:
+    for raw in (False, True):
+        labels = read_label(write(f"{HEADER}\n{PARKED.replace('0.0 0.0', f'{word} 2.5')}"), raw=raw)
+        assert math.isnan(labels.velocity[0, 0])
+        assert abs(labels.velocity[0, 1]) == 2.5
+        labels = read_label(write(f"{HEADER}\n{PARKED.replace('0.0 0.0', f'2.5 {word}')}"), raw=raw)
+        assert_array_equal(labels.velocity, [[2.5, np.nan]])
+
+
+def test_arrays_are_read_only(write) -> None:
+    labels = read_label(write(REAL))
+    for array in (labels.center, labels.velocity, labels.num_boxes, labels.agent_velocity, labels.camera_visible):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (f"{HEADER}\n{PARKED}\n{WALKER[:30]}", r":3: expected 13 fields, found 5: 'pedestrian 21.8"),
+        (f"{HEADER}\n{PARKED[: -len(' True')]}\n", r":2: expected 13 fields, found 12: 'car -38"),
+        (f"{HEADER}\n{PARKED} 1\n", r":2: expected 13 fields, found 14"),
+        (f"{HEADER}\n\n{OWN}\nx\n{PARKED[:-2]}", r":5: camera_visible is 'Tr', expected True or False"),
+        (f"{HEADER}\n{PARKED.replace('True', 'true')}", r":2: camera_visible is 'true', expected True or False"),
+        (f"{HEADER}\n{PARKED.replace('-38.698', 'nan')}", r":2: x is 'nan', expected a finite number"),
+        (f"{HEADER}\n{PARKED.replace('-0.000518', 'inf')}", r":2: yaw is 'inf', expected a finite number"),
+        (f"{HEADER}\n{PARKED.replace('1.381', '-Infinity')}", r":2: h is '-Infinity', expected a finite number"),
+        (f"{HEADER}\n{PARKED.replace('-19.789', '1e400')}", r":2: y is '1e400', expected a finite number"),
+        (f"{HEADER}\n{PARKED.replace('-0.882', 'low')}", r":2: z is 'low', expected a number"),
+        (f"{HEADER}\n{PARKED.replace('-0.882', '1_0')}", r":2: z is '1_0', expected a number"),
+        (f"{HEADER}\n{PARKED.replace('0.0 0.0', '0.0 ?')}", r":2: vy is '\?', expected a number"),
+        (f"{HEADER}\n{OWN}\n{PARKED.replace('car', 'bus')}", r":3: class is 'bus', expected one of car, truck"),
+        (f"{HEADER}\n{PARKED.replace('car', 'Car')}", r":2: class is 'Car'"),
+        (f"{HEADER}\n{PARKED.replace('car', chr(34) + 'car' + chr(34))}", r":2: class is '\"car\"'"),
+        (f"{HEADER}\n{PARKED.replace('20001', '20001.0')}", r":2: id is '20001.0', expected an integer"),
+        (f"{HEADER}\n{PARKED.replace('20001', '0x10')}", r":2: id is '0x10', expected an integer"),
+        (f"{HEADER}\n{PARKED.replace('20001', str(2**63))}", r":2: id is '9223372036854775808', expected an integer"),
+        (f"{HEADER}\n{PARKED.replace(' 0 True', ' 0xA True')}", r":2: num_lidar_pts is '0xA', expected an integer"),
+        (f"{HEADER}\n{PARKED.replace(' 0 True', ' many True')}", r":2: num_lidar_pts is 'many', expected an integer"),
+        (PARKED, r":1: expected '<speed_x> <speed_y>', found 13 fields: 'car"),
+        ("1 2 3\n", r":1: expected '<speed_x> <speed_y>', found 3 fields: '1 2 3'"),
+        ("fast 2\n", r":1: 'fast' is no number"),
+        ("", r":1: expected '<speed_x> <speed_y>', found an empty file"),
+        ("\n \n", r":1: expected '<speed_x> <speed_y>', found an empty file"),
+    ],
+)
+def test_faults_name_file_line_and_remedy(write, text: str, message: str) -> None:
+    good, bad = write(REAL, "good.txt"), write(text, "bad.txt")
+    # alone, and among good files of one call
+    for paths in ([bad], [good, bad, good]):
+        with pytest.raises(LabelError, match=rf"^{bad}{message}.*{REMEDY}$"):
+            read_labels(paths)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [bytes(range(256)) * 4, b"\x80\x04\x95" + bytes(50), b"PK\x03\x04 \xff\xfe" * 20, HEADER.encode() + b"\n\xff\xfe x"],
+)
+def test_binary_garbage_is_a_label_error(write, content: bytes) -> None:
+    with pytest.raises(LabelError, match=r"label\.txt:\d+: .*restore the file"):
+        read_label(write(content))
+
+
+def test_a_missing_file_is_named(tmp_path: Path, write) -> None:
+    with pytest.raises(MissingFileError, match=r"gone\.txt: no such file; unpack the archive"):
+        read_labels([write(REAL), tmp_path / "gone.txt"])
+
+
+@pytest.mark.parametrize("number", ["+20001", "0020001", "-0"])
+def test_integers_are_what_int_says(write, number: str) -> None:
+    labels = read_label(write(f"{HEADER}\n{PARKED.replace('20001', number)}"))
+    assert_array_equal(labels.actor_id, [int(number)])
+
+
+@pytest.mark.parametrize("place", [0, len(HEADER) + 1])
+def test_a_byte_order_mark_means_the_same_alone_and_among_others(write, place: int) -> None:
+    """Arrow drops one at the start of what it is given, which is only the first file's."""
+    text = f"{HEADER}\n{PARKED}\n"
+    marked = write(text[:place].encode() + b"\xef\xbb\xbf" + text[place:].encode(), "marked.txt")
+
+    def outcome(paths: list[Path]) -> str:
+        try:
+            return str(read_labels(paths).actor_id[-1])
+        except LabelError as error:
+            return str(error)
+
+    assert outcome([marked]) == outcome([write(REAL), marked])
+
+
+def test_write_refuses_the_labels_of_several_files(write, tmp_path: Path) -> None:
+    labels = read_labels([write(REAL), write(REAL)])
+    with pytest.raises(LabelError, match=r"out\.txt: expected the labels of one file, found 2"):
+        write_label(tmp_path / "out.txt", labels)
+    assert not (tmp_path / "out.txt").exists()
+
+
+def test_written_text_is_as_the_release_has_it(write, tmp_path: Path) -> None:
+    out = tmp_path / "new folder" / "out.txt"
+    write_label(out, read_label(write(REAL)))
+    assert out.read_text() == REAL
+    write_label(out, read_label(write(REAL), raw=True))
+    assert out.read_text() == REAL
+
+
+@given(st.data())
+def test_damage_raises_our_error_or_nothing(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+    path = tmp_path_factory.getbasetemp() / "damaged.txt"
+    path.write_bytes(data.draw(mutations(REAL.encode())))
+    try:
+        labels = read_label(path)
+    except LabelError as error:
+        assert str(path) in str(error)
+        assert "restore" in str(error)
+    else:
+        assert np.isfinite(labels.center).all()
+        assert labels.num_boxes.sum() == len(labels)

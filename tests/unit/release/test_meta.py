@@ -1,0 +1,179 @@
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import mutations
+
+from deepaccident_devkit.errors import MetaError, MissingFileError
+from deepaccident_devkit.release import Collision, Meta, read_meta, write_meta
+
+# format.md's real files
+ACCIDENT = """\
+HardRainNoon 1236 car 1237 car 6790.168605131015 same front_side 78
+ colliding agents: ego_behind other_behind
+ agents id: 1223 1236 1212 1237
+ road_type: four-way junction
+ another_vehicle_spawn_side: left
+ ego_vehicle_direction: straight
+ other_vehicle_direction: straight
+"""
+NO_COLLISION = "ClearNoon -1 -1 -1 -1 -1 -1 -1 110"
+REMEDY = "; restore the file from its archive"
+
+
+@pytest.fixture
+def write(tmp_path: Path):
+    def write_file(content: str | bytes) -> Path:
+        path = tmp_path / "meta.txt"
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+
+    return write_file
+
+
+ACCIDENT_META = Meta(
+    weather="HardRain",
+    time_of_day="Noon",
+    collision=Collision(
+        ids=(1236, 1237),
+        classes=("car", "car"),
+        impact=6790.168605131015,
+        spawn_relation="same",
+        contact_side="front_side",
+        agents=("ego_vehicle_behind", "other_vehicle_behind"),
+    ),
+    simulated_frames=78,
+    agent_ids=(1223, 1236, 1212, 1237),
+    road_type="four-way junction",
+    spawn_side="left",
+    ego_direction="straight",
+    other_direction="straight",
+)
+
+
+def test_the_real_accident(write) -> None:
+    assert read_meta(write(ACCIDENT)) == ACCIDENT_META
+    assert read_meta(write(ACCIDENT), raw=True) == tuple(ACCIDENT.splitlines())
+
+
+def test_no_collision(write) -> None:
+    assert read_meta(write(NO_COLLISION)) == Meta(
+        weather="Clear", time_of_day="Noon", collision=None, simulated_frames=110
+    )
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        ACCIDENT.replace("\n", "\r\n"),
+        ACCIDENT.rstrip("\n"),
+        ACCIDENT.replace("\n", "  \n"),
+        ACCIDENT.replace("\n", "\n\n"),
+        "\n" + ACCIDENT,
+        ACCIDENT.replace("\n ", "\n"),
+        ACCIDENT.replace(": ", ":"),
+    ],
+    ids=["crlf", "no-final-newline", "blanks", "blank-lines", "blank-first", "no-indent", "no-blank-after-colon"],
+)
+def test_tolerated_forms(write, text: str) -> None:
+    assert read_meta(write(text)) == ACCIDENT_META
+
+
+@pytest.mark.parametrize(
+    ("line", "field"),
+    [
+        (2, "agent_ids"),
+        (3, "road_type"),
+        (4, "spawn_side"),
+        (5, "ego_direction"),
+        (6, "other_direction"),
+    ],
+)
+def test_a_missing_or_empty_line_is_none(write, line: int, field: str) -> None:
+    lines = ACCIDENT.splitlines()
+    without = read_meta(write("\n".join(lines[:line] + lines[line + 1 :])))
+    assert getattr(without, field) is None
+    others = {name for name in Meta.__slots__ if name != field}
+    assert all(getattr(without, name) == getattr(ACCIDENT_META, name) for name in others)
+    if line > 2:
+        lines[line] = lines[line].split(":")[0] + ":"
+        assert getattr(read_meta(write("\n".join(lines))), field) is None
+
+
+def test_colliding_agents_may_be_missing_or_third_road_users(write) -> None:
+    without = read_meta(write(ACCIDENT.replace(" colliding agents: ego_behind other_behind\n", "")))
+    assert without.collision is not None
+    assert without.collision.agents is None
+    third = read_meta(write(ACCIDENT.replace("ego_behind other_behind", "ego none")))
+    assert third.collision is not None
+    assert third.collision.agents == ("ego_vehicle", None)
+
+
+@pytest.mark.parametrize(
+    ("word", "weather", "time_of_day"),
+    [
+        ("WetCloudySunset", "WetCloudy", "Sunset"),
+        ("SoftRainNight", "SoftRain", "Night"),
+        ("WetNoon", "Wet", "Noon"),
+        ("Foggy", "Foggy", None),
+        ("Night", "Night", None),
+    ],
+)
+def test_weather_and_time_of_day(write, word: str, weather: str, time_of_day: str | None) -> None:
+    meta = read_meta(write(NO_COLLISION.replace("ClearNoon", word)))
+    assert (meta.weather, meta.time_of_day) == (weather, time_of_day)
+
+
+def test_a_pair_with_an_untracked_id_is_no_collision(write) -> None:
+    assert read_meta(write(ACCIDENT.replace("1237 car", "-1 pedestrian"))).collision is None
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (ACCIDENT.replace(" same", ""), ":1: expected 9 words '<weather.*found 8: 'HardRainNoon"),
+        (ACCIDENT.replace(" same", " same same"), ":1: expected 9 words .*found 10"),
+        (ACCIDENT.replace("1236 car", "x36 car"), ":1: first id: expected an integer, found 'x36'"),
+        (ACCIDENT.replace("1237 car", "12.5 car"), ":1: second id: expected an integer, found '12.5'"),
+        (ACCIDENT.replace("6790.168605131015", "hard"), ":1: impact: expected a finite number, found 'hard'"),
+        (ACCIDENT.replace("6790.168605131015", "nan"), ":1: impact: expected a finite number, found 'nan'"),
+        ("\n\n" + ACCIDENT.replace("78", "many"), ":3: simulated frames: expected an integer, found 'many'"),
+        (ACCIDENT.replace("ego_behind other", "ego_behind"), ":2: expected two of ego, ego_behind, .*'ego_behind_b"),
+        (ACCIDENT.replace("ego_behind other_behind", "ego"), ":2: expected two of .*, found 'ego'"),
+        (ACCIDENT.replace("1212", "twelve"), ":3: agent's id: expected an integer, found 'twelve'"),
+        (ACCIDENT.replace(" 1212", ""), ":3: expected four agents' ids, found '1223 1236 1237'"),
+        (ACCIDENT.replace("road_type:", "road_type"), ":4: expected '<key>: <value>', found 'road_type four-way"),
+        ("", ":1: expected '<weather.*found an empty file"),
+        (" \n\n", ":1: expected '<weather.*found an empty file"),
+    ],
+)
+def test_faults_name_file_line_and_remedy(write, text: str, message: str) -> None:
+    path = write(text)
+    with pytest.raises(MetaError, match=f"^{path}{message}.*{REMEDY}$"):
+        read_meta(path)
+
+
+def test_binary_garbage_and_a_missing_file(write, tmp_path: Path) -> None:
+    path = write(b"\x80\x04\x95\xff\xfe" * 10)
+    with pytest.raises(MetaError, match=f"^{path}: not a text file .*{REMEDY}$"):
+        read_meta(path)
+    with pytest.raises(MissingFileError, match=r"gone\.txt: no such file; unpack the meta folder"):
+        read_meta(tmp_path / "gone.txt")
+
+
+def test_written_text_is_as_the_release_has_it(tmp_path: Path) -> None:
+    write_meta(tmp_path / "meta.txt", ACCIDENT_META)
+    assert (tmp_path / "meta.txt").read_text() == ACCIDENT
+    write_meta(tmp_path / "meta.txt", Meta(weather="Clear", time_of_day="Noon", collision=None, simulated_frames=110))
+    assert (tmp_path / "meta.txt").read_text().splitlines()[0] == NO_COLLISION
+
+
+@given(st.data())
+def test_damage_raises_our_error_or_nothing(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+    path = tmp_path_factory.getbasetemp() / "damaged_meta.txt"
+    path.write_bytes(data.draw(mutations(ACCIDENT.encode())))
+    try:
+        read_meta(path)
+    except MetaError as error:
+        assert str(path) in str(error)

@@ -1,0 +1,349 @@
+"""Pickles as old and new numpy write them are read; pickles that ask for anything else run nothing."""
+
+import builtins
+import copyreg
+import ctypes
+import functools
+import operator
+import os
+import pickle
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import mutations
+
+from deepaccident_devkit.errors import CalibError
+from deepaccident_devkit.release import read_calib
+
+PROTOCOLS = range(6)
+Calibs = dict[str, np.ndarray]
+
+
+def assert_read_back(path: Path, content: bytes, want: Calibs) -> None:
+    path.write_bytes(content)
+    read = read_calib(path, raw=True)
+    assert read.keys() == want.keys()
+    for key, array in want.items():
+        np.testing.assert_array_equal(read[key], array, err_msg=key, strict=True)
+        assert read[key].dtype.isnative
+
+
+def renamed(content: bytes, core: str) -> bytes:
+    """The pickle as the numpy with this private package (`numpy.core` or `numpy._core`) writes it."""
+    other = "numpy._core" if core == "numpy.core" else "numpy.core"
+    for module in ("multiarray", "numeric"):
+        old, new = f"{other}.{module}".encode(), f"{core}.{module}".encode()
+        content = content.replace(b"c" + old + b"\n", b"c" + new + b"\n")
+        counted, recounted = b"\x8c" + bytes([len(old)]) + old, b"\x8c" + bytes([len(new)]) + new
+        longer = content.count(counted) * (len(new) - len(old))
+        if longer:  # protocols 4 and 5 say how long the frame is
+            frame = int.from_bytes(content[3:11], "little") + longer
+            content = content[:3] + frame.to_bytes(8, "little") + content[11:].replace(counted, recounted)
+    return content
+
+
+@pytest.mark.parametrize("core", ["numpy.core", "numpy._core"])
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_every_protocol_of_both_numpys(tmp_path: Path, raw_calib: Calibs, protocol: int, core: str) -> None:
+    content = renamed(pickle.dumps(raw_calib, protocol), core)
+    assert f"{core}.".encode() in content
+    assert_read_back(tmp_path / "calib.pkl", content, raw_calib)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize(
+    "convert",
+    [
+        np.asfortranarray,
+        lambda array: array[::-1, ::-1][::-1, ::-1],
+        lambda array: array.astype(">f8"),
+        lambda array: np.asfortranarray(array.astype(">f4")),
+        lambda array: array.astype(np.float32),
+        lambda array: array.astype(np.float16),
+    ],
+    ids=["fortran", "strided", "big-endian", "big-endian-fortran-f4", "f4", "f2"],
+)
+def test_every_layout_of_an_array(tmp_path: Path, raw_calib: Calibs, protocol: int, convert: Callable) -> None:
+    stored = {key: convert(array) for key, array in raw_calib.items()}
+    want = {key: array.astype(array.dtype.newbyteorder("=")) for key, array in stored.items()}
+    assert_read_back(tmp_path / "calib.pkl", pickle.dumps(stored, protocol), want)
+
+
+@pytest.mark.parametrize("dtype", [np.int64, np.int32, np.uint8])
+def test_whole_numbers_are_numbers(tmp_path: Path, raw_calib: Calibs, dtype: type) -> None:
+    stored = {key: np.eye(len(array), dtype=dtype) for key, array in raw_calib.items()}
+    assert_read_back(tmp_path / "calib.pkl", pickle.dumps(stored, 2), stored)
+    assert read_calib(tmp_path / "calib.pkl").world_from_ego.matrix.dtype == np.float64
+
+
+def python2_pickle(raw: Calibs) -> bytes:
+    """Protocol 2 as Python 2 and its numpy wrote it: keys, dtypes and contents are byte strings."""
+
+    def string(text: bytes) -> bytes:
+        return b"T" + len(text).to_bytes(4, "little") + text
+
+    def dumped(array: np.ndarray) -> bytes:
+        rows, columns = array.shape
+        dtype = b"cnumpy\ndtype\n" + string(b"f8") + b"K\x00K\x01\x87R(K\x03" + string(b"<")
+        dtype += b"NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb"
+        empty = b"cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85" + string(b"b") + b"\x87R"
+        shape = b"K" + bytes([rows]) + b"K" + bytes([columns]) + b"\x86"
+        return empty + b"(K\x01" + shape + dtype + b"\x89" + string(array.astype("<f8").tobytes()) + b"tb"
+
+    items = b"".join(string(key.encode()) + dumped(array) for key, array in raw.items())
+    return b"\x80\x02}(" + items + b"u."
+
+
+def test_a_python_2_pickle(tmp_path: Path, raw_calib: Calibs) -> None:
+    content = python2_pickle(raw_calib)
+    reference = pickle.loads(renamed(content, "numpy.core"), encoding="latin1")
+    np.testing.assert_array_equal(reference["ego_to_world"], raw_calib["ego_to_world"])
+    assert_read_back(tmp_path / "calib.pkl", content, raw_calib)
+
+
+class Call:
+    """Pickles as a call of `function`, which is what unpickling then does."""
+
+    def __init__(self, function: Callable, *arguments: object) -> None:
+        self.function, self.arguments = function, arguments
+
+    def __reduce__(self) -> tuple:
+        return self.function, self.arguments
+
+
+def touching(flag: str) -> dict[str, Call]:
+    """What makes the file `flag` when a plain unpickler reads it."""
+    code = f"open({flag!r}, 'w').close()"
+    return {
+        "os.system": Call(os.system, f"touch '{flag}'"),
+        "builtins.eval": Call(eval, code),
+        "builtins.exec": Call(exec, code),
+        "builtins.open": Call(open, flag, "w"),
+        "subprocess": Call(subprocess.call, ["touch", flag]),
+        "os.mkdir": Call(os.mkdir, flag),
+        "numpy.save": Call(np.save, flag + ".npy", 1),
+        "numpy.ndarray.tofile": Call(np.ndarray.tofile, np.zeros(1), flag),
+        "getattr-chain": Call(Call(getattr, Call(__import__, "os"), "system"), f"touch '{flag}'"),
+        "partial": Call(Call(functools.partial, os.system, f"touch '{flag}'")),
+        "methodcaller": Call(operator.methodcaller("system", f"touch '{flag}'"), os) if False else Call(os.mkfifo, flag),
+        "nested-in-an-array": Call(list, [Call(os.system, f"touch '{flag}'")]),
+    }
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize("name", list(touching("")))
+def test_a_pickle_that_runs_something_runs_nothing(
+    tmp_path: Path, raw_calib: Calibs, name: str, protocol: int
+) -> None:
+    folder = tmp_path / "made"
+    folder.mkdir()
+    path = tmp_path / "calib.pkl"
+    attack = touching(str(folder / "flag"))[name]
+    for place in ({**raw_calib, "more": attack}, {"first": attack, **raw_calib}, attack, [attack]):
+        path.write_bytes(pickle.dumps(place, protocol))
+        with pytest.raises(CalibError, match=rf"^{path}: not a readable calibration \(.*not allowed\); restore"):
+            read_calib(path)
+        assert list(folder.iterdir()) == []
+    try:
+        pickle.loads(path.read_bytes())
+    except TypeError:
+        assert name == "partial"
+    assert list(folder.iterdir()), "the attack itself does not work, so refusing it shows nothing"
+
+
+# opcodes: c name, S text, V unicode, ( mark, t tuple, R call, i and o call a class, b build, 0 pop, . stop
+SYSTEM = b"cposix\nsystem\n"
+RECONSTRUCT = b"cnumpy.core.multiarray\n_reconstruct\n"
+NDARRAY = b"cnumpy\nndarray\n"
+DTYPE = b"cnumpy\ndtype\n"
+FROMBUFFER = b"cnumpy.core.numeric\n_frombuffer\n"
+ENCODE = b"c_codecs\nencode\n"
+EMPTY_ARRAY = RECONSTRUCT + b"(" + NDARRAY + b"(I0\ntVb\ntR"
+F8 = DTYPE + b"(Vf8\ntR"
+HOSTILE = {
+    "system": SYSTEM + b"(Vtouch FLAG\ntR.",
+    "system by INST": b"(Vtouch FLAG\niposix\nsystem\n.",
+    "system by OBJ": b"(" + SYSTEM + b"Vtouch FLAG\no.",
+    "system by STACK_GLOBAL": b"\x80\x04\x8c\x05posix\x8c\x06system\x93(Vtouch FLAG\ntR.",
+    "dotted name": b"\x80\x04\x8c\x05numpy\x8c\x0fndarray.tofile\x93.",
+    "dotted to globals": b"\x80\x04\x8c\x07_codecs\x8c\x0fencode.__self__\x93.",
+    "extension registry": b"\x80\x02\x82\x01.",
+    "extension registry, four bytes": b"\x80\x02\x84\x01\x00\x00\x00.",
+    "persistent id": b"Pposix.system\n.",
+    "persistent id, binary": b"\x80\x02Vposix.system\nQ.",
+    "out-of-band buffer": b"\x80\x05\x97.",
+    "read-only buffer": b"\x80\x05C\x01x\x98.",
+    "class of a stand-in": b"\x80\x04\x8c\x05numpy\x8c\x11ndarray.__class__\x93.",
+    "copyreg": b"ccopyreg\n_reconstructor\n(" + NDARRAY + b"c__builtin__\nobject\nNtR.",
+    "copy_reg": b"ccopy_reg\n_reconstructor\n(" + NDARRAY + b"c__builtin__\nobject\nNtR.",
+    "add_extension": b"ccopyreg\nadd_extension\n(Vposix\nVsystem\nI1\ntR.",
+    "partial": b"cfunctools\npartial\n(" + SYSTEM + b"Vtouch FLAG\ntR(tR.",
+    "numpy.load": b"cnumpy\nload\n(VFLAG\ntR.",
+    "numpy scalar": b"cnumpy.core.multiarray\nscalar\n(" + F8 + b"Vxxxxxxxx\ntR.",
+    "numpy.core.multiarray.fromfile": b"cnumpy.core.multiarray\nfromfile\n(VFLAG\ntR.",
+    "calling ndarray": NDARRAY + b"((I2\ntVf8\ntR.",
+    "calling ndarray by NEWOBJ": b"\x80\x02" + NDARRAY + b"(I2\n\x85\x81.",
+    "calling a stand-in by NEWOBJ": b"\x80\x02" + DTYPE + b"(Vf8\nt\x81.",
+    "calling a stand-in by NEWOBJ_EX": b"\x80\x04" + DTYPE + b"(Vf8\nt}\x92.",
+    "calling the array": EMPTY_ARRAY + b"(tR.",
+    "calling the dtype": F8 + b"(tR.",
+    "calling text": b"Vtext\n(tR.",
+    "rebuilding another class": RECONSTRUCT + b"(c__builtin__\nobject\n(I0\ntVb\ntR.",
+    "rebuilding a dtype": RECONSTRUCT + b"(" + F8 + b"(I0\ntVb\ntR.",
+    "object dtype": DTYPE + b"(VO\ntR.",
+    "object dtype, numpy's spelling": DTYPE + b"(VO8\nI00\nI01\ntR.",
+    "record with objects": DTYPE + b"(Vf8,O\ntR.",
+    "dtype from a list": DTYPE + b"((lp0\n(Va\nVO\ntatR.",
+    "dtype from a dict": DTYPE + b"((dVnames\n(lstR.",
+    "dtype from a name": DTYPE + b"(" + NDARRAY + b"tR.",
+    "dtype with a shape": DTYPE + b"(V(1000000,1000000)f8\ntR.",
+    "dtype with a leading zero": DTYPE + b"(V010f8\ntR.",
+    "dtype of commas": DTYPE + b"(V,\ntR.",
+    "dtype with two counts": DTYPE + b"(V1 2f8\ntR.",
+    "dtype of an old alias": DTYPE + b"(Va8\ntR.",
+    "dates": DTYPE + b"(VM8[s]\ntR.",
+    "encode by another codec": ENCODE + b"(Vtext\nVidna\ntR.",
+    "encode to bytes by a path": ENCODE + b"(Vtext\nV../../evil\ntR.",
+    "encode an array": ENCODE + b"(" + EMPTY_ARRAY + b"Vlatin1\ntR.",
+    "array of a list": EMPTY_ARRAY + b"(I1\n(I1\nt" + F8 + b"I00\n(lI1\natb.",
+    "array state too short": EMPTY_ARRAY + b"(I1\ntb.",
+    "array state no tuple": EMPTY_ARRAY + b"I1\nb.",
+    "dtype state too short": F8 + b"(I3\ntb.",
+    "dtype state no byte order": F8 + b"(I3\nVsideways\ntb.",
+    "setting an attribute of a function": RECONSTRUCT + b"(dV__call__\n" + SYSTEM + b"sb.",
+    "setting a slot of a function": RECONSTRUCT + b"(N(dV__call__\nVx\nstb.",
+    "setting a slot of ndarray": NDARRAY + b"(N(dV__class__\nVx\nstb.",
+    "setting a slot of dtype": DTYPE + b"(N(dV__setstate__\nVx\nstb.",
+    "setting the class of the encoder": ENCODE + b"(N(dV__class__\n" + NDARRAY + b"stb.",
+    "building a dict": b"(d(dV__class__\nVx\nsb.",
+    "building text": b"Vtext\n(N(dV__class__\nVx\nstb.",
+    "frombuffer of an array": FROMBUFFER + b"(" + EMPTY_ARRAY + F8 + b"(I1\ntVC\ntR.",
+    "frombuffer of objects": FROMBUFFER + b"(C\x08xxxxxxxx" + DTYPE + b"(VO\ntR(I1\ntVC\ntR.",
+    "too few arguments": DTYPE + b"(tR.",
+    "too many arguments": RECONSTRUCT + b"(" + NDARRAY * 9 + b"tR.",
+    "pop from nothing": b"0000.",
+    "no stop": b"(d",
+    "nothing but a stop": b".",
+    "unknown protocol": b"\x80\xff}.",
+    "a frame longer than the file": b"\x80\x04\x95\xff\xff\xff\xff\xff\xff\xff\x7f}.",
+    "bytes longer than the file": b"\x80\x04\x8e\xff\xff\xff\xff\xff\xff\xff\x7f.",
+    "a billion nested lists": b"(" + b"]" * 100_000 + b"t.",
+    "no module": b"c\n\n.",
+    "no text": b"cnumpy\n\xff\xfe\n.",
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_opcodes(tmp_path: Path, raw_calib: Calibs, name: str) -> None:
+    flag, path = tmp_path / "flag", tmp_path / "calib.pkl"
+    path.write_bytes(HOSTILE[name].replace(b"FLAG", bytes(flag)))
+    with pytest.raises(CalibError, match=rf"^{path}: .*; restore the file from its archive$"):
+        read_calib(path)
+    assert not flag.exists()
+    # nothing of it stays behind in the stand-ins
+    assert_read_back(path, pickle.dumps(raw_calib, 2), raw_calib)
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_opcodes_within_a_good_file(tmp_path: Path, raw_calib: Calibs, name: str) -> None:
+    """The attack's value is put on the stack and dropped before a good dict is made."""
+    flag, path = tmp_path / "flag", tmp_path / "calib.pkl"
+    attack = HOSTILE[name].replace(b"FLAG", bytes(flag)).removesuffix(b".")
+    path.write_bytes(attack + b"0" + pickle.dumps(raw_calib, 2))
+    try:
+        read = read_calib(path, raw=True)
+    except CalibError as error:
+        assert str(path) in str(error)
+    else:  # what the attack made is of no harm, and the good part is unharmed
+        np.testing.assert_array_equal(read["ego_to_world"], raw_calib["ego_to_world"])
+    assert not flag.exists()
+
+
+def test_a_registered_extension_is_not_a_way_in(tmp_path: Path) -> None:
+    path = tmp_path / "calib.pkl"
+    copyreg.add_extension("posix", "system", 240)
+    try:
+        path.write_bytes(b"\x80\x02\x82\xf0(Vtouch " + bytes(tmp_path / "flag") + b"\ntR.")
+        with pytest.raises(CalibError, match=r"asks for posix\.system, which is not allowed"):
+            read_calib(path)
+    finally:
+        copyreg.remove_extension("posix", "system", 240)
+    assert not (tmp_path / "flag").exists()
+
+
+@pytest.mark.parametrize("value", [{1: 2}, 5, None, "text", b"x", 1.5, [1], (np.eye(4),), {"a": np.eye(4)}])
+def test_further_plain_values_do_no_harm(tmp_path: Path, raw_calib: Calibs, value: object) -> None:
+    path = tmp_path / "calib.pkl"
+    path.write_bytes(pickle.dumps({**raw_calib, "more": value}, 2))
+    np.testing.assert_array_equal(read_calib(path, raw=True)["ego_to_world"], raw_calib["ego_to_world"])
+
+
+@pytest.mark.parametrize(
+    "array",
+    [np.array([None]), np.array(["text"]), np.array([b"x"]), np.zeros(2, "f8,f8"), np.zeros(2, "M8[s]"), np.array([1j])],
+    ids=lambda array: array.dtype.str,
+)
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_arrays_of_other_than_numbers_are_refused(
+    tmp_path: Path, raw_calib: Calibs, array: np.ndarray, protocol: int
+) -> None:
+    path = tmp_path / "calib.pkl"
+    path.write_bytes(pickle.dumps({**raw_calib, "ego_to_world": array}, protocol))
+    with pytest.raises(CalibError, match=rf"^{path}: .*restore"):
+        read_calib(path)
+
+
+@pytest.fixture
+def _little_memory():
+    """A damaged length must fail for want of memory, and not fill the machine's."""
+    resource = pytest.importorskip("resource")
+    old = resource.getrlimit(resource.RLIMIT_AS)
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + 2**30, old[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, old)
+
+
+PIECES = [
+    *(RECONSTRUCT, NDARRAY, DTYPE, FROMBUFFER, ENCODE, SYSTEM, EMPTY_ARRAY, F8),
+    *(b"(", b"t", b"R", b"b", b"d", b"l", b"s", b"a", b"u", b"e", b"0", b"1", b"2", b".", b"N", b"\x81", b"\x92", b"o"),
+    *(b"Vlatin1\n", b"Vf8\n", b"V__class__\n", b"I1\n", b"I01\n", b"C\x08abcdefgh", b"p0\n", b"g0\n", b"\x85", b"\x86"),
+    *(b"\x80\x04", b"\x8c\x05numpy", b"\x8c\x05dtype", b"\x93", b"}", b"]", b")", b"\x8f", b"\x90", b"\x91", b"\x98"),
+]
+
+
+def assert_calib_or_our_error(path: Path, content: bytes) -> None:
+    path.write_bytes(content)
+    try:
+        read_calib(path)
+    except CalibError as error:
+        assert str(path) in str(error)
+
+
+@pytest.mark.usefixtures("_little_memory")
+@settings(max_examples=400)
+@given(data=st.data(), protocol=st.sampled_from(PROTOCOLS))
+def test_damage_raises_our_error_or_nothing(
+    tmp_path_factory: pytest.TempPathFactory, raw_calib: Calibs, data: st.DataObject, protocol: int
+) -> None:
+    content = data.draw(mutations(pickle.dumps(raw_calib, protocol)))
+    assert_calib_or_our_error(tmp_path_factory.getbasetemp() / "damaged.pkl", content)
+
+
+@pytest.mark.usefixtures("_little_memory")
+@settings(max_examples=400)
+@given(pieces=st.lists(st.sampled_from(PIECES), max_size=25))
+def test_random_programs_raise_our_error(tmp_path_factory: pytest.TempPathFactory, pieces: list[bytes]) -> None:
+    path = tmp_path_factory.getbasetemp() / "program.pkl"
+    path.write_bytes(b"".join(pieces) + b".")
+    with pytest.raises(CalibError, match=r"program\.pkl: "):
+        read_calib(path)
+
+
+def test_the_number_of_a_memo_entry_costs_no_memory(tmp_path: Path) -> None:
+    """A four-byte number makes CPython's unpickler fill a table of twice that length."""
