@@ -8,11 +8,11 @@ from typing import Any, Literal, overload
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, FloatArray, readonly
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, readonly
 from deepaccident_devkit.errors import CalibError, MissingFileError
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.geometry import SE3, handedness
-from deepaccident_devkit.geometry.se3 import rigid_fault
+from deepaccident_devkit.geometry.se3 import RIGID_TOLERANCE, rigid_fault
 from deepaccident_devkit.release._unpickle import UNPICKLE_FAULTS, load_arrays
 from deepaccident_devkit.taxonomy import CAMERAS
 
@@ -24,6 +24,8 @@ KEYS: dict[str, tuple[int, int]] = {
     **dict.fromkeys(_INTRINSIC_KEYS, (3, 3)),
 }
 """Every key of a calib file and the shape of its array."""
+_POSE_KEYS = (*_EGO_KEYS, *_CAMERA_KEYS)
+_LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 _REMEDY = "restore the file from its archive"
 
 
@@ -87,9 +89,9 @@ def read_calib(path: Path, *, raw: bool = False) -> Calib | dict[str, AnyArray]:
             or asks for anything but numpy arrays to be made (nothing of such a file is run).
     """
     arrays = _read_raw(path)
+    calibs = _converted([path], [arrays])
     if raw:
         return arrays
-    calibs = _converted([arrays])
     return Calib(
         ego_from_lidar=SE3(calibs.ego_from_lidar[0]),
         world_from_ego=SE3(calibs.world_from_ego[0]),
@@ -100,7 +102,7 @@ def read_calib(path: Path, *, raw: bool = False) -> Calib | dict[str, AnyArray]:
 
 def read_calibs(paths: Sequence[Path]) -> Calibs:
     """The calibrations of several files as stacked arrays; raises as `read_calib` does."""
-    return _converted([_read_raw(path) for path in paths])
+    return _converted(paths, [_read_raw(path) for path in paths])
 
 
 def write_calib(path: Path, calib: Calib) -> None:
@@ -144,44 +146,47 @@ def _checked_raw(path: Path, loaded: Any) -> dict[str, AnyArray]:
         if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype.kind not in "fiu":
             found = f"{array.shape} of {array.dtype}" if isinstance(array, np.ndarray) else type(array).__name__
             raise CalibError(f"{path}: {key}: expected numbers of shape {shape}, found {found}; {_REMEDY}")
-    faults = _value_faults(loaded)
-    if faults:
-        raise CalibError(f"{path}: {faults[0]}; {_REMEDY}")
     return loaded
 
 
-def _value_faults(raw: Mapping[str, AnyArray]) -> list[str]:
-    """What is wrong with the numbers, checked for all transforms of a file at once; named only on failure."""
-    keys = (*_EGO_KEYS, *_CAMERA_KEYS)
-    poses = np.array([raw[key] for key in keys], dtype=np.float64)
-    intrinsics = np.array([raw[key] for key in _INTRINSIC_KEYS], dtype=np.float64)
-    faults = [
-        f"{key}: holds NaN or infinity"
-        for key, array in zip(_INTRINSIC_KEYS, intrinsics, strict=True)
-        if not np.isfinite(array).all()
-    ]
-    turns = poses[:, :3, :3]
-    off = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max()
-    determinants = (np.cross(turns[:, 0], turns[:, 1]) * turns[:, 2]).sum(axis=1)
-    suspicious = not (off < _WELL_RIGID and (determinants > 0).all() and np.isfinite(poses).all())
-    if suspicious or not (poses[:, 3] == _LAST_ROW).all():
-        faults += [f"{key}: {fault}" for key, pose in zip(keys, poses, strict=True) if (fault := rigid_fault(pose))]
-    return faults
+def _converted(paths: Sequence[Path], files: Sequence[Mapping[str, AnyArray]]) -> Calibs:
+    """Check the numbers of all files at once and turn them right-handed."""
 
-
-_WELL_RIGID = 1e-4
-_LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
-
-
-def _converted(files: Sequence[Mapping[str, AnyArray]]) -> Calibs:
     def stacked(keys: Sequence[str], shape: tuple[int, int]) -> FloatArray:
         rows = [file[key] for file in files for key in keys]
         return np.array(rows, dtype=np.float64).reshape(len(files), len(keys), *shape)
 
-    ego = handedness.flip_pose(stacked(_EGO_KEYS, (4, 4)))
+    poses, intrinsics = stacked(_POSE_KEYS, (4, 4)), stacked(_INTRINSIC_KEYS, (3, 3))
+    rigid = _surely_rigid(poses).all(axis=1)
+    finite = np.isfinite(intrinsics).all(axis=(1, 2, 3))
+    for index in np.flatnonzero(~(rigid & finite)).tolist():
+        fault = _first_value_fault(poses[index], intrinsics[index])
+        if fault:
+            raise CalibError(f"{paths[index]}: {fault}; {_REMEDY}")
+    ego = handedness.flip_pose(poses[:, :2])
     return Calibs(
         ego_from_lidar=ego[:, 0],
         world_from_ego=ego[:, 1],
-        camera_from_lidar=handedness.camera_from_lidar(stacked(_CAMERA_KEYS, (4, 4))),
-        intrinsic=handedness.intrinsic(stacked(_INTRINSIC_KEYS, (3, 3))),
+        camera_from_lidar=handedness.camera_from_lidar(poses[:, 2:]),
+        intrinsic=handedness.intrinsic(intrinsics),
     )
+
+
+def _surely_rigid(poses: FloatArray) -> BoolArray:
+    """Which transforms (…, 4, 4) are beyond doubt; the others get a closer look, and a sentence."""
+    turns = poses[..., :3, :3]
+    with np.errstate(invalid="ignore"):
+        off = np.abs(turns @ np.swapaxes(turns, -1, -2) - np.eye(3)).max(axis=(-1, -2))
+        proper = (off < RIGID_TOLERANCE / 2) & (np.linalg.det(turns) > 0)
+    sure: BoolArray = proper & np.isfinite(poses).all(axis=(-1, -2)) & (poses[..., 3, :] == _LAST_ROW).all(axis=-1)
+    return sure
+
+
+def _first_value_fault(poses: FloatArray, intrinsics: FloatArray) -> str | None:
+    faults = [f"{key}: {fault}" for key, pose in zip(_POSE_KEYS, poses, strict=True) if (fault := rigid_fault(pose))]
+    faults += [
+        f"{key}: holds NaN or infinity"
+        for key, intrinsic in zip(_INTRINSIC_KEYS, intrinsics, strict=True)
+        if not np.isfinite(intrinsic).all()
+    ]
+    return faults[0] if faults else None
