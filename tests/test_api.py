@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from workers import num_boxes
 
 import deepaccident_devkit
 from deepaccident_devkit import DeepAccident, DeepAccidentError
@@ -148,16 +149,12 @@ def test_a_pickle_is_small_and_opens_again(da: DeepAccident) -> None:
     assert pickle.loads(content).get("sample", da.sample[3]["token"]) == da.sample[3]
 
 
-def _num_boxes(release: DeepAccident, row: int) -> int:
-    return len(release.boxes(release.sample[row]))
-
-
 @pytest.mark.parametrize("method", ["spawn", "fork"])
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_workers_get_their_own_copy(da: DeepAccident, method: str) -> None:
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context(method)) as pool:
-        counts = list(pool.map(_num_boxes, [da] * 3, range(3)))
-    assert counts == [_num_boxes(da, row) for row in range(3)]
+        counts = list(pool.map(num_boxes, [da] * 3, range(3)))
+    assert counts == [num_boxes(da, row) for row in range(3)]
 
 
 def test_tables_behave_like_sequences(da: DeepAccident) -> None:

@@ -88,10 +88,9 @@ def read_calib(path: Path, *, raw: bool = False) -> Calib | dict[str, AnyArray]:
         CalibError: it is damaged, lacks a key, holds an array of a wrong shape, NaN or a transform that is not rigid,
             or asks for anything but numpy arrays to be made (nothing of such a file is run).
     """
-    arrays = _read_raw(path)
-    calibs = _converted([path], [arrays])
     if raw:
-        return arrays
+        return read_calibs([path], raw=True)[0]
+    calibs = read_calibs([path])
     return Calib(
         ego_from_lidar=SE3(calibs.ego_from_lidar[0]),
         world_from_ego=SE3(calibs.world_from_ego[0]),
@@ -100,9 +99,18 @@ def read_calib(path: Path, *, raw: bool = False) -> Calib | dict[str, AnyArray]:
     )
 
 
-def read_calibs(paths: Sequence[Path]) -> Calibs:
-    """The calibrations of several files as stacked arrays; raises as `read_calib` does."""
-    return _converted(paths, [_read_raw(path) for path in paths])
+@overload
+def read_calibs(paths: Sequence[Path], *, raw: Literal[False] = False) -> Calibs: ...
+@overload
+def read_calibs(paths: Sequence[Path], *, raw: Literal[True]) -> list[dict[str, AnyArray]]: ...
+def read_calibs(paths: Sequence[Path], *, raw: bool = False) -> Calibs | list[dict[str, AnyArray]]:
+    """The calibrations of several files as stacked arrays, or with `raw` as the files' own dicts.
+
+    Raises as `read_calib` does.
+    """
+    files = [_read_raw(path) for path in paths]
+    calibs = _converted(paths, files)
+    return files if raw else calibs
 
 
 def write_calib(path: Path, calib: Calib) -> None:

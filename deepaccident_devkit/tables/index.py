@@ -121,7 +121,8 @@ def _is_current(layout: ReleaseLayout, index: Index, fingerprint: str) -> bool:
 
     Broken scenarios are looked at file by file: a file mended in place leaves its folder's time alone.
     """
-    if index.manifest.fingerprint != fingerprint:
+    whole = not index.manifest.tables or index.tables_folder.is_dir()
+    if index.manifest.fingerprint != fingerprint or not whole:
         return False
     broken = {problem.scenario: problem.digest for problem in index.manifest.problems if problem.digest}
     return all(

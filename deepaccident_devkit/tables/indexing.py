@@ -120,8 +120,13 @@ def _write_tables(folder: Path, outcomes: Sequence[Outcome], splits: SplitAssign
     )
     name = _TABLES + hashlib.blake2b(made_from.encode(), digest_size=8).hexdigest()
     if not (folder / name).is_dir():
-        with replacing_folder(folder / name) as temporary:
-            join_tables(temporary, [shard_path(folder / _SHARDS, outcome.token) for outcome in outcomes], assigned)
+        shards = [shard_path(folder / _SHARDS, outcome.token) for outcome in outcomes]
+        try:
+            with replacing_folder(folder / name) as temporary:
+                join_tables(temporary, shards, assigned)
+        except OSError:
+            if not (folder / name).is_dir():  # else another process made the same tables meanwhile
+                raise
     return name
 
 

@@ -19,8 +19,8 @@ def visible_mask(
 ) -> BoolArray:
     """Which boxes of one agent's label the agent sees, by points and cameras alone.
 
-    Far boxes need a camera and points (2, or 1 for two-wheelers and pedestrians); near ones points enough (5, or 2);
-    near the infrastructure a camera or one point will do.
+    Far boxes need a camera and points (2, or 1 for two-wheelers and pedestrians); near ones a camera or points (5, or
+    2; near the infrastructure 1).
 
     Args:
         xy: (N, 2) metres in the agent's LiDAR frame, either handedness.
@@ -39,7 +39,7 @@ def visible_mask(
     far_seen = camera & (points >= np.where(small, 1, 2))
     if infrastructure:
         return np.where(distance < NEAR_INFRASTRUCTURE, camera | (points >= 1), far_seen)
-    return np.where(distance < NEAR_VEHICLE, points >= np.where(small, 2, 5), far_seen)
+    return np.where(distance < NEAR_VEHICLE, camera | (points >= np.where(small, 2, 5)), far_seen)
 
 
 def visible_ids(masks: Sequence[ArrayLike], actor_ids: Sequence[ArrayLike]) -> IntArray:
