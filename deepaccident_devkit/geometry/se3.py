@@ -135,8 +135,9 @@ def rigid_fault(matrix: FloatArray) -> str | None:
     if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), atol=RIGID_TOLERANCE):
         return f"its last row is {matrix[3].tolist()}, expected 0 0 0 1"
     rotation = matrix[:3, :3]
-    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if error > RIGID_TOLERANCE:
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if not error <= RIGID_TOLERANCE:  # NaN, where numbers overflow
         return f"its rotation is not orthonormal (off by {error:.2g})"
     if np.linalg.det(rotation) < 0:
         return "its rotation is a mirror image (determinant −1)"

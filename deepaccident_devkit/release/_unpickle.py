@@ -7,6 +7,7 @@ and keep no attribute that a pickle tries to give them. The arrays are made from
 
 import io
 import pickle
+import re
 from collections.abc import Sequence
 from typing import Any, ClassVar, NoReturn
 
@@ -14,6 +15,8 @@ import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray
 
+_PLAIN_NUMBER = re.compile(r"[<>=|]?[fiub][1-9][0-9]?", re.ASCII)
+"""The only dtypes there are: numpy itself would evaluate what else a string may say."""
 UNPICKLE_FAULTS = (
     pickle.UnpicklingError,
     AttributeError,
@@ -60,12 +63,9 @@ class _DtypeNotes:
 
     def __init__(self, code: object) -> None:
         text = code.decode("ascii") if isinstance(code, bytes) else code
-        if not isinstance(text, str):
-            raise pickle.UnpicklingError("a numpy dtype is not named by a string")
-        dtype = np.dtype(text)
-        if dtype.kind not in "fiub" or dtype.shape:
-            raise pickle.UnpicklingError(f"an array of {dtype} is not allowed")
-        self.dtype: np.dtype[Any] = dtype
+        if not isinstance(text, str) or not _PLAIN_NUMBER.fullmatch(text):
+            raise pickle.UnpicklingError(f"an array of {text!r} is not allowed")
+        self.dtype: np.dtype[Any] = np.dtype(text)
 
     def __setstate__(self, state: Sequence[Any]) -> None:
         """Of the state numpy writes, take the byte order."""

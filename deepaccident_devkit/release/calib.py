@@ -183,7 +183,7 @@ def _converted(paths: Sequence[Path], files: Sequence[Mapping[str, AnyArray]]) -
 def _surely_rigid(poses: FloatArray) -> BoolArray:
     """Which transforms (…, 4, 4) are beyond doubt; the others get a closer look, and a sentence."""
     turns = poses[..., :3, :3]
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
         off = np.abs(turns @ np.swapaxes(turns, -1, -2) - np.eye(3)).max(axis=(-1, -2))
         proper = (off < RIGID_TOLERANCE / 2) & (np.linalg.det(turns) > 0)
     sure: BoolArray = proper & np.isfinite(poses).all(axis=(-1, -2)) & (poses[..., 3, :] == _LAST_ROW).all(axis=-1)

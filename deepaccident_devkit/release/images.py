@@ -22,14 +22,16 @@ def read_image(path: Path, *, raw: bool = False) -> ByteArray:
         MissingFileError: there is no such file.
         SensorFileError: it is truncated or no image. (Pillow says so where OpenCV returns a half-grey picture.)
     """
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
+
+    bombs = (Image.DecompressionBombError, Image.DecompressionBombWarning)  # a damaged header names a giant size
 
     try:
         with Image.open(path) as image:
             return np.array(image if raw else image.convert("RGB"))
     except FileNotFoundError:
         raise MissingFileError(f"{path}: no such file; unpack the archive that holds this camera") from None
-    except (OSError, UnidentifiedImageError, SyntaxError, ValueError) as error:
+    except (OSError, SyntaxError, ValueError, *bombs) as error:
         raise SensorFileError(f"{path}: not a readable image ({error}); restore the file from its archive") from error
 
 
@@ -37,6 +39,8 @@ def write_image(path: Path, image: ByteArray) -> None:
     """Write an RGB image (H, W, 3) uint8 as JPEG."""
     import cv2
 
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
+        raise SensorFileError(f"{path}: expected shape (H, W, 3) of uint8, found {image.shape} of {image.dtype}")
     done, encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not done:
         raise SensorFileError(f"{path}: an image of shape {image.shape} cannot be encoded as JPEG")

@@ -4,6 +4,7 @@ Files are parsed in bulk: the bodies of many files are joined and go through Arr
 call does not take (CRLF, blanks at line ends, one-token lines, faults) is tidied or named file by file.
 """
 
+import codecs
 import math
 import os
 import re
@@ -30,7 +31,7 @@ _FILES_A_CALL = 250
 _MOST_THREADS = 4
 _USUAL_SIZE = 1 << 16
 _NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
-_INTEGER = re.compile(r"[+-]?\d+", re.ASCII)
+_INTEGER = re.compile(r"-?\d+", re.ASCII)
 _REMEDY = "restore the file from its archive, or leave the scenario out with on_error='skip'"
 
 
@@ -190,6 +191,7 @@ def _content(path: Path) -> bytes:
             content += more
     finally:
         os.close(descriptor)
+    content = content.removeprefix(codecs.BOM_UTF8)
     return content if content.endswith(b"\n") else content + b"\n"
 
 
@@ -201,7 +203,8 @@ def _parse_joined(contents: Sequence[bytes]) -> dict[str, AnyArray] | None:
     num_boxes = np.array([content.count(b"\n") - 1 for content in contents], dtype=np.int64)
     header = b"".join([content[:start] for content, start in zip(contents, body_starts, strict=True)])
     body = b"".join([memoryview(content)[start:] for content, start in zip(contents, body_starts, strict=True)])
-    if b"\r" in body or b"\r" in header:
+    # Arrow would take a carriage return for a line end, read hexadecimal integers and drop a byte order mark
+    if any(odd in body for odd in (b"\r", b"x", b"X")) or b"\r" in header or body.startswith(codecs.BOM_UTF8):
         return None
     try:
         header_table, body_table = _parse_header(header), _parse_body(body)
@@ -293,7 +296,7 @@ def _first_fault(paths: Sequence[Path], contents: Sequence[bytes]) -> LabelError
     for path, content in zip(paths, contents, strict=True):
         header_seen = False
         for number, line in enumerate(content.splitlines(), start=1):
-            words = line.decode("utf-8", errors="replace").split()
+            words = [word.decode("utf-8", errors="replace") for word in line.split()]
             if len(words) < 2:
                 continue
             fault = _line_fault(words) if header_seen else _header_fault(words)

@@ -135,7 +135,7 @@ def frame_numbers(folder: Path, ending: str) -> tuple[list[int], list[str]]:
             continue
         prefix_length = len(folder.name)
         match = _FRAME_FILE.fullmatch(name[prefix_length:]) if name.startswith(folder.name) else None
-        if match:
+        if match and match[1] == f"{int(match[1]):03d}":
             frames.append(int(match[1]))
         else:
             odd.append(name)

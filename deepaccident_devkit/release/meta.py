@@ -104,9 +104,9 @@ def write_meta(path: Path, meta: Meta) -> None:
         (id1, id2), (class1, class2) = collision.ids, collision.classes
         words += [id1, class1, id2, class2, collision.impact, collision.spawn_relation, collision.contact_side]
     lines = [" ".join(map(str, [*words, meta.simulated_frames]))]
-    agents = (collision and collision.agents) or (None, None)
+    agents = collision.agents if collision else (None, None)
     entries = {
-        "colliding agents": " ".join(_SHORT_NAMES[agent] for agent in agents),
+        "colliding agents": agents and " ".join(_SHORT_NAMES[agent] for agent in agents),
         "agents id": meta.agent_ids and " ".join(map(str, meta.agent_ids)),
         "road_type": meta.road_type,
         "another_vehicle_spawn_side": meta.spawn_side,

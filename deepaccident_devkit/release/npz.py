@@ -12,7 +12,25 @@ from deepaccident_devkit.errors import MissingFileError, SensorFileError
 from deepaccident_devkit.files import write_bytes
 
 KEY = "data"
+_ENDING = ".npy"
+_BARE_ARRAY = b"\x93NUMPY"
+"""How a `.npy` file begins."""
 _REMEDY = "restore the file from its archive"
+_FAULTS = (
+    OSError,
+    ValueError,
+    EOFError,
+    KeyError,
+    MemoryError,
+    OverflowError,
+    RuntimeError,  # an encrypted member
+    SyntaxError,  # a damaged array header
+    NotImplementedError,  # an unknown compression
+    UnicodeError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""What reading damaged bytes can raise."""
 
 
 def read_npz(path: Path) -> AnyArray:
@@ -23,18 +41,15 @@ def read_npz(path: Path) -> AnyArray:
         SensorFileError: it is empty, truncated, holds several arrays and none of them `data`, or objects.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:  # noqa: TID251 - this is the reader to call instead
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise SensorFileError(f"{path}: expected an npz archive, found a bare array; {_REMEDY}")
-            return _only_array(path, archive)
+        with zipfile.ZipFile(path) as archive, archive.open(_array_member(path, archive)) as file:
+            array: AnyArray = np.lib.format.read_array(file, allow_pickle=False)
+            return array
     except FileNotFoundError:
         raise MissingFileError(f"{path}: no such file; unpack the archive that holds it") from None
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+    except _FAULTS as error:
         if isinstance(error, SensorFileError):
             raise
-        size = path.stat().st_size if path.is_file() else 0
-        detail = "the file is empty" if size == 0 else str(error)
-        raise SensorFileError(f"{path}: not a readable npz archive ({detail}); {_REMEDY}") from error
+        raise SensorFileError(f"{path}: {_fault(path, error)}; {_REMEDY}") from error
 
 
 def write_npz(path: Path, array: AnyArray) -> None:
@@ -44,15 +59,25 @@ def write_npz(path: Path, array: AnyArray) -> None:
     archive = io.BytesIO()
     fast = 1  # a BEV array of 4.3 MB takes 10 ms; the default level takes 30 and saves little
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED, compresslevel=fast) as file:
-        file.writestr(zipfile.ZipInfo(f"{KEY}.npy"), member.getvalue(), zipfile.ZIP_DEFLATED, fast)
+        file.writestr(zipfile.ZipInfo(f"{KEY}{_ENDING}"), member.getvalue(), zipfile.ZIP_DEFLATED, fast)
     write_bytes(path, archive.getvalue())
 
 
-def _only_array(path: Path, archive: "np.lib.npyio.NpzFile") -> AnyArray:
-    names = list(archive.files)
-    if KEY in names:
-        return archive[KEY]
+def _array_member(path: Path, archive: zipfile.ZipFile) -> str:
+    names = [name for name in archive.namelist() if name.endswith(_ENDING)]
+    if f"{KEY}{_ENDING}" in names:
+        return f"{KEY}{_ENDING}"
     if len(names) != 1:
-        found = ", ".join(names) or "no array"
+        found = ", ".join(name.removesuffix(_ENDING) for name in names) or "no array"
         raise SensorFileError(f"{path}: expected an array named '{KEY}', found {found}; {_REMEDY}")
-    return archive[names[0]]
+    return names[0]
+
+
+def _fault(path: Path, error: Exception) -> str:
+    if not path.is_file():
+        return f"not a readable npz archive ({error})"
+    with path.open("rb") as file:
+        start = file.read(len(_BARE_ARRAY))
+    if start == _BARE_ARRAY:
+        return "expected an npz archive, found a bare array"
+    return f"not a readable npz archive ({error if start else 'the file is empty'})"
