@@ -33,6 +33,6 @@ def main() -> None:
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     try:
         deepaccident()
-    except DeepAccidentError as error:
+    except (DeepAccidentError, OSError) as error:  # an OSError: a full disk, a folder without permission
         click.echo(f"error: {error}", err=True)
         sys.exit(_ERROR_STATUS)

@@ -122,9 +122,19 @@ class Boxes:
         return [CATEGORIES[code] for code in self.category.tolist()]
 
     def select(self, which: ArrayLike) -> Boxes:
-        """The boxes that a mask (N,), a slice's indices or an integer array picks."""
+        """The boxes that a mask (N,) or an integer array of rows picks.
+
+        Raises:
+            GeometryError: `which` is neither, or names a row that is not there.
+        """
         picked = np.asarray(which)
-        return trusted_boxes(self.frame, {name: getattr(self, name)[picked] for name in _COLUMNS})
+        if picked.ndim != 1:
+            raise GeometryError(f"expected a mask ({len(self)},) or an array of rows, found {which!r}")
+        try:
+            columns = {name: getattr(self, name)[picked if picked.size else []] for name in _COLUMNS}
+        except IndexError as error:
+            raise GeometryError(f"{which!r} does not pick from {len(self)} boxes: {error}") from error
+        return trusted_boxes(self.frame, columns)
 
     def transform(self, target_from_source: SE3, frame: str) -> Boxes:
         """The same boxes in another frame: centers, rotations and velocities move, sizes stay."""
@@ -195,6 +205,10 @@ def _category_codes(category: ArrayLike | None, count: int) -> AnyArray:
         return np.zeros(count, dtype=np.int8)
     given = np.asarray(category)
     if given.dtype.kind not in "US":
+        if not np.isin(given, range(len(CATEGORIES))).all():
+            raise GeometryError(
+                f"category codes are 0 to {len(CATEGORIES) - 1} ({', '.join(CATEGORIES)}), found {given}"
+            )
         return given.astype(np.int8)
     names = [str(name) for name in given]
     unknown = sorted(set(names) - set(CATEGORIES))

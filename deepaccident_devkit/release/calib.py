@@ -9,10 +9,11 @@ from typing import Any, Literal, overload
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, readonly
-from deepaccident_devkit.errors import CalibError, MissingFileError
+from deepaccident_devkit.errors import CalibError
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.geometry import SE3, handedness
 from deepaccident_devkit.geometry.se3 import RIGID_TOLERANCE, rigid_fault
+from deepaccident_devkit.release._content import read_content
 from deepaccident_devkit.release._unpickle import UNPICKLE_FAULTS, load_arrays
 from deepaccident_devkit.taxonomy import CAMERAS
 
@@ -130,11 +131,7 @@ def write_calib(path: Path, calib: Calib) -> None:
 
 
 def _read_raw(path: Path) -> dict[str, AnyArray]:
-    try:
-        with path.open("rb", buffering=0) as file:
-            content = file.readall()
-    except FileNotFoundError:
-        raise MissingFileError(f"{path}: no such file; unpack the archive that holds it") from None
+    content = read_content(path, CalibError, _REMEDY)
     try:
         loaded = load_arrays(content)
     except UNPICKLE_FAULTS as error:

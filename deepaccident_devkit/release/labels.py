@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, readonly
-from deepaccident_devkit.errors import LabelError, MissingFileError
+from deepaccident_devkit.errors import LabelError
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.geometry import Boxes, handedness, quaternions
+from deepaccident_devkit.release._content import read_content
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 FIELDS = ("class", "x", "y", "z", "l", "w", "h", "yaw", "vx", "vy", "id", "num_lidar_pts", "camera_visible")
@@ -29,7 +30,6 @@ _INTEGER_FIELDS = ("id", "num_lidar_pts")
 _HEADER = ("speed_x", "speed_y")
 _FILES_A_CALL = 250
 _MOST_THREADS = 4
-_USUAL_SIZE = 1 << 16
 _NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
 _INTEGER = re.compile(r"-?\d+", re.ASCII)
 _REMEDY = "restore the file from its archive, or leave the scenario out with on_error='skip'"
@@ -180,18 +180,8 @@ def _parse_files(paths: Sequence[Path], contents: Sequence[bytes]) -> dict[str, 
 
 
 def _content(path: Path) -> bytes:
-    """A file's bytes, ending in a line end. Plain system calls: `open` would double the time of a small file."""
-    try:
-        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
-    except FileNotFoundError:
-        raise MissingFileError(f"{path}: no such file; unpack the archive that holds it") from None
-    try:
-        content = os.read(descriptor, _USUAL_SIZE)
-        while more := os.read(descriptor, _USUAL_SIZE):
-            content += more
-    finally:
-        os.close(descriptor)
-    content = content.removeprefix(codecs.BOM_UTF8)
+    """A file's bytes, ending in a line end."""
+    content = read_content(path, LabelError, _REMEDY).removeprefix(codecs.BOM_UTF8)
     return content if content.endswith(b"\n") else content + b"\n"
 
 

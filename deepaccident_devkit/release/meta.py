@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, overload
 
-from deepaccident_devkit.errors import MetaError, MissingFileError
+from deepaccident_devkit.errors import MetaError
 from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.release._content import read_lines
 from deepaccident_devkit.taxonomy import META_AGENTS, TIMES_OF_DAY, UNTRACKED_ID, AgentName
 
 _FIRST_LINE = "<weather+time> <id1> <class1> <id2> <class2> <impact> <spawn relation> <contact side> <frames>"
@@ -79,12 +80,7 @@ def read_meta(path: Path, *, raw: bool = False) -> Meta | tuple[str, ...]:
         MetaError: the first line has not nine words or a word where a number belongs, or another line's ids are
             no numbers.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError:
-        raise MissingFileError(f"{path}: no such file; unpack the meta folder of this scenario type") from None
-    except UnicodeDecodeError as error:
-        raise MetaError(f"{path}: not a text file ({error.reason}); {_REMEDY}") from error
+    lines = read_lines(path, MetaError, _REMEDY)
     if raw:
         return tuple(lines)
     filled = [(number, line.strip()) for number, line in enumerate(lines, start=1) if line.strip()]

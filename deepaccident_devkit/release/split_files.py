@@ -4,8 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, overload
 
-from deepaccident_devkit.errors import MissingFileError, SplitFileError
+from deepaccident_devkit.errors import SplitFileError
 from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.release._content import read_lines
 
 
 @overload
@@ -25,12 +26,7 @@ def read_split_file(path: Path, *, raw: bool = False) -> list[str] | list[tuple[
         MissingFileError: there is no such file.
         SplitFileError: a line has not two words, or the file is no text.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError:
-        raise MissingFileError(f"{path}: no such file") from None
-    except UnicodeDecodeError as error:
-        raise SplitFileError(f"{path}: not a text file ({error.reason}); restore it from the release") from error
+    lines = read_lines(path, SplitFileError, "restore it from the release")
     words = [(number, tuple(line.split())) for number, line in enumerate(lines, start=1) if line.strip()]
     for number, line_words in words:
         if len(line_words) != 2:

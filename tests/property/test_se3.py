@@ -44,7 +44,7 @@ def test_vectors_turn_and_do_not_move(pose: SE3, vector: np.ndarray) -> None:
 @given(ANGLES, arrays((3,), 100))
 def test_yaw_turns_counter_clockwise(yaw: float, translation: np.ndarray) -> None:
     moved = SE3.from_yaw(yaw, translation).apply([1.0, 0.0, 0.0])
-    assert_allclose(moved, translation + [np.cos(yaw), np.sin(yaw), 0], atol=1e-9)
+    assert_allclose(moved - translation, [np.cos(yaw), np.sin(yaw), 0], atol=1e-9)
 
 
 @given(poses(), poses())

@@ -51,7 +51,14 @@ def test_select_by_mask_and_by_index(two: Boxes) -> None:
     for which in ([False, True], [1], np.array([1]), [-1]):
         one = two.select(which)
         assert (len(one), one.actor_id[0], one.row[0]) == (1, 7, 1)
-    assert len(two.select(np.zeros(0, dtype=int))) == 0
+    for nothing in ([], np.zeros(0, dtype=int), [False, False]):
+        assert len(two.select(nothing)) == 0
+
+
+@pytest.mark.parametrize("which", [0, [2], [True], [0.5], ["0"], [[0], [1]]])
+def test_select_says_what_it_cannot_pick(two: Boxes, which: object) -> None:
+    with pytest.raises(GeometryError, match=r"does not pick from 2 boxes|expected a mask \(2,\)"):
+        two.select(which)  # type: ignore[arg-type]
 
 
 def test_contains_takes_faces_in(two: Boxes) -> None:
@@ -94,6 +101,9 @@ def test_arrays_are_read_only_and_the_callers_are_not(two: Boxes) -> None:
         ({"yaw": [[0.0], [0.0]]}, r"Boxes.yaw: expected shape \(N\)"),
         ({"velocity": np.ones((2, 2))}, r"Boxes.velocity: expected shape \(2, 3\)"),
         ({"actor_id": [1]}, r"Boxes.actor_id: expected shape \(2\)"),
+        ({"category": [0, 6]}, r"category codes are 0 to 5 \(car, .*\), found \[0 6\]"),
+        ({"category": [-1, 0]}, r"category codes are 0 to 5"),
+        ({"category": [0.5, 0]}, r"category codes are 0 to 5"),
         ({"category": ["car", "tank"]}, r"unknown category \['tank'\]; known are car, truck"),
         ({"colour": ["red", "blue"]}, r"no column \['colour'\]; it has \['center'"),
         ({"center": "nowhere"}, "Boxes.center: expected an array"),

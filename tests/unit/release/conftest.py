@@ -1,4 +1,6 @@
-"""Calib dicts and pickles for test_calib and test_unpickle."""
+"""What several tests of readers need."""
+
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -19,3 +21,16 @@ def raw_calib() -> dict[str, np.ndarray]:
         else:
             raw[key] = np.array([[800.0, 1000 + number, 0], [450, 0, -1000 - number], [1, 0, 0]])
     return raw
+
+
+@pytest.fixture(scope="session")
+def outcome() -> Callable:
+    """Call a reader: what it returns and None, or None and what its error of this kind says; no other may escape."""
+
+    def call(kind: type[Exception], reader: Callable, *arguments: object) -> tuple:
+        try:
+            return reader(*arguments), None
+        except kind as error:
+            return None, str(error)
+
+    return call

@@ -22,8 +22,9 @@ def path(tmp_path: Path) -> Path:
         f"{TYPE} {NAME}\r\n{TWIN} {NAME}\r\n",
         f"\n {TYPE}  {NAME} \n\n{TWIN}\t{NAME}  \n \n",
         f"{TYPE} {NAME}\n{TWIN} {NAME}\n{TYPE} {NAME}\n",
+        f"\ufeff{TYPE} {NAME}\n{TWIN} {NAME}\n",
     ],
-    ids=["plain", "no-final-newline", "crlf", "blanks", "repeated"],
+    ids=["plain", "no-final-newline", "crlf", "blanks", "repeated", "mark"],
 )
 def test_tokens_in_the_files_order_each_once(path: Path, text: str) -> None:
     path.write_bytes(text.encode())

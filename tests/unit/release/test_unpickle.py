@@ -1,10 +1,7 @@
 """Pickles as old and new numpy write them are read; pickles that ask for anything else run nothing."""
 
-import builtins
 import copyreg
-import ctypes
 import functools
-import operator
 import os
 import pickle
 import subprocess
@@ -115,6 +112,9 @@ class Call:
     def __reduce__(self) -> tuple:
         return self.function, self.arguments
 
+    def __call__(self) -> None:
+        """So that a call's result may be called in turn."""
+
 
 def touching(flag: str) -> dict[str, Call]:
     """What makes the file `flag` when a plain unpickler reads it."""
@@ -123,23 +123,19 @@ def touching(flag: str) -> dict[str, Call]:
         "os.system": Call(os.system, f"touch '{flag}'"),
         "builtins.eval": Call(eval, code),
         "builtins.exec": Call(exec, code),
-        "builtins.open": Call(open, flag, "w"),
         "subprocess": Call(subprocess.call, ["touch", flag]),
         "os.mkdir": Call(os.mkdir, flag),
         "numpy.save": Call(np.save, flag + ".npy", 1),
         "numpy.ndarray.tofile": Call(np.ndarray.tofile, np.zeros(1), flag),
         "getattr-chain": Call(Call(getattr, Call(__import__, "os"), "system"), f"touch '{flag}'"),
-        "partial": Call(Call(functools.partial, os.system, f"touch '{flag}'")),
-        "methodcaller": Call(operator.methodcaller("system", f"touch '{flag}'"), os) if False else Call(os.mkfifo, flag),
+        "functools.partial": Call(functools.partial(os.system, f"touch '{flag}'")),
         "nested-in-an-array": Call(list, [Call(os.system, f"touch '{flag}'")]),
     }
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 @pytest.mark.parametrize("name", list(touching("")))
-def test_a_pickle_that_runs_something_runs_nothing(
-    tmp_path: Path, raw_calib: Calibs, name: str, protocol: int
-) -> None:
+def test_a_pickle_that_runs_something_runs_nothing(tmp_path: Path, raw_calib: Calibs, name: str, protocol: int) -> None:
     folder = tmp_path / "made"
     folder.mkdir()
     path = tmp_path / "calib.pkl"
@@ -149,10 +145,7 @@ def test_a_pickle_that_runs_something_runs_nothing(
         with pytest.raises(CalibError, match=rf"^{path}: not a readable calibration \(.*not allowed\); restore"):
             read_calib(path)
         assert list(folder.iterdir()) == []
-    try:
-        pickle.loads(path.read_bytes())
-    except TypeError:
-        assert name == "partial"
+    pickle.loads(path.read_bytes())
     assert list(folder.iterdir()), "the attack itself does not work, so refusing it shows nothing"
 
 
@@ -232,7 +225,7 @@ HOSTILE = {
     "unknown protocol": b"\x80\xff}.",
     "a frame longer than the file": b"\x80\x04\x95\xff\xff\xff\xff\xff\xff\xff\x7f}.",
     "bytes longer than the file": b"\x80\x04\x8e\xff\xff\xff\xff\xff\xff\xff\x7f.",
-    "a billion nested lists": b"(" + b"]" * 100_000 + b"t.",
+    "many nested lists": b"(" + b"]" * 100_000 + b"t.",
     "no module": b"c\n\n.",
     "no text": b"cnumpy\n\xff\xfe\n.",
 }
@@ -242,7 +235,7 @@ HOSTILE = {
 def test_hostile_opcodes(tmp_path: Path, raw_calib: Calibs, name: str) -> None:
     flag, path = tmp_path / "flag", tmp_path / "calib.pkl"
     path.write_bytes(HOSTILE[name].replace(b"FLAG", bytes(flag)))
-    with pytest.raises(CalibError, match=rf"^{path}: .*; restore the file from its archive$"):
+    with pytest.raises(CalibError, match=rf"(?s)^{path}: .*; restore the file from its archive$"):
         read_calib(path)
     assert not flag.exists()
     # nothing of it stays behind in the stand-ins
@@ -250,17 +243,16 @@ def test_hostile_opcodes(tmp_path: Path, raw_calib: Calibs, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_hostile_opcodes_within_a_good_file(tmp_path: Path, raw_calib: Calibs, name: str) -> None:
+def test_hostile_opcodes_within_a_good_file(tmp_path: Path, raw_calib: Calibs, outcome, name: str) -> None:
     """The attack's value is put on the stack and dropped before a good dict is made."""
     flag, path = tmp_path / "flag", tmp_path / "calib.pkl"
     attack = HOSTILE[name].replace(b"FLAG", bytes(flag)).removesuffix(b".")
     path.write_bytes(attack + b"0" + pickle.dumps(raw_calib, 2))
-    try:
-        read = read_calib(path, raw=True)
-    except CalibError as error:
-        assert str(path) in str(error)
-    else:  # what the attack made is of no harm, and the good part is unharmed
+    read, message = outcome(CalibError, lambda: read_calib(path, raw=True))
+    if message is None:  # what the attack made is of no harm, and the good part is unharmed
         np.testing.assert_array_equal(read["ego_to_world"], raw_calib["ego_to_world"])
+    else:
+        assert message.startswith(f"{path}: ")
     assert not flag.exists()
 
 
@@ -285,7 +277,14 @@ def test_further_plain_values_do_no_harm(tmp_path: Path, raw_calib: Calibs, valu
 
 @pytest.mark.parametrize(
     "array",
-    [np.array([None]), np.array(["text"]), np.array([b"x"]), np.zeros(2, "f8,f8"), np.zeros(2, "M8[s]"), np.array([1j])],
+    [
+        np.array([None]),
+        np.array(["text"]),
+        np.array([b"x"]),
+        np.zeros(2, "f8,f8"),
+        np.zeros(2, "M8[s]"),
+        np.array([1j]),
+    ],
     ids=lambda array: array.dtype.str,
 )
 @pytest.mark.parametrize("protocol", PROTOCOLS)
@@ -317,22 +316,16 @@ PIECES = [
 ]
 
 
-def assert_calib_or_our_error(path: Path, content: bytes) -> None:
-    path.write_bytes(content)
-    try:
-        read_calib(path)
-    except CalibError as error:
-        assert str(path) in str(error)
-
-
 @pytest.mark.usefixtures("_little_memory")
 @settings(max_examples=400)
 @given(data=st.data(), protocol=st.sampled_from(PROTOCOLS))
 def test_damage_raises_our_error_or_nothing(
-    tmp_path_factory: pytest.TempPathFactory, raw_calib: Calibs, data: st.DataObject, protocol: int
+    tmp_path_factory: pytest.TempPathFactory, raw_calib: Calibs, outcome, data: st.DataObject, protocol: int
 ) -> None:
-    content = data.draw(mutations(pickle.dumps(raw_calib, protocol)))
-    assert_calib_or_our_error(tmp_path_factory.getbasetemp() / "damaged.pkl", content)
+    path = tmp_path_factory.getbasetemp() / "damaged.pkl"
+    path.write_bytes(data.draw(mutations(pickle.dumps(raw_calib, protocol))))
+    _, message = outcome(CalibError, read_calib, path)
+    assert message is None or message.startswith(f"{path}: ")
 
 
 @pytest.mark.usefixtures("_little_memory")
@@ -343,7 +336,3 @@ def test_random_programs_raise_our_error(tmp_path_factory: pytest.TempPathFactor
     path.write_bytes(b"".join(pieces) + b".")
     with pytest.raises(CalibError, match=r"program\.pkl: "):
         read_calib(path)
-
-
-def test_the_number_of_a_memo_entry_costs_no_memory(tmp_path: Path) -> None:
-    """A four-byte number makes CPython's unpickler fill a table of twice that length."""

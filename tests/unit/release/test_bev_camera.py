@@ -1,0 +1,53 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit.errors import MissingFileError, SensorFileError
+from deepaccident_devkit.release import read_bev, write_bev
+from deepaccident_devkit.taxonomy import BEV_SHAPE
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "bev.npz"
+
+
+@pytest.mark.parametrize("key", ["data", "arr_0"])
+def test_channels(path: Path, key: str) -> None:
+    raw = np.zeros((*BEV_SHAPE, 3), dtype=np.uint8)
+    raw[10, 20] = 3, 200, 10  # high byte, low byte, vehicle
+    np.savez(path, **{key: raw})
+    image = read_bev(path)
+    assert (image.semantic[10, 20], image.instance[10, 20], image.resolution) == (10, 3 * 256 + 200, 0.1)
+    assert (image.semantic.shape, image.instance.shape) == (BEV_SHAPE, BEV_SHAPE)
+    assert (image.semantic.dtype, image.instance.dtype) == (np.uint8, np.uint16)
+    assert np.count_nonzero(image.semantic) == np.count_nonzero(image.instance) == 1
+    np.testing.assert_array_equal(read_bev(path, raw=True), raw)
+    for array in (image.semantic, image.instance):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0, 0] = 1
+
+
+def test_written_channels(path: Path) -> None:
+    semantic, instance = np.zeros(BEV_SHAPE, dtype=np.uint8), np.zeros(BEV_SHAPE, dtype=np.uint16)
+    semantic[1, 2], instance[1, 2] = 4, 0xABCD
+    write_bev(path, semantic, instance)
+    assert read_bev(path, raw=True)[1, 2].tolist() == [0xAB, 0xCD, 4]
+
+
+@pytest.mark.parametrize("raw", [False, True])
+@pytest.mark.parametrize(
+    ("shape", "dtype"), [((1200, 1200), "u1"), ((600, 600, 3), "u1"), ((3, 1200, 1200), "u1"), ((1200, 1200, 3), "i2")]
+)
+def test_other_arrays_are_refused(path: Path, shape: tuple[int, ...], dtype: str, raw: bool) -> None:
+    np.savez_compressed(path, data=np.zeros(shape, dtype=dtype))
+    found = f"found {shape} of {np.dtype(dtype)}".replace("(", r"\(").replace(")", r"\)")
+    message = rf"^{path}: expected shape \(1200, 1200, 3\) of uint8, {found}; restore the file from its archive$"
+    with pytest.raises(SensorFileError, match=message):
+        read_bev(path, raw=raw)
+
+
+def test_a_missing_file(path: Path) -> None:
+    with pytest.raises(MissingFileError, match=r"bev\.npz: no such file"):
+        read_bev(path)

@@ -1,0 +1,101 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+from strategies import mutations
+
+from deepaccident_devkit.errors import MissingFileError, SensorFileError
+from deepaccident_devkit.release import read_image, write_image
+
+REMEDY = "; restore the file from its archive"
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "image.jpg"
+
+
+@pytest.fixture
+def quarters() -> np.ndarray:
+    """Red and green above, blue and grey below: tells colours, rows and columns apart."""
+    image = np.zeros((32, 64, 3), dtype=np.uint8)
+    image[:16, :32], image[:16, 32:], image[16:, :32], image[16:, 32:] = (255, 0, 0), (0, 255, 0), (0, 0, 255), 128
+    return image
+
+
+@pytest.mark.parametrize("raw", [False, True])
+def test_colours_are_rgb_in_their_places(path: Path, quarters: np.ndarray, raw: bool) -> None:
+    write_image(path, quarters)
+    for read in (read_image(path, raw=raw), np.asarray(Image.open(path))):
+        assert (read.shape, read.dtype) == (quarters.shape, np.uint8)
+        assert np.abs(read[4::8, 4::8].astype(int) - quarters[4::8, 4::8]).max() < 8
+
+
+def test_a_grey_image_is_grey_when_raw_and_rgb_else(path: Path) -> None:
+    grey = np.tile(np.arange(0, 240, 10, dtype=np.uint8), (16, 1))
+    Image.fromarray(grey).save(path, quality=95)
+    raw, rgb = read_image(path, raw=True), read_image(path)
+    assert (raw.shape, rgb.shape) == (grey.shape, (*grey.shape, 3))
+    assert np.abs(raw.astype(int) - grey).max() < 8
+    np.testing.assert_array_equal(rgb, np.repeat(raw[..., None], 3, axis=2))
+
+
+def test_what_is_read_is_the_callers(path: Path, quarters: np.ndarray) -> None:
+    write_image(path, quarters)
+    read_image(path)[0, 0] = 1  # must not raise
+
+
+@pytest.mark.parametrize("raw", [False, True])
+def test_truncated_garbage_empty_and_missing(path: Path, quarters: np.ndarray, raw: bool) -> None:
+    with pytest.raises(MissingFileError, match=r"image\.jpg: no such file; unpack the archive that holds this camera"):
+        read_image(path, raw=raw)
+    write_image(path, quarters)
+    whole = path.read_bytes()
+    ends = (1, 20, len(whole) // 4, len(whole) // 2, len(whole) * 3 // 4)
+    for content in (b"", b"garbage", bytes(1000), *(whole[:end] for end in ends)):
+        path.write_bytes(content)
+        with pytest.raises(SensorFileError, match=rf"^{path}: not a readable image \(.*\){REMEDY}$"):
+            read_image(path, raw=raw)
+
+
+@pytest.mark.parametrize("raw", [False, True])
+@pytest.mark.parametrize("size", [0xFFFF, 0x2800], ids=["bomb", "large"])
+def test_a_damaged_size_is_no_decompression_bomb(path: Path, quarters: np.ndarray, size: int, raw: bool) -> None:
+    write_image(path, quarters)
+    content = bytearray(path.read_bytes())
+    start = content.find(b"\xff\xc0") + 5
+    content[start : start + 4] = size.to_bytes(2, "big") * 2
+    path.write_bytes(content)
+    with pytest.raises(SensorFileError, match=f"(?s)^{path}: .*{REMEDY}$"):
+        read_image(path, raw=raw)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.zeros((16, 24), dtype=np.uint8),
+        np.zeros((16, 24, 4), dtype=np.uint8),
+        np.zeros((16, 24, 2), dtype=np.uint8),
+        np.zeros((0, 24, 3), dtype=np.uint8),
+        np.zeros((16, 24, 3), dtype=np.float64),
+    ],
+    ids=["grey", "rgba", "two-channels", "empty", "floats"],
+)
+def test_writing_other_than_rgb_is_refused_and_leaves_nothing(path: Path, image: np.ndarray) -> None:
+    with pytest.raises(SensorFileError, match=r"image\.jpg: .*shape"):
+        write_image(path, image)
+    assert list(path.parent.iterdir()) == []
+
+
+@given(st.data())
+def test_damage_raises_our_error_or_nothing(
+    tmp_path_factory: pytest.TempPathFactory, outcome, data: st.DataObject
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "damaged.jpg"
+    write_image(path, np.tile(np.arange(0, 240, 10, dtype=np.uint8)[:, None], (16, 1, 3)))
+    path.write_bytes(data.draw(mutations(path.read_bytes())))
+    image, message = outcome(SensorFileError, read_image, path)
+    assert image.dtype == np.uint8 if message is None else str(path) in message

@@ -1,0 +1,179 @@
+from pathlib import Path
+
+import pytest
+
+from deepaccident_devkit.errors import DatarootError, VersionError
+from deepaccident_devkit.release import find_release
+from deepaccident_devkit.release.layout import frame_numbers
+
+ACCIDENT, NORMAL = "type1_subtype1_accident", "type1_subtype2_normal"
+NAME, OTHER = "Town03_type001_subtype0001_scenario00024", "Town10HD_type001_subtype0001_scenario00014"
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A dataroot with a blank in its path."""
+    path = tmp_path / "deep accident"
+    path.mkdir()
+    return path
+
+
+def scenario(folder: Path, scenario_type: str = ACCIDENT, name: str = NAME, agents=("ego_vehicle",)) -> None:
+    for agent in agents:
+        (folder / scenario_type / agent / "calib" / name).mkdir(parents=True)
+
+
+def found(root: Path, version: str = "v1") -> list[tuple[str, str]]:
+    return [(each.folder, each.token) for each in find_release(root, version).scenarios]
+
+
+def test_layout_a_in_the_order_of_tokens(root: Path) -> None:
+    scenario(root, NORMAL)
+    scenario(root, ACCIDENT, OTHER)
+    scenario(root, ACCIDENT)
+    release = find_release(root)
+    assert (release.layout, release.version, release.root) == ("A", "v1", root)
+    assert found(root) == [("", f"{ACCIDENT}/{NAME}"), ("", f"{ACCIDENT}/{OTHER}"), ("", f"{NORMAL}/{NAME}")]
+
+
+def test_layout_b_and_a_scenario_that_stands_in_two_splits(root: Path) -> None:
+    scenario(root / "val")
+    scenario(root / "train")
+    scenario(root / "test", NORMAL)
+    assert find_release(root).layout == "B"
+    assert found(root) == [("train", f"{ACCIDENT}/{NAME}"), ("val", f"{ACCIDENT}/{NAME}"), ("test", f"{NORMAL}/{NAME}")]
+
+
+def test_both_layouts_at_once(root: Path) -> None:
+    scenario(root, name=OTHER)
+    scenario(root / "val")
+    assert find_release(root).layout == "A+B"
+    assert found(root) == [("val", f"{ACCIDENT}/{NAME}"), ("", f"{ACCIDENT}/{OTHER}")]
+
+
+def test_mini_is_apart_unless_it_is_all_there_is(root: Path) -> None:
+    scenario(root / "DeepAccident_mini")
+    mini = [("DeepAccident_mini", f"{ACCIDENT}/{NAME}")]
+    assert found(root) == found(root, "v1-mini") == mini
+    scenario(root / "train", name=OTHER)
+    assert found(root) == [("train", f"{ACCIDENT}/{OTHER}")]
+    assert found(root, "v1-mini") == mini
+
+
+def test_the_mini_folder_given_as_dataroot(root: Path) -> None:
+    scenario(root / "DeepAccident_mini")
+    for version in ("v1", "v1-mini"):
+        assert found(root / "DeepAccident_mini", version) == [("", f"{ACCIDENT}/{NAME}")]
+
+
+def test_a_release_without_mini(root: Path) -> None:
+    scenario(root)
+    with pytest.raises(VersionError, match=rf"^{root}: holds no mini release .*open it with version='v1'$"):
+        find_release(root, "v1-mini")
+
+
+def test_an_unknown_version(root: Path) -> None:
+    scenario(root)
+    with pytest.raises(VersionError, match=r"unknown version 'v2'; known are v1, v1-mini"):
+        find_release(root, "v2")
+
+
+@pytest.mark.parametrize("version", ["v1", "v1-mini"])
+def test_no_release_there(root: Path, version: str) -> None:
+    file = root / "file.txt"
+    file.write_text("")
+    with pytest.raises(DatarootError, match=rf"^{root / 'gone'}: does not exist; give the folder"):
+        find_release(root / "gone", version)
+    with pytest.raises(DatarootError, match=rf"^{file}: is a file; give the folder"):
+        find_release(file, version)
+    with pytest.raises(DatarootError, match=rf"^{root}: no scenario found; expected .*deepaccident synth OUT"):
+        find_release(root, version)
+    # the shell of one: sensors and labels, but no calib; files where folders are expected
+    (root / ACCIDENT / "ego_vehicle" / "label" / NAME).mkdir(parents=True)
+    (root / ACCIDENT / "other_vehicle").write_text("")
+    (root / NORMAL).write_text("")
+    (root / "train").write_text("")
+    with pytest.raises(DatarootError if version == "v1" else VersionError, match=f"^{root}: "):
+        find_release(root, version)
+
+
+def test_agents_are_those_with_a_calib_folder_in_the_usual_order(root: Path) -> None:
+    scenario(root, agents=("infrastructure", "other_vehicle", "ego_vehicle", "bystander"))
+    (root / ACCIDENT / "ego_vehicle_behind" / "label" / NAME).mkdir(parents=True)
+    assert find_release(root).scenarios[0].agents == ("ego_vehicle", "other_vehicle", "infrastructure")
+
+
+def test_what_else_lies_about_is_ignored(root: Path) -> None:
+    scenario(root)
+    scenario(root, "type1_subtype1_accident_old")
+    scenario(root, "my_notes")
+    scenario(root / "trainval")
+    scenario(root / ".deepaccident")
+    (root / ACCIDENT / "ego_vehicle" / "calib" / ".cache").mkdir()
+    (root / ACCIDENT / "ego_vehicle" / "calib" / "readme.txt").write_text("")
+    assert found(root) == [("", f"{ACCIDENT}/{NAME}")]
+    scenario(root, "type2_subtype1_accident")  # the reference code knows it
+    assert found(root)[1:] == [("", f"type2_subtype1_accident/{NAME}")]
+
+
+@pytest.mark.parametrize("folder", ["", "train"])
+def test_paths_of_a_scenarios_files(root: Path, folder: str) -> None:
+    scenario(root / folder)
+    each = find_release(root).scenarios[0]
+    base = root / folder / ACCIDENT
+    assert (each.token, each.scenario_type, each.name) == (f"{ACCIDENT}/{NAME}", ACCIDENT, NAME)
+    assert each.meta_path == base / "meta" / f"{NAME}.txt"
+    assert each.label_path("ego_vehicle", 7) == base / "ego_vehicle" / "label" / NAME / f"{NAME}_007.txt"
+    assert each.calib_path("infrastructure", 100) == base / "infrastructure" / "calib" / NAME / f"{NAME}_100.pkl"
+    image = base / "ego_vehicle" / "Camera_Front" / NAME / f"{NAME}_001.jpg"
+    assert each.channel_path("ego_vehicle", "Camera_Front", 1) == image
+    assert each.channel_path("ego_vehicle", "lidar01", 1).name == f"{NAME}_001.npz"
+    assert each.channel_path("ego_vehicle", "BEV_instance_camera", 1).name == f"{NAME}_001.npz"
+
+
+def test_split_files_in_the_root_win_over_those_in_their_folder(root: Path) -> None:
+    scenario(root)
+    folder = root / "split_txt_files"
+    folder.mkdir()
+    (root / "val.txt").write_text("")
+    (root / "notes.txt").write_text("")
+    (root / "test.txt").mkdir()
+    for name in ("train", "val", "val_mini"):
+        (folder / f"{name}.txt").write_text("")
+    assert find_release(root).split_files == {
+        "train": folder / "train.txt",
+        "val": root / "val.txt",
+        "val_mini": folder / "val_mini.txt",
+    }
+
+
+def test_frame_numbers_ascend_and_odd_names_are_told(tmp_path: Path) -> None:
+    folder = tmp_path / NAME
+    folder.mkdir()
+    odd = [
+        f"{OTHER}_004.txt",
+        f"{NAME}_05.txt",
+        f"{NAME}_abc.txt",
+        "notes.txt",
+        f"{NAME}_006.old.txt",
+        f"{NAME}007.txt",
+    ]
+    good = [f"{NAME}_010.txt", f"{NAME}_002.txt", f"{NAME}_100.txt"]
+    for name in [*odd, *good, f"{NAME}_003.txt~", f"{NAME}_009.pkl", f".{NAME}_011.txt", "README"]:
+        (folder / name).write_text("")
+    assert frame_numbers(folder, "txt") == ([2, 10, 100], sorted(odd))
+    assert frame_numbers(folder, "pkl") == ([9], [])
+    assert frame_numbers(tmp_path / "gone", "txt") == ([], [])
+
+
+def test_a_frame_number_that_leads_to_no_path_is_odd(root: Path) -> None:
+    """A file counts as frame 7 only where the path of frame 7 is that file."""
+    scenario(root)
+    each = find_release(root).scenarios[0]
+    folder = each.kind_folder("ego_vehicle", "calib")
+    for name in (f"{NAME}_007.pkl", f"{NAME}_0007.pkl", f"{NAME}_٠٠٩.pkl", f"{NAME}_1000.pkl"):
+        (folder / name).write_text("")
+    frames, odd = frame_numbers(folder, "pkl")
+    assert all(each.calib_path("ego_vehicle", frame).exists() for frame in frames)
+    assert frames == [7, 1000]
+    assert odd == sorted([f"{NAME}_0007.pkl", f"{NAME}_٠٠٩.pkl"])

@@ -1,0 +1,71 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from deepaccident_devkit.errors import GeometryError, MissingFileError, SensorFileError
+from deepaccident_devkit.release import read_lidar, write_lidar
+
+RAW = np.array([[10.0, 2.5, -1.5, 0.25], [-3, -4, 0.5, 1]])
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "points.npz"
+
+
+@pytest.mark.parametrize("dtype", ["f2", "f4", "f8", ">f4"])
+@pytest.mark.parametrize("key", ["data", "arr_0"])
+def test_any_float_type_becomes_right_handed_double(path: Path, dtype: str, key: str) -> None:
+    np.savez(path, **{key: RAW.astype(dtype)})
+    cloud = read_lidar(path)
+    assert cloud.frame == "lidar"
+    assert cloud.xyz.dtype == np.float64
+    assert_array_equal(cloud.xyz, [[10, -2.5, -1.5], [-3, 4, 0.5]])
+    assert_array_equal(cloud.intensity, [0.25, 1])
+    raw = read_lidar(path, raw=True)
+    assert_array_equal(raw, RAW)
+    assert raw.dtype == np.dtype(dtype)
+
+
+def test_no_points_are_a_cloud(path: Path) -> None:
+    np.savez(path, data=np.zeros((0, 4), dtype=np.float32))
+    assert len(read_lidar(path)) == 0
+
+
+@pytest.mark.parametrize("raw", [False, True])
+@pytest.mark.parametrize(
+    ("data", "found"),
+    [
+        (np.zeros((5, 3)), r"shape \(5, 3\) of float64"),
+        (np.zeros(4), r"shape \(4,\) of float64"),
+        (np.zeros((1, 5, 4)), r"shape \(1, 5, 4\) of float64"),
+        (np.zeros((5, 4), dtype=int), r"shape \(5, 4\) of int64"),
+        (np.zeros((5, 4), dtype=complex), r"shape \(5, 4\) of complex128"),
+        (np.zeros((5, 4), dtype="U3"), r"shape \(5, 4\) of <U3"),
+    ],
+)
+def test_other_arrays_are_refused(path: Path, data: np.ndarray, found: str, raw: bool) -> None:
+    np.savez(path, data=data)
+    message = rf"^{path}: expected points \(N, 4\) of floats, found {found}; restore the file from its archive$"
+    with pytest.raises(SensorFileError, match=message):
+        read_lidar(path, raw=raw)
+
+
+def test_a_missing_file(path: Path) -> None:
+    with pytest.raises(MissingFileError, match=r"points\.npz: no such file"):
+        read_lidar(path)
+
+
+def test_writing_restores_carlas_signs_in_single_precision(path: Path) -> None:
+    write_lidar(path, [[1, 2, 3]], [0.5])
+    with np.load(path) as archive:
+        np.testing.assert_array_equal(archive["data"], np.array([[1, -2, 3, 0.5]], dtype=np.float32), strict=True)
+
+
+@pytest.mark.parametrize(("xyz", "intensity"), [([[1, 2]], [1]), ([[1, 2, 3]], [1, 2]), ([[1, 2, 3]], 1)])
+def test_writing_other_shapes_is_refused_and_leaves_nothing(path: Path, xyz: list, intensity: list) -> None:
+    with pytest.raises(GeometryError, match=r"(xyz|intensity): expected shape"):
+        write_lidar(path, xyz, intensity)
+    assert list(path.parent.iterdir()) == []

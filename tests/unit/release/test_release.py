@@ -1,0 +1,33 @@
+"""What all readers of a release's files have in common."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from deepaccident_devkit import release
+from deepaccident_devkit.errors import MissingFileError, ReleaseError
+
+READERS = {name: getattr(release, name) for name in release.__all__ if name.startswith("read_")}
+SINGLE = {
+    name: reader if name not in ("read_calibs", "read_labels") else lambda path, reader=reader: reader([path])
+    for name, reader in READERS.items()
+}
+
+
+def test_every_reader_is_known() -> None:
+    assert len(READERS) == 9
+
+
+@pytest.mark.parametrize("read", SINGLE.values(), ids=SINGLE)
+def test_a_missing_file_is_ours_and_pythons_own_error(tmp_path: Path, read: Callable) -> None:
+    with pytest.raises(MissingFileError, match=f"^{tmp_path / 'gone'}: no such file") as caught:
+        read(tmp_path / "gone")
+    assert isinstance(caught.value, FileNotFoundError)
+
+
+@pytest.mark.parametrize("read", SINGLE.values(), ids=SINGLE)
+def test_a_folder_in_the_files_place_is_our_error(tmp_path: Path, read: Callable) -> None:
+    """As any file that is there and cannot be read."""
+    with pytest.raises(ReleaseError, match=f"^{tmp_path}"):
+        read(tmp_path)
