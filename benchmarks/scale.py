@@ -18,6 +18,7 @@ from deepaccident_devkit.geometry.se3 import SE3
 from deepaccident_devkit.release import Calibs, Collision, Labels, Meta, ScenarioFolder, find_release, write_meta
 from deepaccident_devkit.tables.build import ScenarioFiles, scenario_rows
 from deepaccident_devkit.tables.index import INDEX_FOLDER
+from deepaccident_devkit.tables.indexing import table_file_states
 from deepaccident_devkit.tables.join import join_tables
 from deepaccident_devkit.tables.manifest import SCHEMA_VERSION, Manifest, write_manifest
 from deepaccident_devkit.tables.scan import ScenarioScan, folder_digest
@@ -121,7 +122,13 @@ def write_whole_release(root: Path) -> Path:
     join_tables(folder, shards, ["train"] * SCENARIOS)
     layout = find_release(root)
     fingerprint = folder_digest(layout.scenarios, layout.split_files.values())
-    write_manifest(index, Manifest(schema_version=SCHEMA_VERSION, fingerprint=fingerprint, tables=folder.name))
+    manifest = Manifest(
+        schema_version=SCHEMA_VERSION,
+        fingerprint=fingerprint,
+        tables=folder.name,
+        table_files=table_file_states(folder),
+    )
+    write_manifest(index, manifest)
     return root
 
 
@@ -152,6 +159,6 @@ def one_scenario() -> ScenarioFiles:
         camera_from_lidar=np.tile(np.eye(4), (samples, len(CAMERAS), 1, 1)),
         intrinsic=np.tile(intrinsic, (samples, len(CAMERAS), 1, 1)),
     )
-    scan = ScenarioScan(agents=AGENTS, labelled=AGENTS, num_frames=FRAMES, problems=(), notices=())
+    scan = ScenarioScan(agents=AGENTS, has_meta=True, labelled=AGENTS, num_frames=FRAMES, problems=(), notices=())
     scenario = ScenarioFolder(Path(), "", "type1_subtype1_accident", "Town03", AGENTS)
     return ScenarioFiles(scenario=scenario, scan=scan, meta=META, calibs=calibs, labels=labels)

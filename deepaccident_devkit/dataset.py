@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
-from deepaccident_devkit.errors import ChoiceError, NotAvailableError
+from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
 from deepaccident_devkit.geometry import SE3, Box, Boxes, LidarPointCloud
 from deepaccident_devkit.geometry.boxes import trusted_boxes
 from deepaccident_devkit.geometry.se3 import trusted_se3
@@ -175,7 +175,9 @@ class Dataset:
 
     def get_sample(self, scenario: RowArgument, agent: str, frame: int) -> records.SampleRecord:
         """The sample of an agent at frame number `frame` (from 1) of a scenario; raises TokenError."""
-        return self.sample.get(f"{_token(scenario)}/{agent}/{int(frame):03d}")
+        if not isinstance(frame, int | np.integer):
+            raise TokenError(f"frame: expected a number from 1, found {frame!r}")
+        return self.sample.get(f"{_token(scenario)}/{agent}/{frame:03d}")
 
     def samples_of(self, frame: RowArgument) -> list[records.SampleRecord]:
         """The samples of one moment, one for each agent that is there, in the order of `taxonomy.AGENTS`."""
@@ -321,6 +323,8 @@ class Dataset:
             SensorFileError: it cannot be read.
         """
         row = self._sample_row(sample)
+        if frame not in get_args(Frame):
+            raise ChoiceError(f"frame: expected one of {', '.join(get_args(Frame))}, found {frame!r}")
         world_from_target = self._world_from(row, frame)
         cloud = read_lidar(self._channel_path(row, LIDAR))
         if frame == "lidar":
@@ -422,6 +426,8 @@ def _reopened(kind: type[Dataset], arguments: dict[str, Any]) -> Dataset:
 
 
 def _token(row: RowArgument) -> str:
-    """The token of a row named by token or record: said once for the whole API."""
-    token = row if isinstance(row, str) else row["token"]
-    return str(token)
+    """The token of a row named by token or record: said once for the whole API; raises TokenError."""
+    token = row.get("token") if isinstance(row, Mapping) else row
+    if not isinstance(token, str):
+        raise TokenError(f"expected a token or a record with one, found {row!r}")
+    return token

@@ -51,10 +51,10 @@ class DeepAccident(Dataset):
             BrokenReleaseError: some scenarios are broken; the message lists them all.
             IndexStoreError: the index cannot be written.
         """
-        layout = find_release(Path(dataroot), version)
+        layout = find_release(_absolute(dataroot), version)
         index = open_index(
             layout,
-            index_dir=None if index_dir is None else Path(index_dir),
+            index_dir=None if index_dir is None else _absolute(index_dir),
             workers=workers,
             on_error=on_error,
             progress=verbose,
@@ -96,6 +96,11 @@ class DeepAccident(Dataset):
             f"DeepAccident(version={self.version!r}, dataroot={str(self.dataroot)!r}): {len(self.scenario):,} "
             f"scenarios, {len(self.sample):,} samples, {len(self.annotation):,} annotations"
         )
+
+
+def _absolute(path: str | os.PathLike[str]) -> Path:
+    """The path from the root, so that a later `chdir` does not matter; symbolic links stay."""
+    return Path(os.path.abspath(Path(path).expanduser()))  # noqa: PTH100
 
 
 def _print(lines: Sequence[str]) -> None:

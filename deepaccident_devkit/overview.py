@@ -132,6 +132,7 @@ def scenario_lines(dataset: Dataset) -> list[str]:
     lines = []
     for scenario in dataset.scenario:
         end = "collision" if scenario["collision"] else "no collision"
+        end = "collision unknown" if scenario["weather"] is None else end  # there is no meta
         weather = f"{scenario['weather'] or _UNKNOWN} {scenario['time_of_day'] or ''}".strip()
         split = scenario["split"] or "split unknown"
         lines.append(f"{scenario['token']}  {scenario['num_frames']} frames  {split}  {weather}  {end}")

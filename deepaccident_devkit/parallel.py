@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from deepaccident_devkit.errors import ChoiceError
+
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
@@ -34,6 +36,9 @@ def run_batch(
         executor: any `concurrent.futures.Executor` to run on instead (a dask client's, a thread pool).
         label: text of the progress bar.
         progress: whether to show one.
+
+    Raises:
+        ChoiceError: `workers` is less than 1.
     """
     from tqdm.auto import tqdm  # here: with asyncio and multiprocessing, a third of the package's import time
 
@@ -46,17 +51,20 @@ def run_batch(
         import multiprocessing
         from concurrent.futures import ProcessPoolExecutor
 
-        with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(count, mp_context=context, initializer=_end_with_parent) as pool:
             return _on_executor(pool, work, items, bar)
 
 
 def _worker_count(workers: int | None, items: int) -> int:
     import multiprocessing
 
+    if workers is not None and workers < 1:
+        raise ChoiceError(f"workers: expected a number of at least 1, or None, found {workers}")
     if multiprocessing.current_process().daemon:  # a DataLoader worker may not have children
         return 1
     if workers is not None:
-        return max(1, min(workers, items))
+        return min(workers, max(items, 1))
     enough_work = 8  # starting a pool costs a second, a scenario a tenth of one
     return max(1, min(os.cpu_count() or 1, items // enough_work))
 
@@ -75,6 +83,22 @@ def _on_executor(executor: Executor, work: Callable[[Item], Result], items: Sequ
             future.cancel()
         raise
     return [results[position] for position in range(len(items))]
+
+
+def _end_with_parent() -> None:
+    """Watch the parent from a thread: a pool's worker whose parent was killed would wait for work for ever."""
+    import multiprocessing
+    import threading
+
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, name="end-with-parent", daemon=True).start()
 
 
 def _counted(result: Result, bar: Any) -> Result:

@@ -116,6 +116,20 @@ def test_missing_and_broken_sensor_files_are_named(own_release: Path) -> None:
         release.load_point_cloud(sample)
 
 
+def test_arguments_of_a_wrong_kind_are_our_errors(da: DeepAccident) -> None:
+    for odd in (None, 3, b"token", {}, {"name": "x"}):
+        with pytest.raises(TokenError, match="expected a token or a record with one, found"):
+            da.get("sample", odd)  # type: ignore[arg-type]
+    for odd in (1.7, "1", None):
+        with pytest.raises(TokenError, match="frame: expected a number from 1, found"):
+            da.get_sample(da.scenario[0], "ego_vehicle", odd)  # type: ignore[arg-type]
+    assert da.get_sample(da.scenario[0], "ego_vehicle", np.int64(2))["token"].endswith("/ego_vehicle/002")
+    with pytest.raises(TableError, match="table 'sample' counts its rows: expected a number, found 'token'"):
+        da.sample["token"]  # type: ignore[call-overload]
+    with pytest.raises(ChoiceError, match="frame: expected one of world, ego, lidar, found 'Camera_Front'"):
+        da.load_point_cloud(da.sample[0], "Camera_Front")  # type: ignore[arg-type]
+
+
 def test_every_error_is_ours_and_also_the_built_in_kind(da: DeepAccident) -> None:
     with pytest.raises(KeyError, match="table 'sample' has no token"):
         da.get("sample", "x")

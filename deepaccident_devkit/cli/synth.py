@@ -41,7 +41,7 @@ def _image_size(context: click.Context, parameter: click.Parameter, value: str) 
 )
 @click.option("--seed", default=_DEFAULTS.seed, show_default=True, help="The same seed gives the same bytes.")
 @click.option("--no-sensors", is_flag=True, help="Only labels, calib and meta: no images, point clouds, BEV arrays.")
-@click.option("--workers", type=int, default=None, help="Processes to use.  [default: as it pays]")
+@click.option("--workers", type=click.IntRange(min=1), default=None, help="Processes to use.  [default: as it pays]")
 def synth(
     out: Path,
     scenarios: int,

@@ -135,7 +135,7 @@ def _read_raw(path: Path) -> dict[str, AnyArray]:
     try:
         loaded = load_arrays(content)
     except UNPICKLE_FAULTS as error:
-        detail = "the file is empty" if not content else str(error)
+        detail = (str(error) or type(error).__name__) if content else "the file is empty"
         raise CalibError(f"{path}: not a readable calibration ({detail}); {_REMEDY}") from error
     return _checked_raw(path, loaded)
 

@@ -20,6 +20,7 @@ MINI_FOLDER = "DeepAccident_mini"
 SPLIT_FOLDERS = SPLITS
 SPLIT_FILE_FOLDER = "split_txt_files"
 _SCENARIO_TYPE = re.compile(r"type\d+_subtype\d+_(accident|normal)")
+_UNLISTABLE_REMEDY = "unpack its archive again, or make it readable"
 _FRAME_FILE = re.compile(r"_(\d{3,})\.\w+")
 
 
@@ -100,6 +101,8 @@ def find_release(root: Path, version: str = "v1") -> ReleaseLayout:
     """
     if version not in VERSIONS:
         raise VersionError(f"unknown version {version!r}; known are {', '.join(VERSIONS)}")
+    if not _is_unicode(root):
+        raise DatarootError(f"{str(root)!r}: is not UTF-8, which Arrow needs a path to be; rename the folder")
     if not root.is_dir():
         state = "is a file" if root.is_file() else "does not exist"
         raise DatarootError(f"{root}: {state}; give the folder that the release was unpacked into as dataroot")
@@ -120,17 +123,24 @@ def find_release(root: Path, version: str = "v1") -> ReleaseLayout:
     )
 
 
+def _is_unicode(path: Path) -> bool:
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 def frame_numbers(folder: Path, ending: str) -> tuple[list[int], list[str]]:
     """The frame numbers of a folder's files, ascending, and the names that end so but carry no frame number.
 
     A folder that is not there has none.
+
+    Raises:
+        DatarootError: it cannot be listed: a file in its place, no permission.
     """
     frames, odd = [], []
-    try:
-        names = [entry.name for entry in os.scandir(folder)]
-    except FileNotFoundError:
-        return [], []
-    for name in names:
+    for name in (entry.name for entry in _entries(folder)):
         if not name.endswith(f".{ending}") or name.startswith("."):
             continue
         prefix_length = len(folder.name)
@@ -158,13 +168,12 @@ def _folders_of(root: Path, version: str) -> list[str]:
 
 
 def _scenario_types(folder: Path) -> list[str]:
-    if not folder.is_dir():
-        return []
-    return sorted(entry.name for entry in os.scandir(folder) if _SCENARIO_TYPE.fullmatch(entry.name) and entry.is_dir())
+    return sorted(name for name in _subfolders(folder) if _SCENARIO_TYPE.fullmatch(name))
 
 
 def _scenarios_in(root: Path, folder: str) -> Iterator[ScenarioFolder]:
     for scenario_type in _scenario_types(root / folder):
+        _entries(root / folder / scenario_type)  # one that cannot be listed would hide its scenarios
         agents_of: dict[str, list[AgentName]] = {}
         for agent in AGENTS:
             for name in _subfolders(root / folder / scenario_type / agent / "calib"):
@@ -174,10 +183,24 @@ def _scenarios_in(root: Path, folder: str) -> Iterator[ScenarioFolder]:
 
 
 def _subfolders(folder: Path) -> list[str]:
+    """The folders in a folder; none where a file stands in the way, which `frame_numbers` tells of each scenario."""
     try:
-        return [entry.name for entry in os.scandir(folder) if entry.is_dir() and not entry.name.startswith(".")]
-    except (FileNotFoundError, NotADirectoryError):
+        entries = _entries(folder)
+    except DatarootError as error:
+        if isinstance(error.__cause__, NotADirectoryError):
+            return []
+        raise
+    return [entry.name for entry in entries if entry.is_dir() and not entry.name.startswith(".")]
+
+
+def _entries(folder: Path) -> list[os.DirEntry[str]]:
+    """What lies in a folder; nothing if there is no such folder."""
+    try:
+        return list(os.scandir(folder))
+    except FileNotFoundError:
         return []
+    except OSError as error:
+        raise DatarootError(f"{folder}: cannot be listed ({error.strerror}); {_UNLISTABLE_REMEDY}") from error
 
 
 def _split_files(root: Path) -> dict[str, Path]:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.files import replacing_folder
+from deepaccident_devkit.files import is_writable_folder, replacing_folder
 from deepaccident_devkit.parallel import run_batch
 from deepaccident_devkit.release import write_split_file
 from deepaccident_devkit.synth.caster import require_embree
@@ -30,12 +30,14 @@ def make_release(
         progress: whether to show a progress bar.
 
     Raises:
-        ConfigError: `out` is a file or holds something.
+        ConfigError: `out` is a file, holds something or cannot be made.
         MissingExtraError: sensors are wanted and the package embreex is not installed.
     """
     wanted = config or SynthConfig()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f"{out}: exists and is not an empty folder; choose another folder, or remove this one")
+    if not is_writable_folder(out.parent):
+        raise ConfigError(f"{out.parent}: cannot be written; choose another folder")
     if wanted.sensors:
         require_embree()
     plans = plan_scenarios(wanted)

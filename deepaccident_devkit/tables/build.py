@@ -65,7 +65,7 @@ def read_scenario(scenario: ScenarioFolder, scan: ScenarioScan) -> tuple[Scenari
             return None
 
     frames = range(1, scan.num_frames + 1)
-    meta = attempt(read_meta, scenario.meta_path) if scenario.meta_path.exists() else None
+    meta = attempt(read_meta, scenario.meta_path) if scan.has_meta else None
     calibs = attempt(read_calibs, [scenario.calib_path(agent, n) for agent in scan.agents for n in frames])
     labels = attempt(read_labels, [scenario.label_path(agent, n) for agent in scan.labelled for n in frames])
     if faults:

@@ -4,15 +4,19 @@
       manifest.json        what the index was made from, and what is broken
       tables-<digest>/     one Arrow file a table
       shards/              one file a scenario, from which the tables are joined
+      .lock                held by the process that makes the index
 
-Opening compares the times of folders, meta and split files with the manifest; making it compares every label and
-calib file, and reads only the scenarios that changed. Everything is written under a temporary name and renamed, the
+Opening compares the times of folders, meta and split files and the sizes of the tables with the manifest; making it
+compares every label and calib file, reads only the scenarios that changed, and compares the checksums of shards and
+tables. Everything is written under a temporary name and renamed, the
 manifest last, so that a reader sees the old index or the new one.
 """
 
 import hashlib
 import logging
+import os
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,6 +31,7 @@ from deepaccident_devkit.taxonomy import OnError
 logger = logging.getLogger(__name__)
 
 INDEX_FOLDER = ".deepaccident"
+_LOCK_FILE = ".lock"
 _MESSAGES_A_SCENARIO = 5
 
 
@@ -74,15 +79,15 @@ def open_index(
     """
     if on_error not in ("raise", "skip"):
         raise ChoiceError(f"on_error: expected 'raise' or 'skip', found {on_error!r}")
-    fingerprint = folder_digest(layout.scenarios, layout.split_files.values())
-    found = (index for index in find_indexes(layout, index_dir) if _is_current(layout, index, fingerprint))
-    index = None if check_files else next(found, None)
+    index = None if check_files else _current_index(layout, index_dir)
     if index is None:
         folder = _writable_folder(layout, index_dir)
-        index = Index(
-            folder=folder,
-            manifest=make_index(layout, folder, fingerprint, workers=workers, progress=progress),
-        )
+        with _locked(folder):
+            index = None if check_files else _current_index(layout, index_dir)  # another process may have made it
+            if index is None:
+                fingerprint = folder_digest(layout.scenarios, layout.split_files.values())
+                manifest = make_index(layout, folder, fingerprint, workers=workers, progress=progress)
+                index = Index(folder=folder, manifest=manifest)
     _accept(layout, index, on_error)
     return index
 
@@ -103,8 +108,31 @@ def index_folders(layout: ReleaseLayout, index_dir: Path | None = None) -> Itera
     yield layout.root / INDEX_FOLDER / layout.version
     from platformdirs import user_cache_path
 
-    key = hashlib.blake2b(str(layout.root.resolve()).encode(), digest_size=8).hexdigest()
+    key = hashlib.blake2b(os.fsencode(layout.root.resolve()), digest_size=8).hexdigest()
     yield user_cache_path("deepaccident_devkit") / key / layout.version
+
+
+def _current_index(layout: ReleaseLayout, index_dir: Path | None) -> Index | None:
+    fingerprint = folder_digest(layout.scenarios, layout.split_files.values())
+    found = (index for index in find_indexes(layout, index_dir) if _is_current(layout, index, fingerprint))
+    return next(found, None)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold the folder's lock, which the system takes back when a process ends, however it ends."""
+    from filelock import FileLock, Timeout
+
+    lock = FileLock(folder / _LOCK_FILE)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        logger.warning("%s: another process makes this index; waiting for it", folder)
+        lock.acquire()
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def _writable_folder(layout: ReleaseLayout, index_dir: Path | None) -> Path:
@@ -121,13 +149,21 @@ def _is_current(layout: ReleaseLayout, index: Index, fingerprint: str) -> bool:
 
     Broken scenarios are looked at file by file: a file mended in place leaves its folder's time alone.
     """
-    whole = not index.manifest.tables or index.tables_folder.is_dir()
-    if index.manifest.fingerprint != fingerprint or not whole:
+    if index.manifest.fingerprint != fingerprint or not _is_whole(index):
         return False
     broken = {problem.scenario: problem.digest for problem in index.manifest.problems if problem.digest}
     return all(
         scenario_state(scenario) == broken[scenario.token] for scenario in layout.scenarios if scenario.token in broken
     )
+
+
+def _is_whole(index: Index) -> bool:
+    """Whether every table's file is there in its size."""
+    files = {index.tables_folder / name: size for name, (size, _) in index.manifest.table_files.items()}
+    try:
+        return all(path.stat().st_size == size for path, size in files.items())
+    except OSError:
+        return False
 
 
 def _accept(layout: ReleaseLayout, index: Index, on_error: OnError) -> None:

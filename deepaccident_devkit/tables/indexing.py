@@ -9,12 +9,12 @@ from functools import partial
 from pathlib import Path
 
 from deepaccident_devkit.errors import IndexStoreError
-from deepaccident_devkit.files import replacing_folder
+from deepaccident_devkit.files import file_checksum, replacing_folder
 from deepaccident_devkit.parallel import run_batch
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder
 from deepaccident_devkit.tables.build import read_scenario, scenario_rows
 from deepaccident_devkit.tables.join import join_tables
-from deepaccident_devkit.tables.manifest import SCHEMA_VERSION, Manifest, Problem, write_manifest
+from deepaccident_devkit.tables.manifest import SCHEMA_VERSION, Manifest, Problem, read_manifest, write_manifest
 from deepaccident_devkit.tables.scan import scan_scenario, scenario_digest
 from deepaccident_devkit.tables.shards import shard_digest, shard_path, write_shard
 from deepaccident_devkit.tables.split_assignment import SplitAssignment, assign_splits
@@ -47,7 +47,8 @@ def make_index(
 ) -> Manifest:
     """Bring the index in `folder` up to date with the release and return its manifest.
 
-    Broken scenarios do not stop it: they are listed in the manifest.
+    Broken scenarios do not stop it: they are listed in the manifest. Damaged shards and tables are made again. The
+    caller holds the folder's lock.
 
     Raises:
         IndexStoreError: something cannot be written; the index that was there stays as it was.
@@ -56,6 +57,7 @@ def make_index(
     splits = assign_splits(layout)
     candidates = [scenario for scenario in layout.scenarios if scenario.token not in splits.problems]
     with _store_errors(folder):
+        _remove_leftovers(folder)
         outcomes = run_batch(
             partial(index_scenario, folder / _SHARDS),
             candidates,
@@ -63,10 +65,12 @@ def make_index(
             label="indexing scenarios",
             progress=progress,
         )
+        tables, table_files = _write_tables(folder, [outcome for outcome in outcomes if outcome.indexed], splits)
         manifest = Manifest(
             schema_version=SCHEMA_VERSION,
             fingerprint=fingerprint,
-            tables=_write_tables(folder, [outcome for outcome in outcomes if outcome.indexed], splits),
+            tables=tables,
+            table_files=table_files,
             problems=_problems(outcomes, splits),
             notices=(*splits.notices, *(notice for outcome in outcomes for notice in outcome.notices)),
         )
@@ -110,24 +114,35 @@ def _problems(outcomes: Sequence[Outcome], splits: SplitAssignment) -> tuple[Pro
     return tuple(sorted(broken + misplaced, key=lambda problem: problem.scenario))
 
 
-def _write_tables(folder: Path, outcomes: Sequence[Outcome], splits: SplitAssignment) -> str:
-    """Join the shards into a new folder of tables, named by what they were made from; empty if there are none."""
+def _write_tables(
+    folder: Path, outcomes: Sequence[Outcome], splits: SplitAssignment
+) -> tuple[str, dict[str, tuple[int, str]]]:
+    """Join the shards into a new folder of tables, named by what they were made from; its name and its files' states.
+
+    The name is empty if there is nothing to join. Whole tables of that name are left as they are.
+    """
     if not outcomes:
-        return ""
+        return "", {}
     assigned = [splits.split_of.get(outcome.token) for outcome in outcomes]
     made_from = repr(
         [(outcome.token, outcome.digest, split) for outcome, split in zip(outcomes, assigned, strict=True)]
     )
     name = _TABLES + hashlib.blake2b(made_from.encode(), digest_size=8).hexdigest()
-    if not (folder / name).is_dir():
-        shards = [shard_path(folder / _SHARDS, outcome.token) for outcome in outcomes]
-        try:
-            with replacing_folder(folder / name) as temporary:
-                join_tables(temporary, shards, assigned)
-        except OSError:
-            if not (folder / name).is_dir():  # else another process made the same tables meanwhile
-                raise
-    return name
+    before = read_manifest(folder)
+    if before and before.tables == name and table_file_states(folder / name) == before.table_files:
+        return name, dict(before.table_files)
+    shards = [shard_path(folder / _SHARDS, outcome.token) for outcome in outcomes]
+    shutil.rmtree(folder / name, ignore_errors=True)  # damaged, or of a process that was stopped before its manifest
+    with replacing_folder(folder / name) as temporary:
+        join_tables(temporary, shards, assigned)
+        states = table_file_states(temporary)
+    return name, states
+
+
+def table_file_states(folder: Path) -> dict[str, tuple[int, str]]:
+    """Size and checksum of each file of a folder of tables, by name; nothing if there is no such folder."""
+    paths = sorted(path for path in folder.glob("*.arrow") if path.is_file())
+    return {path.name: (path.stat().st_size, file_checksum(path)) for path in paths}
 
 
 def _remove_stale(folder: Path, manifest: Manifest, indexed: set[str]) -> None:
@@ -140,6 +155,16 @@ def _remove_stale(folder: Path, manifest: Manifest, indexed: set[str]) -> None:
         for shard in (folder / _SHARDS).glob("*/*.arrow"):
             if shard not in kept:
                 shard.unlink(missing_ok=True)
+
+
+def _remove_leftovers(folder: Path) -> None:
+    """Remove what a stopped process left under temporary names."""
+    with suppress(OSError):
+        for tables in folder.glob(f".{_TABLES}*"):
+            shutil.rmtree(tables, ignore_errors=True)
+        for pattern in (".*.tmp", f"{_SHARDS}/*/.*.tmp"):
+            for file in folder.glob(pattern):
+                file.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from deepaccident_devkit.files import write_bytes
@@ -35,6 +35,7 @@ class Manifest:
         schema_version: of the code that made it.
         fingerprint: digest of the release's folder, meta and split file times.
         tables: name of the folder that holds the tables; empty if none could be made.
+        table_files: the size and checksum of each file in it, by name.
         problems: the scenarios left out.
         notices: what else was left aside, a sentence each.
     """
@@ -42,6 +43,7 @@ class Manifest:
     schema_version: int
     fingerprint: str
     tables: str
+    table_files: Mapping[str, tuple[int, str]] = field(default_factory=dict)
     problems: tuple[Problem, ...] = ()
     notices: tuple[str, ...] = ()
 
@@ -57,18 +59,20 @@ def read_manifest(folder: Path) -> Manifest | None:
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write the manifest, which makes what it names the index."""
-    write_bytes(folder / _FILE, json.dumps(asdict(manifest), indent=1, ensure_ascii=False).encode())
+    write_bytes(folder / _FILE, json.dumps(asdict(manifest), indent=1).encode())
 
 
 def _parsed(content: Mapping[str, object]) -> Manifest:
     problems = content["problems"]
     notices = content["notices"]
-    if not isinstance(problems, list) or not isinstance(notices, list):
+    table_files = content["table_files"]
+    if not isinstance(problems, list) or not isinstance(notices, list) or not isinstance(table_files, dict):
         raise TypeError("not a manifest")
     return Manifest(
         schema_version=SCHEMA_VERSION,
         fingerprint=str(content["fingerprint"]),
         tables=str(content["tables"]),
+        table_files={str(name): (int(size), str(checksum)) for name, (size, checksum) in table_files.items()},
         problems=tuple(
             Problem(scenario=entry["scenario"], messages=tuple(entry["messages"]), digest=entry["digest"])
             for entry in problems

@@ -6,10 +6,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.release import ScenarioFolder
 from deepaccident_devkit.release.layout import frame_numbers
 from deepaccident_devkit.taxonomy import AGENTS, AgentName
 
+_ENDINGS = {"calib": "pkl", "label": "txt"}
 _FRAMES_NAMED = 6
 _REMEDY = "unpack its archive again, or leave the scenario out with on_error='skip'"
 
@@ -20,6 +22,7 @@ class ScenarioScan:
 
     Attributes:
         agents: the agents with calib files.
+        has_meta: whether there is a meta file.
         labelled: those of them with label files.
         num_frames: the highest frame number of any of their files.
         problems: what makes the scenario broken, a sentence each.
@@ -27,6 +30,7 @@ class ScenarioScan:
     """
 
     agents: tuple[AgentName, ...]
+    has_meta: bool
     labelled: tuple[AgentName, ...]
     num_frames: int
     problems: tuple[str, ...]
@@ -35,18 +39,25 @@ class ScenarioScan:
 
 def scan_scenario(scenario: ScenarioFolder) -> ScenarioScan:
     """List a scenario's calib and label folders and check that they hold frames 1 to n for every agent."""
-    frames: dict[tuple[AgentName, str], list[int]] = {}
+    frames: dict[tuple[AgentName, str], list[int]] = {(agent, kind): [] for agent in AGENTS for kind in _ENDINGS}
     problems, notices = [], []
     for agent in AGENTS:
-        for kind, ending in (("calib", "pkl"), ("label", "txt")):
+        for kind, ending in _ENDINGS.items():
             folder = scenario.kind_folder(agent, kind)
-            frames[agent, kind], odd = frame_numbers(folder, ending)
+            try:
+                frames[agent, kind], odd = frame_numbers(folder, ending)
+            except ReleaseError as error:
+                problems.append(str(error))
+                continue
             problems += [f"{folder / name}: expected a name {scenario.name}_<NNN>.{ending}; rename it" for name in odd]
         if frames[agent, "label"] and not frames[agent, "calib"]:
             notices.append(f"{scenario.token}: {agent} has labels but no calib files and is left out")
             frames[agent, "label"] = []
     agents = tuple(agent for agent in AGENTS if frames[agent, "calib"])
     labelled = tuple(agent for agent in agents if frames[agent, "label"])
+    has_meta = os.path.exists(scenario.meta_path)  # noqa: PTH110 - Path.exists raises where the folder is closed
+    if labelled and not has_meta:
+        notices.append(f"{scenario.meta_path}: missing or closed: weather and collision of this scenario are unknown")
     num_frames = max((found[-1] for found in frames.values() if found), default=0)
     for agent in agents:
         for kind in ("calib", "label") if agent in labelled else ("calib",):
@@ -56,6 +67,7 @@ def scan_scenario(scenario: ScenarioFolder) -> ScenarioScan:
                 problems.append(f"{folder}: lacks frames {_ranges(missing)} of 1 to {num_frames}; {_REMEDY}")
     return ScenarioScan(
         agents=agents,
+        has_meta=has_meta,
         labelled=labelled,
         num_frames=num_frames,
         problems=tuple(problems),
@@ -72,23 +84,23 @@ def folder_digest(scenarios: Iterable[ScenarioFolder], files: Iterable[Path]) ->
     for scenario in scenarios:
         root = os.fspath(scenario.root)
         base = os.path.join(root, scenario.folder, scenario.scenario_type)  # noqa: PTH118 - 7,000 of them at start
-        digest.update(f"{scenario.folder}/{scenario.token}\n".encode())
+        digest.update(os.fsencode(f"{scenario.folder}/{scenario.token}\n"))
         paths = [f"{base}/{agent}/{kind}/{scenario.name}" for agent in AGENTS for kind in ("calib", "label")]
         for path in [*paths, f"{base}/meta/{scenario.name}.txt"]:
             digest.update(_stat_words(path))
     for file in files:
-        digest.update(file.name.encode() + _stat_words(os.fspath(file)))
+        digest.update(os.fsencode(file.name) + _stat_words(os.fspath(file)))
     return digest.hexdigest()
 
 
 def scenario_digest(scenario: ScenarioFolder) -> str:
     """A digest of name, size and time of every label, calib and meta file of a scenario."""
-    digest = hashlib.blake2b(scenario.token.encode(), digest_size=16)
+    digest = hashlib.blake2b(os.fsencode(scenario.token), digest_size=16)
     for agent in AGENTS:
         for kind in ("calib", "label"):
             folder = scenario.kind_folder(agent, kind)
             for name in _names(folder):
-                digest.update(f"{agent}/{kind}/{name}".encode() + _stat_words(f"{folder}/{name}"))
+                digest.update(os.fsencode(f"{agent}/{kind}/{name}") + _stat_words(f"{folder}/{name}"))
     digest.update(_stat_words(os.fspath(scenario.meta_path)))
     return digest.hexdigest()
 
@@ -96,7 +108,7 @@ def scenario_digest(scenario: ScenarioFolder) -> str:
 def _names(folder: Path) -> list[str]:
     try:
         return sorted(os.listdir(folder))  # noqa: PTH208 - names alone
-    except (FileNotFoundError, NotADirectoryError):
+    except OSError:
         return []
 
 

@@ -121,10 +121,11 @@ class StoredTable:
         try:
             reader = pa.ipc.open_file(pa.memory_map(str(path)))
             batch = reader.get_batch(0)
-        except (OSError, pa.ArrowInvalid, IndexError) as error:
-            raise IndexStoreError(
-                f"{path}: cannot be read ({error}); remove the index folder to have it remade"
-            ) from error
+        except FileNotFoundError:
+            raise IndexStoreError(f"{path}: no such file: the index was made anew; open the release again") from None
+        except (OSError, pa.ArrowException, IndexError, ValueError) as error:
+            remedy = "mend it with: deepaccident index DATAROOT --check"
+            raise IndexStoreError(f"{path}: cannot be read ({error}); {remedy}") from error
         self.spec = spec
         self.table = pa.Table.from_batches([batch])
         self.views = views(spec, batch)

@@ -6,7 +6,7 @@ from typing import Any, Generic, TypeVar, cast, overload
 
 import numpy as np
 
-from deepaccident_devkit.errors import FieldError, TokenError
+from deepaccident_devkit.errors import FieldError, TableError, TokenError
 from deepaccident_devkit.tables.columns import NULL_INTEGER, Choice, Column, Key, Number, Subset, Vector
 from deepaccident_devkit.tables.resolve import Resolver
 from deepaccident_devkit.tables.specs import table_spec, table_specs
@@ -17,30 +17,23 @@ _Getter = Callable[[int], Any]
 
 
 class Tables:
-    """All tables of an index, memory-mapped; each is opened when first asked for."""
+    """All tables of an index, memory-mapped: they stay readable when another process remakes the index."""
 
     def __init__(self, folder: Path) -> None:
         """Open the tables in `folder`; raises IndexStoreError if they cannot be read."""
         self.folder = folder
-        self._stored: dict[str, StoredTable] = {}
+        self._stored = {name: StoredTable(folder, spec) for name, spec in table_specs().items()}
         self._tables: dict[str, Table[Any]] = {}
-        self.views = _LazyViews(self)
+        self.views = {name: stored.views for name, stored in self._stored.items()}
         self.resolver = Resolver(self.views)
-
-    def stored(self, name: str) -> StoredTable:
-        """One table's mapped file; raises TableError."""
-        try:
-            return self._stored[name]
-        except KeyError:
-            self._stored[name] = StoredTable(self.folder, table_spec(name))
-            return self._stored[name]
 
     def table(self, name: str) -> "Table[Any]":
         """One table's records; raises TableError."""
         try:
             return self._tables[name]
         except KeyError:
-            self._tables[name] = Table(self.stored(name), self.resolver)
+            stored = self._stored[table_spec(name).name]
+            self._tables[name] = Table(stored, self.resolver)
             return self._tables[name]
 
 
@@ -74,6 +67,8 @@ class Table(Sequence[Record], Generic[Record]):
         """The record of a row, or the records of a slice."""
         if isinstance(row, slice):
             return [self._record(position) for position in range(*row.indices(len(self)))]
+        if not isinstance(row, int | np.integer):
+            raise TableError(f"table '{self.name}' counts its rows: expected a number, found {row!r}; use get(token)")
         position = row + len(self) if row < 0 else row
         if not 0 <= position < len(self):
             raise IndexError(f"table '{self.name}' has {len(self)} rows, asked for row {row}")
@@ -145,18 +140,6 @@ class Table(Sequence[Record], Generic[Record]):
                 return _number_getter(view, dtype, nullable=column.nullable)
             case _:
                 return lambda row: view[row].as_py()
-
-
-class _LazyViews(dict[str, Any]):
-    """Table → its column views, opening the table when first asked for."""
-
-    def __init__(self, tables: Tables) -> None:
-        super().__init__()
-        self._tables = tables
-
-    def __missing__(self, name: str) -> dict[str, Any]:
-        self[name] = self._tables.stored(name).views
-        return cast(dict[str, Any], self[name])
 
 
 def table_names() -> list[str]:
