@@ -39,8 +39,8 @@ class DeepAccident(Dataset):
         Args:
             version: `v1` (train, val and test, or the flat layout) or `v1-mini`.
             dataroot: the folder that the release was unpacked into.
-            index_dir: where to keep the index of this release alone; by default `<dataroot>/.deepaccident`, or the user's cache folder
-                where that cannot be written.
+            index_dir: where to keep the index, of this release alone; by default `<dataroot>/.deepaccident`, or the
+                user's cache folder where that cannot be written.
             workers: processes to index with; None takes what the work is worth.
             on_error: `raise` lists every broken scenario and raises; `skip` leaves them out and says so.
             verbose: whether to show a progress bar while indexing.

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from deepaccident_devkit.tables import boxes as box_rules
 from deepaccident_devkit.tables.accidents import accident_type
 from deepaccident_devkit.tables.boxes import ScenarioBoxes
 from deepaccident_devkit.tables.columns import NULL_INTEGER
+from deepaccident_devkit.tables.findings import Finding, finding_of
 from deepaccident_devkit.tables.scan import ScenarioScan
 from deepaccident_devkit.tables.sensor_rows import Rows, neighbour_rows, sensor_tables, timestamps
 from deepaccident_devkit.taxonomy import (
@@ -49,33 +51,46 @@ class ScenarioFiles:
         return len(self.scan.agents) * self.scan.num_frames
 
 
-def read_scenario(scenario: ScenarioFolder, scan: ScenarioScan) -> tuple[ScenarioFiles | None, list[str]]:
+def read_scenario(scenario: ScenarioFolder, scan: ScenarioScan) -> tuple[ScenarioFiles | None, list[Finding]]:
     """Read a scenario's meta, calib and label files, and say everything that is wrong with them.
 
     Returns:
-        The files, None if there is a fault; the faults, a sentence each (the first of every kind of file).
+        The files, None if there is a fault; the faults, the first of every file.
     """
-    faults: list[str] = []
+    faults: list[Finding] = []
 
-    def attempt(read: Any, *arguments: Any) -> Any:
+    def attempt(read: Any, code: str, paths: list[Path]) -> Any:
         try:
-            return read(*arguments)
+            return read(paths)
         except ReleaseError as error:
-            faults.append(str(error))
+            if len(paths) == 1:
+                faults.append(finding_of(error, code, scenario.token))
+            else:
+                for path in paths:  # each by itself: the reader stops at the first
+                    attempt(read, code, [path])
             return None
 
     frames = range(1, scan.num_frames + 1)
-    meta = attempt(read_meta, scenario.meta_path) if scan.has_meta else None
-    calibs = attempt(read_calibs, [scenario.calib_path(agent, n) for agent in scan.agents for n in frames])
-    labels = attempt(read_labels, [scenario.label_path(agent, n) for agent in scan.labelled for n in frames])
+    metas = attempt(_read_metas, "meta-unreadable", [scenario.meta_path] if scan.has_meta else [])
+    calibs = attempt(
+        read_calibs, "calib-unreadable", [scenario.calib_path(agent, n) for agent in scan.agents for n in frames]
+    )
+    labels = attempt(
+        read_labels, "label-unreadable", [scenario.label_path(agent, n) for agent in scan.labelled for n in frames]
+    )
     if faults:
         return None, faults
+    meta = metas[0] if metas else None
     return ScenarioFiles(scenario=scenario, scan=scan, meta=meta, calibs=calibs, labels=labels), []
+
+
+def _read_metas(paths: Sequence[Path]) -> list[Meta]:
+    return [read_meta(path) for path in paths]
 
 
 def scenario_rows(files: ScenarioFiles) -> dict[str, Rows]:
     """The rows of every table but `sensor` and `category`, which are the same for all scenarios."""
-    boxes = _scenario_boxes(files)
+    boxes = scenario_boxes(files)
     instance_rows, instance_of_box = box_rules.instances(boxes)
     centers = box_rules.world_centers(boxes)
     velocities = box_rules.world_velocities(boxes, centers)
@@ -92,7 +107,8 @@ def scenario_rows(files: ScenarioFiles) -> dict[str, Rows]:
     }
 
 
-def _scenario_boxes(files: ScenarioFiles) -> ScenarioBoxes:
+def scenario_boxes(files: ScenarioFiles) -> ScenarioBoxes:
+    """A scenario's boxes, and where each was recorded."""
     labelled = _sample_labelled(files)
     sample = np.repeat(np.flatnonzero(labelled), files.labels.num_boxes)
     agent, frame = np.divmod(sample, files.scan.num_frames)

@@ -13,9 +13,10 @@ from deepaccident_devkit.files import file_checksum, replacing_folder
 from deepaccident_devkit.parallel import run_batch
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder
 from deepaccident_devkit.tables.build import read_scenario, scenario_rows
+from deepaccident_devkit.tables.findings import Finding
 from deepaccident_devkit.tables.join import join_tables
 from deepaccident_devkit.tables.manifest import SCHEMA_VERSION, Manifest, Problem, read_manifest, write_manifest
-from deepaccident_devkit.tables.scan import scan_scenario, scenario_digest
+from deepaccident_devkit.tables.scan import ScenarioScan, scan_scenario, scenario_digest
 from deepaccident_devkit.tables.shards import shard_digest, shard_path, write_shard
 from deepaccident_devkit.tables.split_assignment import SplitAssignment, assign_splits
 
@@ -85,18 +86,21 @@ def index_scenario(shards: Path, scenario: ScenarioFolder) -> Outcome:
     path = shard_path(shards, scenario.token)
     scan = scan_scenario(scenario)
     if scan.problems:
-        return Outcome(token=scenario.token, digest=digest, indexed=False, messages=scan.problems, notices=scan.notices)
+        return _broken(scenario, digest, scan, scan.problems)
     if not scan.agents:
         notice = f"{scenario.token}: its calib folders hold no files; left out"
         return Outcome(token=scenario.token, digest=digest, indexed=False, notices=(*scan.notices, notice))
     if shard_digest(path) != digest:
         files, faults = read_scenario(scenario, scan)
         if files is None:
-            return Outcome(
-                token=scenario.token, digest=digest, indexed=False, messages=tuple(faults), notices=scan.notices
-            )
+            return _broken(scenario, digest, scan, faults)
         write_shard(path, scenario_rows(files), digest)
     return Outcome(token=scenario.token, digest=digest, indexed=True, notices=scan.notices)
+
+
+def _broken(scenario: ScenarioFolder, digest: str, scan: ScenarioScan, faults: Sequence[Finding]) -> Outcome:
+    messages = tuple(str(fault) for fault in faults)
+    return Outcome(token=scenario.token, digest=digest, indexed=False, messages=messages, notices=scan.notices)
 
 
 def scenario_state(scenario: ScenarioFolder) -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.release import ScenarioFolder
 from deepaccident_devkit.release.layout import frame_numbers
+from deepaccident_devkit.tables.findings import Finding, finding_of
 from deepaccident_devkit.taxonomy import AGENTS, AgentName
 
 _ENDINGS = {"calib": "pkl", "label": "txt"}
@@ -25,7 +26,7 @@ class ScenarioScan:
         has_meta: whether there is a meta file.
         labelled: those of them with label files.
         num_frames: the highest frame number of any of their files.
-        problems: what makes the scenario broken, a sentence each.
+        problems: what makes the scenario broken.
         notices: what was left aside, a sentence each.
     """
 
@@ -33,27 +34,23 @@ class ScenarioScan:
     has_meta: bool
     labelled: tuple[AgentName, ...]
     num_frames: int
-    problems: tuple[str, ...]
+    problems: tuple[Finding, ...]
     notices: tuple[str, ...]
 
 
 def scan_scenario(scenario: ScenarioFolder) -> ScenarioScan:
     """List a scenario's calib and label folders and check that they hold frames 1 to n for every agent."""
-    frames: dict[tuple[AgentName, str], list[int]] = {(agent, kind): [] for agent in AGENTS for kind in _ENDINGS}
-    problems, notices = [], []
-    for agent in AGENTS:
-        for kind, ending in _ENDINGS.items():
-            folder = scenario.kind_folder(agent, kind)
-            try:
-                frames[agent, kind], odd = frame_numbers(folder, ending)
-            except ReleaseError as error:
-                problems.append(str(error))
-                continue
-            problems += [f"{folder / name}: expected a name {scenario.name}_<NNN>.{ending}; rename it" for name in odd]
-        if frames[agent, "label"] and not frames[agent, "calib"]:
-            notices.append(f"{scenario.token}: {agent} has labels but no calib files and is left out")
-            frames[agent, "label"] = []
+    problems: list[Finding] = []
+    notices: list[str] = []
+    frames = {
+        (agent, kind): _frames(scenario, agent, kind, ending, problems)
+        for agent in AGENTS
+        for kind, ending in _ENDINGS.items()
+    }
     agents = tuple(agent for agent in AGENTS if frames[agent, "calib"])
+    for agent in AGENTS:
+        if agent not in agents and frames.pop((agent, "label")):
+            notices.append(f"{scenario.token}: {agent} has labels but no calib files and is left out")
     labelled = tuple(agent for agent in agents if frames[agent, "label"])
     has_meta = os.path.exists(scenario.meta_path)  # noqa: PTH110 - Path.exists raises where the folder is closed
     if labelled and not has_meta:
@@ -63,8 +60,8 @@ def scan_scenario(scenario: ScenarioFolder) -> ScenarioScan:
         for kind in ("calib", "label") if agent in labelled else ("calib",):
             missing = sorted(set(range(1, num_frames + 1)) - set(frames[agent, kind]))
             if missing:
-                folder = scenario.kind_folder(agent, kind)
-                problems.append(f"{folder}: lacks frames {_ranges(missing)} of 1 to {num_frames}; {_REMEDY}")
+                what = f"lacks frames {frame_ranges(missing)} of 1 to {num_frames}"
+                problems.append(_broken(scenario, "frames-missing", scenario.kind_folder(agent, kind), what, _REMEDY))
     return ScenarioScan(
         agents=agents,
         has_meta=has_meta,
@@ -73,6 +70,23 @@ def scan_scenario(scenario: ScenarioFolder) -> ScenarioScan:
         problems=tuple(problems),
         notices=tuple(notices),
     )
+
+
+def _frames(scenario: ScenarioFolder, agent: AgentName, kind: str, ending: str, problems: list[Finding]) -> list[int]:
+    """The frame numbers of an agent's files of a kind; what is wrong with the folder goes to `problems`."""
+    folder = scenario.kind_folder(agent, kind)
+    try:
+        frames, odd = frame_numbers(folder, ending)
+    except ReleaseError as error:
+        problems.append(finding_of(error, "folder-unreadable", scenario.token))
+        return []
+    what = f"expected a name {scenario.name}_<NNN>.{ending}"
+    problems += [_broken(scenario, "odd-name", folder / name, what, "rename it") for name in odd]
+    return frames
+
+
+def _broken(scenario: ScenarioFolder, code: str, where: Path, what: str, remedy: str) -> Finding:
+    return Finding(code=code, severity="error", scenario=scenario.token, where=str(where), what=what, remedy=remedy)
 
 
 def folder_digest(scenarios: Iterable[ScenarioFolder], files: Iterable[Path]) -> str:
@@ -120,7 +134,7 @@ def _stat_words(path: str) -> bytes:
     return f" {found.st_size} {found.st_mtime_ns}\n".encode()
 
 
-def _ranges(numbers: Sequence[int]) -> str:
+def frame_ranges(numbers: Sequence[int]) -> str:
     """`3–5, 9`: runs of consecutive numbers, the first few."""
     runs: list[list[int]] = []
     for number in numbers:
