@@ -7,6 +7,14 @@ from deepaccident_devkit.release import find_release
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import AGENTS
 
+WHOLE_SAMPLES, WHOLE_BYTES = 285_000, 310e9
+"""Of the published release: five agents' samples, and its size unpacked."""
+
+
+def index_share_of_raw(index_bytes: float, samples: int) -> float:
+    """The size of the index of some samples as a share of the raw data's of as many."""
+    return index_bytes / (WHOLE_BYTES * samples / WHOLE_SAMPLES)
+
 
 def labels_only_release(root: Path, *, scenarios: int, frames: int) -> Path:
     """A release without sensor files: one accident and its twin, copied under other names."""

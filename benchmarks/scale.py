@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.measure import Figure
+from benchmarks.releases import index_share_of_raw
 from deepaccident_devkit.geometry.se3 import SE3
 from deepaccident_devkit.release import Calibs, Collision, Labels, Meta, ScenarioFolder, find_release, write_meta
 from deepaccident_devkit.tables.build import ScenarioFiles, scenario_rows
@@ -79,7 +80,10 @@ print(json.dumps(figures))
 def measure() -> list[Figure]:
     with tempfile.TemporaryDirectory(prefix="deepaccident_scale_") as folder:
         root = write_whole_release(Path(folder))
-        size = sum(path.stat().st_size for path in root.glob(f"{INDEX_FOLDER}/v1/tables-*/*"))
+        tables, shards = (
+            sum(path.stat().st_size for path in root.glob(f"{INDEX_FOLDER}/v1/{files}"))
+            for files in ("tables-*/*", "shards/*")
+        )
         runs = [probe(root) for _ in range(PROCESSES + 1)][1:]  # the first compiles and fills the file cache
     best = {name: min(run[name] for run in runs) for name in runs[0]}
     bounds = {"open_s": 0.2, "rss_mb": 100, "get_us": 20, "boxes_us": 20}
@@ -87,7 +91,13 @@ def measure() -> list[Figure]:
     figures = [
         Figure(name=name, value=value, unit=units.get(name, ""), bound=bounds.get(name)) for name, value in best.items()
     ]
-    return [*figures, Figure(name="tables_mb", value=size / 1e6, unit="MB")]
+    share = index_share_of_raw(tables + shards, int(best["samples"]))
+    return [
+        *figures,
+        Figure(name="tables_mb", value=tables / 1e6, unit="MB"),
+        Figure(name="index_mb", value=(tables + shards) / 1e6, unit="MB"),
+        Figure(name="index_share_of_raw", value=share, bound=0.01),
+    ]
 
 
 def probe(root: Path) -> dict[str, float]:

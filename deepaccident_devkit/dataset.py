@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
@@ -26,6 +27,7 @@ from deepaccident_devkit.taxonomy import (
     OWN_ACTOR_ID,
     SPLITS,
     Frame,
+    OnError,
 )
 
 if TYPE_CHECKING:
@@ -187,13 +189,26 @@ class Dataset:
         agents = self._tables.resolver.agents_of(scenario_row).values()
         return [self.sample[self._tables.resolver.sample_at(agent, record["index"])] for agent in agents]
 
-    def split_scenarios(self, split: str) -> set[str]:
+    def split_scenarios(self, split: str | os.PathLike[str], *, missing: OnError = "raise") -> set[str]:
         """The tokens of this release's scenarios that belong to a split.
 
+        Args:
+            split: `train`, `val`, `test`, `train_mini` or `val_mini`: those of it that are here. Or a split file of
+                your own, as a path object or a text that ends in `.txt`: blank lines, CRLF and a byte order mark are
+                fine, the same scenario in two lines is a fault.
+            missing: a file's scenarios that are not in this release: `raise`, or `skip` them.
+
         Raises:
-            ChoiceError: no such split.
-            NotAvailableError: nothing says which scenario belongs where: no split file, and no split folders.
+            ChoiceError: no such split, or no such way with the missing.
+            NotAvailableError: nothing says which scenario belongs where: no split file, and no split folders; or
+                scenarios of your file are not in this release.
+            MissingFileError: there is no such file.
+            SplitFileError: your file is none: a line has not two words, or a scenario stands twice.
         """
+        if missing not in get_args(OnError):
+            raise ChoiceError(f"missing: expected one of {', '.join(get_args(OnError))}, found {missing!r}")
+        if not isinstance(split, str) or split.endswith(".txt"):
+            return self._listed_scenarios(Path(split).expanduser(), missing)
         if split in MINI_SPLITS:
             if split not in self._split_files:
                 raise NotAvailableError(f"{self.dataroot}: has no {split}.txt; put the release's split files there")
@@ -207,6 +222,17 @@ class Dataset:
                 f"split folders ({split}/); put the release's split files into it"
             )
         return set(self.scenario.tokens_where("split", split))
+
+    def _listed_scenarios(self, path: Path, missing: OnError) -> set[str]:
+        listed = read_split_file(path, unique=True)
+        here = set(self._tables.resolver.scenario_tokens)
+        absent = [token for token in listed if token not in here]
+        if absent and missing == "raise":
+            raise NotAvailableError(
+                f"{path}: {len(absent)} of its {len(listed)} scenarios are not in {self.dataroot}: "
+                f"{', '.join(absent[:3])}{', …' if len(absent) > 3 else ''}; pass missing='skip' to go without them"
+            )
+        return here.intersection(listed)
 
     # poses
 

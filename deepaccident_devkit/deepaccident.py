@@ -6,7 +6,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from deepaccident_devkit import overview, render, v2x
+from deepaccident_devkit import overview, render, selection, v2x, validation
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.tables import open_index
@@ -68,7 +68,9 @@ class DeepAccident(Dataset):
             problems=index.manifest.problems,
         )
 
+    find = selection.find
     transform = v2x.transform
+    findings = validation.findings
     render_sample = render.render_sample
     render_frame = render.render_frame
     render_sample_data = render.render_sample_data

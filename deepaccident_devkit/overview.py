@@ -1,9 +1,14 @@
 """What a release holds, counted: the texts behind `deepaccident info` and the facade's `list_*` methods."""
 
+from __future__ import annotations
+
 import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.release.layout import ScenarioFolder
@@ -12,33 +17,31 @@ from deepaccident_devkit.taxonomy import (
     CHANNELS,
     EXPECTED_MINI_SCENARIOS,
     EXPECTED_SCENARIOS,
+    SCENARIO_ATTRIBUTES,
     SPLITS,
 )
+from deepaccident_devkit.text import columns_text
 
-ATTRIBUTES = (
-    "scenario_type",
-    "town",
-    "weather",
-    "time_of_day",
-    "road_type",
-    "accident_type",
-)
-"""The scenario fields by which an overview counts."""
+if TYPE_CHECKING:
+    from deepaccident_devkit.tables.records import AgentRecord, ScenarioRecord
+
 _UNKNOWN = "unknown"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Overview:
-    """Counts over one release.
+    """Counts over one release, or over some of its scenarios.
 
     Attributes:
         dataroot: its folder.
         version: `v1` or `v1-mini`.
         layout: `A`, `B` or `A+B`.
         index: folder of the index's tables.
-        tables: table → rows.
+        scenarios: how many the release has; the counts below are of all of them or of a selection.
+        selected: whether they are of a selection.
+        tables: table → rows; of a selection those that belong to its scenarios (`sensor` and `category` to all).
         splits: split → scenarios here; `unknown` for those of no known split.
-        expected: split (or the version, for mini) → scenarios of the whole release.
+        expected: split (or the version, for mini) → scenarios of the whole release; empty for a selection.
         agents: agent → scenarios that have it.
         labelled: agent → scenarios in which it has labels.
         channels: channel → recordings (scenario and agent) that have a folder of it.
@@ -51,6 +54,8 @@ class Overview:
     version: str
     layout: str
     index: str
+    scenarios: int
+    selected: bool
     tables: Mapping[str, int]
     splits: Mapping[str, int]
     expected: Mapping[str, int]
@@ -70,6 +75,8 @@ class Overview:
         scenarios = self.tables["scenario"]
         head = f"DeepAccident {self.version} at {self.dataroot} (layout {self.layout})\nindex: {self.index}"
         splits = [(name, f"{count} of {self.expected.get(name, 0)}") for name, count in self.splits.items()]
+        if self.selected:
+            head += f"\nselected: {scenarios} of {self.scenarios} scenarios; all counts are of these"
         if set(self.expected) != set(SPLITS):
             splits = [(name, str(count)) for name, count in self.splits.items()]
             splits += [(name, f"{scenarios} of {count}") for name, count in self.expected.items()]
@@ -97,10 +104,17 @@ class Overview:
         return "\n\n".join(blocks)
 
 
-def overview(dataset: Dataset) -> Overview:
-    """Count what a release holds."""
-    scenarios = dataset.scenario[:]
-    agents = dataset.agent[:]
+def overview(dataset: Dataset, scenarios: Sequence[ScenarioRecord] | None = None) -> Overview:
+    """Count what a release holds.
+
+    Args:
+        dataset: the release.
+        scenarios: records of its scenarios to count alone, such as `find` gives; None for all.
+    """
+    selected = scenarios is not None
+    scenarios = dataset.scenario[:] if scenarios is None else scenarios
+    tokens = {scenario["token"] for scenario in scenarios}
+    agents = [agent for agent in dataset.agent if agent["scenario_token"] in tokens]
     samples = {agent["token"]: dataset.get("sample", agent["first_sample_token"]) for agent in agents}
     split_counts = Counter(scenario["split"] or _UNKNOWN for scenario in scenarios)
     mini = dataset.version == "v1-mini"
@@ -109,20 +123,19 @@ def overview(dataset: Dataset) -> Overview:
         version=dataset.version,
         layout=dataset.layout,
         index=str(dataset.tables_folder),
-        tables={name: len(dataset.arrow(name)) for name in dataset.table_names},
+        scenarios=len(dataset.scenario),
+        selected=selected,
+        tables=_table_rows(dataset, tokens),
         splits={name: split_counts[name] for name in (*SPLITS, _UNKNOWN) if split_counts[name] or name in SPLITS},
-        expected={dataset.version: EXPECTED_MINI_SCENARIOS} if mini else EXPECTED_SCENARIOS,
+        expected={} if selected else {dataset.version: EXPECTED_MINI_SCENARIOS} if mini else EXPECTED_SCENARIOS,
         agents={name: sum(agent["name"] == name for agent in agents) for name in AGENTS},
         labelled={
             name: sum(agent["name"] == name and samples[agent["token"]]["labelled"] for agent in agents)
             for name in AGENTS
         },
-        channels=_channel_counts(dataset),
+        channels=_channel_counts(dataset, scenarios, agents),
         recordings=len(agents),
-        attributes={
-            field: _counts(scenario[field] for scenario in scenarios)  # type: ignore[literal-required]
-            for field in ATTRIBUTES
-        },
+        attributes={field: _counts(scenario[field] for scenario in scenarios) for field in SCENARIO_ATTRIBUTES},
         left_out=[problem.scenario for problem in dataset.problems],
     )
 
@@ -171,11 +184,7 @@ def sample_lines(dataset: Dataset, sample: RowArgument) -> list[str]:
 
 def table_text(left: str, right: str, rows: Sequence[tuple[str, str]]) -> str:
     """Two aligned columns under a heading."""
-    left_width = max(len(word) for word in [left, *(name for name, _ in rows)])
-    right_width = max(len(word) for word in [right, *(value for _, value in rows)])
-    lines = [f"{left:<{left_width}}  {right:>{right_width}}"]
-    lines += [f"{name:<{left_width}}  {value:>{right_width}}" for name, value in rows]
-    return "\n".join(line.rstrip() for line in lines)
+    return columns_text([(left, right), *rows])
 
 
 def _counts(values: Iterable[object]) -> dict[str, int]:
@@ -183,16 +192,41 @@ def _counts(values: Iterable[object]) -> dict[str, int]:
     return dict(sorted(counts.items()))
 
 
-def _channel_counts(dataset: Dataset) -> dict[str, int]:
+def _table_rows(dataset: Dataset, scenarios: set[str]) -> dict[str, int]:
+    """Rows of every table that belong to some scenarios, counted on the columns: no record is made."""
+    rows = {name: len(dataset.arrow(name)) for name in dataset.table_names}
+    chosen = [dataset.getind("scenario", token) for token in scenarios]
+    if len(chosen) == rows["scenario"]:
+        return rows
+    kept = {
+        name: np.isin(dataset.arrow(name)["scenario_row"].to_numpy(), chosen)
+        for name in ("agent", "frame", "sample", "instance", "track")
+    }
+    agents_of_sensors = dataset.arrow("calibrated_sensor")["agent_row"].to_numpy()
+    samples = int(kept["sample"].sum())
+    return {
+        **rows,
+        "scenario": len(chosen),
+        **{name: int(mask.sum()) for name, mask in kept.items()},
+        "sample_data": samples * len(CHANNELS),
+        "ego_pose": samples,
+        "calibrated_sensor": int(kept["agent"][agents_of_sensors].sum()),
+        "annotation": int(dataset.arrow("sample")["num_annotations"].to_numpy()[kept["sample"]].sum()),
+    }
+
+
+def _channel_counts(
+    dataset: Dataset, scenarios: Sequence[ScenarioRecord], agents: Sequence[AgentRecord]
+) -> dict[str, int]:
     """Recordings that have a folder of each channel; tells nothing of the files in it (`validate` does)."""
     counts = dict.fromkeys(CHANNELS, 0)
     folders = {
         scenario["token"]: ScenarioFolder(
             dataset.dataroot, scenario["folder"], scenario["scenario_type"], scenario["name"], AGENTS
         )
-        for scenario in dataset.scenario
+        for scenario in scenarios
     }
-    for agent in dataset.agent:
+    for agent in agents:
         folder = folders[agent["scenario_token"]]
         for channel in CHANNELS:
             counts[channel] += folder.kind_folder(agent["name"], channel).is_dir()

@@ -78,6 +78,15 @@ EXPECTED_SCENARIOS: Final[dict[str, int]] = {"train": 483, "val": 104, "test": 1
 EXPECTED_MINI_SCENARIOS: Final = 20
 
 TIMES_OF_DAY: Final = ("Noon", "Sunset", "Night")
+WEATHERS: Final = ("Clear", "Cloudy", "HardRain", "MidRain", "SoftRain", "Wet", "WetCloudy")
+TOWNS: Final = ("Town01", "Town02", "Town03", "Town04", "Town05", "Town07", "Town10HD")
+ROAD_TYPES: Final = ("four-way junction", "three-way junction")
+SPAWN_SIDES: Final = ("left", "right", "opposite")
+DIRECTIONS: Final = ("straight", "left", "right")
+"""The words that the whole release is known to use; a release may hold others, so no reader insists on them."""
+
+SCENARIO_ATTRIBUTES: Final = ("scenario_type", "town", "weather", "time_of_day", "road_type", "accident_type")
+"""The scenario fields by which overviews and split reports count."""
 
 
 def frame_timestamp(frame_index: int) -> float:

@@ -247,7 +247,7 @@ def test_what_the_design_names_is_there() -> None:
     tables = (
         "scenario agent frame sample sample_data sensor calibrated_sensor ego_pose instance annotation track category"
     )
-    look_ups = "get getind field2token arrow get_sample samples_of table_names split_scenarios"
+    look_ups = "find get getind field2token arrow get_sample samples_of table_names split_scenarios"
     listings = "list_scenarios list_agents list_categories list_sample"
     data = "get_sample_data_path get_sample_data load_image load_point_cloud load_bev get_boxes boxes transform"
     pictures = "render_sample render_sample_data render_frame render_bev"

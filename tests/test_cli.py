@@ -7,9 +7,12 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from tiny import write_tiny_release
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.release import read_split_file
+from deepaccident_devkit.splits import official_split
 from deepaccident_devkit.synth import SynthConfig
 
 
@@ -65,7 +68,7 @@ def test_a_broken_release_is_listed_and_may_be_skipped(own_release: Path) -> Non
     assert "WARNING: left out" in skipped.stderr
 
 
-@pytest.mark.parametrize("verb", ["info", "index"])
+@pytest.mark.parametrize("verb", ["info", "index", "split"])
 def test_every_verb_on_a_release_has_the_same_grammar(verb: str) -> None:
     text = CliRunner().invoke(deepaccident, [verb, "--help"]).output
     assert "DATAROOT" in text
@@ -76,7 +79,7 @@ def test_every_verb_on_a_release_has_the_same_grammar(verb: str) -> None:
 def test_help_names_the_verbs_and_wrong_usage_is_status_2() -> None:
     runner = CliRunner()
     text = runner.invoke(deepaccident, ["--help"]).output
-    for verb in ("demo", "synth", "index", "info"):
+    for verb in ("demo", "synth", "index", "info", "split"):
         assert verb in text
     assert runner.invoke(deepaccident, ["info"]).exit_code == 2
     assert runner.invoke(deepaccident, ["dance"]).exit_code == 2
@@ -107,3 +110,46 @@ def test_demo_draws_its_accident(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert "Try next:" in result.output
     again = CliRunner().invoke(deepaccident, ["demo", str(out)], catch_exceptions=False)
     assert "using the release that is in" in again.output
+
+
+def test_split_makes_the_official_split_and_writes_it(tmp_path: Path) -> None:
+    root = tmp_path / "release"
+    name = "Town03_type001_subtype0001_scenario000"
+    for number in range(14):
+        write_tiny_release(root, frames=6, agents=("ego_vehicle",), name=f"{name}{number:02d}")
+    made = run("split", root, "--out", tmp_path / "new", "--json")
+    assert made.returncode == 0, made.stderr
+    report = json.loads(made.stdout)
+    assert report["scenarios"] == {"train": 10, "val": 2, "test": 2, "train_mini": 2, "val_mini": 0}
+    assert f"written: {tmp_path / 'new' / 'val_mini.txt'}" in made.stderr
+    by_library = official_split(DeepAccident(dataroot=root)).by_name()
+    assert {path.stem: tuple(read_split_file(path)) for path in (tmp_path / "new").iterdir()} == by_library
+    again = run("split", root, "--out", tmp_path / "new", "--seed", 1)
+    assert (again.returncode, "train.txt: is there already" in again.stderr) == (2, True)
+    assert run("split", root, "--out", tmp_path / "new", "--seed", 1, "--overwrite").returncode == 0
+    assert tuple(read_split_file(tmp_path / "new" / "train.txt")) != by_library["train"]
+
+
+def test_split_saves_a_selection(own_release: Path, tmp_path: Path) -> None:
+    saved = run(
+        "split", own_release, "--where", "collision=true", "--where", "split=train", "--save", tmp_path / "a.txt"
+    )
+    assert saved.returncode == 0, saved.stderr
+    found = DeepAccident(dataroot=own_release).find(collision=True, split="train")
+    assert read_split_file(tmp_path / "a.txt") == [scenario["token"] for scenario in found]
+    assert f"scenarios {len(found)}" in " ".join(saved.stdout.split())
+    assert run("split", own_release, "--save", tmp_path / "b.txt").returncode == 2
+    assert run("split", own_release, "--where", "split=train", "--out", tmp_path / "b").returncode == 2
+    wrong = run("split", own_release, "--where", "wether=Clear")
+    assert (wrong.returncode, wrong.stderr.startswith("error: scenarios cannot be found by 'wether'")) == (2, True)
+
+
+def test_info_counts_only_the_scenarios_of_where(own_release: Path) -> None:
+    whole = json.loads(run("info", own_release, "--json").stdout)
+    some = json.loads(run("info", own_release, "--json", "--where", "designed_accident=true").stdout)
+    assert (some["tables"]["scenario"], some["scenarios"], some["selected"]) == (3, 6, True)
+    assert 0 < some["tables"]["annotation"] < whole["tables"]["annotation"]
+    text = run("info", own_release, "--where", "designed_accident=true").stdout
+    assert "selected: 3 of 6 scenarios" in text
+    wrong = run("info", own_release, "--where", "town=Twon03")
+    assert (wrong.returncode, "town: found 'Twon03'; possible are Town03" in wrong.stderr) == (2, True)

@@ -12,7 +12,9 @@ from deepaccident_devkit._version import __version__
 from deepaccident_devkit.cli.demo import demo
 from deepaccident_devkit.cli.index import index
 from deepaccident_devkit.cli.info import info
+from deepaccident_devkit.cli.split import split
 from deepaccident_devkit.cli.synth import synth
+from deepaccident_devkit.cli.validate import validate
 from deepaccident_devkit.errors import DeepAccidentError
 
 _ERROR_STATUS = 2
@@ -24,7 +26,7 @@ def deepaccident() -> None:
     """Tools for the DeepAccident V2X accident dataset."""
 
 
-for verb in (demo, synth, index, info):
+for verb in (demo, synth, index, info, split, validate):
     deepaccident.add_command(verb)
 
 

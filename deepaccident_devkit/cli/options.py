@@ -30,3 +30,15 @@ def release_parameters(verb: Verb) -> Verb:
     for parameter in reversed(_PARAMETERS):
         verb = parameter(verb)
     return verb
+
+
+def where_parameter(verb: Verb) -> Verb:
+    """Give a verb `where`, the texts of repeated --where (`deepaccident_devkit.selection` says what they may be)."""
+    option = click.option(
+        "--where",
+        multiple=True,
+        metavar="FILTER",
+        help="Only scenarios such as town=Town03,Town05, weather!=Clear, length=40..60 or collision=true; all of "
+        "several --where must hold.",
+    )
+    return option(verb)

@@ -10,10 +10,10 @@ from deepaccident_devkit.release._content import read_lines
 
 
 @overload
-def read_split_file(path: Path, *, raw: Literal[False] = False) -> list[str]: ...
+def read_split_file(path: Path, *, raw: Literal[False] = False, unique: bool = False) -> list[str]: ...
 @overload
-def read_split_file(path: Path, *, raw: Literal[True]) -> list[tuple[str, ...]]: ...
-def read_split_file(path: Path, *, raw: bool = False) -> list[str] | list[tuple[str, ...]]:
+def read_split_file(path: Path, *, raw: Literal[True], unique: bool = False) -> list[tuple[str, ...]]: ...
+def read_split_file(path: Path, *, raw: bool = False, unique: bool = False) -> list[str] | list[tuple[str, ...]]:
     """The scenarios of a split file, in its order, each once, as tokens `<scenario_type>/<scenario>`.
 
     Blank lines, blanks at line ends and CRLF are read.
@@ -21,10 +21,11 @@ def read_split_file(path: Path, *, raw: bool = False) -> list[str] | list[tuple[
     Args:
         path: the file.
         raw: return the words of every non-blank line instead, repeated lines included.
+        unique: take a scenario that stands in two lines as a fault, not once.
 
     Raises:
         MissingFileError: there is no such file.
-        SplitFileError: a line has not two words, or the file is no text.
+        SplitFileError: a line has not two words, the file is no text, or a scenario stands twice and `unique` is set.
     """
     lines = read_lines(path, SplitFileError, "restore it from the release")
     words = [(number, tuple(line.split())) for number, line in enumerate(lines, start=1) if line.strip()]
@@ -34,6 +35,8 @@ def read_split_file(path: Path, *, raw: bool = False) -> list[str] | list[tuple[
                 f"{path}:{number}: expected '<scenario_type> <scenario>', found '{' '.join(line_words)}'; "
                 "mend or remove the line"
             )
+    if unique:
+        _check_unique(path, words)
     if raw:
         return [line_words for _, line_words in words]
     return list(dict.fromkeys("/".join(line_words) for _, line_words in words))
@@ -43,3 +46,14 @@ def write_split_file(path: Path, scenario_tokens: Sequence[str]) -> None:
     """Write scenario tokens, one line each."""
     lines = [f"{scenario_type} {name}\n" for scenario_type, name in (token.split("/") for token in scenario_tokens)]
     write_bytes(path, "".join(lines).encode())
+
+
+def _check_unique(path: Path, words: Sequence[tuple[int, tuple[str, ...]]]) -> None:
+    first_line: dict[tuple[str, ...], int] = {}
+    for number, line_words in words:
+        if line_words in first_line:
+            raise SplitFileError(
+                f"{path}:{number}: '{' '.join(line_words)}' stands in line {first_line[line_words]} already; "
+                "remove one of the two lines"
+            )
+        first_line[line_words] = number

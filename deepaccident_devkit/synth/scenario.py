@@ -16,14 +16,14 @@ from deepaccident_devkit.synth.world import World, random_world
 from deepaccident_devkit.taxonomy import (
     STATIC_ACTOR_ID,
     TIMES_OF_DAY,
+    TOWNS,
     VEHICLE_AGENTS,
     WARM_UP_FRAMES,
+    WEATHERS,
     AgentName,
     frame_timestamp,
 )
 
-TOWNS = ("Town01", "Town02", "Town03", "Town04", "Town05", "Town07", "Town10HD")
-WEATHERS = ("Clear", "Cloudy", "HardRain", "MidRain", "SoftRain", "Wet", "WetCloudy")
 _FIRST_PAIRS = ("train", "val", "test")
 _GOLDEN_RATIO = 0.6180339887498949
 """Its multiples fill [0, 1) evenly, whatever their number."""

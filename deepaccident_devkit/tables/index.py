@@ -5,33 +5,41 @@
       tables-<digest>/     one Arrow file a table
       shards/              one file a scenario, from which the tables are joined
       .lock                held by the process that makes the index
+      .unfinished          there while it is made; what a stopped process left is finished by the next one
 
 Opening compares the times of folders, meta and split files and the sizes of the tables with the manifest; making it
 compares every label and calib file, reads only the scenarios that changed, and compares the checksums of shards and
-tables. Everything is written under a temporary name and renamed, the
-manifest last, so that a reader sees the old index or the new one.
+tables. Everything is written under a temporary name and renamed, the manifest last, so that a reader sees the old index
+or the new one.
 """
 
 import hashlib
 import logging
 import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from deepaccident_devkit.errors import BrokenReleaseError, ChoiceError, DatarootError, IndexStoreError
 from deepaccident_devkit.files import is_writable_folder
 from deepaccident_devkit.release import ReleaseLayout
-from deepaccident_devkit.tables.indexing import make_index, scenario_state
-from deepaccident_devkit.tables.manifest import Manifest, Problem, read_manifest
+from deepaccident_devkit.tables.indexing import is_unfinished, make_index, scenario_state
+from deepaccident_devkit.tables.locking import index_lock
+from deepaccident_devkit.tables.manifest import (
+    MANIFEST_FILE,
+    SCHEMA_VERSION,
+    Manifest,
+    Problem,
+    read_manifest,
+    stored_schema_version,
+)
 from deepaccident_devkit.tables.scan import folder_digest
 from deepaccident_devkit.taxonomy import OnError
 
 logger = logging.getLogger(__name__)
 
 INDEX_FOLDER = ".deepaccident"
-_LOCK_FILE = ".lock"
 _MESSAGES_A_SCENARIO = 5
 
 
@@ -75,68 +83,91 @@ def open_index(
     Raises:
         BrokenReleaseError: some scenarios are broken and `on_error` is `raise`, or all of them are.
         DatarootError: no scenario has any file.
-        IndexStoreError: the index cannot be written.
+        IndexStoreError: the index cannot be written, or is a newer devkit's.
     """
     if on_error not in ("raise", "skip"):
         raise ChoiceError(f"on_error: expected 'raise' or 'skip', found {on_error!r}")
     index = None if check_files else _current_index(layout, index_dir)
+    make = partial(_found_or_made, layout, index_dir, check_files=check_files, workers=workers, progress=progress)
     if index is None:
         folder = _writable_folder(layout, index_dir)
-        with _locked(folder):
-            index = None if check_files else _current_index(layout, index_dir)  # another process may have made it
-            if index is None:
-                fingerprint = folder_digest(layout.scenarios, layout.split_files.values())
-                manifest = make_index(layout, folder, fingerprint, workers=workers, progress=progress)
-                index = Index(folder=folder, manifest=manifest)
+        with index_lock(folder):
+            index = make(folder)
+    elif is_unfinished(index.folder):
+        index = _finished(index, make)
     _accept(layout, index, on_error)
     return index
 
 
 def find_indexes(layout: ReleaseLayout, index_dir: Path | None = None) -> Iterator[Index]:
     """The release's indexes on disk, up to date or not, the first choice first."""
-    for folder in index_folders(layout, index_dir):
+    for folder in index_folders(layout.root, layout.version, index_dir):
         manifest = read_manifest(folder)
         if manifest:
             yield Index(folder=folder, manifest=manifest)
 
 
-def index_folders(layout: ReleaseLayout, index_dir: Path | None = None) -> Iterator[Path]:
-    """Where the release's index may lie, the first choice first."""
+def index_folders(root: Path, version: str, index_dir: Path | None = None) -> Iterator[Path]:
+    """Where a release's index may lie, the first choice first."""
     if index_dir is not None:
-        yield index_dir / layout.version
+        yield index_dir / version
         return
-    yield layout.root / INDEX_FOLDER / layout.version
+    yield root / INDEX_FOLDER / version
     from platformdirs import user_cache_path
 
-    key = hashlib.blake2b(os.fsencode(layout.root.resolve()), digest_size=8).hexdigest()
-    yield user_cache_path("deepaccident_devkit") / key / layout.version
+    key = hashlib.blake2b(os.fsencode(root.resolve()), digest_size=8).hexdigest()
+    yield user_cache_path("deepaccident_devkit") / key / version
 
 
 def _current_index(layout: ReleaseLayout, index_dir: Path | None) -> Index | None:
     fingerprint = folder_digest(layout.scenarios, layout.split_files.values())
-    found = (index for index in find_indexes(layout, index_dir) if _is_current(layout, index, fingerprint))
+    found = (index for index in find_indexes(layout, index_dir) if is_current(layout, index, fingerprint))
     return next(found, None)
 
 
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Hold the folder's lock, which the system takes back when a process ends, however it ends."""
-    from filelock import FileLock, Timeout
+def _found_or_made(
+    layout: ReleaseLayout,
+    index_dir: Path | None,
+    folder: Path,
+    *,
+    check_files: bool,
+    workers: int | None,
+    progress: bool,
+) -> Index:
+    """The index, made in `folder`, whose lock is held, unless another process has made it meanwhile."""
+    index = None if check_files else _current_index(layout, index_dir)
+    if index is not None and not (index.folder == folder and is_unfinished(folder)):
+        return index
+    _refuse_newer(folder)
+    fingerprint = folder_digest(layout.scenarios, layout.split_files.values())
+    manifest = make_index(layout, folder, fingerprint, workers=workers, progress=progress)
+    return Index(folder=folder, manifest=manifest)
 
-    lock = FileLock(folder / _LOCK_FILE)
+
+def _finished(index: Index, make: Callable[[Path], Index]) -> Index:
+    """Finish what a stopped process left; an index that is good is used as it is where that cannot be done."""
+    if not is_writable_folder(index.folder):
+        return index
     try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        logger.warning("%s: another process makes this index; waiting for it", folder)
-        lock.acquire()
-    try:
-        yield
-    finally:
-        lock.release()
+        with index_lock(index.folder, wait=False) as held:
+            return make(index.folder) if held else index
+    except IndexStoreError as error:
+        logger.warning("%s", error)
+        return index
+
+
+def _refuse_newer(folder: Path) -> None:
+    version = stored_schema_version(folder)
+    if version is not None and version > SCHEMA_VERSION:
+        raise IndexStoreError(
+            f"{folder / MANIFEST_FILE}: a newer devkit's index (schema version {version}, this devkit's is "
+            f"{SCHEMA_VERSION}); update the devkit, give another index_dir=, or remove the index with: "
+            "deepaccident index clear DATAROOT"
+        )
 
 
 def _writable_folder(layout: ReleaseLayout, index_dir: Path | None) -> Path:
-    folders = list(index_folders(layout, index_dir))
+    folders = list(index_folders(layout.root, layout.version, index_dir))
     for folder in folders:
         if is_writable_folder(folder):
             return folder
@@ -144,7 +175,7 @@ def _writable_folder(layout: ReleaseLayout, index_dir: Path | None) -> Path:
     raise IndexStoreError(f"{places}: no place to write the index; give a writable folder with index_dir=")
 
 
-def _is_current(layout: ReleaseLayout, index: Index, fingerprint: str) -> bool:
+def is_current(layout: ReleaseLayout, index: Index, fingerprint: str) -> bool:
     """Whether nothing was added or removed, and what was broken still is as it was.
 
     Broken scenarios are looked at file by file: a file mended in place leaves its folder's time alone.

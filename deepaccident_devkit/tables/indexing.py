@@ -3,25 +3,35 @@
 import hashlib
 import shutil
 from collections.abc import Iterator, Sequence
+from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from deepaccident_devkit.errors import IndexStoreError
+from deepaccident_devkit.errors import DeepAccidentError, IndexStoreError
 from deepaccident_devkit.files import file_checksum, replacing_folder
 from deepaccident_devkit.parallel import run_batch
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder
 from deepaccident_devkit.tables.build import read_scenario, scenario_rows
 from deepaccident_devkit.tables.findings import Finding
 from deepaccident_devkit.tables.join import join_tables
-from deepaccident_devkit.tables.manifest import SCHEMA_VERSION, Manifest, Problem, read_manifest, write_manifest
+from deepaccident_devkit.tables.manifest import (
+    SCHEMA_VERSION,
+    Manifest,
+    Problem,
+    read_manifest,
+    stored_tables,
+    write_manifest,
+)
 from deepaccident_devkit.tables.scan import ScenarioScan, scan_scenario, scenario_digest
 from deepaccident_devkit.tables.shards import shard_digest, shard_path, write_shard
 from deepaccident_devkit.tables.split_assignment import SplitAssignment, assign_splits
 
-_SHARDS = "shards"
-_TABLES = "tables-"
+SHARDS_FOLDER = "shards"
+TABLES_PREFIX = "tables-"
+MARK_FILE = ".unfinished"
+"""There while an index is made; if no process makes it, one was stopped."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,10 +67,9 @@ def make_index(
     """
     splits = assign_splits(layout)
     candidates = [scenario for scenario in layout.scenarios if scenario.token not in splits.problems]
-    with _store_errors(folder):
-        _remove_leftovers(folder)
+    with _store_errors(folder), _marked_unfinished(folder):
         outcomes = run_batch(
-            partial(index_scenario, folder / _SHARDS),
+            partial(index_scenario, folder / SHARDS_FOLDER),
             candidates,
             workers=workers,
             label="indexing scenarios",
@@ -76,8 +85,13 @@ def make_index(
             notices=(*splits.notices, *(notice for outcome in outcomes for notice in outcome.notices)),
         )
         write_manifest(folder, manifest)
-        _remove_stale(folder, manifest, {outcome.token for outcome in outcomes if outcome.indexed})
+        _remove_stale_shards(folder, {outcome.token for outcome in outcomes if outcome.indexed})
     return manifest
+
+
+def is_unfinished(folder: Path) -> bool:
+    """Whether an index is being made in this folder, or a process was stopped that made one."""
+    return (folder / MARK_FILE).exists()
 
 
 def index_scenario(shards: Path, scenario: ScenarioFolder) -> Outcome:
@@ -108,6 +122,33 @@ def scenario_state(scenario: ScenarioFolder) -> str:
     return f"{SCHEMA_VERSION}:{scenario_digest(scenario)}"
 
 
+def edited_scenarios(layout: ReleaseLayout, folder: Path, manifest: Manifest) -> tuple[list[str], bool]:
+    """Compare every label, calib and meta file with the index in `folder`; changes nothing.
+
+    Returns:
+        The tokens of the scenarios whose files are not those the index was made from, or whose shard is damaged; and
+        whether the tables are made from what the other scenarios' shards hold.
+
+    Raises:
+        SplitFileError: a split file is none.
+    """
+    splits = assign_splits(layout)
+    broken = {problem.scenario: problem.digest for problem in manifest.problems}
+    same, edited = [], []
+    for scenario in layout.scenarios:
+        token = scenario.token
+        if token in splits.problems:
+            continue
+        state = scenario_state(scenario)
+        kept = broken[token] if token in broken else shard_digest(shard_path(folder / SHARDS_FOLDER, token))
+        if kept == state:
+            same.append(Outcome(token=token, digest=state, indexed=token not in broken))
+        elif kept is not None or scan_scenario(scenario).agents:  # without agents it has no shard
+            edited.append(token)
+    name = _tables_name([outcome for outcome in same if outcome.indexed], splits)
+    return edited, bool(edited) or name == manifest.tables
+
+
 def _problems(outcomes: Sequence[Outcome], splits: SplitAssignment) -> tuple[Problem, ...]:
     broken = [
         Problem(scenario=outcome.token, messages=outcome.messages, digest=outcome.digest)
@@ -125,22 +166,25 @@ def _write_tables(
 
     The name is empty if there is nothing to join. Whole tables of that name are left as they are.
     """
-    if not outcomes:
+    name = _tables_name(outcomes, splits)
+    if not name:
         return "", {}
-    assigned = [splits.split_of.get(outcome.token) for outcome in outcomes]
-    made_from = repr(
-        [(outcome.token, outcome.digest, split) for outcome, split in zip(outcomes, assigned, strict=True)]
-    )
-    name = _TABLES + hashlib.blake2b(made_from.encode(), digest_size=8).hexdigest()
     before = read_manifest(folder)
     if before and before.tables == name and table_file_states(folder / name) == before.table_files:
         return name, dict(before.table_files)
-    shards = [shard_path(folder / _SHARDS, outcome.token) for outcome in outcomes]
+    shards = [shard_path(folder / SHARDS_FOLDER, outcome.token) for outcome in outcomes]
+    assigned = [splits.split_of.get(outcome.token) for outcome in outcomes]
     shutil.rmtree(folder / name, ignore_errors=True)  # damaged, or of a process that was stopped before its manifest
     with replacing_folder(folder / name) as temporary:
         join_tables(temporary, shards, assigned)
         states = table_file_states(temporary)
     return name, states
+
+
+def _tables_name(outcomes: Sequence[Outcome], splits: SplitAssignment) -> str:
+    """The name of the folder of tables made from these scenarios; empty if there are none."""
+    made_from = [(outcome.token, outcome.digest, splits.split_of.get(outcome.token)) for outcome in outcomes]
+    return TABLES_PREFIX + hashlib.blake2b(repr(made_from).encode(), digest_size=8).hexdigest() if made_from else ""
 
 
 def table_file_states(folder: Path) -> dict[str, tuple[int, str]]:
@@ -149,33 +193,58 @@ def table_file_states(folder: Path) -> dict[str, tuple[int, str]]:
     return {path.name: (path.stat().st_size, file_checksum(path)) for path in paths}
 
 
-def _remove_stale(folder: Path, manifest: Manifest, indexed: set[str]) -> None:
-    """Remove the tables and shards that the manifest no longer stands on; what resists is left to the next time."""
-    with suppress(OSError):
-        for tables in folder.glob(f"{_TABLES}*"):
-            if tables.name != manifest.tables:
-                shutil.rmtree(tables, ignore_errors=True)
-        kept = {shard_path(folder / _SHARDS, token) for token in indexed}
-        for shard in (folder / _SHARDS).glob("*/*.arrow"):
-            if shard not in kept:
+def _remove_stale_shards(folder: Path, indexed: set[str]) -> None:
+    """Remove the shards of scenarios that are gone or broken; what resists is left to the next time."""
+    shards = folder / SHARDS_FOLDER
+    kept = {shard_path(shards, token) for token in indexed}
+    for shard in shards.glob("*/*.arrow"):
+        if shard not in kept:
+            with suppress(OSError):
                 shard.unlink(missing_ok=True)
+    for scenario_type in shards.glob("*/"):
+        with suppress(OSError):  # not empty
+            scenario_type.rmdir()
 
 
 def _remove_leftovers(folder: Path) -> None:
-    """Remove what a stopped process left under temporary names."""
+    """Remove temporary files and the tables that the manifest does not name; what resists is left to the next time."""
     with suppress(OSError):
-        for tables in folder.glob(f".{_TABLES}*"):
+        named = stored_tables(folder)
+        stale = [tables for tables in folder.glob(f"{TABLES_PREFIX}*") if tables.name != named]
+        for tables in [*folder.glob(f".{TABLES_PREFIX}*"), *stale]:
             shutil.rmtree(tables, ignore_errors=True)
-        for pattern in (".*.tmp", f"{_SHARDS}/*/.*.tmp"):
+        for pattern in (".*.tmp", f"{SHARDS_FOLDER}/*/.*.tmp"):
             for file in folder.glob(pattern):
                 file.unlink(missing_ok=True)
 
 
 @contextmanager
-def _store_errors(folder: Path) -> Iterator[None]:
+def _marked_unfinished(folder: Path) -> Iterator[None]:
+    """Mark the folder while an index is made in it, so that a process that is stopped leaves the mark behind."""
+    folder.mkdir(parents=True, exist_ok=True)
+    mark = folder / MARK_FILE
+    mark.touch()
+    _remove_leftovers(folder)
     try:
         yield
-    except OSError as error:
-        if isinstance(error, IndexStoreError):
-            raise
-        raise IndexStoreError(f"{folder}: the index cannot be written ({error}); give another index_dir=") from error
+    finally:  # the mark last: what is not tidied up is seen
+        _remove_leftovers(folder)
+        with suppress(OSError):
+            mark.unlink(missing_ok=True)
+
+
+@contextmanager
+def _store_errors(folder: Path) -> Iterator[None]:
+    """Turn what can happen to files and workers into errors that name the folder and the remedy."""
+    import pyarrow as pa
+
+    try:
+        yield
+    except DeepAccidentError:
+        raise
+    except (OSError, pa.ArrowException) as error:
+        remedy = "make room there or give another index_dir="
+        raise IndexStoreError(f"{folder}: the index cannot be written ({error}); {remedy}") from error
+    except BrokenExecutor as error:
+        remedy = "if memory ran out, give fewer workers="
+        raise IndexStoreError(f"{folder}: a process that made the index was killed ({error}); {remedy}") from error

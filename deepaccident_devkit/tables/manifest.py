@@ -9,7 +9,7 @@ from deepaccident_devkit.files import write_bytes
 
 SCHEMA_VERSION = 1
 """Counts up whenever the stored columns or their meaning change."""
-_FILE = "manifest.json"
+MANIFEST_FILE = "manifest.json"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,16 +50,36 @@ class Manifest:
 
 def read_manifest(folder: Path) -> Manifest | None:
     """The manifest of an index folder; None if there is none that today's code can use."""
+    content = _content(folder)
     try:
-        content = json.loads((folder / _FILE).read_text(encoding="utf-8"))
-        return _parsed(content) if content["schema_version"] == SCHEMA_VERSION else None
-    except (OSError, ValueError, KeyError, TypeError):
+        return _parsed(content) if content.get("schema_version") == SCHEMA_VERSION else None
+    except (ValueError, KeyError, TypeError, OverflowError):
         return None
+
+
+def stored_schema_version(folder: Path) -> int | None:
+    """The schema version that an index folder's manifest states, be it known here or not; None if it states none."""
+    version = _content(folder).get("schema_version")
+    return version if isinstance(version, int) and not isinstance(version, bool) else None
+
+
+def stored_tables(folder: Path) -> str:
+    """The name of the tables' folder that an index folder's manifest states, of any schema; empty if it states none."""
+    return str(_content(folder).get("tables", ""))
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write the manifest, which makes what it names the index."""
-    write_bytes(folder / _FILE, json.dumps(asdict(manifest), indent=1).encode())
+    write_bytes(folder / MANIFEST_FILE, json.dumps(asdict(manifest), indent=1).encode())
+
+
+def _content(folder: Path) -> Mapping[str, object]:
+    """The manifest's JSON object, empty if there is none."""
+    try:
+        content = json.loads((folder / MANIFEST_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}
 
 
 def _parsed(content: Mapping[str, object]) -> Manifest:
@@ -68,6 +88,8 @@ def _parsed(content: Mapping[str, object]) -> Manifest:
     table_files = content["table_files"]
     if not isinstance(problems, list) or not isinstance(notices, list) or not isinstance(table_files, dict):
         raise TypeError("not a manifest")
+    if content["tables"] and not table_files:
+        raise ValueError("tables without files")
     return Manifest(
         schema_version=SCHEMA_VERSION,
         fingerprint=str(content["fingerprint"]),

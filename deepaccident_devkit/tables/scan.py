@@ -41,21 +41,22 @@ class ScenarioScan:
 def scan_scenario(scenario: ScenarioFolder) -> ScenarioScan:
     """List a scenario's calib and label folders and check that they hold frames 1 to n for every agent."""
     problems: list[Finding] = []
-    notices: list[str] = []
     frames = {
         (agent, kind): _frames(scenario, agent, kind, ending, problems)
         for agent in AGENTS
         for kind, ending in _ENDINGS.items()
     }
     agents = tuple(agent for agent in AGENTS if frames[agent, "calib"])
-    for agent in AGENTS:
-        if agent not in agents and frames.pop((agent, "label")):
-            notices.append(f"{scenario.token}: {agent} has labels but no calib files and is left out")
+    notices = [
+        f"{scenario.token}: {agent} has labels but no calib files and is left out"
+        for agent in AGENTS
+        if frames[agent, "label"] and agent not in agents
+    ]
     labelled = tuple(agent for agent in agents if frames[agent, "label"])
     has_meta = os.path.exists(scenario.meta_path)  # noqa: PTH110 - Path.exists raises where the folder is closed
     if labelled and not has_meta:
         notices.append(f"{scenario.meta_path}: missing or closed: weather and collision of this scenario are unknown")
-    num_frames = max((found[-1] for found in frames.values() if found), default=0)
+    num_frames = max((found[-1] for (agent, _), found in frames.items() if found and agent in agents), default=0)
     for agent in agents:
         for kind in ("calib", "label") if agent in labelled else ("calib",):
             missing = sorted(set(range(1, num_frames + 1)) - set(frames[agent, kind]))

@@ -15,11 +15,13 @@ class SplitAssignment:
     Attributes:
         split_of: scenario token → split; absent where it is unknown.
         problems: scenario token → why it has no single place, a sentence each.
+        unlisted: scenarios that no split file lists, though there is one of every split.
         notices: what is odd but does not hinder, a sentence each.
     """
 
     split_of: Mapping[str, str]
     problems: Mapping[str, tuple[str, ...]]
+    unlisted: tuple[str, ...]
     notices: tuple[str, ...]
 
 
@@ -43,6 +45,7 @@ def assign_splits(layout: ReleaseLayout) -> SplitAssignment:
     return SplitAssignment(
         split_of={token: split for token, split in {**in_folder, **in_files}.items() if token in tokens},
         problems={token: tuple(messages) for token, messages in problems.items()},
+        unlisted=tuple(sorted(tokens - set(in_files))) if set(SPLITS) <= set(listed) else (),
         notices=tuple(
             f"{layout.split_files[split]}: lists {count} scenarios that are not in this release"
             for split, count in missing.items()

@@ -63,3 +63,14 @@ def test_written_text(path: Path) -> None:
     assert path.read_text() == f"{TYPE} {NAME}\n{TWIN} {NAME}\n"
     write_split_file(path, [])
     assert path.read_bytes() == b""
+
+
+def test_unique_names_both_lines(path: Path) -> None:
+    path.write_text(f"{TYPE} {NAME}\n\n{TWIN} {NAME}\n{TYPE}  {NAME}\n")
+    for raw in (False, True):
+        with pytest.raises(
+            SplitFileError, match=rf"train\.txt:4: '{TYPE} {NAME}' stands in line 1 already; remove one"
+        ):
+            read_split_file(path, raw=raw, unique=True)
+    path.write_text(f"{TYPE} {NAME}\n{TWIN} {NAME}\n")
+    assert read_split_file(path, unique=True) == [f"{TYPE}/{NAME}", f"{TWIN}/{NAME}"]

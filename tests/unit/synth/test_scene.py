@@ -13,9 +13,9 @@ from deepaccident_devkit.synth.config import SynthConfig
 from deepaccident_devkit.synth.lidar import scan
 from deepaccident_devkit.synth.look import make_look
 from deepaccident_devkit.synth.roads import tag_of_code
-from deepaccident_devkit.synth.scenario import WEATHERS, build_scenario, plan_scenarios
+from deepaccident_devkit.synth.scenario import build_scenario, plan_scenarios
 from deepaccident_devkit.synth.scene import GROUND, ground_distance, make_scene
-from deepaccident_devkit.taxonomy import TIMES_OF_DAY
+from deepaccident_devkit.taxonomy import TIMES_OF_DAY, WEATHERS
 
 
 @pytest.fixture(scope="module")

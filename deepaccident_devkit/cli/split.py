@@ -1,0 +1,51 @@
+"""`deepaccident split`: the official split, made again, or the scenarios that filters let through."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from deepaccident_devkit.cli.options import release_parameters, where_parameter
+from deepaccident_devkit.deepaccident import DeepAccident
+from deepaccident_devkit.splits import OFFICIAL_SEED, official_split, save_selection, split_report
+
+
+@click.command()
+@release_parameters
+@click.option("--seed", default=OFFICIAL_SEED, show_default=True, help="Of the official procedure's shuffles.")
+@click.option("--released-skip", is_flag=True, help="Pass over the twins that the released loop passes over.")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder for train.txt, val.txt, test.txt and the minis.")
+@where_parameter
+@click.option("--save", type=click.Path(path_type=Path), help="With --where: the split file to write.")
+@click.option("--overwrite", is_flag=True, help="Replace files that are there.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON object, for programs.")
+def split(
+    seed: int,
+    released_skip: bool,
+    out: Path | None,
+    where: tuple[str, ...],
+    save: Path | None,
+    overwrite: bool,
+    as_json: bool,
+    **release: Any,
+) -> None:
+    """Split the release under DATAROOT by the official procedure and print how it is distributed.
+
+    With --where, report the scenarios that meet all filters instead, and --save them as a split file.
+    """
+    if where and out:
+        raise click.UsageError("--out is for the official split; with --where give --save FILE")
+    if save and not where:
+        raise click.UsageError("--save is for a selection; give --where too, or --out FOLDER for the official split")
+    dataset = DeepAccident(**release)
+    if where:
+        chosen = [scenario["token"] for scenario in dataset.find(*where)]
+        written = [save_selection(chosen, save, overwrite=overwrite)] if save else []
+        report = split_report(dataset, {"selection": chosen})
+    else:
+        made = official_split(dataset, seed, released_skip=released_skip)
+        written = made.save(out, overwrite=overwrite) if out else []
+        report = split_report(dataset, made)
+    click.echo(report.to_json() if as_json else report.to_text())
+    for path in written:
+        click.echo(f"written: {path}", err=as_json)

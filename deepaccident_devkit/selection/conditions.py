@@ -1,0 +1,162 @@
+"""One filter on one field: as a text, as a keyword's value, and as the test that it comes to."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.selection.fields import Field, Value
+from deepaccident_devkit.text import possible_text
+
+FilterValue = Value | Collection[Value]
+"""What a keyword of `find` takes: a value, or several of which any will do."""
+
+_TEXT = re.compile(r"\s*(\w+)\s*(!=|>=|<=|=|>|<)(.*)", re.DOTALL)
+_RANGE = re.compile(r"(-?\d+)?\s*\.\.\s*(-?\d+)?")
+_BOUND = re.compile(r"(>=|<=|>|<)\s*(-?\d+)")
+_UNKNOWN = ("unknown", "none")
+_FLAGS = {"true": True, "yes": True, "false": False, "no": False}
+
+
+@dataclass(frozen=True, slots=True)
+class Filter:
+    """A field and the values that are wanted of it, as given.
+
+    Attributes:
+        name: the field's name or its short form.
+        values: any of them will do.
+        negated: whether those scenarios are wanted instead that have none of the values.
+    """
+
+    name: str
+    values: tuple[Any, ...]
+    negated: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """A filter that was checked against its field.
+
+    Attributes:
+        field: what is looked at.
+        values: the single values that will do, None among them for unknown.
+        ranges: (lowest, highest) of the numbers that will do; None for no bound.
+        negated: as of `Filter`.
+    """
+
+    field: Field
+    values: frozenset[Value]
+    ranges: tuple[tuple[int | None, int | None], ...]
+    negated: bool
+
+    def holds(self, value: Value) -> bool:
+        """Whether a scenario with this value of the field is wanted."""
+        return (value in self.values or any(_within(value, *bounds) for bounds in self.ranges)) != self.negated
+
+
+def parse_where(text: str) -> Filter:
+    """Read a filter such as `town=Town03,Town05`, `weather!=Clear`, `length>=50` or `length=40..60`.
+
+    Field and values are checked where the filter is used, as those of keywords are.
+
+    Raises:
+        ChoiceError: the text has no field, no sign or no value.
+    """
+    match = _TEXT.fullmatch(text)
+    values = [value.strip() for value in match[3].split(",")] if match else []
+    if match is None or not all(values):
+        raise ChoiceError(
+            f"expected field=value[,value…] with one of the signs =, !=, >=, <=, > and <, found '{text}'; such as "
+            "town=Town03,Town05 or length=40..60"
+        )
+    name, sign = match[1], match[2]
+    if sign in {"=", "!="}:
+        return Filter(name, tuple(values), negated=sign == "!=")
+    if len(values) > 1:
+        raise ChoiceError(f"'{text}': {sign} takes one number, found {len(values)}")
+    return Filter(name, (f"{sign}{values[0]}",))
+
+
+def keyword_filter(name: str, value: FilterValue) -> Filter:
+    """The filter that a keyword of `find` stands for."""
+    several = isinstance(value, Collection) and not isinstance(value, str)
+    return Filter(name, tuple(value) if several else (value,))  # type: ignore[arg-type]
+
+
+def condition_of(wanted: Filter, field: Field, here: Iterable[Value]) -> Condition:
+    """Check a filter's values against its field.
+
+    Args:
+        wanted: the filter.
+        field: the field that it names.
+        here: the values that the field has in this release, which are possible whatever else is known of it.
+
+    Raises:
+        ChoiceError: a value that the field cannot have.
+    """
+    possible = list(dict.fromkeys([*field.known, *sorted({str(value) for value in here if value is not None})]))
+    singles: set[Value] = set()
+    ranges = []
+    for value in wanted.values:
+        bounds = _bounds(field, value) if isinstance(value, str) else None
+        if bounds is not None:
+            ranges.append(bounds)
+        else:
+            singles.add(_single(field, value, [str(word) for word in possible]))
+    return Condition(field, frozenset(singles), tuple(ranges), wanted.negated)
+
+
+def _single(field: Field, value: object, possible: list[str]) -> Value:
+    """One value of a field, in the field's own type."""
+    if value is None or (isinstance(value, str) and value.lower() in _UNKNOWN):
+        return None
+    if field.kind == "flag":
+        flag = _FLAGS.get(value.lower()) if isinstance(value, str) else value
+        if isinstance(flag, bool):
+            return flag
+        raise ChoiceError(f"{field.name}: expected true, false or unknown, found {value!r}")
+    if field.kind == "number":
+        return _number(field, value)
+    if isinstance(value, str) and value in possible:
+        return value
+    raise ChoiceError(f"{field.name}: found {value!r}; possible are {possible_text(str(value), possible)}")
+
+
+def _number(field: Field, value: object) -> int:
+    is_text = isinstance(value, str) and re.fullmatch(r"-?\d+", value) is not None
+    # an index of numpy's or pandas' is a number too; a bool is none
+    number = int(str(value)) if is_text or (hasattr(value, "__index__") and not isinstance(value, bool)) else None
+    if number is None:
+        raise ChoiceError(
+            f"{field.name}: expected a number, a range such as 40..60 or a bound such as >=50, found {value!r}"
+        )
+    if field.known and number not in field.known:
+        raise ChoiceError(f"{field.name}: found {number}; possible are {', '.join(map(str, field.known))}")
+    return number
+
+
+def _bounds(field: Field, text: str) -> tuple[int | None, int | None] | None:
+    """The lowest and highest number that a text allows; None if it is no range."""
+    text = text.strip()
+    if (bound := _BOUND.fullmatch(text)) is not None:
+        number = int(bound[2])
+        ends = {">=": (number, None), ">": (number + 1, None), "<=": (None, number), "<": (None, number - 1)}[bound[1]]
+    elif (between := _RANGE.fullmatch(text)) is not None:
+        ends = (int(between[1]) if between[1] else None, int(between[2]) if between[2] else None)
+    else:
+        return None
+    if field.kind != "number":
+        raise ChoiceError(f"{field.name}: '{text}' is a range, which only numbers have")
+    lowest, highest = ends
+    if lowest is not None and highest is not None and lowest > highest:
+        raise ChoiceError(f"{field.name}: '{text}': {lowest} is more than {highest}")
+    return ends
+
+
+def _within(value: Value, lowest: int | None, highest: int | None) -> bool:
+    if not isinstance(value, int):
+        return False
+    return (lowest is None or lowest <= value) and (highest is None or value <= highest)

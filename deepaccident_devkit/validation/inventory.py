@@ -1,0 +1,85 @@
+"""Which sensor files there are, by their names and sizes: nothing is opened."""
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from deepaccident_devkit.errors import ReleaseError
+from deepaccident_devkit.release import ScenarioFolder
+from deepaccident_devkit.release.layout import frame_numbers
+from deepaccident_devkit.tables import Finding
+from deepaccident_devkit.tables.findings import finding_of
+from deepaccident_devkit.tables.scan import ScenarioScan, frame_ranges
+from deepaccident_devkit.taxonomy import AGENTS, CHANNEL_FORMAT, CHANNELS
+from deepaccident_devkit.validation.subject import frames_text, make_finding
+
+Recording = tuple[str, str]
+"""Agent and kind of file: `label`, `calib` or a channel."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Inventory:
+    """The sensor files of one scenario.
+
+    Attributes:
+        frames: agent and channel → frame numbers, for folders that have any.
+    """
+
+    frames: Mapping[Recording, list[int]]
+
+
+def take_inventory(scenario: ScenarioFolder, scan: ScenarioScan) -> tuple[Inventory, list[Finding]]:
+    """List a scenario's sensor folders; a channel that is wholly absent was not downloaded, and is no finding."""
+    findings: list[Finding] = []
+    frames: dict[Recording, list[int]] = {}
+    for agent in scan.agents:
+        for channel in CHANNELS:
+            folder = scenario.kind_folder(agent, channel)
+            try:
+                found, odd = frame_numbers(folder, CHANNEL_FORMAT[channel])
+            except ReleaseError as error:
+                findings.append(finding_of(error, "folder-unreadable", scenario.token))
+                continue
+            if odd:
+                names = ", ".join(odd[:3])
+                findings.append(make_finding("sensor-odd-name", scenario.token, str(folder), f"{len(odd)}: {names}"))
+            if found:
+                frames[agent, channel] = found
+                findings += _frame_findings(scenario, scan, agent, channel, found)
+    return Inventory(frames=frames), findings
+
+
+def absences(scenario: ScenarioFolder, scan: ScenarioScan) -> Iterator[Finding]:
+    """What a partial download lacks as a whole: agents, labels, meta."""
+    token = scenario.token
+    missing = [agent for agent in AGENTS if agent not in scan.agents]
+    with_labels = [agent for agent in missing if scenario.kind_folder(agent, "label").is_dir()]
+    for agent in with_labels:
+        where = str(scenario.kind_folder(agent, "calib"))
+        yield make_finding("labels-without-calib", token, where, f"{agent} has labels, but no calib files")
+    missing = [agent for agent in missing if agent not in with_labels]
+    if missing:
+        yield make_finding("agent-missing", token, token, f"has no {', '.join(missing)}")
+    unlabelled = [agent for agent in scan.agents if agent not in scan.labelled]
+    if unlabelled:
+        code = "agent-unlabelled" if scan.labelled else "unlabelled"
+        yield make_finding(code, token, token, f"no labels of {', '.join(unlabelled)}")
+    if scan.labelled and not scan.has_meta:
+        yield make_finding("meta-missing", token, str(scenario.meta_path), "missing or closed")
+
+
+def _frame_findings(
+    scenario: ScenarioFolder, scan: ScenarioScan, agent: str, channel: str, found: list[int]
+) -> Iterator[Finding]:
+    folder = scenario.kind_folder(agent, channel)
+    expected = set(range(1, scan.num_frames + 1))
+    missing, extra = sorted(expected - set(found)), sorted(set(found) - expected)
+    if missing:
+        what = f"lacks {frames_text(missing)} of 1 to {scan.num_frames}"
+        yield make_finding("sensor-frames-missing", scenario.token, str(folder), what)
+    if extra:
+        what = f"has frames {frame_ranges(extra)} beyond {scan.num_frames}"
+        yield make_finding("sensor-frames-extra", scenario.token, str(folder), what)
+    empty = [entry.name for entry in os.scandir(folder) if entry.is_file() and not entry.stat().st_size]
+    for name in sorted(empty):
+        yield make_finding("sensor-empty", scenario.token, str(folder / name), "has no bytes")

@@ -1,0 +1,182 @@
+"""What one agent's labels say by themselves: ids, sizes, own rows, tracks (format.md, label)."""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray
+from deepaccident_devkit.tables import Finding
+from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID, UNTRACKED_ID
+from deepaccident_devkit.validation.subject import Subject, frames_text
+
+MOST_ACTOR_ID = 2_000_000
+"""The released code drops ids from here on."""
+LENGTHS: dict[str, tuple[float, float]] = {
+    "car": (1.8, 7.5),
+    "truck": (3.0, 20.0),
+    "van": (2.5, 9.0),
+    "cyclist": (0.3, 3.0),
+    "motorcycle": (0.5, 3.5),
+    "pedestrian": (0.1, 1.6),
+}
+"""Metres, shortest and longest of each class."""
+LARGEST_SIZE = 5.0
+"""Metres that no road user is wide or high."""
+OWN_OFFSET = 0.6
+"""Metres that the own row's box may lie off the agent's origin; the real ones reach 0.3."""
+OWN_VELOCITY = 0.05
+"""m/s between the own row and the first line, which print the same number with other digits."""
+SAME_PLACE = 0.05
+"""Metres within which two boxes of a class stand in the same place."""
+SIZE_CHANGE = 0.02
+JUMP = 0.6
+"""Metres that an actor may be off the middle of its neighbours in time: 120 m/s²."""
+TURN = np.radians(40.0)
+"""Heading that a car may be off the middle of its neighbours in time."""
+LAST_FRAMES = 2
+"""Frames at the end in which a collision may throw its pair about."""
+_FOUR_WHEELS = [CATEGORIES.index(name) for name in ("car", "truck", "van")]
+NEAR = 40.0
+"""Metres within which an actor is not lost from one frame to the next; further off tracking comes and goes."""
+
+
+def check_labels(subject: Subject) -> Iterator[Finding]:
+    """Everything that one label, or one agent's labels, show without the others."""
+    for check in _CHECKS:
+        yield from check(subject)
+
+
+def _ids(subject: Subject) -> Iterator[Finding]:
+    label_id = subject.label_id
+    odd = (label_id < UNTRACKED_ID) & (label_id != OWN_ACTOR_ID) | (label_id >= MOST_ACTOR_ID)
+    yield from subject.label_findings("odd-id", odd, "ids that the format does not know")
+    repeated = _repeated(np.column_stack([subject.boxes.sample, label_id])) & (label_id != UNTRACKED_ID)
+    yield from subject.label_findings("duplicate-id", repeated & ~subject.own, "an id occurs twice in one label")
+
+
+def _same_places(subject: Subject) -> Iterator[Finding]:
+    from scipy.spatial import cKDTree
+
+    labels, sample = subject.boxes.labels, subject.boxes.sample
+    apart = 10 * SAME_PLACE  # samples and classes lie apart in the tree, so that only boxes of one can be near
+    tree = cKDTree(np.column_stack([labels.center, sample * apart * 10, labels.category * apart]))
+    doubled = np.zeros(len(sample), dtype=bool)
+    doubled[tree.query_pairs(SAME_PLACE, output_type="ndarray").ravel()] = True
+    yield from subject.label_findings("duplicate-box", doubled, "two boxes stand in the same place")
+
+
+def _sizes_and_points(subject: Subject) -> Iterator[Finding]:
+    size = subject.boxes.labels.size
+    shortest, longest = np.array([LENGTHS[name] for name in CATEGORIES])[subject.boxes.labels.category].T
+    odd: BoolArray = np.any(size <= 0, axis=1) | np.any(size[:, 1:] > LARGEST_SIZE, axis=1)
+    odd |= (size[:, 0] < shortest) | (size[:, 0] > longest) | (_is_car(subject) & (size[:, 0] < size[:, 1]))
+    yield from subject.label_findings("odd-size", odd, "sizes that their classes do not have")
+    yield from subject.label_findings("odd-points", subject.boxes.labels.num_lidar_pts < 0, "less than 0 LiDAR points")
+    unknown: BoolArray = np.any(np.isnan(subject.boxes.labels.velocity), axis=1)
+    yield from subject.label_findings("velocity-unknown", unknown, "velocities that are no numbers")
+
+
+def _own_rows(subject: Subject) -> Iterator[Finding]:
+    labelled = [agent in subject.files.scan.labelled for agent in subject.agents]
+    count = np.bincount(subject.boxes.sample[subject.own], minlength=subject.files.num_samples)
+    for agent, counts in enumerate(count.reshape(len(subject.agents), -1)):
+        if not labelled[agent]:
+            continue
+        expected = 0 if subject.is_pole(agent) else 1
+        for code, frames in (
+            ("own-row-missing", np.flatnonzero(counts < expected) + 1),
+            ("own-row-odd", np.flatnonzero(counts > expected) + 1),
+        ):
+            if len(frames):
+                what = f"expected {expected} rows of id {OWN_ACTOR_ID}, found another number in {frames_text(frames)}"
+                yield subject.finding(code, subject.label_where(agent), what)
+
+
+def _own_boxes(subject: Subject) -> Iterator[Finding]:
+    rows = np.flatnonzero(subject.own)
+    ego = subject.files.calibs.world_from_ego[subject.boxes.sample[rows], :2, 3]
+    far = np.zeros(len(subject.own), dtype=bool)
+    far[rows] = np.linalg.norm(subject.centers[rows, :2] - ego, axis=1) > OWN_OFFSET
+    yield from subject.label_findings("own-box-off", far, f"the own box is over {OWN_OFFSET} m off the agent's origin")
+    first_line = np.full((subject.files.num_samples, 2), np.nan)
+    labelled = np.repeat([agent in subject.files.scan.labelled for agent in subject.agents], subject.num_frames)
+    first_line[labelled] = subject.files.labels.agent_velocity
+    differs = np.zeros(len(subject.own), dtype=bool)
+    difference = np.abs(subject.boxes.labels.velocity[rows] - first_line[subject.boxes.sample[rows]]).max(axis=1)
+    differs[rows] = difference > OWN_VELOCITY
+    yield from subject.label_findings("own-velocity", differs, "the own velocity is not that of the first line")
+
+
+def _tracks(subject: Subject) -> Iterator[Finding]:
+    """Changes along each track: one agent's rows of one id."""
+    rows = np.flatnonzero(subject.seen)
+    boxes = subject.boxes
+    rows = rows[np.lexsort((boxes.frame[rows], subject.label_id[rows], boxes.agent[rows]))]
+    frame = boxes.frame[rows]
+    same = (subject.label_id[rows][1:] == subject.label_id[rows][:-1]) & (
+        boxes.agent[rows][1:] == boxes.agent[rows][:-1]
+    )
+    for code, changed in (
+        ("class-changes", boxes.labels.category[rows][1:] != boxes.labels.category[rows][:-1]),
+        ("size-changes", (np.abs(np.diff(boxes.labels.size[rows], axis=0)) > SIZE_CHANGE).any(axis=1)),
+    ):
+        yield from subject.label_findings(code, _mask(subject, rows[1:][same & changed]), "changes along the track")
+    step = np.diff(frame)
+    three = same[1:] & same[:-1] & (step[1:] == 1) & (step[:-1] == 1)
+    bend = np.linalg.norm(_second_difference(subject.centers[rows]), axis=1) / 2
+    free = ~(_in_collision(subject)[rows[1:-1]] & (frame[2:] > subject.num_frames - LAST_FRAMES))
+    jumps = three & (bend > JUMP) & free
+    yield from subject.label_findings(
+        "track-jump", _mask(subject, rows[1:-1][jumps]), f"over {JUMP} m off the middle of the frames around"
+    )
+    yaw = subject.yaw[rows]
+    steps = np.abs(np.arctan2(np.sin(np.diff(yaw)), np.cos(np.diff(yaw))))
+    turns = three & free & _is_car(subject)[rows[1:-1]] & (steps[1:] > TURN) & (steps[:-1] > TURN)
+    yield from subject.label_findings("track-turn", _mask(subject, rows[1:-1][turns]), "turned to and fro")
+    near = np.linalg.norm(boxes.labels.center[rows], axis=1) < NEAR
+    gap = same & (step > 1) & near[1:] & near[:-1]
+    yield from subject.label_findings(
+        "track-gap", _mask(subject, rows[1:][gap]), f"missing in the frames before, though within {NEAR:.0f} m"
+    )
+
+
+def _is_car(subject: Subject) -> BoolArray:
+    """(N,) boxes of what has four wheels."""
+    return np.isin(subject.boxes.labels.category, _FOUR_WHEELS)
+
+
+def _in_collision(subject: Subject) -> BoolArray:
+    """(N,) boxes of meta's pair; all, where meta does not say."""
+    meta = subject.files.meta
+    if meta is None:
+        return np.ones(len(subject.boxes), dtype=bool)
+    return np.isin(subject.boxes.actor, meta.collision.ids if meta.collision else ())
+
+
+def _second_difference(values: FloatArray) -> FloatArray:
+    return values[2:] - 2 * values[1:-1] + values[:-2] if len(values) > 2 else np.zeros((0, values.shape[1]))
+
+
+def _mask(subject: Subject, rows: AnyArray) -> BoolArray:
+    mask = np.zeros(len(subject.boxes), dtype=bool)
+    mask[rows] = True
+    return mask
+
+
+def _repeated(keys: AnyArray) -> BoolArray:
+    """Which rows of keys (N, K) occur more than once."""
+    if not len(keys):
+        return np.zeros(0, dtype=bool)
+    _, inverse, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+    repeated: BoolArray = count[inverse.reshape(-1)] > 1
+    return repeated
+
+
+_CHECKS: tuple[Callable[[Subject], Iterator[Finding]], ...] = (
+    _ids,
+    _same_places,
+    _sizes_and_points,
+    _own_rows,
+    _own_boxes,
+    _tracks,
+)

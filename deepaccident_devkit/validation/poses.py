@@ -1,0 +1,142 @@
+"""Are the agents where vehicles can be, and their sensors where the format says (format.md, calib)."""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from deepaccident_devkit.arrays import BoolArray, FloatArray
+from deepaccident_devkit.tables import Finding
+from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD
+from deepaccident_devkit.validation.subject import Subject, frames_text
+
+CAMERA_YAW = dict(zip(CAMERAS, (0.0, 55.0, -55.0, 180.0, 110.0, -110.0), strict=True))
+"""Degrees to the left of the agent's front."""
+CAMERA_FIELD = {**dict.fromkeys(CAMERAS, 70.0), "Camera_Back": 110.0}
+"""Horizontal field of view, degrees."""
+_YAW_TOLERANCE = 5.0
+_FIELD_TOLERANCE = 0.02
+_FURTHEST_CAMERA = 6.0
+_LIDAR_HEIGHTS = (0.8, 4.5)
+_MOUNT_CHANGE = 0.01
+_POLE_CHANGE = 0.02
+_JUMP = 0.75
+"""Metres off the middle of the frames around."""
+_LAST_FRAMES = 2
+_SPEED_DIFFERENCE = (1.0, 0.2)
+"""m/s, and as a share of the speed, between a label's first line and the displacement around it."""
+
+
+def check_poses(subject: Subject) -> Iterator[Finding]:
+    """Everything that the calib files of a scenario show, and the labels' first lines beside them."""
+    for agent in range(len(subject.agents)):
+        for check in _CHECKS:
+            yield from check(subject, agent)
+
+
+def _frames_of(subject: Subject, agent: int) -> slice:
+    return slice(agent * subject.num_frames, (agent + 1) * subject.num_frames)
+
+
+def _intrinsics(subject: Subject, agent: int) -> Iterator[Finding]:
+    intrinsic = subject.files.calibs.intrinsic[_frames_of(subject, agent)]
+    focal = intrinsic[..., (0, 1), (0, 1)]
+    rest = np.abs(intrinsic[..., (0, 1, 2, 2, 2), (1, 0, 0, 1, 2)] - (0.0, 0.0, 0.0, 0.0, 1.0))
+    pinhole: BoolArray = np.asarray((focal > 0).all(axis=-1) & (rest < 1e-6).all(axis=-1))
+    ratio = focal[..., 0] / np.where(intrinsic[..., 0, 2] > 0, intrinsic[..., 0, 2], np.nan)
+    expected = 1 / np.tan(np.radians([CAMERA_FIELD[camera] for camera in CAMERAS]) / 2)
+    odd = pinhole & ~(np.abs(ratio / expected - 1) < _FIELD_TOLERANCE)
+    yield from _camera_findings(subject, agent, "intrinsic-form", ~pinhole, "is no pinhole camera's K")
+    yield from _camera_findings(subject, agent, "intrinsic-odd", odd, "its f does not fit its field of view")
+
+
+def _cameras(subject: Subject, agent: int) -> Iterator[Finding]:
+    pose = subject.files.calibs.camera_from_lidar[_frames_of(subject, agent)]
+    forward = pose[..., 2, :3]  # the optical axis in the LiDAR frame
+    yaw = np.degrees(np.arctan2(forward[..., 1], forward[..., 0]))
+    off = np.abs((yaw - [CAMERA_YAW[camera] for camera in CAMERAS] + 180) % 360 - 180)
+    position = -np.einsum("...ji,...j->...i", pose[..., :3, :3], pose[..., :3, 3])
+    far = np.linalg.norm(position, axis=-1) > _FURTHEST_CAMERA
+    bad: BoolArray = (off > _YAW_TOLERANCE) | far
+    yield from _camera_findings(subject, agent, "camera-misplaced", bad, "looks another way, or is far from the LiDAR")
+
+
+def _camera_findings(subject: Subject, agent: int, code: str, bad: BoolArray, what: str) -> Iterator[Finding]:
+    """A finding a camera for a mask (F, 6)."""
+    for camera, frames in zip(CAMERAS, bad.T, strict=True):
+        if frames.any():
+            where = f"{subject.calib_where(agent)}: {camera}"
+            yield subject.finding(code, where, f"{what}, {frames_text(np.flatnonzero(frames) + 1)}")
+
+
+def _mounts(subject: Subject, agent: int) -> Iterator[Finding]:
+    calibs, frames = subject.files.calibs, _frames_of(subject, agent)
+    lidar = calibs.ego_from_lidar[frames]
+    height = lidar[:, 2, 3]
+    if subject.is_pole(agent):
+        odd = np.abs(lidar - np.eye(4)).max(axis=(1, 2)) > _MOUNT_CHANGE
+        expected = "expected the identity on a pole"
+    else:
+        odd = (height < _LIDAR_HEIGHTS[0]) | (height > _LIDAR_HEIGHTS[1])
+        expected = "expected {} to {} m above the road".format(*_LIDAR_HEIGHTS)
+    if odd.any():
+        yield subject.finding(
+            "lidar-height", subject.calib_where(agent), f"{expected}, {frames_text(np.flatnonzero(odd) + 1)}"
+        )
+    mounts = {"lidar_to_ego": lidar, "lidar_to_Camera": calibs.camera_from_lidar[frames]}
+    for name, pose in mounts.items():
+        change = np.abs(pose - np.median(pose, axis=0)).reshape(len(pose), -1).max(axis=1)
+        if (change > _MOUNT_CHANGE).any():
+            what = (
+                f"{name} changes by up to {change.max():.2f}, {frames_text(np.flatnonzero(change > _MOUNT_CHANGE) + 1)}"
+            )
+            yield subject.finding("calib-changes", subject.calib_where(agent), what)
+    intrinsic = calibs.intrinsic[frames]
+    if (np.abs(intrinsic - intrinsic[0]) > 1.0).any():
+        yield subject.finding("calib-changes", subject.calib_where(agent), "intrinsics change")
+
+
+def _path(subject: Subject, agent: int) -> Iterator[Finding]:
+    position = subject.positions[agent]
+    where = subject.calib_where(agent)
+    up = subject.files.calibs.world_from_ego[_frames_of(subject, agent), 2, 2]
+    if (up < np.cos(np.radians(45))).any():
+        tilted = np.flatnonzero(up < np.cos(np.radians(45))) + 1
+        yield subject.finding("pose-tilted", where, f"over 45° in {frames_text(tilted)}")
+    if subject.is_pole(agent):
+        pose = subject.files.calibs.world_from_ego[_frames_of(subject, agent)]
+        moved = np.abs(pose - np.median(pose, axis=0)).max(axis=(1, 2)) > _POLE_CHANGE
+        if moved.any():
+            yield subject.finding("pole-moves", where, frames_text(np.flatnonzero(moved) + 1))
+        return
+    bend = np.linalg.norm(position[2:] - 2 * position[1:-1] + position[:-2], axis=1) / 2
+    jumps = np.flatnonzero(bend > _JUMP) + 2
+    jumps = jumps[jumps <= subject.num_frames - 1 - _LAST_FRAMES]
+    if len(jumps):
+        yield subject.finding("pose-jump", where, f"over {_JUMP} m off the frames around at {frames_text(jumps)}")
+
+
+def _speed(subject: Subject, agent: int) -> Iterator[Finding]:
+    """A label's first line against the agent's displacement: central differences, but not in the last frames."""
+    name = subject.agents[agent]
+    if name not in subject.files.scan.labelled:
+        return
+    start = list(subject.files.scan.labelled).index(name) * subject.num_frames
+    said = subject.files.labels.agent_velocity[start : start + subject.num_frames]
+    moved = _central(subject.positions[agent, :, :2])
+    least, share = _SPEED_DIFFERENCE
+    off = np.linalg.norm(said - moved, axis=1) > least + share * np.linalg.norm(moved, axis=1)
+    off[max(0, subject.num_frames - _LAST_FRAMES) :] = False
+    if off.any():
+        what = f"the first line is over {least:.0f} m/s off the displacement, {frames_text(np.flatnonzero(off) + 1)}"
+        yield subject.finding("speed-off", subject.label_where(agent), what)
+
+
+def _central(position: FloatArray) -> FloatArray:
+    """(F, 2) m/s from positions (F, 2) at 10 Hz; one-sided at the ends, 0 for a single frame."""
+    if len(position) < 2:
+        return np.zeros_like(position)
+    velocity: FloatArray = np.gradient(position, FRAME_PERIOD, axis=0)
+    return velocity
+
+
+_CHECKS: tuple[Callable[[Subject, int], Iterator[Finding]], ...] = (_intrinsics, _cameras, _mounts, _path, _speed)

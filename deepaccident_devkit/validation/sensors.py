@@ -1,0 +1,264 @@
+"""What only the sensor files show (`--deep`): every image and array is decoded."""
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
+from deepaccident_devkit.errors import ReleaseError
+from deepaccident_devkit.files import file_checksum
+from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.release import read_bev, read_image, read_lidar
+from deepaccident_devkit.release.bev_camera import TAGS
+from deepaccident_devkit.tables import Finding
+from deepaccident_devkit.tables.findings import finding_of
+from deepaccident_devkit.taxonomy import (
+    BEV_CAMERA,
+    BEV_RESOLUTION,
+    BEV_SHAPE,
+    CAMERAS,
+    CATEGORIES,
+    LIDAR,
+    OWN_ACTOR_ID,
+)
+from deepaccident_devkit.validation.inventory import Inventory
+from deepaccident_devkit.validation.subject import Subject, frames_text
+
+LIDAR_RANGE = 75.0
+"""Metres; the real LiDAR ends at 70."""
+POINT_COUNT = (3, 0.1)
+"""Points, and as a share, by which a box's count may be off."""
+_BEV_HALF = 55.0
+_VEHICLES = tuple(CATEGORIES.index(name) for name in ("car", "truck", "van"))
+_BEV_LEAST_SHARE = 0.5
+_THUMBNAIL = (32, 18)
+_OUT_OF_SEQUENCE = 3.0
+"""How many times further an image may be from its neighbours in time than these are from each other."""
+_LEAST_DIFFERENCE = 6.0
+"""Grey levels; below it images are the same to the eye."""
+_BLANK = 40.0
+"""Grey levels between the darkest and the lightest spot of a picture that shows something."""
+_STILL = 0.02
+"""Metres an agent may move while its pictures stay the same."""
+
+ORIENTATIONS: dict[str, str] = {
+    "forward-up": "as the format says",
+    "mirrored": "left and right exchanged",
+    "backward-up": "turned by half",
+    "mirrored-backward": "front and rear exchanged",
+    "left-up": "turned by a quarter, left up",
+    "right-up": "turned by a quarter, right up",
+    "transposed": "rows and columns exchanged",
+    "anti-transposed": "rows and columns exchanged, and turned by half",
+}
+"""The eight ways in which the BEV camera's picture could lie."""
+
+
+@dataclass(slots=True)
+class _BevHits:
+    """Vehicles whose centre has the vehicle's tag, for one recording: under each orientation, and frame by frame."""
+
+    boxes: int = 0
+    hits: dict[str, int] = field(default_factory=lambda: dict.fromkeys(ORIENTATIONS, 0))
+    poor_frames: list[int] = field(default_factory=list)
+
+
+def check_sensors(subject: Subject, inventory: Inventory) -> Iterator[Finding]:
+    """Decode all sensor files of a scenario and hold them against its labels and calib files."""
+    checksums: dict[str, list[tuple[str, str, int]]] = defaultdict(list)
+    for (agent, channel), frames in inventory.frames.items():
+        usable = [frame for frame in frames if frame <= subject.num_frames]
+        paths = {frame: subject.files.scenario.channel_path(agent, channel, frame) for frame in usable}
+        row = subject.agents.index(agent)
+        blank: list[int] = []
+        if channel in CAMERAS:
+            yield from _images(subject, row, channel, paths, blank)
+        elif channel == LIDAR:
+            yield from _clouds(subject, row, paths)
+        else:
+            yield from _bevs(subject, row, paths)
+        for frame, path in paths.items():
+            if frame not in blank:
+                checksums[file_checksum(path)].append((agent, channel, frame))
+    yield from _repeated(subject, checksums)
+
+
+def _images(
+    subject: Subject, agent: int, channel: str, paths: Mapping[int, Path], blank: list[int]
+) -> Iterator[Finding]:
+    """Decode a camera's images; the frames that show nothing (a wall, fog) go to `blank`."""
+    import cv2
+
+    thumbnails: dict[int, FloatArray] = {}
+    sizes: dict[int, tuple[int, int]] = {}
+    for frame, path in paths.items():
+        try:
+            image = read_image(path)
+        except ReleaseError as error:
+            yield finding_of(error, "sensor-unreadable", subject.token)
+            continue
+        sizes[frame] = (image.shape[1], image.shape[0])
+        thumbnails[frame] = cv2.resize(image, _THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.float64)
+    yield from _image_sizes(subject, agent, channel, sizes)
+    blank += [frame for frame, picture in thumbnails.items() if np.ptp(picture, axis=(0, 1)).max() < _BLANK]
+    odd = out_of_sequence(thumbnails)
+    if odd:
+        folder = subject.files.scenario.kind_folder(subject.agents[agent], channel)
+        what = f"does not fit between its neighbours, {frames_text(odd)}"
+        yield subject.finding("image-out-of-sequence", str(folder), what)
+
+
+def _image_sizes(subject: Subject, agent: int, channel: str, sizes: Mapping[int, tuple[int, int]]) -> Iterator[Finding]:
+    """Every image must be as large as its K says: twice the principal point."""
+    camera = CAMERAS.index(channel)
+    for frame, (width, height) in sizes.items():
+        intrinsic = subject.files.calibs.intrinsic[agent * subject.num_frames + frame - 1, camera]
+        expected = 2 * intrinsic[:2, 2]
+        if np.abs(expected - (width, height)).max() > 1:
+            path = subject.files.scenario.channel_path(subject.agents[agent], channel, frame)
+            what = f"is {width}x{height}, K says {expected[0]:.0f}x{expected[1]:.0f}"
+            yield subject.finding("image-size", str(path), what)
+
+
+def out_of_sequence(thumbnails: Mapping[int, FloatArray]) -> list[int]:
+    """Frames whose picture (h, w, 3) is much further from both neighbours than these are from each other.
+
+    At the ends, where there is one neighbour, its distance is held against that of the next step, unless the neighbour
+    shows nothing: what hid the view may just have gone.
+    """
+    frames = sorted(thumbnails)
+    if len(frames) < 3:
+        return []
+    pictures = np.stack([thumbnails[frame] for frame in frames])
+    step = _distance(pictures[1:], pictures[:-1])
+    over = _distance(pictures[2:], pictures[:-2])
+    least = np.minimum(step[1:], step[:-1])
+    odd = np.zeros(len(frames), dtype=bool)
+    odd[1:-1] = least > np.maximum(_OUT_OF_SEQUENCE * over, _LEAST_DIFFERENCE)
+    usual = np.median(step)
+    for end, inner, first, second in ((0, 1, step[0], step[1]), (-1, -2, step[-1], step[-2])):
+        told = not odd[inner] and np.ptp(pictures[inner], axis=(0, 1)).max() >= _BLANK
+        odd[end] = told and first > max(_OUT_OF_SEQUENCE * max(second, usual), _LEAST_DIFFERENCE)
+    return [frame for frame, is_odd in zip(frames, odd.tolist(), strict=True) if is_odd]
+
+
+def _distance(first: FloatArray, second: FloatArray) -> FloatArray:
+    distance: FloatArray = np.abs(first - second).mean(axis=(1, 2, 3))
+    return distance
+
+
+def _clouds(subject: Subject, agent: int, paths: Mapping[int, Path]) -> Iterator[Finding]:
+    odd, differing = [], {}
+    for frame, path in paths.items():
+        try:
+            points = read_lidar(path).xyz
+        except ReleaseError as error:
+            yield finding_of(error, "sensor-unreadable", subject.token)
+            continue
+        if not np.isfinite(points).all() or (len(points) and np.abs(points).max() > LIDAR_RANGE):
+            odd.append(frame)
+        boxes = _sample_boxes(subject, agent, frame)
+        if len(boxes):
+            counted = boxes.contains(points).sum(axis=1)
+            off = np.abs(counted - boxes.num_lidar_pts)
+            least, share = POINT_COUNT
+            wrong = off > np.maximum(least, share * np.maximum(counted, boxes.num_lidar_pts))
+            if wrong.any():
+                differing[frame] = int(wrong.sum())
+    folder = str(subject.files.scenario.kind_folder(subject.agents[agent], LIDAR))
+    if odd:
+        what = f"points that are no numbers, or beyond {LIDAR_RANGE:.0f} m, {frames_text(odd)}"
+        yield subject.finding("points-odd", folder, what)
+    if differing:
+        what = f"{sum(differing.values())} boxes hold other points than their labels count, {frames_text(differing)}"
+        yield subject.finding("points-differ", folder, what)
+
+
+def _sample_boxes(subject: Subject, agent: int, frame: int) -> Boxes:
+    """The boxes of one label in its LiDAR frame."""
+    rows = np.flatnonzero(subject.boxes.sample == agent * subject.num_frames + frame - 1)
+    return subject.lidar_boxes.select(rows)
+
+
+def _bevs(subject: Subject, agent: int, paths: Mapping[int, Path]) -> Iterator[Finding]:
+    total = _BevHits()
+    for frame, path in paths.items():
+        try:
+            semantic = read_bev(path).semantic
+        except ReleaseError as error:
+            yield finding_of(error, "sensor-unreadable", subject.token)
+            continue
+        places = _vehicle_places(subject, agent, frame)
+        if not len(places):
+            continue
+        hits = {name: _hits(semantic, _turned(places, name)) for name in ORIENTATIONS}
+        total.boxes += len(places)
+        for name, hit in hits.items():
+            total.hits[name] += int(hit.sum())
+        if len(places) > 2 and hits["forward-up"].mean() < _BEV_LEAST_SHARE:
+            total.poor_frames.append(frame)
+    folder = str(subject.files.scenario.kind_folder(subject.agents[agent], BEV_CAMERA))
+    best = max(total.hits, key=lambda name: total.hits[name])
+    if total.hits[best] > total.hits["forward-up"] + max(2, 0.25 * total.boxes) and total.boxes:
+        shown = f"{total.hits[best]} of {total.boxes} vehicles are where the labels have them if it is '{best}'"
+        what = f"{shown} ({ORIENTATIONS[best]}), {total.hits['forward-up']} if forward is up"
+        yield subject.finding("bev-orientation", folder, what)
+    elif total.poor_frames:
+        what = f"fewer than half of the labels' vehicles are in the picture, {frames_text(total.poor_frames)}"
+        yield subject.finding("bev-differs", folder, what)
+
+
+def _vehicle_places(subject: Subject, agent: int, frame: int) -> FloatArray:
+    """(M, 2) metres forward and left of the agent: centres of the vehicles that the BEV camera has in view."""
+    sample = agent * subject.num_frames + frame - 1
+    boxes = subject.boxes
+    vehicles = np.isin(boxes.labels.category, _VEHICLES) & (subject.label_id != OWN_ACTOR_ID)
+    rows = np.flatnonzero((boxes.sample == sample) & vehicles)
+    places: FloatArray = subject.boxes.labels.center[rows, :2]
+    return places[(np.abs(places) < _BEV_HALF).all(axis=1)]
+
+
+def _turned(places: FloatArray, orientation: str) -> FloatArray:
+    """Where a place (M, 2) forward, left lies in a picture of another orientation, as if forward were up."""
+    x, y = places.T
+    turned = {
+        "forward-up": (x, y),
+        "mirrored": (x, -y),
+        "backward-up": (-x, -y),
+        "mirrored-backward": (-x, y),
+        "left-up": (y, -x),
+        "right-up": (-y, x),
+        "transposed": (y, x),
+        "anti-transposed": (-y, -x),
+    }[orientation]
+    return np.column_stack(turned)
+
+
+def _hits(semantic: ByteArray, places: FloatArray) -> BoolArray:
+    center = (BEV_SHAPE[0] - 1) / 2
+    pixels: IntArray = np.rint(center - places / BEV_RESOLUTION).astype(np.int64)
+    hit: BoolArray = semantic[pixels[:, 0], pixels[:, 1]] == TAGS["vehicle"]
+    return hit
+
+
+def _repeated(subject: Subject, checksums: Mapping[str, Sequence[tuple[str, str, int]]]) -> Iterator[Finding]:
+    """Files with the same bytes; an agent that stands still may see the same again and again."""
+    for places in checksums.values():
+        if len(places) < 2 or _stood_still(subject, places):
+            continue
+        names = [f"{agent}/{channel}/{frame:03d}" for agent, channel, frame in places]
+        more = f" and {len(names) - 4} more" if len(names) > 4 else ""
+        yield subject.finding("file-repeated", subject.token, f"the same bytes: {', '.join(names[:4])}{more}")
+
+
+def _stood_still(subject: Subject, places: Sequence[tuple[str, str, int]]) -> bool:
+    """Whether these are consecutive frames of one channel of an agent that did not move."""
+    recordings = {(agent, channel) for agent, channel, _ in places}
+    frames: AnyArray = np.array(sorted(frame for _, _, frame in places))
+    if len(recordings) > 1 or (np.diff(frames) != 1).any():
+        return False
+    path = subject.positions[subject.agents.index(places[0][0])][frames - 1]
+    return bool(np.ptp(path, axis=0).max() < _STILL)

@@ -1,0 +1,148 @@
+"""`Subject`: one scenario's small files in memory, with what every check on their meaning starts from."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
+from deepaccident_devkit.geometry import Boxes, quaternions
+from deepaccident_devkit.tables import Finding
+from deepaccident_devkit.tables import boxes as box_rules
+from deepaccident_devkit.tables.boxes import ScenarioBoxes
+from deepaccident_devkit.tables.build import ScenarioFiles, scenario_boxes
+from deepaccident_devkit.tables.scan import frame_ranges
+from deepaccident_devkit.taxonomy import INFRASTRUCTURE, OWN_ACTOR_ID, UNTRACKED_ID, AgentName
+from deepaccident_devkit.validation.codes import CODES
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Subject:
+    """One scenario; A agents, F frames, S = A·F samples agent by agent, N boxes. All in world, right-handed.
+
+    Attributes:
+        files: what was read.
+        boxes: the boxes and where each was recorded.
+        centers: (N, 3) box centres, metres.
+    """
+
+    files: ScenarioFiles
+    boxes: ScenarioBoxes
+    centers: FloatArray
+
+    @property
+    def token(self) -> str:
+        """The scenario's."""
+        return self.files.scenario.token
+
+    @property
+    def agents(self) -> Sequence[AgentName]:
+        """The agents that are there, A."""
+        return self.files.scan.agents
+
+    @property
+    def num_frames(self) -> int:
+        """F."""
+        return self.files.scan.num_frames
+
+    @property
+    def label_id(self) -> IntArray:
+        """(N,) ids as the labels say."""
+        return self.boxes.labels.actor_id
+
+    @cached_property
+    def seen(self) -> BoolArray:
+        """(N,) tracked boxes of others: neither the recording agent itself nor untracked."""
+        seen: BoolArray = (self.label_id != OWN_ACTOR_ID) & (self.label_id != UNTRACKED_ID)
+        return seen
+
+    @cached_property
+    def own(self) -> BoolArray:
+        """(N,) the recording agents' own rows."""
+        own: BoolArray = self.label_id == OWN_ACTOR_ID
+        return own
+
+    @cached_property
+    def yaw(self) -> FloatArray:
+        """(N,) heading of each box in world, radians."""
+        return quaternions.yaw_of(box_rules.world_rotations(self.boxes))
+
+    @cached_property
+    def lidar_boxes(self) -> Boxes:
+        """All N boxes, each in the LiDAR frame it was recorded in."""
+        return self.boxes.labels.boxes()
+
+    @cached_property
+    def velocity(self) -> FloatArray:
+        """(N, 3) m/s from displacements, NaN where unknown."""
+        return box_rules.world_velocities(self.boxes, self.centers)
+
+    @cached_property
+    def positions(self) -> FloatArray:
+        """(A, F, 3) of the agents, metres."""
+        return self.files.calibs.world_from_ego[:, :3, 3].reshape(len(self.agents), self.num_frames, 3)
+
+    def is_pole(self, agent: int) -> bool:
+        """Whether the agent of this row stands at the roadside."""
+        return self.agents[agent] == INFRASTRUCTURE
+
+    def finding(self, code: str, where: str, what: str) -> Finding:
+        """A finding about this scenario; how bad it is and what to do stand in `CODES`."""
+        return make_finding(code, self.token, where, what)
+
+    def label_where(self, agent: int) -> str:
+        """The folder of an agent's labels."""
+        return str(self.files.scenario.kind_folder(self.agents[agent], "label"))
+
+    def calib_where(self, agent: int) -> str:
+        """The folder of an agent's calib files."""
+        return str(self.files.scenario.kind_folder(self.agents[agent], "calib"))
+
+    def rows_by_agent(self, rows: BoolArray) -> Iterable[tuple[int, IntArray]]:
+        """Agent → the rows (M,) of its boxes that a mask (N,) picks, for agents that have any."""
+        for agent in range(len(self.agents)):
+            picked = np.flatnonzero(rows & (self.boxes.agent == agent))
+            if len(picked):
+                yield agent, picked
+
+    def label_findings(self, code: str, rows: BoolArray, what: str) -> Iterable[Finding]:
+        """One finding an agent for the boxes that a mask (N,) picks: `what`, the actors, and in which frames."""
+        for agent, picked in self.rows_by_agent(rows):
+            frames = frames_text(self.boxes.frame[picked])
+            actors = actors_text(self.label_id[picked])
+            yield self.finding(code, self.label_where(agent), f"{what}: {actors}, {frames}")
+
+
+def subject_of(files: ScenarioFiles) -> Subject:
+    """What the checks start from."""
+    boxes = scenario_boxes(files)
+    return Subject(files=files, boxes=boxes, centers=box_rules.world_centers(boxes))
+
+
+def make_finding(code: str, scenario: str | None, where: str, what: str) -> Finding:
+    """A finding of a kind in `CODES`."""
+    kind = CODES[code]
+    return Finding(
+        code=code,
+        severity=kind.severity,
+        scenario=scenario,
+        where=where,
+        what=what,
+        remedy=kind.remedy,
+        known=bool(kind.known),
+    )
+
+
+def frames_text(frames: Iterable[int]) -> str:
+    """`frame 7`, `frames 3–5, 9`."""
+    numbers = sorted({int(frame) for frame in frames})
+    return f"{'frame' if len(numbers) == 1 else 'frames'} {frame_ranges(numbers)}"
+
+
+def actors_text(ids: Iterable[int], most: int = 4) -> str:
+    """`actor 1236`, `actors 12, 17, 20, 31 and 5 more`."""
+    numbers = sorted({int(actor) for actor in ids})
+    shown = ", ".join(map(str, numbers[:most]))
+    more = f" and {len(numbers) - most} more" if len(numbers) > most else ""
+    return f"{'actor' if len(numbers) == 1 else 'actors'} {shown}{more}"

@@ -1,0 +1,51 @@
+"""Write docs/validation.md from the table of findings: `python docs/make_validation_page.py`."""
+
+from pathlib import Path
+
+from deepaccident_devkit.validation import CODES
+
+PAGE = Path(__file__).parent / "validation.md"
+
+_HEAD = """# What `deepaccident validate` looks for
+
+    deepaccident validate DATAROOT            # labels, calib, meta and the names of all files: a minute or two
+    deepaccident validate DATAROOT --deep     # also decodes every image and array: hours for the whole release
+    deepaccident validate DATAROOT --json     # one JSON document
+
+```python
+da.findings("type1_subtype1_accident/Town03_type001_subtype0001_scenario00024")  # one scenario's, worst first
+```
+
+It reads the files and needs no index. Each finding says what is wrong, where, how bad it is and what to do:
+
+- **error**: the scenario cannot be indexed, or what it says cannot be true.
+- **warning**: probably wrong. The scenario can be opened.
+- **note**: worth knowing; shown with `--notes`.
+
+Exit status: 0 if there are at most notes and known findings, 1 if there are errors or other warnings, 2 if the release
+cannot be looked at.
+What keeps a scenario from being indexed is found by the same code that indexes it; its meaning is only looked at if
+there is nothing of that kind. Findings marked *known* are the real release's own, not your download's.
+
+A file that is wholly absent is no fault, since most downloads are partial: what is still to download stands at the
+end of the report.
+
+[fault_table.md](fault_table.md) tells which of 200 planted faults it finds.
+
+## The findings
+
+"""
+
+
+def page() -> str:
+    """The page's text."""
+    lines = ["| finding | how bad | what it means | what to do |", "|---|---|---|---|"]
+    for name, code in CODES.items():
+        meaning = code.meaning + (f" Known: {code.known}." if code.known else "")
+        depth = " (`--deep`)" if code.deep else ""
+        lines.append(f"| `{name}` | {code.severity}{depth} | {meaning} | {code.remedy} |")
+    return _HEAD + "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")

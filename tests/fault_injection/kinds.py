@@ -1,0 +1,85 @@
+"""What a mutation is."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from fault_injection.place import Place
+
+Apply = Callable[[Place, np.random.Generator], str]
+Only = Literal["accident", "normal"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mutation:
+    """One way to damage a release.
+
+    Attributes:
+        name: as the table lists it.
+        group: what kind of file it damages.
+        apply: damages a scenario; returns what was done.
+        deep: whether the sensors' files alone show it.
+        harmless: why nobody can or need tell, None for a fault.
+        beyond: why `validate` does not tell this fault, None if it must.
+        only: the kind of scenario that it can be done to, None for both.
+    """
+
+    name: str
+    group: str
+    apply: Apply
+    deep: bool = False
+    harmless: str | None = None
+    beyond: str | None = None
+    only: Only | None = None
+
+    @property
+    def title(self) -> str:
+        """What it does, in a phrase."""
+        return " ".join((self.apply.__doc__ or "").split()).rstrip(".")
+
+
+@dataclass(slots=True)
+class Group:
+    """Gathers the mutations of one module."""
+
+    name: str
+    deep: bool = False
+    mutations: list[Mutation] = field(default_factory=list)
+
+    def kind(
+        self,
+        *,
+        deep: bool | None = None,
+        harmless: str | None = None,
+        beyond: str | None = None,
+        only: Only | None = None,
+    ) -> Callable[[Apply], Apply]:
+        """Enter the decorated function under its own name."""
+
+        def enter(apply: Apply) -> Apply:
+            self.mutations.append(
+                Mutation(
+                    name=apply.__name__,
+                    group=self.name,
+                    apply=apply,
+                    deep=self.deep if deep is None else deep,
+                    harmless=harmless,
+                    beyond=beyond,
+                    only=only,
+                )
+            )
+            return apply
+
+        return enter
+
+
+def cut(content: bytes, rng: np.random.Generator, *, end: int | None = None) -> bytes:
+    """The beginning of a file: at least a byte stays and two go."""
+    return content[: rng.integers(1, (end or len(content)) - 1)]
+
+
+def garbage(rng: np.random.Generator, size: int) -> bytes:
+    """Random bytes."""
+    return rng.integers(0, 256, size=max(size, 16), dtype=np.uint8).tobytes()

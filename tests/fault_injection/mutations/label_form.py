@@ -1,0 +1,123 @@
+"""Label files that are no label files any more."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from fault_injection.kinds import Group, cut, garbage
+from fault_injection.place import FIELD, Place
+
+GROUP = Group("label, form")
+_NUMBERS = ("x", "y", "z", "l", "w", "h", "yaw")
+
+
+def _edit_a_line(place: Place, rng: np.random.Generator, edit: Callable[[list[str]], None]) -> str:
+    agent, frame = place.any_agent(rng), place.any_frame(rng)
+    rows = place.rows(agent, frame)
+    row = place.any_row(rng, rows)
+    edit(row)
+    place.write_rows(agent, frame, rows)
+    return f"{agent} {frame}: {' '.join(row)[:60]}"
+
+
+def _replace_file(place: Place, rng: np.random.Generator, change: Callable[[bytes], bytes]) -> str:
+    agent, frame = place.any_agent(rng), place.any_frame(rng)
+    path = place.file(agent, "label", frame)
+    content = path.read_bytes()
+    place.write(path, change(content))
+    return f"{agent} {frame}: {len(content)} to {path.stat().st_size} bytes"
+
+
+@GROUP.kind()
+def label_cut(place: Place, rng: np.random.Generator) -> str:
+    """A label file ends at a random byte."""
+    return _replace_file(place, rng, lambda content: cut(content, rng))
+
+
+@GROUP.kind()
+def label_cut_between_lines(place: Place, rng: np.random.Generator) -> str:
+    """A label file ends after a line, amid the boxes; each line left is sound."""
+    return _cut_after(place, rng, letters=0)
+
+
+@GROUP.kind()
+def label_cut_in_a_class(place: Place, rng: np.random.Generator) -> str:
+    """A label file ends within a line's first word, and lines of one word are skipped."""
+    return _cut_after(place, rng, letters=2)
+
+
+def _cut_after(place: Place, rng: np.random.Generator, *, letters: int) -> str:
+    def change(content: bytes) -> bytes:
+        lines = content.splitlines(keepends=True)
+        whole = int(rng.integers(2, len(lines) // 2))
+        return b"".join(lines[:whole]) + lines[whole][:letters]
+
+    return _replace_file(place, rng, change)
+
+
+@GROUP.kind()
+def label_emptied(place: Place, rng: np.random.Generator) -> str:
+    """A label file is empty."""
+    return _replace_file(place, rng, lambda _: b"")
+
+
+@GROUP.kind()
+def label_garbage(place: Place, rng: np.random.Generator) -> str:
+    """A label file holds random bytes."""
+    return _replace_file(place, rng, lambda content: garbage(rng, len(content)))
+
+
+@GROUP.kind()
+def label_zeros(place: Place, rng: np.random.Generator) -> str:
+    """A label file's second half is zero bytes, as a full disk leaves it."""
+    return _replace_file(
+        place, rng, lambda content: content[: len(content) // 2] + bytes(len(content) - len(content) // 2)
+    )
+
+
+@GROUP.kind()
+def label_field_dropped(place: Place, rng: np.random.Generator) -> str:
+    """A line lacks a field."""
+    return _edit_a_line(place, rng, lambda row: row.pop(int(rng.integers(len(row)))) and None)
+
+
+@GROUP.kind()
+def label_field_added(place: Place, rng: np.random.Generator) -> str:
+    """A line has a field too many."""
+    return _edit_a_line(place, rng, lambda row: row.insert(int(rng.integers(1, len(row))), "0.5"))
+
+
+@GROUP.kind()
+def label_nan(place: Place, rng: np.random.Generator) -> str:
+    """NaN stands in a position, size or yaw."""
+    return _edit_a_line(place, rng, lambda row: row.__setitem__(FIELD[str(rng.choice(_NUMBERS))], "nan"))
+
+
+@GROUP.kind()
+def label_infinite(place: Place, rng: np.random.Generator) -> str:
+    """Infinity stands in a position."""
+    word = str(rng.choice(["inf", "-inf"]))
+    return _edit_a_line(place, rng, lambda row: row.__setitem__(FIELD[str(rng.choice(_NUMBERS[:3]))], word))
+
+
+@GROUP.kind()
+def label_number_garbled(place: Place, rng: np.random.Generator) -> str:
+    """A number has a second decimal point."""
+
+    def garble(row: list[str]) -> None:
+        field = FIELD[str(rng.choice(_NUMBERS))]
+        row[field] += ".5"
+
+    return _edit_a_line(place, rng, garble)
+
+
+@GROUP.kind()
+def label_class_unknown(place: Place, rng: np.random.Generator) -> str:
+    """A line names a class that does not exist."""
+    return _edit_a_line(place, rng, lambda row: row.__setitem__(0, str(rng.choice(["bus", "Car", "0"]))))
+
+
+@GROUP.kind()
+def label_header_removed(place: Place, rng: np.random.Generator) -> str:
+    """A label file lacks its first line."""
+    return _replace_file(place, rng, lambda content: content.split(b"\n", 1)[1])

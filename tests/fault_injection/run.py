@@ -1,0 +1,126 @@
+"""Applying mutations, asking `validate`, and putting everything back: in several processes, each with its own copy."""
+
+import multiprocessing
+import os
+import shutil
+import tempfile
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from deepaccident_devkit.release import find_release
+from deepaccident_devkit.synth import SynthConfig, make_release
+from fault_injection.mutations import BEYOND, MUTATIONS, seeded
+from fault_injection.mutations.calib import marker
+from fault_injection.place import Place
+
+RELEASE = SynthConfig(scenarios=2, frames=7, image_size=(96, 54), seed=8)
+NUM_MUTATIONS = 200
+SEEDS_BEYOND = 2
+WORKERS = 2
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Job:
+    """One application of a mutation."""
+
+    name: str
+    seed: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outcome:
+    """What `validate` said of a mutated release.
+
+    Attributes:
+        job: the mutation and its seed.
+        token: the scenario that was mutated.
+        done: what was done to it.
+        errors: codes of the new findings that are errors, sorted.
+        warnings: codes of the new warnings, sorted.
+        code_ran: whether a pickle of the release ran its own code.
+    """
+
+    job: Job
+    token: str
+    done: str
+    errors: tuple[str, ...]
+    warnings: tuple[str, ...]
+    code_ran: bool
+
+    @property
+    def found(self) -> bool:
+        """Whether anything was said."""
+        return bool(self.errors or self.warnings)
+
+
+def jobs(count: int = NUM_MUTATIONS) -> list[Job]:
+    """Every mutation with seed 0, then every one with seed 1, … up to `count`, and besides those that may go untold."""
+    names = [name for name in MUTATIONS if name not in BEYOND]
+    counted = [Job(names[number % len(names)], number // len(names)) for number in range(count)]
+    return [*counted, *(Job(name, seed) for seed in range(SEEDS_BEYOND) for name in BEYOND)]
+
+
+def make_healthy(folder: Path) -> Path:
+    """The release that is mutated: an accident and its normal twin."""
+    return make_release(folder / "release", RELEASE, workers=WORKERS)
+
+
+def places(root: Path) -> dict[str, Place]:
+    """Token → scenario of a release."""
+    return {scenario.token: Place(root, scenario) for scenario in find_release(root).scenarios}
+
+
+def mutate(job: Job, of: dict[str, Place]) -> tuple[Place, str]:
+    """Apply a mutation to one of the scenarios, which its seed chooses."""
+    mutation, rng = MUTATIONS[job.name], seeded(job.name, job.seed)
+    fitting = sorted(token for token in of if mutation.only is None or token.split("/")[0].endswith(mutation.only))
+    place = of[str(rng.choice(fitting))]
+    assert set(place.sightings) == set(place.agents)  # looked at while all is well
+    return place, mutation.apply(place, rng)
+
+
+def run(root: Path, wanted: Sequence[Job]) -> list[Outcome]:
+    """Outcomes of the jobs, in their order. The dear ones (deep) are spread evenly over the processes."""
+    dear_first = sorted(wanted, key=lambda job: (not MUTATIONS[job.name].deep, job))
+    with tempfile.TemporaryDirectory(dir=root.parent) as folder:  # hard links need one file system
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(WORKERS, context, _start, (root, Path(folder))) as pool:
+            outcomes = {outcome.job: outcome for outcome in pool.map(_outcome, dear_first)}
+    return [outcomes[job] for job in wanted]
+
+
+_OWN: dict[str, Place] = {}
+"""The scenarios of this process's copy."""
+
+
+def _start(root: Path, folder: Path) -> None:
+    copy = folder / str(os.getpid())
+    shutil.copytree(root, copy, copy_function=os.link)
+    _OWN.update(places(copy))
+
+
+def _outcome(job: Job) -> Outcome:
+    from deepaccident_devkit.validation import validate_release
+
+    place, done = mutate(job, _OWN)
+    try:
+        report = validate_release(place.root, deep=MUTATIONS[job.name].deep, workers=1, scenarios=[place.token])
+        code_ran = marker(place.root).exists()
+    finally:
+        place.restore()
+        shutil.rmtree(marker(place.root), ignore_errors=True)
+        shutil.rmtree(place.root / ".deepaccident", ignore_errors=True)
+    codes = {
+        severity: tuple(sorted({finding.code for finding in report.findings if finding.severity == severity}))
+        for severity in ("error", "warning")
+    }
+    return Outcome(
+        job=job,
+        token=place.token,
+        done=done,
+        errors=codes["error"],
+        warnings=codes["warning"],
+        code_ran=code_ran,
+    )

@@ -1,0 +1,112 @@
+"""The table of found and missed, as Markdown: made from a run, read back by a test."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from fault_injection.mutations import MUTATIONS, Mutation
+from fault_injection.run import Outcome
+
+_HEAD = """# What `deepaccident validate` finds
+
+{count} seeded mutations of a synthetic release ({kinds} kinds), each applied to one scenario that is otherwise sound.
+*Found* means an error or a warning; the healthy release has neither. Of these mutations {found} are found, {harmless}
+are *harmless* (nobody can or need tell them) and {missed} are missed. The {beyond} kinds that may go untold, for a
+stated reason, are tried besides and not counted among the {count}. *Needs* says what `validate` was run with. Made by
+`python docs/make_fault_table.py`; a test holds kinds and verdicts against its own run.
+"""
+_COLUMNS = ("kind", "what is done", "needs", "applied", "found", "verdict", "told by, or why not")
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One kind of mutation and what became of it."""
+
+    mutation: Mutation
+    outcomes: Sequence[Outcome]
+
+    @property
+    def found(self) -> int:
+        """How many applications were told."""
+        return sum(outcome.found for outcome in self.outcomes)
+
+    @property
+    def verdict(self) -> str:
+        """`found`, `harmless`, `missed`, or `by chance` for what is found now and then."""
+        if self.mutation.harmless is not None:
+            return "harmless"
+        if self.mutation.beyond is not None and self.found:
+            return "by chance"
+        return "found" if self.found == len(self.outcomes) else "missed"
+
+    def cells(self) -> list[str]:
+        """As the table shows it."""
+        codes = sorted({code for outcome in self.outcomes for code in (*outcome.errors, *outcome.warnings)})
+        told = ", ".join(f"`{code}`" for code in codes)
+        why = self.mutation.harmless or self.mutation.beyond
+        return [
+            f"`{self.mutation.name}`",
+            self.mutation.title,
+            "`--deep`" if self.mutation.deep else "",
+            str(len(self.outcomes)),
+            str(self.found),
+            self.verdict,
+            "; ".join(part for part in (why, told) if part),
+        ]
+
+
+def rows_of(outcomes: Iterable[Outcome]) -> list[Row]:
+    """A row a kind, in the order of the groups."""
+    by_name: dict[str, list[Outcome]] = {}
+    for outcome in outcomes:
+        by_name.setdefault(outcome.job.name, []).append(outcome)
+    return [Row(mutation, by_name[name]) for name, mutation in MUTATIONS.items() if name in by_name]
+
+
+def to_markdown(outcomes: Sequence[Outcome]) -> str:
+    """The whole page."""
+    rows = rows_of(outcomes)
+    parts = [_HEAD.format(**_counts(rows)), _summary(rows)]
+    for group in dict.fromkeys(row.mutation.group for row in rows):
+        lines = [_line(row.cells()) for row in rows if row.mutation.group == group]
+        parts.append("\n".join([f"## {group[0].upper()}{group[1:]}", "", *_header(_COLUMNS), *lines, ""]))
+    return "\n".join(parts)
+
+
+def verdicts_of(markdown: str) -> dict[str, str]:
+    """Kind → verdict, as a page says."""
+    lines = [line.strip("| \n").split(" | ") for line in markdown.splitlines() if line.startswith("| `")]
+    return {cells[0].strip("`"): cells[_COLUMNS.index("verdict")].strip() for cells in lines}
+
+
+def _counts(rows: Sequence[Row]) -> dict[str, int]:
+    must = [row for row in rows if row.mutation.beyond is None]
+    count, found = sum(len(row.outcomes) for row in must), sum(row.found for row in must if row.verdict != "harmless")
+    harmless = sum(len(row.outcomes) for row in must if row.verdict == "harmless")
+    return {
+        "count": count,
+        "kinds": len(must),
+        "found": found,
+        "harmless": harmless,
+        "missed": count - found - harmless,
+        "beyond": len(rows) - len(must),
+    }
+
+
+def _summary(rows: Sequence[Row]) -> str:
+    lines = []
+    rows = [row for row in rows if row.mutation.beyond is None]
+    for group in dict.fromkeys(row.mutation.group for row in rows):
+        of_group = [row for row in rows if row.mutation.group == group]
+        harmless = sum(len(row.outcomes) for row in of_group if row.verdict == "harmless")
+        found = sum(row.found for row in of_group if row.verdict != "harmless")
+        counts = (found, harmless, sum(len(row.outcomes) for row in of_group) - found - harmless)
+        lines.append(_line([group, str(len(of_group)), *map(str, counts)]))
+    return "\n".join([*_header(("files", "kinds", "found", "harmless", "missed")), *lines, ""])
+
+
+def _header(columns: Sequence[str]) -> list[str]:
+    return [_line(columns), _line(["---"] * len(columns))]
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"

@@ -1,0 +1,99 @@
+"""A server of processes that index and are stopped: `python killed.py` reads a job a line, and answers with a line.
+
+A job forks this process, which has everything imported, so that a kill costs no interpreter's start.
+"""
+
+import json
+import os
+import resource
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pyarrow.csv
+
+from deepaccident_devkit.errors import DeepAccidentError
+from deepaccident_devkit.release import find_release
+from deepaccident_devkit.tables import open_index
+from deepaccident_devkit.tables.indexing import MARK_FILE
+
+assert pyarrow.csv  # what the work imports lazily is there before the clock starts
+
+
+def main() -> None:
+    for line in sys.stdin:
+        print(json.dumps(run(json.loads(line))), flush=True)
+
+
+def run(job: dict[str, Any]) -> dict[str, Any]:
+    """Index in a new process; `status` is its exit status, −9 if it was killed, `message` its error's."""
+    reading, writing = os.pipe()
+    start = time.perf_counter()
+    process = os.fork()
+    if process == 0:
+        _work(job, writing)
+    os.close(writing)
+    if job.get("delay") is not None:
+        time.sleep(job["delay"])
+        os.kill(process, signal.SIGKILL)
+    _, status = os.waitpid(process, 0)
+    seconds = time.perf_counter() - start
+    with os.fdopen(reading) as pipe:  # workers of a killed process may hold it a moment longer
+        message = pipe.read()
+    return {"status": os.waitstatus_to_exitcode(status), "message": message, "seconds": seconds}
+
+
+def _work(job: dict[str, Any], writing: int) -> None:
+    status = 1
+    try:
+        if job.get("step") is not None:
+            _kill_at(job["step"], after=job["after"])
+        if job.get("limit") is not None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (job["limit"], job["limit"]))
+        open_index(
+            find_release(Path(job["root"])),
+            index_dir=Path(job["index_dir"]),
+            workers=job.get("workers", 1),
+            check_files=job.get("check", False),
+        )
+        status = 0
+    except DeepAccidentError as error:
+        os.write(writing, f"{type(error).__name__}: {error}".encode())
+    except BaseException as error:  # noqa: BLE001 - a fork must not return into the server
+        os.write(writing, f"not ours: {error!r}".encode())
+    finally:
+        os._exit(status)
+
+
+def _kill_at(step: int, *, after: bool) -> None:
+    """End this process, as kill -9 would, before or after its n-th renaming, removal of a folder or of the mark.
+
+    Of the twelve tables one is enough: all lie in a folder that is removed if it is not renamed.
+    """
+    steps = iter(range(step, -1, -1))
+
+    def watched(function: Callable[..., Any], counts: Callable[..., bool]) -> Callable[..., Any]:
+        def call(*arguments: Any, **options: Any) -> Any:
+            last = counts(*arguments) and next(steps) == 0
+            if last and not after:
+                os.kill(os.getpid(), signal.SIGKILL)
+            result = function(*arguments, **options)
+            if last:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return result
+
+        return call
+
+    os.replace = watched(
+        os.replace, lambda _, path: not path.parent.name.startswith(".tables-") or path.name == "track.arrow"
+    )
+    shutil.rmtree = watched(shutil.rmtree, lambda path, *_: Path(path).exists())
+    Path.unlink = watched(Path.unlink, lambda path: path.name == MARK_FILE)  # type: ignore[method-assign]
+
+
+if __name__ == "__main__":
+    main()

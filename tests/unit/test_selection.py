@@ -1,0 +1,272 @@
+"""Queries over the scenario table, and whether an accident can be seen coming."""
+
+from pathlib import Path
+
+import pytest
+from tiny import META, NAME, TYPE, label_lines, write_tiny_release
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError, FieldError
+from deepaccident_devkit.overview import overview
+from deepaccident_devkit.selection import Filter, accident_visibility, accident_visible, parse_where
+from deepaccident_devkit.selection.accident_visibility import SHEER_CURTAINS
+
+QUIET = "ClearNight -1 -1 -1 -1 -1 -1 -1 15\n"
+NORMAL = "type1_subtype2_normal"
+
+
+def named(town: str, number: int) -> str:
+    return f"{town}_type001_subtype0001_scenario{number:05d}"
+
+
+@pytest.fixture(scope="module")
+def da(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
+    """Five scenarios: an accident, a quiet one, one without a meta, one with a third vehicle, one in another town."""
+    root = tmp_path_factory.mktemp("selection")
+    third = META.replace("1223 car 1212", "1223 car 1300").replace("ego other", "ego none")
+    scenarios = [
+        (TYPE, named("Town03", 1), META, 4),
+        (NORMAL, named("Town03", 2), QUIET, 5),
+        (TYPE, named("Town03", 3), None, 6),
+        (TYPE, named("Town05", 4), third.replace("HardRain", "Wet"), 7),
+        (NORMAL, named("Town10HD", 5), QUIET, 8),
+    ]
+    for scenario_type, name, meta, frames in scenarios:
+        write_tiny_release(
+            root, scenario_type=scenario_type, name=name, meta=meta, frames=frames, agents=("ego_vehicle",)
+        )
+    (root / "train.txt").write_text(f"{TYPE} {named('Town03', 1)}\n")
+    return DeepAccident(dataroot=root, verbose=False)
+
+
+def numbers(da: DeepAccident, *where: str, **filters) -> list[int]:
+    """The scenarios found, by the last number of their names, ascending."""
+    return sorted(int(scenario["name"][-5:]) for scenario in da.find(*where, **filters))
+
+
+@pytest.mark.parametrize(
+    ("where", "filters", "found"),
+    [
+        ((), {}, [1, 2, 3, 4, 5]),
+        (("town=Town03",), {"town": "Town03"}, [1, 2, 3]),
+        (("town=Town05, Town10HD",), {"town": {"Town05", "Town10HD"}}, [4, 5]),
+        (("type=type1_subtype2_normal",), {"scenario_type": NORMAL}, [2, 5]),
+        (("weather=Wet,Clear",), {"weather": ["Wet", "Clear"]}, [2, 4, 5]),
+        (("weather=unknown",), {"weather": None}, [3]),
+        (("weather=Wet,unknown",), {"weather": ("Wet", None)}, [3, 4]),
+        (("time_of_day=Night",), {"time_of_day": "Night"}, [2, 5]),
+        (("collision=true",), {"collision": True}, [1, 4]),
+        (("collision=No",), {"collision": False}, [2, 5]),
+        (("collision=none",), {"collision": None}, [3]),
+        (("designed_accident=true",), {"designed_accident": True}, [1, 3, 4]),
+        (("signalized=false",), {"signalized": False}, [2, 5]),
+        (("split=train",), {"split": "train"}, [1]),
+        (("split=unknown",), {"split": None}, [2, 3, 4, 5]),
+        (("accident_type=1",), {"accident_type": 1}, [1]),
+        (("accident_type=none",), {"accident_type": None}, [2, 3, 4, 5]),
+        (("road_type=four-way junction",), {"road_type": "four-way junction"}, [1, 4]),
+        (("spawn_side=left", "ego_direction=straight"), {"spawn_side": "left", "other_direction": "straight"}, [1, 4]),
+        (("num_frames=5..7",), {"length": "5..7"}, [2, 3, 4]),
+        (("length=..5,8",), {"num_frames": ["..5", 8]}, [1, 2, 5]),
+        (("length=7..",), {"length": range(7, 9)}, [4, 5]),
+        (("length >= 7",), {"length": ">=7"}, [4, 5]),
+        (("length>7",), {"length": ">7"}, [5]),
+        (("length<5",), {"length": "<5"}, [1]),
+        (("length<=5",), {"length": "<=5"}, [1, 2]),
+        (("accident_type>=1",), {"accident_type": "1..12"}, [1]),
+        (("town=Town03", "collision=true"), {"town": "Town03", "collision": True}, [1]),
+        (("town=Town07",), {"town": "Town07"}, []),
+        (("town=Town03", "town=Town05"), {"town": []}, []),
+        ((f"name={named('Town05', 4)}",), {"name": named("Town05", 4)}, [4]),
+    ],
+)
+def test_texts_and_keywords_find_the_same(da: DeepAccident, where, filters, found: list[int]) -> None:
+    assert numbers(da, *where) == numbers(da, **filters) == found
+
+
+@pytest.mark.parametrize("field", ["weather=Wet", "length=5..7", "collision=true", "accident_type=1", "town=Town07"])
+def test_not_equal_finds_all_that_equal_leaves_out(da: DeepAccident, field: str) -> None:
+    found = numbers(da, field)
+    assert sorted(found + numbers(da, field.replace("=", "!="))) == [1, 2, 3, 4, 5]
+
+
+def test_a_mix_of_texts_and_keywords_and_the_callers_own_records(da: DeepAccident) -> None:
+    (scenario,) = da.find("town!=Town03", weather="Wet")
+    scenario["town"] = "changed"
+    assert da.find(weather="Wet")[0]["town"] == "Town05"
+    assert [one["token"] for one in da.find(town="Town03")] == [
+        one["token"] for one in da.scenario if one["town"] == "Town03"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "parsed"),
+    [
+        ("town=Town03", Filter("town", ("Town03",))),
+        (" town != Town03 , Town05 ", Filter("town", ("Town03", "Town05"), negated=True)),
+        ("length>=50", Filter("length", (">=50",))),
+        ("length < 50", Filter("length", ("<50",))),
+        ("length=40..60", Filter("length", ("40..60",))),
+        ("road_type=four-way junction", Filter("road_type", ("four-way junction",))),
+    ],
+)
+def test_parsed_texts(text: str, parsed: Filter) -> None:
+    assert parse_where(text) == parsed
+
+
+@pytest.mark.parametrize("text", ["", "town", "=Town03", "town=", "town=Town03,", "length>", "to wn=Town03"])
+def test_texts_that_are_no_filter(text: str) -> None:
+    with pytest.raises(ChoiceError, match="expected field=value"):
+        parse_where(text)
+
+
+def test_what_is_impossible_is_named_with_what_is_possible(da: DeepAccident) -> None:
+    with pytest.raises(FieldError, match=r"cannot be found by 'wether'; the fields are weather, "):
+        da.find(wether="Clear")
+    with pytest.raises(FieldError, match="cannot be found by 'token'"):
+        da.find("token=1")
+    with pytest.raises(ChoiceError, match=r"weather: found 'hardrain'; possible are HardRain, .*WetCloudy"):
+        da.find(weather="hardrain")
+    with pytest.raises(ChoiceError, match="town: found '='; possible are Town01"):
+        da.find("town==")
+    with pytest.raises(ChoiceError, match=r"scenario_type: found 'normal'; possible are .*type1_subtype2_normal"):
+        da.find(type="normal")
+    with pytest.raises(ChoiceError, match="visibility: found 'seen'; possible are visible, partial, invisible"):
+        da.find(visibility="seen")
+    with pytest.raises(ChoiceError, match="collision: expected true, false or unknown, found 'maybe'"):
+        da.find("collision=maybe")
+    with pytest.raises(ChoiceError, match="signalized: expected true, false or unknown, found 1"):
+        da.find(signalized=1)
+    with pytest.raises(ChoiceError, match=r"num_frames: expected a number, a range such as 40..60 .*, found 'long'"):
+        da.find(length="long")
+    with pytest.raises(ChoiceError, match=r"num_frames: expected a number.*, found True"):
+        da.find(length=True)
+    with pytest.raises(ChoiceError, match=r"num_frames: expected a number.*, found 4.5"):
+        da.find(length=4.5)  # type: ignore[arg-type]
+    with pytest.raises(ChoiceError, match=r"accident_type: found 13; possible are 1, 2, .*12"):
+        da.find(accident_type=13)
+    with pytest.raises(ChoiceError, match=r"num_frames: '60..40': 60 is more than 40"):
+        da.find("length=60..40")
+    with pytest.raises(ChoiceError, match="town: '>=3' is a range, which only numbers have"):
+        da.find("town>=3")
+    with pytest.raises(ChoiceError, match="'length>3,4': > takes one number, found 2"):
+        da.find("length>3,4")
+
+
+def test_an_overview_of_a_selection_counts_only_that(da: DeepAccident) -> None:
+    whole, some = overview(da), overview(da, da.find(town="Town03"))
+    assert (some.scenarios, some.selected, whole.selected) == (5, True, False)
+    tokens = {one["token"] for one in da.find(town="Town03")}
+    for name in ("agent", "frame", "sample", "instance", "track"):
+        by_hand = sum(row["scenario_token"] in tokens for row in getattr(da, name))
+        assert some.tables[name] == by_hand < whole.tables[name]
+    for name in ("annotation", "sample_data", "ego_pose", "calibrated_sensor"):
+        of_token = sum("/".join(row["token"].split("/")[:2]) in tokens for row in getattr(da, name))
+        assert some.tables[name] == of_token < whole.tables[name]
+    assert (some.tables["sensor"], some.tables["category"]) == (8, 6)
+    assert some.attributes["town"] == {"Town03": 3}
+    assert some.recordings == some.agents["ego_vehicle"] == some.labelled["ego_vehicle"] == 3
+    assert "selected: 3 of 5 scenarios" in some.to_text()
+    assert " of 483" not in some.to_text()
+    assert overview(da, da.find()).tables == whole.tables
+    assert overview(da, []).tables["annotation"] == 0
+
+
+# visibility
+
+
+def sight(seen_at: set[int], actor: int = 1212):
+    """Labels in which an actor far ahead is seen by camera and LiDAR at some frames, and by neither at the others."""
+
+    def lines(agent: str, frame: int) -> list[str]:
+        points, camera = (9, "True") if frame in seen_at else (0, "False")
+        return [*label_lines(agent, frame), f"car 30 0 0 4.5 1.9 1.5 0 0 0 {actor} {points} {camera}"]
+
+    return lines
+
+
+def released(root: Path, seen_at: set[int], *, frames: int = 40, agents=("ego_vehicle",), **options) -> DeepAccident:
+    lines_of = options.pop("lines_of", None) or sight(seen_at)
+    write_tiny_release(root, frames=frames, agents=agents, lines_of=lines_of, **options)
+    return DeepAccident(dataroot=root, verbose=False)
+
+
+def at(da: DeepAccident, frame: int, agent: str = "ego_vehicle") -> bool | None:
+    return accident_visible(da, da.get_sample(da.scenario[0], agent, frame))
+
+
+def test_the_released_rule_of_a_sample(tmp_path: Path) -> None:
+    da = released(tmp_path, {10, 25, 30})
+    assert at(da, 30)  # seen now
+    assert at(da, 10)  # seen now, although not at 5, and 0 is before the recording
+    assert at(da, 35)  # not now, but at both moments before: one of three is a minority
+    assert not at(da, 40)  # seen at 30, not at 35 and 40
+    assert not at(da, 20)  # seen at 10, not at 15 and 20
+    assert not at(da, 5)  # not seen, and nothing was recorded before
+
+
+def test_an_agent_must_see_by_itself_and_need_not_see_itself(tmp_path: Path) -> None:
+    seen_by_ego = sight(set(range(41)))
+    unseen = sight(set(), actor=1223)
+    da = released(
+        tmp_path,
+        set(),
+        agents=("ego_vehicle", "other_vehicle", "infrastructure"),
+        lines_of=lambda agent, frame: (seen_by_ego if agent == "ego_vehicle" else unseen)(agent, frame),
+    )
+    assert at(da, 20)
+    assert not at(da, 20, "other_vehicle")
+    assert not at(da, 20, "infrastructure")  # would have to see both
+
+
+@pytest.mark.parametrize(
+    ("seen_at", "expected"),
+    [
+        (set(range(41)), "visible"),
+        (set(), "invisible"),
+        ({35}, "partial"),  # evaluated are 20, 25, 30 and 35
+        ({40}, "invisible"),  # the last frame itself is not evaluated
+        ({10, 15}, "partial"),  # the past makes 20 seen
+    ],
+)
+def test_visibility_of_a_scenario(tmp_path: Path, seen_at: set[int], expected: str) -> None:
+    da = released(tmp_path, seen_at)
+    assert accident_visibility(da, da.scenario[0]) == expected
+    assert len(da.find(visibility=expected)) == 1
+    assert da.find(f"visibility!={expected}") == da.find(visibility=None) == []
+
+
+@pytest.mark.parametrize("name", SHEER_CURTAINS)
+def test_sheer_curtains_count_as_seen(tmp_path: Path, name: str) -> None:
+    da = released(tmp_path, set(), name=name)
+    assert at(da, 20)
+    assert accident_visibility(da, da.scenario[0]) == "visible"
+
+
+def test_without_a_collision_every_sample_is_seen_but_no_scenario_has_a_visibility(tmp_path: Path) -> None:
+    da = released(tmp_path, set(), frames=12, meta=QUIET)
+    assert at(da, 7)
+    assert accident_visibility(da, da.scenario[0]) is None
+    assert len(da.find(visibility=None)) == 1
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"meta": None},
+        {"labelled": False},
+        {"meta": META.splitlines()[0] + "\n"},  # nobody says who ego is
+    ],
+)
+def test_what_cannot_be_told_is_unknown(tmp_path: Path, options: dict) -> None:
+    da = released(tmp_path, set(range(41)), frames=12, **options)
+    assert at(da, 7) is None
+    assert accident_visibility(da, da.scenario[0]) is None
+    assert da.find(visibility=("visible", "partial", "invisible")) == []
+
+
+def test_a_release_without_ego_and_a_recording_too_short_have_no_visibility(tmp_path: Path) -> None:
+    without_ego = released(tmp_path / "a", set(range(41)), agents=("other_vehicle",))
+    assert accident_visibility(without_ego, without_ego.scenario[0]) is None
+    short = released(tmp_path / "b", set(range(41)), frames=4)
+    assert accident_visibility(short, f"{TYPE}/{NAME}") is None

@@ -1,0 +1,243 @@
+"""`validate`: healthy releases are clean, what it says is right, and it says so in every form it promises.
+
+Planted faults are in tests/fault_injection; here are the rules behind them and what a fault cannot show.
+"""
+
+import importlib.util
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny
+from click.testing import CliRunner
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.errors import DatarootError, TokenError
+from deepaccident_devkit.release.npz import read_npz
+from deepaccident_devkit.validation import CODES, ValidationReport, validate_release
+from deepaccident_devkit.validation.sensors import ORIENTATIONS, out_of_sequence
+
+DOCS = Path(__file__).parents[3] / "docs"
+
+
+def codes(report: ValidationReport) -> set[str]:
+    return {finding.code for finding in report.findings}
+
+
+def labels_of(root: Path, agent: str) -> list[Path]:
+    return sorted(root.glob(f"**/{agent}/label/*/*.txt"))
+
+
+def rewrite_boxes(path: Path, change: Callable[[list[str]], list[str]]) -> None:
+    first, *lines = path.read_text().splitlines()
+    path.write_text("\n".join([first, *(" ".join(change(line.split())) for line in lines)]) + "\n")
+
+
+def test_healthy_releases_are_clean(release_root: Path, release_root_b: Path) -> None:
+    for root, deep in ((release_root, True), (release_root_b, False)):
+        report = validate_release(root, deep=deep)
+        assert report.findings == []
+        assert report.is_good
+        assert report.velocity.best == "lidar"
+
+
+def test_the_whole_release_is_what_coverage_counts_against(release_root_b: Path) -> None:
+    report = validate_release(release_root_b)
+    assert sum(report.coverage.scenarios.values()) == len(list(release_root_b.glob("*/*/meta/*.txt")))
+    missing = list(report.coverage.to_download())
+    assert f"train: {483 - report.coverage.scenarios['train']} of 483 scenarios" in missing
+    (sensors,) = [line for line in missing if line.startswith("train: Camera_Front")]
+    assert sensors.endswith("lidar01, BEV_instance_camera of all agents")
+    (of_test,) = [line for line in missing if line.startswith("test: Camera_Front")]
+    assert "BEV_instance_camera" not in of_test  # the test split ships without
+
+
+def test_partial_downloads_are_notes(own_release: Path) -> None:
+    for folder in own_release.glob("train/*/infrastructure"):
+        shutil.rmtree(folder)
+    for folder in own_release.glob("test/*/*/label"):
+        shutil.rmtree(folder)
+    report = validate_release(own_release)
+    assert report.is_good
+    assert codes(report) == {"agent-missing", "unlabelled"}
+    missing = list(report.coverage.to_download())
+    assert any(line.startswith("train: calib, label of infrastructure in ") for line in missing)
+    assert not any(line.startswith("test: ") and "label" in line for line in missing)
+
+
+def test_labels_in_another_frame_are_told(own_release: Path) -> None:
+    root = own_release
+    release = DeepAccident(dataroot=root, verbose=False)
+    for sample in release.sample:
+        pose = release.world_from(sample["token"], "lidar").rotation
+        turn = pose[:2, :2]
+        scenario = release.get("scenario", sample["scenario_token"])
+        frame = release.get("frame", sample["frame_token"])["index"]
+        name = scenario["name"]
+        folder = root / scenario["folder"] / scenario["scenario_type"] / sample["agent"] / "label" / name
+
+        def in_world(words: list[str], turn: np.ndarray = turn) -> list[str]:
+            if words[10] != "-100":
+                right_handed = turn @ np.array([float(words[8]), -float(words[9])])
+                words[8:10] = [repr(float(right_handed[0])), repr(float(-right_handed[1]))]
+            return words
+
+        rewrite_boxes(folder / f"{name}_{frame:03d}.txt", in_world)
+    report = validate_release(root)
+    assert report.velocity.best == "world"
+    assert codes(report) == {"velocity-frame"}
+    assert all(finding.known and finding.severity == "note" for finding in report.findings)
+
+
+def test_velocities_of_no_frame_are_told(own_release: Path) -> None:
+    def nonsense(words: list[str]) -> list[str]:
+        return words if words[10] == "-100" else [*words[:8], "31.0", "-17.0", *words[10:]]
+
+    for agent in ("ego_vehicle", "ego_vehicle_behind", "other_vehicle", "other_vehicle_behind", "infrastructure"):
+        for path in labels_of(own_release, agent):
+            rewrite_boxes(path, nonsense)
+    report = validate_release(own_release)
+    assert report.velocity.best is None
+    assert codes(report) == {"velocity-unexplained"}
+
+
+def test_findings_of_one_scenario_even_if_it_is_left_out(tmp_path: Path) -> None:
+    other = "Town05_type001_subtype0001_scenario00007"
+    root = tiny.write_tiny_release(tmp_path / "release")
+    tiny.write_tiny_release(root, name=other)
+    label = root / tiny.TYPE / "ego_vehicle" / "label" / tiny.NAME / f"{tiny.NAME}_002.txt"
+    label.write_text("0 0\ncar 1 2\n")
+    release = DeepAccident(dataroot=root, verbose=False, on_error="skip")
+    (finding,) = [found for found in release.findings(tiny.TOKEN) if found.severity == "error"]
+    assert (finding.code, finding.where) == ("label-unreadable", f"{label}:2")
+    assert finding.what == "expected 13 fields, found 3: 'car 1 2'"
+    assert [str(finding)] == list(release.problems[0].messages)  # one implementation: what indexing said
+    assert not [found for found in release.findings(release.scenario[0]) if found.severity == "error"]
+    with pytest.raises(TokenError, match="has no scenario 'nowhere'"):
+        release.findings("nowhere")
+
+
+def test_every_faulty_file_is_named(tmp_path: Path) -> None:
+    root = tiny.write_tiny_release(tmp_path)
+    for frame in (1, 3):
+        (root / tiny.TYPE / "ego_vehicle" / "label" / tiny.NAME / f"{tiny.NAME}_{frame:03d}.txt").write_text("")
+    (root / tiny.TYPE / "other_vehicle" / "calib" / tiny.NAME / f"{tiny.NAME}_002.pkl").write_bytes(b"")
+    (root / tiny.TYPE / "meta" / f"{tiny.NAME}.txt").write_text("x\n")
+    report = validate_release(root)
+    named = sorted((finding.code, Path(finding.where.split(":")[0]).name) for finding in report.findings)
+    assert named == [
+        ("calib-unreadable", f"{tiny.NAME}_002.pkl"),
+        ("label-unreadable", f"{tiny.NAME}_001.txt"),
+        ("label-unreadable", f"{tiny.NAME}_003.txt"),
+        ("meta-unreadable", f"{tiny.NAME}.txt"),
+    ]
+
+
+def test_the_known_faults_of_the_release_are_told_apart(tmp_path: Path) -> None:
+    name = "Town05_type001_subtype0002_scenario00035"
+    meta = "ClearNoon -1 -1 -1 -1 -1 -1 -1 14\n"
+    report = validate_release(
+        tiny.write_tiny_release(tmp_path, scenario_type="type1_subtype2_accident", name=name, meta=meta)
+    )
+    known = {finding.code for finding in report.findings if finding.known}
+    assert {"sheer-curtain", "no-collision-in-accident", "meta-incomplete"} <= known
+
+
+@pytest.mark.parametrize("orientation", [name for name in ORIENTATIONS if name != "forward-up"])
+def test_a_turned_bev_camera_is_recognised(release_root: Path, tmp_path: Path, orientation: str) -> None:
+    root = tmp_path / "release"
+    scenario = next(path for path in release_root.glob("*_accident/meta/*.txt"))
+    agent = f"{scenario.parent.parent.name}/ego_vehicle"
+    for kind in ("calib", "label", "BEV_instance_camera"):
+        shutil.copytree(release_root / agent / kind, root / agent / kind)
+    turns: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+        "mirrored": lambda picture: picture[:, ::-1],
+        "backward-up": lambda picture: picture[::-1, ::-1],
+        "mirrored-backward": lambda picture: picture[::-1],
+        "left-up": lambda picture: np.rot90(picture, -1),
+        "right-up": lambda picture: np.rot90(picture, 1),
+        "transposed": lambda picture: picture.swapaxes(0, 1),
+        "anti-transposed": lambda picture: np.rot90(picture, 2).swapaxes(0, 1),
+    }
+    for path in root.glob("*/ego_vehicle/BEV_instance_camera/*/*.npz"):
+        picture = read_npz(path)
+        np.savez(path, data=turns[orientation](picture))
+    report = validate_release(root, deep=True)
+    found = [finding for finding in report.findings if finding.code == "bev-orientation"]
+    assert found
+    assert all(f"'{orientation}'" in finding.what for finding in found)
+
+
+def test_images_out_of_sequence() -> None:
+    rng = np.random.default_rng(0)
+    scene = rng.uniform(0, 64, (18, 32, 3))
+    smooth = {frame: 10.0 * frame + scene for frame in range(1, 9)}
+    assert out_of_sequence(smooth) == []
+    for frame in range(1, 9):
+        foreign = {**smooth, frame: rng.uniform(0, 255, (18, 32, 3))}
+        assert out_of_sequence(foreign) == [frame]
+    assert out_of_sequence({1: smooth[1], 2: foreign[8]}) == []  # two pictures have no sequence
+
+
+def test_json_has_everything_and_exit_status_tells(own_release: Path) -> None:
+    runner = CliRunner()
+    clean = runner.invoke(deepaccident, ["validate", str(own_release), "--json"])
+    assert clean.exit_code == 0
+    content = json.loads(clean.stdout)
+    assert content["counts"] == {"error": 0, "warning": 0, "note": 0}
+    assert content["velocity"]["best"] == "lidar"
+    first = labels_of(own_release, "ego_vehicle")[0]
+    first.write_text(first.read_text()[:-20])
+    broken = runner.invoke(deepaccident, ["validate", str(own_release), "--json"])
+    assert broken.exit_code == 1
+    (finding,) = json.loads(broken.stdout)["findings"]
+    assert set(finding) == {"code", "severity", "scenario", "where", "what", "remedy", "known"}
+    text = runner.invoke(deepaccident, ["validate", str(own_release)])
+    assert text.exit_code == 1
+    assert f"{finding['scenario']}  (1 error)\n  error   label-unreadable: {finding['where']}: " in text.stdout
+    alone = runner.invoke(deepaccident, ["validate", str(own_release), "--scenario", finding["scenario"], "--json"])
+    assert json.loads(alone.stdout)["scenarios"] == 1
+    with pytest.raises(DatarootError, match="does not exist"):
+        runner.invoke(deepaccident, ["validate", "nowhere"], catch_exceptions=False)
+
+
+def test_the_worst_scenario_comes_first(own_release: Path) -> None:
+    files = labels_of(own_release, "other_vehicle")
+    scenarios = sorted({path.parent for path in files})
+    for path in sorted(scenarios[1].iterdir()):
+        path.write_text("")
+    warned = sorted(scenarios[0].iterdir())[1]
+    rewrite_boxes(warned, lambda words: [*words[:1], repr(float(words[1]) + 3), *words[2:]])
+    report = validate_release(own_release)
+    order = list(dict.fromkeys(finding.scenario for finding in report.findings))
+    assert [str(scenario).split("/")[1] for scenario in order] == [scenarios[1].name, scenarios[0].name]
+    severities = [finding.severity for finding in report.findings]
+    assert severities == sorted(severities, key=("error", "warning", "note").index)
+
+
+def test_split_faults_are_findings(own_release: Path) -> None:
+    first = (own_release / "train.txt").read_text().splitlines()[0]
+    with (own_release / "val.txt").open("a") as file:
+        file.write(f"{first}\ntype1_subtype1_accident Town01_type001_subtype0001_scenario00099\n")
+    report = validate_release(own_release)
+    assert {(finding.code, finding.scenario) for finding in report.findings} == {
+        ("two-places", "/".join(first.split())),
+        ("split-file-partial", None),
+    }
+    (own_release / "val.txt").write_text("one_word\n")
+    (finding,) = validate_release(own_release).findings
+    assert (finding.code, finding.where) == ("split-file-unreadable", f"{own_release / 'val.txt'}:1")
+
+
+def test_the_docs_list_every_finding() -> None:
+    spec = importlib.util.spec_from_file_location("make_validation_page", DOCS / "make_validation_page.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    assert module.PAGE.read_text() == module.page(), "run: python docs/make_validation_page.py"
+    assert all(f"`{code}`" in module.page() for code in CODES)
