@@ -172,7 +172,7 @@ def _parse_batches(batches: Sequence[Sequence[Path]]) -> list[dict[str, AnyArray
 
 def _parse_files(paths: Sequence[Path], contents: Sequence[bytes]) -> dict[str, AnyArray]:
     parsed = _parse_joined(contents)
-    if parsed is None:
+    if parsed is None and not any(b"\0" in content for content in contents):
         parsed = _parse_joined([_tidied(content) for content in contents])
     if parsed is None or _has_fault(parsed):
         raise _first_fault(paths, contents)
@@ -193,8 +193,9 @@ def _parse_joined(contents: Sequence[bytes]) -> dict[str, AnyArray] | None:
     num_boxes = np.array([content.count(b"\n") - 1 for content in contents], dtype=np.int64)
     header = b"".join([content[:start] for content, start in zip(contents, body_starts, strict=True)])
     body = b"".join([memoryview(content)[start:] for content, start in zip(contents, body_starts, strict=True)])
-    # Arrow would take a carriage return for a line end, read hexadecimal integers and drop a byte order mark
-    if any(odd in body for odd in (b"\r", b"x", b"X")) or b"\r" in header or body.startswith(codecs.BOM_UTF8):
+    # Arrow would take a carriage return for a line end, read hexadecimal integers and drop a byte order mark; a line
+    # of zero bytes would be skipped as one token
+    if any(odd in body for odd in (b"\r", b"x", b"X", b"\0")) or b"\r" in header or body.startswith(codecs.BOM_UTF8):
         return None
     try:
         header_table, body_table = _parse_header(header), _parse_body(body)
@@ -286,6 +287,8 @@ def _first_fault(paths: Sequence[Path], contents: Sequence[bytes]) -> LabelError
     for path, content in zip(paths, contents, strict=True):
         header_seen = False
         for number, line in enumerate(content.splitlines(), start=1):
+            if b"\0" in line:
+                return LabelError(f"{path}:{number}: holds zero bytes, as a full disk leaves them; {_REMEDY}")
             words = [word.decode("utf-8", errors="replace") for word in line.split()]
             if len(words) < 2:
                 continue

@@ -16,6 +16,9 @@ CAMERA_FIELD = {**dict.fromkeys(CAMERAS, 70.0), "Camera_Back": 110.0}
 _YAW_TOLERANCE = 5.0
 _FIELD_TOLERANCE = 0.02
 _FURTHEST_CAMERA = 6.0
+"""Metres from the LiDAR."""
+_CAMERA_HEIGHTS = 0.4
+"""Metres between a camera's height and that of the others."""
 _LIDAR_HEIGHTS = (0.8, 4.5)
 _MOUNT_CHANGE = 0.01
 _POLE_CHANGE = 0.02
@@ -55,7 +58,9 @@ def _cameras(subject: Subject, agent: int) -> Iterator[Finding]:
     yaw = np.degrees(np.arctan2(forward[..., 1], forward[..., 0]))
     off = np.abs((yaw - [CAMERA_YAW[camera] for camera in CAMERAS] + 180) % 360 - 180)
     position = -np.einsum("...ji,...j->...i", pose[..., :3, :3], pose[..., :3, 3])
+    height = position[..., 2]
     far = np.linalg.norm(position, axis=-1) > _FURTHEST_CAMERA
+    far |= np.abs(height - np.median(height, axis=-1, keepdims=True)) > _CAMERA_HEIGHTS
     bad: BoolArray = (off > _YAW_TOLERANCE) | far
     yield from _camera_findings(subject, agent, "camera-misplaced", bad, "looks another way, or is far from the LiDAR")
 

@@ -8,7 +8,7 @@ from fault_injection.mutations import MUTATIONS
 from fault_injection.place import Place
 from fault_injection.run import Job, mutate, places
 
-SEEDS = (0, 1)
+SEED = 1
 
 
 @pytest.fixture(scope="module")
@@ -18,16 +18,15 @@ def own_places(healthy_release: Path, release_copy: Path) -> dict[str, Place]:
 
 @pytest.mark.parametrize("name", MUTATIONS)
 def test_a_mutation_changes_files_and_depends_on_its_seed_alone(own_places, name):
-    for seed in SEEDS:
-        place, done = mutate(Job(name, seed), own_places)
-        changes = place.changes()
-        place.restore()
-        assert changes
-        assert done
-        again, done_again = mutate(Job(name, seed), own_places)
-        changes_again = again.changes()
-        again.restore()
-        assert (again.token, done_again, changes_again) == (place.token, done, changes)
+    place, done = mutate(Job(name, SEED), own_places)
+    changes = place.changes()
+    place.restore()
+    assert changes
+    assert done
+    again, done_again = mutate(Job(name, SEED), own_places)
+    changes_again = again.changes()
+    again.restore()
+    assert (again.token, done_again, changes_again) == (place.token, done, changes)
 
 
 def test_restoring_brings_every_file_back(own_places, healthy_release):

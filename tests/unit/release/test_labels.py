@@ -320,3 +320,12 @@ def test_damage_raises_our_error_or_nothing(
     else:
         assert message.startswith(f"{path}:")
         assert message.endswith(REMEDY)
+
+
+def test_zero_bytes_are_a_fault_wherever_they_stand(tmp_path: Path) -> None:
+    path = tmp_path / "label.txt"
+    good = b"0.0 0.0\ncar 1.0 2.0 0.0 4.0 2.0 1.5 0.0 0.0 0.0 7 1 True\n"
+    for content, line in ((good + b"pedestr" + b"\0" * 50, 3), (good + b"\0\0\n", 3), (b"\0" + good, 1)):
+        path.write_bytes(content)
+        with pytest.raises(LabelError, match=rf"label\.txt:{line}: holds zero bytes"):
+            read_label(path)
