@@ -8,6 +8,7 @@ from pathlib import Path
 
 from deepaccident_devkit import overview, render, selection, v2x, validation
 from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import IndexStoreError
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.tables import open_index
 from deepaccident_devkit.taxonomy import OnError
@@ -52,21 +53,28 @@ class DeepAccident(Dataset):
             IndexStoreError: the index cannot be written.
         """
         layout = find_release(_absolute(dataroot), version)
-        index = open_index(
-            layout,
-            index_dir=None if index_dir is None else _absolute(index_dir),
-            workers=workers,
-            on_error=on_error,
-            progress=verbose,
-        )
-        super().__init__(
-            dataroot=layout.root,
-            version=version,
-            layout=layout.layout,
-            split_files=layout.split_files,
-            tables_folder=index.tables_folder,
-            problems=index.manifest.problems,
-        )
+        for last_attempt in (False, True):
+            index = open_index(
+                layout,
+                index_dir=None if index_dir is None else _absolute(index_dir),
+                workers=workers,
+                on_error=on_error,
+                progress=verbose,
+            )
+            try:
+                super().__init__(
+                    dataroot=layout.root,
+                    version=version,
+                    layout=layout.layout,
+                    split_files=layout.split_files,
+                    tables_folder=index.tables_folder,
+                    problems=index.manifest.problems,
+                )
+                break
+            except IndexStoreError:
+                if last_attempt or index.tables_folder.is_dir():
+                    raise
+                # another process has just put newer tables in their place
 
     find = selection.find
     transform = v2x.transform

@@ -59,6 +59,7 @@ def _what_next(out: Path, root: Path) -> str:
     return f"""
 Look at the pictures in {out}{"/" if str(out) != "." else ""}: the colliding pair is red.
 Try next:
-  deepaccident info {root}
+  deepaccident info {root} --where collision=true
+  deepaccident validate {root} --deep
   python -c "from deepaccident_devkit import DeepAccident; DeepAccident(dataroot='{root}').list_scenarios()"
   deepaccident synth my_release --scenarios 6 --layout B"""

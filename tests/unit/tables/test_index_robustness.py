@@ -132,6 +132,23 @@ def test_an_open_release_outlives_a_new_index(root: Path) -> None:
         pickle.loads(pickled)
 
 
+def test_tables_that_vanish_while_they_are_opened(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from deepaccident_devkit import deepaccident as facade
+
+    original, calls = facade.open_index, []
+
+    def overtaken(*arguments: object, **options: object) -> object:
+        index = original(*arguments, **options)  # type: ignore[arg-type]
+        calls.append(index)
+        if len(calls) == 1:
+            shutil.rmtree(index.tables_folder)  # as another process does that has made newer ones
+        return index
+
+    monkeypatch.setattr(facade, "open_index", overtaken)
+    assert len(opened(root).scenario) == 2
+    assert len(calls) == 2
+
+
 def test_what_a_stopped_process_left_is_removed(root: Path) -> None:
     folder = root / ".deepaccident" / "v1"
     (folder / ".tables-0123.abcd").mkdir(parents=True)
