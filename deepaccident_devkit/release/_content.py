@@ -6,7 +6,7 @@ from pathlib import Path
 from deepaccident_devkit.errors import MissingFileError, ReleaseError
 
 _USUAL_SIZE = 1 << 16
-_FLAGS = os.O_RDONLY | getattr(os, "O_BINARY", 0)
+_FLAGS = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)  # a pipe in a file's place is empty
 
 
 def read_content(path: Path, fault: type[ReleaseError], remedy: str) -> bytes:

@@ -145,11 +145,25 @@ def frame_numbers(folder: Path, ending: str) -> tuple[list[int], list[str]]:
             continue
         prefix_length = len(folder.name)
         match = _FRAME_FILE.fullmatch(name[prefix_length:]) if name.startswith(folder.name) else None
-        if match and match[1] == f"{int(match[1]):03d}":
+        if match and match[1] == f"{int(match[1]):03d}" and int(match[1]):
             frames.append(int(match[1]))
         else:
             odd.append(name)
     return sorted(frames), sorted(odd)
+
+
+def names_without_calib(layout: ReleaseLayout) -> Iterator[tuple[Path, str]]:
+    """Scenario type folders and the names in them that have labels, meta or sensor files, but no calib of any agent."""
+    known: dict[Path, set[str]] = {}
+    for scenario in layout.scenarios:
+        known.setdefault(scenario.root / scenario.folder / scenario.scenario_type, set()).add(scenario.name)
+    for folder, names in known.items():
+        found = {path.stem for path in (folder / "meta").glob("*.txt")}
+        for agent in AGENTS:
+            for kind in ("label", *CHANNEL_FORMAT):
+                found.update(_subfolders(folder / agent / kind))
+        for name in sorted(found - names):
+            yield folder, name
 
 
 def _folders_of(root: Path, version: str) -> list[str]:
@@ -175,9 +189,16 @@ def _scenarios_in(root: Path, folder: str) -> Iterator[ScenarioFolder]:
     for scenario_type in _scenario_types(root / folder):
         _entries(root / folder / scenario_type)  # one that cannot be listed would hide its scenarios
         agents_of: dict[str, list[AgentName]] = {}
+        closed: DatarootError | None = None
         for agent in AGENTS:
-            for name in _subfolders(root / folder / scenario_type / agent / "calib"):
+            try:
+                names = _subfolders(root / folder / scenario_type / agent / "calib")
+            except DatarootError as error:  # the scenarios that other agents name tell it each, when they are read
+                closed, names = error, []
+            for name in names:
                 agents_of.setdefault(name, []).append(agent)
+        if closed and not agents_of:
+            raise closed
         for name, agents in agents_of.items():
             yield ScenarioFolder(root, folder, scenario_type, name, tuple(agents))
 

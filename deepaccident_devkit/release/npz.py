@@ -1,6 +1,7 @@
 """The one array of an `.npz` file: read without unpickling, written with fixed bytes."""
 
 import io
+import tokenize
 import zipfile
 import zlib
 from pathlib import Path
@@ -27,6 +28,7 @@ _FAULTS = (
     SyntaxError,  # a damaged array header
     NotImplementedError,  # an unknown compression
     UnicodeError,
+    tokenize.TokenError,  # an array header with an open bracket
     zipfile.BadZipFile,
     zlib.error,
 )

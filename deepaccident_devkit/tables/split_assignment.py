@@ -16,12 +16,14 @@ class SplitAssignment:
         split_of: scenario token → split; absent where it is unknown.
         problems: scenario token → why it has no single place, a sentence each.
         unlisted: scenarios that no split file lists, though there is one of every split.
+        contradictions: scenario token → what files and folders say against each other; the files win.
         notices: what is odd but does not hinder, a sentence each.
     """
 
     split_of: Mapping[str, str]
     problems: Mapping[str, tuple[str, ...]]
     unlisted: tuple[str, ...]
+    contradictions: Mapping[str, tuple[str, ...]]
     notices: tuple[str, ...]
 
 
@@ -46,12 +48,27 @@ def assign_splits(layout: ReleaseLayout) -> SplitAssignment:
         split_of={token: split for token, split in {**in_folder, **in_files}.items() if token in tokens},
         problems={token: tuple(messages) for token, messages in problems.items()},
         unlisted=tuple(sorted(tokens - set(in_files))) if set(SPLITS) <= set(listed) else (),
+        contradictions=_contradictions(listed, in_folder),
         notices=tuple(
             f"{layout.split_files[split]}: lists {count} scenarios that are not in this release"
             for split, count in missing.items()
             if count
         ),
     )
+
+
+def _contradictions(listed: Mapping[str, set[str]], in_folder: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
+    messages: dict[str, list[str]] = {}
+    for token, folder in in_folder.items():
+        for split in SPLITS:
+            if split != folder and token in listed.get(split, ()):
+                messages.setdefault(token, []).append(f"lies in {folder}/, {split}.txt lists it")
+    for mini in MINI_SPLITS:
+        split = mini.removesuffix("_mini")
+        if split in listed:
+            for token in sorted(listed.get(mini, set()) - listed[split]):
+                messages.setdefault(token, []).append(f"{mini}.txt lists it, {split}.txt does not")
+    return {token: tuple(found) for token, found in messages.items()}
 
 
 def _folders_of(layout: ReleaseLayout) -> dict[str, list[str]]:

@@ -42,6 +42,11 @@ CODES: dict[str, Code] = {
     "in-no-split": Code(
         "warning", "There is a file of every split, and none lists this scenario.", "restore the split files"
     ),
+    "splits-contradict": Code(
+        "warning",
+        "A split file lists a scenario that lies in another split's folder, or a mini split one that its split lacks.",
+        "move the scenario, or restore the split files",
+    ),
     "split-file-partial": Code(
         "note",
         "A split file lists scenarios that are not here.",
@@ -50,6 +55,9 @@ CODES: dict[str, Code] = {
     "labels-without-calib": Code(
         "warning", "An agent has labels but no calib files, and is left out.", "unpack its calib archive"
     ),
+    "calib-missing": Code(
+        "warning", "A scenario has files, but no calib of any agent, and is left out.", "unpack its calib archive"
+    ),
     "meta-missing": Code(
         "warning", "A labelled scenario has no meta: weather and collision are unknown.", "unpack the meta folder"
     ),
@@ -57,8 +65,7 @@ CODES: dict[str, Code] = {
     "unlabelled": Code(
         "note",
         "A scenario has no labels.",
-        "download them if you need them",
-        known="the test split ships without labels",
+        "download them if you need them; those of the test split were never published",
     ),
     "agent-unlabelled": Code("warning", "An agent has no labels, while others have.", "unpack its label archive"),
     # sensor files by their names and sizes
@@ -80,13 +87,16 @@ CODES: dict[str, Code] = {
     # labels
     "own-row-missing": Code("warning", "A vehicle's label lacks its own row (id −100).", _RESTORE_ONE),
     "own-row-odd": Code("warning", "A label has several own rows, or a pole has one.", _RESTORE_ONE),
-    "own-box-off": Code("warning", "The own row's box is not around the agent's origin.", _RESTORE_ONE),
+    "own-box-off": Code(
+        "warning", "The own row's box does not stand on the agent's origin, turned as the agent is.", _RESTORE_ONE
+    ),
     "own-velocity": Code("warning", "The own row's velocity is not the label's first line.", _RESTORE_ONE),
     "speed-off": Code("warning", "A label's first line does not fit the agent's displacement.", _RESTORE_ONE),
     "duplicate-id": Code("warning", "An id occurs twice in one label.", _RESTORE_ONE),
     "duplicate-box": Code("warning", "Two boxes of a label stand in the same place.", _RESTORE_ONE),
     "odd-id": Code("warning", "An id is none that the format knows.", _RESTORE_ONE),
     "odd-size": Code("warning", "A box has no volume, or a size that its class cannot have.", _RESTORE_ONE),
+    "odd-position": Code("warning", "A box is absurdly far away.", _RESTORE_ONE),
     "odd-points": Code("warning", "A box counts a negative number of LiDAR points.", _RESTORE_ONE),
     "velocity-unknown": Code(
         "note", "A label's velocity is NaN or infinite.", _NOTHING, known="the release has such velocities"
@@ -130,6 +140,7 @@ CODES: dict[str, Code] = {
         known="the frame of vx vy is doubtful in the real release",
     ),
     # meta
+    "name-and-folder": Code("warning", "A scenario lies in another type's folder than its name says.", "move it"),
     "meta-word": Code("warning", "Meta says a word that is none of the format's.", _RESTORE_ONE),
     "meta-frames": Code("warning", "Meta counts other frames than were recorded (and 10).", _RESTORE),
     "meta-incomplete": Code(

@@ -7,7 +7,7 @@ import numpy as np
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID, UNTRACKED_ID
-from deepaccident_devkit.validation.subject import Subject, frames_text
+from deepaccident_devkit.validation.subject import Subject, frames_text, place_tree
 
 MOST_ACTOR_ID = 2_000_000
 """The released code drops ids from here on."""
@@ -22,8 +22,12 @@ LENGTHS: dict[str, tuple[float, float]] = {
 """Metres, shortest and longest of each class."""
 LARGEST_SIZE = 5.0
 """Metres that no road user is wide or high."""
+FURTHEST = 1000.0
+"""Metres from the LiDAR in which labels annotate."""
 OWN_OFFSET = 0.6
 """Metres that the own row's box may lie off the agent's origin; the real ones reach 0.3."""
+OWN_TURN = np.radians(15.0)
+"""Heading of the own row's box against the agent's."""
 OWN_VELOCITY = 0.05
 """m/s between the own row and the first line, which print the same number with other digits."""
 SAME_PLACE = 0.05
@@ -36,8 +40,6 @@ TURN = np.radians(40.0)
 LAST_FRAMES = 2
 """Frames at the end in which a collision may throw its pair about."""
 _FOUR_WHEELS = [CATEGORIES.index(name) for name in ("car", "truck", "van")]
-NEAR = 40.0
-"""Metres within which an actor is not lost from one frame to the next; further off tracking comes and goes."""
 
 
 def check_labels(subject: Subject) -> Iterator[Finding]:
@@ -55,11 +57,8 @@ def _ids(subject: Subject) -> Iterator[Finding]:
 
 
 def _same_places(subject: Subject) -> Iterator[Finding]:
-    from scipy.spatial import cKDTree
-
     labels, sample = subject.boxes.labels, subject.boxes.sample
-    apart = 10 * SAME_PLACE  # samples and classes lie apart in the tree, so that only boxes of one can be near
-    tree = cKDTree(np.column_stack([labels.center, sample * apart * 10, labels.category * apart]))
+    tree = place_tree(labels.center, sample * len(CATEGORIES) + labels.category, SAME_PLACE)
     doubled = np.zeros(len(sample), dtype=bool)
     doubled[tree.query_pairs(SAME_PLACE, output_type="ndarray").ravel()] = True
     yield from subject.label_findings("duplicate-box", doubled, "two boxes stand in the same place")
@@ -72,6 +71,8 @@ def _sizes_and_points(subject: Subject) -> Iterator[Finding]:
     odd |= (size[:, 0] < shortest) | (size[:, 0] > longest) | (_is_car(subject) & (size[:, 0] < size[:, 1]))
     yield from subject.label_findings("odd-size", odd, "sizes that their classes do not have")
     yield from subject.label_findings("odd-points", subject.boxes.labels.num_lidar_pts < 0, "less than 0 LiDAR points")
+    far: BoolArray = np.any(np.abs(subject.boxes.labels.center) > FURTHEST, axis=1)
+    yield from subject.label_findings("odd-position", far, f"over {FURTHEST:.0f} m from the LiDAR")
     unknown: BoolArray = np.any(np.isnan(subject.boxes.labels.velocity), axis=1)
     yield from subject.label_findings("velocity-unknown", unknown, "velocities that are no numbers")
 
@@ -94,10 +95,14 @@ def _own_rows(subject: Subject) -> Iterator[Finding]:
 
 def _own_boxes(subject: Subject) -> Iterator[Finding]:
     rows = np.flatnonzero(subject.own)
-    ego = subject.files.calibs.world_from_ego[subject.boxes.sample[rows], :2, 3]
+    pose = subject.files.calibs.world_from_ego[subject.boxes.sample[rows]]
+    standing = pose[:, :3, 3] + pose[:, :3, 2] * subject.boxes.labels.size[rows, 2:] / 2  # on the road, upright
+    turn = subject.yaw[rows] - np.arctan2(pose[:, 1, 0], pose[:, 0, 0])
     far = np.zeros(len(subject.own), dtype=bool)
-    far[rows] = np.linalg.norm(subject.centers[rows, :2] - ego, axis=1) > OWN_OFFSET
-    yield from subject.label_findings("own-box-off", far, f"the own box is over {OWN_OFFSET} m off the agent's origin")
+    far[rows] = np.linalg.norm(subject.centers[rows] - standing, axis=1) > OWN_OFFSET
+    far[rows] |= np.abs(np.arctan2(np.sin(turn), np.cos(turn))) > OWN_TURN
+    what = f"the own box is turned, or over {OWN_OFFSET} m off standing on the agent's origin"
+    yield from subject.label_findings("own-box-off", far, what)
     first_line = np.full((subject.files.num_samples, 2), np.nan)
     labelled = np.repeat([agent in subject.files.scan.labelled for agent in subject.agents], subject.num_frames)
     first_line[labelled] = subject.files.labels.agent_velocity
@@ -120,24 +125,30 @@ def _tracks(subject: Subject) -> Iterator[Finding]:
         ("class-changes", boxes.labels.category[rows][1:] != boxes.labels.category[rows][:-1]),
         ("size-changes", (np.abs(np.diff(boxes.labels.size[rows], axis=0)) > SIZE_CHANGE).any(axis=1)),
     ):
-        yield from subject.label_findings(code, _mask(subject, rows[1:][same & changed]), "changes along the track")
+        yield from subject.label_findings(code, subject.mask(rows[1:][same & changed]), "changes along the track")
     step = np.diff(frame)
     three = same[1:] & same[:-1] & (step[1:] == 1) & (step[:-1] == 1)
     bend = np.linalg.norm(_second_difference(subject.centers[rows]), axis=1) / 2
     free = ~(_in_collision(subject)[rows[1:-1]] & (frame[2:] > subject.num_frames - LAST_FRAMES))
     jumps = three & (bend > JUMP) & free
     yield from subject.label_findings(
-        "track-jump", _mask(subject, rows[1:-1][jumps]), f"over {JUMP} m off the middle of the frames around"
+        "track-jump", subject.mask(rows[1:-1][jumps]), f"over {JUMP} m off the middle of the frames around"
     )
     yaw = subject.yaw[rows]
     steps = np.abs(np.arctan2(np.sin(np.diff(yaw)), np.cos(np.diff(yaw))))
     turns = three & free & _is_car(subject)[rows[1:-1]] & (steps[1:] > TURN) & (steps[:-1] > TURN)
-    yield from subject.label_findings("track-turn", _mask(subject, rows[1:-1][turns]), "turned to and fro")
-    near = np.linalg.norm(boxes.labels.center[rows], axis=1) < NEAR
-    gap = same & (step > 1) & near[1:] & near[:-1]
-    yield from subject.label_findings(
-        "track-gap", _mask(subject, rows[1:][gap]), f"missing in the frames before, though within {NEAR:.0f} m"
-    )
+    yield from subject.label_findings("track-turn", subject.mask(rows[1:-1][turns]), "turned to and fro")
+    near = np.linalg.norm(boxes.labels.center[rows, :2], axis=1) < subject.reach[boxes.agent[rows]]
+    gap = np.flatnonzero(same & (step > 1) & near[1:] & near[:-1])
+    before, after = rows[gap], rows[gap + 1]
+    middle = (subject.centers[before] + subject.centers[after]) / 2
+    for agent in range(len(subject.agents)):
+        of_agent = boxes.agent[before] == agent
+        frames = (boxes.frame[before] + boxes.frame[after])[of_agent] // 2
+        of_agent[of_agent] = ~subject.has_untracked(agent, frames, middle[of_agent])
+        yield from subject.label_findings(
+            "track-gap", subject.mask(after[of_agent]), "near, and missing in the frames before"
+        )
 
 
 def _is_car(subject: Subject) -> BoolArray:
@@ -155,12 +166,6 @@ def _in_collision(subject: Subject) -> BoolArray:
 
 def _second_difference(values: FloatArray) -> FloatArray:
     return values[2:] - 2 * values[1:-1] + values[:-2] if len(values) > 2 else np.zeros((0, values.shape[1]))
-
-
-def _mask(subject: Subject, rows: AnyArray) -> BoolArray:
-    mask = np.zeros(len(subject.boxes), dtype=bool)
-    mask[rows] = True
-    return mask
 
 
 def _repeated(keys: AnyArray) -> BoolArray:

@@ -15,8 +15,9 @@ CAMERA_FIELD = {**dict.fromkeys(CAMERAS, 70.0), "Camera_Back": 110.0}
 """Horizontal field of view, degrees."""
 _YAW_TOLERANCE = 5.0
 _FIELD_TOLERANCE = 0.02
-_FURTHEST_CAMERA = 6.0
+_FURTHEST_CAMERA = 4.0
 """Metres from the LiDAR."""
+_TILT = np.sin(np.radians(10.0))
 _CAMERA_HEIGHTS = 0.4
 """Metres between a camera's height and that of the others."""
 _LIDAR_HEIGHTS = (0.8, 4.5)
@@ -47,7 +48,8 @@ def _intrinsics(subject: Subject, agent: int) -> Iterator[Finding]:
     pinhole: BoolArray = np.asarray((focal > 0).all(axis=-1) & (rest < 1e-6).all(axis=-1))
     ratio = focal[..., 0] / np.where(intrinsic[..., 0, 2] > 0, intrinsic[..., 0, 2], np.nan)
     expected = 1 / np.tan(np.radians([CAMERA_FIELD[camera] for camera in CAMERAS]) / 2)
-    odd = pinhole & ~(np.abs(ratio / expected - 1) < _FIELD_TOLERANCE)
+    square = np.abs(focal[..., 1] / np.where(focal[..., 0] > 0, focal[..., 0], np.nan) - 1) < _FIELD_TOLERANCE
+    odd = pinhole & ~((np.abs(ratio / expected - 1) < _FIELD_TOLERANCE) & square)
     yield from _camera_findings(subject, agent, "intrinsic-form", ~pinhole, "is no pinhole camera's K")
     yield from _camera_findings(subject, agent, "intrinsic-odd", odd, "its f does not fit its field of view")
 
@@ -60,6 +62,8 @@ def _cameras(subject: Subject, agent: int) -> Iterator[Finding]:
     position = -np.einsum("...ji,...j->...i", pose[..., :3, :3], pose[..., :3, 3])
     height = position[..., 2]
     far = np.linalg.norm(position, axis=-1) > _FURTHEST_CAMERA
+    if not subject.is_pole(agent):  # a pole's may look down
+        far |= (np.abs(pose[..., 0, 2]) > _TILT) | (np.abs(forward[..., 2]) > _TILT)  # rolled or pitched
     far |= np.abs(height - np.median(height, axis=-1, keepdims=True)) > _CAMERA_HEIGHTS
     bad: BoolArray = (off > _YAW_TOLERANCE) | far
     yield from _camera_findings(subject, agent, "camera-misplaced", bad, "looks another way, or is far from the LiDAR")
@@ -129,7 +133,7 @@ def _speed(subject: Subject, agent: int) -> Iterator[Finding]:
     said = subject.files.labels.agent_velocity[start : start + subject.num_frames]
     moved = _central(subject.positions[agent, :, :2])
     least, share = _SPEED_DIFFERENCE
-    off = np.linalg.norm(said - moved, axis=1) > least + share * np.linalg.norm(moved, axis=1)
+    off = ~(np.linalg.norm(said - moved, axis=1) <= least + share * np.linalg.norm(moved, axis=1))  # NaN is off too
     off[max(0, subject.num_frames - _LAST_FRAMES) :] = False
     if off.any():
         what = f"the first line is over {least:.0f} m/s off the displacement, {frames_text(np.flatnonzero(off) + 1)}"

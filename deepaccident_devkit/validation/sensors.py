@@ -73,23 +73,22 @@ def check_sensors(subject: Subject, inventory: Inventory) -> Iterator[Finding]:
         usable = [frame for frame in frames if frame <= subject.num_frames]
         paths = {frame: subject.files.scenario.channel_path(agent, channel, frame) for frame in usable}
         row = subject.agents.index(agent)
-        blank: list[int] = []
+        telling: list[int] = []
         if channel in CAMERAS:
-            yield from _images(subject, row, channel, paths, blank)
+            yield from _images(subject, row, channel, paths, telling)
         elif channel == LIDAR:
-            yield from _clouds(subject, row, paths)
+            yield from _clouds(subject, row, paths, telling)
         else:
-            yield from _bevs(subject, row, paths)
-        for frame, path in paths.items():
-            if frame not in blank:
-                checksums[file_checksum(path)].append((agent, channel, frame))
+            yield from _bevs(subject, row, paths, telling)
+        for frame in telling:
+            checksums[file_checksum(paths[frame])].append((agent, channel, frame))
     yield from _repeated(subject, checksums)
 
 
 def _images(
-    subject: Subject, agent: int, channel: str, paths: Mapping[int, Path], blank: list[int]
+    subject: Subject, agent: int, channel: str, paths: Mapping[int, Path], telling: list[int]
 ) -> Iterator[Finding]:
-    """Decode a camera's images; the frames that show nothing (a wall, fog) go to `blank`."""
+    """Decode a camera's images; the frames that show something (more than a wall, fog) go to `telling`."""
     import cv2
 
     thumbnails: dict[int, FloatArray] = {}
@@ -103,7 +102,7 @@ def _images(
         sizes[frame] = (image.shape[1], image.shape[0])
         thumbnails[frame] = cv2.resize(image, _THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.float64)
     yield from _image_sizes(subject, agent, channel, sizes)
-    blank += [frame for frame, picture in thumbnails.items() if np.ptp(picture, axis=(0, 1)).max() < _BLANK]
+    telling += [frame for frame, picture in thumbnails.items() if np.ptp(picture, axis=(0, 1)).max() >= _BLANK]
     odd = out_of_sequence(thumbnails)
     if odd:
         folder = subject.files.scenario.kind_folder(subject.agents[agent], channel)
@@ -150,15 +149,20 @@ def _distance(first: FloatArray, second: FloatArray) -> FloatArray:
     return distance
 
 
-def _clouds(subject: Subject, agent: int, paths: Mapping[int, Path]) -> Iterator[Finding]:
+def _clouds(subject: Subject, agent: int, paths: Mapping[int, Path], telling: list[int]) -> Iterator[Finding]:
+    """Decode an agent's point clouds; the frames that could be read go to `telling`."""
     odd, differing = [], {}
     for frame, path in paths.items():
         try:
-            points = read_lidar(path).xyz
+            cloud = read_lidar(path)
+            points = cloud.xyz
         except ReleaseError as error:
             yield finding_of(error, "sensor-unreadable", subject.token)
             continue
-        if not np.isfinite(points).all() or (len(points) and np.abs(points).max() > LIDAR_RANGE):
+        telling.append(frame)
+        if not (np.isfinite(points).all() and np.isfinite(cloud.intensity).all()) or (
+            len(points) and np.abs(points).max() > LIDAR_RANGE
+        ):
             odd.append(frame)
         boxes = _sample_boxes(subject, agent, frame)
         if len(boxes):
@@ -183,7 +187,8 @@ def _sample_boxes(subject: Subject, agent: int, frame: int) -> Boxes:
     return subject.lidar_boxes.select(rows)
 
 
-def _bevs(subject: Subject, agent: int, paths: Mapping[int, Path]) -> Iterator[Finding]:
+def _bevs(subject: Subject, agent: int, paths: Mapping[int, Path], telling: list[int]) -> Iterator[Finding]:
+    """Decode an agent's BEV arrays; the frames that could be read go to `telling`."""
     total = _BevHits()
     for frame, path in paths.items():
         try:
@@ -191,6 +196,7 @@ def _bevs(subject: Subject, agent: int, paths: Mapping[int, Path]) -> Iterator[F
         except ReleaseError as error:
             yield finding_of(error, "sensor-unreadable", subject.token)
             continue
+        telling.append(frame)
         places = _vehicle_places(subject, agent, frame)
         if not len(places):
             continue
@@ -255,10 +261,9 @@ def _repeated(subject: Subject, checksums: Mapping[str, Sequence[tuple[str, str,
 
 
 def _stood_still(subject: Subject, places: Sequence[tuple[str, str, int]]) -> bool:
-    """Whether these are consecutive frames of one channel of an agent that did not move."""
-    recordings = {(agent, channel) for agent, channel, _ in places}
-    frames: AnyArray = np.array(sorted(frame for _, _, frame in places))
-    if len(recordings) > 1 or (np.diff(frames) != 1).any():
+    """Whether these are frames of one channel of an agent that did not move between them."""
+    frames: AnyArray = np.array([frame for _, _, frame in places])
+    if len({(agent, channel) for agent, channel, _ in places}) > 1:
         return False
     path = subject.positions[subject.agents.index(places[0][0])][frames - 1]
     return bool(np.ptp(path, axis=0).max() < _STILL)

@@ -1,5 +1,6 @@
 """Does meta tell what was recorded: words, counts, ids, and an impact at the end (format.md, meta)."""
 
+import re
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -30,9 +31,20 @@ def check_story(subject: Subject) -> Iterator[Finding]:
     if subject.files.scenario.name in SHEER_CURTAINS:
         what = "vehicles behind sheer curtains are marked invisible"
         yield subject.finding("sheer-curtain", subject.token, what)
+    yield from _name(subject)
     if subject.files.meta is not None:
         for check in _CHECKS:
             yield from check(subject, subject.files.meta)
+
+
+def _name(subject: Subject) -> Iterator[Finding]:
+    """The scenario's name says its type and subtype once more."""
+    scenario = subject.files.scenario
+    folder = re.match(r"type(\d+)_subtype(\d+)_", scenario.scenario_type)
+    name = re.search(r"_type(\d+)_subtype(\d+)_", scenario.name)
+    if folder and name and [int(word) for word in folder.groups()] != [int(word) for word in name.groups()]:
+        what = f"its name says type {int(name[1])}, subtype {int(name[2])}, its folder {scenario.scenario_type}"
+        yield subject.finding("name-and-folder", subject.token, what)
 
 
 def _words(subject: Subject, meta: Meta) -> Iterator[Finding]:
@@ -89,6 +101,10 @@ def _pair(subject: Subject, meta: Meta) -> Iterator[Finding]:
             yield _at_meta(subject, "meta-pair", what)
     if not subject.files.scan.labelled:
         return
+    agent_of = dict(zip(meta.agent_ids or (), VEHICLE_AGENTS, strict=False))
+    told_by = [agent_of[actor] for actor in collision.ids if actor in agent_of]
+    if not set(told_by) & set(subject.files.scan.labelled):
+        return  # nobody of the pair was downloaded, and the others may be far off
     for actor, name in zip(collision.ids, collision.classes, strict=True):
         rows = np.flatnonzero(subject.boxes.actor == actor)
         found = sorted({CATEGORIES[code] for code in subject.boxes.labels.category[rows].tolist()})

@@ -1,12 +1,15 @@
 """`Subject`: one scenario's small files in memory, with what every check on their meaning starts from."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.geometry import Boxes, quaternions
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables import boxes as box_rules
@@ -15,6 +18,16 @@ from deepaccident_devkit.tables.build import ScenarioFiles, scenario_boxes
 from deepaccident_devkit.tables.scan import frame_ranges
 from deepaccident_devkit.taxonomy import INFRASTRUCTURE, OWN_ACTOR_ID, UNTRACKED_ID, AgentName
 from deepaccident_devkit.validation.codes import CODES
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+_SURE_REACH = 35.0
+"""Metres at the most within which a label is taken to be complete."""
+_SHARE_OF_FURTHEST = 0.8
+_FURTHEST = 1e7
+_UNTRACKED_PLACE = 2.0
+"""Metres between an untracked row and where the actor should be."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,6 +82,33 @@ class Subject:
         return quaternions.yaw_of(box_rules.world_rotations(self.boxes))
 
     @cached_property
+    def reach(self) -> FloatArray:
+        """(A,) metres around each agent within which its labels leave nobody out; 0 where nothing shows that.
+
+        Whose labels hold what neither its LiDAR nor its cameras saw leaves nobody out for being hidden; how far that
+        goes is told by the boxes that it has.
+        """
+        labels, agent = self.boxes.labels, self.boxes.agent
+        distance = np.linalg.norm(labels.center[:, :2], axis=1)
+        hidden = self.seen & (labels.num_lidar_pts == 0) & ~labels.camera_visible & (distance < _SURE_REACH)
+        furthest = np.zeros(len(self.agents))
+        np.maximum.at(furthest, agent, distance)
+        reach: FloatArray = np.minimum(_SURE_REACH, _SHARE_OF_FURTHEST * furthest)
+        reach[~np.isin(np.arange(len(reach)), agent[hidden])] = 0.0
+        return reach
+
+    def has_untracked(self, agent: int, frames: IntArray, places: FloatArray) -> BoolArray:
+        """Which places (M, 3) of the world an agent annotated as untracked (id −1) at the frames (M,)."""
+        rows = np.flatnonzero((self.label_id == UNTRACKED_ID) & (self.boxes.agent == agent))
+        if not len(rows) or not len(frames):
+            return np.zeros(len(frames), dtype=bool)
+        tree = place_tree(self.centers[rows], self.boxes.frame[rows], _UNTRACKED_PLACE)
+        points = tree_points(places, frames, _UNTRACKED_PLACE)
+        distance, _ = tree.query(points, distance_upper_bound=_UNTRACKED_PLACE)
+        found: BoolArray = np.isfinite(distance)
+        return found
+
+    @cached_property
     def lidar_boxes(self) -> Boxes:
         """All N boxes, each in the LiDAR frame it was recorded in."""
         return self.boxes.labels.boxes()
@@ -106,6 +146,12 @@ class Subject:
             if len(picked):
                 yield agent, picked
 
+    def mask(self, rows: AnyArray) -> BoolArray:
+        """(N,) true for some rows (M,)."""
+        mask = np.zeros(len(self.boxes), dtype=bool)
+        mask[rows] = True
+        return mask
+
     def label_findings(self, code: str, rows: BoolArray, what: str) -> Iterable[Finding]:
         """One finding an agent for the boxes that a mask (N,) picks: `what`, the actors, and in which frames."""
         for agent, picked in self.rows_by_agent(rows):
@@ -118,6 +164,18 @@ def subject_of(files: ScenarioFiles) -> Subject:
     """What the checks start from."""
     boxes = scenario_boxes(files)
     return Subject(files=files, boxes=boxes, centers=box_rules.world_centers(boxes))
+
+
+def place_tree(places: FloatArray, moments: AnyArray, radius: float) -> cKDTree:
+    """A tree over places (M, 3) in which those of different moments (M,) are further apart than `radius`."""
+    from scipy.spatial import cKDTree
+
+    return cKDTree(tree_points(places, moments, radius))
+
+
+def tree_points(places: FloatArray, moments: AnyArray, radius: float) -> FloatArray:
+    """(M, 4) what `place_tree` is made of and asked for; absurd places are cut off, which would overflow."""
+    return np.column_stack([np.clip(places, -_FURTHEST, _FURTHEST), moments * (10 * radius)])
 
 
 def make_finding(code: str, scenario: str | None, where: str, what: str) -> Finding:

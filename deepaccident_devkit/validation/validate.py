@@ -5,10 +5,13 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import SplitFileError, TokenError
 from deepaccident_devkit.parallel import run_batch
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, find_release
+from deepaccident_devkit.release.layout import names_without_calib
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.build import read_scenario
 from deepaccident_devkit.tables.findings import finding_of
@@ -83,6 +86,7 @@ def validate_release(
     splits, of_release = _split_findings(layout)
     tokens = {check.token for check in checks}
     of_release = [finding for finding in of_release if finding.scenario is None or finding.scenario in tokens]
+    of_release += _strays(layout) if scenarios is None else ()
     return ValidationReport(
         dataroot=str(root),
         version=version,
@@ -90,7 +94,7 @@ def validate_release(
         scenarios=len(checks),
         samples=sum(check.samples for check in checks),
         findings=worst_first([*of_release, *(finding for check in checks for finding in check.findings)]),
-        coverage=_coverage(version, checks, splits),
+        coverage=_coverage(version, checks if scenarios is None else [], splits),
         velocity=total_fit([check.velocity for check in checks]),
     )
 
@@ -126,16 +130,17 @@ def check_scenario(scenario: ScenarioFolder, *, deep: bool = False) -> ScenarioC
     found += faults
     velocity = _NO_FIT
     if files is not None:
-        subject = subject_of(files)
-        velocity = fit_velocities(subject)
-        found += [
-            *check_poses(subject),
-            *check_labels(subject),
-            *check_agreement(subject),
-            *check_velocities(subject, velocity),
-            *check_story(subject),
-            *(check_sensors(subject, inventory) if deep else ()),
-        ]
+        with np.errstate(all="ignore"):  # absurd numbers are what is looked for
+            subject = subject_of(files)
+            velocity = fit_velocities(subject)
+            found += [
+                *check_poses(subject),
+                *check_labels(subject),
+                *check_agreement(subject),
+                *check_velocities(subject, velocity),
+                *check_story(subject),
+                *(check_sensors(subject, inventory) if deep else ()),
+            ]
     return ScenarioCheck(
         token=scenario.token,
         findings=tuple(found),
@@ -153,19 +158,30 @@ def _split_findings(layout: ReleaseLayout) -> tuple[SplitAssignment | None, list
     return splits, list(_assignment_findings(splits))
 
 
+def _strays(layout: ReleaseLayout) -> Iterator[Finding]:
+    for folder, name in names_without_calib(layout):
+        what = "has labels, meta or sensor files, but no calib files of any agent, and is left out"
+        yield make_finding("calib-missing", None, str(folder / "*" / "calib" / name), what)
+
+
 def _assignment_findings(splits: SplitAssignment) -> Iterator[Finding]:
     for token, messages in splits.problems.items():
         for message in messages:
             yield make_finding("two-places", token, token, message.rpartition(";")[0])
     for token in splits.unlisted:
         yield make_finding("in-no-split", token, token, "no split file lists it")
+    for token, messages in splits.contradictions.items():
+        for message in messages if token not in splits.problems else ():
+            yield make_finding("splits-contradict", token, token, message)
     for notice in splits.notices:
         where, _, what = notice.partition(": ")
         yield make_finding("split-file-partial", None, where, what)
 
 
 def _coverage(version: str, checks: Sequence[ScenarioCheck], splits: SplitAssignment | None) -> Coverage:
-    """Scenarios and recordings by split; the mini release counts as one."""
+    """Scenarios and recordings by split; the mini release counts as one; nothing where only some were looked at."""
+    if not checks:
+        return Coverage(scenarios={}, expected={}, recordings={})
     mini = version == "v1-mini"
     split_of = {} if splits is None else splits.split_of
     scenarios: dict[str, int] = {}

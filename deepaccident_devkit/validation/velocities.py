@@ -99,6 +99,5 @@ def _actors_off(subject: Subject, hypothesis: str) -> Iterator[Finding]:
     wrong = np.bincount(track[~fits[hypothesis]], minlength=len(tracks))
     least, share = _ACTOR_OFF
     off = (wrong >= least) & (wrong >= share * count)
-    mask = np.zeros(len(subject.boxes), dtype=bool)
-    mask[rows[off[track] & ~fits[hypothesis]]] = True
-    yield from subject.label_findings("velocity-off", mask, "velocities do not fit the displacement")
+    wrong_rows = subject.mask(rows[off[track] & ~fits[hypothesis]])
+    yield from subject.label_findings("velocity-off", wrong_rows, "velocities do not fit the displacement")
