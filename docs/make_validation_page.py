@@ -35,10 +35,10 @@ end of the report.
 ## The JSON document
 
 One object: `dataroot`, `version`, `deep`; `scenarios` and `samples` that were looked at; `counts` by how bad;
-`findings`, worst scenario first, each with `code`, `severity`, `scenario` (null for the release as a whole), `where`, `what`,
-`remedy` and `known`; `coverage` with the `scenarios` here and `expected` by split and the `recordings` by split, agent
-and kind of file; `to_download`, a sentence each; `velocity` with how many moving `boxes` were tried, how many each
-hypothesis `fits`, and the `best` one. With `--scenario` there is nothing in `coverage`.
+`findings`, worst scenario first, each with `code`, `severity`, `scenario` (null for the release as a whole), `where`,
+`what`, `remedy` and `known`; `coverage` with the `scenarios` here and `expected` by split and the `recordings` by
+split, agent and kind of file; `to_download`, a sentence each; `velocity` with how many moving `boxes` were tried, how
+many each hypothesis `fits`, and the `best` one. With `--scenario` there is nothing in `coverage`.
 
 ## The findings
 
