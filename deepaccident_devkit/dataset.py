@@ -26,6 +26,7 @@ from deepaccident_devkit.taxonomy import (
     MINI_SPLITS,
     OWN_ACTOR_ID,
     SPLITS,
+    UNTRACKED_ID,
     Frame,
     OnError,
 )
@@ -175,6 +176,13 @@ class Dataset:
         """A table as `pyarrow.Table`, without copying; `…_row` columns hold row numbers instead of tokens."""
         return self._tables.table(table).arrow
 
+    def columns(self, table: str) -> Mapping[str, Any]:
+        """A table's stored columns by name as read-only arrays, without copying; raises TableError.
+
+        Numbers are numpy views (row keys, choices as codes, null as −1 or NaN), words Arrow arrays.
+        """
+        return self._tables.views[self._tables.table(table).name]
+
     def get_sample(self, scenario: RowArgument, agent: str, frame: int) -> records.SampleRecord:
         """The sample of an agent at frame number `frame` (from 1) of a scenario; raises TokenError."""
         if not isinstance(frame, int | np.integer):
@@ -297,6 +305,22 @@ class Dataset:
             instance = annotations.item(first + label_row)
             instance_token = tokens["instance"](instance) if instance >= 0 else None
             result.append(Box(boxes.select([index]), tokens["annotation"](first + label_row), instance_token))
+        return result
+
+    def actor_ids(self, sample: RowArgument) -> IntArray:
+        """Which actors the boxes of a sample are, (N,) CARLA ids, in the order of its label.
+
+        Unlike `Boxes.actor_id`, the agent's own row has the agent's id. Untracked rows are −1, and so is an own row
+        where meta does not say who the agent is.
+
+        Raises:
+            TokenError: no such sample.
+        """
+        instances = self._tables.views["annotation"]["instance_row"][self._annotation_slice(self._sample_row(sample))]
+        actors = self._tables.views["instance"]["actor_id"]
+        known = instances >= 0
+        result = np.full(len(instances), UNTRACKED_ID, dtype=np.int64)
+        result[known] = actors[instances[known]]
         return result
 
     # sensor data

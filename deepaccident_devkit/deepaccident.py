@@ -78,6 +78,14 @@ class DeepAccident(Dataset):
 
     find = selection.find
     transform = v2x.transform
+    aggregate_point_cloud = v2x.aggregate_point_cloud
+    cooperative_boxes = v2x.cooperative_boxes
+    visible_instances = v2x.visible_instances
+    project_to_image = v2x.project_to_image
+    map_pointcloud_to_image = v2x.map_pointcloud_to_image
+    trajectory = v2x.trajectory
+    collision = v2x.collision
+    message_sizes = v2x.message_sizes
     findings = validation.findings
     render_sample = render.render_sample
     render_frame = render.render_frame

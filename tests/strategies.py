@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from deepaccident_devkit.geometry import SE3, Boxes, LidarPointCloud
+from deepaccident_devkit.geometry import SE3, BevGrid, Boxes, LidarPointCloud, PinholeCamera
 from deepaccident_devkit.release import Calib, Collision, Labels, Meta
 from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES, META_AGENTS, TIMES_OF_DAY
 
@@ -69,6 +69,38 @@ def boxes(draw: st.DrawFn, max_count: int = 5, frame: str = "lidar") -> Boxes:
         camera_visible=draw(hnp.arrays(np.bool_, (count,))),
         row=np.arange(count),
     )
+
+
+@st.composite
+def upright_boxes(draw: st.DrawFn, max_count: int = 4, reach: float = 10.0, frame: str = "lidar") -> Boxes:
+    """Boxes that stand on the ground, so near to one another that many overlap, axis-parallel ones among them."""
+    count = draw(st.integers(0, max_count))
+    yaws = ANGLES | st.sampled_from([0.0, np.pi / 2, -np.pi / 2, np.pi])
+    return Boxes.from_arrays(
+        draw(arrays((count, 3), reach)),
+        draw(hnp.arrays(np.float64, (count, 3), elements=st.floats(0.1, 10))),
+        draw(hnp.arrays(np.float64, (count,), elements=yaws)),
+        frame=frame,
+    )
+
+
+def cameras() -> st.SearchStrategy[PinholeCamera]:
+    """Pinhole cameras of all focal lengths and centres that a picture can have."""
+    focal, centre = st.floats(50, 5000), st.floats(0, 2000)
+    matrix = st.builds(
+        lambda fx, fy, cx, cy: np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), focal, focal, centre, centre
+    )
+    return st.builds(PinholeCamera, matrix, st.integers(1, 2000), st.integers(1, 2000))
+
+
+@st.composite
+def grids(draw: st.DrawFn) -> BevGrid:
+    """Small BEV grids in every orientation, not square and not centred as a rule."""
+    axes = []
+    for _ in range(2):
+        start, size = draw(st.integers(-50, 50)), draw(st.sampled_from([0.1, 0.25, 0.5, 1.0, 3.0]))
+        axes.append((start, start + draw(st.integers(1, 12)) * size, size))
+    return BevGrid(axes[0], axes[1], draw(st.sampled_from(["devkit", "released", "fiery"])))
 
 
 @st.composite

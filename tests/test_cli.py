@@ -68,7 +68,7 @@ def test_a_broken_release_is_listed_and_may_be_skipped(own_release: Path) -> Non
     assert "WARNING: left out" in skipped.stderr
 
 
-@pytest.mark.parametrize("verb", ["info", "index", "split"])
+@pytest.mark.parametrize("verb", ["info", "index", "split", "stats"])
 def test_every_verb_on_a_release_has_the_same_grammar(verb: str) -> None:
     text = CliRunner().invoke(deepaccident, [verb, "--help"]).output
     assert "DATAROOT" in text
@@ -153,3 +153,21 @@ def test_info_counts_only_the_scenarios_of_where(own_release: Path) -> None:
     assert "selected: 3 of 6 scenarios" in text
     wrong = run("info", own_release, "--where", "town=Twon03")
     assert (wrong.returncode, "town: found 'Twon03'; possible are Town03" in wrong.stderr) == (2, True)
+
+
+def test_stats_prints_and_writes_tables_and_figures(own_release: Path, tmp_path: Path) -> None:
+    out = tmp_path / "new" / "stats"
+    made = run("stats", own_release, "--where", "designed_accident=true", "--out", out, "--format", "png")
+    assert made.returncode == 0, made.stderr
+    assert "selected: 3 scenarios" in made.stdout
+    names = {path.name for path in out.iterdir()}
+    assert f"written: {len(names)} files in {out}" in made.stdout
+    assert {"statistics.json", "ends.csv", "collision_pairs.csv", "scenarios.png", "collisions.png"} <= names
+    assert not any(name.endswith((".pdf", ".tmp")) for name in names)
+    whole = run("stats", own_release, "--json")
+    content = json.loads(whole.stdout)
+    assert (content["scenarios"]["total"], content["selected"]) == (6, False)
+    assert content["counts"]["collisions"]["counts"]["yes"]["total"] == 3
+    assert json.loads((out / "statistics.json").read_text())["scenarios"]["total"] == 3
+    misplaced = run("stats", own_release, "--format", "png")
+    assert (misplaced.returncode, "--format is for figures; give --out FOLDER too" in misplaced.stderr) == (2, True)

@@ -13,6 +13,7 @@ from deepaccident_devkit.cli.demo import demo
 from deepaccident_devkit.cli.index import index
 from deepaccident_devkit.cli.info import info
 from deepaccident_devkit.cli.split import split
+from deepaccident_devkit.cli.stats import stats
 from deepaccident_devkit.cli.synth import synth
 from deepaccident_devkit.cli.validate import validate
 from deepaccident_devkit.errors import DeepAccidentError
@@ -26,7 +27,7 @@ def deepaccident() -> None:
     """Tools for the DeepAccident V2X accident dataset."""
 
 
-for verb in (demo, synth, index, info, split, validate):
+for verb in (demo, synth, index, info, split, stats, validate):
     deepaccident.add_command(verb)
 
 

@@ -1,9 +1,10 @@
 """Geometry in one right-handed convention: x forward, y left, z up, yaw counter-clockwise; metres, radians."""
 
+from deepaccident_devkit.geometry.bev_grid import BevGrid
 from deepaccident_devkit.geometry.box import Box
 from deepaccident_devkit.geometry.boxes import Boxes
-from deepaccident_devkit.geometry.camera import PinholeCamera
+from deepaccident_devkit.geometry.camera import BoxVisibility, PinholeCamera
 from deepaccident_devkit.geometry.pointcloud import LidarPointCloud
 from deepaccident_devkit.geometry.se3 import SE3
 
-__all__ = ["SE3", "Box", "Boxes", "LidarPointCloud", "PinholeCamera"]
+__all__ = ["SE3", "BevGrid", "Box", "BoxVisibility", "Boxes", "LidarPointCloud", "PinholeCamera"]

@@ -7,11 +7,13 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, checked, readonly
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, as_floats, checked, readonly
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import quaternions
+from deepaccident_devkit.geometry.footprints import gaps, intersection_areas
+from deepaccident_devkit.geometry.points_in_boxes import points_in_boxes
 from deepaccident_devkit.geometry.se3 import SE3
-from deepaccident_devkit.taxonomy import CATEGORIES
+from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES
 
 CORNER_SIGNS = np.array(
     [[1, 1, 1], [1, -1, 1], [1, -1, -1], [1, 1, -1], [-1, 1, 1], [-1, -1, 1], [-1, -1, -1], [-1, 1, -1]],
@@ -168,13 +170,93 @@ class Boxes:
     def contains(self, points: ArrayLike) -> BoolArray:
         """Which points (P, 3) of the same frame lie in which box, faces included: (N, P) bool."""
         given = checked("points", points, (None, 3))
-        inside = np.empty((len(self), len(given)), dtype=bool)
-        axes = quaternions.to_matrix(self.rotation)
-        for index, (center, half) in enumerate(zip(self.center, self.size / 2, strict=True)):
-            near = np.flatnonzero((np.abs(given - center) <= np.linalg.norm(half)).all(axis=1))
-            inside[index] = False
-            inside[index, near] = (np.abs((given[near] - center) @ axes[index]) <= half).all(axis=1)
+        inside = np.zeros((len(self), len(given)), dtype=bool)
+        inside[self._points_within(given)] = True
         return inside
+
+    def count_points(self, points: ArrayLike) -> IntArray:
+        """How many of the points (P, 3) of the same frame lie in each box, faces included: (N,) int64."""
+        given = checked("points", points, (None, 3))
+        return np.bincount(self._points_within(given)[0], minlength=len(self)).astype(np.int64)
+
+    def iou_bev(self, other: Boxes) -> FloatArray:
+        """Intersection over union of the footprints of these N boxes and M others: (N, M) in [0, 1].
+
+        A footprint is the rectangle of length × width at the box's yaw: a tilted box counts as if it stood upright in
+        the frame, with the same centre, size and yaw. Two boxes without any area have 0.
+
+        Raises:
+            GeometryError: the frames differ, or are a camera's (whose z points forward).
+        """
+        self._check_ground(other)
+        common = intersection_areas(self._footprints(), other._footprints())
+        return _over_union(common, _product(self.size[:, :2]), _product(other.size[:, :2]))
+
+    def iou_3d(self, other: Boxes) -> FloatArray:
+        """Intersection over union of the volumes of these N boxes and M others: (N, M) in [0, 1].
+
+        The common volume is the footprints' common area times the common height. That is exact for boxes that stand
+        upright in the frame, as the labels' do in the LiDAR frame; a tilted box counts as if it stood upright, with
+        the same centre, size and yaw. Two boxes without any volume have 0.
+
+        Raises:
+            GeometryError: the frames differ, or are a camera's (whose z points forward).
+        """
+        self._check_ground(other)
+        common = intersection_areas(self._footprints(), other._footprints())
+        (low, high), (other_low, other_high) = self._heights(), other._heights()
+        shared = np.minimum(high[:, None], other_high) - np.maximum(low[:, None], other_low)
+        return _over_union(common * np.maximum(shared, 0), _product(self.size), _product(other.size))
+
+    def distance_bev(self, other: Boxes) -> FloatArray:
+        """The gap between the footprints of these N boxes and M others: (N, M) metres, 0 where they touch or overlap.
+
+        Footprints are those of `iou_bev`. Raises GeometryError likewise.
+        """
+        self._check_ground(other)
+        return gaps(self._footprints(), other._footprints())
+
+    def center_distance(self, other: Boxes, *, in_3d: bool = False) -> FloatArray:
+        """From the centres of these N boxes to those of M others: (N, M) metres.
+
+        Args:
+            other: boxes of the same frame.
+            in_3d: count the difference in height too; without it, distances are those on the ground, as the nuScenes
+                devkit's of this name.
+
+        Raises:
+            GeometryError: the frames differ or, for distances on the ground, are a camera's.
+        """
+        if in_3d:
+            self._check_frame(other)
+        else:
+            self._check_ground(other)
+        axes = 3 if in_3d else 2
+        return as_floats(np.linalg.norm(self.center[:, None, :axes] - other.center[:, :axes], axis=-1))
+
+    def _points_within(self, points: FloatArray) -> tuple[IntArray, IntArray]:
+        """Rows of boxes and of points (P, 3), a pair for each point in a box."""
+        return points_in_boxes(points, self.center, self.size / 2, quaternions.to_matrix(self.rotation))
+
+    def _footprints(self) -> FloatArray:
+        return np.column_stack([self.center[:, :2], self.size[:, :2], self.yaw])
+
+    def _heights(self) -> tuple[FloatArray, FloatArray]:
+        half = self.size[:, 2] / 2
+        return self.center[:, 2] - half, self.center[:, 2] + half
+
+    def _check_frame(self, other: Boxes) -> None:
+        if other.frame != self.frame:
+            raise GeometryError(
+                f"boxes of frame {self.frame!r} cannot be compared with those of {other.frame!r}; transform them first"
+            )
+
+    def _check_ground(self, other: Boxes) -> None:
+        self._check_frame(other)
+        if self.frame in CAMERAS:
+            raise GeometryError(
+                f"boxes of {self.frame} have no ground plane, z points forward there; transform them to ego or lidar"
+            )
 
 
 def trusted_boxes(frame: str, columns: dict[str, AnyArray]) -> Boxes:
@@ -198,6 +280,15 @@ def concatenate(parts: list[Boxes], frame: str) -> Boxes:
             raise GeometryError(f"boxes of frame {part.frame!r} cannot join those of {frame!r}; transform them first")
     names = [field.name for field in fields(Boxes) if field.name != "frame"]
     return trusted_boxes(frame, {name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
+
+def _over_union(common: FloatArray, mine: FloatArray, theirs: FloatArray) -> FloatArray:
+    union = mine[:, None] + theirs - common
+    return as_floats(np.divide(common, union, out=np.zeros_like(common), where=union > 0).clip(0, 1))
+
+
+def _product(sizes: FloatArray) -> FloatArray:
+    return as_floats(sizes.prod(axis=1))
 
 
 def _category_codes(category: ArrayLike | None, count: int) -> AnyArray:

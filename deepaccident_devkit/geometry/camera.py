@@ -3,11 +3,36 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
+from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, as_floats, checked, readonly
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, checked, readonly
+from deepaccident_devkit.errors import GeometryError
+from deepaccident_devkit.geometry.boxes import Boxes
+from deepaccident_devkit.taxonomy import Frame
+
+VISIBLE_DEPTH = 1.0
+"""Metres in front of the camera from which on a corner in the image counts as seen (the nuScenes devkit's)."""
+IN_FRONT_DEPTH = 0.1
+"""Metres in front of the camera that all corners of a visible box must be (the nuScenes devkit's)."""
+
+
+class BoxVisibility(IntEnum):
+    """How much of a box an image shows, with the nuScenes devkit's names and numbers.
+
+    The lower, the stricter: a box that meets `ALL` meets `ANY`, and every box meets `NONE`, so
+    `camera.box_visibility(boxes) <= BoxVisibility.ANY` are the boxes that the nuScenes devkit lists by default.
+    """
+
+    ALL = 0
+    """All corners are in the image and in front of the camera."""
+    ANY = 1
+    """A corner is in the image, and all are in front of the camera."""
+    NONE = 2
+    """Nothing is asked."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,10 +69,68 @@ class PinholeCamera:
         given = checked("points", points, (None, 3))
         depth: FloatArray = given[:, 2]
         safe = np.where(depth > 0, depth, np.nan)
-        return as_floats((given / safe[:, None]) @ self.intrinsic[:2].T), depth
+        pixels: FloatArray = (given / safe[:, None]) @ self.intrinsic[:2].T
+        return pixels, depth
 
-    def in_image(self, pixels: ArrayLike) -> BoolArray:
-        """Which pixels (N, 2) lie in the image; NaN does not."""
+    def unproject(self, pixels: ArrayLike, depth: ArrayLike) -> FloatArray:
+        """Pixels (N, 2) as (u, v) and their depths (N,) along the optical axis, metres → points (N, 3), optical frame.
+
+        NaN stays NaN. Raises GeometryError if the intrinsic has no inverse.
+        """
         uv = checked("pixels", pixels, (None, 2))
-        inside: BoolArray = np.all((uv >= 0) & (uv < (self.width, self.height)), axis=1)
+        distance = checked("depth", depth, (len(uv),))
+        try:
+            inverse = np.linalg.inv(self.intrinsic)
+        except np.linalg.LinAlgError:
+            raise GeometryError(
+                f"the intrinsic {self.intrinsic.tolist()} has no inverse; is a focal length 0?"
+            ) from None
+        points: FloatArray = (uv @ inverse[:, :2].T + inverse[:, 2]) * distance[:, None]
+        return points
+
+    def in_image(
+        self, pixels: ArrayLike, depth: ArrayLike | None = None, *, min_depth: float = 0.0, margin: float = 0.0
+    ) -> BoolArray:
+        """Which pixels (N, 2) lie in the image, 0 ≤ u < width and 0 ≤ v < height; NaN does not.
+
+        Args:
+            pixels: as (u, v).
+            depth: (N,) metres along the optical axis; without it only the pixels count.
+            min_depth: points not deeper than this many metres are left out.
+            margin: a strip of this many pixels along the edges is left out; a negative one takes in as many beside.
+        """
+        uv = checked("pixels", pixels, (None, 2))
+        u, v = uv[:, 0], uv[:, 1]
+        inside: BoolArray = (u >= margin) & (u < self.width - margin) & (v >= margin) & (v < self.height - margin)
+        if depth is not None:
+            inside &= checked("depth", depth, (len(uv),)) > min_depth
         return inside
+
+    def box_visibility(self, boxes: Boxes) -> AnyArray:
+        """The strictest `BoxVisibility` that each of N boxes meets: (N,) int8.
+
+        As in the nuScenes devkit, a corner is seen if it is in the image and deeper than 1 m, and a box of which a
+        corner is not deeper than 0.1 m is `NONE`. (Its image lacks the pixels of u = 0 and of v = 0; ours has them.)
+
+        Args:
+            boxes: in this camera's optical frame.
+
+        Raises:
+            GeometryError: the boxes are in world, ego or LiDAR axes.
+        """
+        if boxes.frame in get_args(Frame):
+            raise GeometryError(
+                f"expected boxes in this camera's optical frame, found {boxes.frame!r}; "
+                "transform them by camera_from_source first"
+            )
+        corners = boxes.corners().reshape(-1, 3)
+        pixels, depth = self.project(corners)
+        seen = self.in_image(pixels, depth, min_depth=VISIBLE_DEPTH).reshape(-1, 8)
+        in_front = (depth > IN_FRONT_DEPTH).reshape(-1, 8).all(axis=1)
+        levels = [in_front & seen.all(axis=1), in_front & seen.any(axis=1)]
+        return np.select(levels, [BoxVisibility.ALL, BoxVisibility.ANY], BoxVisibility.NONE).astype(np.int8)
+
+    def boxes_in_image(self, boxes: Boxes, level: BoxVisibility = BoxVisibility.ANY) -> BoolArray:
+        """Which of N boxes of this camera's optical frame meet `level`: (N,) bool. Raises GeometryError likewise."""
+        meets: BoolArray = self.box_visibility(boxes) <= level
+        return meets

@@ -2,12 +2,41 @@
 
 from __future__ import annotations
 
+import math
+import zipfile
+import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, FloatArray, checked, readonly
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, checked, readonly
+from deepaccident_devkit.errors import GeometryError, MissingFileError, SensorFileError
+from deepaccident_devkit.files import replacing
+from deepaccident_devkit.geometry.bev_grid import BevGrid
 from deepaccident_devkit.geometry.se3 import SE3
+
+Range = tuple[float, float]
+_FIELDS = ("xyz", "intensity", "frame")
+_FAULTS = (
+    OSError,
+    ValueError,
+    TypeError,  # a bare array, which is no archive; up to Python 3.10 an AttributeError
+    AttributeError,
+    EOFError,
+    KeyError,
+    MemoryError,
+    OverflowError,
+    RuntimeError,  # an encrypted member
+    SyntaxError,  # a damaged array header
+    NotImplementedError,  # an unknown compression
+    UnicodeError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""What reading a damaged or foreign file can raise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,3 +72,130 @@ class LidarPointCloud:
     def transform(self, target_from_source: SE3, frame: str) -> LidarPointCloud:
         """The same points in another frame."""
         return LidarPointCloud(target_from_source.apply(self.xyz), self.intensity, frame)
+
+    def select(self, which: ArrayLike) -> LidarPointCloud:
+        """The points that a mask (N,) or an integer array of rows picks. Raises GeometryError."""
+        picked = np.asarray(which)
+        rows = picked if picked.size else np.zeros(0, dtype=np.int64)
+        try:
+            return LidarPointCloud(self.xyz[rows], self.intensity[rows], self.frame)
+        except IndexError as error:
+            raise GeometryError(f"{which!r} does not pick from {len(self)} points: {error}") from error
+
+    def crop(
+        self, grid: BevGrid | None = None, *, x: Range | None = None, y: Range | None = None, z: Range | None = None
+    ) -> LidarPointCloud:
+        """The points over the cells of `grid` and within the ranges given, in their order.
+
+        Args:
+            grid: x forward and y left of the cloud's own frame; its orientation does not matter.
+            x: metres, the start in, the end out, as a grid's cells; likewise `y` and `z`. None: any.
+            y: see `x`.
+            z: see `x`.
+        """
+        keep = np.ones(len(self), dtype=bool) if grid is None else grid.index_of(self.xyz)[1]
+        for name, values, limits in zip("xyz", self.xyz.T, (x, y, z), strict=True):
+            if limits is not None:
+                keep &= _within(name, values, limits)
+        return self.select(keep)
+
+    def remove_close(self, radius: float, sensor: ArrayLike | None = None) -> LidarPointCloud:
+        """The points that are `radius` or more from the sensor, measured on the ground (x and y), in their order.
+
+        Where the nuScenes devkit cuts a square of that half side out, this cuts a circle.
+
+        Args:
+            radius: metres.
+            sensor: (3,) where the sensor is in the cloud's frame, metres; without it, at the frame's origin.
+
+        Raises:
+            GeometryError: the cloud is in the world frame and `sensor` is missing, or the radius is negative.
+        """
+        if not radius >= 0:
+            raise GeometryError(f"radius: expected metres from 0 on, found {radius}")
+        if sensor is None and self.frame == "world":
+            raise GeometryError("a cloud in the world frame does not know its sensor; give sensor=(x, y, z)")
+        place = checked("sensor", (0.0, 0.0, 0.0) if sensor is None else sensor, (3,))
+        return self.select(np.hypot(*(self.xyz[:, :2] - place[:2]).T) >= radius)
+
+    def voxel_downsample(self, size: float) -> LidarPointCloud:
+        """One point a cube of `size` metres: the first one in it, unchanged, and the points keep their order.
+
+        Cubes are counted from the frame's origin, each owns its lower faces.
+
+        Raises:
+            GeometryError: the size is not above 0, or so small that the cubes cannot be counted; or a point is not
+                finite.
+        """
+        if not 0 < size < math.inf:
+            raise GeometryError(f"size: expected metres above 0, found {size}")
+        if not np.isfinite(self.xyz).all():
+            raise GeometryError(
+                "the cloud holds NaN or infinity, which lie in no voxel; select the finite points first"
+            )
+        if len(self) == 0:
+            return self
+        first: IntArray = np.unique(_voxel_keys(self.xyz, size), return_index=True)[1]
+        return self.select(np.sort(first))
+
+    def save(self, path: str | Path) -> None:
+        """Write the cloud to an `.npz` of its own (xyz float64, intensity, frame), whole or not at all.
+
+        `load` gives the same cloud back, to the bit. It is not the release's format, which is single precision,
+        left-handed and in the LiDAR frame: `release.write_lidar` writes that.
+        """
+        with replacing(Path(path)) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, xyz=self.xyz, intensity=self.intensity, frame=np.array(self.frame))
+
+    @classmethod
+    def load(cls, path: str | Path) -> LidarPointCloud:
+        """Read what `save` wrote.
+
+        Raises:
+            MissingFileError: there is no such file.
+            SensorFileError: it cannot be read, or is another kind of file.
+        """
+        try:
+            # never unpickles; release.npz, which reads the release's own arrays, stands above this layer
+            with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:  # noqa: TID251
+                xyz, intensity, frame = (archive[name] for name in _FIELDS)
+            return cls(xyz, intensity, str(frame))
+        except FileNotFoundError:
+            raise MissingFileError(f"{path}: no such file; LidarPointCloud.save writes one") from None
+        except _FAULTS as error:
+            raise SensorFileError(
+                f"{path}: not a cloud that LidarPointCloud.save wrote ({error}); "
+                "files of the release are read by load_point_cloud"
+            ) from error
+
+
+def concatenate(parts: Sequence[LidarPointCloud], frame: str) -> LidarPointCloud:
+    """All points of `parts`, in order; every part must be in `frame`, or GeometryError is raised."""
+    for part in parts:
+        if part.frame != frame:
+            raise GeometryError(f"points of frame {part.frame!r} cannot join those of {frame!r}; transform them first")
+    xyz = np.concatenate([np.zeros((0, 3)), *(part.xyz for part in parts)])
+    intensity = np.concatenate([np.zeros(0, dtype=np.float32), *(part.intensity for part in parts)])
+    return LidarPointCloud(xyz, intensity, frame)
+
+
+def _within(name: str, values: FloatArray, limits: Range) -> BoolArray:
+    low, high = checked(name, limits, (2,)).tolist()
+    if not low <= high:
+        raise GeometryError(f"{name}: expected a start and an end not before it, found {limits}")
+    within: BoolArray = (values >= low) & (values < high)
+    return within
+
+
+def _voxel_keys(xyz: FloatArray, size: float) -> IntArray:
+    """One integer a voxel, (N,)."""
+    voxels = np.floor(xyz / size)
+    lowest = voxels.min(axis=0)
+    along_x, along_y, along_z = (int(length) for length in (voxels.max(axis=0) - lowest + 1).tolist())
+    if along_x * along_y * along_z >= 2**62:
+        raise GeometryError(
+            f"size: {along_x} × {along_y} × {along_z} voxels of {size} m are too many; give a larger size"
+        )
+    x, y, z = (voxels - lowest).astype(np.int64).T
+    keys: IntArray = (x * along_y + y) * along_z + z
+    return keys

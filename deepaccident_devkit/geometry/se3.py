@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from deepaccident_devkit.arrays import FloatArray, as_floats, checked, readonly
 from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.geometry import quaternions
+from deepaccident_devkit.geometry import quaternions, six_vectors
 
 if TYPE_CHECKING:
     from pyquaternion import Quaternion
@@ -64,6 +64,18 @@ class SE3:
         """From an angle about z, radians counter-clockwise, and a translation (3,), metres."""
         return cls.from_quaternion(quaternions.from_yaw(yaw), translation)
 
+    @classmethod
+    def from_six(cls, vector: ArrayLike) -> SE3:
+        """From (6,) tx, ty, tz, rx, ry, rz: metres and radians, R = Rx(rx) · Ry(ry) · Rz(rz) (evaluation.md g).
+
+        The vector is right-handed, as all of SE3; one of the released code goes through
+        `handedness.flip_six_vector` first. Raises GeometryError if a number is not finite.
+        """
+        six = checked("vector", vector, (6,))
+        if not np.isfinite(six).all():
+            raise GeometryError(f"vector: {six.tolist()} holds NaN or infinity")
+        return trusted_se3(six_vectors.to_matrices(six))
+
     @property
     def rotation(self) -> FloatArray:
         """The rotation matrix (3, 3), read-only."""
@@ -85,6 +97,32 @@ class SE3:
     def yaw(self) -> float:
         """Heading of the source's x axis in the target frame, radians in (−π, π]."""
         return float(np.arctan2(self.matrix[1, 0], self.matrix[0, 0]))
+
+    def to_six(self) -> FloatArray:
+        """The 6-vector (6,) tx, ty, tz, rx, ry, rz: metres and radians, right-handed, as `from_six` takes it.
+
+        ry is in [−π/2, π/2]; at its ends, a source x axis that points straight up or down, rx and rz are not
+        determined one by one.
+        """
+        return six_vectors.from_matrices(self.matrix)
+
+    def interpolate(self, other: SE3, share: float) -> SE3:
+        """The pose at `share` of the way from this one (0) to `other` (1), both between the same two frames.
+
+        The rotation turns evenly about one axis on the shorter way (slerp), the translation goes straight.
+
+        Raises:
+            GeometryError: `share` is not between 0 and 1.
+        """
+        if not 0 <= share <= 1:
+            raise GeometryError(f"share: expected a number from 0 to 1, found {share}")
+        if share in (0, 1):
+            return other if share else self
+        mine, theirs = quaternions.from_matrix(self.rotation), quaternions.from_matrix(other.rotation)
+        matrix = np.eye(4)
+        matrix[:3, :3] = quaternions.to_matrix(quaternions.slerp(mine, theirs, share))
+        matrix[:3, 3] = (1 - share) * self.translation + share * other.translation
+        return trusted_se3(matrix)
 
     def inverse(self) -> SE3:
         """The transform the other way, `source_from_target`."""

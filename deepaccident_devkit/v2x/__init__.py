@@ -1,5 +1,46 @@
-"""Agents and what connects them: transforms between any two of them."""
+"""Agents and what connects them: who cooperates, what they see together, over which link, and where everything is."""
 
+from deepaccident_devkit.selection import accident_visibility, accident_visible
+from deepaccident_devkit.v2x.clouds import aggregate_point_cloud
+from deepaccident_devkit.v2x.collisions import Contact, collision
+from deepaccident_devkit.v2x.configurations import AGENT_CONFIGS, AgentConfig, Agents, cooperating_agents
+from deepaccident_devkit.v2x.cooperation import (
+    CooperativeView,
+    cooperative_boxes,
+    cooperative_view,
+    visible_instances,
+)
+from deepaccident_devkit.v2x.link import Link, PoseNoise
+from deepaccident_devkit.v2x.message_sizes import MessageSize, message_sizes
+from deepaccident_devkit.v2x.poses import future_egomotion, relative_pose_to_ego
+from deepaccident_devkit.v2x.projection import ImagePoints, map_pointcloud_to_image, project_to_image
+from deepaccident_devkit.v2x.tracks import Trajectory, trajectory
 from deepaccident_devkit.v2x.transforms import transform
 
-__all__ = ["transform"]
+__all__ = [
+    "AGENT_CONFIGS",
+    "AgentConfig",
+    "Agents",
+    "Contact",
+    "CooperativeView",
+    "ImagePoints",
+    "Link",
+    "MessageSize",
+    "PoseNoise",
+    "Trajectory",
+    "accident_visibility",
+    "accident_visible",
+    "aggregate_point_cloud",
+    "collision",
+    "cooperating_agents",
+    "cooperative_boxes",
+    "cooperative_view",
+    "future_egomotion",
+    "map_pointcloud_to_image",
+    "message_sizes",
+    "project_to_image",
+    "relative_pose_to_ego",
+    "trajectory",
+    "transform",
+    "visible_instances",
+]

@@ -15,14 +15,13 @@ from deepaccident_devkit.taxonomy import (
     VEHICLE_AGENTS,
     WARM_UP_FRAMES,
 )
+from deepaccident_devkit.v2x.collisions import CONTACT_GAP
 from deepaccident_devkit.validation.subject import Subject
 
 WEATHERS = ("Clear", "Cloudy", "HardRain", "MidRain", "SoftRain", "Wet", "WetCloudy")
 ROAD_TYPES = ("four-way junction", "three-way junction")
 SPAWN_SIDES = ("left", "right", "opposite")
 DIRECTIONS = ("straight", "left", "right")
-CONTACT_GAP = 1.5
-"""Metres between the pair at the last frame: a frame is a tenth of a second, in which they may still close in."""
 SHEER_CURTAINS = ("Town05_type001_subtype0002_scenario00035", "Town05_type001_subtype0002_scenario00004")
 
 

@@ -1,11 +1,13 @@
 """Golden cases from the folder that `--golden` names.
 
 A test marked `golden_cases(part, list)` runs once for each entry of that list in `<folder>/<part>.json` and takes the
-fixture `golden`. Where the folder, the file or the list is missing or empty, it runs once, and fails.
+fixture `golden`; one marked `golden_rows(part, array)` runs once for each row of that array in `<folder>/<part>.npz`
+and takes `golden_row`. Where the folder, the file, the list or the array is missing or empty, it runs once, and fails.
 """
 
 import functools
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,8 +37,33 @@ class GoldenCase:
 
     def __getitem__(self, name: str | tuple[str | int, ...]) -> np.ndarray:
         first, *rest = (name,) if isinstance(name, str) else name
-        words = [str(first), f"{self._checked_index():02d}", *map(str, rest)]
-        return _arrays(self.folder / f"{self.part}.npz")["_".join(words)]
+        arrays, index = _arrays(self.folder / f"{self.part}.npz"), self._checked_index()
+        names = ["_".join([str(first), f"{index:0{width}d}", *map(str, rest)]) for width in (2, 3)]
+        return arrays[next((name for name in names if name in arrays), names[0])]
+
+    @property
+    def whole(self) -> dict[str, Any]:
+        """All that the part's JSON says."""
+        return _json(self.folder / f"{self.part}.json")
+
+    def array(self, name: str) -> np.ndarray:
+        """An array of the part that is not one case's."""
+        return _arrays(self.folder / f"{self.part}.npz")[name]
+
+
+@dataclass(frozen=True)
+class GoldenRow:
+    """One row of the arrays of a golden part that have a row a case: `golden_row["ego_to_world"]`."""
+
+    folder: Path
+    part: str
+    key: str
+    index: int | None
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if self.index is None:
+            pytest.fail(f"{self.folder / self.part}.npz: no row in its array '{self.key}'; see pytest --golden DIR")
+        return _arrays(self.folder / f"{self.part}.npz")[name][self.index]
 
 
 @functools.cache
@@ -46,20 +73,30 @@ def _json(path: Path) -> dict[str, Any]:
 
 @functools.cache
 def _arrays(path: Path) -> dict[str, np.ndarray]:
+    if not path.is_file():
+        return {}
     with np.load(path) as archive:
         return dict(archive)
 
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "golden_cases(part, list): one test an entry of that list in the part's JSON")
+    config.addinivalue_line("markers", "golden_rows(part, array): one test a row of that array in the part's npz")
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    marker = metafunc.definition.get_closest_marker("golden_cases")
-    if marker is None:
-        return
-    part, key = marker.args
     folder = metafunc.config.getoption("golden")
-    count = len(_json(folder / f"{part}.json").get(key, []))
-    cases = [GoldenCase(folder, part, key, index) for index in range(count) or [None]]
-    metafunc.parametrize("golden", cases, ids=lambda case: f"{part}-{case.index}")
+    by_case = metafunc.definition.get_closest_marker("golden_cases")
+    if by_case is not None:
+        part, key = by_case.args
+        count = len(_json(folder / f"{part}.json").get(key, []))
+        _parametrize(metafunc, "golden", [GoldenCase(folder, part, key, index) for index in range(count) or [None]])
+    by_row = metafunc.definition.get_closest_marker("golden_rows")
+    if by_row is not None:
+        part, key = by_row.args
+        count = len(_arrays(folder / f"{part}.npz").get(key, []))
+        _parametrize(metafunc, "golden_row", [GoldenRow(folder, part, key, index) for index in range(count) or [None]])
+
+
+def _parametrize(metafunc: pytest.Metafunc, name: str, cases: Sequence[GoldenCase | GoldenRow]) -> None:
+    metafunc.parametrize(name, cases, ids=lambda case: f"{case.part}-{case.index}")

@@ -1,10 +1,11 @@
 import numpy as np
 from hypothesis import given
-from numpy.testing import assert_allclose
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 from pyquaternion import Quaternion
 from strategies import ANGLES, arrays, boxes, points, poses
 
-from deepaccident_devkit.geometry import SE3, Boxes, quaternions
+from deepaccident_devkit.geometry import SE3, Boxes, handedness, quaternions, six_vectors
 from deepaccident_devkit.geometry.boxes import CORNER_SIGNS
 
 
@@ -85,3 +86,52 @@ def test_points_in_boxes_by_their_own_coordinates(given_boxes: Boxes, unit: np.n
         points = box.center[0] + (clear_of_the_faces * box.size[0] / 2) @ axes.T
         np.testing.assert_array_equal(box.contains(points)[0], (np.abs(clear_of_the_faces) <= 1).all(axis=1))
         assert_allclose(box.corners()[0], box.center[0] + (CORNER_SIGNS * box.size[0] / 2) @ axes.T, atol=1e-9)
+
+
+@given(poses())
+def test_six_vector_there_and_back(pose: SE3) -> None:
+    assert_allclose(SE3.from_six(pose.to_six()).matrix, pose.matrix, atol=1e-7)  # the gimbal costs half the digits
+
+
+@given(arrays((3,), 1e3), ANGLES, st.floats(-1.5, 1.5), ANGLES)
+def test_six_numbers_there_and_back(translation: np.ndarray, rx: float, ry: float, rz: float) -> None:
+    six = SE3.from_six([*translation, rx, ry, rz]).to_six()
+    assert_array_equal(six[:3], translation)
+    turns = np.abs(six[3:] - [rx, ry, rz])
+    assert_allclose(np.minimum(turns, 2 * np.pi - turns), 0, atol=1e-9)  # −π and π are the same turn
+
+
+@given(arrays((3,), 1e3), ANGLES, ANGLES, ANGLES)
+def test_six_turns_about_z_then_y_then_x(translation: np.ndarray, rx: float, ry: float, rz: float) -> None:
+    x, y, z = (
+        Quaternion(axis=axis, angle=angle).rotation_matrix for axis, angle in zip(np.eye(3), (rx, ry, rz), strict=True)
+    )
+    pose = SE3.from_six([*translation, rx, ry, rz])
+    assert_allclose(pose.rotation, x @ y @ z, atol=1e-12)
+    assert_array_equal(pose.translation, translation)
+
+
+@given(poses())
+def test_a_flipped_six_vector_is_the_flipped_poses(pose: SE3) -> None:
+    flipped = handedness.flip_six_vector(pose.to_six())
+    assert_allclose(six_vectors.to_matrices(flipped), handedness.flip_pose(pose.matrix), atol=1e-7)
+
+
+@given(poses(), poses(), st.floats(0, 1))
+def test_interpolation_turns_evenly_and_goes_straight(one: SE3, two: SE3, share: float) -> None:
+    assert_array_equal(one.interpolate(two, 0).matrix, one.matrix)
+    assert_array_equal(one.interpolate(two, 1).matrix, two.matrix)
+    between = one.interpolate(two, share)
+    SE3(between.matrix)  # is rigid
+    assert_allclose(between.translation, one.translation + share * (two.translation - one.translation), atol=1e-9)
+    whole = (one.inverse() @ two).quaternion.angle
+    part = (one.inverse() @ between).quaternion.angle
+    assert_allclose(abs(part), share * min(abs(whole), 2 * np.pi - abs(whole)), atol=1e-6)
+
+
+@given(poses(), ANGLES, arrays((3,), 100), st.floats(0, 1))
+def test_interpolation_there_is_interpolation_back(one: SE3, yaw: float, step: np.ndarray, share: float) -> None:
+    two = one @ SE3.from_yaw(yaw * 0.99, step)  # of a half turn, either way round is the shorter
+    assert_allclose(one.interpolate(two, share).matrix, two.interpolate(one, 1 - share).matrix, atol=1e-6)
+    expected = one @ SE3.from_yaw(yaw * 0.99 * share, share * step)
+    assert_allclose(one.interpolate(two, share).matrix, expected.matrix, atol=1e-6)

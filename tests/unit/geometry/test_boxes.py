@@ -3,7 +3,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.geometry import SE3, Boxes
+from deepaccident_devkit.geometry import SE3, Boxes, footprints, points_in_boxes
 from deepaccident_devkit.geometry.boxes import concatenate
 
 
@@ -113,3 +113,83 @@ def test_wrong_columns_are_refused_by_name(columns: dict[str, object], message: 
     good = {"center": np.zeros((2, 3)), "size": np.ones((2, 3)), "yaw": np.zeros(2)}
     with pytest.raises(GeometryError, match=message):
         Boxes.from_arrays(**{**good, **columns})
+
+
+@pytest.fixture
+def square() -> Boxes:
+    """2 × 2 × 2 around the origin."""
+    return Boxes.from_arrays([[0, 0, 0]], [[2, 2, 2]], [0], frame="lidar")
+
+
+def test_iou_by_hand(square: Boxes) -> None:
+    centers = [[0, 0, 0], [1, 0, 0], [1, 1, 1], [2, 0, 0], [0, 0, 3], [5, 5, 0], [0, 0, 0]]
+    sizes = [[2, 2, 2]] * 6 + [[1, 1, 1]]
+    others = Boxes.from_arrays(centers, sizes, [0, np.pi / 2, np.pi, 0, 0, 0, 0], frame="lidar")
+    assert_allclose(square.iou_bev(others), [[1, 1 / 3, 1 / 7, 0, 1, 0, 1 / 4]], atol=1e-15)
+    assert_allclose(square.iou_3d(others), [[1, 1 / 3, 1 / 15, 0, 0, 0, 1 / 8]], atol=1e-15)
+    star = Boxes.from_arrays([[0, 0, 0]], [[2, 2, 2]], [np.pi / 4], frame="lidar")  # a regular octagon in common
+    octagon = 8 * np.tan(np.pi / 8)
+    assert square.iou_bev(star)[0, 0] == pytest.approx(octagon / (8 - octagon), abs=1e-12)
+
+
+def test_gap_by_hand(square: Boxes) -> None:
+    """Side by side, corner to corner, corner to edge, edges crossing with no corner inside, touching, above."""
+    centers = [[4, 0, 0], [4, 5, 0], [3, 0, 0], [0, 0, 0], [2, 0, 0], [0, 0, 9]]
+    sizes = [[2, 2, 2], [2, 2, 2], [2, 2, 2], [9, 0.5, 1], [2, 1, 1], [1, 1, 1]]
+    others = Boxes.from_arrays(centers, sizes, [0, np.pi, np.pi / 4, 0.1, 0, 0], frame="lidar")
+    assert_allclose(square.distance_bev(others), [[2, np.hypot(2, 3), 2 - np.sqrt(2), 0, 0, 0]], atol=1e-12)
+    assert_allclose(square.center_distance(others), [[4, np.hypot(4, 5), 3, 0, 2, 0]])
+    assert_allclose(square.center_distance(others, in_3d=True), [[4, np.hypot(4, 5), 3, 0, 2, 9]])
+
+
+def test_tilted_boxes_count_as_if_upright(square: Boxes) -> None:
+    nod = SE3.from_six([0, 0, 0, 0, 0.3, 0])
+    assert_allclose(square.transform(nod, "lidar").iou_bev(square), [[1]])
+    assert_allclose(square.transform(nod, "lidar").iou_3d(square), [[1]])
+
+
+def test_boxes_without_area_overlap_nothing(square: Boxes) -> None:
+    flat = Boxes.from_arrays([[0, 0, 0]] * 2, [[0, 2, 1], [0, 0, 0]], [0, 0], frame="lidar")
+    for iou in (flat.iou_bev(flat), flat.iou_3d(flat)):
+        assert_array_equal(iou, np.zeros((2, 2)))
+    assert_array_equal(flat.iou_bev(square), np.zeros((2, 1)))
+    assert_array_equal(flat.distance_bev(square), np.zeros((2, 1)))
+    unknown = Boxes.from_arrays([[np.nan] * 3], [[1, 1, 1]], [0], frame="lidar")
+    assert_array_equal(unknown.iou_bev(square), [[0]])
+    assert_array_equal(unknown.contains([[0, 0, 0]]), [[False]])
+    assert_array_equal(square.contains([[np.nan, 0, 0], [0, np.inf, 0]]), [[False, False]])
+
+
+@pytest.mark.parametrize("compare", ["iou_bev", "iou_3d", "distance_bev", "center_distance"])
+def test_comparing_needs_one_frame_with_a_ground(two: Boxes, compare: str) -> None:
+    none = two.select([])
+    assert getattr(two, compare)(none).shape == (2, 0)
+    assert getattr(none, compare)(two).shape == (0, 2)
+    elsewhere = two.transform(SE3.identity(), "ego")
+    with pytest.raises(GeometryError, match="'lidar' cannot be compared with those of 'ego'; transform them first"):
+        getattr(two, compare)(elsewhere)
+    in_camera = two.transform(SE3.identity(), "Camera_Back")
+    with pytest.raises(GeometryError, match=r"Camera_Back have no ground plane, .*; transform them to ego or lidar"):
+        getattr(in_camera, compare)(in_camera)
+
+
+def test_counts_are_those_of_contains(two: Boxes) -> None:
+    points = np.array([[10, 0, 1], [11, 0.5, 1], [0, 5, 1], [50, 50, 1]])
+    assert_array_equal(two.count_points(points), [2, 1])
+    assert two.count_points(points).dtype == np.int64
+    assert_array_equal(two.count_points(np.zeros((0, 3))), [0, 0])
+    assert two.select([]).count_points(points).shape == (0,)
+    with pytest.raises(GeometryError, match=r"points: expected shape \(N, 3\)"):
+        two.count_points([1, 2, 3])
+
+
+def test_many_pairs_are_worked_off_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    some = Boxes.from_arrays(rng.normal(size=(40, 3)) * 5, rng.uniform(1, 5, (40, 3)), rng.uniform(-3, 3, 40))
+    points = rng.normal(size=(300, 3)) * 5
+    whole = some.iou_bev(some), some.distance_bev(some), some.contains(points)
+    monkeypatch.setattr(footprints, "_PAIRS_AT_ONCE", 7)
+    monkeypatch.setattr(points_in_boxes, "_PAIRS_AT_ONCE", 7)
+    monkeypatch.setattr(points_in_boxes, "_POINTS_AT_ONCE", 7)
+    for have, want in zip((some.iou_bev(some), some.distance_bev(some), some.contains(points)), whole, strict=True):
+        assert_array_equal(have, want)

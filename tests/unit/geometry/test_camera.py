@@ -3,7 +3,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.geometry import PinholeCamera
+from deepaccident_devkit.geometry import SE3, Boxes, BoxVisibility, PinholeCamera
 
 
 @pytest.mark.parametrize(("degrees", "focal"), [(70, 1142.5184), (110, 560.166)])
@@ -47,3 +47,67 @@ def test_wrong_shapes_are_refused_and_the_intrinsic_is_a_copy() -> None:
         camera.project([1, 2, 3])
     with pytest.raises(GeometryError, match=r"pixels: expected shape \(N, 2\)"):
         camera.in_image([[1, 2, 3]])
+
+
+def test_unproject_by_hand() -> None:
+    camera = PinholeCamera(np.array([[500.0, 0, 800], [0, 400, 450], [0, 0, 1]]), 1600, 900)
+    points = camera.unproject([[800, 450], [900, 450], [800, 530], [np.nan] * 2], [5, 5, 10, 1])
+    assert_allclose(points, [[0, 0, 5], [1, 0, 5], [0, 2, 10], [np.nan] * 3], atol=1e-12)
+    assert camera.unproject(np.zeros((0, 2)), []).shape == (0, 3)
+    with pytest.raises(GeometryError, match=r"depth: expected shape \(1\), found \(2,\)"):
+        camera.unproject([[1, 2]], [1, 2])
+    with pytest.raises(GeometryError, match=r"has no inverse; is a focal length 0\?"):
+        PinholeCamera(np.zeros((3, 3)), 10, 10).unproject([[1, 2]], [1])
+
+
+def test_in_image_by_depth_and_margin() -> None:
+    camera = PinholeCamera.from_field_of_view(100, 50, 1.2)
+    pixels = [[50, 25], [50, 25], [1, 25], [-1, 25], [98, 25], [99, 25]]
+    assert_array_equal(
+        camera.in_image(pixels, [3, 1, 3, 3, 3, -3], min_depth=1), [True, False, True, False, True, False]
+    )
+    assert_array_equal(camera.in_image(pixels, margin=1), [True, True, True, False, True, False])
+    assert_array_equal(camera.in_image(pixels, margin=-1), [True] * 6)
+    top_and_bottom = [[50, 0.5], [50, 1], [50, 48.5], [50, 49]]
+    assert_array_equal(camera.in_image(top_and_bottom, margin=1), [False, True, True, False])
+    assert camera.in_image(top_and_bottom).all()
+    assert_array_equal(camera.in_image([[50, np.nan]], margin=-100), [False])
+    with pytest.raises(GeometryError, match=r"depth: expected shape \(6\)"):
+        camera.in_image(pixels, [1.0])
+
+
+def test_a_box_is_seen_whole_in_part_or_not() -> None:
+    """Ahead; cut by the left edge; beside; behind; around the camera; with corners nearer than 1 m; too large."""
+    camera = PinholeCamera.from_field_of_view(100, 100, np.pi / 2)
+    centers = [[0, 0, 10], [-10, 0, 10], [-30, 0, 10], [0, 0, -10], [0, 0, 0.5], [0, 0, 1.2], [0, 0, 10]]
+    sizes = [[2, 2, 2], [2, 2, 2], [2, 2, 2], [2, 2, 2], [2, 2, 2], [1, 1, 1], [40, 40, 2]]
+    boxes = Boxes.from_arrays(centers, sizes, np.zeros(7), frame="Camera_Front")
+    whole, part, none = BoxVisibility.ALL, BoxVisibility.ANY, BoxVisibility.NONE
+    assert_array_equal(camera.box_visibility(boxes), [whole, part, none, none, none, part, none])
+    assert_array_equal(camera.boxes_in_image(boxes), [True, True, False, False, False, True, False])
+    assert_array_equal(camera.boxes_in_image(boxes, whole), [True] + [False] * 6)
+    assert camera.boxes_in_image(boxes, none).all()
+    assert camera.box_visibility(boxes.select([])).shape == (0,)
+
+
+def test_all_corners_must_be_a_little_in_front() -> None:
+    camera = PinholeCamera.from_field_of_view(100, 100, np.pi / 2)
+    nearest = np.array([0.2, 0.11, 0.09, -0.05])
+    sizes = np.column_stack([np.ones((4, 2)), 3 - nearest])
+    boxes = Boxes.from_arrays(
+        np.column_stack([np.zeros((4, 2)), 3 - sizes[:, 2] / 2]), sizes, [0] * 4, frame="Camera_Back"
+    )
+    assert_array_equal(camera.boxes_in_image(boxes), [True, True, False, False])
+
+
+def test_the_levels_have_the_nuscenes_numbers() -> None:
+    assert [(level.name, level.value) for level in BoxVisibility] == [("ALL", 0), ("ANY", 1), ("NONE", 2)]
+
+
+def test_boxes_must_be_in_the_cameras_frame() -> None:
+    camera = PinholeCamera.from_field_of_view(100, 100, 1.2)
+    box = Boxes.from_arrays([[10, 0, 0]], [[2, 2, 2]], [0], frame="lidar")
+    with pytest.raises(GeometryError, match="found 'lidar'; transform them by camera_from_source first"):
+        camera.boxes_in_image(box)
+    camera_from_lidar = SE3.from_rotation([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    assert camera.boxes_in_image(box.transform(camera_from_lidar, "Camera_Front")).all()

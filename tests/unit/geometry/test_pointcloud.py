@@ -1,9 +1,12 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.geometry import SE3, LidarPointCloud
+from deepaccident_devkit.errors import GeometryError, MissingFileError, SensorFileError
+from deepaccident_devkit.geometry import SE3, BevGrid, LidarPointCloud
+from deepaccident_devkit.geometry.pointcloud import concatenate
 
 
 def test_points_move_and_intensity_stays() -> None:
@@ -35,3 +38,92 @@ def test_an_empty_cloud_moves_too() -> None:
 def test_wrong_shapes_are_refused(xyz: np.ndarray, intensity: np.ndarray, name: str) -> None:
     with pytest.raises(GeometryError, match=f"LidarPointCloud.{name}: expected shape"):
         LidarPointCloud(xyz, intensity)
+
+
+@pytest.fixture
+def cloud() -> LidarPointCloud:
+    xyz = [[0.0, 0, 0], [1, 1, 0], [1.4, 1.4, 0.4], [-3, 4, 1], [10, -2, 2]]
+    return LidarPointCloud(np.array(xyz), np.arange(5) / 10)
+
+
+def rows(part: LidarPointCloud) -> list[int]:
+    return (part.intensity * 10).round().astype(int).tolist()
+
+
+def test_crop_by_ranges_and_by_grid(cloud: LidarPointCloud) -> None:
+    assert rows(cloud.crop(x=(0, 10))) == [0, 1, 2]  # the start is in, the end is out
+    assert rows(cloud.crop(x=(-5, 11), z=(0.4, 3))) == [2, 3, 4]
+    assert rows(cloud.crop(BevGrid((0, 12, 1), (-2, 2, 1)))) == [0, 1, 2, 4]
+    assert rows(cloud.crop(BevGrid((0, 12, 1), (-2, 0, 1), "released"))) == [4]  # left is left in every orientation
+    assert rows(cloud.crop(BevGrid((0, 12, 1), (-2, 2, 1)), z=(0, 1))) == [0, 1, 2]
+    assert rows(cloud.crop()) == [0, 1, 2, 3, 4]
+    assert rows(cloud.crop(y=(1, 1))) == []
+    with pytest.raises(GeometryError, match=r"y: expected a start and an end not before it, found \(1, 0\)"):
+        cloud.crop(y=(1, 0))
+    with pytest.raises(GeometryError, match=r"z: expected shape \(2\)"):
+        cloud.crop(z=(1, 2, 3))  # type: ignore[arg-type]
+
+
+def test_remove_close_cuts_a_circle_around_the_sensor(cloud: LidarPointCloud) -> None:
+    assert rows(cloud.remove_close(1.5)) == [2, 3, 4]  # (1, 1) is 1.41 m away
+    assert rows(cloud.remove_close(5)) == [3, 4]
+    assert rows(cloud.remove_close(0)) == [0, 1, 2, 3, 4]
+    assert rows(cloud.remove_close(1, sensor=(10, -2, -7))) == [0, 1, 2, 3]
+    in_world = cloud.transform(SE3.from_yaw(0, (100, 0, 0)), "world")
+    assert rows(in_world.remove_close(1.5, sensor=(100, 0, 2))) == [2, 3, 4]
+    with pytest.raises(GeometryError, match=r"does not know its sensor; give sensor=\(x, y, z\)"):
+        in_world.remove_close(1.5)
+    with pytest.raises(GeometryError, match="radius: expected metres from 0 on, found -1"):
+        cloud.remove_close(-1)
+
+
+def test_the_first_point_of_a_voxel_stays(cloud: LidarPointCloud) -> None:
+    assert rows(cloud.voxel_downsample(1)) == [0, 1, 3, 4]
+    assert rows(cloud.voxel_downsample(0.1)) == [0, 1, 2, 3, 4]
+    assert rows(cloud.voxel_downsample(100)) == [0, 3, 4]  # voxels meet at the origin
+    assert len(cloud.crop(x=(90, 91)).voxel_downsample(1)) == 0
+    with pytest.raises(GeometryError, match="size: expected metres above 0, found 0"):
+        cloud.voxel_downsample(0)
+    with pytest.raises(GeometryError, match="voxels of 1e-09 m are too many; give a larger size"):
+        cloud.voxel_downsample(1e-9)
+    with pytest.raises(GeometryError, match=r"NaN or infinity, .* select the finite points first"):
+        LidarPointCloud(np.array([[np.nan, 0, 0]]), np.zeros(1)).voxel_downsample(1)
+
+
+def test_select_picks_points(cloud: LidarPointCloud) -> None:
+    assert rows(cloud.select([4, 0])) == [4, 0]
+    assert rows(cloud.select([])) == []
+    assert rows(cloud.select(cloud.xyz[:, 2] > 0.5)) == [3, 4]
+    with pytest.raises(GeometryError, match="does not pick from 5 points"):
+        cloud.select([5])
+
+
+def test_clouds_of_one_frame_join(cloud: LidarPointCloud) -> None:
+    joined = concatenate([cloud, cloud.crop(z=(1, 5))], "lidar")
+    assert rows(joined) == [0, 1, 2, 3, 4, 3, 4]
+    assert joined.intensity.dtype == np.float32
+    assert len(concatenate([], "ego")) == 0
+    with pytest.raises(GeometryError, match="'lidar' cannot join those of 'ego'; transform them first"):
+        concatenate([cloud], "ego")
+
+
+def test_the_same_cloud_is_the_same_bytes(cloud: LidarPointCloud, tmp_path: Path) -> None:
+    for name in ("one.npz", "two"):
+        cloud.save(str(tmp_path / "new" / name))
+    assert (tmp_path / "new" / "one.npz").read_bytes() == (tmp_path / "new" / "two").read_bytes()
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["one.npz", "two"]
+    assert LidarPointCloud.load(str(tmp_path / "new" / "two")).frame == "lidar"
+
+
+def test_what_is_no_saved_cloud_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(MissingFileError, match=r"nowhere.npz: no such file"):
+        LidarPointCloud.load(tmp_path / "nowhere.npz")
+    np.savez(tmp_path / "release.npz", data=np.zeros((2, 4)))
+    np.savez(tmp_path / "objects.npz", xyz=np.array([{}]), intensity=np.zeros(1), frame="lidar")
+    np.savez(tmp_path / "shapes.npz", xyz=np.zeros((2, 4)), intensity=np.zeros(2), frame="lidar")
+    np.save(tmp_path / "bare.npz.npy", np.zeros(3))
+    (tmp_path / "text.npz").write_text("points")
+    (tmp_path / "empty.npz").touch()
+    for path in tmp_path.iterdir():
+        with pytest.raises(SensorFileError, match=f"{path.name}: not a cloud that LidarPointCloud.save wrote"):
+            LidarPointCloud.load(path)

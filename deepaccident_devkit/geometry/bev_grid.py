@@ -1,0 +1,162 @@
+"""`BevGrid`: the cells of a raster seen from above, in three orientations."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, as_floats
+from deepaccident_devkit.errors import ChoiceError, ConfigError, GeometryError
+
+Orientation = Literal["devkit", "released", "fiery"]
+Axis = tuple[float, float, float]
+ORIENTATIONS: tuple[Orientation, ...] = get_args(Orientation)
+_WHOLE = 1e-6
+"""How far from a whole number of cells a range may be: decimal resolutions are not exact in binary."""
+
+
+@dataclass(frozen=True, slots=True)
+class BevGrid:
+    """Square or oblong cells over a piece of ground; equal ones are equal and hash alike.
+
+    Ranges are always right-handed metres, x forward and y **left**, whatever the orientation; that only says how the
+    cells lie in an array (for the default ranges, 200 × 200):
+
+    - `"devkit"`: row = y index, column = x index, both rising: row 0 is the far right (y = −50), column 0 the far
+      rear (x = −50).
+    - `"released"`: the released labels' left-handed rows, column = x index: row 0 is the far **left** (y = 50).
+      Exactly the devkit's rows in reverse order: `released[..., ::-1, :]` is the devkit's.
+    - `"fiery"`: row = x index, column = y index, both rising: row 0 is the far rear, column 0 the far right. Exactly
+      the devkit's, transposed.
+
+    Attributes:
+        x: start, end and cell size along x, metres.
+        y: start, end and cell size along y, metres.
+        orientation: how the cells lie in an array.
+    """
+
+    x: Axis = (-50.0, 50.0, 0.5)
+    y: Axis = (-50.0, 50.0, 0.5)
+    orientation: Orientation = "devkit"
+    _counts: tuple[int, int] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Check the ranges; raises ConfigError, or ChoiceError for an unknown orientation."""
+        if self.orientation not in ORIENTATIONS:
+            raise ChoiceError(f"orientation: expected one of {', '.join(ORIENTATIONS)}, found {self.orientation!r}")
+        for name in ("x", "y"):
+            object.__setattr__(self, name, _axis(name, getattr(self, name)))
+        object.__setattr__(self, "_counts", (_cell_count("x", self.x), _cell_count("y", self.y)))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of an array of this orientation; (y cells, x cells), for `"fiery"` (x cells, y cells)."""
+        along_x, along_y = self._counts
+        return (along_x, along_y) if self.orientation == "fiery" else (along_y, along_x)
+
+    @property
+    def cells(self) -> int:
+        """Number of cells."""
+        return math.prod(self._counts)
+
+    def with_orientation(self, orientation: Orientation) -> BevGrid:
+        """The same cells, lying otherwise in an array. Raises ChoiceError."""
+        return replace(self, orientation=orientation)
+
+    def index_of(self, points: ArrayLike) -> tuple[IntArray, BoolArray]:
+        """The cells that points (N, 2) or (N, 3) lie in; x forward, y left, metres.
+
+        A cell owns its lower edges in x and y, whatever the orientation. (Label rasters round polygon corners by a
+        rule of their own, evaluation.md a; this one is for points.)
+
+        Returns:
+            (N, 2) int64 row and column in this orientation, −1 −1 for points beside the grid; and (N,) bool, which
+            points are on it (NaN is not).
+
+        Raises:
+            GeometryError: `points` has another shape.
+        """
+        given = as_floats(points)
+        if given.ndim != 2 or given.shape[1] not in (2, 3):
+            raise GeometryError(f"points: expected shape (N, 2) or (N, 3), found {given.shape}")
+        steps, inside = [], np.ones(len(given), dtype=bool)
+        for values, (low, high, size), count in zip(given.T, (self.x, self.y), self._counts, strict=False):
+            within = (values >= low) & (values < high)
+            cell = np.floor((np.where(within, values, low) - low) / size).astype(np.int64)
+            steps.append(np.minimum(cell, count - 1))
+            inside &= within
+        index = np.stack(self._arranged(*steps), axis=1)
+        index[~inside] = -1
+        return index, inside
+
+    def centers(self) -> FloatArray:
+        """The cells' centres, (rows, columns, 2) x forward, y left, metres, in this orientation."""
+        across, along = (
+            low + (np.arange(count) + 0.5) * size
+            for (low, _, size), count in zip((self.x, self.y), self._counts, strict=True)
+        )
+        return self._laid_out(np.stack(np.meshgrid(across, along), axis=-1))
+
+    def reorient(self, raster: AnyArray, orientation: Orientation) -> AnyArray:
+        """A raster (…, rows, columns) of this grid as a view that lies as `orientation` says.
+
+        Only cells change places: the values of offset and flow channels point along rows and columns, and are the
+        caller's to negate or swap.
+
+        Raises:
+            GeometryError: the raster has another shape than the grid.
+            ChoiceError: there is no such orientation.
+        """
+        target = self.with_orientation(orientation)
+        array = np.asarray(raster)
+        if array.shape[-2:] != self.shape:
+            raise GeometryError(f"raster: expected shape (…, {self.shape[0]}, {self.shape[1]}), found {array.shape}")
+        devkit = _turned(array, self.orientation)
+        return _turned(devkit, target.orientation)
+
+    def _arranged(self, column: IntArray, row: IntArray) -> tuple[IntArray, IntArray]:
+        """Row and column in this orientation of cells counted along x and y."""
+        if self.orientation == "fiery":
+            return column, row
+        return (row if self.orientation == "devkit" else self._counts[1] - 1 - row), column
+
+    def _laid_out(self, devkit: FloatArray) -> FloatArray:
+        """An array (rows, columns, …) of the devkit's orientation in this one."""
+        if self.orientation == "fiery":
+            return devkit.swapaxes(0, 1)
+        return devkit if self.orientation == "devkit" else devkit[::-1]
+
+
+def _turned(raster: AnyArray, orientation: Orientation) -> AnyArray:
+    """The devkit's orientation → `orientation`, or back: each is its own way back."""
+    if orientation == "fiery":
+        return raster.swapaxes(-1, -2)
+    return raster if orientation == "devkit" else raster[..., ::-1, :]
+
+
+def _axis(name: str, given: Axis) -> Axis:
+    try:
+        low, high, size = (float(number) for number in given)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{name}: expected start, end and cell size in metres, found {given!r}") from error
+    if not (math.isfinite(low) and math.isfinite(high) and low < high and 0 < size < math.inf):
+        raise ConfigError(f"{name}: expected start < end and a cell size above 0 in metres, found {given!r}")
+    return low, high, size
+
+
+def _cell_count(name: str, axis: Axis) -> int:
+    low, high, size = axis
+    cells = (high - low) / size
+    count = round(cells)
+    if count > 0 and abs(cells - count) <= _WHOLE:
+        return count
+    shorter, longer = math.floor(cells), math.floor(cells) + 1
+    ends = [f"({low:g}, {low + number * size:g}, {size:g})" for number in (shorter, longer) if number > 0]
+    raise ConfigError(
+        f"{name}: {low:g} to {high:g} m is not a whole number of cells of {size:g} m ({cells:.6g}); "
+        f"{'the nearest that are' if len(ends) > 1 else 'the nearest that is'}: {' and '.join(ends)}"
+    )

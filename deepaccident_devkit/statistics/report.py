@@ -1,0 +1,167 @@
+"""All statistics of a release in one value, and its forms: JSON, CSV, text."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.statistics.results import (
+    GROUPS,
+    PROBABILITIES,
+    TOTAL,
+    CollisionPair,
+    CountTable,
+    Histogram,
+    QuantileTable,
+    Row,
+    Table,
+    collision_rows,
+)
+from deepaccident_devkit.taxonomy import CATEGORIES
+from deepaccident_devkit.text import columns_text
+
+_PAIRS = "collision_pairs"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DatasetStatistics:
+    """The statistics of a release, or of some of its scenarios; groups are those of `GROUPS`.
+
+    Attributes:
+        dataroot: the release's folder.
+        version: `v1` or `v1-mini`.
+        selected: whether they are of a selection.
+        scenarios: group → scenarios.
+        frames: group → frames.
+        samples: group → samples (an agent at a moment).
+        unlabelled: group → scenarios without labels, which count only where labels are not needed.
+        counts: name → table of counts.
+        histograms: name → histogram.
+        quantiles: name → table of quantiles.
+        collisions: the colliding pairs at the last frame.
+    """
+
+    dataroot: str
+    version: str
+    selected: bool
+    scenarios: Mapping[str, int]
+    frames: Mapping[str, int]
+    samples: Mapping[str, int]
+    unlabelled: Mapping[str, int]
+    counts: Mapping[str, CountTable]
+    histograms: Mapping[str, Histogram]
+    quantiles: Mapping[str, QuantileTable]
+    collisions: tuple[CollisionPair, ...]
+
+    @property
+    def tables(self) -> tuple[Table, ...]:
+        """All tables: counts, histograms, quantiles."""
+        return (*self.counts.values(), *self.histograms.values(), *self.quantiles.values())
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """The total and the groups that have a scenario."""
+        return (TOTAL, *(group for group in GROUPS[1:] if self.scenarios[group]))
+
+    def to_json(self) -> str:
+        """One JSON object; null for what has no value."""
+        return json.dumps({**asdict(self), "probabilities": PROBABILITIES}, indent=2, ensure_ascii=False)
+
+    def to_csv(self, folder: str | os.PathLike[str]) -> list[Path]:
+        """Write a file a table into a folder, each atomically, over those that are there.
+
+        Args:
+            folder: where; it is made if it is not there.
+
+        Returns:
+            The files' paths.
+
+        Raises:
+            ConfigError: `folder` is a file.
+        """
+        folder = Path(folder)
+        if folder.exists() and not folder.is_dir():
+            raise ConfigError(f"{folder}: is a file; give a folder")
+        contents: dict[str, Iterable[Row]] = {
+            **{table.name: table.rows() for table in self.tables},
+            _PAIRS: collision_rows(self.collisions),
+        }
+        paths = []
+        for name, rows in contents.items():
+            text = io.StringIO(newline="")
+            csv.writer(text, lineterminator="\n").writerows(rows)
+            paths.append(folder / f"{name}.csv")
+            write_bytes(paths[-1], text.getvalue().encode())
+        return paths
+
+    def to_text(self) -> str:
+        """Some aligned blocks for a terminal: scenarios (without zeros), a line a category, what is left out."""
+        head = f"DeepAccident {self.version} at {self.dataroot}"
+        if self.selected:
+            head += f"\nselected: {self.scenarios[TOTAL]} scenarios; all counts are of these"
+        sums = {"scenarios": self.scenarios, "frames": self.frames, "samples": self.samples}
+        blocks = [
+            head,
+            columns_text([("", *self.groups)] + [(word, *self._cells(counts)) for word, counts in sums.items()]),
+        ]
+        for table in self.counts.values():
+            if table.counted == "scenarios":
+                rows = [(value, *self._shares(table, value)) for value in table.counts if table.counts[value][TOTAL]]
+                blocks.append(columns_text([(table.field, *self.groups), *rows]))
+        blocks += [self._lengths_text(), self._categories_text()]
+        left_out = {
+            f"{table.left_out.counts[TOTAL]:,} {table.left_out.what}"
+            for table in self.tables
+            if table.left_out and table.left_out.counts[TOTAL]
+        }
+        if left_out:
+            blocks.append("\n".join(["left out where a value is needed that they lack:", *sorted(left_out)]))
+        return "\n\n".join(blocks)
+
+    def _cells(self, counts: Mapping[str, int]) -> list[str]:
+        return [f"{counts[group]:,}" for group in self.groups]
+
+    def _shares(self, table: CountTable, value: str) -> list[str]:
+        cells = []
+        for group in self.groups:
+            count, total = table.counts[value][group], table.total(group)
+            cells.append(f"{count:,} ({round(100 * count / total) if total else 0:>3} %)")
+        return cells
+
+    def _lengths_text(self) -> str:
+        lengths = self.histograms["lengths"]
+        rows = [
+            (label, *(str(lengths.counts[group][index]) for group in self.groups))
+            for index, label in enumerate(lengths.bin_labels())
+        ]
+        return columns_text([("length in frames", *self.groups), *rows, ("other", *self._cells(lengths.outside))])
+
+    def _categories_text(self) -> str:
+        """A line a category: counts, and medians of size, distance and speed."""
+        sizes = self.quantiles["box_sizes"]
+        rows = []
+        for category in CATEGORIES:
+            size = [_number(sizes.median(field, category), 2) for field in ("length", "width", "height")]
+            rows.append(
+                (
+                    category,
+                    f"{self.counts['instances'].counts[category][TOTAL]:,}",
+                    f"{self.counts['annotations'].counts[category][TOTAL]:,}",
+                    " × ".join(size) if size[0] != "–" else "–",
+                    _number(self.quantiles["distance_quantiles"].median("distance", category), 1),
+                    _number(self.quantiles["speed_quantiles"].median("speed", category), 1),
+                )
+            )
+        heading = ("category, medians", "instances", "annotations", "l × w × h (m)", "distance (m)", "speed (m/s)")
+        return columns_text([heading, *rows])
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "–" if value is None else f"{value:.{digits}f}"

@@ -1,0 +1,221 @@
+"""What statistics are made of: counts by a word, histograms, quantiles, colliding pairs; each also as rows of CSV."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import astuple, dataclass, fields
+from typing import Final
+
+from deepaccident_devkit.taxonomy import SPLITS
+
+TOTAL: Final = "total"
+UNKNOWN: Final = "unknown"
+GROUPS: Final = (TOTAL, *SPLITS, UNKNOWN)
+"""What everything is counted for: all scenarios, those of each split, those whose split is unknown."""
+
+NO_ACCIDENT: Final = "no accident"
+WITH_PEDESTRIAN: Final = "collide with pedestrians"
+WITH_OTHER: Final = "collide with other vehicles"
+NO_DESIGN: Final = "no design"
+ENDS: Final = (
+    NO_ACCIDENT,
+    WITH_PEDESTRIAN,
+    WITH_OTHER,
+    *(f"design {number}" for number in range(1, 13)),
+    NO_DESIGN,
+)
+"""How a scenario can end, as the reference's statistics say it: designs 1–6 signalised, 7–12 not; the reference calls
+a collision of two agents that realises none of them `none`."""
+
+PROBABILITIES: Final = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
+"""Of all quantiles; the first and last are the extremes."""
+
+Cell = str | int | float | None
+Row = tuple[Cell, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LeftOut:
+    """What a table does not count, since it has no value.
+
+    Attributes:
+        what: what they are and why.
+        counts: group → how many.
+    """
+
+    what: str
+    counts: Mapping[str, int]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CountTable:
+    """How many there are of each value of a word.
+
+    Attributes:
+        name: of the table, also of its file.
+        title: for people.
+        field: what the values are, such as `weather`.
+        counted: what is counted: `scenarios`, `frames`, `instances`, `annotations`.
+        counts: value → group → how many.
+        left_out: what is not counted.
+    """
+
+    name: str
+    title: str
+    field: str
+    counted: str
+    counts: Mapping[str, Mapping[str, int]]
+    left_out: LeftOut | None = None
+
+    def total(self, group: str = TOTAL) -> int:
+        """Everything that is counted in a group."""
+        return sum(row[group] for row in self.counts.values())
+
+    def rows(self) -> list[Row]:
+        """A heading, then a row a value."""
+        rows: list[Row] = [(value, *row.values()) for value, row in self.counts.items()]
+        return [(self.field, *GROUPS), *rows]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Histogram:
+    """How a number is distributed.
+
+    Attributes:
+        name: of the table, also of its file.
+        title: for people.
+        field: what the number is.
+        unit: of the number.
+        counted: what is counted.
+        edges: B + 1 ascending edges; a bin holds its lower edge, the last one both.
+        counts: group → how many in each of the B bins.
+        outside: group → how many lie below the first edge or above the last.
+        left_out: what has no value.
+    """
+
+    name: str
+    title: str
+    field: str
+    unit: str
+    counted: str
+    edges: tuple[float, ...]
+    counts: Mapping[str, tuple[int, ...]]
+    outside: Mapping[str, int]
+    left_out: LeftOut | None = None
+
+    def total(self, group: str = TOTAL) -> int:
+        """Everything that is counted in a group, outside of the bins too."""
+        return sum(self.counts[group]) + self.outside[group]
+
+    def bin_labels(self) -> list[str]:
+        """What each bin of whole numbers holds: `30–39`, …, `90–100`."""
+        last = len(self.edges) - 2
+        bins = enumerate(zip(self.edges[:-1], self.edges[1:], strict=True))
+        return [f"{low:g}–{high - (index < last):g}" for index, (low, high) in bins]
+
+    def rows(self) -> list[Row]:
+        """A heading, a row a bin, and one of what lies outside."""
+        bins = zip(self.edges[:-1], self.edges[1:], *self.counts.values(), strict=True)
+        heading = (f"{self.field} from ({self.unit})", f"to ({self.unit})", *GROUPS)
+        return [heading, *bins, ("outside", None, *self.outside.values())]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class QuantileRow:
+    """The quantiles of one number of one category in one group.
+
+    Attributes:
+        field: what the number is.
+        category: whose it is.
+        group: of `GROUPS`.
+        number: how many values there are.
+        values: the quantiles at `PROBABILITIES`, linear between neighbours; None without a value.
+    """
+
+    field: str
+    category: str
+    group: str
+    number: int
+    values: tuple[float, ...] | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class QuantileTable:
+    """Quantiles of one or more numbers, by category and group.
+
+    Attributes:
+        name: of the table, also of its file.
+        title: for people.
+        unit: of all values.
+        counted: what the values belong to.
+        quantiles: the rows.
+        left_out: what has no value.
+    """
+
+    name: str
+    title: str
+    unit: str
+    counted: str
+    quantiles: tuple[QuantileRow, ...]
+    left_out: LeftOut | None = None
+
+    def row(self, field: str, category: str, group: str = TOTAL) -> QuantileRow:
+        """The row of a field, category and group; raises KeyError."""
+        for row in self.quantiles:
+            if (row.field, row.category, row.group) == (field, category, group):
+                return row
+        raise KeyError((field, category, group))
+
+    def median(self, field: str, category: str, group: str = TOTAL) -> float | None:
+        """The median of a field, category and group, None without a value; raises KeyError."""
+        values = self.row(field, category, group).values
+        return None if values is None else values[PROBABILITIES.index(0.5)]
+
+    def rows(self) -> list[Row]:
+        """A heading, then a row a field, category and group."""
+        names = [f"q{round(100 * probability)} ({self.unit})" for probability in PROBABILITIES]
+        absent = (None,) * len(PROBABILITIES)
+        return [
+            ("field", "category", "group", "number", *names),
+            *((row.field, row.category, row.group, row.number, *(row.values or absent)) for row in self.quantiles),
+        ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CollisionPair:
+    """The colliding pair of a scenario at its last frame, by the merged tracks.
+
+    The first of the pair is the agent that comes first in `taxonomy.AGENTS`; without an agent, meta's first.
+
+    Attributes:
+        scenario: its token.
+        split: the group that it counts for, besides `total`.
+        end: of `ENDS`.
+        actor: name of the first's agent, None if it records nothing.
+        category: of the first.
+        other: name of the other's agent, None if it records nothing.
+        other_category: of the other.
+        angle: the other's heading less the first's, degrees, counter-clockwise, in [−15, 345): 0 same direction,
+            90 the other drives to the first's left, 180 head-on, 270 to its right.
+        x: centre of the other, forward of the first's centre, metres.
+        y: the same, to the left.
+    """
+
+    scenario: str
+    split: str
+    end: str
+    actor: str | None
+    category: str
+    other: str | None
+    other_category: str
+    angle: float
+    x: float
+    y: float
+
+
+def collision_rows(pairs: tuple[CollisionPair, ...]) -> list[Row]:
+    """A heading, then a row a pair."""
+    return [tuple(field.name for field in fields(CollisionPair)), *(astuple(pair) for pair in pairs)]
+
+
+Table = CountTable | Histogram | QuantileTable

@@ -1,0 +1,100 @@
+"""Point clouds of several agents and moments in one frame."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.geometry import SE3, Boxes, LidarPointCloud, quaternions
+from deepaccident_devkit.geometry.pointcloud import concatenate
+from deepaccident_devkit.v2x.configurations import Agents
+from deepaccident_devkit.v2x.link import Link
+from deepaccident_devkit.v2x.messages import Message, messages
+from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
+
+
+def aggregate_point_cloud(
+    dataset: Dataset,
+    sample: RowArgument,
+    *,
+    agents: Agents = None,
+    sweeps: int = 1,
+    frame: str = "world",
+    compensate: bool = False,
+    link: Link | None = None,
+) -> LidarPointCloud:
+    """The LiDAR points of some agents at a sample's moment and the frames before it, in one frame.
+
+    Args:
+        dataset: the release.
+        sample: token or record: its agent is the ego, its frame the present.
+        agents: names of agents, a configuration or its name as seen from the ego, or None for all that are there.
+        sweeps: how many frames (0.1 s), the present included; those before the recording began are left out.
+        frame: frame of the result, of the sample at the present: `world`, `ego`, `lidar` or a camera channel.
+        compensate: move the points in the box of an actor from where it was to where it is at the present, by the
+            track table (all agents' labels); points of actors that are not annotated at both moments stay.
+        link: what happens to the partners' data; None for nothing. Each sweep is a message of its own: lost, wrong and
+            late by itself. Compensation makes up for latency, not for wrong poses.
+
+    Returns:
+        The points by frame from the present back, then by agent, the ego first; no points if all were lost.
+
+    Raises:
+        TokenError: no such sample.
+        ChoiceError: no such agent, configuration or frame, or `sweeps` is no number from 1.
+        NotAvailableError: an agent is not in this (partial) release.
+        ConfigError: the link's latency is longer than the scenario's past.
+        MissingFileError: a point cloud was not downloaded.
+        SensorFileError: one cannot be read.
+    """
+    if sweeps < 1:
+        raise ChoiceError(f"sweeps: expected a number of frames from 1, found {sweeps!r}")
+    target_from_world = dataset.world_from(sample, frame).inverse()
+    scenario, _, present = dataset.get("sample", sample)["token"].rsplit("/", 2)
+    tracks = scenario_tracks(dataset, scenario) if compensate else None
+    parts = []
+    for message in messages(dataset, sample, agents, link, sweeps=sweeps):
+        cloud = dataset.load_point_cloud(message.sample, "lidar")
+        if tracks is not None:
+            cloud = _compensated(cloud, dataset.world_from(message.sample, "lidar"), tracks, message, int(present))
+        parts.append(cloud.transform(message.target_from(dataset, "lidar", target_from_world), frame))
+    if not parts:
+        return LidarPointCloud(np.zeros((0, 3)), np.zeros(0, dtype=np.float32), frame)
+    return concatenate(parts, frame)
+
+
+def moved_points(points: FloatArray, then: Boxes, now: Boxes) -> FloatArray:
+    """Points (P, 3) carried along by the boxes that they lie in.
+
+    Args:
+        points: in the frame of the boxes, metres.
+        then: the actors when the points were taken.
+        now: actors at another moment, each id once; those that are not among `then` do not matter.
+
+    Returns:
+        (P, 3): a point in a box of `then` has the same place in that actor's box of `now`; in several, the last
+        one's. The others are where they were.
+    """
+    both, row_then, row_now = np.intersect1d(then.actor_id, now.actor_id, return_indices=True)
+    before, after = then.select(row_then), now.select(row_now)
+    moves = (before.center != after.center).any(axis=1) | (before.rotation != after.rotation).any(axis=1)
+    before, after = before.select(moves), after.select(moves)
+    result = np.array(points)
+    turns_then, turns_now = quaternions.to_matrix(before.rotation), quaternions.to_matrix(after.rotation)
+    for box, inside in enumerate(before.contains(points) if len(both) else ()):
+        local = (points[inside] - before.center[box]) @ turns_then[box]
+        result[inside] = local @ turns_now[box].T + after.center[box]
+    return result
+
+
+def _compensated(
+    cloud: LidarPointCloud, world_from_lidar: SE3, tracks: ScenarioTracks, message: Message, present: int
+) -> LidarPointCloud:
+    """A cloud in its LiDAR frame with moving actors where they are at frame `present`."""
+    taken = int(message.sample.rsplit("/", 1)[1])
+    if taken == present:
+        return cloud
+    moved = moved_points(world_from_lidar.apply(cloud.xyz), tracks.at(taken), tracks.at(present))
+    return LidarPointCloud(world_from_lidar.inverse().apply(moved), cloud.intensity, cloud.frame)

@@ -1,0 +1,180 @@
+"""How a scenario's accident happened, from the actors' tracks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Literal
+
+import numpy as np
+
+from deepaccident_devkit.arrays import FloatArray, readonly
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import NotAvailableError
+from deepaccident_devkit.geometry import Boxes, quaternions
+from deepaccident_devkit.tables.tokens import frame_token, instance_token
+from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
+
+if TYPE_CHECKING:
+    from deepaccident_devkit.tables.records import ScenarioRecord
+
+ContactSide = Literal["front", "rear", "left", "right"]
+CONTACT_GAP: Final = 1.5
+"""Metres between the pair at the last frame up to which they can have collided within the next tenth of a second."""
+_TOUCHING: Final = 0.02
+"""Metres of gap from which on the direction of the shortest line between two outlines is trusted."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Contact:
+    """The end of an accident scenario; pairs are in meta's order; world, right-handed, metres, seconds, radians.
+
+    Attributes:
+        instances: tokens of the pair.
+        actor_ids: their CARLA ids.
+        frame: token of the last moment at which both are annotated: of a whole recording the last frame, which is at
+            most 0.1 s before the impact.
+        point: (3,) where they touch, seen from above: half-way between their outlines where these are nearest, the
+            middle of the overlap where they overlap already; at the mean height of their centres. Read-only.
+        gap: metres between the outlines from above, 0 where they overlap.
+        speeds: m/s over the ground; NaN where unknown.
+        closing_speed: m/s at which they near each other along the shortest line between their outlines (along the
+            normal of the sides that meet where they touch or overlap); negative if they part; NaN where unknown.
+        impact_angle: between their headings, in [0, π]: 0 the same way, π head-on.
+        sides: the side of each that faces the other across the widest gap along any side's normal (the least overlap).
+        agrees: whether meta agrees with the recording: `disagreements` is empty.
+        disagreements: what does not, in words: nothing but a gap of more than 1.5 m, another class than meta's, an end
+            before the last frame, or a contact side of meta's that is neither's.
+    """
+
+    instances: tuple[str, str]
+    actor_ids: tuple[int, int]
+    frame: str
+    point: FloatArray
+    gap: float
+    speeds: tuple[float, float]
+    closing_speed: float
+    impact_angle: float
+    sides: tuple[ContactSide, ContactSide]
+    disagreements: tuple[str, ...]
+
+    @property
+    def agrees(self) -> bool:
+        """Whether meta agrees with the recording."""
+        return not self.disagreements
+
+
+def collision(dataset: Dataset, scenario: RowArgument) -> Contact | None:
+    """How a scenario's accident happened: the pair that meta names, where and how fast they met.
+
+    Recorded at 10 Hz, the last frame may still show a gap, up to a metre at 10 m/s.
+
+    Args:
+        dataset: the release.
+        scenario: token or record.
+
+    Returns:
+        None if meta names no collision.
+
+    Raises:
+        TokenError: no such scenario.
+        NotAvailableError: the scenario has no meta, or nobody annotated the pair at one moment.
+    """
+    record = dataset.scenario[dataset.getind("scenario", scenario)]
+    if record["weather"] is None:
+        raise NotAvailableError(f"{record['token']} has no meta file, which names the colliding pair; unpack meta")
+    if record["collision"] is None:
+        return None
+    first, second = record["collision"]["ids"]
+    tracks = scenario_tracks(dataset, record["token"])
+    index = _last_moment(tracks, record["token"], first, second)
+    there = tracks.at(index)
+    pair = there.select(there.actor_id.searchsorted((first, second)))
+    facing, sides = _facing(pair)
+    point, gap, normal = _contact(pair, facing)
+    closing = float((pair.velocity[0] - pair.velocity[1])[:2] @ normal)
+    turn = pair.yaw[0] - pair.yaw[1]
+    speeds = np.linalg.norm(pair.velocity, axis=1)
+    return Contact(
+        instances=(instance_token(record["token"], first), instance_token(record["token"], second)),
+        actor_ids=(first, second),
+        frame=frame_token(record["token"], index),
+        point=readonly(point),
+        gap=gap,
+        speeds=(float(speeds[0]), float(speeds[1])),
+        closing_speed=closing,
+        impact_angle=float(abs(np.arctan2(np.sin(turn), np.cos(turn)))),
+        sides=sides,
+        disagreements=tuple(_disagreements(record, pair, index, gap, sides)),
+    )
+
+
+def _last_moment(tracks: ScenarioTracks, scenario: str, first: int, second: int) -> int:
+    common = np.intersect1d(tracks.index[tracks.actor_id == first], tracks.index[tracks.actor_id == second])
+    if not len(common):
+        raise NotAvailableError(f"{scenario}: no label shows the colliding pair {first} and {second} at one moment")
+    return int(common[-1])
+
+
+def _contact(pair: Boxes, facing: FloatArray) -> tuple[FloatArray, float, FloatArray]:
+    """The point of contact (3,), the gap from above, and the horizontal unit vector (2,) from first to second.
+
+    That vector leads along the shortest line between the outlines; where they touch there is none, and `facing` is it.
+
+    The second outline is pushed against the first, a little into it, and the middle of what they then share is taken:
+    of two faces in parallel, nearest along a whole stretch, that is the middle of the stretch.
+    """
+    from shapely import Polygon, get_coordinates, shortest_line
+    from shapely.affinity import translate
+
+    first, second = (Polygon(corners[:, :2]) for corners in pair.bottom_corners())
+    gap = float(first.distance(second))
+    normal = facing
+    if gap > _TOUCHING:
+        start, end = get_coordinates(shortest_line(first, second))
+        normal = (end - start) / gap
+    push = normal * (gap + _TOUCHING)
+    shared = first.intersection(translate(second, *(-push).tolist()))
+    middle = get_coordinates(shared.centroid)[0] + push / 2
+    return np.array([*middle, pair.center[:, 2].mean()]), gap, normal
+
+
+def _facing(pair: Boxes) -> tuple[FloatArray, tuple[ContactSide, ContactSide]]:
+    """The normal (2,) of a side, from first to second, along which the gap is widest (or the overlap least).
+
+    Returns:
+        The unit vector, and the side of each box that faces the other along it.
+    """
+    axes = quaternions.to_matrix(pair.rotation)[:, :2, :2]  # box, xy, along or across
+    normals = np.concatenate([axes[0].T, axes[1].T])
+    reach = np.einsum("nbk,bk->n", np.abs(np.einsum("na,bak->nbk", normals, axes)), pair.size[:, :2] / 2)
+    apart = normals @ (pair.center[1] - pair.center[0])[:2]
+    best = int(np.argmax(np.abs(apart) - reach))
+    toward_second = normals[best] * (1.0 if apart[best] >= 0 else -1.0)
+    return toward_second, (_side(toward_second @ axes[0]), _side(-toward_second @ axes[1]))
+
+
+def _side(direction: FloatArray) -> ContactSide:
+    """The side of a box that faces a horizontal direction (2,) of the box's own frame."""
+    along, across = direction.tolist()
+    if abs(along) >= abs(across):
+        return "front" if along >= 0 else "rear"
+    return "left" if across >= 0 else "right"
+
+
+def _disagreements(
+    record: ScenarioRecord, pair: Boxes, index: int, gap: float, sides: tuple[ContactSide, ContactSide]
+) -> list[str]:
+    told = record["collision"]
+    if told is None:  # only for the type: the caller has one
+        return []
+    found = []
+    if index != record["num_frames"]:
+        found.append(f"the pair is last seen at frame {index:03d} of {record['num_frames']:03d}")
+    if gap > CONTACT_GAP:
+        found.append(f"the pair is {gap:.2f} m apart")
+    if pair.category_names != told["classes"]:
+        found.append(f"the classes are {pair.category_names}, meta says {told['classes']}")
+    side = told["contact_side"].removesuffix("_side").replace("back", "rear")
+    if side in ("front", "rear", "left", "right") and side not in sides:
+        found.append(f"the sides are {list(sides)}, meta says {told['contact_side']}")
+    return found

@@ -1,0 +1,160 @@
+"""Which agents cooperate: the paper's seven configurations, as seen from any agent."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal, get_args
+
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import ChoiceError, NotAvailableError
+from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE, AgentName
+
+Role = Literal["behind", "other", "other_behind", "infrastructure"]
+"""What a partner is to the ego: the vehicle behind it, the other side's two, the roadside pole."""
+Side = Literal["ego_vehicle", "other_vehicle"]
+
+_PARTNERS: Final[dict[AgentName, dict[Role, AgentName]]] = {
+    "ego_vehicle": {
+        "behind": "ego_vehicle_behind",
+        "other": "other_vehicle",
+        "other_behind": "other_vehicle_behind",
+        "infrastructure": "infrastructure",
+    },
+    "ego_vehicle_behind": {
+        "behind": "ego_vehicle",
+        "other": "other_vehicle",
+        "other_behind": "other_vehicle_behind",
+        "infrastructure": "infrastructure",
+    },
+    "other_vehicle": {
+        "behind": "other_vehicle_behind",
+        "other": "ego_vehicle",
+        "other_behind": "ego_vehicle_behind",
+        "infrastructure": "infrastructure",
+    },
+    "other_vehicle_behind": {
+        "behind": "other_vehicle",
+        "other": "ego_vehicle",
+        "other_behind": "ego_vehicle_behind",
+        "infrastructure": "infrastructure",
+    },
+}
+"""Ego → role → agent: the released V2X dataset's renaming (evaluation.md g)."""
+
+
+@dataclass(frozen=True, slots=True)
+class AgentConfig:
+    """Who cooperates with an ego agent, named by what they are to it.
+
+    Attributes:
+        name: as in `AGENT_CONFIGS`.
+        partners: the roles beside the ego.
+    """
+
+    name: str
+    partners: tuple[Role, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check the roles; raises ChoiceError."""
+        unknown = [role for role in self.partners if role not in get_args(Role)]
+        if unknown:
+            raise ChoiceError(f"partners: expected roles of {', '.join(get_args(Role))}, found {unknown}")
+
+    def agents_for(self, ego: str, *, side: Side = "ego_vehicle") -> tuple[AgentName, ...]:
+        """The agents of this configuration by their own names, the ego first.
+
+        Seen from a vehicle, `behind` is the other vehicle of its side (for a vehicle behind: the one in front), and
+        `other` the first of the other side. Seen from the pole, `infrastructure` is the first vehicle of `side`,
+        `behind` the one behind that, `other` and `other_behind` those of the other side. So `vehicles` always is four
+        agents, three of them partners.
+
+        The released code shuffles the vehicles and draws the pole's side at random; here the order is that of the
+        roles and the side is the caller's.
+
+        Args:
+            ego: the agent that the others serve.
+            side: whose side the pole takes; without effect for a vehicle.
+
+        Raises:
+            ChoiceError: no such agent or side.
+        """
+        agent = _agent_name(ego)
+        if side not in get_args(Side):
+            raise ChoiceError(f"side: expected one of {', '.join(get_args(Side))}, found {side!r}")
+        if agent == INFRASTRUCTURE:
+            named: Mapping[Role, AgentName] = {**_PARTNERS[side], "infrastructure": side}
+        else:
+            named = _PARTNERS[agent]
+        return (agent, *(named[role] for role in self.partners))
+
+
+AGENT_CONFIGS: Final[dict[str, AgentConfig]] = {
+    config.name: config
+    for config in (
+        AgentConfig("single"),
+        AgentConfig("+behind", ("behind",)),
+        AgentConfig("+other", ("other",)),
+        AgentConfig("+infrastructure", ("infrastructure",)),
+        AgentConfig("+behind+other", ("behind", "other")),
+        AgentConfig("vehicles", ("behind", "other", "other_behind")),
+        AgentConfig("all", ("behind", "other", "other_behind", "infrastructure")),
+    )
+}
+"""The paper's seven, by name."""
+
+Agents = AgentConfig | str | Sequence[str] | None
+"""Who cooperates, wherever a call takes `agents=`: agents' names, a configuration or the name of one as seen from the
+sample's agent, or None for all that are there."""
+
+
+def cooperating_agents(dataset: Dataset, sample: RowArgument, agents: Agents = None) -> tuple[AgentName, ...]:
+    """The agents that an `agents=` argument means at a sample, each once; the sample's own first, if it is one.
+
+    Args:
+        dataset: the release.
+        sample: token or record: its agent is the ego.
+        agents: names of agents, a configuration, the name of one, or None for all that are there.
+
+    Raises:
+        TokenError: no such sample.
+        ChoiceError: no such agent or configuration, or none at all.
+        NotAvailableError: an agent is not in this (partial) release of the scenario.
+    """
+    scenario, ego, _ = dataset.get("sample", sample)["token"].rsplit("/", 2)
+    there = agents_of(dataset, scenario)
+    wanted = there if agents is None else _named(agents, ego)
+    if not wanted:
+        raise ChoiceError("agents: expected at least one agent, found none")
+    for agent in wanted:
+        if agent not in there:
+            raise NotAvailableError(
+                f"agents: {agent} is not in this release of {scenario}, which has {', '.join(there)}; "
+                "unpack the agent's archive, or name others"
+            )
+    return tuple(sorted(dict.fromkeys(wanted), key=lambda agent: agent != ego))
+
+
+def agents_of(dataset: Dataset, scenario: RowArgument) -> tuple[AgentName, ...]:
+    """The agents that a scenario has in this release, in the order of `taxonomy.AGENTS`; raises TokenError."""
+    row, names = dataset.getind("scenario", scenario), dataset.columns("agent")
+    first, last = names["scenario_row"].searchsorted((row, row + 1))
+    return tuple(AGENTS[code] for code in names["name"][first:last].tolist())
+
+
+def _named(agents: AgentConfig | str | Sequence[str], ego: str) -> tuple[AgentName, ...]:
+    if isinstance(agents, AgentConfig):
+        return agents.agents_for(ego)
+    if isinstance(agents, str):
+        if agents not in AGENT_CONFIGS:
+            hint = f"; for that agent alone give [{agents!r}]" if agents in AGENTS else ""
+            raise ChoiceError(f"agents: expected one of {', '.join(AGENT_CONFIGS)}, found {agents!r}{hint}")
+        return AGENT_CONFIGS[agents].agents_for(ego)
+    return tuple(_agent_name(agent) for agent in agents)
+
+
+def _agent_name(name: str) -> AgentName:
+    for agent in AGENTS:
+        if agent == name:
+            return agent
+    raise ChoiceError(f"agent: expected one of {', '.join(AGENTS)}, found {name!r}")

@@ -1,0 +1,204 @@
+"""What a set of agents sees together: visible actors and boxes, one an actor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, readonly
+from deepaccident_devkit.dataset import Dataset, RowArgument, Visible
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.geometry.boxes import concatenate, trusted_boxes
+from deepaccident_devkit.tables import visible_ids, visible_mask
+from deepaccident_devkit.tables.tokens import instance_token
+from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE, OWN_ACTOR_ID, UNTRACKED_ID
+from deepaccident_devkit.v2x.configurations import Agents
+from deepaccident_devkit.v2x.link import Link
+from deepaccident_devkit.v2x.messages import Message, messages
+
+SAME_PLACE: Final = 0.5
+"""Metres between two centres below which two agents' boxes of one class are of the same untracked actor."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CooperativeView:
+    """What several agents see at one moment, one box an actor; arrays are read-only.
+
+    Attributes:
+        boxes: N boxes in one frame, tracked actors by ascending id, then untracked ones (−1). An agent's own row has
+            the agent's id. `num_lidar_pts` is the sum over the agents and `camera_visible` whether any camera of
+            theirs sees it (own rows do not count); `row` is the row in the label of `source`.
+        source: (N,) int8, index into `taxonomy.AGENTS`: whose box it is.
+        seen_by: (N,) uint8, bit mask over `taxonomy.AGENTS`: who contributed a box of it; of an untracked actor only
+            the source, since nothing but the place says that others' rows are of the same.
+    """
+
+    boxes: Boxes
+    source: AnyArray
+    seen_by: AnyArray
+
+    def __post_init__(self) -> None:
+        """Freeze the arrays."""
+        object.__setattr__(self, "source", readonly(self.source))
+        object.__setattr__(self, "seen_by", readonly(self.seen_by))
+
+
+def visible_instances(
+    dataset: Dataset, sample: RowArgument, *, agents: Agents = None, link: Link | None = None
+) -> list[str]:
+    """The instances that at least one of some agents sees at a sample's moment, by the released rule.
+
+    With all five agents and no link, these are the actors that the released labels count as visible (evaluation.md f).
+    Own rows and untracked ones never are.
+
+    Args:
+        dataset: the release.
+        sample: token or record: its agent is the ego, its frame the present.
+        agents: names of agents, a configuration or its name as seen from the ego, or None for all that are there.
+        link: what happens to the partners' data; None for nothing.
+
+    Returns:
+        Tokens by ascending actor id; of agents without labels nothing.
+
+    Raises:
+        TokenError: no such sample.
+        ChoiceError: no such agent or configuration.
+        NotAvailableError: an agent is not in this (partial) release.
+        ConfigError: the link's latency is longer than the scenario's past.
+    """
+    masks, ids = [], []
+    scenario = dataset.get("sample", sample)["scenario_token"]
+    for message in messages(dataset, sample, agents, link):
+        boxes = dataset.boxes(message.sample, "lidar")
+        masks.append(_released_mask(message, boxes))
+        ids.append(boxes.actor_id)
+    return [instance_token(scenario, actor) for actor in visible_ids(masks, ids).tolist()]
+
+
+def cooperative_boxes(
+    dataset: Dataset,
+    sample: RowArgument,
+    *,
+    agents: Agents = None,
+    frame: str = "world",
+    visible: Visible | None = None,
+    link: Link | None = None,
+) -> Boxes:
+    """The union of what some agents annotated at a sample's moment, one box an actor, in one frame.
+
+    Of an actor that several have, the box of the ego counts, else of the first agent that saw it from outside; an
+    agent's own row (which becomes the agent's actor) only where no other has it, since it lies up to 0.3 m off.
+    Untracked rows (−1) are kept, but once: one within 0.5 m of another agent's of the same class, or of a tracked
+    actor's chosen box, is left out. `cooperative_view` also says who saw what.
+
+    Args:
+        dataset: the release.
+        sample: token or record: its agent is the ego, its frame the present.
+        agents: names of agents, a configuration or its name as seen from the ego, or None for all that are there.
+        frame: frame of the result, of the sample: `world`, `ego`, `lidar` or a camera channel (optical).
+        visible: None for all that is annotated, own rows among it; `camera` for what a camera of the agent itself
+            sees; `released` for what the agent itself sees by the released rule (evaluation.md f).
+        link: what happens to the partners' data; None for nothing.
+
+    Returns:
+        The boxes as `CooperativeView.boxes` says; actor ids are CARLA's, or −1 for untracked.
+
+    Raises:
+        TokenError: no such sample.
+        ChoiceError: no such agent, configuration, frame or visibility.
+        NotAvailableError: an agent is not in this (partial) release.
+        ConfigError: the link's latency is longer than the scenario's past.
+    """
+    return cooperative_view(dataset, sample, agents=agents, frame=frame, visible=visible, link=link).boxes
+
+
+def cooperative_view(
+    dataset: Dataset,
+    sample: RowArgument,
+    *,
+    agents: Agents = None,
+    frame: str = "world",
+    visible: Visible | None = None,
+    link: Link | None = None,
+) -> CooperativeView:
+    """`cooperative_boxes` and who saw each of them; arguments and errors as there."""
+    target_from_world = dataset.world_from(sample, frame).inverse()
+    parts, actors, agent_codes = [], [], []
+    for message in messages(dataset, sample, agents, link):
+        boxes, ids = dataset.boxes(message.sample, "lidar"), dataset.actor_ids(message.sample)
+        if visible is not None:
+            seen = _visible_mask(message, boxes, visible)
+            boxes, ids = boxes.select(seen), ids[seen]
+        parts.append(boxes.transform(message.target_from(dataset, "lidar", target_from_world), frame))
+        actors.append(ids)
+        agent_codes.append(np.full(len(ids), AGENTS.index(message.agent), dtype=np.int8))
+    if not parts:
+        empty = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [], frame=frame)
+        return CooperativeView(boxes=empty, source=np.zeros(0, dtype=np.int8), seen_by=np.zeros(0, dtype=np.uint8))
+    return _one_an_actor(concatenate(parts, frame), np.concatenate(actors), np.concatenate(agent_codes))
+
+
+def _one_an_actor(boxes: Boxes, actor: IntArray, agent: AnyArray) -> CooperativeView:
+    """Merge all agents' boxes (N), which are in the order of preference, with their actors and agents (N,)."""
+    own = boxes.actor_id == OWN_ACTOR_ID
+    tracked = np.flatnonzero(actor != UNTRACKED_ID)
+    order = tracked[np.lexsort((own[tracked], actor[tracked]))]
+    ids, first, group = np.unique(actor[order], return_index=True, return_inverse=True)
+    chosen = order[first]
+    from_outside = ~own[order]
+    count = len(ids)
+    points = np.bincount(group, np.where(from_outside, boxes.num_lidar_pts[order], 0), count).astype(np.int64)
+    camera = np.bincount(group, boxes.camera_visible[order] & from_outside, count) > 0
+    seen_by = np.zeros(count, dtype=np.uint8)
+    bits = np.left_shift(1, agent, dtype=np.uint8, casting="unsafe")
+    np.bitwise_or.at(seen_by, group, bits[order])
+
+    loose = np.flatnonzero(actor == UNTRACKED_ID)
+    loose = loose[~_repeated(boxes, agent, loose, chosen)]
+    picked = np.concatenate([chosen, loose])
+    result = boxes.select(picked)
+    columns = {name: getattr(result, name) for name in ("center", "size", "rotation", "velocity", "category", "row")}
+    merged = trusted_boxes(
+        boxes.frame,
+        {
+            **columns,
+            "actor_id": actor[picked],
+            "num_lidar_pts": np.concatenate([points, boxes.num_lidar_pts[loose]]),
+            "camera_visible": np.concatenate([camera, boxes.camera_visible[loose]]),
+        },
+    )
+    return CooperativeView(boxes=merged, source=agent[picked], seen_by=np.concatenate([seen_by, bits[loose]]))
+
+
+def _repeated(boxes: Boxes, agent: AnyArray, loose: IntArray, chosen: IntArray) -> BoolArray:
+    """Which untracked rows stand where a tracked actor does, or where an agent before them has an untracked one."""
+    against = np.concatenate([chosen, loose])
+    apart: FloatArray = np.linalg.norm(boxes.center[loose][:, None] - boxes.center[against][None], axis=-1)
+    same = (apart < SAME_PLACE) & (boxes.category[loose][:, None] == boxes.category[against])
+    earlier = np.tril(agent[loose][:, None] != agent[loose], k=-1)
+    same[:, len(chosen) :] &= earlier
+    result: BoolArray = same.any(axis=1)
+    return result
+
+
+def _visible_mask(message: Message, boxes: Boxes, visible: Visible) -> BoolArray:
+    if visible == "camera":
+        return boxes.camera_visible
+    if visible != "released":
+        raise ChoiceError(f"visible: expected None, 'camera' or 'released', found {visible!r}")
+    tracked: BoolArray = (boxes.actor_id != OWN_ACTOR_ID) & (boxes.actor_id != UNTRACKED_ID)
+    return _released_mask(message, boxes) & tracked
+
+
+def _released_mask(message: Message, boxes: Boxes) -> BoolArray:
+    """What an agent sees by its own points and cameras, of boxes in its LiDAR frame."""
+    return visible_mask(
+        boxes.center[:, :2],
+        boxes.category,
+        boxes.num_lidar_pts,
+        boxes.camera_visible,
+        infrastructure=message.agent == INFRASTRUCTURE,
+    )

@@ -1,0 +1,156 @@
+"""What a real link between agents does to what they share: wrong poses, delay, loss (the paper's robustness study)."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import Final, Literal, get_args
+
+import numpy as np
+
+from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.geometry import SE3
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
+
+NoiseLaw = Literal["paper", "zero-mean"]
+_NORMAL: Final = NormalDist()
+_FRAME_TOLERANCE: Final = 1e-6
+"""How far, in frames, a latency may be from a whole number of them."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoseNoise:
+    """How wrongly a partner knows where it is: one draw a partner and frame.
+
+    The law `paper`: the partner is off by a distance drawn from a normal distribution of `mean` and `std`. The paper
+    studies means of 0.1 to 0.5 m with σ = 0.02 m and does not say in which direction; ours is horizontal, uniform over
+    the compass and drawn with the distance. The law `zero-mean`: x and y of the world are each off by a normal number
+    of mean 0 and deviation `std`, as other V2X studies do; its `mean` must be 0.
+
+    Attributes:
+        mean: metres.
+        std: standard deviation, metres.
+        heading_std: standard deviation of the heading about the vertical, radians; its mean is 0.
+        law: `paper` or `zero-mean`.
+    """
+
+    mean: float = 0.0
+    std: float = 0.02
+    heading_std: float = 0.0
+    law: NoiseLaw = "paper"
+
+    def __post_init__(self) -> None:
+        """Check the numbers; raises ConfigError."""
+        for name in ("mean", "std", "heading_std"):
+            value = getattr(self, name)
+            if not 0 <= value < math.inf:
+                raise ConfigError(f"pose noise: {name} is {value}; choose a finite number of at least 0")
+        if self.law not in get_args(NoiseLaw):
+            raise ConfigError(f"pose noise: expected a law of {', '.join(get_args(NoiseLaw))}, found {self.law!r}")
+        if self.law == "zero-mean" and self.mean:
+            raise ConfigError(f"pose noise: the law zero-mean takes no mean, found {self.mean}; give std alone")
+
+    def draw(self, key: str) -> tuple[float, float, float]:
+        """The error of one partner at one frame: x and y in world, metres, and heading, radians; the same by key."""
+        turn, distance, sideways, heading = uniforms(f"{key}/pose")
+        about = self.heading_std * _NORMAL.inv_cdf(heading)
+        if self.law == "zero-mean":
+            return self.std * _NORMAL.inv_cdf(distance), self.std * _NORMAL.inv_cdf(sideways), about
+        off, direction = self.mean + self.std * _NORMAL.inv_cdf(distance), 2 * math.pi * turn
+        return off * math.cos(direction), off * math.sin(direction), about
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Link:
+    """What happens to the data of partners on their way to the ego; the ego's own are never touched.
+
+    Every draw depends on the seed, the scenario, the partner and the frame at which the ego receives, and on nothing
+    else: not on the order of calls, on other agents or on the other effects.
+
+    Attributes:
+        latency: seconds, a multiple of 0.1 (the paper: 0.1 to 0.5): a partner's data are those of an earlier frame,
+            placed by the pose it had then, so that what stands still stays and what moves lags behind.
+        pose_noise: None for exact poses; a number is `PoseNoise(mean=…)`.
+        packet_loss: probability in [0, 1] that nothing of a partner arrives at a frame.
+        seed: of all draws.
+    """
+
+    latency: float = 0.0
+    pose_noise: PoseNoise | float | None = None
+    packet_loss: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the numbers; raises ConfigError."""
+        if not 0 <= self.latency < math.inf:
+            raise ConfigError(f"latency: {self.latency} is not possible; choose a finite number of seconds from 0")
+        frames = self.latency / FRAME_PERIOD
+        if abs(frames - round(frames)) > _FRAME_TOLERANCE:
+            below, above = math.floor(frames) / 10, math.ceil(frames) / 10
+            raise ConfigError(
+                f"latency: {self.latency} s is no multiple of a frame ({FRAME_PERIOD} s); "
+                f"the nearest are {below} s and {above} s"
+            )
+        if not 0 <= self.packet_loss <= 1:
+            raise ConfigError(f"packet_loss: {self.packet_loss} is no probability; choose a number from 0 to 1")
+        if self.pose_noise is not None and not isinstance(self.pose_noise, PoseNoise):
+            object.__setattr__(self, "pose_noise", _noise_of_mean(self.pose_noise))
+
+    @property
+    def latency_frames(self) -> int:
+        """The latency in frames of 0.1 s."""
+        return round(self.latency / FRAME_PERIOD)
+
+    def frame_sent(self, scenario: str, index: int) -> int:
+        """The number of the frame whose data arrive at frame `index` of a scenario.
+
+        Raises:
+            ConfigError: that was before the recording began.
+        """
+        sent = index - self.latency_frames
+        if sent < 1:
+            raise ConfigError(
+                f"latency: {self.latency} s reaches back before the first frame of {scenario} from frame {index:03d}; "
+                f"the most there is {(index - 1) / 10} s, and this latency works from frame "
+                f"{self.latency_frames + 1:03d} on"
+            )
+        return sent
+
+    def loses(self, scenario: str, partner: str, index: int) -> bool:
+        """Whether nothing of a partner arrives at frame number `index`."""
+        return self.packet_loss > 0 and uniforms(f"{self._key(scenario, partner, index)}/loss")[0] < self.packet_loss
+
+    def pose_error(self, scenario: str, partner: str, index: int, position: FloatArray) -> SE3 | None:
+        """Where the ego places what the partner has at its true place: `claimed_from_world`; None without noise.
+
+        Args:
+            scenario: token.
+            partner: the agent's name.
+            index: number of the frame at which the ego receives.
+            position: (3,) where the partner truly was, world, metres: its heading is wrong about this point.
+        """
+        if not isinstance(self.pose_noise, PoseNoise):
+            return None
+        x, y, heading = self.pose_noise.draw(self._key(scenario, partner, index))
+        turn = SE3.from_yaw(heading)
+        return SE3.from_rotation(turn.rotation, position + np.array([x, y, 0.0]) - turn.rotate(position))
+
+    def _key(self, scenario: str, partner: str, index: int) -> str:
+        return f"{self.seed}/{scenario}/{partner}/{index}"
+
+
+def _noise_of_mean(mean: object) -> PoseNoise:
+    if not isinstance(mean, int | float):
+        raise ConfigError(f"pose_noise: expected metres or a PoseNoise, found {mean!r}")
+    return PoseNoise(mean=float(mean))
+
+
+def uniforms(key: str) -> tuple[float, float, float, float]:
+    """Four numbers strictly between 0 and 1 that a text determines, on every machine and numpy."""
+    digest = hashlib.sha256(key.encode()).digest()
+    numbers = [int.from_bytes(digest[start : start + 8], "big") >> 12 for start in range(0, 32, 8)]
+    first, second, third, fourth = ((number + 0.5) / 2**52 for number in numbers)
+    return first, second, third, fourth

@@ -1,0 +1,130 @@
+"""Points of any agent in the images of any agent."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from deepaccident_devkit.arrays import BoolArray, ByteArray, FloatArray, checked, readonly
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.geometry import LidarPointCloud, PinholeCamera
+from deepaccident_devkit.taxonomy import CAMERAS
+from deepaccident_devkit.v2x.transforms import transform
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ImagePoints:
+    """Where N points fall in an image; arrays are read-only.
+
+    Attributes:
+        pixels: (N, 2) float64 as (u, v); pixel centres are at halves; NaN behind the camera.
+        depth: (N,) float64, metres along the optical axis.
+        color: (N, 3) uint8 RGB of the pixel, black outside the image; None if no colours were asked for.
+        mask: (N,) bool, in front of the camera and in the image (whatever may stand before the point).
+    """
+
+    pixels: FloatArray
+    depth: FloatArray
+    color: ByteArray | None
+    mask: BoolArray
+
+    def __post_init__(self) -> None:
+        """Freeze the arrays."""
+        for name in ("pixels", "depth", "mask"):
+            object.__setattr__(self, name, readonly(getattr(self, name)))
+        if self.color is not None:
+            object.__setattr__(self, "color", readonly(self.color))
+
+
+def project_to_image(
+    dataset: Dataset,
+    points: LidarPointCloud | ArrayLike,
+    sample: RowArgument,
+    camera: RowArgument,
+    *,
+    frame: str | None = None,
+    colors: bool = True,
+) -> ImagePoints:
+    """Points of one agent in an image of any agent at any moment of the same scenario.
+
+    The points are taken to stand still: those of another moment are off where something moved.
+
+    Args:
+        dataset: the release.
+        points: a point cloud, or an array (N, 3), metres.
+        sample: token or record of the sample that the points' frame belongs to.
+        camera: token or record of the image (sample data).
+        frame: the points' frame: `world`, `ego`, `lidar` or a channel of `sample`; None for a cloud's own, and `world`
+            of an array.
+        colors: whether to load the image for its colours.
+
+    Raises:
+        TokenError: no such sample or sensor file, such as a camera that does not exist.
+        ChoiceError: the sensor is no camera, there is no such frame, or the two are of two scenarios.
+        GeometryError: the points are no array (N, 3).
+        MissingFileError: the image was not downloaded (and colours are asked for).
+        SensorFileError: it cannot be read.
+    """
+    if isinstance(points, LidarPointCloud):
+        xyz, source = points.xyz, frame or points.frame
+    else:
+        xyz, source = checked("points", points, (None, 3)), frame or "world"
+    record = dataset.get("sample_data", camera)
+    lens = camera_of(dataset, record)
+    optical_from_source = transform(dataset, record["sample_token"], sample, record["channel"], source)
+    pixels, depth = lens.project(optical_from_source.apply(xyz))
+    mask = lens.in_image(pixels)
+    color = _colors_at(dataset.load_image(record), lens, pixels, mask) if colors else None
+    return ImagePoints(pixels=pixels, depth=depth, color=color, mask=mask)
+
+
+def map_pointcloud_to_image(
+    dataset: Dataset, camera: RowArgument, sample: RowArgument | None = None, *, colors: bool = True
+) -> ImagePoints:
+    """The points of a sample's LiDAR in an image, as the nuScenes devkit's explorer has it.
+
+    Args:
+        dataset: the release.
+        camera: token or record of the image (sample data).
+        sample: token or record: whose LiDAR; None for the camera's own sample.
+        colors: whether to load the image for its colours.
+
+    Returns:
+        A row a point, in the cloud's order.
+
+    Raises:
+        TokenError: no such sample or sensor file.
+        ChoiceError: the sensor is no camera, or the two are of two scenarios.
+        MissingFileError: the image or the cloud was not downloaded.
+        SensorFileError: one cannot be read.
+    """
+    record = dataset.get("sample_data", camera)
+    source = record["sample_token"] if sample is None else sample
+    return project_to_image(dataset, dataset.load_point_cloud(source, "lidar"), source, record, colors=colors)
+
+
+def camera_of(dataset: Dataset, camera: RowArgument) -> PinholeCamera:
+    """The lens of an image, of the size that calib gives it.
+
+    Raises:
+        TokenError: no such sensor file.
+        ChoiceError: the sensor is no camera.
+    """
+    record = dataset.get("sample_data", camera)
+    if record["modality"] != "camera":
+        raise ChoiceError(f"camera: expected one of {', '.join(CAMERAS)}, found {record['channel']}")
+    sensor = dataset.get("calibrated_sensor", record["calibrated_sensor_token"])
+    return PinholeCamera(np.array(sensor["camera_intrinsic"]), record["width"], record["height"])
+
+
+def _colors_at(image: ByteArray, lens: PinholeCamera, pixels: FloatArray, mask: BoolArray) -> ByteArray:
+    """(N, 3) uint8; an image that was stored smaller than its calib says is read at the same place."""
+    height, width = image.shape[:2]
+    columns = (pixels[mask, 0] * (width / lens.width)).astype(np.intp)
+    rows = (pixels[mask, 1] * (height / lens.height)).astype(np.intp)
+    result = np.zeros((len(pixels), 3), dtype=np.uint8)
+    result[mask] = image[np.minimum(rows, height - 1), np.minimum(columns, width - 1)]
+    return result

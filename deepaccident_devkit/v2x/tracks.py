@@ -1,0 +1,174 @@
+"""Where actors were and will be, from all agents' labels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, as_floats, readonly
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.geometry import SE3, Boxes, quaternions
+from deepaccident_devkit.geometry.boxes import trusted_boxes
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Trajectory:
+    """An actor at the T moments at which anybody annotated it, in one right-handed frame; arrays are read-only.
+
+    Attributes:
+        instance: token of the actor.
+        frame: `world`, or a frame of the sample that was asked for.
+        index: (T,) int64, frame numbers from 1, ascending; gaps where nobody annotated the actor.
+        center: (T, 3) float64, metres.
+        rotation: (T, 4) float64, unit quaternions w, x, y, z.
+        size: (T, 3) float64, length, width, height, metres.
+        velocity: (T, 3) float64, m/s over the ground, NaN where unknown.
+        agents: (T,) uint8, bit masks over `taxonomy.AGENTS`: who annotated it.
+        present: frame number of the sample that was asked for; None without one.
+    """
+
+    instance: str
+    frame: str
+    index: IntArray
+    center: FloatArray
+    rotation: FloatArray
+    size: FloatArray
+    velocity: FloatArray
+    agents: AnyArray
+    present: int | None = None
+
+    def __post_init__(self) -> None:
+        """Freeze the arrays."""
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                object.__setattr__(self, field.name, readonly(value))
+
+    def __len__(self) -> int:
+        """Number of moments."""
+        return len(self.index)
+
+    @property
+    def timestamp(self) -> FloatArray:
+        """(T,) seconds since the scenario's first frame."""
+        return as_floats((self.index - 1) * FRAME_PERIOD)
+
+    @property
+    def yaw(self) -> FloatArray:
+        """(T,) heading about z of `frame`, radians in (−π, π]."""
+        return quaternions.yaw_of(self.rotation)
+
+    @property
+    def past(self) -> Trajectory:
+        """The moments before the present; raises ChoiceError if there is no present."""
+        return self._part(self.index < self._present())
+
+    @property
+    def future(self) -> Trajectory:
+        """The moments after the present; raises ChoiceError if there is no present."""
+        return self._part(self.index > self._present())
+
+    def _present(self) -> int:
+        if self.present is None:
+            raise ChoiceError("past and future: this trajectory has no present; ask for it with sample=")
+        return self.present
+
+    def _part(self, which: BoolArray) -> Trajectory:
+        columns = {name: getattr(self, name)[which] for name in (*_MOVED, "size", "index", "agents")}
+        return Trajectory(instance=self.instance, frame=self.frame, present=self.present, **columns)
+
+
+def trajectory(
+    dataset: Dataset, instance: RowArgument, sample: RowArgument | None = None, frame: str = "world"
+) -> Trajectory:
+    """An actor's past and future from all agents' labels: the track table's rows, which it chooses among agents.
+
+    Args:
+        dataset: the release.
+        instance: token or record.
+        sample: token or record of the present: it parts past from future, and `frame` is its.
+        frame: `world`, or `ego`, `lidar` or a channel of `sample`, which stays where it is at that moment.
+
+    Raises:
+        TokenError: no such instance or sample.
+        ChoiceError: no such frame, one other than `world` without a sample, or a sample of another scenario.
+    """
+    record = dataset.get("instance", instance)
+    tracks = scenario_tracks(dataset, record["scenario_token"])
+    rows = np.flatnonzero(tracks.actor_id == record["actor_id"])
+    frame_from_world, present = SE3.identity(), None
+    if sample is not None:
+        there = dataset.get("sample", sample)
+        if there["scenario_token"] != record["scenario_token"]:
+            raise ChoiceError(
+                f"trajectory: expected a sample of {record['scenario_token']}, found {there['token']}; "
+                "scenarios take place in different worlds"
+            )
+        frame_from_world = dataset.world_from(there, frame).inverse()
+        present = int(there["token"].rsplit("/", 1)[1])
+    elif frame != "world":
+        raise ChoiceError(f"trajectory: frame {frame!r} is one of a sample; name it with sample=")
+    moved = tracks.boxes.select(rows).transform(frame_from_world, frame)
+    return Trajectory(
+        instance=record["token"],
+        frame=frame,
+        index=tracks.index[rows],
+        agents=tracks.agents[rows],
+        size=moved.size,
+        present=present,
+        **{name: getattr(moved, name) for name in _MOVED},
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ScenarioTracks:
+    """All actors of a scenario at all moments, one row an actor and moment, ordered by frame and actor; in world.
+
+    Attributes:
+        boxes: M boxes in world; points and cameras are not known (0, False).
+        index: (M,) int64, frame numbers from 1.
+        agents: (M,) uint8, bit masks over `taxonomy.AGENTS`: who annotated it.
+    """
+
+    boxes: Boxes
+    index: IntArray
+    agents: AnyArray
+
+    @property
+    def actor_id(self) -> IntArray:
+        """(M,) CARLA ids."""
+        return self.boxes.actor_id
+
+    def at(self, index: int) -> Boxes:
+        """The actors at frame number `index`, by ascending id."""
+        first, last = self.index.searchsorted((index, index + 1))
+        return self.boxes.select(np.arange(first, last))
+
+
+def scenario_tracks(dataset: Dataset, scenario: RowArgument) -> ScenarioTracks:
+    """A scenario's rows of the track table as arrays; raises TokenError."""
+    columns, scenario_row = dataset.columns("track"), dataset.getind("scenario", scenario)
+    first_frame = dataset.columns("scenario")["first_frame_row"].item(scenario_row)
+    frames = dataset.columns("scenario")["num_frames"].item(scenario_row)
+    first, last = columns["frame_row"].searchsorted((first_frame, first_frame + frames))
+    rows = slice(int(first), int(last))
+    count = rows.stop - rows.start
+    boxes = trusted_boxes(
+        "world",
+        {
+            "center": columns["translation"][rows],
+            **{name: columns[name][rows] for name in ("rotation", "size", "velocity", "category")},
+            "actor_id": dataset.columns("instance")["actor_id"][columns["instance_row"][rows]],
+            "num_lidar_pts": np.zeros(count, dtype=np.int64),
+            "camera_visible": np.zeros(count, dtype=bool),
+            "row": np.arange(count),
+        },
+    )
+    index = columns["frame_row"][rows].astype(np.int64) - first_frame + 1
+    return ScenarioTracks(boxes=boxes, index=index, agents=columns["agents"][rows])
+
+
+_MOVED = ("center", "rotation", "velocity")

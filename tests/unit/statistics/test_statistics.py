@@ -1,0 +1,280 @@
+"""The statistics' numbers: by hand on a tiny release, and by plain Python over records on a synthetic one."""
+
+import csv
+import json
+import math
+import statistics as plain
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny import META, TYPE, write_tiny_release
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ConfigError, TokenError
+from deepaccident_devkit.geometry import quaternions
+from deepaccident_devkit.statistics import ENDS, GROUPS, DatasetStatistics, dataset_statistics
+from deepaccident_devkit.taxonomy import CATEGORIES
+
+QUIET = "ClearNight -1 -1 -1 -1 -1 -1 -1 45\n"
+NORMAL = "type1_subtype2_normal"
+EGO = ("ego_vehicle",)
+WALKER = META.replace("1212 car", "1400 pedestrian").replace("ego other", "ego none").replace("HardRainNoon", "WetNoon")
+THIRD = META.replace("1212 car", "1300 van").replace("ego other", "ego none").replace("four-way", "three-way")
+ODD = META.replace("spawn_side: left", "spawn_side: opposite")
+
+
+def named(number: int) -> str:
+    return f"Town03_type001_subtype0001_scenario{number:05d}"
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
+    """Six scenarios: design 1, a quiet one, a pedestrian hit, a third vehicle, no design; one without anything."""
+    root = tmp_path_factory.mktemp("statistics")
+    write_tiny_release(root, name=named(1))
+    write_tiny_release(root, name=named(2), scenario_type=NORMAL, meta=QUIET, agents=EGO, frames=35)
+    write_tiny_release(root, name=named(3), meta=WALKER, agents=EGO, frames=2)
+    write_tiny_release(root, name=named(4), meta=THIRD, agents=("ego_vehicle", "infrastructure"), frames=2)
+    write_tiny_release(root, name=named(5), meta=ODD, agents=EGO, frames=1)
+    write_tiny_release(root, name=named(6), meta=None, labelled=False, agents=EGO, frames=30)
+    (root / "train.txt").write_text(f"{TYPE} {named(1)}\n{TYPE} {named(3)}\n{TYPE} {named(5)}\n")
+    (root / "val.txt").write_text(f"{NORMAL} {named(2)}\n")
+    (root / "test.txt").write_text(f"{TYPE} {named(6)}\n")
+    return DeepAccident(dataroot=root, verbose=False)
+
+
+@pytest.fixture(scope="module")
+def of_tiny(tiny: DeepAccident) -> DatasetStatistics:
+    return dataset_statistics(tiny)
+
+
+def test_scenarios_are_counted_by_split(of_tiny: DatasetStatistics) -> None:
+    assert of_tiny.scenarios == {"total": 6, "train": 3, "val": 1, "test": 1, "unknown": 1}
+    assert of_tiny.frames == {"total": 74, "train": 7, "val": 35, "test": 30, "unknown": 2}
+    assert of_tiny.samples["total"] == 5 * 4 + 35 + 2 + 2 * 2 + 1 + 30
+    assert of_tiny.unlabelled == {"total": 1, "train": 0, "val": 0, "test": 1, "unknown": 0}
+    weather = of_tiny.counts["weathers"].counts
+    assert {name: row["total"] for name, row in weather.items() if row["total"]} == {
+        "Clear": 1,
+        "HardRain": 3,
+        "Wet": 1,
+        "unknown": 1,
+    }
+    assert of_tiny.counts["weather_frames"].counts["HardRain"] == {
+        "total": 7, "train": 5, "val": 0, "test": 0, "unknown": 2,
+    }  # fmt: skip
+    assert of_tiny.counts["times_of_day"].counts["Night"]["val"] == 1
+    assert of_tiny.counts["time_of_day_frames"].counts["Night"]["val"] == 35
+    assert of_tiny.counts["road_types"].counts["three-way junction"]["unknown"] == 1
+
+
+def test_how_scenarios_ended(of_tiny: DatasetStatistics) -> None:
+    ends = {end: row["total"] for end, row in of_tiny.counts["ends"].counts.items() if row["total"]}
+    assert ends == {
+        "no accident": 1,
+        "collide with pedestrians": 1,
+        "collide with other vehicles": 1,
+        "design 1": 1,
+        "no design": 1,
+        "unknown": 1,
+    }
+    assert tuple(of_tiny.counts["ends"].counts)[: len(ENDS)] == ENDS
+    assert {name: row["total"] for name, row in of_tiny.counts["collisions"].counts.items()} == {
+        "yes": 4,
+        "no": 1,
+        "unknown": 1,
+    }
+
+
+def test_an_agent_that_was_not_downloaded_is_no_third_vehicle(tmp_path: Path) -> None:
+    design = write_tiny_release(tmp_path / "a", meta=ODD, agents=EGO, frames=1)
+    silent = "\n".join(META.splitlines()[:1]) + "\n"
+    mute = write_tiny_release(tmp_path / "b", meta=silent, frames=1)
+    alone = write_tiny_release(tmp_path / "d", meta=silent, agents=EGO, frames=1)
+    brief = "\n".join(META.splitlines()[:3]) + "\n"
+    short = write_tiny_release(tmp_path / "c", meta=brief, frames=1)
+    for root, end in ((design, "no design"), (mute, "unknown"), (short, "unknown"), (alone, "unknown")):
+        counts = dataset_statistics(DeepAccident(dataroot=root, verbose=False)).counts["ends"].counts
+        assert {name for name, row in counts.items() if row["total"]} == {end}
+
+
+def test_lengths_have_the_references_seven_bins(of_tiny: DatasetStatistics) -> None:
+    lengths = of_tiny.histograms["lengths"]
+    assert lengths.edges == (30, 40, 50, 60, 70, 80, 90, 100)
+    assert lengths.counts["total"] == (2, 0, 0, 0, 0, 0, 0)
+    assert lengths.counts["val"] == (1, 0, 0, 0, 0, 0, 0)
+    assert lengths.outside == {"total": 4, "train": 3, "val": 0, "test": 0, "unknown": 1}
+    assert lengths.bin_labels()[0] == "30–39"
+    assert lengths.bin_labels()[-1] == "90–100"
+
+
+def test_ego_drives_at_ten_metres_a_second_and_has_the_size_of_its_row(of_tiny: DatasetStatistics) -> None:
+    speeds = of_tiny.histograms["ego_speeds"]
+    assert speeds.counts["total"][10] == 4 + 35 + 2 + 2 + 1
+    assert speeds.total() == 44
+    assert speeds.left_out is not None
+    assert speeds.left_out.counts["test"] == 30
+    sizes = of_tiny.quantiles["ego_sizes"]
+    assert [sizes.median(field, "ego_vehicle") for field in ("length", "width", "height")] == [4.5, 1.9, 1.5]
+    assert sizes.row("length", "ego_vehicle").number == 5
+    assert sizes.median("length", "ego_vehicle", "test") is None
+    assert sizes.left_out is not None
+    assert sizes.left_out.counts["total"] == 1
+    with pytest.raises(KeyError, match="depth"):
+        sizes.row("depth", "ego_vehicle")
+
+
+def test_actors_and_boxes(of_tiny: DatasetStatistics) -> None:
+    instances = {name: row["total"] for name, row in of_tiny.counts["instances"].counts.items()}
+    # four cars and the van; the van alone where meta has no ids; ego and the van three times
+    assert instances == {"car": 4 + 0 + 3, "truck": 0, "van": 5, "cyclist": 0, "motorcycle": 0, "pedestrian": 0}
+    annotations = of_tiny.counts["annotations"].counts
+    assert annotations["car"] == {"total": 56, "train": 19, "val": 35, "test": 0, "unknown": 2}
+    assert annotations["pedestrian"]["train"] == 20 + 2 + 1
+    assert of_tiny.counts["parked_instances"].total() == 0
+    assert of_tiny.histograms["actors"].counts["total"][0] == 5
+    assert of_tiny.histograms["actors"].left_out == of_tiny.counts["instances"].left_out
+    sizes = of_tiny.quantiles["box_sizes"]
+    assert [sizes.median(field, "van") for field in ("length", "width", "height")] == [5.0, 2.0, 2.2]
+    assert sizes.median("length", "truck") is None
+
+
+def test_distances_leave_out_the_agents_own_row(of_tiny: DatasetStatistics) -> None:
+    quantiles, histogram = of_tiny.quantiles["distance_quantiles"], of_tiny.histograms["distances"]
+    assert quantiles.row("distance", "car").number == 0
+    assert quantiles.median("distance", "pedestrian") == pytest.approx(math.hypot(30.0, 1.5))
+    assert histogram.counts["val"][6] >= 35  # 30 to 35 m: every pedestrian
+    assert histogram.total("val") == 2 * 35
+
+
+def test_speeds_are_the_tracks(of_tiny: DatasetStatistics) -> None:
+    quantiles, histogram = of_tiny.quantiles["speed_quantiles"], of_tiny.histograms["speeds"]
+    assert quantiles.median("speed", "van") == pytest.approx(2.0)
+    assert quantiles.row("speed", "van").number == 4 + 35 + 2 + 2
+    assert quantiles.row("speed", "car", "train").values == pytest.approx((0, 0, 0, 0, 10, 10, 10), abs=1e-9)
+    assert histogram.left_out is not None
+    assert histogram.left_out.counts["train"] == 2  # ego and van of the scenario with one frame
+
+
+def test_the_pair_as_ego_sees_it(of_tiny: DatasetStatistics) -> None:
+    """Ego at (5, −4.1) looks along −y, the other at (−19.9, 0) along x."""
+    first, third = of_tiny.collisions
+    assert (first.actor, first.other, first.end, first.split) == ("ego_vehicle", "other_vehicle", "design 1", "train")
+    assert (first.angle, first.x, first.y) == pytest.approx((90.0, -4.1, -24.9))
+    assert (third.actor, third.other, third.other_category) == ("ego_vehicle", None, "van")
+    angles, bearings = of_tiny.histograms["collision_angles"], of_tiny.histograms["collision_bearings"]
+    assert angles.counts["train"] == tuple(int(index == 3) for index in range(12))
+    assert bearings.counts["train"] == tuple(int(index == 9) for index in range(12))  # 260.6° is near 270°
+    assert angles.left_out is not None
+    assert angles.left_out.counts == {"total": 2, "train": 2, "val": 0, "test": 0, "unknown": 0}
+
+
+def test_equal_to_plain_python_over_records(both_layouts: DeepAccident) -> None:
+    da = both_layouts
+    made = dataset_statistics(da)
+    split_of = {scenario["token"]: scenario["split"] or "unknown" for scenario in da.scenario}
+    scenario_of_sample = {sample["token"]: sample["scenario_token"] for sample in da.sample}
+    annotations, numbers, lengths, far = Counter[tuple[str, str]](), Counter[int](), {}, {}
+    for box in da.annotation:
+        group = split_of[scenario_of_sample[box["sample_token"]]]
+        distance = math.hypot(*box["translation"][:2])
+        for key in ((box["category"], "total"), (box["category"], group)):
+            annotations[key] += 1
+            lengths.setdefault(key, []).append(box["size"][0])
+            if box["actor_id"] != -100:
+                far.setdefault(key, []).append(distance)
+        numbers[int(distance // 5)] += box["actor_id"] != -100
+    for category in CATEGORIES:
+        for group in GROUPS:
+            key = (category, group)
+            assert made.counts["annotations"].counts[category][group] == annotations[key]
+            for table, field, values in (("box_sizes", "length", lengths), ("distance_quantiles", "distance", far)):
+                median = made.quantiles[table].median(field, category, group)
+                assert median == (pytest.approx(plain.median(values[key])) if key in values else None)
+    assert made.histograms["distances"].counts["total"] == tuple(numbers[index] for index in range(20))
+    parked = {record["token"] for record in da.instance if record["actor_id"] >= 20000}
+    speeds = [
+        (track["category"], math.hypot(*track["velocity"][:2]))
+        for track in da.track
+        if track["instance_token"] not in parked and not math.isnan(track["velocity"][0])
+    ]
+    for category in CATEGORIES:
+        row = made.quantiles["speed_quantiles"].row("speed", category)
+        values = [speed for name, speed in speeds if name == category]
+        assert (row.number, row.values[-1] if row.values else 0) == (len(values), pytest.approx(max(values, default=0)))
+    assert made.counts["instances"].total() == len(da.instance)
+    assert sum(row["total"] for row in made.counts["ends"].counts.values()) == len(da.scenario)
+
+
+def test_pairs_are_those_of_the_track_records(da: DeepAccident) -> None:
+    pairs = dataset_statistics(da).collisions
+    assert len(pairs) == sum(scenario["collision"] is not None for scenario in da.scenario) > 0
+    for pair in pairs:
+        scenario = da.scenario.get(pair.scenario)
+        assert scenario["collision"] is not None
+        assert pair.actor is not None
+        agent = da.agent.get(f"{pair.scenario}/{pair.actor}")
+        (other_id,) = set(scenario["collision"]["ids"]) - {agent["actor_id"]}
+        ego, other = (
+            da.track.get(f"{scenario['last_frame_token']}/actor/{actor}") for actor in (agent["actor_id"], other_id)
+        )
+        yaws = [float(quaternions.yaw_of(track["rotation"])) for track in (ego, other)]
+        assert math.cos(math.radians(pair.angle)) == pytest.approx(math.cos(yaws[1] - yaws[0]))
+        offset = np.subtract(other["translation"], ego["translation"])[:2]
+        assert math.hypot(pair.x, pair.y) == pytest.approx(np.linalg.norm(offset))
+        assert pair.x == pytest.approx(offset @ [math.cos(yaws[0]), math.sin(yaws[0])])
+
+
+def test_a_selection_counts_alone(tiny: DeepAccident, of_tiny: DatasetStatistics) -> None:
+    train = dataset_statistics(tiny, tiny.find(split="train"))
+    rest = dataset_statistics(tiny, [record["token"] for record in tiny.scenario if record["split"] != "train"])
+    assert train.selected
+    for name, table in of_tiny.counts.items():
+        for group in GROUPS:
+            assert train.counts[name].total(group) + rest.counts[name].total(group) == table.total(group)
+    for name, histogram in of_tiny.histograms.items():
+        assert train.histograms[name].counts["train"] == histogram.counts["train"]
+        assert train.histograms[name].total() + rest.histograms[name].total() == histogram.total()
+    assert (
+        train.quantiles["box_sizes"].row("length", "van").values
+        == of_tiny.quantiles["box_sizes"].row("length", "van", "train").values
+    )
+    assert "selected: 3 scenarios" in train.to_text()
+    nothing = dataset_statistics(tiny, [])
+    assert (nothing.scenarios["total"], nothing.collisions) == (0, ())
+    assert nothing.counts["annotations"].total() == 0
+    with pytest.raises(TokenError, match="nowhere"):
+        dataset_statistics(tiny, ["nowhere/at all"])
+
+
+def test_a_release_without_labels_counts_what_it_can(tmp_path: Path) -> None:
+    root = write_tiny_release(tmp_path, labelled=False, frames=40)
+    made = dataset_statistics(DeepAccident(dataroot=root, verbose=False))
+    assert made.counts["ends"].counts["design 1"]["unknown"] == 1
+    assert made.histograms["lengths"].counts["total"][1] == 1
+    assert made.counts["instances"].total() == made.histograms["speeds"].total() == 0
+    text = made.to_text()
+    assert "1 scenarios without labels" in text
+    assert "1 collisions whose pair is not labelled at the last frame" in text
+    json.loads(made.to_json(), parse_constant=pytest.fail)
+
+
+def test_json_and_csv_say_the_same(of_tiny: DatasetStatistics, tmp_path: Path) -> None:
+    content = json.loads(of_tiny.to_json(), parse_constant=pytest.fail)
+    assert content["counts"]["ends"]["counts"]["design 1"]["train"] == 1
+    assert content["histograms"]["lengths"]["edges"][-1] == 100
+    written = of_tiny.to_csv(tmp_path / "new" / "folder")
+    assert len(written) == len(of_tiny.tables) + 1
+    assert sorted(path.name for path in (tmp_path / "new" / "folder").iterdir()) == sorted(p.name for p in written)
+    tables = {path.stem: list(csv.reader(path.read_text().splitlines())) for path in written}
+    assert tables["ends"][4] == ["design 1", "1", "1", "0", "0", "0"]
+    assert tables["lengths"][0] == ["length from (frames)", "to (frames)", *GROUPS]
+    assert tables["lengths"][1] == ["30", "40", "2", "0", "1", "1", "0"]
+    assert tables["lengths"][-1] == ["outside", "", "4", "3", "0", "0", "1"]
+    assert ["length", "van", "total"] in [row[:3] for row in tables["box_sizes"]]
+    assert len(tables["collision_pairs"]) == 1 + len(of_tiny.collisions)
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="is a file; give a folder"):
+        of_tiny.to_csv(tmp_path / "file")

@@ -1,0 +1,137 @@
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError, TokenError
+from deepaccident_devkit.geometry import Boxes, LidarPointCloud
+from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
+from deepaccident_devkit.v2x import Link
+from deepaccident_devkit.v2x.clouds import moved_points
+from deepaccident_devkit.v2x.tracks import scenario_tracks
+
+
+@pytest.fixture
+def sample(da: DeepAccident) -> str:
+    return f"{da.scenario[0]['token']}/ego_vehicle/004"
+
+
+def test_agents_and_sweeps_come_one_after_another(da: DeepAccident, sample: str) -> None:
+    scenario = da.scenario[0]["token"]
+    cloud = da.aggregate_point_cloud(sample, sweeps=2)
+    parts = [
+        da.load_point_cloud(f"{scenario}/{agent}/{index}", "world") for index in ("004", "003") for agent in AGENTS
+    ]
+    assert cloud.frame == "world"
+    assert_allclose(cloud.xyz, np.concatenate([part.xyz for part in parts]), atol=1e-6)
+    assert_array_equal(cloud.intensity, np.concatenate([part.intensity for part in parts]))
+    own = da.aggregate_point_cloud(sample, agents="single", frame="lidar")
+    assert_allclose(own.xyz, da.load_point_cloud(sample, "lidar").xyz, atol=1e-6)
+    assert len(da.aggregate_point_cloud(sample, agents="single", sweeps=99)) == sum(
+        len(da.load_point_cloud(f"{scenario}/ego_vehicle/{index:03d}")) for index in range(1, 5)
+    )
+    with pytest.raises(ChoiceError, match="sweeps: expected a number of frames from 1, found 0"):
+        da.aggregate_point_cloud(sample, sweeps=0)
+
+
+def test_compensated_points_lie_on_the_actors_of_the_present(da: DeepAccident, sample: str) -> None:
+    """Points that lay in a moving actor's box lie in its present box, and were not all there before."""
+    tracks = scenario_tracks(da, da.scenario[0])
+    now = tracks.at(4)
+    moving = now.select(np.linalg.norm(now.velocity, axis=1) > 4)
+    smeared, sharp = (da.aggregate_point_cloud(sample, sweeps=4, compensate=compensate) for compensate in (False, True))
+    wide = Boxes.from_arrays(moving.center, moving.size + 0.02, moving.yaw)
+    inside = [wide.contains(cloud.xyz).sum(axis=1) for cloud in (smeared, sharp)]
+    assert inside[1].sum() > 1.5 * inside[0].sum()
+    assert len(sharp) == len(smeared)
+
+
+def test_compensation_makes_up_for_latency(da: DeepAccident, sample: str) -> None:
+    moving = da.cooperative_boxes(sample)
+    moving = moving.select(np.linalg.norm(moving.velocity, axis=1) > 4)
+    wide = Boxes.from_arrays(moving.center, moving.size + 0.02, moving.yaw)
+    hits = {
+        compensate: wide.contains(
+            da.aggregate_point_cloud(
+                sample, agents=["infrastructure"], compensate=compensate, link=Link(latency=0.3)
+            ).xyz
+        ).sum()
+        for compensate in (False, True)
+    }
+    assert hits[True] > 1.2 * hits[False]
+
+
+def test_a_point_keeps_its_place_in_its_box() -> None:
+    then = Boxes.from_arrays([[0.0, 0, 0], [50, 0, 0]], [[4.0, 2, 2]] * 2, [0.0, 0], actor_id=[7, 8])
+    now = Boxes.from_arrays([[10.0, 5, 1], [0, 0, 0]], [[4.0, 2, 2]] * 2, [np.pi / 2, 0], actor_id=[7, 9])
+    points = np.array([[1.5, 0.5, 0.2], [3, 0, 0], [50, 0, 0]])
+    moved = moved_points(points, then, now)
+    assert_allclose(moved, [[9.5, 6.5, 1.2], [3, 0, 0], [50, 0, 0]])
+    assert_allclose(points[0], [1.5, 0.5, 0.2])
+
+
+def test_lost_clouds_leave_no_points(da: DeepAccident, sample: str) -> None:
+    cloud = da.aggregate_point_cloud(sample, agents=["infrastructure"], link=Link(packet_loss=1), frame="ego")
+    assert len(cloud) == 0
+    assert cloud.frame == "ego"
+
+
+def test_a_cloud_in_an_image_of_its_own_agent(da: DeepAccident, sample: str) -> None:
+    camera = f"{sample}/Camera_Front"
+    image = da.load_image(camera)
+    shown = da.map_pointcloud_to_image(camera)
+    cloud = da.load_point_cloud(sample, "lidar")
+    optical = da.transform(sample, sample, "Camera_Front", "lidar").apply(cloud.xyz)
+    assert_allclose(shown.depth, optical[:, 2], atol=1e-9)
+    assert shown.mask.sum() > 100
+    assert not shown.mask[optical[:, 2] <= 0].any()
+    u, v = np.floor(shown.pixels[shown.mask]).astype(int).T
+    assert_array_equal(shown.color[shown.mask], image[v, u])
+    assert not shown.color[~shown.mask].any()
+    height, width = image.shape[:2]
+    assert u.min() >= 0
+    assert v.min() >= 0
+    assert u.max() < width
+    assert v.max() < height
+    assert da.map_pointcloud_to_image(camera, colors=False).color is None
+
+
+def test_points_of_any_agent_in_any_camera_and_frame(da: DeepAccident, sample: str) -> None:
+    pole = sample.replace("ego_vehicle", "infrastructure").replace("/004", "/002")
+    camera = f"{sample}/Camera_Back"
+    cloud = da.load_point_cloud(pole, "lidar")
+    shown = da.map_pointcloud_to_image(camera, pole, colors=False)
+    world = da.load_point_cloud(pole, "world")
+    for again in (
+        da.project_to_image(world, pole, camera, colors=False),
+        da.project_to_image(world.xyz, sample, camera, colors=False),
+        da.project_to_image(cloud.xyz, pole, camera, frame="lidar", colors=False),
+        da.project_to_image(LidarPointCloud(cloud.xyz, cloud.intensity), pole, camera, colors=False),
+    ):
+        assert_allclose(again.depth, shown.depth, atol=1e-6)
+        assert_array_equal(again.mask, shown.mask)
+    assert da.project_to_image(np.zeros((0, 3)), pole, camera).pixels.shape == (0, 2)
+
+
+def test_sensors_that_are_no_camera_or_of_another_scenario(da: DeepAccident, sample: str) -> None:
+    with pytest.raises(TokenError, match=r"the channels are Camera_Front"):
+        da.map_pointcloud_to_image(f"{sample}/Camera_Top")
+    with pytest.raises(ChoiceError, match=r"camera: expected one of Camera_Front, .* found lidar01"):
+        da.map_pointcloud_to_image(f"{sample}/lidar01")
+    other = f"{da.scenario[1]['token']}/ego_vehicle/001"
+    with pytest.raises(ChoiceError, match="expected two samples of one scenario"):
+        da.project_to_image(np.zeros((1, 3)), other, f"{sample}/{CAMERAS[0]}")
+
+
+def test_message_sizes(da: DeepAccident, sample: str) -> None:
+    sizes = da.message_sizes(sample, bev_shape=(8, 100, 50), bev_dtype=np.float16)
+    assert list(sizes) == list(AGENTS)
+    mine = sizes["ego_vehicle"]
+    assert mine.images == 24 + 6 * 64 * 36 * 3
+    assert mine.cloud == 24 + 16 * len(da.load_point_cloud(sample))
+    assert mine.boxes == 24 + 45 * len(da.boxes(sample))
+    assert mine.bev == 24 + 8 * 100 * 50 * 2
+    assert da.message_sizes(sample, agents="single", clouds=False)["ego_vehicle"].cloud is None
+    for wrong in ((8, 100), (0, 1, 1), 5):
+        with pytest.raises(ChoiceError, match="bev_shape: expected"):
+            da.message_sizes(sample, bev_shape=wrong)

@@ -1,0 +1,77 @@
+from pathlib import Path
+
+import pytest
+import tiny
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
+from deepaccident_devkit.taxonomy import AGENTS
+from deepaccident_devkit.v2x import AGENT_CONFIGS, AgentConfig, cooperating_agents
+
+EGO, EGO_BEHIND, OTHER, OTHER_BEHIND, POLE = AGENTS
+
+
+def test_the_papers_seven_as_seen_from_the_ego_vehicle() -> None:
+    assert {name: config.agents_for(EGO) for name, config in AGENT_CONFIGS.items()} == {
+        "single": (EGO,),
+        "+behind": (EGO, EGO_BEHIND),
+        "+other": (EGO, OTHER),
+        "+infrastructure": (EGO, POLE),
+        "+behind+other": (EGO, EGO_BEHIND, OTHER),
+        "vehicles": (EGO, EGO_BEHIND, OTHER, OTHER_BEHIND),
+        "all": AGENTS,
+    }
+
+
+@pytest.mark.parametrize(
+    ("ego", "side", "expected"),
+    [
+        (EGO, EGO, (EGO_BEHIND, OTHER, OTHER_BEHIND, POLE)),
+        (EGO_BEHIND, EGO, (EGO, OTHER, OTHER_BEHIND, POLE)),
+        (OTHER, EGO, (OTHER_BEHIND, EGO, EGO_BEHIND, POLE)),
+        (OTHER_BEHIND, EGO, (OTHER, EGO, EGO_BEHIND, POLE)),
+        (POLE, EGO, (EGO_BEHIND, OTHER, OTHER_BEHIND, EGO)),
+        (POLE, OTHER, (OTHER_BEHIND, EGO, EGO_BEHIND, OTHER)),
+    ],
+)
+def test_partners_are_renamed_as_in_the_released_code(ego: str, side: str, expected: tuple[str, ...]) -> None:
+    """The released V2X dataset's name_mapping, written out (evaluation.md g)."""
+    everyone = AGENT_CONFIGS["all"].agents_for(ego, side=side)
+    assert everyone == (ego, *expected)
+    assert set(everyone) == set(AGENTS)
+
+
+def test_wrong_roles_agents_and_sides() -> None:
+    with pytest.raises(ChoiceError, match=r"partners: expected roles of behind, .*found \['front'\]"):
+        AgentConfig("mine", ("front",))  # type: ignore[arg-type]
+    with pytest.raises(ChoiceError, match=r"agent: expected one of ego_vehicle, .*found 'bus'"):
+        AGENT_CONFIGS["all"].agents_for("bus")
+    with pytest.raises(ChoiceError, match="side: expected one of ego_vehicle, other_vehicle, found 'left'"):
+        AGENT_CONFIGS["all"].agents_for(POLE, side="left")  # type: ignore[arg-type]
+
+
+def test_what_an_agents_argument_means(da_b: DeepAccident) -> None:
+    sample = f"{da_b.scenario[0]['token']}/{OTHER}/002"
+    assert cooperating_agents(da_b, sample) == (OTHER, EGO, EGO_BEHIND, OTHER_BEHIND, POLE)
+    assert cooperating_agents(da_b, da_b.get("sample", sample), "+behind") == (OTHER, OTHER_BEHIND)
+    assert cooperating_agents(da_b, sample, AGENT_CONFIGS["+other"]) == (OTHER, EGO)
+    assert cooperating_agents(da_b, sample, [POLE, OTHER, POLE]) == (OTHER, POLE)
+    assert cooperating_agents(da_b, sample, [POLE]) == (POLE,)
+    with pytest.raises(ChoiceError, match=r"expected one of single, .*found 'infrastructure'; .*\['infrastructure'\]"):
+        cooperating_agents(da_b, sample, POLE)
+    with pytest.raises(ChoiceError, match="at least one agent"):
+        cooperating_agents(da_b, sample, [])
+    with pytest.raises(TokenError, match="table 'sample' has no token"):
+        cooperating_agents(da_b, sample + "9")
+
+
+def test_an_agent_that_was_not_downloaded_is_named(tmp_path: Path) -> None:
+    da = DeepAccident(dataroot=tiny.write_tiny_release(tmp_path, agents=(EGO, POLE)), verbose=False)
+    sample = f"{tiny.TOKEN}/{EGO}/001"
+    assert cooperating_agents(da, sample) == (EGO, POLE)
+    for call in (da.cooperative_boxes, da.visible_instances, da.aggregate_point_cloud, da.message_sizes):
+        with pytest.raises(
+            NotAvailableError, match=r"other_vehicle is not in .* which has ego_vehicle, infrastructure"
+        ):
+            call(sample, agents="+other")
+    assert len(da.cooperative_boxes(sample)) > 0

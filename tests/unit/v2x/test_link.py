@@ -1,0 +1,150 @@
+import math
+import pickle
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.taxonomy import AGENTS
+from deepaccident_devkit.v2x import Link, PoseNoise
+from deepaccident_devkit.v2x.link import uniforms
+from deepaccident_devkit.v2x.messages import messages
+
+FIRST_DRAW = (0.8390037267799063, 0.07483574513276203, 0.8888751418060693, 0.6098842047921865)
+
+
+@pytest.fixture
+def sample(da_b: DeepAccident) -> str:
+    return f"{da_b.scenario[0]['token']}/ego_vehicle/004"
+
+
+def test_a_latency_that_is_no_multiple_of_a_frame_names_the_two_nearest() -> None:
+    assert [Link(latency=frames / 10).latency_frames for frames in range(12)] == list(range(12))
+    assert Link(latency=0.1 + 0.2).latency_frames == 3
+    with pytest.raises(
+        ConfigError, match=r"0\.25 s is no multiple of a frame \(0\.1 s\); the nearest are 0\.2 s and 0\.3"
+    ):
+        Link(latency=0.25)
+    for wrong in (-0.1, math.nan, math.inf):
+        with pytest.raises(ConfigError, match=r"latency: .* is not possible"):
+            Link(latency=wrong)
+
+
+def test_a_latency_longer_than_the_past_names_what_there_is(da_b: DeepAccident, sample: str) -> None:
+    assert len(da_b.cooperative_boxes(sample, link=Link(latency=0.3))) > 0
+    for call in (da_b.cooperative_boxes, da_b.visible_instances, da_b.aggregate_point_cloud):
+        with pytest.raises(
+            ConfigError, match=r"from frame 004; the most there is 0\.3 s, and .* works from frame 006 on"
+        ):
+            call(sample, agents=["infrastructure"], link=Link(latency=0.5))
+
+
+def test_settings_that_are_not_possible() -> None:
+    with pytest.raises(ConfigError, match="packet_loss: 2 is no probability"):
+        Link(packet_loss=2)
+    with pytest.raises(ConfigError, match="std is -1; choose a finite number"):
+        PoseNoise(std=-1)
+    with pytest.raises(ConfigError, match="pose_noise: expected metres or a PoseNoise, found 'much'"):
+        Link(pose_noise="much")  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="expected a law of paper, zero-mean, found 'cauchy'"):
+        PoseNoise(law="cauchy")  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match=r"zero-mean takes no mean, found 0\.3"):
+        PoseNoise(mean=0.3, law="zero-mean")
+    assert Link(pose_noise=0.3) == Link(pose_noise=PoseNoise(mean=0.3, std=0.02, heading_std=0, law="paper"))
+    assert pickle.loads(pickle.dumps(Link(pose_noise=0.3))) == Link(pose_noise=0.3)
+
+
+def test_the_laws_have_the_moments_that_they_say() -> None:
+    keys = [str(number) for number in range(20000)]
+    paper = np.array([PoseNoise(mean=0.5, std=0.02, heading_std=0.1).draw(key) for key in keys])
+    distance = np.hypot(paper[:, 0], paper[:, 1])
+    assert_allclose([distance.mean(), distance.std()], [0.5, 0.02], atol=2e-3)
+    assert_allclose(paper.mean(axis=0), 0, atol=0.02)
+    assert_allclose(paper[:, 2].std(), 0.1, atol=5e-3)
+    normal = np.array([PoseNoise(std=0.2, law="zero-mean").draw(key) for key in keys])
+    assert_allclose(normal.mean(axis=0), 0, atol=0.02)
+    assert_allclose(normal.std(axis=0), [0.2, 0.2, 0], atol=0.01)
+    assert abs(np.corrcoef(normal[:, 0], normal[:, 1])[0, 1]) < 0.05
+
+
+def test_draws_are_the_same_on_every_machine() -> None:
+    assert_allclose(uniforms("0/scenario/agent/1"), FIRST_DRAW, rtol=0, atol=1e-15)
+
+
+def test_a_draw_depends_on_seed_scenario_partner_and_frame_alone(da_b: DeepAccident, sample: str) -> None:
+    link = Link(pose_noise=0.3, packet_loss=0.4, seed=7)
+
+    def errors(agents: list[str] | None, link: Link) -> dict[str, bytes]:
+        received = messages(da_b, sample, agents, link)
+        return {message.agent: message.pose_error.matrix.tobytes() for message in received if message.pose_error}
+
+    together = errors(None, Link(pose_noise=0.3, seed=7))
+    assert len(set(together.values())) == len(AGENTS) - 1
+    for agent in AGENTS[:0:-1]:
+        assert errors([agent], link) in ({}, {agent: together[agent]})
+    assert not set(errors(None, Link(pose_noise=0.3, seed=8)).values()) & set(together.values())
+
+
+def test_loss_is_as_frequent_as_asked_and_never_the_egos() -> None:
+    link = Link(packet_loss=0.3)
+    lost = [link.loses("scenario", agent, frame) for agent in AGENTS for frame in range(1000)]
+    assert np.mean(lost) == pytest.approx(0.3, abs=0.03)
+    assert not any(Link().loses("scenario", AGENTS[0], frame) for frame in range(100))
+
+
+def test_the_egos_own_data_are_never_disturbed(da_b: DeepAccident, sample: str) -> None:
+    link = Link(latency=0.2, pose_noise=0.5, packet_loss=1)
+    alone, through = (da_b.cooperative_boxes(sample, agents="single", link=way) for way in (None, link))
+    everyone = da_b.cooperative_boxes(sample, link=link)
+    for got in (through, everyone):
+        assert_array_equal(got.center, alone.center)
+        assert_array_equal(got.actor_id, alone.actor_id)
+    nobody = da_b.cooperative_boxes(sample, agents=["infrastructure"], link=link)
+    assert len(nobody) == 0
+    assert nobody.frame == "world"
+    assert da_b.visible_instances(sample, agents=["infrastructure"], link=link) == []
+
+
+def test_pose_noise_moves_all_of_a_partners_boxes_by_the_same_distance(da_b: DeepAccident, sample: str) -> None:
+    pole = ["infrastructure"]
+    true, noisy = (da_b.cooperative_boxes(sample, agents=pole, link=link) for link in (None, Link(pose_noise=0.4)))
+    off = noisy.center - true.center
+    assert_allclose(off, np.broadcast_to(off[0], off.shape), atol=1e-9)
+    assert off[0, 2] == pytest.approx(0, abs=1e-9)
+    assert np.hypot(*off[0, :2]) == pytest.approx(0.4, abs=0.1)
+
+
+def test_a_wrong_heading_turns_about_the_partner(da_b: DeepAccident, sample: str) -> None:
+    link = Link(pose_noise=PoseNoise(std=0, heading_std=0.1))
+    pole = da_b.world_from(sample.replace("ego_vehicle", "infrastructure"), "ego").translation
+    true, noisy = (da_b.cooperative_boxes(sample, agents=["infrastructure"], link=way) for way in (None, link))
+    distances = [np.linalg.norm(boxes.center - pole, axis=1) for boxes in (true, noisy)]
+    assert_allclose(*distances, atol=1e-9)
+    turned = np.angle(np.exp(1j * (noisy.yaw - true.yaw)))
+    assert_allclose(turned, turned[0], atol=1e-6)
+    assert abs(turned[0]) > 1e-3
+
+
+def test_latency_shows_what_the_partner_saw_then(da_b: DeepAccident, sample: str) -> None:
+    pole = ["infrastructure"]
+    late = da_b.cooperative_boxes(sample, agents=pole, link=Link(latency=0.2))
+    then = da_b.cooperative_boxes(sample.replace("/004", "/002"), agents=pole)
+    assert_array_equal(late.center, then.center)
+    assert_array_equal(late.actor_id, then.actor_id)
+
+
+def test_a_sweep_arrives_as_it_did_when_it_was_the_present(da_b: DeepAccident, sample: str) -> None:
+    """Of four sweeps each is what its own frame received, as far as the latency lets anything arrive there."""
+    link = Link(latency=0.1, pose_noise=0.3, packet_loss=0.4, seed=5)
+    agents = list(AGENTS[1:])
+
+    def facts(token: str, sweeps: int) -> list[tuple[str, str, bytes]]:
+        return [
+            (message.agent, message.sample, message.pose_error.matrix.tobytes())
+            for message in messages(da_b, token, agents, link, sweeps=sweeps)
+        ]
+
+    tokens = [sample.replace("/004", f"/{index:03d}") for index in (4, 3, 2)]
+    assert facts(sample, 4) == [fact for token in tokens for fact in facts(token, 1)]

@@ -1,0 +1,75 @@
+"""Projected box centres fall on the pixels that the synthetic renderer painted for that actor.
+
+What is painted where comes from the generator's own rays; where a box lands comes from the labels of one agent, the
+calib files and the devkit's transforms into the cameras of another.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.geometry import SE3
+from deepaccident_devkit.synth import SynthConfig
+from deepaccident_devkit.synth.agents import Agent, Camera, make_agents
+from deepaccident_devkit.synth.camera import _pixel_slopes, _ray_directions
+from deepaccident_devkit.synth.recording import RecordingJob, record_scenario
+from deepaccident_devkit.synth.scenario import Scenario, build_scenario, plan_scenarios
+from deepaccident_devkit.synth.scene import Scene, make_scene
+from deepaccident_devkit.taxonomy import frame_timestamp
+
+CONFIG = SynthConfig(scenarios=1, frames=2, image_size=(320, 180), seed=11)
+FRAME = 2
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[DeepAccident, Scenario]:
+    plan = plan_scenarios(CONFIG)[0]
+    root: Path = tmp_path_factory.mktemp("pixels")
+    record_scenario(RecordingJob(root, CONFIG, plan))
+    return DeepAccident(dataroot=root, verbose=False), build_scenario(CONFIG, plan)
+
+
+def painted(scene: Scene, camera: Camera, ground_from_camera: SE3) -> np.ndarray:
+    """The actor id of each pixel (H, W), or −1."""
+    directions = _ray_directions(ground_from_camera, *_pixel_slopes(camera))
+    _, face = scene.caster.cast(ground_from_camera.translation, directions.reshape(-1, 3))
+    owner = scene.owner_of(face)
+    ids = np.where(owner >= 0, scene.actors.actor_id[np.maximum(owner, 0)], -1)
+    return ids.reshape(directions.shape[:2])
+
+
+def unoccluded(scene: Scene, ground_from_camera: SE3) -> set[int]:
+    """The actors (true poses) towards whose middle the first surface is their own."""
+    middle = np.column_stack([scene.snapshot.poses[:, :2], scene.actors.size[:, 2] / 2])
+    rays = (middle - ground_from_camera.translation).astype(np.float32)
+    _, face = scene.caster.cast(ground_from_camera.translation, rays)
+    return set(scene.actors.actor_id[scene.owner_of(face) == np.arange(len(scene.actors))].tolist())
+
+
+def hits_and_tries(da: DeepAccident, scene: Scene, agent: Agent, labeller: str) -> tuple[int, int]:
+    """How many of a labeller's boxes land on their own actor in the images of an agent, and how many should."""
+    scenario, hits, tries = da.scenario[0]["token"], 0, 0
+    source, sample = (f"{scenario}/{name}/{FRAME:03d}" for name in (labeller, agent.name))
+    boxes, ids = da.boxes(source, "lidar"), da.actor_ids(source)
+    for camera in agent.cameras:
+        ground_from_camera = agent.ground_from_ego(scene.snapshot) @ agent.ego_from_lidar
+        ground_from_camera = ground_from_camera @ camera.camera_from_lidar.inverse()
+        picture, free = painted(scene, camera, ground_from_camera), unoccluded(scene, ground_from_camera)
+        shown = da.project_to_image(boxes.center, source, f"{sample}/{camera.channel}", frame="lidar", colors=False)
+        wanted = shown.mask & np.isin(ids, list(free))
+        u, v = shown.pixels[wanted].astype(int).T
+        hits += int((picture[v, u] == ids[wanted]).sum())
+        tries += int(wanted.sum())
+    return hits, tries
+
+
+@pytest.mark.parametrize("labeller", ["ego_vehicle", "other_vehicle_behind", "infrastructure"])
+def test_box_centres_fall_on_their_actors_pixels(recorded: tuple[DeepAccident, Scenario], labeller: str) -> None:
+    da, scenario = recorded
+    scene = make_scene(scenario.world, scenario.actors, frame_timestamp(FRAME))
+    agents = make_agents(scenario, CONFIG.image_size)
+    hits, tries = np.sum([hits_and_tries(da, scene, agent, labeller) for agent in agents], axis=0)
+    assert tries > 80
+    assert hits >= 0.99 * tries

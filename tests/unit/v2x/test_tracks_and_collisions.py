@@ -1,0 +1,158 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny
+from numpy.testing import assert_allclose, assert_array_equal
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
+from deepaccident_devkit.v2x.tracks import scenario_tracks
+
+
+def test_a_trajectory_is_the_rows_of_the_track_table(da: DeepAccident) -> None:
+    instance = da.instance[3]
+    rows = [track for track in da.track if track["instance_token"] == instance["token"]]
+    path = da.trajectory(instance)
+    assert len(path) == len(rows) > 0
+    assert path.frame == "world"
+    assert_array_equal(path.center, [row["translation"] for row in rows])
+    assert_allclose(path.timestamp, [da.get("frame", row["frame_token"])["timestamp"] for row in rows])
+    assert_array_equal(path.velocity, [row["velocity"] for row in rows])
+    with pytest.raises(ValueError, match="read-only"):
+        path.center[0] = 0
+    with pytest.raises(ChoiceError, match="this trajectory has no present"):
+        _ = path.past
+
+
+def test_a_trajectory_in_a_samples_frame_has_a_past_and_a_future(da: DeepAccident) -> None:
+    sample = da.get_sample(da.scenario[0], "other_vehicle", 3)
+    instance = f"{da.scenario[0]['token']}/actor/{da.agent.get(sample['agent_token'])['actor_id']}"
+    path = da.trajectory(instance, sample, "ego")
+    world = da.trajectory(instance)
+    assert_allclose(path.center, da.world_from(sample, "ego").inverse().apply(world.center), atol=1e-9)
+    assert_array_equal(path.past.index, [1, 2])
+    assert_array_equal(path.future.index, [4, 5, 6])
+    assert (np.diff(path.center[:, 0]) > 0).all()
+    assert_allclose(path.yaw, 0, atol=0.05)
+
+
+def test_trajectories_that_cannot_be(da: DeepAccident) -> None:
+    instance = da.instance[0]["token"]
+    with pytest.raises(TokenError, match="has no actor 7"):
+        da.trajectory(f"{da.scenario[0]['token']}/actor/7")
+    with pytest.raises(ChoiceError, match="frame 'ego' is one of a sample"):
+        da.trajectory(instance, frame="ego")
+    with pytest.raises(ChoiceError, match="different worlds"):
+        da.trajectory(instance, f"{da.scenario[1]['token']}/ego_vehicle/001", "ego")
+
+
+def test_tracks_of_every_scenario_are_its_own(da: DeepAccident) -> None:
+    for scenario in da.scenario:
+        tracks = scenario_tracks(da, scenario)
+        rows = [track for track in da.track if track["scenario_token"] == scenario["token"]]
+        assert len(tracks.index) == len(rows)
+        assert tracks.at(2).actor_id.tolist() == [
+            da.get("instance", row["instance_token"])["actor_id"] for row in rows if row["frame_token"].endswith("/002")
+        ]
+
+
+def test_synthetic_accidents_end_in_contact(da: DeepAccident) -> None:
+    accidents = [scenario for scenario in da.scenario if scenario["collision"]]
+    assert accidents
+    for scenario in accidents:
+        found = da.collision(scenario)
+        assert found.agrees, found.disagreements
+        assert list(found.actor_ids) == scenario["collision"]["ids"]
+        assert found.frame == scenario["last_frame_token"]
+        assert found.gap == pytest.approx(0, abs=0.01)
+        assert found.closing_speed > 3
+    assert [da.collision(scenario) for scenario in da.scenario if not scenario["collision"]] != []
+    assert all(da.collision(scenario) is None for scenario in da.scenario if not scenario["collision"])
+
+
+def accident(tmp_path: Path, lines, meta: str = tiny.META, **release) -> DeepAccident:
+    """Three frames in which all agents stand in the origin and the ego's label has lines by frame."""
+    lines_of = lambda agent, frame: ["0 0", *(lines(frame) if agent == "ego_vehicle" else ())]  # noqa: E731
+    return DeepAccident(
+        dataroot=tiny.write_tiny_release(tmp_path, frames=3, meta=meta, lines_of=lines_of, **release), verbose=False
+    )
+
+
+@pytest.fixture
+def origin(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tiny, "ego_to_world", lambda *_: tiny.pose())
+    monkeypatch.setattr(tiny, "lidar_height", lambda _: 0.0)
+
+
+@pytest.mark.usefixtures("origin")
+def test_a_car_that_drives_into_anothers_left_side(tmp_path: Path) -> None:
+    """1223 drives along CARLA's +y (our −y) at 10 m/s; 1212 crosses along x at 2 m/s, its left side towards it."""
+
+    def lines(frame: int) -> list[str]:
+        y = -5.5 + frame  # 2.5 m before the other's middle, 0.5 m from side to bumper, at the last frame
+        return [
+            f"car 20.0 {y} 0.0 2.0 2.0 1.5 {np.pi / 2} 0 0 1223 9 True",
+            f"car {19.4 + 0.2 * frame} 0.0 0.0 4.0 2.0 1.5 0.0 0 0 1212 9 True",
+        ]
+
+    da = accident(tmp_path, lines)
+    found = da.collision(tiny.TOKEN)
+    assert found.instances == (f"{tiny.TOKEN}/actor/1223", f"{tiny.TOKEN}/actor/1212")
+    assert found.frame == f"{tiny.TOKEN}/003"
+    assert found.gap == pytest.approx(0.5)
+    assert_allclose(found.point, [20.0, 1.25, 0.0], atol=0.02)
+    assert_allclose(found.speeds, (10, 2))
+    assert found.closing_speed == pytest.approx(10)
+    assert found.impact_angle == pytest.approx(np.pi / 2)
+    assert found.sides == ("front", "left")
+    assert found.agrees
+
+
+@pytest.mark.usefixtures("origin")
+def test_what_meta_says_against_the_recording(tmp_path: Path) -> None:
+    def lines(frame: int) -> list[str]:
+        other = [f"van {30.0 + frame} 0.0 0.0 4.0 2.0 1.5 0.0 0 0 1212 9 True"] if frame < 3 else []
+        return [f"car {20.0 + frame} 0.0 0.0 4.0 2.0 1.5 0.0 0 0 1223 9 True", *other]
+
+    da = accident(tmp_path, lines, meta=tiny.META.replace("front_side", "left_side"))
+    found = da.collision(da.scenario[0])
+    assert found.frame == f"{tiny.TOKEN}/002"
+    assert found.gap == pytest.approx(6)
+    assert found.sides == ("front", "rear")
+    assert found.closing_speed == pytest.approx(0)
+    assert found.impact_angle == pytest.approx(0)
+    assert not found.agrees
+    assert found.disagreements == (
+        "the pair is last seen at frame 002 of 003",
+        "the pair is 6.00 m apart",
+        "the classes are ['car', 'van'], meta says ['car', 'car']",
+        "the sides are ['front', 'rear'], meta says left_side",
+    )
+
+
+@pytest.mark.usefixtures("origin")
+def test_overlapping_boxes_have_no_gap_and_still_a_side(tmp_path: Path) -> None:
+    def lines(frame: int) -> list[str]:
+        return [
+            f"car {16.3 + frame} 0.0 0.0 4.0 2.0 1.5 0.0 0 0 1223 9 True",
+            f"car 23.0 0.0 0.0 4.0 2.0 1.5 {np.pi} 0 0 1212 9 True",
+        ]
+
+    found = accident(tmp_path, lines).collision(tiny.TOKEN)
+    assert found.gap == 0
+    assert found.sides == ("front", "front")
+    assert found.impact_angle == pytest.approx(np.pi)
+    assert found.closing_speed == pytest.approx(10)
+    assert_allclose(found.point, [21.15, 0, 0], atol=0.03)
+
+
+def test_collisions_that_cannot_be_told(tmp_path: Path) -> None:
+    silent = DeepAccident(dataroot=tiny.write_tiny_release(tmp_path / "silent", meta=None), verbose=False)
+    with pytest.raises(NotAvailableError, match="has no meta file"):
+        silent.collision(tiny.TOKEN)
+    unseen = accident(tmp_path / "unseen", lambda _: [])
+    with pytest.raises(NotAvailableError, match="no label shows the colliding pair 1223 and 1212"):
+        unseen.collision(tiny.TOKEN)
+    with pytest.raises(TokenError, match="table 'scenario' has no token"):
+        unseen.collision("nowhere")
