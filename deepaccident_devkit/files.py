@@ -1,8 +1,9 @@
-"""Writing files so that a reader sees the old one or the whole new one, never half."""
+"""Files: written so that a reader sees the old one or the whole new one, never half; opened if they are files."""
 
 import hashlib
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -54,6 +55,17 @@ def file_checksum(path: Path) -> str:
         while block := file.read(_BLOCK):
             checksum.update(block)
     return checksum.hexdigest()
+
+
+def irregular_text(mode: int) -> str | None:
+    """What stands in a file's place, by the mode that `stat` gives: `not a regular file (a named pipe)`; else None.
+
+    Opening a pipe waits for whoever writes to it, and a device may have no end.
+    """
+    if stat.S_ISREG(mode):
+        return None
+    kind = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket"}.get(stat.S_IFMT(mode))
+    return f"not a regular file ({kind or 'a device'})"
 
 
 def is_writable_folder(path: Path) -> bool:

@@ -72,6 +72,7 @@ class Splits:
 
         Raises:
             ConfigError: one of the files is there and `overwrite` is not set, or `folder` is a file.
+            TokenError: a scenario's name has blanks, which a split file cannot hold.
         """
         return _write_all({Path(folder) / f"{name}.txt": tokens for name, tokens in self.by_name().items()}, overwrite)
 
@@ -141,7 +142,8 @@ def save_selection(scenarios: Iterable[RowArgument], path: str | os.PathLike[str
     Raises:
         ConfigError: the name does not end in `.txt`; the file is there and `overwrite` is not set; its folder is a
             file.
-        TokenError: something is neither a scenario's token nor a record of one.
+        TokenError: something is neither a scenario's token nor a record of one, or has blanks, which a split file
+            cannot hold.
     """
     path = Path(path)
     if path.suffix != ".txt":
@@ -319,7 +321,9 @@ def _dealt(
 
 def _write_all(files: Mapping[Path, Sequence[str]], overwrite: bool) -> list[Path]:  # noqa: FBT001
     """Write split files; they are renamed into place once all of them are whole."""
-    for path in files:
+    for path, tokens in files.items():
+        for token in tokens:
+            _check_line(path, token)
         if path.exists() and not overwrite:
             raise ConfigError(f"{path}: is there already; choose another place, or ask to overwrite it")
         if path.is_dir():
@@ -337,6 +341,15 @@ def _scenario_token(scenario: RowArgument) -> str:
     if not isinstance(token, str) or token.count("/") != 1:
         raise TokenError(f"expected a scenario's token or its record, found {scenario!r}")
     return token
+
+
+def _check_line(path: Path, token: str) -> None:
+    """Refuse a token whose line would not be read as two words."""
+    if token.replace("/", " ").split() != token.split("/") or not token.isprintable():
+        raise TokenError(
+            f"{path}: scenario {token!r} cannot stand in a split file, whose lines are '<scenario_type> <scenario>' of "
+            "printable characters without blanks; leave it out, or rename its folders"
+        )
 
 
 def _distribution(records: Mapping[str, Sequence[ScenarioRecord]], field: str) -> dict[str, dict[str, int]]:

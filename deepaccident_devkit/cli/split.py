@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from deepaccident_devkit.cli.options import release_parameters, where_parameter
 from deepaccident_devkit.deepaccident import DeepAccident
@@ -37,6 +38,8 @@ def split(
         raise click.UsageError("--out is for the official split; with --where give --save FILE")
     if save and not where:
         raise click.UsageError("--save is for a selection; give --where too, or --out FOLDER for the official split")
+    if where:
+        _refuse("seed", "released_skip")
     dataset = DeepAccident(**release)
     if where:
         chosen = [scenario["token"] for scenario in dataset.find(*where)]
@@ -49,3 +52,14 @@ def split(
     click.echo(report.to_json() if as_json else report.to_text())
     for path in written:
         click.echo(f"written: {path}", err=as_json)
+
+
+def _refuse(*parameters: str) -> None:
+    """End with a usage error if one of these options, which a selection has no use for, was given."""
+    context = click.get_current_context()
+    for name in parameters:
+        if context.get_parameter_source(name) is not ParameterSource.DEFAULT:
+            option = f"--{name.replace('_', '-')}"
+            raise click.UsageError(
+                f"{option} is for the official split; --where shuffles nothing, leave one of them out"
+            )

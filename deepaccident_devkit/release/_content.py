@@ -4,9 +4,10 @@ import os
 from pathlib import Path
 
 from deepaccident_devkit.errors import MissingFileError, ReleaseError
+from deepaccident_devkit.files import irregular_text
 
 _USUAL_SIZE = 1 << 16
-_FLAGS = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)  # a pipe in a file's place is empty
+_FLAGS = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)  # no waiting for a pipe
 
 
 def read_content(path: Path, fault: type[ReleaseError], remedy: str) -> bytes:
@@ -14,11 +15,13 @@ def read_content(path: Path, fault: type[ReleaseError], remedy: str) -> bytes:
 
     Raises:
         MissingFileError: there is no such file.
-        ReleaseError: of the kind `fault`, if it cannot be read: a folder, no permission, a failing disk.
+        ReleaseError: of the kind `fault`, if it cannot be read: a folder or a pipe, no permission, a failing disk.
     """
     try:
         descriptor = os.open(path, _FLAGS)
         try:
+            if (irregular := irregular_text(os.fstat(descriptor).st_mode)) is not None:
+                raise fault(f"{path}: {irregular}; {remedy}")
             content = os.read(descriptor, _USUAL_SIZE)
             while more := os.read(descriptor, _USUAL_SIZE):
                 content += more
@@ -29,6 +32,16 @@ def read_content(path: Path, fault: type[ReleaseError], remedy: str) -> bytes:
     except OSError as error:
         raise fault(f"{path}: cannot be read ({error.strerror}); {remedy}") from error
     return content
+
+
+def check_regular(path: Path, fault: type[ReleaseError], remedy: str) -> None:
+    """Refuse what is no regular file, for readers that open by themselves; what is not there is left to them."""
+    try:
+        irregular = irregular_text(path.stat().st_mode)
+    except OSError:
+        return
+    if irregular is not None:
+        raise fault(f"{path}: {irregular}; {remedy}")
 
 
 def read_lines(path: Path, fault: type[ReleaseError], remedy: str) -> list[str]:

@@ -7,8 +7,10 @@ import numpy as np
 from deepaccident_devkit.arrays import ByteArray
 from deepaccident_devkit.errors import MissingFileError, SensorFileError
 from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.release._content import check_regular
 
 JPEG_QUALITY = 90
+_REMEDY = "restore the file from its archive"
 
 
 def read_image(path: Path, *, raw: bool = False) -> ByteArray:
@@ -20,10 +22,12 @@ def read_image(path: Path, *, raw: bool = False) -> ByteArray:
 
     Raises:
         MissingFileError: there is no such file.
-        SensorFileError: it is truncated or no image. (Pillow says so where OpenCV returns a half-grey picture.)
+        SensorFileError: it is truncated, no image or no file. (Of a truncated one, OpenCV returns a half-grey
+            picture.)
     """
     from PIL import Image
 
+    check_regular(path, SensorFileError, _REMEDY)
     bombs = (Image.DecompressionBombError, Image.DecompressionBombWarning)  # a damaged header names a giant size
 
     try:
@@ -32,7 +36,7 @@ def read_image(path: Path, *, raw: bool = False) -> ByteArray:
     except FileNotFoundError:
         raise MissingFileError(f"{path}: no such file; unpack the archive that holds this camera") from None
     except (OSError, SyntaxError, ValueError, *bombs) as error:
-        raise SensorFileError(f"{path}: not a readable image ({error}); restore the file from its archive") from error
+        raise SensorFileError(f"{path}: not a readable image ({error}); {_REMEDY}") from error
 
 
 def write_image(path: Path, image: ByteArray) -> None:

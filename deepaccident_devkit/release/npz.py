@@ -11,6 +11,7 @@ import numpy as np
 from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.errors import MissingFileError, SensorFileError
 from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.release._content import check_regular
 
 KEY = "data"
 _ENDING = ".npy"
@@ -40,8 +41,9 @@ def read_npz(path: Path) -> AnyArray:
 
     Raises:
         MissingFileError: there is no such file.
-        SensorFileError: it is empty, truncated, holds several arrays and none of them `data`, or objects.
+        SensorFileError: it is no file, empty, truncated, holds several arrays and none of them `data`, or objects.
     """
+    check_regular(path, SensorFileError, _REMEDY)
     try:
         with zipfile.ZipFile(path) as archive, archive.open(_array_member(path, archive)) as file:
             array: AnyArray = np.lib.format.read_array(file, allow_pickle=False)
@@ -76,10 +78,11 @@ def _array_member(path: Path, archive: zipfile.ZipFile) -> str:
 
 
 def _fault(path: Path, error: Exception) -> str:
-    if not path.is_file():
+    try:
+        with path.open("rb") as file:
+            start = file.read(len(_BARE_ARRAY))
+    except OSError:
         return f"not a readable npz archive ({error})"
-    with path.open("rb") as file:
-        start = file.read(len(_BARE_ARRAY))
     if start == _BARE_ARRAY:
         return "expected an npz archive, found a bare array"
     return f"not a readable npz archive ({error if start else 'the file is empty'})"

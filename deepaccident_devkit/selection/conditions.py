@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import operator
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.selection.fields import Field, Value
@@ -19,6 +22,11 @@ _RANGE = re.compile(r"(-?\d+)?\s*\.\.\s*(-?\d+)?")
 _BOUND = re.compile(r"(>=|<=|>|<)\s*(-?\d+)")
 _UNKNOWN = ("unknown", "none")
 _FLAGS = {"true": True, "yes": True, "false": False, "no": False}
+_SINGLE = (str, bytes, bytearray, Mapping, np.ndarray)
+"""What Python counts among the collections and a filter does not; of these only a str can be a value."""
+_MOST_DIGITS = 18
+_LONGEST = 60
+"""Characters of a wrong value that a message shows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,24 +73,29 @@ def parse_where(text: str) -> Filter:
     Raises:
         ChoiceError: the text has no field, no sign or no value.
     """
+    if not isinstance(text, str):
+        raise ChoiceError(
+            f"expected a text such as town=Town03,Town05, found {_shown(text)}; other values are given as keywords, "
+            "such as town=['Town03', 'Town05']"
+        )
     match = _TEXT.fullmatch(text)
     values = [value.strip() for value in match[3].split(",")] if match else []
     if match is None or not all(values):
         raise ChoiceError(
-            f"expected field=value[,value…] with one of the signs =, !=, >=, <=, > and <, found '{text}'; such as "
-            "town=Town03,Town05 or length=40..60"
+            f"expected field=value[,value…] with one of the signs =, !=, >=, <=, > and <, found {_shown(text)}; "
+            "such as town=Town03,Town05 or length=40..60"
         )
     name, sign = match[1], match[2]
     if sign in {"=", "!="}:
         return Filter(name, tuple(values), negated=sign == "!=")
     if len(values) > 1:
-        raise ChoiceError(f"'{text}': {sign} takes one number, found {len(values)}")
+        raise ChoiceError(f"{_shown(text)}: {sign} takes one number, found {len(values)}")
     return Filter(name, (f"{sign}{values[0]}",))
 
 
 def keyword_filter(name: str, value: FilterValue) -> Filter:
     """The filter that a keyword of `find` stands for."""
-    several = isinstance(value, Collection) and not isinstance(value, str)
+    several = isinstance(value, Collection) and not isinstance(value, _SINGLE)
     return Filter(name, tuple(value) if several else (value,))  # type: ignore[arg-type]
 
 
@@ -100,7 +113,8 @@ def condition_of(wanted: Filter, field: Field, here: Iterable[Value]) -> Conditi
     possible = list(dict.fromkeys([*field.known, *sorted({str(value) for value in here if value is not None})]))
     singles: set[Value] = set()
     ranges = []
-    for value in wanted.values:
+    for given in wanted.values:
+        value = given.item() if isinstance(given, np.generic) else given
         bounds = _bounds(field, value) if isinstance(value, str) else None
         if bounds is not None:
             ranges.append(bounds)
@@ -113,43 +127,77 @@ def _single(field: Field, value: object, possible: list[str]) -> Value:
     """One value of a field, in the field's own type."""
     if value is None or (isinstance(value, str) and value.lower() in _UNKNOWN):
         return None
+    if isinstance(value, Collection) and not isinstance(value, str):
+        raise ChoiceError(
+            f"{field.name}: expected a value, or a list, tuple or set of values, found {_shown(value)}; give an array "
+            "as a list: array.tolist()"
+        )
     if field.kind == "flag":
         flag = _FLAGS.get(value.lower()) if isinstance(value, str) else value
         if isinstance(flag, bool):
             return flag
-        raise ChoiceError(f"{field.name}: expected true, false or unknown, found {value!r}")
+        raise ChoiceError(f"{field.name}: expected true, false or unknown, found {_shown(value)}")
     if field.kind == "number":
         return _number(field, value)
     if isinstance(value, str) and value in possible:
         return value
-    raise ChoiceError(f"{field.name}: found {value!r}; possible are {possible_text(str(value), possible)}")
+    meant = value if isinstance(value, str) and len(value) <= _LONGEST else ""
+    raise ChoiceError(f"{field.name}: found {_shown(value)}; possible are {possible_text(meant, possible)}")
 
 
 def _number(field: Field, value: object) -> int:
-    is_text = isinstance(value, str) and re.fullmatch(r"-?\d+", value) is not None
-    # an index of numpy's or pandas' is a number too; a bool is none
-    number = int(str(value)) if is_text or (hasattr(value, "__index__") and not isinstance(value, bool)) else None
+    number = None
+    if isinstance(value, str):
+        if re.fullmatch(r"-?\d+", value) is not None:
+            number = _whole(field, value)
+    elif not isinstance(value, bool):
+        try:
+            number = operator.index(value)  # type: ignore[arg-type]
+        except TypeError:
+            number = None
     if number is None:
         raise ChoiceError(
-            f"{field.name}: expected a number, a range such as 40..60 or a bound such as >=50, found {value!r}"
+            f"{field.name}: expected a number, a range such as 40..60 or a bound such as >=50, found {_shown(value)}"
         )
     if field.known and number not in field.known:
-        raise ChoiceError(f"{field.name}: found {number}; possible are {', '.join(map(str, field.known))}")
+        raise ChoiceError(f"{field.name}: found {_shown(number)}; possible are {', '.join(map(str, field.known))}")
     return number
+
+
+def _whole(field: Field, digits: str) -> int:
+    """The number that a sign and digits stand for; Python itself reads no more than 4300 digits."""
+    if len(digits) > _MOST_DIGITS:
+        raise ChoiceError(
+            f"{field.name}: found a number of {len(digits)} characters, {_shown(digits)}; expected one of at most "
+            f"{_MOST_DIGITS}"
+        )
+    return int(digits)
+
+
+def _shown(value: object) -> str:
+    """A wrong value as a message shows it: in full if it is short."""
+    try:
+        text = repr(value)
+    except ValueError:  # an int of more than 4300 digits
+        text = f"{type(value).__name__} of very many digits"
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
 
 
 def _bounds(field: Field, text: str) -> tuple[int | None, int | None] | None:
     """The lowest and highest number that a text allows; None if it is no range."""
     text = text.strip()
     if (bound := _BOUND.fullmatch(text)) is not None:
-        number = int(bound[2])
+        number = _whole(field, bound[2])
         ends = {">=": (number, None), ">": (number + 1, None), "<=": (None, number), "<": (None, number - 1)}[bound[1]]
     elif (between := _RANGE.fullmatch(text)) is not None:
-        ends = (int(between[1]) if between[1] else None, int(between[2]) if between[2] else None)
+        ends = (
+            _whole(field, between[1]) if between[1] else None,
+            _whole(field, between[2]) if between[2] else None,
+        )
     else:
         return None
     if field.kind != "number":
-        raise ChoiceError(f"{field.name}: '{text}' is a range, which only numbers have")
+        raise ChoiceError(f"{field.name}: {_shown(text)} is a range, which only numbers have")
     lowest, highest = ends
     if lowest is not None and highest is not None and lowest > highest:
         raise ChoiceError(f"{field.name}: '{text}': {lowest} is more than {highest}")

@@ -52,6 +52,12 @@ CODES: dict[str, Code] = {
         "A split file lists scenarios that are not here.",
         "download them if you need the whole split",
     ),
+    "split-file-repeats": Code("warning", "A split file lists a scenario more than once.", "remove all lines but one"),
+    "twins-apart": Code(
+        "warning",
+        "A scenario and its twin (the accident and the normal one of a name) are of different splits.",
+        "restore the split files, whose twins go together, or move one of the two",
+    ),
     "labels-without-calib": Code(
         "warning", "An agent has labels but no calib files, and is left out.", "unpack its calib archive"
     ),
@@ -95,6 +101,11 @@ CODES: dict[str, Code] = {
     "duplicate-id": Code("warning", "An id occurs twice in one label.", _RESTORE_ONE),
     "duplicate-box": Code("warning", "Two boxes of a label stand in the same place.", _RESTORE_ONE),
     "odd-id": Code("warning", "An id is none that the format knows.", _RESTORE_ONE),
+    "ids-untracked": Code(
+        "warning",
+        "All ids of a label, or of an agent's labels, are −1, though its actors can be tracked.",
+        _RESTORE_ONE,
+    ),
     "odd-size": Code("warning", "A box has no volume, or a size that its class cannot have.", _RESTORE_ONE),
     "odd-position": Code("warning", "A box is absurdly far away.", _RESTORE_ONE),
     "odd-points": Code("warning", "A box counts a negative number of LiDAR points.", _RESTORE_ONE),

@@ -25,6 +25,7 @@ from deepaccident_devkit.taxonomy import (
     OWN_ACTOR_ID,
 )
 from deepaccident_devkit.validation.inventory import Inventory
+from deepaccident_devkit.validation.jpeg import zero_stretch
 from deepaccident_devkit.validation.subject import Subject, frames_text
 
 LIDAR_RANGE = 75.0
@@ -98,6 +99,10 @@ def _images(
             image = read_image(path)
         except ReleaseError as error:
             yield finding_of(error, "sensor-unreadable", subject.token)
+            continue
+        if (zeros := zero_stretch(path.read_bytes())) is not None:
+            what = f"holds {zeros[1]} zero bytes in a row from byte {zeros[0]} on: part of the picture is lost"
+            yield subject.finding("sensor-unreadable", str(path), what)
             continue
         sizes[frame] = (image.shape[1], image.shape[0])
         thumbnails[frame] = cv2.resize(image, _THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.float64)

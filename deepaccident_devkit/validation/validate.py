@@ -1,6 +1,6 @@
 """Looking at a whole release, or at one scenario: the checks in their order."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -8,15 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import SplitFileError, TokenError
+from deepaccident_devkit.errors import TokenError
 from deepaccident_devkit.parallel import run_batch
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, find_release
 from deepaccident_devkit.release.layout import names_without_calib
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.build import read_scenario
-from deepaccident_devkit.tables.findings import finding_of
 from deepaccident_devkit.tables.scan import scan_scenario
-from deepaccident_devkit.tables.split_assignment import SplitAssignment, assign_splits
+from deepaccident_devkit.tables.split_assignment import SplitAssignment
 from deepaccident_devkit.taxonomy import EXPECTED_MINI_SCENARIOS, EXPECTED_SCENARIOS
 from deepaccident_devkit.validation.agreement import check_agreement
 from deepaccident_devkit.validation.inventory import Recording, absences, take_inventory
@@ -24,8 +23,10 @@ from deepaccident_devkit.validation.labels import check_labels
 from deepaccident_devkit.validation.poses import check_poses
 from deepaccident_devkit.validation.report import Coverage, ValidationReport, empty_recordings, worst_first
 from deepaccident_devkit.validation.sensors import check_sensors
+from deepaccident_devkit.validation.split_files import check_splits
 from deepaccident_devkit.validation.story import check_story
 from deepaccident_devkit.validation.subject import make_finding, subject_of
+from deepaccident_devkit.validation.untracked import check_untracked
 from deepaccident_devkit.validation.velocities import VelocityFit, check_velocities, fit_velocities, total_fit
 
 _UNKNOWN_SPLIT = "unknown"
@@ -83,7 +84,7 @@ def validate_release(
     checks = run_batch(
         partial(check_scenario, deep=deep), chosen, workers=workers, label="validating scenarios", progress=progress
     )
-    splits, of_release = _split_findings(layout)
+    splits, of_release = check_splits(layout)
     tokens = {check.token for check in checks}
     of_release = [finding for finding in of_release if finding.scenario is None or finding.scenario in tokens]
     of_release += _strays(layout) if scenarios is None else ()
@@ -110,7 +111,9 @@ def findings(dataset: Dataset, scenario: RowArgument, *, deep: bool = False) -> 
     Raises:
         TokenError: the release has no such scenario.
     """
-    token = scenario if isinstance(scenario, str) else str(scenario["token"])
+    token = scenario.get("token") if isinstance(scenario, Mapping) else scenario
+    if not isinstance(token, str):
+        raise TokenError(f"scenario: expected a token or a record with one, found {scenario!r}")
     report = validate_release(dataset.dataroot, dataset.version, deep=deep, workers=1, scenarios=[token])
     return [finding for finding in report.findings if finding.scenario == token]
 
@@ -137,6 +140,7 @@ def check_scenario(scenario: ScenarioFolder, *, deep: bool = False) -> ScenarioC
                 *check_poses(subject),
                 *check_labels(subject),
                 *check_agreement(subject),
+                *check_untracked(subject),
                 *check_velocities(subject, velocity),
                 *check_story(subject),
                 *(check_sensors(subject, inventory) if deep else ()),
@@ -150,44 +154,21 @@ def check_scenario(scenario: ScenarioFolder, *, deep: bool = False) -> ScenarioC
     )
 
 
-def _split_findings(layout: ReleaseLayout) -> tuple[SplitAssignment | None, list[Finding]]:
-    try:
-        splits = assign_splits(layout)
-    except SplitFileError as error:
-        return None, [finding_of(error, "split-file-unreadable", None)]
-    return splits, list(_assignment_findings(splits))
-
-
 def _strays(layout: ReleaseLayout) -> Iterator[Finding]:
     for folder, name in names_without_calib(layout):
         what = "has labels, meta or sensor files, but no calib files of any agent, and is left out"
         yield make_finding("calib-missing", None, str(folder / "*" / "calib" / name), what)
 
 
-def _assignment_findings(splits: SplitAssignment) -> Iterator[Finding]:
-    for token, messages in splits.problems.items():
-        for message in messages:
-            yield make_finding("two-places", token, token, message.rpartition(";")[0])
-    for token in splits.unlisted:
-        yield make_finding("in-no-split", token, token, "no split file lists it")
-    for token, messages in splits.contradictions.items():
-        for message in messages if token not in splits.problems else ():
-            yield make_finding("splits-contradict", token, token, message)
-    for notice in splits.notices:
-        where, _, what = notice.partition(": ")
-        yield make_finding("split-file-partial", None, where, what)
-
-
-def _coverage(version: str, checks: Sequence[ScenarioCheck], splits: SplitAssignment | None) -> Coverage:
+def _coverage(version: str, checks: Sequence[ScenarioCheck], splits: SplitAssignment) -> Coverage:
     """Scenarios and recordings by split; the mini release counts as one; nothing where only some were looked at."""
     if not checks:
         return Coverage(scenarios={}, expected={}, recordings={})
     mini = version == "v1-mini"
-    split_of = {} if splits is None else splits.split_of
     scenarios: dict[str, int] = {}
     recordings: dict[str, dict[str, dict[str, int]]] = {}
     for check in checks:
-        split = version if mini else split_of.get(check.token, _UNKNOWN_SPLIT)
+        split = version if mini else splits.split_of.get(check.token, _UNKNOWN_SPLIT)
         scenarios[split] = scenarios.get(split, 0) + 1
         counts = recordings.setdefault(split, empty_recordings())
         for agent, kind in check.recordings:

@@ -2,11 +2,12 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from tiny import META, NAME, TYPE, label_lines, write_tiny_release
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError, FieldError
+from deepaccident_devkit.errors import ChoiceError, DeepAccidentError, FieldError
 from deepaccident_devkit.overview import overview
 from deepaccident_devkit.selection import Filter, accident_visibility, accident_visible, parse_where
 from deepaccident_devkit.selection.accident_visibility import SHEER_CURTAINS
@@ -151,6 +152,74 @@ def test_what_is_impossible_is_named_with_what_is_possible(da: DeepAccident) -> 
         da.find("town>=3")
     with pytest.raises(ChoiceError, match="'length>3,4': > takes one number, found 2"):
         da.find("length>3,4")
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("collision", np.True_),
+        ("collision", np.False_),
+        ("collision", [np.True_, None]),
+        ("num_frames", np.int64(5)),
+        ("num_frames", np.uint8(5)),
+        ("num_frames", {np.int32(5), np.int64(7)}),
+        ("accident_type", np.int8(1)),
+        ("town", np.str_("Town03")),
+        ("length", np.str_("5..7")),
+    ],
+)
+def test_numpys_scalars_are_as_pythons(da: DeepAccident, field: str, value) -> None:
+    several = isinstance(value, list | set)
+    plain = [getattr(one, "item", lambda one=one: one)() for one in (value if several else [value])]
+    assert numbers(da, **{field: value}) == numbers(da, **{field: plain}) != []
+
+
+@pytest.mark.parametrize("field", ["town", "num_frames", "accident_type", "collision", "visibility"])
+@pytest.mark.parametrize(
+    "value",
+    [
+        "9" * 5000,
+        "-" + "9" * 5000,
+        f"{'9' * 5000}..",
+        f"..{'9' * 5000}",
+        f">={'9' * 5000}",
+        -(10**5000),
+        np.array([5, 7]),
+        np.array(5),
+        np.array(["Town03"]),
+        np.array([[True]]),
+        [np.array([5, 7])],
+        [["Town03"]],
+        [{}],
+        {"Town03": 1},
+        b"Town03",
+        np.float64(4.5),
+        np.datetime64("2024-01-01"),
+        float("nan"),
+        object(),
+    ],
+    ids=lambda value: repr(value)[:20] if not isinstance(value, int) else "long number",
+)
+def test_values_that_no_field_has_are_our_error(da: DeepAccident, field: str, value) -> None:
+    if field == "num_frames" and isinstance(value, int):
+        assert numbers(da, num_frames=value) == []  # a number, if not of a recording
+        return
+    with pytest.raises(ChoiceError, match=f"^{field}: ") as caught:
+        da.find(**{field: value})
+    assert len(str(caught.value)) < 400
+    assert any(remedy in str(caught.value) for remedy in ("possible are", "expected", "only numbers have"))
+
+
+def test_an_arrays_error_says_how_to_give_it(da: DeepAccident) -> None:
+    with pytest.raises(ChoiceError, match=r"found array\(\[5, 7\]\); give an array as a list: array.tolist\(\)"):
+        da.find(length=np.array([5, 7]))  # type: ignore[arg-type]
+    assert numbers(da, length=np.array([5, 7]).tolist()) == [2, 4]
+
+
+@pytest.mark.parametrize("text", [None, 5, ["town=Town03"], {"town": "Town03"}, np.array(["town=Town03"])])
+def test_a_text_that_is_none_is_our_error(da: DeepAccident, text) -> None:
+    with pytest.raises(DeepAccidentError, match=r"expected a text such as town=Town03,Town05, found .*as keywords"):
+        da.find(text)
 
 
 def test_an_overview_of_a_selection_counts_only_that(da: DeepAccident) -> None:

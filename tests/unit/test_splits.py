@@ -1,6 +1,7 @@
 """The official split procedure on hand-made scenarios, and split files of one's own."""
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -295,6 +296,29 @@ def test_a_selection_saved_is_a_split(da_b: DeepAccident, tmp_path: Path) -> Non
         save_selection(chosen, tmp_path / "mine")
     with pytest.raises(TokenError, match="expected a scenario's token"):
         save_selection(["Town03"], tmp_path / "other.txt")
+
+
+@pytest.mark.parametrize(
+    "token", ["a b/c", "a/b c", "a/b\n", "a/b\u2028c", "a/\xa0b", "a/", "/b", " a/b", "\ufeffa/b", "a/\udcff", "a/b\0"]
+)
+def test_a_name_that_would_not_be_read_back_is_refused(tmp_path: Path, token: str) -> None:
+    with pytest.raises(TokenError, match=r"mine\.txt: scenario .* cannot stand in a split file.*; leave it out"):
+        save_selection(["type1_subtype1_normal/Town03", token], tmp_path / "mine.txt")
+    made = split_records(many_twins(3))
+    with pytest.raises(TokenError, match=r"val\.txt: scenario .* cannot stand in a split file"):
+        replace(made, val=(token,)).save(tmp_path / "splits")
+    assert list(tmp_path.iterdir()) == []
+
+
+@given(st.text(), st.text())
+def test_what_is_saved_is_read_back(tmp_path_factory: pytest.TempPathFactory, scenario_type: str, name: str) -> None:
+    path = tmp_path_factory.getbasetemp() / "any.txt"
+    token = f"{scenario_type}/{name}"
+    try:
+        save_selection([token], path, overwrite=True)
+    except TokenError:
+        return
+    assert read_split_file(path) == [token]
 
 
 def test_split_files_of_ones_own(da_b: DeepAccident, tmp_path: Path) -> None:

@@ -149,6 +149,27 @@ def id_lost(place: Place, rng: np.random.Generator) -> str:
 
 
 @GROUP.kind()
+def ids_lost(place: Place, rng: np.random.Generator) -> str:
+    """All ids of others in one agent's labels are those of untracked ones (−1)."""
+    return _lose_ids(place, place.any_agent(rng), list(place.frames))
+
+
+@GROUP.kind()
+def ids_lost_at_one_frame(place: Place, rng: np.random.Generator) -> str:
+    """All ids of others in one label are those of untracked ones (−1)."""
+    return _lose_ids(place, place.any_agent(rng), [place.middle_frame(rng)])
+
+
+def _lose_ids(place: Place, agent: str, frames: list[int]) -> str:
+    def lose(row: list[str]) -> None:
+        if row[_ID] != str(OWN_ACTOR_ID):
+            _set_id(row, -1)
+
+    place.edit_rows(agent, frames, lose)
+    return f"{agent}: all ids are -1 at {len(frames)} frames"
+
+
+@GROUP.kind()
 def own_row_removed(place: Place, rng: np.random.Generator) -> str:
     """The recording agent's own line is missing at one frame."""
     agent, frame = place.vehicle(rng), place.any_frame(rng)

@@ -21,15 +21,34 @@ def _append(place: Place, name: str, line: bytes) -> str:
     return f"{name}: {line.decode().strip()}"
 
 
-def _drop(place: Place, name: str) -> None:
+def _drop(place: Place, name: str, line: bytes | None = None) -> None:
     path = place.root / name
-    place.write(path, path.read_bytes().replace(_line(place), b""))
+    place.write(path, path.read_bytes().replace(line or _line(place), b""))
+
+
+def _twin(line: bytes) -> bytes:
+    words = (b"_accident ", b"_normal ")
+    return line.replace(*(words if words[0] in line else words[::-1]))
 
 
 @GROUP.kind()
 def scenario_in_two_splits(place: Place, rng: np.random.Generator) -> str:
     """A second split file lists the scenario."""
     return _append(place, str(rng.choice(["val.txt", "test.txt"])), _line(place))
+
+
+@GROUP.kind()
+def twins_in_two_splits(place: Place, rng: np.random.Generator) -> str:
+    """The scenario is listed in another split than its twin."""
+    for name in ("train.txt", "train_mini.txt"):
+        _drop(place, name)
+    return _append(place, str(rng.choice(["val.txt", "test.txt"])), _line(place))
+
+
+@GROUP.kind()
+def split_line_twice(place: Place, rng: np.random.Generator) -> str:
+    """A split file lists the scenario twice."""
+    return _append(place, str(rng.choice(["train.txt", "train_mini.txt"])), _line(place))
 
 
 @GROUP.kind()
@@ -113,10 +132,12 @@ def all_sensors_removed(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind(harmless="the real test split ships without labels, BEV arrays and sometimes meta (format.md)")
 def test_labels_removed(place: Place, rng: np.random.Generator) -> str:
-    """The scenario is of the test split and has no labels, no BEV arrays and no meta."""
+    """The scenario is of the test split, as its twin is, and has no labels, no BEV arrays and no meta."""
+    line = _line(place)
     for name in ("train.txt", "train_mini.txt"):
         _drop(place, name)
-    _append(place, "test.txt", _line(place))
+        _drop(place, name, _twin(line))
+    _append(place, "test.txt", line + _twin(line))
     for agent in place.agents:
         for kind in ("label", BEV_CAMERA):
             place.remove_folder(place.folder(agent, kind))

@@ -98,6 +98,19 @@ def image_emptied(place: Place, rng: np.random.Generator) -> str:
 
 
 @IMAGES.kind()
+def image_zeros(place: Place, rng: np.random.Generator) -> str:
+    """A stretch of an image's coded data is zero bytes, which decoders pass over."""
+
+    def change(content: bytes) -> bytes:
+        start = content.index(b"\xff\xda") + 14
+        length = min(512, (len(content) - start) // 2)
+        start = int(rng.integers(start, len(content) - length))
+        return content[:start] + bytes(length) + content[start + length :]
+
+    return _replace_file(place, rng, _camera(rng), change)
+
+
+@IMAGES.kind()
 def image_garbage(place: Place, rng: np.random.Generator) -> str:
     """An image file holds random bytes."""
     return _replace_file(place, rng, _camera(rng), lambda content: garbage(rng, len(content)))

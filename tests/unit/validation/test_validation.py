@@ -121,6 +121,12 @@ def test_findings_of_one_scenario_even_if_it_is_left_out(tmp_path: Path) -> None
         release.findings("nowhere")
 
 
+@pytest.mark.parametrize("scenario", [None, 5, {}, {"token": None}, ["a/b"]])
+def test_findings_of_what_is_no_scenario(da: DeepAccident, scenario) -> None:
+    with pytest.raises(TokenError, match="expected a token or a record with one, found"):
+        da.findings(scenario)
+
+
 def test_every_faulty_file_is_named(tmp_path: Path) -> None:
     root = tiny.write_tiny_release(tmp_path)
     for frame in (1, 3):

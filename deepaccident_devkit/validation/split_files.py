@@ -1,0 +1,70 @@
+"""Do the split files, and the folders of layout B, give every scenario one place, and twins the same."""
+
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from deepaccident_devkit.errors import ReleaseError
+from deepaccident_devkit.release import ReleaseLayout, read_split_file
+from deepaccident_devkit.tables import Finding
+from deepaccident_devkit.tables.findings import finding_of
+from deepaccident_devkit.tables.split_assignment import SplitAssignment, assign_splits
+from deepaccident_devkit.validation.subject import make_finding
+
+_NAMED = 3
+"""Repeated lines that a finding names at most."""
+
+
+def check_splits(layout: ReleaseLayout) -> tuple[SplitAssignment, list[Finding]]:
+    """Which split each scenario belongs to, by the split files that can be read, and what is wrong with all of them."""
+    found: list[Finding] = []
+    readable: dict[str, Path] = {}
+    for split, path in layout.split_files.items():
+        try:
+            lines = read_split_file(path, raw=True)
+        except ReleaseError as error:
+            found.append(finding_of(error, "split-file-unreadable", None))
+            continue
+        readable[split] = path
+        found += _repeated(path, lines)
+    splits = assign_splits(replace(layout, split_files=readable))
+    return splits, [*found, *_assignment_findings(splits), *_twins(splits)]
+
+
+def _repeated(path: Path, lines: list[tuple[str, ...]]) -> Iterator[Finding]:
+    """Scenarios that a file lists more than once; reading takes them once."""
+    repeated = [" ".join(words) for words, count in Counter(lines).items() if count > 1]
+    if repeated:
+        more = f" and {len(repeated) - _NAMED} more" if len(repeated) > _NAMED else ""
+        what = f"lists more than once: {', '.join(repeated[:_NAMED])}{more}"
+        yield make_finding("split-file-repeats", None, str(path), what)
+
+
+def _assignment_findings(splits: SplitAssignment) -> Iterator[Finding]:
+    for token, messages in splits.problems.items():
+        for message in messages:
+            yield make_finding("two-places", token, token, message.rpartition(";")[0])
+    for token in splits.unlisted:
+        yield make_finding("in-no-split", token, token, "no split file lists it")
+    for token, messages in splits.contradictions.items():
+        for message in messages if token not in splits.problems else ():
+            yield make_finding("splits-contradict", token, token, message)
+    for notice in splits.notices:
+        where, _, what = notice.partition(": ")
+        yield make_finding("split-file-partial", None, where, what)
+
+
+def _twins(splits: SplitAssignment) -> Iterator[Finding]:
+    """Scenarios of one name and family, such as an accident and its normal twin, that belong to different splits."""
+    twins: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for token in splits.split_of:
+        scenario_type, _, name = token.partition("/")
+        if token not in splits.problems and token not in splits.contradictions:
+            twins[scenario_type.rpartition("_")[0], name].append(token)
+    for tokens in twins.values():
+        for token in tokens:
+            for other in tokens:
+                mine, theirs = splits.split_of[token], splits.split_of[other]
+                if mine != theirs:
+                    yield make_finding("twins-apart", token, token, f"is of {mine}, its twin {other} of {theirs}")

@@ -1,0 +1,117 @@
+"""Stretches of zero bytes in pictures: found wherever they lie, and never where an encoder wrote them."""
+
+import io
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from deepaccident_devkit.validation import validate_release
+from deepaccident_devkit.validation.jpeg import ZEROS, zero_stretch
+
+
+def jpeg(image: np.ndarray, **options: object) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(image).save(file, "JPEG", **options)
+    return file.getvalue()
+
+
+def scene(seed: int = 0) -> np.ndarray:
+    """A picture with some texture."""
+    noise = np.random.default_rng(seed).normal(0, 6, (180, 320, 3))
+    return np.clip(np.linspace(40, 200, 320)[None, :, None] + noise, 0, 255).astype(np.uint8)
+
+
+def test_zero_bytes_amid_a_picture_are_a_finding(small: Path) -> None:
+    path = next(small.glob("*/*/Camera_Front/*/*_002.jpg"))
+    content = jpeg(scene(), quality=90)
+    start = len(content) // 2
+    with Image.open(path) as image:
+        sound = jpeg(np.asarray(image.resize((320, 180))), quality=90)
+    for other in small.glob("*/*/Camera_Front/*/*.jpg"):
+        other.write_bytes(sound)
+    path.write_bytes(content[:start] + bytes(512) + content[start + 512 :])
+    found = validate_release(small, deep=True, workers=1).findings
+    (finding,) = [one for one in found if one.code == "sensor-unreadable"]
+    assert finding.where == str(path)
+    assert re.fullmatch(r"holds 51\d zero bytes in a row from byte \d+ on: part of the picture is lost", finding.what)
+
+
+@pytest.mark.parametrize("subsampling", [0, 1, 2])
+@pytest.mark.parametrize("stretch", [ZEROS, 512, 4096])
+def test_a_stretch_is_found_wherever_it_lies(subsampling: int, stretch: int) -> None:
+    content = jpeg(scene(), quality=95, subsampling=subsampling)
+    first = content.index(b"\xff\xda") + 14
+    for start in np.linspace(first, len(content) - stretch, 9, dtype=int).tolist():
+        damaged = content[:start] + bytes(stretch) + content[start + stretch :]
+        found = zero_stretch(damaged)
+        assert found is not None
+        assert abs(found[0] - start) <= 8
+        assert found[1] >= stretch
+    assert zero_stretch(content[: len(content) // 2] + bytes(len(content) // 2)) is not None
+
+
+COLOURS = [
+    *((level, level, level) for level in (0, 127, 128, 255)),
+    (255, 0, 0),
+    (0, 255, 0),
+    (0, 0, 255),
+    (9, 200, 77),
+]
+
+
+def even_and_regular() -> dict[str, np.ndarray]:
+    """Pictures whose coded data are as poor as can be."""
+    y, x = np.mgrid[:96, :160]
+    pictures = {f"flat {colour}": np.full((96, 160, 3), colour, np.uint8) for colour in COLOURS}
+    for step in (1, 2, 4, 8, 16):
+        board = ((y // step + x // step) % 2)[..., None].repeat(3, axis=2)
+        pictures[f"board {step}"] = (255 * board).astype(np.uint8)
+        pictures[f"faint board {step}"] = (128 - 2 * board).astype(np.uint8)
+    for corner in (0, 7):
+        dots = ((y % 8 == corner) & (x % 8 == corner))[..., None].repeat(3, axis=2)
+        for height in (-60, -9, -3, -1, 1, 3, 9, 60):
+            pictures[f"dots {corner} {height}"] = (128 + height * dots).astype(np.uint8)
+    pictures["ramp"] = np.linspace(0, 255, 160).astype(np.uint8)[None, :, None].repeat(96, axis=0).repeat(3, axis=2)
+    pictures["noise"] = np.random.default_rng(1).integers(0, 256, (96, 160, 3), dtype=np.uint8)
+    return pictures
+
+
+@pytest.mark.parametrize("optimize", [False, True])
+@pytest.mark.parametrize("progressive", [False, True])
+def test_no_encoder_writes_such_a_stretch(optimize: bool, progressive: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("PIL.ImageFile.MAXBLOCK", 1 << 22)  # Pillow's buffer for optimised noise
+    for name, picture in even_and_regular().items():
+        for quality in (1, 50, 75, 90, 95, 100):
+            for subsampling in (0, 2):
+                options = {"quality": quality, "optimize": optimize, "progressive": progressive}
+                content = jpeg(picture, subsampling=subsampling, **options)
+                assert zero_stretch(content) is None, (name, quality, subsampling)
+            assert zero_stretch(jpeg(picture[..., 0], **options)) is None, (name, quality)
+
+
+def test_an_even_picture_with_tables_of_its_own_may_be_zeros() -> None:
+    """The reason why the tables are looked at."""
+    content = jpeg(np.zeros((720, 1280, 3), np.uint8), quality=90, optimize=True)
+    assert bytes(ZEROS) in content
+    assert zero_stretch(content) is None
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"\xff", b"\xff\xd8", b"\xff\xd8\xff\xc4", b"\xff\xd8\xff\xda", b"\x89PNG" + bytes(999)]
+)
+def test_what_is_no_jpeg_has_no_stretch(content: bytes) -> None:
+    assert zero_stretch(content) is None
+    assert zero_stretch(content + bytes(1000)) is None
+
+
+def test_damaged_headers_end_nothing() -> None:
+    content = jpeg(scene(), quality=90)
+    rng = np.random.default_rng(3)
+    for _ in range(300):
+        damaged = bytearray(content)
+        for place in rng.integers(2, 700, 4).tolist():
+            damaged[place] = int(rng.integers(256))
+        zero_stretch(bytes(damaged))
