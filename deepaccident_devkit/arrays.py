@@ -1,12 +1,17 @@
-"""Array aliases and the checks that turn what a caller passes into what a record holds."""
+"""Array aliases, and the checks that turn what a caller passes into what a record holds."""
 
-from collections.abc import Sequence
+from __future__ import annotations
+
+import operator
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
+from numbers import Real
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from deepaccident_devkit.errors import GeometryError
+from deepaccident_devkit.errors import DeepAccidentError, GeometryError
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -15,20 +20,34 @@ ByteArray = NDArray[np.uint8]
 AnyArray = NDArray[Any]
 
 
+class FrozenArrays:
+    """Base of frozen dataclasses that hold arrays: these are read-only, from the start and in every copy.
+
+    numpy forgets on pickling and on `copy.deepcopy` that an array was read-only.
+    """
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        """Freeze the arrays; a class that checks them freezes them itself."""
+        _put(self, {name: getattr(self, name) for name in _field_names(type(self))})
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copies go without `__init__`, since what they hold was checked."""
+        return _restored, (type(self), {name: getattr(self, name) for name in _field_names(type(self))})
+
+
 def checked(name: str, values: ArrayLike, shape: Sequence[int | None], dtype: DTypeLike = np.float64) -> AnyArray:
-    """Return `values` as an array of `dtype`, or raise GeometryError if its shape is another.
+    """Return `values` as an array of `dtype`, or raise GeometryError if they are no numbers or of another shape.
 
     Args:
         name: how the error names the array.
         values: what the caller passed.
         shape: the expected shape, None where any length is good.
-        dtype: the element type wanted; an array that has it already is not copied.
+        dtype: the element type wanted; an array that has it already is not copied. Of an integer type, numbers must be
+            whole and in its range.
     """
-    try:
-        array = np.asarray(values, dtype=dtype)
-    except (TypeError, ValueError) as error:
-        message = f"{name}: expected an array of shape {_shape_text(shape)}, found {type(values).__name__}"
-        raise GeometryError(f"{message} ({error})") from error
+    array = as_numbers(name, values, f"an array of shape {_shape_text(shape)}", dtype)
     if array.ndim != len(shape) or any(
         want is not None and want != have for want, have in zip(shape, array.shape, strict=True)
     ):
@@ -36,9 +55,48 @@ def checked(name: str, values: ArrayLike, shape: Sequence[int | None], dtype: DT
     return array
 
 
+def as_numbers(name: str, values: ArrayLike, expected: str = "numbers", dtype: DTypeLike = np.float64) -> AnyArray:
+    """`checked` for any shape; `expected` says in the error what the caller should have passed."""
+    try:
+        given = np.asarray(values)
+        if given.dtype.kind not in "biuf":
+            raise TypeError(f"no numbers: {given.dtype}")
+        with np.errstate(invalid="ignore"):
+            array = given.astype(dtype, copy=False)
+    except (TypeError, ValueError) as error:
+        raise GeometryError(f"{name}: expected {expected}, found {type(values).__name__} ({error})") from error
+    if array.dtype.kind in "iu" and not np.array_equal(array, given):
+        raise GeometryError(f"{name}: expected whole numbers of {array.dtype}, found {given}")
+    return array
+
+
+def checked_number(
+    name: str, value: object, expected: str = "a number", error: type[DeepAccidentError] = GeometryError
+) -> float:
+    """A single number, numpy's scalars among them, as Python's float; or raise `error`, which says what is expected."""
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value.item()
+    if not isinstance(value, Real):
+        raise error(f"{name}: expected {expected}, found {value!r}")
+    return float(value)
+
+
+def checked_whole(
+    name: str, value: object, expected: str = "a whole number", error: type[DeepAccidentError] = GeometryError
+) -> int:
+    """A single whole number, numpy's integers among them, as Python's int; or raise `error`."""
+    try:
+        return operator.index(value)  # type: ignore[arg-type]  # what is none is refused
+    except TypeError:
+        raise error(f"{name}: expected {expected}, found {value!r}") from None
+
+
 def as_floats(values: ArrayLike) -> FloatArray:
-    """`values` as float64; arrays that are float64 already are not copied."""
-    return np.asarray(values, dtype=np.float64)
+    """`values` as float64; arrays that are float64 already are not copied. Raises GeometryError."""
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise GeometryError(f"expected numbers, found {type(values).__name__} ({error})") from error
 
 
 def readonly(array: AnyArray) -> AnyArray:
@@ -46,6 +104,22 @@ def readonly(array: AnyArray) -> AnyArray:
     view = array.view()
     view.flags.writeable = False
     return view
+
+
+def _restored(kind: type[FrozenArrays], values: Mapping[str, Any]) -> FrozenArrays:
+    """Undo `FrozenArrays.__reduce__`."""
+    result = object.__new__(kind)
+    _put(result, values)
+    return result
+
+
+def _put(record: FrozenArrays, values: Mapping[str, Any]) -> None:
+    for name, value in values.items():
+        object.__setattr__(record, name, readonly(value) if isinstance(value, np.ndarray) else value)
+
+
+def _field_names(kind: type[Any]) -> Iterable[str]:
+    return [field.name for field in fields(kind)]
 
 
 def _shape_text(shape: Sequence[int | None]) -> str:

@@ -13,7 +13,7 @@ from deepaccident_devkit.arrays import AnyArray, BoolArray, ByteArray, FloatArra
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
 from deepaccident_devkit.geometry import SE3, Box, Boxes, LidarPointCloud
 from deepaccident_devkit.geometry.boxes import trusted_boxes
-from deepaccident_devkit.geometry.se3 import trusted_se3
+from deepaccident_devkit.geometry.se3 import LAST_ROW, trusted_se3
 from deepaccident_devkit.release import BevImage, read_bev, read_image, read_lidar, read_split_file
 from deepaccident_devkit.tables import Problem, Table, Tables, table_names, visible_ids, visible_mask
 from deepaccident_devkit.taxonomy import (
@@ -38,6 +38,7 @@ RowArgument = str | Mapping[str, Any]
 """How a row is named wherever the API takes one: by its token, or by its record."""
 Visible = Literal["camera", "released"]
 VelocitySource = Literal["derived", "label"]
+_FRAMES = frozenset((*get_args(Frame), *CHANNELS))
 
 
 class Dataset:
@@ -245,13 +246,36 @@ class Dataset:
     # poses
 
     def world_from(self, sample: RowArgument, frame: str) -> SE3:
-        """The transform to world from a frame of a sample: `world`, `ego`, `lidar` or a channel (optical).
+        """The transform to world from a frame of a sample: `world`, `ego`, `lidar` or a channel (cameras optical).
 
         Raises:
             TokenError: no such sample.
             ChoiceError: no such frame.
         """
-        return self._world_from(self._sample_row(sample), frame)
+        return self._world_from(self._sample_row(sample), self.frame_name(frame))
+
+    def ego_from(self, sample: RowArgument, channel: str) -> SE3:
+        """The transform to a sample's ego frame from a sensor's, with the numbers that calib has for the LiDAR.
+
+        Raises:
+            TokenError: no such sample or sensor.
+        """
+        row = self.getind("sample_data", f"{_token(sample)}/{channel}")
+        calibrated = self.columns("sample_data")["calibrated_sensor_row"].item(row)
+        return trusted_se3(_pose(self.columns("calibrated_sensor")["matrix"][calibrated]))
+
+    def frame_name(self, frame: str) -> str:
+        """The one name of a frame of samples, which results carry: `lidar` for the channel `lidar01`, else its own.
+
+        Raises:
+            ChoiceError: no such frame.
+        """
+        if isinstance(frame, str):
+            if frame == LIDAR:
+                return "lidar"
+            if frame in _FRAMES:
+                return frame
+        raise ChoiceError(f"frame: expected world, ego, lidar or one of {', '.join(CHANNELS)}, found {frame!r}")
 
     # boxes
 
@@ -276,7 +300,7 @@ class Dataset:
             TokenError: no such sample.
             ChoiceError: no such frame, visibility or velocity.
         """
-        row = self._sample_row(sample)
+        row, frame = self._sample_row(sample), self.frame_name(frame)
         lidar_boxes = self._lidar_boxes(row, velocity)
         if visible is not None:
             lidar_boxes = lidar_boxes.select(self._visible(row, lidar_boxes, visible))
@@ -323,6 +347,10 @@ class Dataset:
         result[known] = actors[instances[known]]
         return result
 
+    def annotation_rows(self, sample: RowArgument) -> slice:
+        """Where a sample's boxes are in the annotation table's columns; empty without a label. Raises TokenError."""
+        return self._annotation_slice(self._sample_row(sample))
+
     # sensor data
 
     def get_sample_data_path(self, sample_data: RowArgument) -> Path:
@@ -345,7 +373,7 @@ class Dataset:
             calibrated = self._tables.views["sample_data"]["calibrated_sensor_row"].item(row)
             intrinsic = self._tables.views["calibrated_sensor"]["camera_intrinsic"][calibrated].reshape(3, 3).copy()
         sample_token = self._tables.resolver.token("sample", sample_row)
-        boxes = self.get_boxes(sample_token, "lidar" if channel == LIDAR else channel)
+        boxes = self.get_boxes(sample_token, channel)
         return self.get_sample_data_path(sample_data), boxes, intrinsic
 
     def load_image(self, sample_data: RowArgument) -> ByteArray:
@@ -372,14 +400,13 @@ class Dataset:
             MissingFileError: the file was not downloaded.
             SensorFileError: it cannot be read.
         """
-        row = self._sample_row(sample)
-        if frame not in get_args(Frame):
+        row, name = self._sample_row(sample), self.frame_name(frame)
+        if name not in get_args(Frame):
             raise ChoiceError(f"frame: expected one of {', '.join(get_args(Frame))}, found {frame!r}")
-        world_from_target = self._world_from(row, frame)
         cloud = read_lidar(self._channel_path(row, LIDAR))
-        if frame == "lidar":
+        if name == "lidar":
             return cloud
-        return cloud.transform(world_from_target.inverse() @ self._world_from(row, "lidar"), frame)
+        return cloud.transform(self._world_from(row, name).inverse() @ self._world_from(row, "lidar"), name)
 
     def load_bev(self, sample: RowArgument) -> BevImage:
         """What the BEV instance camera of a sample's agent saw; forward is up (see `BevImage`).
@@ -454,18 +481,24 @@ class Dataset:
         return [resolver.sample_at(agent, index) for agent in resolver.agents_of(scenario).values()]
 
     def _world_from(self, sample_row: int, frame: str) -> SE3:
+        """`world_from` of a frame by the name that `frame_name` gives."""
         if frame == "world":
             return SE3.identity()
         views = self._tables.views
-        pose = views["ego_pose"]["matrix"][sample_row].reshape(4, 4)
+        pose = _pose(views["ego_pose"]["matrix"][sample_row])
         if frame == "ego":
-            return trusted_se3(pose.copy())
+            return trusted_se3(pose)
         channel = LIDAR if frame == "lidar" else frame
-        if channel not in CHANNELS:
-            raise ChoiceError(f"frame: expected world, ego, lidar or one of {', '.join(CHANNELS)}, found {frame!r}")
         sample_data_row = sample_row * len(CHANNELS) + CHANNELS.index(channel)
         calibrated = views["sample_data"]["calibrated_sensor_row"].item(sample_data_row)
-        return trusted_se3(pose @ views["calibrated_sensor"]["matrix"][calibrated].reshape(4, 4))
+        return trusted_se3(pose @ _pose(views["calibrated_sensor"]["matrix"][calibrated]))
+
+
+def _pose(numbers: FloatArray) -> FloatArray:
+    """A stored transform (16,) as a new array (4, 4); the file's numbers, but for a last row that is a little off."""
+    pose = numbers.reshape(4, 4).copy()
+    pose[3] = LAST_ROW
+    return pose
 
 
 def _reopened(kind: type[Dataset], arguments: dict[str, Any]) -> Dataset:

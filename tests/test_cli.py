@@ -163,7 +163,7 @@ def test_stats_prints_and_writes_tables_and_figures(own_release: Path, tmp_path:
     out = tmp_path / "new" / "stats"
     made = run("stats", own_release, "--where", "designed_accident=true", "--out", out, "--format", "png")
     assert made.returncode == 0, made.stderr
-    assert "selected: 3 scenarios" in made.stdout
+    assert "selected: 3 of 6 scenarios" in made.stdout
     names = {path.name for path in out.iterdir()}
     assert f"written: {len(names)} files in {out}" in made.stdout
     assert {"statistics.json", "ends.csv", "collision_pairs.csv", "scenarios.png", "collisions.png"} <= names
@@ -175,3 +175,28 @@ def test_stats_prints_and_writes_tables_and_figures(own_release: Path, tmp_path:
     assert json.loads((out / "statistics.json").read_text())["scenarios"]["total"] == 3
     misplaced = run("stats", own_release, "--format", "png")
     assert (misplaced.returncode, "--format is for figures; give --out FOLDER too" in misplaced.stderr) == (2, True)
+
+
+def test_stats_says_before_anything_else_what_it_cannot_write(own_release: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    faults = {
+        "": "expected a folder to write to, found an empty path",
+        tmp_path / "file": "file is a file; give a folder",
+        tmp_path / "file" / "new" / "folder": "file is a file; give a folder",
+        "/proc/nowhere": "no file can be written there; give a folder that you may write to",
+    }
+    for out, why in faults.items():
+        failed = run("stats", own_release, "--out", out)
+        assert (failed.returncode, failed.stdout, why in failed.stderr) == (2, "", True), failed.stderr
+        assert "Traceback" not in failed.stderr
+
+
+def test_stats_of_nothing(own_release: Path, tmp_path: Path) -> None:
+    nothing = run("stats", own_release, "--where", "length=1..2")
+    assert nothing.returncode == run("info", own_release, "--where", "length=1..2").returncode == 0
+    assert "selected: 0 of 6 scenarios" in nothing.stdout
+    assert "no scenario meets the filters, so there is nothing to count" in nothing.stdout
+    failed = run("stats", own_release, "--where", "length=1..2", "--out", tmp_path / "new")
+    assert (failed.returncode, failed.stdout) == (2, "")
+    assert "no scenario meets --where, so there is nothing to write" in failed.stderr
+    assert not (tmp_path / "new").exists()

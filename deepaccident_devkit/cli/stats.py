@@ -1,6 +1,5 @@
 """`deepaccident stats`: the paper's statistics of a release, as text, tables and figures."""
 
-from pathlib import Path
 from typing import Any, get_args
 
 import click
@@ -9,13 +8,13 @@ from deepaccident_devkit.cli.options import release_parameters, where_parameter
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.render.statistics import PictureFormat, save_statistics
-from deepaccident_devkit.statistics import dataset_statistics
+from deepaccident_devkit.statistics import dataset_statistics, writable_folder
 
 
 @click.command()
 @release_parameters
 @where_parameter
-@click.option("--out", type=click.Path(path_type=Path), help="Folder for statistics.json, a CSV a table, and figures.")
+@click.option("--out", type=click.Path(), help="Folder for statistics.json, a CSV a table, and figures.")
 @click.option(
     "--format",
     "formats",
@@ -25,20 +24,24 @@ from deepaccident_devkit.statistics import dataset_statistics
 )
 @click.option("--json", "as_json", is_flag=True, help="One JSON object, for programs.")
 def stats(
-    where: tuple[str, ...], out: Path | None, formats: tuple[PictureFormat, ...], as_json: bool, **release: Any
+    where: tuple[str, ...], out: str | None, formats: tuple[PictureFormat, ...], as_json: bool, **release: Any
 ) -> None:
     """Print the paper's statistics of the release under DATAROOT: scenarios, actors, boxes, ends, by split.
 
     With --out, write them too; files of earlier statistics there are replaced.
     """
-    if formats and not out:
+    if formats and out is None:
         raise click.UsageError("--format is for figures; give --out FOLDER too")
     dataset = DeepAccident(**release)
-    statistics = dataset_statistics(dataset, dataset.find(*where) if where else None)
+    chosen = dataset.find(*where) if where else None
+    if out is not None and chosen == []:
+        raise click.UsageError("no scenario meets --where, so there is nothing to write; change it or leave --out away")
+    statistics = dataset_statistics(dataset, chosen)
+    folder = None if out is None else writable_folder(out)
     click.echo(statistics.to_json() if as_json else statistics.to_text())
-    if out:
-        written = statistics.to_csv(out)
-        written.append(out / "statistics.json")
+    if folder:
+        written = statistics.to_csv(folder)
+        written.append(folder / "statistics.json")
         write_bytes(written[-1], statistics.to_json().encode())
-        written += save_statistics(statistics, out, formats or get_args(PictureFormat))
-        click.echo(f"written: {len(written)} files in {out}", err=as_json)
+        written += save_statistics(statistics, folder, formats or get_args(PictureFormat))
+        click.echo(f"written: {len(written)} files in {folder}", err=as_json)

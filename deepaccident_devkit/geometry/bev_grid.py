@@ -9,7 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, as_floats
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, as_numbers
 from deepaccident_devkit.errors import ChoiceError, ConfigError, GeometryError
 
 Orientation = Literal["devkit", "released", "fiery"]
@@ -80,7 +80,7 @@ class BevGrid:
         Raises:
             GeometryError: `points` has another shape.
         """
-        given = as_floats(points)
+        given = as_numbers("points", points, "points of shape (N, 2) or (N, 3)")
         if given.ndim != 2 or given.shape[1] not in (2, 3):
             raise GeometryError(f"points: expected shape (N, 2) or (N, 3), found {given.shape}")
         steps, inside = [], np.ones(len(given), dtype=bool)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from deepaccident_devkit.arrays import FloatArray, as_floats, checked
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import quaternions
-from deepaccident_devkit.geometry.boxes import Boxes
+from deepaccident_devkit.geometry.boxes import Boxes, checked_boxes
 from deepaccident_devkit.geometry.se3 import SE3
 from deepaccident_devkit.taxonomy import CATEGORIES
 
@@ -29,7 +29,7 @@ class Box:
 
     def __init__(self, boxes: Boxes, token: str | None = None, instance_token: str | None = None) -> None:
         """Wrap the only row of `boxes`; raises GeometryError if there are none or several."""
-        if len(boxes) != 1:
+        if len(checked_boxes("boxes", boxes)) != 1:
             raise GeometryError(f"a Box is one row of Boxes, found {len(boxes)}; pick one with Boxes.select([i])")
         self._boxes = boxes
         self.token = token
@@ -115,7 +115,7 @@ class Box:
         return self.transform(SE3.from_quaternion(quaternion), self.frame)
 
     def transform(self, target_from_source: SE3, frame: str) -> Box:
-        """The same box in another frame."""
+        """The same box in another frame. Raises GeometryError."""
         return Box(self._boxes.transform(target_from_source, frame), self.token, self.instance_token)
 
     def __repr__(self) -> str:

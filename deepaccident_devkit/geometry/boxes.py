@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, as_floats, checked, readonly
+from deepaccident_devkit.arrays import (
+    AnyArray,
+    BoolArray,
+    FloatArray,
+    FrozenArrays,
+    IntArray,
+    as_floats,
+    checked,
+    readonly,
+)
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.geometry.footprints import gaps, intersection_areas
+from deepaccident_devkit.geometry.frames import checked_frame
 from deepaccident_devkit.geometry.points_in_boxes import points_in_boxes
-from deepaccident_devkit.geometry.se3 import SE3
+from deepaccident_devkit.geometry.se3 import SE3, checked_transform
 from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES
 
 CORNER_SIGNS = np.array(
@@ -34,11 +45,14 @@ _COLUMNS: dict[str, tuple[tuple[int | None, ...], type]] = {
     "camera_visible": ((None,), np.bool_),
     "row": ((None,), np.int64),
 }
+_FINITE = ("center", "size", "rotation")
+_UNIT_TOLERANCE = 1e-3
+"""How far a quaternion's norm may be from 1; it is brought there."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Boxes:
-    """N oriented boxes in one right-handed frame; immutable, arrays are read-only.
+class Boxes(FrozenArrays):
+    """N oriented boxes in one right-handed frame; immutable, arrays are read-only copies of those given.
 
     Attributes:
         frame: the frame of all of it: `world`, `ego`, `lidar` or a camera channel (then optical axes).
@@ -65,10 +79,16 @@ class Boxes:
     row: IntArray
 
     def __post_init__(self) -> None:
-        """Check the columns' shapes; raises GeometryError."""
-        count = len(np.atleast_1d(np.asarray(self.center)))
+        """Check shapes and numbers; raises GeometryError."""
+        checked_frame("Boxes.frame", self.frame)
+        count = len(checked("Boxes.center", self.center, (None, 3)))
+        columns: dict[str, AnyArray] = {}
         for name, (shape, dtype) in _COLUMNS.items():
-            array = checked(f"Boxes.{name}", getattr(self, name), (count, *shape[1:]), dtype)
+            given = _category_codes(self.category) if name == "category" else getattr(self, name)
+            columns[name] = checked(f"Boxes.{name}", given, (count, *shape[1:]), dtype).copy()
+        _check_numbers(columns)
+        columns["rotation"] = _unit(columns["rotation"])
+        for name, array in columns.items():
             object.__setattr__(self, name, readonly(array))
 
     @classmethod
@@ -89,7 +109,8 @@ class Boxes:
         """
         heading = checked("Boxes.yaw", yaw, (None,))
         count = len(heading)
-        given = {
+        given: dict[str, Any] = {
+            "category": np.zeros(count, dtype=np.int8) if category is None else category,
             "velocity": np.full((count, 3), np.nan),
             "actor_id": np.full(count, -1),
             "num_lidar_pts": np.zeros(count),
@@ -105,8 +126,7 @@ class Boxes:
             center=center,  # type: ignore[arg-type]  # checked in __post_init__
             size=size,  # type: ignore[arg-type]
             rotation=quaternions.from_yaw(heading),
-            category=_category_codes(category, count),
-            **given,  # type: ignore[arg-type]
+            **given,
         )
 
     def __len__(self) -> int:
@@ -139,7 +159,9 @@ class Boxes:
         return trusted_boxes(self.frame, columns)
 
     def transform(self, target_from_source: SE3, frame: str) -> Boxes:
-        """The same boxes in another frame: centers, rotations and velocities move, sizes stay."""
+        """The same boxes in another frame: centers, rotations and velocities move, sizes stay. Raises GeometryError."""
+        checked_transform("target_from_source", target_from_source)
+        checked_frame("frame", frame)
         turn = target_from_source.rotation
         turn_transposed = turn.T
         return trusted_boxes(
@@ -246,6 +268,7 @@ class Boxes:
         return self.center[:, 2] - half, self.center[:, 2] + half
 
     def _check_frame(self, other: Boxes) -> None:
+        checked_boxes("other", other)
         if other.frame != self.frame:
             raise GeometryError(
                 f"boxes of frame {self.frame!r} cannot be compared with those of {other.frame!r}; transform them first"
@@ -291,9 +314,43 @@ def _product(sizes: FloatArray) -> FloatArray:
     return as_floats(sizes.prod(axis=1))
 
 
-def _category_codes(category: ArrayLike | None, count: int) -> AnyArray:
-    if category is None:
-        return np.zeros(count, dtype=np.int8)
+def checked_boxes(name: str, boxes: object) -> Boxes:
+    """`boxes` if they are `Boxes`; raises GeometryError."""
+    if not isinstance(boxes, Boxes):
+        raise GeometryError(f"{name}: expected Boxes, found {type(boxes).__name__}; Boxes.from_arrays makes some")
+    return boxes
+
+
+def _check_numbers(columns: dict[str, AnyArray]) -> None:
+    for name in _FINITE:
+        bad = ~np.isfinite(columns[name]).all(axis=1)
+        if bad.any():
+            raise GeometryError(
+                f"Boxes.{name}: expected finite numbers, found {columns[name][bad][0].tolist()} in row "
+                f"{np.argmax(bad)}; leave such boxes out"
+            )
+    negative = (columns["size"] < 0).any(axis=1)
+    if negative.any():
+        raise GeometryError(
+            f"Boxes.size: expected lengths, widths and heights from 0, found {columns['size'][negative][0].tolist()} "
+            f"in row {np.argmax(negative)}"
+        )
+
+
+def _unit(rotation: FloatArray) -> FloatArray:
+    """The quaternions (N, 4), which must be unit ones but for rounding."""
+    norm = np.linalg.norm(rotation, axis=1)
+    off = np.abs(norm - 1)
+    if (off > _UNIT_TOLERANCE).any():
+        row = int(np.argmax(off))
+        raise GeometryError(
+            f"Boxes.rotation: expected unit quaternions w, x, y, z, found {rotation[row].tolist()} in row {row}"
+        )
+    return rotation / norm[:, None] if (off > 1e-12).any() else rotation
+
+
+def _category_codes(category: ArrayLike) -> AnyArray:
+    """Codes of categories, given by code or by name."""
     given = np.asarray(category)
     if given.dtype.kind not in "US":
         if not np.isin(given, range(len(CATEGORIES))).all():
@@ -301,8 +358,8 @@ def _category_codes(category: ArrayLike | None, count: int) -> AnyArray:
                 f"category codes are 0 to {len(CATEGORIES) - 1} ({', '.join(CATEGORIES)}), found {given}"
             )
         return given.astype(np.int8)
-    names = [str(name) for name in given]
+    names = [str(name) for name in given.ravel()]
     unknown = sorted(set(names) - set(CATEGORIES))
     if unknown:
         raise GeometryError(f"unknown category {unknown}; known are {', '.join(CATEGORIES)}")
-    return np.array([CATEGORIES.index(name) for name in names], dtype=np.int8)
+    return np.array([CATEGORIES.index(name) for name in names], dtype=np.int8).reshape(given.shape)

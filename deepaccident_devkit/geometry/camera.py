@@ -4,20 +4,31 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import get_args
+from typing import Final, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, checked, readonly
-from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.geometry.boxes import Boxes
-from deepaccident_devkit.taxonomy import Frame
+from deepaccident_devkit.arrays import (
+    AnyArray,
+    BoolArray,
+    FloatArray,
+    FrozenArrays,
+    checked,
+    checked_number,
+    checked_whole,
+    readonly,
+)
+from deepaccident_devkit.errors import ChoiceError, GeometryError
+from deepaccident_devkit.geometry.boxes import Boxes, checked_boxes
+from deepaccident_devkit.taxonomy import BEV_CAMERA, LIDAR, Frame
 
 VISIBLE_DEPTH = 1.0
 """Metres in front of the camera from which on a corner in the image counts as seen (the nuScenes devkit's)."""
 IN_FRONT_DEPTH = 0.1
 """Metres in front of the camera that all corners of a visible box must be (the nuScenes devkit's)."""
+_NO_PINHOLE: Final = (*get_args(Frame), LIDAR, BEV_CAMERA)
+"""The known frames whose axes are not optical."""
 
 
 class BoxVisibility(IntEnum):
@@ -36,7 +47,7 @@ class BoxVisibility(IntEnum):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PinholeCamera:
+class PinholeCamera(FrozenArrays):
     """A camera without distortion.
 
     Attributes:
@@ -50,26 +61,38 @@ class PinholeCamera:
     height: int
 
     def __post_init__(self) -> None:
-        """Check the intrinsic's shape; raises GeometryError."""
-        object.__setattr__(
-            self, "intrinsic", readonly(checked("PinholeCamera.intrinsic", self.intrinsic, (3, 3)).copy())
-        )
+        """Check the numbers; raises GeometryError."""
+        intrinsic = checked("PinholeCamera.intrinsic", self.intrinsic, (3, 3)).copy()
+        if not np.isfinite(intrinsic).all():
+            raise GeometryError(f"PinholeCamera.intrinsic: expected finite numbers, found {intrinsic.tolist()}")
+        object.__setattr__(self, "intrinsic", readonly(intrinsic))
+        for name in ("width", "height"):
+            object.__setattr__(self, name, _pixels(f"PinholeCamera.{name}", getattr(self, name)))
 
     @classmethod
     def from_field_of_view(cls, width: int, height: int, horizontal: float) -> PinholeCamera:
-        """A camera with its optical axis in the middle and a horizontal field of view in radians."""
-        focal = width / 2 / np.tan(horizontal / 2)
+        """A camera with its optical axis in the middle and a horizontal field of view in radians.
+
+        Raises:
+            GeometryError: the image has no pixels, or the field of view is not between 0 and π.
+        """
+        width, height = _pixels("width", width), _pixels("height", height)
+        angle = checked_number("horizontal", horizontal, "a field of view in radians")
+        if not 0 < angle < np.pi:
+            raise GeometryError(f"horizontal: expected a field of view between 0 and π radians, found {horizontal}")
+        focal = width / 2 / np.tan(angle / 2)
         return cls(np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]), width, height)
 
     def project(self, points: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Points (N, 3) of the optical frame → pixels (N, 2) as (u, v), and depths (N,) metres.
 
-        Pixels of points that are not in front of the camera (depth ≤ 0) are NaN.
+        Pixels of points that are not in front of the camera (depth ≤ 0) are NaN, and so are those of infinite ones.
         """
         given = checked("points", points, (None, 3))
         depth: FloatArray = given[:, 2]
         safe = np.where(depth > 0, depth, np.nan)
-        pixels: FloatArray = (given / safe[:, None]) @ self.intrinsic[:2].T
+        with np.errstate(invalid="ignore"):
+            pixels: FloatArray = (given / safe[:, None]) @ self.intrinsic[:2].T
         return pixels, depth
 
     def unproject(self, pixels: ArrayLike, depth: ArrayLike) -> FloatArray:
@@ -116,9 +139,9 @@ class PinholeCamera:
             boxes: in this camera's optical frame.
 
         Raises:
-            GeometryError: the boxes are in world, ego or LiDAR axes.
+            GeometryError: they are no boxes, or in another frame than a camera's: world, ego, LiDAR, the BEV camera's.
         """
-        if boxes.frame in get_args(Frame):
+        if checked_boxes("boxes", boxes).frame in _NO_PINHOLE:
             raise GeometryError(
                 f"expected boxes in this camera's optical frame, found {boxes.frame!r}; "
                 "transform them by camera_from_source first"
@@ -131,6 +154,21 @@ class PinholeCamera:
         return np.select(levels, [BoxVisibility.ALL, BoxVisibility.ANY], BoxVisibility.NONE).astype(np.int8)
 
     def boxes_in_image(self, boxes: Boxes, level: BoxVisibility = BoxVisibility.ANY) -> BoolArray:
-        """Which of N boxes of this camera's optical frame meet `level`: (N,) bool. Raises GeometryError likewise."""
+        """Which of N boxes of this camera's optical frame meet `level`: (N,) bool.
+
+        Raises:
+            ChoiceError: there is no such level.
+            GeometryError: as `box_visibility`.
+        """
+        if level not in list(BoxVisibility):
+            names = ", ".join(f"BoxVisibility.{one.name}" for one in BoxVisibility)
+            raise ChoiceError(f"level: expected one of {names}, found {level!r}")
         meets: BoolArray = self.box_visibility(boxes) <= level
         return meets
+
+
+def _pixels(name: str, value: object) -> int:
+    number = checked_whole(name, value, "a whole number of pixels from 1")
+    if number < 1:
+        raise GeometryError(f"{name}: expected a whole number of pixels from 1, found {number}")
+    return number

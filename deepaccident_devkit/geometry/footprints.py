@@ -27,15 +27,18 @@ def intersection_areas(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def gaps(first: FloatArray, second: FloatArray) -> FloatArray:
-    """The shortest way from each of N footprints to each of M: (N, 5) and (M, 5) → (N, M), metres, 0 if they touch."""
+    """The shortest way from each of N footprints to each of M: (N, 5) and (M, 5) → (N, M), metres.
+
+    0 if they touch; NaN where one of the two is.
+    """
     result = np.zeros((len(first), len(second)))
     step = max(1, _PAIRS_AT_ONCE // max(1, len(second)))
     for start in range(0, len(first), step):
         some = first[start : start + step, None]
         beside, here = _outside(some, second[None])
         beside_too, there = _outside(second[None], some)
-        apart = np.maximum(beside, beside_too) > 0
-        result[start : start + step] = np.where(apart, np.minimum(here, there), 0.0)
+        together = np.maximum(beside, beside_too) <= 0
+        result[start : start + step] = np.where(together, 0.0, np.minimum(here, there))
     return result
 
 

@@ -12,11 +12,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, checked, readonly
+from deepaccident_devkit.arrays import (
+    AnyArray,
+    BoolArray,
+    FloatArray,
+    FrozenArrays,
+    IntArray,
+    checked,
+    checked_number,
+    readonly,
+)
 from deepaccident_devkit.errors import GeometryError, MissingFileError, SensorFileError
 from deepaccident_devkit.files import replacing
 from deepaccident_devkit.geometry.bev_grid import BevGrid
-from deepaccident_devkit.geometry.se3 import SE3
+from deepaccident_devkit.geometry.frames import checked_frame
+from deepaccident_devkit.geometry.se3 import SE3, checked_transform
 
 Range = tuple[float, float]
 _FIELDS = ("xyz", "intensity", "frame")
@@ -40,8 +50,10 @@ _FAULTS = (
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LidarPointCloud:
-    """N points in one right-handed frame; immutable, arrays are read-only.
+class LidarPointCloud(FrozenArrays):
+    """N points in one right-handed frame; arrays are read-only views.
+
+    Clouds are large, so arrays of the right type are not copied: whoever changes their own array changes the cloud.
 
     Attributes:
         xyz: (N, 3) float64, metres.
@@ -55,6 +67,7 @@ class LidarPointCloud:
 
     def __post_init__(self) -> None:
         """Check the shapes; raises GeometryError."""
+        checked_frame("LidarPointCloud.frame", self.frame)
         xyz = checked("LidarPointCloud.xyz", self.xyz, (None, 3))
         intensity = checked("LidarPointCloud.intensity", self.intensity, (len(xyz),), np.float32)
         object.__setattr__(self, "xyz", readonly(xyz))
@@ -70,7 +83,8 @@ class LidarPointCloud:
         return np.column_stack([self.xyz, self.intensity])
 
     def transform(self, target_from_source: SE3, frame: str) -> LidarPointCloud:
-        """The same points in another frame."""
+        """The same points in another frame. Raises GeometryError."""
+        checked_transform("target_from_source", target_from_source)
         return LidarPointCloud(target_from_source.apply(self.xyz), self.intensity, frame)
 
     def select(self, which: ArrayLike) -> LidarPointCloud:
@@ -93,6 +107,8 @@ class LidarPointCloud:
             y: see `x`.
             z: see `x`.
         """
+        if grid is not None and not isinstance(grid, BevGrid):
+            raise GeometryError(f"grid: expected a BevGrid, found {grid!r}; ranges go by name, x=(start, end)")
         keep = np.ones(len(self), dtype=bool) if grid is None else grid.index_of(self.xyz)[1]
         for name, values, limits in zip("xyz", self.xyz.T, (x, y, z), strict=True):
             if limits is not None:
@@ -111,12 +127,13 @@ class LidarPointCloud:
         Raises:
             GeometryError: the cloud is in the world frame and `sensor` is missing, or the radius is negative.
         """
-        if not radius >= 0:
+        distance = checked_number("radius", radius, "metres from 0 on")
+        if not distance >= 0:
             raise GeometryError(f"radius: expected metres from 0 on, found {radius}")
         if sensor is None and self.frame == "world":
             raise GeometryError("a cloud in the world frame does not know its sensor; give sensor=(x, y, z)")
         place = checked("sensor", (0.0, 0.0, 0.0) if sensor is None else sensor, (3,))
-        return self.select(np.hypot(*(self.xyz[:, :2] - place[:2]).T) >= radius)
+        return self.select(np.hypot(*(self.xyz[:, :2] - place[:2]).T) >= distance)
 
     def voxel_downsample(self, size: float) -> LidarPointCloud:
         """One point a cube of `size` metres: the first one in it, unchanged, and the points keep their order.
@@ -127,7 +144,8 @@ class LidarPointCloud:
             GeometryError: the size is not above 0, or so small that the cubes cannot be counted; or a point is not
                 finite.
         """
-        if not 0 < size < math.inf:
+        edge = checked_number("size", size, "metres above 0")
+        if not 0 < edge < math.inf:
             raise GeometryError(f"size: expected metres above 0, found {size}")
         if not np.isfinite(self.xyz).all():
             raise GeometryError(
@@ -135,7 +153,7 @@ class LidarPointCloud:
             )
         if len(self) == 0:
             return self
-        first: IntArray = np.unique(_voxel_keys(self.xyz, size), return_index=True)[1]
+        first: IntArray = np.unique(_voxel_keys(self.xyz, edge), return_index=True)[1]
         return self.select(np.sort(first))
 
     def save(self, path: str | Path) -> None:

@@ -55,7 +55,11 @@ def to_matrix(quaternion: ArrayLike) -> FloatArray:
 
 
 def single_from_matrix(rotation: FloatArray) -> tuple[float, float, float, float]:
-    """`from_matrix` of one rotation (3, 3): on plain floats, which is twenty times faster for a single one."""
+    """`from_matrix` of one rotation (3, 3): on plain floats, which is twenty times faster for a single one.
+
+    Of a matrix that is off a rotation by a small e, such as one of single precision, it is the nearest rotation's up
+    to e².
+    """
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation.tolist()
     rows = (
         (1 + xx + yy + zz, zy - yz, xz - zx, yx - xy),
@@ -64,7 +68,9 @@ def single_from_matrix(rotation: FloatArray) -> tuple[float, float, float, float
         (yx - xy, xz + zx, zy + yz, 1 - xx - yy + zz),
     )
     best = max(range(4), key=lambda part: rows[part][part])
+    # the nearest rotation's is the first eigenvector of these rows; all of them are near it, and once through closer
     w, x, y, z = rows[best]
+    w, x, y, z = (a * w + b * x + c * y + d * z for a, b, c, d in rows)
     norm = math.copysign(math.sqrt(w * w + x * x + y * y + z * z), w)
     return w / norm, x / norm, y / norm, z / norm
 

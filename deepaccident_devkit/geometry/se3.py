@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar, overload, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import FloatArray, as_floats, checked, readonly
+from deepaccident_devkit.arrays import AnyArray, FloatArray, FrozenArrays, as_numbers, checked, checked_number, readonly
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import quaternions, six_vectors
 
@@ -16,12 +17,33 @@ if TYPE_CHECKING:
     from pyquaternion import Quaternion
 
 RIGID_TOLERANCE = 1e-3
-"""How far a rotation may be from orthonormal; files carry single-precision poses."""
+"""How far a rotation may be from orthonormal; files carry poses of single precision, or rounded ones."""
+LAST_ROW = (0.0, 0.0, 0.0, 1.0)
+
+
+@runtime_checkable
+class Movable(Protocol):
+    """What a transform carries from frame to frame: boxes, a box, a point cloud."""
+
+    @property
+    def frame(self) -> str:
+        """The frame that it is in."""
+        ...
+
+    def transform(self: MovableT, target_from_source: SE3, frame: str) -> MovableT:
+        """The same in another frame."""
+        ...
+
+
+MovableT = TypeVar("MovableT", bound=Movable)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SE3:
+class SE3(FrozenArrays):
     """A rigid transform, right-handed: `target_from_source.apply(p_source)` is `p_target`.
+
+    A rotation that is a little off an orthonormal one, as files have them, is kept as it is, to the bit. `inverse` is
+    the true inverse all the same, so that ways there and back end where they began.
 
     Attributes:
         matrix: (4, 4) float64, column-vector convention, read-only.
@@ -31,11 +53,12 @@ class SE3:
 
     def __post_init__(self) -> None:
         """Check the matrix; raises GeometryError if it is not a rigid transform."""
-        matrix = checked("SE3.matrix", self.matrix, (4, 4))
+        matrix = checked("SE3.matrix", self.matrix, (4, 4)).copy()
         fault = rigid_fault(matrix)
         if fault:
             raise GeometryError(f"SE3.matrix: {fault}")
-        object.__setattr__(self, "matrix", readonly(matrix.copy()))
+        matrix[3] = LAST_ROW
+        object.__setattr__(self, "matrix", readonly(matrix))
 
     @classmethod
     def identity(cls) -> SE3:
@@ -53,7 +76,7 @@ class SE3:
     @classmethod
     def from_quaternion(cls, quaternion: Quaternion, translation: ArrayLike = (0.0, 0.0, 0.0)) -> SE3:
         """From a unit quaternion (pyquaternion's, or four numbers w, x, y, z) and a translation (3,), metres."""
-        wxyz = checked("quaternion", [float(part) for part in quaternion], (4,))
+        wxyz = checked("quaternion", getattr(quaternion, "elements", quaternion), (4,))
         norm = float(np.linalg.norm(wxyz))
         if not np.isfinite(norm) or norm < RIGID_TOLERANCE:
             raise GeometryError(f"quaternion: {wxyz.tolist()} has no direction; give a unit quaternion w, x, y, z")
@@ -62,7 +85,10 @@ class SE3:
     @classmethod
     def from_yaw(cls, yaw: float, translation: ArrayLike = (0.0, 0.0, 0.0)) -> SE3:
         """From an angle about z, radians counter-clockwise, and a translation (3,), metres."""
-        return cls.from_quaternion(quaternions.from_yaw(yaw), translation)
+        angle = checked_number("yaw", yaw, "an angle in radians")
+        if not math.isfinite(angle):
+            raise GeometryError(f"yaw: expected a finite angle in radians, found {yaw}")
+        return cls.from_rotation(quaternions.to_matrix(quaternions.from_yaw(angle)), translation)
 
     @classmethod
     def from_six(cls, vector: ArrayLike) -> SE3:
@@ -112,8 +138,10 @@ class SE3:
         The rotation turns evenly about one axis on the shorter way (slerp), the translation goes straight.
 
         Raises:
-            GeometryError: `share` is not between 0 and 1.
+            GeometryError: `share` is not between 0 and 1, or `other` is no SE3.
         """
+        checked_transform("other", other)
+        share = checked_number("share", share, "a number from 0 to 1")
         if not 0 <= share <= 1:
             raise GeometryError(f"share: expected a number from 0 to 1, found {share}")
         if share in (0, 1):
@@ -126,28 +154,54 @@ class SE3:
 
     def inverse(self) -> SE3:
         """The transform the other way, `source_from_target`."""
-        matrix = np.eye(4)
-        matrix[:3, :3] = self.rotation.T
-        matrix[:3, 3] = -self.rotation.T @ self.translation
-        return trusted_se3(matrix)
+        return trusted_se3(inverses(self.matrix))
 
-    def apply(self, points: ArrayLike) -> FloatArray:
-        """Points (N, 3) or one point (3,) of the source frame in the target frame, metres."""
-        given = as_floats(points)
+    @overload
+    def apply(self, points: MovableT, frame: str | None = None) -> MovableT: ...
+    @overload
+    def apply(self, points: ArrayLike) -> FloatArray: ...
+    def apply(self, points: Any, frame: str | None = None) -> Any:
+        """What is in the source frame in the target frame.
+
+        Args:
+            points: (N, 3) or one point (3,), metres; or `Boxes`, a `Box` or a `LidarPointCloud`. NaN stays NaN, and
+                infinity has no place after a turn.
+            frame: of boxes and clouds: the target frame's name, since a transform does not know between which frames
+                it leads. Without it they keep the name that they have, as after a motion within one frame.
+
+        Returns:
+            Points as a new array of their shape; boxes and clouds as their `transform` gives them.
+
+        Raises:
+            GeometryError: `points` is neither, or a frame is named for plain points.
+        """
+        if not isinstance(points, np.ndarray) and isinstance(points, Movable):
+            return points.transform(self, points.frame if frame is None else frame)
+        if frame is not None:
+            raise GeometryError(f"frame: points of an array carry no name of a frame, found {frame!r}; leave it out")
+        given = as_numbers("points", points, "points of shape (N, 3) or (3,), boxes or a point cloud")
         if given.ndim == 0 or given.ndim > 2 or given.shape[-1] != 3:
-            raise GeometryError(f"points: expected shape (N, 3) or (3,), found {given.shape}")
-        return as_floats(given @ self.rotation.T + self.translation)
+            hint = "; of a matrix (4, 4) make SE3(matrix)" if given.shape == (4, 4) else ""
+            raise GeometryError(f"points: expected shape (N, 3) or (3,), found {given.shape}{hint}")
+        with np.errstate(invalid="ignore"):
+            return given @ self.rotation.T + self.translation
 
     def rotate(self, vectors: ArrayLike) -> FloatArray:
-        """Free vectors (…, 3), such as velocities, of the source frame in the target frame."""
-        return as_floats(as_floats(vectors) @ self.rotation.T)
+        """Free vectors (…, 3), such as velocities, of the source frame in the target frame. Raises GeometryError."""
+        given = as_numbers("vectors", vectors, "vectors of shape (…, 3)")
+        if given.ndim == 0 or given.shape[-1] != 3:
+            raise GeometryError(f"vectors: expected shape (…, 3), found {given.shape}")
+        with np.errstate(invalid="ignore"):
+            return given @ self.rotation.T
 
     @overload
     def __matmul__(self, other: SE3) -> SE3: ...
     @overload
+    def __matmul__(self, other: MovableT) -> MovableT: ...
+    @overload
     def __matmul__(self, other: ArrayLike) -> FloatArray: ...
-    def __matmul__(self, other: SE3 | ArrayLike) -> SE3 | FloatArray:
-        """Compose: `a_from_b @ b_from_c` is `a_from_c`; with points (N, 3), apply."""
+    def __matmul__(self, other: Any) -> Any:
+        """Compose: `a_from_b @ b_from_c` is `a_from_c`; with points (N, 3), boxes or a point cloud, `apply`."""
         if isinstance(other, SE3):
             return trusted_se3(self.matrix @ other.matrix)
         return self.apply(other)
@@ -166,11 +220,35 @@ def trusted_se3(matrix: FloatArray) -> SE3:
     return result
 
 
+def inverses(matrix: AnyArray) -> AnyArray:
+    """The inverses of transforms (…, 4, 4), also of those whose rotations are a little off; raises GeometryError.
+
+    Transposing a rotation that is off by 1e-3 would put what is 600 m away 60 cm beside its place.
+    """
+    result = np.zeros_like(matrix)
+    try:
+        result[..., :3, :3] = turned_back = np.linalg.inv(matrix[..., :3, :3])
+    except np.linalg.LinAlgError:
+        raise GeometryError("a transform has no inverse: its rotation is none") from None
+    result[..., :3, 3] = -(turned_back @ matrix[..., :3, 3, None])[..., 0]
+    result[..., 3, 3] = 1
+    return result
+
+
+def checked_transform(name: str, transform: object) -> SE3:
+    """`transform` if it is an SE3; raises GeometryError."""
+    if not isinstance(transform, SE3):
+        raise GeometryError(
+            f"{name}: expected an SE3, found {type(transform).__name__}; of a matrix (4, 4) make SE3(matrix)"
+        )
+    return transform
+
+
 def rigid_fault(matrix: FloatArray) -> str | None:
     """Say why `matrix` (4, 4) is no rigid transform, or None if it is one."""
     if not np.isfinite(matrix).all():
         return "holds NaN or infinity"
-    if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), atol=RIGID_TOLERANCE):
+    if not np.allclose(matrix[3], LAST_ROW, atol=RIGID_TOLERANCE):
         return f"its last row is {matrix[3].tolist()}, expected 0 0 0 1"
     rotation = matrix[:3, :3]
     with np.errstate(over="ignore", invalid="ignore"):

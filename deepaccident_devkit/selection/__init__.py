@@ -28,8 +28,22 @@ A field that does not exist is a FieldError, a value that the field cannot have 
 possible. A value that the whole release knows, but not the part of it that is here, is none: it matches nothing.
 """
 
-from deepaccident_devkit.selection.accident_visibility import accident_visibility, accident_visible
+from deepaccident_devkit.selection.accident_visibility import (
+    accident_visibility,
+    accident_visible,
+    accident_visible_mask,
+    pair_in_view,
+)
 from deepaccident_devkit.selection.conditions import Filter, FilterValue, parse_where
 from deepaccident_devkit.selection.query import find
 
-__all__ = ["Filter", "FilterValue", "accident_visibility", "accident_visible", "find", "parse_where"]
+__all__ = [
+    "Filter",
+    "FilterValue",
+    "accident_visibility",
+    "accident_visible",
+    "accident_visible_mask",
+    "find",
+    "pair_in_view",
+    "parse_where",
+]

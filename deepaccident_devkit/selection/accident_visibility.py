@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from deepaccident_devkit.arrays import BoolArray, as_numbers
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import TokenError
+from deepaccident_devkit.errors import GeometryError, TokenError
 from deepaccident_devkit.tables import visible_ids, visible_mask
 from deepaccident_devkit.taxonomy import INFRASTRUCTURE, VEHICLE_AGENTS
 
@@ -75,23 +80,60 @@ def accident_visible(dataset: Dataset, sample: RowArgument) -> bool | None:
     return _accident_visible(dataset, scenario, dataset.agent.get(record["agent_token"]), index)
 
 
+def accident_visible_mask(in_view: ArrayLike, *, collision: ArrayLike = True, exempt: ArrayLike = False) -> BoolArray:
+    """The released rule by itself (evaluation.md f): which samples count as seeing the accident.
+
+    A sample does not if its agent does not have the accident in view now and at one or two of the two moments before.
+
+    Args:
+        in_view: (…, 3) bool, whether the agent has all of the colliding pair but itself in view (`pair_in_view`) 1 s
+            ago, 0.5 s ago and now; False for a moment before the recording.
+        collision: (…) whether meta names a collision; without one a sample counts as seeing it.
+        exempt: (…) whether the scenario is one of `SHEER_CURTAINS`, which always count as seen.
+
+    Returns:
+        (…) bool.
+
+    Raises:
+        GeometryError: `in_view` has another shape.
+    """
+    views = as_numbers("in_view", in_view, f"truth values (…, {_OBSERVED})", np.bool_)
+    if views.shape[-1:] != (_OBSERVED,):
+        raise GeometryError(f"in_view: expected shape (…, {_OBSERVED}), found {views.shape}")
+    unseen = ((~views).sum(axis=-1) > _OBSERVED / 2) & ~views[..., -1]
+    counts = np.asarray(collision, dtype=bool) & ~np.asarray(exempt, dtype=bool)
+    return np.asarray(~(unseen & counts))
+
+
+def pair_in_view(mask: ArrayLike, actor_ids: ArrayLike, pair: Collection[int], own_id: int | None = None) -> bool:
+    """Whether an agent sees everyone of a colliding pair but itself, at one moment (evaluation.md f).
+
+    Args:
+        mask: (N,) which boxes of its label the agent sees (`tables.visible_mask`).
+        actor_ids: (N,) the label's ids; −1 and −100 are never seen, so that a pair of −1 (no collision) is not.
+        pair: actor ids.
+        own_id: the agent's; None for one that is no vehicle.
+    """
+    others = {int(actor) for actor in pair} - {own_id}
+    return others <= set(visible_ids([mask], [actor_ids]).tolist())
+
+
 def _accident_visible(dataset: Dataset, scenario: ScenarioRecord, agent: AgentRecord, index: int) -> bool | None:
     if scenario["weather"] is None:  # there is no meta
         return None
-    if scenario["collision"] is None or scenario["name"] in SHEER_CURTAINS:
-        return True
+    collision, exempt = scenario["collision"], scenario["name"] in SHEER_CURTAINS
+    if collision is None or exempt:  # whatever is in view
+        return bool(accident_visible_mask([False] * _OBSERVED, collision=collision is not None, exempt=exempt))
     if agent["actor_id"] is None and agent["name"] != INFRASTRUCTURE:
         return None
-    others = set(scenario["collision"]["ids"]) - {agent["actor_id"]}
     moments = [index - _STEP * back for back in reversed(range(_OBSERVED))]
-    views = [_has_in_view(dataset, agent, moment, others) if moment > 0 else False for moment in moments]
-    if None in views:
-        return None
-    return not (views.count(False) > _OBSERVED / 2 and not views[-1])
+    views = [_has_in_view(dataset, agent, moment, collision["ids"]) if moment > 0 else False for moment in moments]
+    seen = [view for view in views if view is not None]
+    return bool(accident_visible_mask(seen)) if len(seen) == _OBSERVED else None
 
 
-def _has_in_view(dataset: Dataset, agent: AgentRecord, index: int, actors: set[int]) -> bool | None:
-    """Whether an agent itself sees all of some actors at a frame; None without a label."""
+def _has_in_view(dataset: Dataset, agent: AgentRecord, index: int, pair: Sequence[int]) -> bool | None:
+    """Whether an agent itself sees the others of a pair at a frame; None without a label."""
     sample = dataset.get_sample(agent["scenario_token"], agent["name"], index)
     if not sample["labelled"]:
         return None
@@ -103,4 +145,4 @@ def _has_in_view(dataset: Dataset, agent: AgentRecord, index: int, actors: set[i
         boxes.camera_visible,
         infrastructure=agent["is_infrastructure"],
     )
-    return actors <= set(visible_ids([mask], [boxes.actor_id]).tolist())
+    return pair_in_view(mask, boxes.actor_id, pair, agent["actor_id"])

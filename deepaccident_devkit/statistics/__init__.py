@@ -1,7 +1,7 @@
 """The paper's statistics of a release, computed on the tables' columns."""
 
 from deepaccident_devkit.statistics.compute import dataset_statistics
-from deepaccident_devkit.statistics.report import DatasetStatistics
+from deepaccident_devkit.statistics.report import DatasetStatistics, writable_folder
 from deepaccident_devkit.statistics.results import (
     ENDS,
     GROUPS,
@@ -26,4 +26,5 @@ __all__ = [
     "QuantileRow",
     "QuantileTable",
     "dataset_statistics",
+    "writable_folder",
 ]

@@ -24,7 +24,10 @@ _ANGLE_EDGES = tuple(range(-_BIN // 2, 360, _BIN))
 
 
 def collision_pairs(selected: Selected) -> tuple[tuple[CollisionPair, ...], LeftOut]:
-    """The pairs of the selected scenarios with a collision, and how many of these lack one of the pair's tracks."""
+    """The pairs of the selected scenarios with a collision, and how many of these lack one of the pair's tracks.
+
+    Meta may name one actor twice: that is no pair.
+    """
     ends, agents, tracks = scenario_ends(selected), _agents_of_actors(selected), _tracks_at_the_end(selected)
     pairs, left_out = [], Counter[str]()
     for row, scenario in zip(selected.rows, selected.scenarios, strict=True):
@@ -33,13 +36,13 @@ def collision_pairs(selected: Selected) -> tuple[tuple[CollisionPair, ...], Left
         names = agents.get(row, {})
         ids = _in_agents_order(scenario["collision"]["ids"], names)
         here = tracks.get(row, {})
-        if set(ids) <= set(here):
+        if len(set(ids)) == len(ids) and set(ids) <= set(here):
             end = ends[scenario["token"]] or UNKNOWN
             pairs.append(_pair(selected, scenario, end, [here[actor] for actor in ids], list(map(names.get, ids))))
         else:
             left_out.update((TOTAL, group_of(scenario)))
     counts = {group: left_out[group] for group in GROUPS}
-    return tuple(pairs), LeftOut(what="collisions whose pair is not labelled at the last frame", counts=counts)
+    return tuple(pairs), LeftOut(what="collisions without a pair labelled at the last frame", counts=counts)
 
 
 def collision_histograms(pairs: Sequence[CollisionPair], left_out: LeftOut) -> tuple[Histogram, Histogram]:

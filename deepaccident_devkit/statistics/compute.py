@@ -12,7 +12,9 @@ from deepaccident_devkit.statistics.report import DatasetStatistics
 from deepaccident_devkit.statistics.selected import Selected, group_counts
 
 
-def dataset_statistics(dataset: Dataset, scenarios: Iterable[RowArgument] | None = None) -> DatasetStatistics:
+def dataset_statistics(
+    dataset: Dataset, scenarios: RowArgument | Iterable[RowArgument] | None = None
+) -> DatasetStatistics:
     """Compute the paper's statistics on the tables' columns: no record of an annotation is made.
 
     Everything is counted for all scenarios and for each split. Scenarios without labels count where calib, meta and
@@ -20,10 +22,12 @@ def dataset_statistics(dataset: Dataset, scenarios: Iterable[RowArgument] | None
 
     Args:
         dataset: the release.
-        scenarios: tokens or records of its scenarios to count alone, such as `find` gives; None for all.
+        scenarios: tokens or records of its scenarios to count alone, such as `find` gives, or a single one; None for
+            all.
 
     Raises:
         TokenError: something is no scenario of the release.
+        ChoiceError: `scenarios` is nothing of this.
     """
     selected = Selected(dataset, scenarios)
     pairs, left_out = collision_pairs(selected)
@@ -44,6 +48,7 @@ def dataset_statistics(dataset: Dataset, scenarios: Iterable[RowArgument] | None
     return DatasetStatistics(
         dataroot=str(dataset.dataroot),
         version=dataset.version,
+        release_scenarios=len(dataset.scenario),
         selected=scenarios is not None,
         scenarios=group_counts(selected.scenario_group),
         frames=group_counts(selected.group("frame")),

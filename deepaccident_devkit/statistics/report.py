@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.files import is_writable_folder, write_bytes
 from deepaccident_devkit.statistics.results import (
     GROUPS,
     PROBABILITIES,
@@ -37,6 +37,7 @@ class DatasetStatistics:
     Attributes:
         dataroot: the release's folder.
         version: `v1` or `v1-mini`.
+        release_scenarios: how many scenarios the release has, selected or not.
         selected: whether they are of a selection.
         scenarios: group → scenarios.
         frames: group → frames.
@@ -50,6 +51,7 @@ class DatasetStatistics:
 
     dataroot: str
     version: str
+    release_scenarios: int
     selected: bool
     scenarios: Mapping[str, int]
     frames: Mapping[str, int]
@@ -84,11 +86,9 @@ class DatasetStatistics:
             The files' paths.
 
         Raises:
-            ConfigError: `folder` is a file.
+            ConfigError: `folder` cannot be written to, or is not one.
         """
-        folder = Path(folder)
-        if folder.exists() and not folder.is_dir():
-            raise ConfigError(f"{folder}: is a file; give a folder")
+        folder = writable_folder(folder)
         contents: dict[str, Iterable[Row]] = {
             **{table.name: table.rows() for table in self.tables},
             _PAIRS: collision_rows(self.collisions),
@@ -105,7 +105,10 @@ class DatasetStatistics:
         """Some aligned blocks for a terminal: scenarios (without zeros), a line a category, what is left out."""
         head = f"DeepAccident {self.version} at {self.dataroot}"
         if self.selected:
-            head += f"\nselected: {self.scenarios[TOTAL]} scenarios; all counts are of these"
+            count = self.scenarios[TOTAL]
+            head += f"\nselected: {count} of {self.release_scenarios} scenarios; all counts are of these"
+            if not count:
+                return f"{head}\nno scenario meets the filters, so there is nothing to count"
         sums = {"scenarios": self.scenarios, "frames": self.frames, "samples": self.samples}
         blocks = [
             head,
@@ -161,6 +164,23 @@ class DatasetStatistics:
             )
         heading = ("category, medians", "instances", "annotations", "l × w × h (m)", "distance (m)", "speed (m/s)")
         return columns_text([heading, *rows])
+
+
+def writable_folder(folder: str | os.PathLike[str]) -> Path:
+    """A folder that files can be written to, made if it is not there.
+
+    Raises:
+        ConfigError: the path is empty, it or a folder above it is a file, or it may not be written to.
+    """
+    if not os.fspath(folder):
+        raise ConfigError("expected a folder to write to, found an empty path; give '.' for the current one")
+    path = Path(folder)
+    if is_writable_folder(path):
+        return path
+    for part in (path, *path.parents):
+        if os.path.isfile(part):  # noqa: PTH113 - Path.is_file raises where it may not look
+            raise ConfigError(f"{path}: no file can be written there, {part} is a file; give a folder")
+    raise ConfigError(f"{path}: no file can be written there; give a folder that you may write to")
 
 
 def _number(value: float | None, digits: int) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.statistics.results import GROUPS, PROBABILITIES, TOTAL, UNKNOWN, LeftOut, QuantileRow
 from deepaccident_devkit.tables.arrow import record_batch, views
 from deepaccident_devkit.tables.specs import table_spec
@@ -30,8 +31,12 @@ class Selected:
         scenario_group: (S,) int8 group code of every scenario of the release, −1 for those that do not count.
     """
 
-    def __init__(self, dataset: Dataset, scenarios: Iterable[RowArgument] | None = None) -> None:
-        """Select scenarios by token or record, None for all; raises TokenError."""
+    def __init__(self, dataset: Dataset, scenarios: RowArgument | Iterable[RowArgument] | None) -> None:
+        """Select scenarios by token or record, or a single one, None for all; raises TokenError or ChoiceError."""
+        if isinstance(scenarios, str | Mapping):
+            scenarios = [scenarios]
+        if scenarios is not None and not isinstance(scenarios, Iterable):
+            raise ChoiceError(f"scenarios: expected tokens or records of scenarios, found {scenarios!r}")
         self.dataset = dataset
         self.scenario_group = np.full(len(dataset.scenario), -1, dtype=np.int8)
         chosen = range(len(dataset.scenario))

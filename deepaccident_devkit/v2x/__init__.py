@@ -1,6 +1,11 @@
 """Agents and what connects them: who cooperates, what they see together, over which link, and where everything is."""
 
-from deepaccident_devkit.selection import accident_visibility, accident_visible
+from deepaccident_devkit.selection import (
+    accident_visibility,
+    accident_visible,
+    accident_visible_mask,
+    pair_in_view,
+)
 from deepaccident_devkit.v2x.clouds import aggregate_point_cloud
 from deepaccident_devkit.v2x.collisions import Contact, collision
 from deepaccident_devkit.v2x.configurations import AGENT_CONFIGS, AgentConfig, Agents, cooperating_agents
@@ -30,6 +35,7 @@ __all__ = [
     "Trajectory",
     "accident_visibility",
     "accident_visible",
+    "accident_visible_mask",
     "aggregate_point_cloud",
     "collision",
     "cooperating_agents",
@@ -38,6 +44,7 @@ __all__ = [
     "future_egomotion",
     "map_pointcloud_to_image",
     "message_sizes",
+    "pair_in_view",
     "project_to_image",
     "relative_pose_to_ego",
     "trajectory",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.arrays import FloatArray, checked_whole
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import SE3, Boxes, LidarPointCloud, quaternions
@@ -43,14 +43,16 @@ def aggregate_point_cloud(
 
     Raises:
         TokenError: no such sample.
-        ChoiceError: no such agent, configuration or frame, or `sweeps` is no number from 1.
+        ChoiceError: no such agent, configuration or frame, or `sweeps` is no whole number from 1.
         NotAvailableError: an agent is not in this (partial) release.
-        ConfigError: the link's latency is longer than the scenario's past.
+        ConfigError: `link` is no Link, or its latency is longer than the scenario's past.
         MissingFileError: a point cloud was not downloaded.
         SensorFileError: one cannot be read.
     """
+    sweeps = checked_whole("sweeps", sweeps, "a whole number of frames from 1", ChoiceError)
     if sweeps < 1:
-        raise ChoiceError(f"sweeps: expected a number of frames from 1, found {sweeps!r}")
+        raise ChoiceError(f"sweeps: expected a whole number of frames from 1, found {sweeps}")
+    frame = dataset.frame_name(frame)
     target_from_world = dataset.world_from(sample, frame).inverse()
     scenario, _, present = dataset.get("sample", sample)["token"].rsplit("/", 2)
     tracks = scenario_tracks(dataset, scenario) if compensate else None

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray, readonly
+from deepaccident_devkit.arrays import FloatArray, FrozenArrays
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.geometry import Boxes, quaternions
 from deepaccident_devkit.tables.tokens import frame_token, instance_token
+from deepaccident_devkit.v2x.configurations import agents_of
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
 if TYPE_CHECKING:
@@ -25,7 +27,7 @@ _TOUCHING: Final = 0.02
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Contact:
+class Contact(FrozenArrays):
     """The end of an accident scenario; pairs are in meta's order; world, right-handed, metres, seconds, radians.
 
     Attributes:
@@ -42,8 +44,8 @@ class Contact:
         impact_angle: between their headings, in [0, π]: 0 the same way, π head-on.
         sides: the side of each that faces the other across the widest gap along any side's normal (the least overlap).
         agrees: whether meta agrees with the recording: `disagreements` is empty.
-        disagreements: what does not, in words: nothing but a gap of more than 1.5 m, another class than meta's, an end
-            before the last frame, or a contact side of meta's that is neither's.
+        disagreements: what does not, in words: nothing but a gap of more than 1.5 m, another class than meta's, other
+            agents than meta's, an end before the last frame, or a contact side of meta's that is neither's.
     """
 
     instances: tuple[str, str]
@@ -77,7 +79,8 @@ def collision(dataset: Dataset, scenario: RowArgument) -> Contact | None:
 
     Raises:
         TokenError: no such scenario.
-        NotAvailableError: the scenario has no meta, or nobody annotated the pair at one moment.
+        NotAvailableError: the scenario has no meta, it names one actor twice, or nobody annotated the pair at one
+            moment.
     """
     record = dataset.scenario[dataset.getind("scenario", scenario)]
     if record["weather"] is None:
@@ -85,6 +88,10 @@ def collision(dataset: Dataset, scenario: RowArgument) -> Contact | None:
     if record["collision"] is None:
         return None
     first, second = record["collision"]["ids"]
+    if first == second:
+        raise NotAvailableError(
+            f"{record['token']}: meta names actor {first} twice instead of a colliding pair; restore the meta file"
+        )
     tracks = scenario_tracks(dataset, record["token"])
     index = _last_moment(tracks, record["token"], first, second)
     there = tracks.at(index)
@@ -98,13 +105,13 @@ def collision(dataset: Dataset, scenario: RowArgument) -> Contact | None:
         instances=(instance_token(record["token"], first), instance_token(record["token"], second)),
         actor_ids=(first, second),
         frame=frame_token(record["token"], index),
-        point=readonly(point),
+        point=point,
         gap=gap,
         speeds=(float(speeds[0]), float(speeds[1])),
         closing_speed=closing,
         impact_angle=float(abs(np.arctan2(np.sin(turn), np.cos(turn)))),
         sides=sides,
-        disagreements=tuple(_disagreements(record, pair, index, gap, sides)),
+        disagreements=tuple(_disagreements(dataset, record, pair, index, gap, sides)),
     )
 
 
@@ -162,7 +169,12 @@ def _side(direction: FloatArray) -> ContactSide:
 
 
 def _disagreements(
-    record: ScenarioRecord, pair: Boxes, index: int, gap: float, sides: tuple[ContactSide, ContactSide]
+    dataset: Dataset,
+    record: ScenarioRecord,
+    pair: Boxes,
+    index: int,
+    gap: float,
+    sides: tuple[ContactSide, ContactSide],
 ) -> list[str]:
     told = record["collision"]
     if told is None:  # only for the type: the caller has one
@@ -174,7 +186,36 @@ def _disagreements(
         found.append(f"the pair is {gap:.2f} m apart")
     if pair.category_names != told["classes"]:
         found.append(f"the classes are {pair.category_names}, meta says {told['classes']}")
+    found += _other_agents(_agent_ids(dataset, record["token"]), pair.actor_id.tolist(), told["agents"])
     side = told["contact_side"].removesuffix("_side").replace("back", "rear")
     if side in ("front", "rear", "left", "right") and side not in sides:
         found.append(f"the sides are {list(sides)}, meta says {told['contact_side']}")
     return found
+
+
+def _agent_ids(dataset: Dataset, scenario: str) -> dict[str, int | None]:
+    """The vehicles that recorded a scenario in this release → their actor ids, None where meta does not say."""
+    agents = (dataset.agent.get(f"{scenario}/{name}") for name in agents_of(dataset, scenario))
+    return {agent["name"]: agent["actor_id"] for agent in agents if not agent["is_infrastructure"]}
+
+
+def _other_agents(ids: Mapping[str, int | None], pair: Sequence[int], told: Sequence[str | None] | None) -> list[str]:
+    """Where the agents that meta says collided are not those whose ids the pair has, in words.
+
+    Args:
+        ids: the vehicles that are agents here → their actor ids; None where meta does not say.
+        pair: actor ids.
+        told: names of agents, None for a road user that records nothing; None if meta is silent.
+    """
+    if told is None:
+        return []
+    owners = [next((name for name, actor in ids.items() if actor == one), None) for one in pair]
+    strangers = set(owners) - set(told) - {None}
+    absent = {name for name in told if name is not None and ids.get(name) is not None} - set(owners)
+    if not strangers and not absent:
+        return []
+    return [f"the agents are {_words(owners)}, meta says {_words(told)}"]
+
+
+def _words(agents: Sequence[str | None]) -> list[str]:
+    return [agent or "none" for agent in agents]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
@@ -43,6 +43,13 @@ _PARTNERS: Final[dict[AgentName, dict[Role, AgentName]]] = {
 """Ego → role → agent: the released V2X dataset's renaming (evaluation.md g)."""
 
 
+def _names(argument: str, expected: str, given: Iterable[str]) -> tuple[str, ...]:
+    """What a caller gave as several names; raises ChoiceError."""
+    if isinstance(given, str) or not isinstance(given, Iterable):
+        raise ChoiceError(f"{argument}: expected {expected}, found {given!r}")
+    return tuple(given)
+
+
 @dataclass(frozen=True, slots=True)
 class AgentConfig:
     """Who cooperates with an ego agent, named by what they are to it.
@@ -57,6 +64,7 @@ class AgentConfig:
 
     def __post_init__(self) -> None:
         """Check the roles; raises ChoiceError."""
+        object.__setattr__(self, "partners", _names("partners", "roles", self.partners))
         unknown = [role for role in self.partners if role not in get_args(Role)]
         if unknown:
             raise ChoiceError(f"partners: expected roles of {', '.join(get_args(Role))}, found {unknown}")
@@ -150,11 +158,11 @@ def _named(agents: AgentConfig | str | Sequence[str], ego: str) -> tuple[AgentNa
             hint = f"; for that agent alone give [{agents!r}]" if agents in AGENTS else ""
             raise ChoiceError(f"agents: expected one of {', '.join(AGENT_CONFIGS)}, found {agents!r}{hint}")
         return AGENT_CONFIGS[agents].agents_for(ego)
-    return tuple(_agent_name(agent) for agent in agents)
+    return tuple(_agent_name(agent) for agent in _names("agents", "agents' names or a configuration", agents))
 
 
-def _agent_name(name: str) -> AgentName:
+def _agent_name(name: object) -> AgentName:
     for agent in AGENTS:
-        if agent == name:
+        if isinstance(name, str) and agent == name:
             return agent
     raise ChoiceError(f"agent: expected one of {', '.join(AGENTS)}, found {name!r}")

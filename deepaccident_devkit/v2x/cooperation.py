@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, readonly
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.dataset import Dataset, RowArgument, Visible
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import Boxes
@@ -24,13 +24,14 @@ SAME_PLACE: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class CooperativeView:
+class CooperativeView(FrozenArrays):
     """What several agents see at one moment, one box an actor; arrays are read-only.
 
     Attributes:
         boxes: N boxes in one frame, tracked actors by ascending id, then untracked ones (−1). An agent's own row has
             the agent's id. `num_lidar_pts` is the sum over the agents and `camera_visible` whether any camera of
-            theirs sees it (own rows do not count); `row` is the row in the label of `source`.
+            theirs sees it (own rows do not count, and of rows that a label repeats the first alone); `row` is the row
+            in the label of `source`.
         source: (N,) int8, index into `taxonomy.AGENTS`: whose box it is.
         seen_by: (N,) uint8, bit mask over `taxonomy.AGENTS`: who contributed a box of it; of an untracked actor only
             the source, since nothing but the place says that others' rows are of the same.
@@ -39,11 +40,6 @@ class CooperativeView:
     boxes: Boxes
     source: AnyArray
     seen_by: AnyArray
-
-    def __post_init__(self) -> None:
-        """Freeze the arrays."""
-        object.__setattr__(self, "source", readonly(self.source))
-        object.__setattr__(self, "seen_by", readonly(self.seen_by))
 
 
 def visible_instances(
@@ -67,15 +63,23 @@ def visible_instances(
         TokenError: no such sample.
         ChoiceError: no such agent or configuration.
         NotAvailableError: an agent is not in this (partial) release.
-        ConfigError: the link's latency is longer than the scenario's past.
+        ConfigError: `link` is no Link, or its latency is longer than the scenario's past.
     """
-    masks, ids = [], []
     scenario = dataset.get("sample", sample)["scenario_token"]
+    seen = visible_actors(dataset, sample, agents=agents, link=link)
+    return [instance_token(scenario, actor) for actor in seen.tolist()]
+
+
+def visible_actors(
+    dataset: Dataset, sample: RowArgument, *, agents: Agents = None, link: Link | None = None
+) -> IntArray:
+    """The actor ids of `visible_instances`, ascending; arguments and errors as there."""
+    masks, ids = [], []
     for message in messages(dataset, sample, agents, link):
         boxes = dataset.boxes(message.sample, "lidar")
         masks.append(_released_mask(message, boxes))
         ids.append(boxes.actor_id)
-    return [instance_token(scenario, actor) for actor in visible_ids(masks, ids).tolist()]
+    return visible_ids(masks, ids)
 
 
 def cooperative_boxes(
@@ -110,7 +114,7 @@ def cooperative_boxes(
         TokenError: no such sample.
         ChoiceError: no such agent, configuration, frame or visibility.
         NotAvailableError: an agent is not in this (partial) release.
-        ConfigError: the link's latency is longer than the scenario's past.
+        ConfigError: `link` is no Link, or its latency is longer than the scenario's past.
     """
     return cooperative_view(dataset, sample, agents=agents, frame=frame, visible=visible, link=link).boxes
 
@@ -125,6 +129,7 @@ def cooperative_view(
     link: Link | None = None,
 ) -> CooperativeView:
     """`cooperative_boxes` and who saw each of them; arguments and errors as there."""
+    frame = dataset.frame_name(frame)
     target_from_world = dataset.world_from(sample, frame).inverse()
     parts, actors, agent_codes = [], [], []
     for message in messages(dataset, sample, agents, link):
@@ -146,6 +151,7 @@ def _one_an_actor(boxes: Boxes, actor: IntArray, agent: AnyArray) -> Cooperative
     own = boxes.actor_id == OWN_ACTOR_ID
     tracked = np.flatnonzero(actor != UNTRACKED_ID)
     order = tracked[np.lexsort((own[tracked], actor[tracked]))]
+    order = order[_first_of_each(actor[order], agent[order])]
     ids, first, group = np.unique(actor[order], return_index=True, return_inverse=True)
     chosen = order[first]
     from_outside = ~own[order]
@@ -171,6 +177,13 @@ def _one_an_actor(boxes: Boxes, actor: IntArray, agent: AnyArray) -> Cooperative
         },
     )
     return CooperativeView(boxes=merged, source=agent[picked], seen_by=np.concatenate([seen_by, bits[loose]]))
+
+
+def _first_of_each(actor: IntArray, agent: AnyArray) -> IntArray:
+    """The rows, ascending, at which a pair of an actor and an agent stands first: a label may repeat an actor."""
+    first: IntArray = np.unique(actor * len(AGENTS) + agent, return_index=True)[1]
+    first.sort()
+    return first
 
 
 def _repeated(boxes: Boxes, agent: AnyArray, loose: IntArray, chosen: IntArray) -> BoolArray:

@@ -10,7 +10,7 @@ from typing import Final, Literal, get_args
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.arrays import FloatArray, checked_number, checked_whole
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
@@ -45,9 +45,10 @@ class PoseNoise:
     def __post_init__(self) -> None:
         """Check the numbers; raises ConfigError."""
         for name in ("mean", "std", "heading_std"):
-            value = getattr(self, name)
+            value = checked_number(f"pose noise: {name}", getattr(self, name), "a number from 0", ConfigError)
             if not 0 <= value < math.inf:
-                raise ConfigError(f"pose noise: {name} is {value}; choose a finite number of at least 0")
+                raise ConfigError(f"pose noise: {name} is {value:g}; choose a finite number of at least 0")
+            object.__setattr__(self, name, value)
         if self.law not in get_args(NoiseLaw):
             raise ConfigError(f"pose noise: expected a law of {', '.join(get_args(NoiseLaw))}, found {self.law!r}")
         if self.law == "zero-mean" and self.mean:
@@ -84,20 +85,18 @@ class Link:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Check the numbers; raises ConfigError."""
-        if not 0 <= self.latency < math.inf:
-            raise ConfigError(f"latency: {self.latency} is not possible; choose a finite number of seconds from 0")
-        frames = self.latency / FRAME_PERIOD
-        if abs(frames - round(frames)) > _FRAME_TOLERANCE:
-            below, above = math.floor(frames) / 10, math.ceil(frames) / 10
-            raise ConfigError(
-                f"latency: {self.latency} s is no multiple of a frame ({FRAME_PERIOD} s); "
-                f"the nearest are {below} s and {above} s"
-            )
-        if not 0 <= self.packet_loss <= 1:
-            raise ConfigError(f"packet_loss: {self.packet_loss} is no probability; choose a number from 0 to 1")
-        if self.pose_noise is not None and not isinstance(self.pose_noise, PoseNoise):
-            object.__setattr__(self, "pose_noise", _noise_of_mean(self.pose_noise))
+        """Check the numbers and make them Python's own; raises ConfigError."""
+        loss = checked_number("packet_loss", self.packet_loss, "a probability from 0 to 1", ConfigError)
+        if not 0 <= loss <= 1:
+            raise ConfigError(f"packet_loss: {loss:g} is no probability; choose a number from 0 to 1")
+        checked = {
+            "latency": _whole_frames(self.latency),
+            "pose_noise": _noise(self.pose_noise),
+            "packet_loss": loss,
+            "seed": checked_whole("seed", self.seed, "a whole number", ConfigError),
+        }
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
 
     @property
     def latency_frames(self) -> int:
@@ -142,10 +141,32 @@ class Link:
         return f"{self.seed}/{scenario}/{partner}/{index}"
 
 
-def _noise_of_mean(mean: object) -> PoseNoise:
-    if not isinstance(mean, int | float):
-        raise ConfigError(f"pose_noise: expected metres or a PoseNoise, found {mean!r}")
-    return PoseNoise(mean=float(mean))
+def checked_link(link: object) -> Link | None:
+    """What a call's `link=` may be; raises ConfigError."""
+    if link is None or isinstance(link, Link):
+        return link
+    raise ConfigError(f"link: expected a Link, such as Link(latency=0.2, pose_noise=0.3), or None, found {link!r}")
+
+
+def _whole_frames(latency: object) -> float:
+    """The latency in seconds, exactly that of its frames."""
+    seconds = checked_number("latency", latency, "seconds from 0", ConfigError)
+    if not 0 <= seconds < math.inf:
+        raise ConfigError(f"latency: {seconds} is not possible; choose a finite number of seconds from 0")
+    frames = seconds / FRAME_PERIOD
+    if abs(frames - round(frames)) > _FRAME_TOLERANCE:
+        below, above = math.floor(frames) / 10, math.ceil(frames) / 10
+        raise ConfigError(
+            f"latency: {seconds} s is no multiple of a frame ({FRAME_PERIOD} s); "
+            f"the nearest are {below} s and {above} s"
+        )
+    return round(frames) / 10
+
+
+def _noise(noise: object) -> PoseNoise | None:
+    if noise is None or isinstance(noise, PoseNoise):
+        return noise
+    return PoseNoise(mean=checked_number("pose_noise", noise, "metres or a PoseNoise", ConfigError))
 
 
 def uniforms(key: str) -> tuple[float, float, float, float]:

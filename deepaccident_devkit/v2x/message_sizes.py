@@ -1,17 +1,22 @@
-"""How many bytes each agent would have to send."""
+"""How many bytes the agents have to send."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import DTypeLike
 
+from deepaccident_devkit.arrays import checked_whole
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.taxonomy import CAMERAS
-from deepaccident_devkit.v2x.configurations import Agents, cooperating_agents
+from deepaccident_devkit.v2x.configurations import Agents
+from deepaccident_devkit.v2x.link import Link
+from deepaccident_devkit.v2x.messages import messages
 
 POINT_BYTES: Final = 4 * 4
 """x, y, z and intensity in single precision."""
@@ -46,8 +51,9 @@ def message_sizes(
     bev_shape: tuple[int, int, int] = (64, 200, 200),
     bev_dtype: DTypeLike = np.float32,
     clouds: bool = True,
+    link: Link | None = None,
 ) -> dict[str, MessageSize]:
-    """Bytes that each agent would send at a sample's moment, by modality; what a link does to them changes nothing.
+    """Bytes that each agent sends for a sample's moment, by modality.
 
     Args:
         dataset: the release.
@@ -56,29 +62,43 @@ def message_sizes(
         bev_shape: channels, rows, columns of the BEV features.
         bev_dtype: their type.
         clouds: whether to read the point clouds in order to count their points.
+        link: what happens to the partners' data; None for nothing. Under latency, sizes are those of the earlier frame
+            that arrives; pose noise makes no message longer or shorter.
 
     Returns:
-        Agent → sizes, the sample's own agent (who sends nothing to itself) first, if it is among them.
+        Agent → sizes of what arrives, the sample's own agent (who sends nothing to itself) first, if it is among them.
+        A partner whose message is lost is left out; what it sent in vain, a call without `link` says.
 
     Raises:
         TokenError: no such sample.
-        ChoiceError: no such agent or configuration, or `bev_shape` is no shape.
+        ChoiceError: no such agent or configuration, or `bev_shape` is no shape or `bev_dtype` no type.
         NotAvailableError: an agent is not in this (partial) release.
+        ConfigError: `link` is no Link, or its latency is longer than the scenario's past.
         MissingFileError: a point cloud was not downloaded (and is to be counted).
+        SensorFileError: one cannot be read (and is to be counted).
     """
-    if np.shape(bev_shape) != (3,) or min(bev_shape) < 1:
-        raise ChoiceError(f"bev_shape: expected (channels, rows, columns) from 1, found {bev_shape!r}")
-    scenario, _, number = dataset.get("sample", sample)["token"].rsplit("/", 2)
-    bev = int(np.prod(bev_shape)) * np.dtype(bev_dtype).itemsize
+    bev = _bev_bytes(bev_shape, bev_dtype)
     sizes: dict[str, MessageSize] = {}
-    for agent in cooperating_agents(dataset, sample, agents):
-        token = f"{scenario}/{agent}/{number}"
-        images = [dataset.get("sample_data", f"{token}/{camera}") for camera in CAMERAS]
-        points = len(dataset.load_point_cloud(token, "lidar")) if clouds else None
-        sizes[agent] = MessageSize(
+    for message in messages(dataset, sample, agents, link):
+        images = [dataset.get("sample_data", f"{message.sample}/{camera}") for camera in CAMERAS]
+        points = len(dataset.load_point_cloud(message.sample, "lidar")) if clouds else None
+        sizes[message.agent] = MessageSize(
             images=POSE_BYTES + sum(3 * image["width"] * image["height"] for image in images),
             cloud=None if points is None else POSE_BYTES + POINT_BYTES * points,
-            boxes=POSE_BYTES + BOX_BYTES * len(dataset.boxes(token, "lidar")),
+            boxes=POSE_BYTES + BOX_BYTES * len(dataset.boxes(message.sample, "lidar")),
             bev=POSE_BYTES + bev,
         )
     return sizes
+
+
+def _bev_bytes(shape: Sequence[int], dtype: DTypeLike) -> int:
+    expected = "(channels, rows, columns), whole numbers from 1"
+    if np.shape(shape) != (3,):
+        raise ChoiceError(f"bev_shape: expected {expected}, found {shape!r}")
+    lengths = [checked_whole("bev_shape", length, expected, ChoiceError) for length in shape]
+    if min(lengths) < 1:
+        raise ChoiceError(f"bev_shape: expected {expected}, found {shape!r}")
+    try:
+        return math.prod(lengths) * np.dtype(dtype).itemsize
+    except TypeError as error:
+        raise ChoiceError(f"bev_dtype: expected a type such as 'float32', found {dtype!r} ({error})") from error

@@ -10,7 +10,7 @@ from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AgentName
 from deepaccident_devkit.v2x.configurations import Agents, cooperating_agents
-from deepaccident_devkit.v2x.link import Link
+from deepaccident_devkit.v2x.link import Link, checked_link
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -52,8 +52,9 @@ def messages(
 
     Raises:
         TokenError, ChoiceError, NotAvailableError: as `cooperating_agents`.
-        ConfigError: the link's latency is longer than the scenario's past at the present.
+        ConfigError: `link` is no Link, or its latency is longer than the scenario's past at the present.
     """
+    link = checked_link(link)
     names = cooperating_agents(dataset, sample, agents)
     scenario, ego, number = dataset.get("sample", sample)["token"].rsplit("/", 2)
     for index in range(int(number), max(int(number) - sweeps, 0), -1):

@@ -4,19 +4,26 @@ Every function serves both handednesses: right-handed poses (the devkit's) give 
 poses give the released code's; `geometry.handedness.flip_six_vector` leads from one to the other.
 """
 
+from collections.abc import Iterable, Sequence
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, checked
+from deepaccident_devkit.arrays import BoolArray, FloatArray, checked
 from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.geometry import six_vectors
+from deepaccident_devkit.geometry import SE3, six_vectors
+from deepaccident_devkit.geometry.se3 import inverses
+
+Poses = Sequence[SE3] | ArrayLike
+"""Poses of several agents or moments: SE3 objects, or an array (K, 4, 4)."""
 
 
-def relative_pose_to_ego(world_from_agent: ArrayLike) -> FloatArray:
+def relative_pose_to_ego(world_from_agent: Poses) -> FloatArray:
     """Where agents stand in the ego's frame: `ego_from_agent` of each as a 6-vector (evaluation.md g).
 
     Args:
-        world_from_agent: (K, 4, 4) poses of one moment, the ego's first.
+        world_from_agent: (K, 4, 4), or K SE3: poses of one moment, the ego's first.
 
     Returns:
         (K, 6) metres and radians, in the ego's frame and the poses' handedness; row 0 is zero up to rounding.
@@ -24,20 +31,20 @@ def relative_pose_to_ego(world_from_agent: ArrayLike) -> FloatArray:
     Raises:
         GeometryError: the poses have another shape, or there is none.
     """
-    poses = checked("world_from_agent", world_from_agent, (None, 4, 4))
+    poses = _stacked("world_from_agent", world_from_agent)
     if not len(poses):
         raise GeometryError("world_from_agent: expected the ego's pose and its partners', found none")
-    return six_vectors.from_matrices(_inverse(poses[:1]) @ poses)
+    return six_vectors.from_matrices(inverses(poses[:1]) @ poses)
 
 
-def future_egomotion(world_from_ego: ArrayLike, valid: ArrayLike | None = None) -> FloatArray:
+def future_egomotion(world_from_ego: Poses, valid: ArrayLike | None = None) -> FloatArray:
     """An agent's motion from each of its moments to the next: `next_from_this` as 6-vectors (evaluation.md g).
 
     A row maps points of a moment's ego frame into the next one's. For the released seven rows give eight poses: 1 s
     before the present to 2.5 s after it, in steps of 0.5 s.
 
     Args:
-        world_from_ego: (T + 1, 4, 4) poses of one agent in the order of time.
+        world_from_ego: (T + 1, 4, 4), or T + 1 SE3: poses of one agent in the order of time.
         valid: (T + 1,) whether each moment is in the recording; what stands in `world_from_ego` where it is not does
             not matter. All are, if None.
 
@@ -48,21 +55,19 @@ def future_egomotion(world_from_ego: ArrayLike, valid: ArrayLike | None = None) 
     Raises:
         GeometryError: the shapes do not fit, or there is no pose.
     """
-    poses = checked("world_from_ego", world_from_ego, (None, 4, 4))
+    poses = _stacked("world_from_ego", world_from_ego)
     if not len(poses):
         raise GeometryError("world_from_ego: expected at least one pose, found none")
     known: BoolArray = checked("valid", np.ones(len(poses)) if valid is None else valid, (len(poses),), np.bool_)
     both = known[:-1] & known[1:]
     motion = np.zeros((len(poses) - 1, 6))
-    motion[both] = six_vectors.from_matrices(_inverse(poses[1:][both]) @ poses[:-1][both])
+    motion[both] = six_vectors.from_matrices(inverses(poses[1:][both]) @ poses[:-1][both])
     return motion
 
 
-def _inverse(pose: AnyArray) -> AnyArray:
-    """The inverses of rigid transforms (…, 4, 4), by transposing their rotations."""
-    turned_back = np.swapaxes(pose[..., :3, :3], -1, -2)
-    result = np.zeros_like(pose)
-    result[..., :3, :3] = turned_back
-    result[..., :3, 3] = -np.einsum("...ij,...j->...i", turned_back, pose[..., :3, 3])
-    result[..., 3, 3] = 1
-    return result
+def _stacked(name: str, poses: Poses) -> FloatArray:
+    """(K, 4, 4)."""
+    matrices: Any = poses
+    if isinstance(poses, Iterable) and not isinstance(poses, np.ndarray):
+        matrices = [pose.matrix if isinstance(pose, SE3) else pose for pose in poses]
+    return checked(name, matrices, (None, 4, 4))

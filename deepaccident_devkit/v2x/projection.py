@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import BoolArray, ByteArray, FloatArray, checked, readonly
+from deepaccident_devkit.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays, checked
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import LidarPointCloud, PinholeCamera
@@ -16,7 +16,7 @@ from deepaccident_devkit.v2x.transforms import transform
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ImagePoints:
+class ImagePoints(FrozenArrays):
     """Where N points fall in an image; arrays are read-only.
 
     Attributes:
@@ -30,13 +30,6 @@ class ImagePoints:
     depth: FloatArray
     color: ByteArray | None
     mask: BoolArray
-
-    def __post_init__(self) -> None:
-        """Freeze the arrays."""
-        for name in ("pixels", "depth", "mask"):
-            object.__setattr__(self, name, readonly(getattr(self, name)))
-        if self.color is not None:
-            object.__setattr__(self, "color", readonly(self.color))
 
 
 def project_to_image(

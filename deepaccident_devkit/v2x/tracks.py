@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, as_floats, readonly
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray, as_floats
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import SE3, Boxes, quaternions
@@ -15,7 +15,7 @@ from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Trajectory:
+class Trajectory(FrozenArrays):
     """An actor at the T moments at which anybody annotated it, in one right-handed frame; arrays are read-only.
 
     Attributes:
@@ -39,13 +39,6 @@ class Trajectory:
     velocity: FloatArray
     agents: AnyArray
     present: int | None = None
-
-    def __post_init__(self) -> None:
-        """Freeze the arrays."""
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, np.ndarray):
-                object.__setattr__(self, field.name, readonly(value))
 
     def __len__(self) -> int:
         """Number of moments."""
@@ -99,7 +92,7 @@ def trajectory(
     record = dataset.get("instance", instance)
     tracks = scenario_tracks(dataset, record["scenario_token"])
     rows = np.flatnonzero(tracks.actor_id == record["actor_id"])
-    frame_from_world, present = SE3.identity(), None
+    frame, frame_from_world, present = dataset.frame_name(frame), SE3.identity(), None
     if sample is not None:
         there = dataset.get("sample", sample)
         if there["scenario_token"] != record["scenario_token"]:
@@ -124,7 +117,7 @@ def trajectory(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ScenarioTracks:
+class ScenarioTracks(FrozenArrays):
     """All actors of a scenario at all moments, one row an actor and moment, ordered by frame and actor; in world.
 
     Attributes:

@@ -1,6 +1,7 @@
-"""Golden f: which actors the released code counts as seen. Exact.
+"""Golden f, and of golden a the accident's visibility: which actors the released code counts as seen. Exact.
 
-Made by the released functions under numpy 1.23.5 (golden/README.md, f_visibility); the rule is evaluation.md f.
+Made by the released functions under numpy 1.23.5 (golden/README.md, f_visibility and a_labels); the rules are
+evaluation.md f.
 """
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.testing import assert_array_equal
 
 from deepaccident_devkit.tables import visible_ids, visible_mask
 from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE, UNTRACKED_ID, VEHICLE_AGENTS
+from deepaccident_devkit.v2x import accident_visible_mask, pair_in_view
 
 pytestmark = pytest.mark.golden_cases("f_visibility", "cases")
 
@@ -49,8 +51,7 @@ def test_whether_each_agent_itself_sees_the_others_of_the_accident(golden) -> No
     own = dict(zip(VEHICLE_AGENTS, own_ids, strict=True))
     seen = {}
     for a, (agent, mask) in enumerate(zip(AGENTS, masks_of(golden), strict=True)):
-        others = set(pair) - {own.get(agent)}
-        seen[agent] = others <= set(visible_ids([mask], [golden["ids", a]]).tolist())
+        seen[agent] = pair_in_view(mask, golden["ids", a], pair, own.get(agent))
     assert seen == golden.entry["check_accident_vehicles_visibility"]
 
 
@@ -59,3 +60,21 @@ def test_another_handedness_sees_the_same(golden) -> None:
         fields = golden["cls", a], golden["pts", a], golden["cam", a]
         flipped = visible_mask(golden["xy", a] * (1, -1), *fields, infrastructure=AGENTS[a] == INFRASTRUCTURE)
         assert_array_equal(flipped, mask)
+
+
+@pytest.mark.golden_cases("a_labels", "scenes")
+def test_accident_visibility_equals_the_released_codes(golden) -> None:
+    """The rule over three moments; the last of them also from what the scene's agent sees (frame 0 is the present)."""
+    scene, agent = golden.entry, AGENTS.index(golden.entry["agent"])
+    _, first, _, second, _ = scene["meta"][0].split()
+    with np.load(golden.folder / f"{scene['name']}.npz") as arrays:
+        in_view, expected = arrays["check_accident_visibility"], arrays["accident_visibility"]
+        xy, classes, points, camera, ids = (
+            arrays[f"vis_{name}_0_{agent}"] for name in ("xy", "cls", "pts", "cam", "ids")
+        )
+    mask = visible_mask(xy, classes, points, camera, infrastructure=AGENTS[agent] == INFRASTRUCTURE)
+    own = scene["agent_ids"].get(scene["agent"])
+    now = pair_in_view(mask, ids, (int(first), int(second)), own)
+    assert_array_equal(now, in_view[-1])
+    assert_array_equal(accident_visible_mask([*in_view[:-1], now], collision=first != "-1"), expected)
+    assert str(bool(expected)) == scene["accident_visibility"]

@@ -93,3 +93,9 @@ def test_ranges_that_are_no_cells_are_refused(x: object, message: str) -> None:
 def test_an_unknown_orientation_is_refused() -> None:
     with pytest.raises(ChoiceError, match="expected one of devkit, released, fiery, found 'up'"):
         BevGrid(orientation="up")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("points", ["a", None, [["1", "2"]], [[1, 2], [1, 2, 3]]])
+def test_what_is_no_points_is_refused(points: object) -> None:
+    with pytest.raises(GeometryError, match=r"points: expected points of shape \(N, 2\) or \(N, 3\), found"):
+        BevGrid().index_of(points)

@@ -3,8 +3,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.geometry import SE3, Boxes, footprints, points_in_boxes
-from deepaccident_devkit.geometry.boxes import concatenate
+from deepaccident_devkit.geometry import SE3, Box, Boxes, footprints, points_in_boxes
+from deepaccident_devkit.geometry.boxes import _COLUMNS, concatenate, trusted_boxes
 
 
 @pytest.fixture
@@ -97,7 +97,7 @@ def test_arrays_are_read_only_and_the_callers_are_not(two: Boxes) -> None:
     ("columns", "message"),
     [
         ({"size": np.ones((3, 3))}, r"Boxes.size: expected shape \(2, 3\), found \(3, 3\)"),
-        ({"center": np.ones((2, 2))}, r"Boxes.center: expected shape \(2, 3\)"),
+        ({"center": np.ones((2, 2))}, r"Boxes.center: expected shape \(N, 3\)"),
         ({"yaw": [[0.0], [0.0]]}, r"Boxes.yaw: expected shape \(N\)"),
         ({"velocity": np.ones((2, 2))}, r"Boxes.velocity: expected shape \(2, 3\)"),
         ({"actor_id": [1]}, r"Boxes.actor_id: expected shape \(2\)"),
@@ -154,10 +154,19 @@ def test_boxes_without_area_overlap_nothing(square: Boxes) -> None:
         assert_array_equal(iou, np.zeros((2, 2)))
     assert_array_equal(flat.iou_bev(square), np.zeros((2, 1)))
     assert_array_equal(flat.distance_bev(square), np.zeros((2, 1)))
-    unknown = Boxes.from_arrays([[np.nan] * 3], [[1, 1, 1]], [0], frame="lidar")
-    assert_array_equal(unknown.iou_bev(square), [[0]])
-    assert_array_equal(unknown.contains([[0, 0, 0]]), [[False]])
     assert_array_equal(square.contains([[np.nan, 0, 0], [0, np.inf, 0]]), [[False, False]])
+
+
+@pytest.mark.parametrize("column", ["center", "size", "rotation"])
+def test_boxes_that_are_nowhere_have_no_gap_and_hold_nothing(square: Boxes, column: str) -> None:
+    columns = {name: getattr(square, name).copy() for name in _COLUMNS}
+    columns[column][0, 0] = np.nan
+    nowhere = trusted_boxes("lidar", columns)  # the constructor takes none
+    assert_array_equal(nowhere.distance_bev(square), [[np.nan]])
+    assert_array_equal(square.distance_bev(nowhere), [[np.nan]])
+    assert_array_equal(nowhere.contains([[0, 0, 0]]), [[False]])
+    if column != "rotation":
+        assert_array_equal(nowhere.iou_bev(square), [[0]])
 
 
 @pytest.mark.parametrize("compare", ["iou_bev", "iou_3d", "distance_bev", "center_distance"])
@@ -193,3 +202,53 @@ def test_many_pairs_are_worked_off_in_pieces(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(points_in_boxes, "_POINTS_AT_ONCE", 7)
     for have, want in zip((some.iou_bev(some), some.distance_bev(some), some.contains(points)), whole, strict=True):
         assert_array_equal(have, want)
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"center": [[0, 0, 0], [np.nan, 0, 0]]}, r"Boxes.center: expected finite numbers, found \[nan, .* in row 1"),
+        ({"size": [[1, 1, np.inf], [1, 1, 1]]}, r"Boxes.size: expected finite numbers, found .* in row 0"),
+        ({"size": [[1, 1, 1], [1, -1, 1]]}, r"Boxes.size: expected lengths, widths and heights from 0, .* in row 1"),
+        ({"rotation": [[1, 0, 0, 0], [0, 0, 0, 0]]}, r"Boxes.rotation: expected unit quaternions .* in row 1"),
+        ({"rotation": [[2, 0, 0, 2], [1, 0, 0, 0]]}, r"Boxes.rotation: expected unit quaternions .* in row 0"),
+        ({"rotation": [[np.nan, 0, 0, 1], [1, 0, 0, 0]]}, "Boxes.rotation: expected finite numbers"),
+        ({"category": [0, 77]}, r"category codes are 0 to 5 \(car, .* found \[ 0 77\]"),
+        ({"category": [0, 300]}, "category codes are 0 to 5"),
+        ({"actor_id": [1.7, 2]}, "Boxes.actor_id: expected whole numbers of int64"),
+        ({"frame": 7}, "Boxes.frame: expected the name of a frame, such as 'world', 'ego' or 'lidar', found 7"),
+        ({"frame": ""}, "Boxes.frame: expected the name of a frame"),
+        ({"center": [[1, 2], [1, 2, 3]]}, "Boxes.center: expected an array"),
+    ],
+)
+def test_numbers_that_are_no_boxes_are_refused(two: Boxes, columns: dict[str, object], message: str) -> None:
+    good = {name: getattr(two, name) for name in ("frame", *_COLUMNS)}
+    with pytest.raises(GeometryError, match=message):
+        Boxes(**{**good, **columns})
+
+
+def test_names_and_nearly_unit_quaternions_are_taken(two: Boxes) -> None:
+    good = {name: getattr(two, name) for name in ("frame", *_COLUMNS)}
+    made = Boxes(**{**good, "category": ["van", "car"], "rotation": two.rotation * 1.0005})
+    assert_array_equal(made.category, [2, 0])
+    assert_allclose(made.rotation, two.rotation, atol=1e-15)
+    assert_array_equal(Boxes(**good).rotation, two.rotation)
+
+
+def test_the_callers_arrays_are_copied() -> None:
+    center = np.zeros((1, 3))
+    made = Boxes.from_arrays(center, np.ones((1, 3)), [0.0])
+    center[0] = 5
+    assert_array_equal(made.center, [[0, 0, 0]])
+
+
+def test_other_things_than_boxes_and_transforms_are_refused(two: Boxes) -> None:
+    for compare in (two.iou_bev, two.iou_3d, two.distance_bev, two.center_distance):
+        with pytest.raises(GeometryError, match="other: expected Boxes, found NoneType"):
+            compare(None)
+    with pytest.raises(GeometryError, match="boxes: expected Boxes, found list"):
+        Box([])
+    with pytest.raises(GeometryError, match="target_from_source: expected an SE3, found ndarray; of a matrix"):
+        two.transform(np.eye(4), "ego")
+    with pytest.raises(GeometryError, match=r"frame: expected the name of a frame, .* found 5"):
+        two.transform(SE3.identity(), 5)

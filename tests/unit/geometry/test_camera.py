@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from deepaccident_devkit.errors import GeometryError
+from deepaccident_devkit.errors import ChoiceError, GeometryError
 from deepaccident_devkit.geometry import SE3, Boxes, BoxVisibility, PinholeCamera
 
 
@@ -111,3 +111,45 @@ def test_boxes_must_be_in_the_cameras_frame() -> None:
         camera.boxes_in_image(box)
     camera_from_lidar = SE3.from_rotation([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
     assert camera.boxes_in_image(box.transform(camera_from_lidar, "Camera_Front")).all()
+
+
+@pytest.mark.parametrize("frame", ["world", "ego", "lidar", "lidar01", "BEV_instance_camera"])
+def test_boxes_of_frames_that_are_no_cameras_are_refused(frame: str) -> None:
+    box = Boxes.from_arrays([[0, 0, 10]], [[2, 2, 2]], [0], frame=frame)
+    with pytest.raises(GeometryError, match=f"found '{frame}'; transform them by camera_from_source first"):
+        PinholeCamera.from_field_of_view(100, 100, 1.2).box_visibility(box)
+
+
+def test_cameras_that_cannot_be() -> None:
+    for wrong in (np.nan, np.inf):
+        with pytest.raises(GeometryError, match="intrinsic: expected finite numbers"):
+            PinholeCamera(np.diag([wrong, 1, 1]), 10, 10)
+    for wrong in (0, -3, 10.5, "10", None):
+        with pytest.raises(GeometryError, match="width: expected a whole number of pixels from 1, found"):
+            PinholeCamera(np.eye(3), wrong, 10)
+        with pytest.raises(GeometryError, match="height: expected a whole number of pixels from 1, found"):
+            PinholeCamera.from_field_of_view(10, wrong, 1.2)
+    for wrong in (0, np.pi, -1, np.nan):
+        with pytest.raises(GeometryError, match="horizontal: expected a field of view between 0 and π radians, found"):
+            PinholeCamera.from_field_of_view(10, 10, wrong)
+    with pytest.raises(GeometryError, match="horizontal: expected a field of view in radians, found 'wide'"):
+        PinholeCamera.from_field_of_view(10, 10, "wide")
+    camera = PinholeCamera(np.eye(3), np.int64(8), np.uint16(6))
+    assert (type(camera.width), camera.width, camera.height) == (int, 8, 6)
+
+
+def test_levels_that_do_not_exist() -> None:
+    camera = PinholeCamera.from_field_of_view(100, 100, 1.2)
+    box = Boxes.from_arrays([[0, 0, 10]], [[2, 2, 2]], [0], frame="Camera_Front")
+    assert camera.boxes_in_image(box, 1)  # type: ignore[arg-type]
+    for wrong in ("any", 3, None):
+        with pytest.raises(ChoiceError, match=r"level: expected one of BoxVisibility.ALL, BoxVisibility.ANY, .*found"):
+            camera.boxes_in_image(box, wrong)
+    with pytest.raises(GeometryError, match="boxes: expected Boxes, found NoneType"):
+        camera.box_visibility(None)
+
+
+def test_points_at_infinity_have_no_pixel_and_warn_of_nothing() -> None:
+    camera = PinholeCamera.from_field_of_view(100, 100, 1.2)
+    pixels, _ = camera.project([[np.inf, 0, 5], [0, 0, np.inf], [-np.inf, 1, -1], [0, np.nan, 1]])
+    assert not camera.in_image(pixels).any()

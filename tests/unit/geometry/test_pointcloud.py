@@ -127,3 +127,28 @@ def test_what_is_no_saved_cloud_is_refused_by_name(tmp_path: Path) -> None:
     for path in tmp_path.iterdir():
         with pytest.raises(SensorFileError, match=f"{path.name}: not a cloud that LidarPointCloud.save wrote"):
             LidarPointCloud.load(path)
+
+
+def test_misuse_of_clouds_says_what_to_give(cloud: LidarPointCloud) -> None:
+    for wrong in (7, None, ""):
+        with pytest.raises(GeometryError, match=r"LidarPointCloud.frame: expected the name of a frame, .* found"):
+            LidarPointCloud(np.zeros((1, 3)), [0], wrong)
+    for wrong in ("near", None, [1.0]):
+        with pytest.raises(GeometryError, match="radius: expected metres from 0 on, found"):
+            cloud.remove_close(wrong)
+        with pytest.raises(GeometryError, match="size: expected metres above 0, found"):
+            cloud.voxel_downsample(wrong)
+    with pytest.raises(GeometryError, match=r"grid: expected a BevGrid, found \(-50, 50\); ranges go by name"):
+        cloud.crop((-50, 50))
+    with pytest.raises(GeometryError, match="target_from_source: expected an SE3, found NoneType"):
+        cloud.transform(None, "ego")
+    with pytest.raises(GeometryError, match="frame: expected the name of a frame"):
+        cloud.transform(SE3.identity(), 5)
+    assert rows(cloud.remove_close(np.float32(1.5))) == rows(cloud.remove_close(1.5))
+
+
+def test_points_at_infinity_warn_of_nothing() -> None:
+    cloud = LidarPointCloud([[np.inf, 0, 0], [1, -np.inf, 2], [np.nan, 0, 0], [5, 0, 0]], [0, 0.1, 0.2, 0.3])
+    assert rows(cloud.crop(BevGrid())) == [3]
+    assert rows(cloud.remove_close(2)) == [0, 1, 3]
+    assert len(cloud.transform(SE3.from_yaw(0.3), "ego")) == 4

@@ -4,7 +4,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pyquaternion import Quaternion
 
 from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.geometry import SE3
+from deepaccident_devkit.geometry import SE3, Box, Boxes, LidarPointCloud
 
 QUARTER_LEFT = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 
@@ -96,3 +96,120 @@ def test_half_way() -> None:
 def test_shares_beyond_the_ends_are_refused(share: float) -> None:
     with pytest.raises(GeometryError, match="share: expected a number from 0 to 1"):
         SE3.identity().interpolate(SE3.identity(), share)
+
+
+@pytest.fixture
+def boxes() -> Boxes:
+    return Boxes.from_arrays(
+        [[1, 2, 3], [4, 5, 6]], [[4, 2, 1.5]] * 2, [0.1, 2.0], frame="lidar", velocity=np.eye(3)[:2]
+    )
+
+
+def test_boxes_a_box_and_a_cloud_are_carried_along(boxes: Boxes) -> None:
+    pose = SE3.from_rotation(QUARTER_LEFT, (10, 0, 1))
+    want = boxes.transform(pose, "ego")
+    for moved, frame in (
+        (pose @ boxes, "lidar"),
+        (pose.apply(boxes), "lidar"),
+        (pose.apply(boxes, frame="ego"), "ego"),
+    ):
+        assert isinstance(moved, Boxes)
+        assert moved.frame == frame
+        assert_array_equal(moved.corners(), want.corners())
+        assert_array_equal(moved.velocity, want.velocity)
+    box = Box(boxes.select([0]), "a/b")
+    for one, frame in ((pose @ box, "lidar"), (pose.apply(box, frame="ego"), "ego")):
+        assert (one.frame, one.token) == (frame, "a/b")
+        assert_array_equal(one.center, want.center[0])
+    cloud = pose.apply(LidarPointCloud(boxes.center, [1, 2]), frame="ego")
+    assert cloud.frame == "ego"
+    assert_array_equal(cloud.xyz, want.center)
+    assert_array_equal((pose @ LidarPointCloud(boxes.center, [1, 2])).xyz, want.center)
+
+
+@pytest.mark.parametrize("points", [None, "abc", object(), ["1", "2", "3"], [[1, 2], [1, 2, 3]], {}])
+def test_what_cannot_be_moved_is_refused(points: object) -> None:
+    pose = SE3.identity()
+    for move in (pose.apply, pose.__matmul__):
+        with pytest.raises(
+            GeometryError, match=r"points: expected points of shape \(N, 3\) or \(3,\), boxes or a point"
+        ):
+            move(points)
+    with pytest.raises(GeometryError, match=r"vectors: expected vectors of shape \(…, 3\), found"):
+        pose.rotate(points)
+
+
+def test_other_misuse_says_what_to_give(boxes: Boxes) -> None:
+    pose = SE3.identity()
+    with pytest.raises(GeometryError, match=r"found \(4, 4\); of a matrix \(4, 4\) make SE3"):
+        pose @ np.eye(4)
+    with pytest.raises(GeometryError, match=r"vectors: expected shape \(…, 3\), found \(3, 2\)"):
+        pose.rotate(np.zeros((3, 2)))
+    with pytest.raises(GeometryError, match="frame: points of an array carry no name of a frame, found 'ego'"):
+        pose.apply([1, 2, 3], frame="ego")  # type: ignore[call-overload]
+    with pytest.raises(GeometryError, match=r"frame: expected the name of a frame, .* found 5"):
+        pose.apply(boxes, frame=5)
+    for wrong in ("left", None, [0.1]):
+        with pytest.raises(GeometryError, match="yaw: expected an angle in radians, found"):
+            SE3.from_yaw(wrong)
+    with pytest.raises(GeometryError, match="yaw: expected a finite angle in radians, found nan"):
+        SE3.from_yaw(np.nan)
+    assert SE3.from_yaw(np.float32(0.5)).yaw == pytest.approx(0.5)
+    for wrong in (None, 7, "abcd", [None] * 4):
+        with pytest.raises(GeometryError, match="quaternion: expected"):
+            SE3.from_quaternion(wrong)
+    with pytest.raises(GeometryError, match="other: expected an SE3, found NoneType; of a matrix"):
+        pose.interpolate(None, 0.5)
+    for wrong in ("half", None, [0.1, 0.2]):
+        with pytest.raises(GeometryError, match="share: expected a number from 0 to 1, found"):
+            pose.interpolate(pose, wrong)
+
+
+def test_points_at_infinity_warn_of_nothing() -> None:
+    pose = SE3.from_yaw(0.3)
+    assert not np.isfinite(pose.apply([[np.inf, 0, 0], [np.nan, 1, 2]])).all(axis=1).any()
+    assert not np.isfinite(pose.rotate([np.inf, 0, 0])).all()
+
+
+def off_rotation(source: np.random.Generator, *, how: str) -> np.ndarray:
+    """A pose up to 600 m out whose rotation is as far from orthonormal as files have it."""
+    matrix = SE3.from_six([*source.uniform(-600, 600, 3), *source.uniform(-3, 3, 3)]).matrix
+    if how == "single":
+        return matrix.astype(np.float32)
+    if how == "rounded":
+        return matrix.round(4)
+    return matrix + np.pad(source.uniform(-2e-4, 2e-4, (3, 3)), (0, 1))
+
+
+@pytest.mark.parametrize("how", ["single", "rounded", "coarse"])
+def test_ways_there_and_back_end_where_they_began_though_poses_are_rounded(how: str) -> None:
+    source = np.random.default_rng(0)
+    for _ in range(100):
+        a, b, c = (SE3(off_rotation(source, how=how)) for _ in range(3))
+        a_from_b, b_from_a = a.inverse() @ b, b.inverse() @ a
+        assert_allclose((a_from_b @ b_from_a).matrix, np.eye(4), atol=1e-9)
+        assert_allclose((a @ a.inverse()).matrix, np.eye(4), atol=1e-9)
+        points = source.uniform(-600, 600, (9, 3))
+        assert_allclose(b_from_a.apply(a_from_b.apply(points)), points, atol=1e-9)
+        around = (a.inverse() @ b) @ (b.inverse() @ c) @ (c.inverse() @ a)
+        assert_allclose(around.apply(points), points, atol=1e-9)
+        boxes = Boxes.from_arrays(points, np.full((9, 3), 8.0), source.uniform(-3, 3, 9), frame="a")
+        back = boxes.transform(b_from_a, "b").transform(a_from_b, "a")
+        assert_allclose(back.corners(), boxes.corners(), atol=1e-5)
+
+
+def test_a_rounded_pose_keeps_its_numbers_and_has_the_nearest_rotations_quaternion() -> None:
+    turn = SE3.from_six([0, 0, 0, 0.4, -0.3, 2.0]).rotation
+    stretch = np.eye(3) + 1e-4 * np.array([[1, 2, -1], [2, 0, 3], [-1, 3, -2]])
+    pose = SE3.from_rotation(turn @ stretch)  # a polar decomposition: the nearest rotation is `turn`
+    assert_array_equal(pose.rotation, turn @ stretch)
+    assert_allclose(pose.quaternion.rotation_matrix, turn, atol=1e-7)
+    assert_allclose(pose.inverse().quaternion.rotation_matrix, turn.T, atol=1e-7)
+
+
+def test_a_last_row_that_is_a_little_off_is_made_exact() -> None:
+    matrix = SE3.from_yaw(0.3, (600, -600, 10)).matrix.copy()
+    matrix[3] = (1e-4, 0, -1e-4, 1.0005)
+    pose = SE3(matrix)
+    assert_array_equal(pose.matrix[3], [0, 0, 0, 1])
+    assert_allclose((pose.inverse() @ pose).matrix, np.eye(4), atol=1e-9)

@@ -12,7 +12,7 @@ import pytest
 from tiny import META, TYPE, write_tiny_release
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ConfigError, TokenError
+from deepaccident_devkit.errors import ChoiceError, ConfigError, TokenError
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.statistics import ENDS, GROUPS, DatasetStatistics, dataset_statistics
 from deepaccident_devkit.taxonomy import CATEGORIES
@@ -241,12 +241,25 @@ def test_a_selection_counts_alone(tiny: DeepAccident, of_tiny: DatasetStatistics
         train.quantiles["box_sizes"].row("length", "van").values
         == of_tiny.quantiles["box_sizes"].row("length", "van", "train").values
     )
-    assert "selected: 3 scenarios" in train.to_text()
+    assert "selected: 3 of 6 scenarios" in train.to_text()
     nothing = dataset_statistics(tiny, [])
     assert (nothing.scenarios["total"], nothing.collisions) == (0, ())
     assert nothing.counts["annotations"].total() == 0
+    assert "selected: 0 of 6 scenarios" in nothing.to_text()
+    assert nothing.to_text().endswith("no scenario meets the filters, so there is nothing to count")
     with pytest.raises(TokenError, match="nowhere"):
         dataset_statistics(tiny, ["nowhere/at all"])
+
+
+def test_a_single_scenario_by_token_or_record(tiny: DeepAccident) -> None:
+    record = tiny.scenario[2]
+    want = dataset_statistics(tiny, [record["token"]]).to_json()
+    assert dataset_statistics(tiny, record["token"]).to_json() == want
+    assert dataset_statistics(tiny, record).to_json() == want
+    with pytest.raises(TokenError, match="nowhere"):
+        dataset_statistics(tiny, "nowhere")
+    with pytest.raises(ChoiceError, match="scenarios: expected tokens or records of scenarios, found 3"):
+        dataset_statistics(tiny, 3)
 
 
 def test_a_release_without_labels_counts_what_it_can(tmp_path: Path) -> None:
@@ -257,7 +270,7 @@ def test_a_release_without_labels_counts_what_it_can(tmp_path: Path) -> None:
     assert made.counts["instances"].total() == made.histograms["speeds"].total() == 0
     text = made.to_text()
     assert "1 scenarios without labels" in text
-    assert "1 collisions whose pair is not labelled at the last frame" in text
+    assert "1 collisions without a pair labelled at the last frame" in text
     json.loads(made.to_json(), parse_constant=pytest.fail)
 
 
@@ -276,5 +289,5 @@ def test_json_and_csv_say_the_same(of_tiny: DatasetStatistics, tmp_path: Path) -
     assert ["length", "van", "total"] in [row[:3] for row in tables["box_sizes"]]
     assert len(tables["collision_pairs"]) == 1 + len(of_tiny.collisions)
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigError, match="is a file; give a folder"):
+    with pytest.raises(ConfigError, match="file is a file; give a folder"):
         of_tiny.to_csv(tmp_path / "file")

@@ -3,11 +3,12 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError, TokenError
+from deepaccident_devkit.errors import ChoiceError, ConfigError, TokenError
 from deepaccident_devkit.geometry import Boxes, LidarPointCloud
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 from deepaccident_devkit.v2x import Link
 from deepaccident_devkit.v2x.clouds import moved_points
+from deepaccident_devkit.v2x.messages import messages
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 
@@ -30,7 +31,7 @@ def test_agents_and_sweeps_come_one_after_another(da: DeepAccident, sample: str)
     assert len(da.aggregate_point_cloud(sample, agents="single", sweeps=99)) == sum(
         len(da.load_point_cloud(f"{scenario}/ego_vehicle/{index:03d}")) for index in range(1, 5)
     )
-    with pytest.raises(ChoiceError, match="sweeps: expected a number of frames from 1, found 0"):
+    with pytest.raises(ChoiceError, match="sweeps: expected a whole number of frames from 1, found 0"):
         da.aggregate_point_cloud(sample, sweeps=0)
 
 
@@ -132,6 +133,66 @@ def test_message_sizes(da: DeepAccident, sample: str) -> None:
     assert mine.boxes == 24 + 45 * len(da.boxes(sample))
     assert mine.bev == 24 + 8 * 100 * 50 * 2
     assert da.message_sizes(sample, agents="single", clouds=False)["ego_vehicle"].cloud is None
-    for wrong in ((8, 100), (0, 1, 1), 5):
+    for wrong in ((8, 100), (0, 1, 1), 5, (1.5, 2, 3), "abc", None, ("a", 1, 1)):
         with pytest.raises(ChoiceError, match="bev_shape: expected"):
             da.message_sizes(sample, bev_shape=wrong)
+    with pytest.raises(ChoiceError, match="bev_dtype: expected a type such as 'float32', found 'foo'"):
+        da.message_sizes(sample, bev_dtype="foo")
+    assert da.message_sizes(sample, agents="single", bev_shape=np.array((8, 100, 50)))["ego_vehicle"].bev == 24 + 160000
+
+
+def test_message_sizes_are_of_what_arrives(da: DeepAccident, sample: str) -> None:
+    late = da.message_sizes(sample, link=Link(latency=0.2, pose_noise=0.3))
+    then = da.message_sizes(sample.replace("/004", "/002"))
+    now = da.message_sizes(sample)
+    assert late["ego_vehicle"] == now["ego_vehicle"]
+    assert {agent: late[agent] for agent in AGENTS[1:]} == {agent: then[agent] for agent in AGENTS[1:]}
+    assert late != now
+    lossy = Link(packet_loss=0.5, seed=2)
+    arrived = [message.agent for message in messages(da, sample, None, lossy)]
+    assert 1 < len(arrived) < len(AGENTS)
+    assert da.message_sizes(sample, link=lossy) == {agent: now[agent] for agent in arrived}
+    with pytest.raises(ConfigError, match=r"from frame 004; the most there is 0\.3 s"):
+        da.message_sizes(sample, link=Link(latency=0.4))
+
+
+@pytest.mark.parametrize("sweeps", [0, -1, 2.0, 2.5, "a", None])
+def test_sweeps_are_whole_numbers_from_1(da: DeepAccident, sample: str, sweeps: object) -> None:
+    with pytest.raises(ChoiceError, match="sweeps: expected a whole number of frames from 1, found"):
+        da.aggregate_point_cloud(sample, sweeps=sweeps)
+
+
+def test_numpy_whole_numbers_are_sweeps(da: DeepAccident, sample: str) -> None:
+    both = [da.aggregate_point_cloud(sample, agents="single", sweeps=sweeps) for sweeps in (2, np.int64(2))]
+    assert_array_equal(both[0].xyz, both[1].xyz)
+
+
+def test_the_lidars_frame_has_one_name(da: DeepAccident, sample: str) -> None:
+    results = [
+        da.boxes(sample, "lidar01"),
+        da.get_boxes(sample, "lidar01")[0],
+        da.get_sample_data(f"{sample}/lidar01")[1][0],
+        da.load_point_cloud(sample, "lidar01"),
+        da.cooperative_boxes(sample, frame="lidar01"),
+        da.aggregate_point_cloud(sample, agents="single", frame="lidar01"),
+        da.trajectory(da.instance[0], sample, "lidar01"),
+    ]
+    assert [result.frame for result in results] == ["lidar"] * len(results)
+    assert_array_equal(da.world_from(sample, "lidar01").matrix, da.world_from(sample, "lidar").matrix)
+    assert da.boxes(sample, "lidar01").iou_bev(da.cooperative_boxes(sample, frame="lidar")).max() == 1
+
+
+@pytest.mark.parametrize("frame", ["map", "", None, 3, ["ego"], "Lidar"])
+def test_frames_that_do_not_exist(da: DeepAccident, sample: str, frame: object) -> None:
+    calls = [
+        da.boxes,
+        da.world_from,
+        da.load_point_cloud,
+        lambda token, frame: da.cooperative_boxes(token, frame=frame),
+        lambda token, frame: da.aggregate_point_cloud(token, frame=frame),
+        lambda token, frame: da.transform(token, token, frame),
+        lambda token, frame: da.trajectory(da.instance[0], token, frame),
+    ]
+    for call in calls:
+        with pytest.raises(ChoiceError, match=r"frame: expected world, ego, lidar or one of Camera_Front, .* found"):
+            call(sample, frame)

@@ -1,5 +1,6 @@
 from pathlib import Path
 
+import numpy as np
 import pytest
 import tiny
 
@@ -75,3 +76,21 @@ def test_an_agent_that_was_not_downloaded_is_named(tmp_path: Path) -> None:
         ):
             call(sample, agents="+other")
     assert len(da.cooperative_boxes(sample)) > 0
+
+
+@pytest.mark.parametrize("agents", [3, 2.5, object()])
+def test_what_names_no_agents_is_refused(da_b: DeepAccident, agents: object) -> None:
+    with pytest.raises(ChoiceError, match="agents: expected agents' names or a configuration, found"):
+        da_b.cooperative_boxes(da_b.sample[0], agents=agents)
+
+
+def test_names_of_another_kind(da_b: DeepAccident) -> None:
+    for wrong in ([None], [3], [np.zeros(2)]):
+        with pytest.raises(ChoiceError, match=r"agent: expected one of ego_vehicle, .* found"):
+            cooperating_agents(da_b, da_b.sample[0], wrong)
+    named = cooperating_agents(da_b, da_b.sample[0], np.array(["infrastructure", "ego_vehicle"]))
+    assert named == ("ego_vehicle", "infrastructure")
+    for wrong in (3, "behind", None):
+        with pytest.raises(ChoiceError, match="partners: expected roles, found"):
+            AgentConfig("mine", wrong)
+    assert AgentConfig("mine", ["behind"]) == AgentConfig("mine", ("behind",))

@@ -154,3 +154,17 @@ def test_the_callers_release_is_not_changed(da: DeepAccident) -> None:
         boxes.center[0] = 0
     assert_array_equal(da.boxes(da.sample[0], "lidar").center, before)
     assert np.isfinite(boxes.center).all()
+
+
+def test_a_row_that_a_label_repeats_counts_once(stacked) -> None:
+    rows = {
+        "ego_vehicle": [row(20.0, 5, 3), row(20.4, 5, 8), row(0.0, -100), row(0.1, -100, 70)],
+        "infrastructure": [row(20.2, 5, 4), row(20.2, 5, 4), row(0.0, 1223, 6), row(0.0, 1223, 6)],
+    }
+    da = stacked(rows)
+    view = cooperative_view(da, f"{tiny.TOKEN}/ego_vehicle/001")
+    assert_array_equal(view.boxes.actor_id, [5, 1223])
+    assert_array_equal(view.boxes.num_lidar_pts, [7, 6])
+    assert_allclose(view.boxes.center[:, 0], [20.0, 0.0])
+    assert_array_equal(view.seen_by, [0b10001, 0b10001])
+    assert_array_equal(view.source, [0, 4])

@@ -1,3 +1,4 @@
+import inspect
 import math
 import pickle
 
@@ -5,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from deepaccident_devkit import DeepAccident
+from deepaccident_devkit import DeepAccident, v2x
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x import Link, PoseNoise
@@ -34,7 +35,7 @@ def test_a_latency_that_is_no_multiple_of_a_frame_names_the_two_nearest() -> Non
 
 def test_a_latency_longer_than_the_past_names_what_there_is(da_b: DeepAccident, sample: str) -> None:
     assert len(da_b.cooperative_boxes(sample, link=Link(latency=0.3))) > 0
-    for call in (da_b.cooperative_boxes, da_b.visible_instances, da_b.aggregate_point_cloud):
+    for call in (da_b.cooperative_boxes, da_b.visible_instances, da_b.aggregate_point_cloud, da_b.message_sizes):
         with pytest.raises(
             ConfigError, match=r"from frame 004; the most there is 0\.3 s, and .* works from frame 006 on"
         ):
@@ -148,3 +149,54 @@ def test_a_sweep_arrives_as_it_did_when_it_was_the_present(da_b: DeepAccident, s
 
     tokens = [sample.replace("/004", f"/{index:03d}") for index in (4, 3, 2)]
     assert facts(sample, 4) == [fact for token in tokens for fact in facts(token, 1)]
+
+
+@pytest.mark.parametrize("wrong", ["0.2", None, [0.2], (0.1, 0.02), 1j])
+def test_what_is_no_number_is_refused(wrong: object) -> None:
+    for name in ("latency", "packet_loss"):
+        with pytest.raises(ConfigError, match=f"{name}: expected .*, found"):
+            Link(**{name: wrong})
+    for name in ("mean", "std", "heading_std"):
+        with pytest.raises(ConfigError, match=f"pose noise: {name}: expected a number from 0, found"):
+            PoseNoise(**{name: wrong})
+    if wrong is not None:
+        with pytest.raises(ConfigError, match="pose_noise: expected metres or a PoseNoise, found"):
+            Link(pose_noise=wrong)
+
+
+def test_seeds_are_whole_numbers() -> None:
+    for wrong in (1.5, "a", None, 1.0):
+        with pytest.raises(ConfigError, match="seed: expected a whole number, found"):
+            Link(seed=wrong)
+    assert Link(seed=-1) != Link(seed=1)
+
+
+def test_equal_links_draw_alike_whatever_their_numbers_types() -> None:
+    links = [
+        Link(latency=0.3, pose_noise=0.5, packet_loss=0.5, seed=1),
+        Link(latency=0.1 + 0.2, pose_noise=np.float32(0.5), packet_loss=np.float16(0.5), seed=np.int64(1)),
+        Link(latency=np.float32(0.3), pose_noise=np.array(0.5), packet_loss=np.float64(0.5), seed=True),
+    ]
+    assert len(set(links)) == 1
+    for link in links:
+        assert (type(link.latency), type(link.packet_loss), type(link.seed)) == (float, float, int)
+        assert type(link.pose_noise.mean) is float
+        draws = [link.pose_error("scenario", "agent", 4, np.zeros(3)).matrix.tobytes() for link in links]
+        assert len(set(draws)) == 1
+    assert Link(pose_noise=np.int64(1)) == Link(pose_noise=1.0) == Link(pose_noise=PoseNoise(mean=np.uint8(1)))
+
+
+@pytest.mark.parametrize("wrong", [{"latency": 0.2}, "a", 0.2, Link])
+def test_what_is_no_link_is_refused_by_every_call(da_b: DeepAccident, sample: str, wrong: object) -> None:
+    calls = (da_b.cooperative_boxes, da_b.visible_instances, da_b.aggregate_point_cloud, da_b.message_sizes)
+    for call in calls:
+        with pytest.raises(ConfigError, match=r"link: expected a Link, such as Link\(latency=0\.2, .* found"):
+            call(sample, link=wrong)
+
+
+def test_every_call_that_takes_agents_takes_a_link() -> None:
+    """But `cooperating_agents`, which only names them; the motion labels show what is there, not what is received."""
+    takers = {name: inspect.signature(getattr(v2x, name)).parameters for name in v2x.__all__ if name[0].islower()}
+    taking = {name for name, parameters in takers.items() if "agents" in parameters}
+    assert taking - {"cooperating_agents"} == {name for name, parameters in takers.items() if "link" in parameters}
+    assert "message_sizes" in taking

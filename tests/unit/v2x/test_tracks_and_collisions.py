@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
+from deepaccident_devkit.statistics import dataset_statistics
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 
@@ -156,3 +157,55 @@ def test_collisions_that_cannot_be_told(tmp_path: Path) -> None:
         unseen.collision(tiny.TOKEN)
     with pytest.raises(TokenError, match="table 'scenario' has no token"):
         unseen.collision("nowhere")
+
+
+def side_by_side(frame: int) -> list[str]:
+    actors = ((1223, 0.0), (1236, 3.0), (1212, 6.0), (1300, 9.0))
+    return [f"car {16.0 + frame} {y} 0.0 4.0 2.0 1.5 0.0 0 0 {actor} 9 True" for actor, y in actors]
+
+
+@pytest.mark.usefixtures("origin")
+@pytest.mark.parametrize(
+    ("pair", "told", "names"),
+    [
+        ("1223 car 1212", "ego other", ()),
+        ("1212 car 1223", "ego other", ()),  # in another order
+        ("1223 car 1300", "ego none", ()),
+        ("1223 car 1212", "ego_behind other_behind", ("ego_vehicle_behind", "other_vehicle_behind")),
+        ("1223 car 1212", "ego other_behind", ("ego_vehicle", "other_vehicle_behind")),
+        ("1223 car 1212", "ego none", ("ego_vehicle", "none")),
+        ("1223 car 1212", "none none", ("none", "none")),
+        ("1223 car 1300", "ego other", ("ego_vehicle", "other_vehicle")),
+    ],
+)
+def test_the_agents_that_meta_names_against_those_of_the_pair(
+    tmp_path: Path, pair: str, told: str, names: tuple[str, ...]
+) -> None:
+    meta = tiny.META.replace("1223 car 1212", pair).replace("ego other\n", f"{told}\n")
+    said = accident(tmp_path, side_by_side, meta=meta).collision(tiny.TOKEN).disagreements
+    about_agents = [words for words in said if words.startswith("the agents are")]
+    assert len(about_agents) == bool(names)
+    assert all(words.endswith(f"meta says {list(names)}") for words in about_agents)
+
+
+@pytest.mark.usefixtures("origin")
+def test_agents_that_were_not_downloaded_cannot_disagree(tmp_path: Path) -> None:
+    """Whose id 1212 is, nobody says; but 1223 is the ego's, and meta does not name the ego."""
+    here = ("ego_vehicle", "infrastructure")
+    there = accident(tmp_path / "one", side_by_side, agents=here).collision(tiny.TOKEN)
+    assert not [words for words in there.disagreements if words.startswith("the agents are")]
+    meta = tiny.META.replace("ego other\n", "ego_behind other\n")
+    wrong = accident(tmp_path / "two", side_by_side, agents=here, meta=meta).collision(tiny.TOKEN)
+    assert "the agents are ['ego_vehicle', 'none'], meta says ['ego_vehicle_behind', 'other_vehicle']" in (
+        wrong.disagreements
+    )
+
+
+@pytest.mark.usefixtures("origin")
+def test_one_actor_is_no_pair(tmp_path: Path) -> None:
+    da = accident(tmp_path, side_by_side, meta=tiny.META.replace("1223 car 1212", "1223 car 1223"))
+    with pytest.raises(NotAvailableError, match="meta names actor 1223 twice instead of a colliding pair"):
+        da.collision(tiny.TOKEN)
+    made = dataset_statistics(da)
+    assert made.collisions == ()
+    assert made.histograms["collision_angles"].left_out.counts["total"] == 1
