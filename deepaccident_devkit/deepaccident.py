@@ -4,14 +4,37 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from deepaccident_devkit import overview, render, selection, v2x, validation
+from deepaccident_devkit import overview, selection, v2x
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import IndexStoreError
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.tables import open_index
 from deepaccident_devkit.taxonomy import OnError
+
+if TYPE_CHECKING:
+    from deepaccident_devkit import motion, render, validation
+
+
+class _Later:
+    """A function of a package that takes its time to import: fetched when somebody asks for it, and then in its place.
+
+    `DeepAccident` binds functions of all layers, and who only reads tables should not wait for those that draw.
+    """
+
+    def __init__(self, package: str) -> None:
+        self._package = f"{__package__}.{package}"
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, instance: object, owner: type) -> Any:
+        function = getattr(import_module(self._package), self._name)
+        setattr(owner, self._name, function)
+        return function.__get__(instance, owner)
 
 
 class DeepAccident(Dataset):
@@ -86,11 +109,27 @@ class DeepAccident(Dataset):
     trajectory = v2x.trajectory
     collision = v2x.collision
     message_sizes = v2x.message_sizes
-    findings = validation.findings
-    render_sample = render.render_sample
-    render_frame = render.render_frame
-    render_sample_data = render.render_sample_data
-    render_bev = render.render_bev
+
+    if TYPE_CHECKING:
+        motion_labels = motion.motion_labels
+        bev_segmentation = motion.bev_segmentation
+        samples = motion.samples
+        findings = validation.findings
+        render_sample = render.render_sample
+        render_frame = render.render_frame
+        render_sample_data = render.render_sample_data
+        render_bev = render.render_bev
+        render_motion_labels = render.render_motion_labels
+    else:
+        motion_labels = _Later("motion")
+        bev_segmentation = _Later("motion")
+        samples = _Later("motion")
+        findings = _Later("validation")
+        render_sample = _Later("render")
+        render_frame = _Later("render")
+        render_sample_data = _Later("render")
+        render_bev = _Later("render")
+        render_motion_labels = _Later("render")
 
     def list_scenarios(self) -> None:
         """Print a line for each scenario."""

@@ -58,6 +58,10 @@ class IndexStoreError(DeepAccidentError, OSError):
     """The index cannot be written or read where it should lie."""
 
 
+class LabelFilesError(DeepAccidentError, OSError):
+    """A folder of written motion labels is missing, damaged or something else."""
+
+
 class LookupFailedError(DeepAccidentError, KeyError):
     """A table, token, field or channel that does not exist was asked for."""
 

@@ -53,6 +53,14 @@ def da_b(release_root_b: Path) -> DeepAccident:
     return DeepAccident("v1", release_root_b, verbose=False)
 
 
+@pytest.fixture(scope="session")
+def da_motion(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
+    """An accident and its normal twin of 3.5 s, labels only: long enough for pasts, futures and ends of recordings."""
+    root = tmp_path_factory.mktemp("synthetic") / "motion"
+    make_release(root, SynthConfig(scenarios=2, frames=35, seed=5, sensors=False), workers=2)
+    return DeepAccident("v1", root, verbose=False)
+
+
 @pytest.fixture(params=["A", "B"])
 def both_layouts(request: pytest.FixtureRequest) -> DeepAccident:
     """Each of the two releases in turn."""

@@ -12,6 +12,7 @@ from deepaccident_devkit._version import __version__
 from deepaccident_devkit.cli.demo import demo
 from deepaccident_devkit.cli.index import index
 from deepaccident_devkit.cli.info import info
+from deepaccident_devkit.cli.labels import labels
 from deepaccident_devkit.cli.split import split
 from deepaccident_devkit.cli.stats import stats
 from deepaccident_devkit.cli.synth import synth
@@ -27,7 +28,7 @@ def deepaccident() -> None:
     """Tools for the DeepAccident V2X accident dataset."""
 
 
-for verb in (demo, synth, index, info, split, stats, validate):
+for verb in (demo, synth, index, info, labels, split, stats, validate):
     deepaccident.add_command(verb)
 
 

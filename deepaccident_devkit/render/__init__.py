@@ -5,5 +5,15 @@ from deepaccident_devkit.render.bev import render_bev
 from deepaccident_devkit.render.boxes import draw_box
 from deepaccident_devkit.render.camera import render_sample_data
 from deepaccident_devkit.render.moments import render_frame, render_sample
+from deepaccident_devkit.render.motion import draw_motion_labels, render_motion_labels
 
-__all__ = ["detached_figure", "draw_box", "render_bev", "render_frame", "render_sample", "render_sample_data"]
+__all__ = [
+    "detached_figure",
+    "draw_box",
+    "draw_motion_labels",
+    "render_bev",
+    "render_frame",
+    "render_motion_labels",
+    "render_sample",
+    "render_sample_data",
+]

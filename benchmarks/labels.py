@@ -1,0 +1,75 @@
+"""Motion labels of a sample from boxes, on golden-like input: 5 frames, 30 objects, 200 × 200 cells."""
+
+import numpy as np
+
+from benchmarks.measure import Figure, best_of, one_core
+from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionLabelConfig
+from deepaccident_devkit.motion.drawing.from_boxes import FrameBoxes, motion_labels_from_boxes
+from deepaccident_devkit.motion.drawing.polygon_fill import filled_cells
+
+OBJECTS, STEP = 30, 0.5
+REPEATS = 200
+RELEASED_MS = 112.0
+"""The released code on 30 objects took 112 to 136 ms on two cores (design.md 6)."""
+
+
+def measure() -> list[Figure]:
+    frames, motion = make_frames(np.random.default_rng(0)), make_motion()
+    quads, image = make_quads(np.random.default_rng(1))
+    configs = {name: MotionLabelConfig(protocol=name) for name in LABEL_PROTOCOLS}
+    with one_core():
+        milliseconds = {
+            name: 1e3 * best_of(REPEATS, lambda config=config: motion_labels_from_boxes(frames, motion, config))
+            for name, config in configs.items()
+        }
+        filling = 1e3 * best_of(REPEATS, lambda: filled_cells(quads, (200, 200), image, 5))
+    released = milliseconds.pop("released")
+    return [
+        Figure(name="labels_ms", value=released, unit="ms", bound=3.0),
+        Figure(name="labels_against_released", value=RELEASED_MS / released, unit="times", higher_is_better=True),
+        Figure(name="labels_fill_150_quads_ms", value=filling, unit="ms", bound=0.6),
+        *(Figure(name=f"labels_{name}_ms", value=value, unit="ms") for name, value in milliseconds.items()),
+    ]
+
+
+def make_frames(source: np.random.Generator) -> list[FrameBoxes]:
+    """The ego and 30 actors around it, most of them in sight and on the grid, half a second apart."""
+    count = OBJECTS + 1
+    start = np.vstack([np.zeros(2), source.uniform(-55, 55, (OBJECTS, 2))])
+    yaw = np.append(0, source.uniform(-np.pi, np.pi, OBJECTS))
+    speed = np.append(0, source.uniform(0, 10, OBJECTS))
+    size = source.uniform([3.6, 1.6, 1.4], [9, 2.6, 3.5], (count, 3))
+    seen = np.append(False, source.random(OBJECTS) < 0.9)
+    return [
+        FrameBoxes(
+            center=np.column_stack([start + STEP * t * speed[:, None] * heading(yaw), np.zeros(count)]),
+            size=size,
+            yaw=yaw,
+            actor_id=np.append(-100, np.arange(OBJECTS) + 200),
+            category=np.zeros(count),
+            visible=seen,
+            ego_from_lidar=np.eye(4),
+        )
+        for t in range(5)
+    ]
+
+
+def heading(yaw: np.ndarray) -> np.ndarray:
+    return np.stack([np.cos(yaw), np.sin(yaw)], axis=-1)
+
+
+def make_motion() -> np.ndarray:
+    """An ego that drives 10 m/s in a bend."""
+    return np.tile([-5.0, 0, 0, 0, 0, -0.05], (7, 1))
+
+
+def make_quads(source: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """150 quadrangles of cars' and trucks' sizes in cells, all over five images, some across the border."""
+    count = 5 * OBJECTS
+    size = source.uniform([7, 3.2], [18, 5.2], (count, 2))
+    ahead = heading(source.uniform(-np.pi, np.pi, count))
+    left = ahead[:, ::-1] * [-1, 1]
+    ends = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]]) / 2
+    around = np.einsum("vk,nk,nkd->nvd", ends, size, np.stack([ahead, left], axis=1))
+    quads = np.rint(source.uniform(0, 200, (count, 1, 2)) + around).astype(np.int64)
+    return quads, np.repeat(np.arange(5), OBJECTS)

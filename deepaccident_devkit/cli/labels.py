@@ -1,0 +1,86 @@
+"""`deepaccident labels`: the motion labels of a split, written into a folder."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, get_args
+
+import click
+
+from deepaccident_devkit.cli.options import release_parameters
+from deepaccident_devkit.deepaccident import DeepAccident
+from deepaccident_devkit.errors import NotAvailableError
+from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
+from deepaccident_devkit.motion import LABEL_PROTOCOLS, PRESETS, LabelProtocol, MotionLabelConfig, write_label_files
+from deepaccident_devkit.motion.protocols import slip_names
+from deepaccident_devkit.motion.sample_lists import Purpose
+from deepaccident_devkit.taxonomy import AGENTS
+from deepaccident_devkit.v2x import AGENT_CONFIGS
+
+_CONFIG_OPTIONS = ("preset", "protocol", "switches", "orientation", "seen_by", "only_vehicle")
+
+
+@click.command()
+@release_parameters
+@click.option("--split", required=True, help="train, val, train_mini, val_mini, or a split file (….txt).")
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="Folder for the labels.")
+@click.option("--agents", multiple=True, metavar="NAME[,NAME…]", help="Whose samples; all if not given.")
+@click.option(
+    "--samples",
+    "purpose",
+    type=click.Choice(get_args(Purpose)),
+    default="every",
+    show_default=True,
+    help="Which of their samples: every one (10 Hz), all key frames (2 Hz), those to train on or evaluate at.",
+)
+@click.option("--preset", type=click.Choice(list(PRESETS)), default="deepaccident", show_default=True)
+@click.option("--protocol", type=click.Choice(list(LABEL_PROTOCOLS)), help="The preset's own if not given.")
+@click.option("--switch", "switches", multiple=True, metavar="NAME=yes|no", help="Keep a slip of the protocol or not.")
+@click.option("--orientation", type=click.Choice(ORIENTATIONS), help="How cells lie; the preset's own if not given.")
+@click.option("--seen-by", type=click.Choice(list(AGENT_CONFIGS)), help="Draw what these agents see; all if not given.")
+@click.option("--only-vehicle", is_flag=True, help="Leave out pedestrians.")
+def labels(split: str, out: Path, agents: tuple[str, ...], purpose: Purpose, **options: Any) -> None:
+    """Write the motion labels of a split of the release under DATAROOT.
+
+    One file a scenario and agent. A call that was broken off goes on where it stopped.
+    """
+    config = _config(**{name: options.pop(name) for name in _CONFIG_OPTIONS})
+    chosen = _agents(agents)
+    dataset = DeepAccident(**options)
+    tokens = [token for token in dataset.samples(split, purpose) if token.rsplit("/", 2)[1] in chosen]
+    if not tokens:
+        raise NotAvailableError(f"{split}: has no such samples of {', '.join(chosen)} with labels")
+    done = write_label_files(dataset, out, tokens, config, workers=options["workers"], progress=True)
+    click.echo(f"{done.samples:,} samples in {out}: {done.written} files written, {done.kept} were there")
+
+
+def _config(
+    preset: str,
+    protocol: str | None,
+    switches: tuple[str, ...],
+    orientation: str | None,
+    seen_by: str | None,
+    **flags: Any,
+) -> MotionLabelConfig:
+    named = {"protocol": protocol, "orientation": orientation, "agents": seen_by}
+    changes: dict[str, Any] = {name: value for name, value in named.items() if value is not None}
+    config = MotionLabelConfig.preset(preset, **changes, **{name: value for name, value in flags.items() if value})
+    return replace(config, protocol=_switched(config.rules, switches)) if switches else config
+
+
+def _agents(given: tuple[str, ...]) -> tuple[str, ...]:
+    names = [name for text in given for name in text.split(",")]
+    unknown = [name for name in names if name not in (*AGENTS, "all")]
+    if unknown:
+        raise click.BadParameter(f"--agents: expected all or some of {', '.join(AGENTS)}; found {unknown[0]!r}")
+    return AGENTS if not names or "all" in names else tuple(names)
+
+
+def _switched(rules: LabelProtocol, switches: tuple[str, ...]) -> LabelProtocol:
+    changes: dict[str, Any] = {}
+    for text in switches:
+        name, _, value = text.partition("=")
+        if name not in slip_names() or value not in ("yes", "no"):
+            names = ", ".join(slip_names())
+            raise click.BadParameter(f"--switch: expected NAME=yes or NAME=no, NAME one of {names}; found {text!r}")
+        changes[name] = value == "yes"
+    return replace(rules, **changes)

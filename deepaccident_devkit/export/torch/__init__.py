@@ -1,0 +1,32 @@
+"""Training with PyTorch: cooperative samples as tensors, and how they become batches (the extra `torch`).
+
+    from torch.utils.data import DataLoader
+    from deepaccident_devkit import DeepAccident, motion
+    from deepaccident_devkit.export.torch import ImageConfig, V2XConfig, V2XDataset, collate
+
+    da = DeepAccident(dataroot="data/DeepAccident")
+    config = V2XConfig(agents="all", images=ImageConfig(resize=(224, 400)), labels=motion.MotionLabelConfig())
+    data = V2XDataset(da, motion.samples(da, "train"), config)
+    loader = DataLoader(data, batch_size=2, shuffle=True, num_workers=4, collate_fn=collate)
+
+`V2XDataset` says what an item holds, `collate` and `collate_fusion` what a batch does. docs/training.md has a training
+loop. Only this package imports torch; importing it without torch raises MissingExtraError.
+"""
+
+from deepaccident_devkit.errors import MissingExtraError
+
+try:
+    import torch  # noqa: F401 - nothing here is of use without it
+except ModuleNotFoundError as error:
+    raise MissingExtraError(
+        "the torch adapter needs PyTorch: pip install 'deepaccident_devkit[torch]' "
+        "(for its CPU build alone: pip install torch --index-url https://download.pytorch.org/whl/cpu)"
+    ) from error
+
+from deepaccident_devkit.export.torch.augmentation import RandomAugmentation
+from deepaccident_devkit.export.torch.collate import collate, collate_fusion
+from deepaccident_devkit.export.torch.config import V2XConfig
+from deepaccident_devkit.export.torch.dataset import V2XDataset
+from deepaccident_devkit.export.torch.images import ImageConfig
+
+__all__ = ["ImageConfig", "RandomAugmentation", "V2XConfig", "V2XDataset", "collate", "collate_fusion"]

@@ -1,0 +1,91 @@
+"""The bird's-eye-view transform A (rotation, scale, flip) on boxes, points and poses, and random ones for training.
+
+Every agent's ego frame is transformed alike: points become A p, a pose W between two ego frames A W A⁻¹, and what leads
+from an ego frame to a sensor loses A again, so that points hit the pixels that they hit before. Images stay.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from deepaccident_devkit.arrays import AnyArray, FloatArray, as_floats
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.geometry import Boxes, LidarPointCloud, six_vectors
+from deepaccident_devkit.motion import Augmentation
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RandomAugmentation:
+    """Draws an `Augmentation` from a generator; the defaults are BEVerse's ranges.
+
+    Attributes:
+        rotation: the largest angle either way, radians; uniform.
+        scale: the smallest and the largest factor; uniform.
+        flip: the probability of mirroring left and right.
+    """
+
+    rotation: float = math.radians(22.5)
+    scale: tuple[float, float] = (0.95, 1.05)
+    flip: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Check the ranges; raises ConfigError."""
+        if not 0 <= self.rotation < math.inf:
+            raise ConfigError(f"random augmentation: rotation is {self.rotation}; choose finite radians from 0")
+        smallest, largest = self.scale
+        if not 0 < smallest <= largest < math.inf:
+            raise ConfigError(f"random augmentation: scale is {self.scale}; choose (smallest, largest) above 0")
+        if not 0 <= self.flip <= 1:
+            raise ConfigError(f"random augmentation: flip is {self.flip}; choose a probability from 0 to 1")
+
+    def __call__(self, generator: np.random.Generator) -> Augmentation:
+        """One draw."""
+        return Augmentation(
+            rotation=float(generator.uniform(-self.rotation, self.rotation)),
+            scale=float(generator.uniform(*self.scale)),
+            flip=bool(generator.random() < self.flip),
+        )
+
+
+def augmented_boxes(boxes: Boxes, augmentation: Augmentation) -> FloatArray:
+    """Boxes of an ego frame in the augmented one, (M, 9): x y z l w h yaw vx vy.
+
+    Right-handed, z of the centre; metres, radians in (−π, π], m/s; NaN velocities stay NaN. As in the released code
+    sizes and velocities scale too. Its flip, though, makes yaw π − yaw, which swaps front and rear; here a mirrored
+    box heads where its mirrored velocity does.
+    """
+    turn = augmentation.matrix[:2, :2]
+    heading = np.column_stack([np.cos(boxes.yaw), np.sin(boxes.yaw)]) @ turn.T
+    return np.column_stack(
+        [
+            transformed(augmentation.matrix, boxes.center),
+            boxes.size * augmentation.scale,
+            np.arctan2(heading[:, 1], heading[:, 0]),
+            boxes.velocity[:, :2] @ turn.T,
+        ]
+    )
+
+
+def augmented_points(cloud: LidarPointCloud, augmentation: Augmentation) -> AnyArray:
+    """A cloud of an ego frame in the augmented one, (N, 4) float32: x y z in metres, and the intensity as it was."""
+    return np.column_stack([transformed(augmentation.matrix, cloud.xyz), cloud.intensity]).astype(np.float32)
+
+
+def augmented_pose(pose: ArrayLike, augmentation: Augmentation) -> FloatArray:
+    """Poses (…, 4, 4) between two ego frames as poses between the two augmented ones: A W A⁻¹."""
+    matrix = augmentation.matrix
+    return as_floats(matrix @ as_floats(pose) @ np.linalg.inv(matrix))
+
+
+def augmented_six_vectors(six: ArrayLike, augmentation: Augmentation) -> FloatArray:
+    """The same of 6-vectors (…, 6): shifts scale, and a mirror leaves a rotation a rotation."""
+    return six_vectors.from_matrices(augmented_pose(six_vectors.to_matrices(six), augmentation))
+
+
+def transformed(matrix: FloatArray, points: FloatArray) -> FloatArray:
+    """Points (N, 3) moved by an affine matrix (4, 4)."""
+    return as_floats(points @ matrix[:3, :3].T + matrix[:3, 3])

@@ -1,0 +1,98 @@
+"""Items of a `V2XDataset` as batches, for a DataLoader's `collate_fn`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+from deepaccident_devkit.taxonomy import AGENTS
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+_OF_AGENTS: Final = ("agent_valid", "ego_from_agent", "images", "intrinsics", "ego_from_camera", "image_from_ego")
+"""Tensors whose first axis is the agents'."""
+_MATRICES: Final = ("ego_from_agent", "intrinsics", "ego_from_camera", "image_from_ego")
+_OF_BOXES: Final = ("boxes", "velocity_known", "categories", "actor_ids")
+_LISTS: Final = ("token", "agents", "points", *_OF_BOXES)
+"""What stays a list with an entry an item: texts, and tensors of different lengths."""
+
+
+def collate(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """B items as one dict, agents side by side: for models that know how many agents there are, or mask them.
+
+    Of what an item holds (`V2XDataset`), `token`, `agents`, `points` and the boxes (`boxes`, `velocity_known`,
+    `categories`, `actor_ids`) become lists of B. All else is stacked, (B, …); where items have fewer agents than
+    others, (B, A, …) is filled with agents whose `agent_valid` is False, whose images are 0 and matrices the identity.
+    """
+    import torch
+
+    agents = max(len(item["agents"]) for item in items)
+    batch: dict[str, Any] = {}
+    for key in items[0]:
+        values = [item[key] for item in items]
+        if key in _LISTS:
+            batch[key] = values
+        elif key in _OF_AGENTS:
+            batch[key] = torch.stack([_with_agents(key, value, agents) for value in values])
+        else:
+            batch[key] = torch.stack(values)
+    return batch
+
+
+def collate_fusion(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """B items as one dict, agents one after another: as V2X fusion models in the manner of OpenCOOD take them.
+
+    Agents of whom nothing arrived at the present are left out (of the others, `agent_valid` still says what is missing
+    of the past); the sample's own agent always is the first of its item. N is the number of those that are left in the
+    whole batch. Besides what `collate` gives, with all that is each agent's as (N, …) instead of (B, A, …), `points` a
+    list of N, and `agents` a list of B tuples of names:
+
+    - `record_len` (B,) int64: how many agents each item has; they add up to N.
+    - `pairwise_t_matrix` (B, L, L, 4, 4) float32, L = 5: [b, i, j] takes points of agent i's ego frame to agent j's,
+      `j_from_i` = `ego_from_j`⁻¹ · `ego_from_i`, at the present, so that [b, i, 0] leads to the sample's own agent.
+      Augmented as the points are, with the link's errors. The identity on the diagonal and beyond `record_len`.
+
+    OpenCOOD's own frames are the LiDARs', left-handed as CARLA's are; these are ego frames, right-handed, as all here.
+    """
+    import torch
+
+    present = [item["agent_valid"][:, -1] for item in items]
+    batch = collate([{key: value for key, value in item.items() if key not in _OF_AGENTS} for item in items])
+    for key in _OF_AGENTS:
+        if key in items[0]:
+            batch[key] = torch.cat([item[key][kept] for item, kept in zip(items, present, strict=True)])
+    kept_rows = [kept.nonzero()[:, 0].tolist() for kept in present]
+    batch["agents"] = [tuple(item["agents"][row] for row in rows) for item, rows in zip(items, kept_rows, strict=True)]
+    if "points" in batch:
+        batch["points"] = [item["points"][row] for item, rows in zip(items, kept_rows, strict=True) for row in rows]
+    batch["record_len"] = torch.tensor([len(rows) for rows in kept_rows])
+    batch["pairwise_t_matrix"] = torch.stack(
+        [_pairwise(item["ego_from_agent"][kept, -1]) for item, kept in zip(items, present, strict=True)]
+    )
+    return batch
+
+
+def _pairwise(ego_from_agent: Tensor) -> Tensor:
+    """(L, L, 4, 4) of (n, 4, 4), padded with identities."""
+    import torch
+
+    count = len(ego_from_agent)
+    exact = ego_from_agent.double()
+    result = torch.eye(4).repeat(len(AGENTS), len(AGENTS), 1, 1)
+    result[:count, :count] = (torch.linalg.inv(exact)[None, :] @ exact[:, None]).float()
+    result[range(count), range(count)] = torch.eye(4)
+    return result
+
+
+def _with_agents(key: str, value: Tensor, count: int) -> Tensor:
+    """A tensor (A, …) with as many blank agents behind as there must be."""
+    import torch
+
+    missing = count - len(value)
+    if not missing:
+        return value
+    blank = torch.zeros((missing, *value.shape[1:]), dtype=value.dtype)
+    if key in _MATRICES:
+        blank[...] = torch.eye(value.shape[-1])
+    return torch.cat([value, blank])

@@ -1,0 +1,95 @@
+"""`V2XConfig`: what the items of a `V2XDataset` hold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from deepaccident_devkit.dataset import Visible
+from deepaccident_devkit.errors import ChoiceError, ConfigError
+from deepaccident_devkit.export.torch.images import ImageConfig
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.motion import Augmentation, MotionLabelConfig
+from deepaccident_devkit.motion.warps.warping import WarpMode
+from deepaccident_devkit.v2x import Agents, Link
+
+BoxSource = Literal["sample", "cooperative"]
+AugmentationSource = Augmentation | Callable[[np.random.Generator], Augmentation]
+"""The same for all items, or a draw for each (`RandomAugmentation`; a lambda does not reach spawned workers)."""
+_DEFAULT_STEP = 5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class V2XConfig:
+    """What an item holds and how it is made; checked when made, raises ConfigError or ChoiceError.
+
+    Attributes:
+        agents: who cooperates with the sample's own agent, which is always there and first: a configuration, its name,
+            agents' names, or None for all that are there (`v2x.Agents`).
+        link: what happens to the partners' sensor data and poses; boxes and labels are the truth and stay it.
+        past: frames of sensor data, the present included.
+        step: recorded frames (0.1 s) between them; None for the labels' own step, else 5 (2 Hz).
+        images: None for no images and cameras.
+        points: whether to load point clouds.
+        boxes: `sample` for those that the sample's agent annotated, `cooperative` for the union of what the
+            cooperating agents annotated (`v2x.cooperative_boxes`: the sample's own agent among them, where another one
+            annotated it), None for none.
+        visible: which of them: `released`, `camera`, or None for all, own rows among them (`DeepAccident.boxes`,
+            `v2x.cooperative_boxes`).
+        labels: the motion labels; None for none. Whose sight counts for them is their own `agents`, what augments
+            them is this configuration's `augmentation`.
+        to_present: warp the labels to the present ego frame and sample centerness this way: `nearest` as the released
+            training, `bilinear` as its evaluation. None: each frame in its own ego frame.
+        bev_segmentation: cells of the segmentation targets from the BEV camera; None for none.
+        augmentation: A, applied to all that stands in an ego frame; None for none.
+        seed: of the augmentations drawn.
+    """
+
+    agents: Agents = "single"
+    link: Link | None = None
+    past: int = 1
+    step: int | None = None
+    images: ImageConfig | None = None
+    points: bool = True
+    boxes: BoxSource | None = "sample"
+    visible: Visible | None = "released"
+    labels: MotionLabelConfig | None = None
+    to_present: WarpMode | None = "nearest"
+    bev_segmentation: BevGrid | None = None
+    augmentation: AugmentationSource | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check and complete."""
+        if self.step is None:
+            object.__setattr__(self, "step", _DEFAULT_STEP if self.labels is None else self.labels.step)
+        for name, least in (("past", 1), ("step", 1), ("seed", 0)):
+            value = getattr(self, name)
+            if not isinstance(value, int) or isinstance(value, bool) or value < least:
+                raise ConfigError(f"{name}: expected a whole number from {least}, found {value!r}")
+        for name, value, choices in (
+            ("boxes", self.boxes, get_args(BoxSource)),
+            ("visible", self.visible, get_args(Visible)),
+            ("to_present", self.to_present, get_args(WarpMode)),
+        ):
+            if value is not None and value not in choices:
+                raise ChoiceError(f"{name}: expected None or one of {', '.join(choices)}, found {value!r}")
+        if self.labels is not None and self.labels.augmentation is not None:
+            raise ConfigError(
+                "labels: their augmentation is that of boxes, points and poses; give V2XConfig(augmentation=…) alone"
+            )
+        if not (
+            self.augmentation is None or isinstance(self.augmentation, Augmentation) or callable(self.augmentation)
+        ):
+            raise ConfigError(
+                f"augmentation: expected an Augmentation or a function that draws one, found {self.augmentation!r}"
+            )
+
+    def augmentation_of(self, epoch: int, index: int) -> Augmentation:
+        """The augmentation of an item in an epoch: it depends on these two and the seed alone."""
+        if self.augmentation is None or isinstance(self.augmentation, Augmentation):
+            return self.augmentation or Augmentation()
+        return self.augmentation(np.random.default_rng([self.seed, epoch, index]))

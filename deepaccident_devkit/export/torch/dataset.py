@@ -1,0 +1,218 @@
+"""`V2XDataset`: cooperative samples of a release as a map-style torch dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike
+
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import ConfigError, NotAvailableError
+from deepaccident_devkit.export.torch import sensor_data
+from deepaccident_devkit.export.torch.augmentation import augmented_boxes, augmented_six_vectors
+from deepaccident_devkit.export.torch.config import V2XConfig
+from deepaccident_devkit.motion import Augmentation, MotionLabelConfig, bev_segmentation
+from deepaccident_devkit.motion.sample_labels import motion_labels
+from deepaccident_devkit.v2x import cooperative_boxes
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    # without torch's types mypy would see an Any here, which strict forbids as a base
+    TorchDataset = object
+else:
+    from torch.utils.data import Dataset as TorchDataset
+
+
+class V2XDataset(TorchDataset):
+    """Samples of a release with what cooperating agents add to them; an item is a dict of tensors.
+
+    Everything is right-handed: x forward, y left, z up; metres, radians, seconds. With an augmentation A, each agent's
+    ego frame is the augmented one: points are A p, poses between ego frames A W A⁻¹, and so on; images stay. A is the
+    number of agents, the sample's own first, P of frames, the present last, C of cameras, T and R of label frames
+    (`motion.MotionLabels`), H × W a grid's rows and columns in its own orientation.
+
+    Always:
+
+    - `token`: str. `agents`: their names, a tuple of A.
+    - `agent_valid` (A, P) bool: False where the link lost a message, or the frame is before the recording. There
+      clouds are empty, images 0 and matrices the identity.
+    - `ego_from_agent` (A, P, 4, 4) float32: where the sample's agent, at the present, believes the sender's ego frame
+      at that frame to be, pose noise included. [0, −1] is the identity, [0, :] the agent's own motion.
+    - `world_from_ego` (4, 4) float64: of the sample's agent at the present; takes augmented coordinates.
+    - `augmentation` (4, 4) float32: A.
+
+    With `points`: `points`, a list of A lists of P clouds (N, 4) float32: x y z in the sender's own ego frame at that
+    frame, and the intensity.
+
+    With `images`:
+
+    - `images` (A, P, C, 3, h, w), RGB, as `ImageConfig` says.
+    - `intrinsics` (A, P, C, 3, 3) float32, of the resized and cropped image; pixel centres are at halves.
+    - `ego_from_camera` (A, P, C, 4, 4) float32: the sender's ego frame from the optical camera frame (with A before
+      it, so neither rigid nor right-handed under scale and flip).
+    - `image_from_ego` (A, P, C, 4, 4) float32: point of the sender's ego frame → (u · d, v · d, d, 1), depth d.
+
+    With `boxes`, M of them in the ego frame of the sample's agent at the present:
+
+    - `boxes` (M, 9) float32: x y z l w h yaw vx vy; z of the centre. `velocity_known` (M,) bool: False where vx and vy
+      are 0 because they are not known.
+    - `categories` (M,) int64, positions in `taxonomy.CATEGORIES`. `actor_ids` (M,) int64, as the label has them (−100
+      is the agent's own row) or, of cooperative boxes, CARLA's; −1 is untracked.
+
+    With `labels`, all at the present or each frame in its own ego frame, as `to_present` says:
+
+    - `segmentation` (T, H, W) int64, `instance` (T, H, W) int64, `centerness` (T, 1, H, W) float32, `offset` and
+      `flow` (T, 2, H, W) float32.
+    - `future_egomotion` (R, 6) float32: `next_from_this` from the first past frame on, of augmented ego frames.
+    - `label_valid` (T,) bool: the frames that are in the recording.
+
+    With `bev_segmentation`: `bev_segmentation` (5, H, W) bool, classes as `motion.BEV_CLASSES`, and `bev_known`
+    (H, W) bool (`motion.BevSegmentation`).
+
+    Items depend on the configuration, the epoch and the index alone, not on workers. The dataset pickles cheaply and
+    may be used in forked and in spawned workers.
+    """
+
+    def __init__(self, dataset: Dataset, tokens: Iterable[RowArgument], config: V2XConfig | None = None) -> None:
+        """Choose samples, such as those of `motion.samples`, and what their items hold.
+
+        Args:
+            dataset: the release.
+            tokens: tokens or records of samples; an item each, in this order.
+            config: what an item holds; None for the agent's own points and boxes.
+
+        Raises:
+            TokenError: no such sample.
+            NotAvailableError: labels are wanted of a sample that has none, or an agent is not in this (partial)
+                release.
+            ConfigError: the link's latency is longer than the past of a sample.
+        """
+        import torch
+
+        self.config = config or V2XConfig()
+        self._dataset = dataset
+        self._rows = np.array([dataset.getind("sample", token) for token in tokens], dtype=np.int64)
+        self._check_labelled()
+        self._check_latency()
+        # shared, so that workers that outlive an epoch hear of the next one
+        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
+
+    def __len__(self) -> int:
+        """Number of samples."""
+        return len(self._rows)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Say which epoch follows, before its loader is iterated: other augmentations are drawn."""
+        self._epoch.fill_(epoch)
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        """The item of a sample, as the class says.
+
+        Raises:
+            IndexError: no such item.
+            MissingFileError: a sensor file was not downloaded.
+            SensorFileError: one cannot be read.
+            ConfigError: images of different sizes without `resize`, or smaller than the crop.
+        """
+        position = range(len(self))[index]
+        sample = self._dataset.sample[int(self._rows[position])]["token"]
+        augmentation = self.config.augmentation_of(int(self._epoch), position)
+        item = self._received_item(sample, augmentation)
+        if self.config.boxes is not None:
+            item |= self._box_item(sample, augmentation)
+        if self.config.labels is not None:
+            item |= self._label_item(sample, self.config.labels, augmentation)
+        if self.config.bev_segmentation is not None:
+            target = bev_segmentation(self._dataset, sample, self.config.bev_segmentation, augmentation=augmentation)
+            item |= {"bev_segmentation": _tensor(target.masks), "bev_known": _tensor(target.known)}
+        return item
+
+    def _received_item(self, sample: str, augmentation: Augmentation) -> dict[str, Any]:
+        """What holds of a sample itself, and what arrived of sensor data."""
+        dataset, config = self._dataset, self.config
+        names = sensor_data.participants(dataset, sample, config.agents)
+        arrived = sensor_data.received(dataset, sample, names, config)
+        world_from_ego = dataset.world_from(sample, "ego").matrix @ np.linalg.inv(augmentation.matrix)
+        item: dict[str, Any] = {
+            "token": sample,
+            "agents": names,
+            "agent_valid": _tensor(sensor_data.valid_mask(names, arrived)),
+            "ego_from_agent": _tensor(sensor_data.relative_poses(dataset, sample, names, arrived, augmentation)),
+            "world_from_ego": _tensor(world_from_ego),
+            "augmentation": _tensor(augmentation.matrix, np.float32),
+        }
+        if config.points:
+            clouds = sensor_data.point_clouds(dataset, names, arrived, augmentation)
+            item["points"] = [[_tensor(cloud) for cloud in of_agent] for of_agent in clouds]
+        if config.images is not None:
+            arrays = sensor_data.camera_arrays(dataset, names, arrived, augmentation, config.images)
+            item |= {name: _tensor(array) for name, array in arrays.items()}
+        return item
+
+    def _box_item(self, sample: str, augmentation: Augmentation) -> dict[str, Tensor]:
+        visible = self.config.visible
+        if self.config.boxes == "cooperative":
+            names = sensor_data.participants(self._dataset, sample, self.config.agents)
+            boxes = cooperative_boxes(self._dataset, sample, agents=names, frame="ego", visible=visible)
+        else:
+            boxes = self._dataset.boxes(sample, "ego", visible)
+        return {
+            "boxes": _tensor(np.nan_to_num(augmented_boxes(boxes, augmentation)), np.float32),
+            "velocity_known": _tensor(np.isfinite(boxes.velocity).all(axis=1)),
+            "categories": _tensor(boxes.category, np.int64),
+            "actor_ids": _tensor(boxes.actor_id),
+        }
+
+    def _label_item(self, sample: str, config: MotionLabelConfig, augmentation: Augmentation) -> dict[str, Tensor]:
+        if self.config.augmentation is not None:
+            config = replace(config, augmentation=augmentation)
+        labels = motion_labels(self._dataset, sample, config)
+        if self.config.to_present is not None:
+            labels = labels.to_present(centerness=self.config.to_present)
+        return {
+            "segmentation": _tensor(labels.segmentation, np.int64),
+            "instance": _tensor(labels.instance, np.int64),
+            "centerness": _tensor(labels.centerness),
+            "offset": _tensor(labels.offset),
+            "flow": _tensor(labels.flow),
+            "future_egomotion": _tensor(augmented_six_vectors(labels.future_egomotion, augmentation), np.float32),
+            "label_valid": _tensor(labels.label_valid),
+        }
+
+    def _check_labelled(self) -> None:
+        if self.config.labels is None:
+            return
+        bare = self._rows[~self._dataset.columns("sample")["labelled"][:][self._rows]]
+        if len(bare):
+            raise NotAvailableError(
+                f"{len(bare)} of the {len(self)} samples have no label, such as "
+                f"{self._dataset.sample[int(bare[0])]['token']} (the test split ships without them); leave them out, "
+                "or choose labels=None"
+            )
+
+    def _check_latency(self) -> None:
+        """Partners' data from before a recording are an error at any sample: better now than within an epoch."""
+        frames = 0 if self.config.link is None else self.config.link.latency_frames
+        samples, scenarios = self._dataset.columns("sample"), self._dataset.columns("scenario")
+        first = scenarios["first_frame_row"][samples["scenario_row"][self._rows]]
+        early = self._rows[samples["frame_row"][self._rows] - first < frames]
+        tokens = [self._dataset.sample[row]["token"] for row in early.tolist()]
+        alone = [len(sensor_data.participants(self._dataset, token, self.config.agents)) == 1 for token in tokens]
+        refused = [token for token, without in zip(tokens, alone, strict=True) if not without]
+        if refused:
+            raise ConfigError(
+                f"latency: {len(refused)} of the {len(self)} samples are within the first {frames / 10} s of their "
+                f"scenario, such as {refused[0]}, so that partners' data would be from before it; leave them out, or "
+                "choose a shorter latency"
+            )
+
+
+def _tensor(values: ArrayLike, dtype: DTypeLike | None = None) -> Tensor:
+    """A tensor with memory of its own: the devkit's arrays are read-only, which torch does not know."""
+    import torch
+
+    return torch.from_numpy(np.array(values, dtype=dtype, order="C"))

@@ -1,0 +1,119 @@
+"""Camera images as a model takes them: resized, cropped, scaled; with intrinsics that keep pace."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Literal, get_args
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, ByteArray, FloatArray
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.taxonomy import CAMERAS
+from deepaccident_devkit.v2x.projection import camera_of
+
+ImageDtype = Literal["float32", "uint8"]
+_NO_MEAN: Final = (0.0, 0.0, 0.0)
+_NO_STD: Final = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImageConfig:
+    """How images are made ready; checked when made, raises ConfigError.
+
+    Attributes:
+        resize: height and width that a whole image is resized to; None leaves it as it is stored.
+        crop: top, left, height and width of the part to keep, in pixels of the resized image; None keeps all.
+        dtype: `float32` in [0, 1], or `uint8` as decoded.
+        mean: subtracted from the channels R, G, B in [0, 1]; `float32` only.
+        std: what they are divided by then.
+        cameras: which ones, and in which order.
+    """
+
+    resize: tuple[int, int] | None = None
+    crop: tuple[int, int, int, int] | None = None
+    dtype: ImageDtype = "float32"
+    mean: tuple[float, float, float] = _NO_MEAN
+    std: tuple[float, float, float] = _NO_STD
+    cameras: tuple[str, ...] = CAMERAS
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        if self.resize is not None and not _are_pixels(self.resize, (1, 1)):
+            raise ConfigError(f"resize: expected height and width in pixels, found {self.resize}")
+        if self.crop is not None:
+            if not _are_pixels(self.crop, (0, 0, 1, 1)):
+                raise ConfigError(f"crop: expected top, left, height and width in pixels, found {self.crop}")
+            if self.resize is not None:
+                _check_crop(self.crop, self.resize)
+        if self.dtype not in get_args(ImageDtype):
+            raise ConfigError(f"dtype: expected one of {', '.join(get_args(ImageDtype))}, found {self.dtype!r}")
+        if not (_are_channels(self.mean) and _are_channels(self.std) and min(self.std) > 0):
+            raise ConfigError(f"mean and std: expected three numbers each, std above 0; found {self.mean}, {self.std}")
+        if self.dtype == "uint8" and (self.mean, self.std) != (_NO_MEAN, _NO_STD):
+            raise ConfigError("mean and std: uint8 images are as decoded; choose dtype='float32', or leave them out")
+        unknown = [camera for camera in self.cameras if camera not in CAMERAS]
+        if unknown or not self.cameras or len(set(self.cameras)) != len(self.cameras):
+            raise ConfigError(f"cameras: expected some of {', '.join(CAMERAS)}, each once; found {self.cameras}")
+
+    def load(self, dataset: Dataset, camera: RowArgument) -> tuple[ByteArray, FloatArray]:
+        """An image (h, w, 3) uint8 RGB, resized and cropped, and the intrinsic (3, 3) that belongs to it.
+
+        The intrinsic is for pixels whose centres are at halves, as everywhere in the devkit: a point at (u, v) of the
+        whole image is at (u · width' / width − left, v · height' / height − top).
+
+        Raises:
+            TokenError: no such image.
+            MissingFileError: it was not downloaded.
+            SensorFileError: it cannot be read.
+            ConfigError: the crop reaches beyond the image.
+        """
+        from PIL import Image
+
+        lens, image = camera_of(dataset, camera), dataset.load_image(camera)
+        if self.resize is not None and image.shape[:2] != self.resize:
+            image = np.asarray(Image.fromarray(image).resize(self.resize[::-1], Image.Resampling.BILINEAR))
+        height, width = image.shape[:2]
+        intrinsic: FloatArray = np.diag([width / lens.width, height / lens.height, 1.0]) @ lens.intrinsic
+        if self.crop is not None:
+            _check_crop(self.crop, (height, width))
+            top, left, height, width = self.crop
+            image = image[top : top + height, left : left + width]
+            intrinsic[:2, 2] -= (left, top)
+        return image, intrinsic
+
+    def stacked(self, images: list[ByteArray]) -> AnyArray:
+        """Images of one size as one array (C, 3, h, w) of `dtype`. Raises ConfigError if their sizes differ."""
+        sizes = sorted({image.shape[:2] for image in images})
+        if len(sizes) > 1:
+            raise ConfigError(f"the cameras' images have different sizes, {sizes[0]} and {sizes[-1]}; choose resize=")
+        pixels = np.ascontiguousarray(np.stack(images).transpose(0, 3, 1, 2))
+        if self.dtype == "uint8":
+            return pixels
+        scaled = pixels.astype(np.float32) / np.float32(255)
+        if (self.mean, self.std) == (_NO_MEAN, _NO_STD):
+            return scaled
+        mean, std = (np.array(three, dtype=np.float32)[:, None, None] for three in (self.mean, self.std))
+        return (scaled - mean) / std
+
+
+def _are_pixels(numbers: Sequence[object], least: Sequence[int]) -> bool:
+    return len(numbers) == len(least) and all(
+        isinstance(number, int) and number >= low for number, low in zip(numbers, least, strict=True)
+    )
+
+
+def _are_channels(numbers: Sequence[float]) -> bool:
+    return len(numbers) == 3 and all(math.isfinite(number) for number in numbers)
+
+
+def _check_crop(crop: tuple[int, int, int, int], size: tuple[int, int]) -> None:
+    top, left, height, width = crop
+    if top + height > size[0] or left + width > size[1]:
+        raise ConfigError(
+            f"crop: rows {top} to {top + height} and columns {left} to {left + width} reach beyond an image of "
+            f"{size[0]} × {size[1]} (height × width); choose a smaller part"
+        )

@@ -1,0 +1,164 @@
+"""What cooperating agents' sensors contribute to a sample, as arrays (agents × past frames × …)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.export.torch.augmentation import augmented_points, augmented_pose
+from deepaccident_devkit.export.torch.config import V2XConfig
+from deepaccident_devkit.export.torch.images import ImageConfig
+from deepaccident_devkit.motion import Augmentation
+from deepaccident_devkit.tables.tokens import sample_token
+from deepaccident_devkit.taxonomy import AgentName
+from deepaccident_devkit.v2x import Agents, Link, cooperating_agents
+from deepaccident_devkit.v2x.messages import Message, messages
+
+_NO_POINTS: Final = np.zeros((0, 4), dtype=np.float32)
+Received = Sequence[Mapping[AgentName, Message]]
+"""By past frame, the present last: the messages that are there, by sender."""
+
+
+def participants(dataset: Dataset, sample: str, agents: Agents) -> tuple[AgentName, ...]:
+    """The sample's own agent and those that cooperate with it; errors as of `v2x.cooperating_agents`."""
+    own = cooperating_agents(dataset, sample, "single")
+    return tuple(dict.fromkeys([*own, *cooperating_agents(dataset, sample, agents)]))
+
+
+def received(dataset: Dataset, sample: str, names: tuple[AgentName, ...], config: V2XConfig) -> Received:
+    """What arrives at a sample and at the `config.past` − 1 moments before it, each as the link would have it then.
+
+    A moment before the recording began has no messages, one that latency puts there none of partners; at the sample
+    itself that is an error.
+
+    Raises:
+        ConfigError: the link's latency is longer than the scenario's past at the present.
+    """
+    scenario, ego, number = sample.rsplit("/", 2)
+    result: list[dict[AgentName, Message]] = []
+    for steps_back in range(config.past - 1, -1, -1):
+        index = int(number) - steps_back * (config.step or 1)
+        if index < 1:
+            result.append({})
+            continue
+        heard = names if not steps_back or _reaches(config.link, index) else names[:1]
+        then = sample_token(scenario, ego, index)
+        result.append({message.agent: message for message in messages(dataset, then, heard, config.link)})
+    return result
+
+
+def _reaches(link: Link | None, index: int) -> bool:
+    return link is None or index > link.latency_frames
+
+
+def valid_mask(names: Sequence[AgentName], arrived: Received) -> BoolArray:
+    """(A, P) bool, which messages are there."""
+    return np.array([[name in moment for moment in arrived] for name in names])
+
+
+def relative_poses(
+    dataset: Dataset, sample: str, names: Sequence[AgentName], arrived: Received, augmentation: Augmentation
+) -> AnyArray:
+    """`ego_from_agent` (A, P, 4, 4) float32: augmented, with the link's errors; the identity where nothing is there."""
+    ego_from_world = dataset.world_from(sample, "ego").inverse()
+    poses = np.tile(np.eye(4), (len(names), len(arrived), 1, 1))
+    for a, name in enumerate(names):
+        for p, moment in enumerate(arrived):
+            if name in moment and moment[name].sample != sample:
+                pose = moment[name].target_from(dataset, "ego", ego_from_world).matrix
+                poses[a, p] = augmented_pose(pose, augmentation)
+    return poses.astype(np.float32)
+
+
+def point_clouds(
+    dataset: Dataset, names: Sequence[AgentName], arrived: Received, augmentation: Augmentation
+) -> list[list[AnyArray]]:
+    """By agent and moment (N, 4) float32: x y z in the sender's own augmented ego frame, intensity.
+
+    Raises:
+        MissingFileError: a point cloud was not downloaded.
+        SensorFileError: one cannot be read.
+    """
+
+    def cloud(message: Message) -> AnyArray:
+        return augmented_points(dataset.load_point_cloud(message.sample, "ego"), augmentation)
+
+    return [[cloud(moment[name]) if name in moment else _NO_POINTS for moment in arrived] for name in names]
+
+
+def camera_arrays(
+    dataset: Dataset,
+    names: Sequence[AgentName],
+    arrived: Received,
+    augmentation: Augmentation,
+    config: ImageConfig,
+) -> dict[str, AnyArray]:
+    """All agents' C cameras; where nothing is there images are 0 and matrices the identity.
+
+    Returns:
+        `images` (A, P, C, 3, h, w) as the configuration says, and, all float32, `intrinsics` (A, P, C, 3, 3),
+        `ego_from_camera` (A, P, C, 4, 4) and `image_from_ego` (A, P, C, 4, 4), the ego frames being the senders' own
+        augmented ones.
+
+    Raises:
+        MissingFileError: an image was not downloaded.
+        SensorFileError: one cannot be read.
+        ConfigError: images have different sizes, or the crop reaches beyond them.
+    """
+    seen = {
+        (a, p): _cameras_of(dataset, moment[name].sample, augmentation, config)
+        for a, name in enumerate(names)
+        for p, moment in enumerate(arrived)
+        if name in moment
+    }
+    result: dict[str, AnyArray] = {}
+    for key, blank_like in _BLANK.items():
+        parts = {place: arrays[key] for place, arrays in seen.items()}
+        example = next(iter(parts.values()))
+        for part in parts.values():
+            if part.shape != example.shape:
+                raise ConfigError(
+                    f"agents' images have different sizes, {example.shape[2:]} and {part.shape[2:]}; choose resize="
+                )
+        blank = blank_like(example)
+        result[key] = np.stack(
+            [np.stack([parts.get((a, p), blank) for p in range(len(arrived))]) for a in range(len(names))]
+        )
+    return result
+
+
+def _cameras_of(dataset: Dataset, sample: str, augmentation: Augmentation, config: ImageConfig) -> dict[str, AnyArray]:
+    """One agent's cameras at one moment, as `camera_arrays` without the first two axes."""
+    ego_from_world = dataset.world_from(sample, "ego").inverse()
+    images, intrinsics, poses = [], [], []
+    for channel in config.cameras:
+        image, intrinsic = config.load(dataset, f"{sample}/{channel}")
+        images.append(image)
+        intrinsics.append(intrinsic)
+        poses.append((ego_from_world @ dataset.world_from(sample, channel)).matrix)
+    ego_from_camera: FloatArray = augmentation.matrix @ np.stack(poses)
+    projection = np.tile(np.eye(4), (len(images), 1, 1))
+    projection[:, :3, :3] = intrinsics
+    return {
+        "images": config.stacked(images),
+        "intrinsics": np.stack(intrinsics).astype(np.float32),
+        "ego_from_camera": ego_from_camera.astype(np.float32),
+        "image_from_ego": (projection @ np.linalg.inv(ego_from_camera)).astype(np.float32),
+    }
+
+
+def _identities(like: AnyArray) -> AnyArray:
+    return np.broadcast_to(np.eye(like.shape[-1], dtype=like.dtype), like.shape)
+
+
+_BLANK: Final[Mapping[str, Callable[[AnyArray], AnyArray]]] = {
+    "images": np.zeros_like,
+    "intrinsics": _identities,
+    "ego_from_camera": _identities,
+    "image_from_ego": _identities,
+}

@@ -1,0 +1,44 @@
+"""A rotation, scale and flip of the bird's-eye view, applied to boxes, labels and poses alike (evaluation.md a)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.errors import ConfigError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Augmentation:
+    """What training does to the ground plane: first turn, then scale, then mirror; right-handed.
+
+    Attributes:
+        rotation: radians about z, counter-clockwise.
+        scale: factor of all lengths.
+        flip: mirror left and right: y changes its sign.
+    """
+
+    rotation: float = 0.0
+    scale: float = 1.0
+    flip: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the numbers; raises ConfigError."""
+        if not math.isfinite(self.rotation):
+            raise ConfigError(f"augmentation: rotation is {self.rotation}; choose finite radians")
+        if not 0 < self.scale < math.inf:
+            raise ConfigError(f"augmentation: scale is {self.scale}; choose a factor above 0, 1 for none")
+
+    @property
+    def matrix(self) -> FloatArray:
+        """(4, 4) A = flip · scale · rotation, right-handed, metres: points of the ego frame to augmented ones."""
+        cosine, sine = math.cos(self.rotation), math.sin(self.rotation)
+        turn = np.eye(4)
+        turn[:2, :2] = [[cosine, -sine], [sine, cosine]]
+        mirror = np.diag([1.0, -1.0 if self.flip else 1.0, 1.0, 1.0])
+        stretch = np.diag([self.scale, self.scale, self.scale, 1.0])
+        result: FloatArray = mirror @ stretch @ turn
+        return result

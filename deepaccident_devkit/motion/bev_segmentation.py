@@ -1,0 +1,125 @@
+"""Targets of BEV semantic segmentation, from what the camera above the agent saw."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from deepaccident_devkit.arrays import BoolArray, IntArray, readonly
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import ChoiceError, ConfigError
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.motion.augmentation import Augmentation
+from deepaccident_devkit.release import BevImage
+from deepaccident_devkit.release.bev_camera import TAGS
+from deepaccident_devkit.taxonomy import BEV_RESOLUTION, BEV_SHAPE
+
+BEV_CLASSES: Final = ("road", "lane_line", "sidewalk", "vehicle", "pedestrian")
+"""The classes of the targets, in their order."""
+_TAGS: Final = tuple(TAGS[tag] for tag in ("road", "road_line", "sidewalk", "vehicle", "pedestrian"))
+COVERAGE: Final[Mapping[str, float]] = {
+    "road": 0.5,
+    "lane_line": 0.0,
+    "sidewalk": 0.5,
+    "vehicle": 0.5,
+    "pedestrian": 0.0,
+}
+"""The share of a cell that a class must cover; 0: any bit of it, as for what is thinner than a cell."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BevSegmentation:
+    """What covers each cell around an agent, by class; arrays are read-only.
+
+    Attributes:
+        grid: the cells and how they lie.
+        masks: (5, H, W) bool, a layer a class of `BEV_CLASSES`. Only what is seen from above: no road beneath a car,
+            nothing beneath a bridge or a tree.
+        known: (H, W) bool, whether the cell is within the camera's ±60 m; beside it all masks are False.
+    """
+
+    grid: BevGrid
+    masks: BoolArray
+    known: BoolArray
+
+    def __post_init__(self) -> None:
+        """Freeze the arrays."""
+        object.__setattr__(self, "masks", readonly(self.masks))
+        object.__setattr__(self, "known", readonly(self.known))
+
+    def mask(self, name: str) -> BoolArray:
+        """(H, W) bool, the layer of a class. Raises ChoiceError."""
+        if name not in BEV_CLASSES:
+            raise ChoiceError(f"class: expected one of {', '.join(BEV_CLASSES)}, found {name!r}")
+        layer: BoolArray = self.masks[BEV_CLASSES.index(name)]
+        return layer
+
+
+def bev_segmentation(
+    dataset: Dataset,
+    sample: RowArgument,
+    grid: BevGrid | None = None,
+    *,
+    coverage: Mapping[str, float] | None = None,
+    augmentation: Augmentation | None = None,
+) -> BevSegmentation:
+    """The segmentation targets of a sample on a grid of its ego frame.
+
+    Args:
+        dataset: the release.
+        sample: token or record.
+        grid: cells, right-handed metres; None for ±50 m in cells of 0.5 m.
+        coverage: class → share of a cell in [0, 1) that it must cover, where it is to differ from `COVERAGE`.
+        augmentation: turns, scales or mirrors the ground as it does labels; None for none.
+
+    Raises:
+        TokenError: no such sample.
+        ConfigError: a class in `coverage` does not exist, or its share is none.
+        MissingFileError: the BEV camera's file was not downloaded (the test split has none).
+        SensorFileError: it cannot be read.
+    """
+    return segmentation_of(dataset.load_bev(sample), grid or BevGrid(), coverage=coverage, augmentation=augmentation)
+
+
+def segmentation_of(
+    image: BevImage,
+    grid: BevGrid,
+    *,
+    coverage: Mapping[str, float] | None = None,
+    augmentation: Augmentation | None = None,
+) -> BevSegmentation:
+    """The targets on a grid, from a BEV camera's array; arguments and errors as of `bev_segmentation`."""
+    shares = {**COVERAGE, **(coverage or {})}
+    for name, share in shares.items():
+        if name not in BEV_CLASSES:
+            raise ConfigError(f"coverage: expected classes of {', '.join(BEV_CLASSES)}, found {name!r}")
+        if not 0 <= share < 1:
+            raise ConfigError(f"coverage: {name} is {share}; choose a share of a cell from 0, below 1")
+    index = _pixels_of_cells(grid, augmentation)
+    tags = np.append(image.semantic.reshape(-1), np.uint8(0))[index]
+    needed = [max(1, math.ceil(shares[name] * index.shape[-1])) for name in BEV_CLASSES]
+    layers = [np.count_nonzero(tags == tag, axis=-1) >= pixels for tag, pixels in zip(_TAGS, needed, strict=True)]
+    known: BoolArray = np.all(index < image.semantic.size, axis=-1)
+    return BevSegmentation(grid=grid, masks=np.stack(layers), known=known)
+
+
+@functools.lru_cache(maxsize=4)
+def _pixels_of_cells(grid: BevGrid, augmentation: Augmentation | None) -> IntArray:
+    """(H, W, P) flat indices of the pixels at P points spread evenly over each cell; beside the image its size."""
+    size_x, size_y = grid.x[2], grid.y[2]
+    per_cell = [max(1, round(size / BEV_RESOLUTION)) for size in (size_x, size_y)]
+    within = [(np.arange(count) + 0.5) / count - 0.5 for count in per_cell]
+    spread = np.stack(np.meshgrid(within[0] * size_x, within[1] * size_y), axis=-1).reshape(-1, 2)
+    points = grid.centers()[:, :, None] + spread
+    if augmentation is not None:
+        points = points @ np.linalg.inv(augmentation.matrix)[:2, :2].T
+    # pixel centres are at multiples of the resolution from the middle of the image, half a pixel off
+    row, column = (np.rint(BEV_SHAPE[axis] / 2 - 0.5 - points[..., axis] / BEV_RESOLUTION) for axis in (0, 1))
+    inside = (row >= 0) & (row < BEV_SHAPE[0]) & (column >= 0) & (column < BEV_SHAPE[1])
+    index = np.where(inside, row * BEV_SHAPE[1] + column, BEV_SHAPE[0] * BEV_SHAPE[1]).astype(np.int64)
+    return readonly(index)

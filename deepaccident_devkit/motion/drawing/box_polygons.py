@@ -1,0 +1,247 @@
+"""Which boxes labels show at a frame, and where their corners lie on the ground of the agent's ego frame.
+
+The released code turns label rows into mmdet3d boxes and moves those, all in float32 and CARLA's left-handed frames;
+the cells depend on the rounding, so its steps are repeated here one by one (evaluation.md 0 and a).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, checked, readonly
+from deepaccident_devkit.errors import GeometryError
+from deepaccident_devkit.geometry.handedness import flip_pose
+from deepaccident_devkit.motion.augmentation import Augmentation
+from deepaccident_devkit.motion.config import MotionLabelConfig
+from deepaccident_devkit.motion.labels import OWN_BOX_ID
+from deepaccident_devkit.motion.warps.single_precision import Float32Array, product
+from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID, UNTRACKED_ID
+
+_DEFAULT_SIZE: Final = (3.99, 1.85, 1.62)
+"""The box that the released code draws where it finds no own row: a Lincoln's, by the looks of it."""
+_CORNERS: Final = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]], dtype=np.float32) / 2
+"""mmdet3d's corners 0, 3, 7, 4 from above, in lengths and widths."""
+_UP: Final = np.array([0, 0, 1, 0, 0, 0, 0], dtype=np.float32)
+_PEDESTRIAN: Final = CATEGORIES.index("pedestrian")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FrameBoxes:
+    """What an agent annotated at one moment, in its LiDAR frame, right-handed; arrays are read-only.
+
+    Attributes:
+        center: (N, 3) float64, metres.
+        size: (N, 3) float64, length, width, height, metres.
+        yaw: (N,) float64, heading about z, radians.
+        actor_id: (N,) int64; −100 is the agent's own row, −1 an untracked actor's.
+        category: (N,) int, position in `taxonomy.CATEGORIES`.
+        visible: (N,) bool, whether anybody whose sight counts sees the actor (evaluation.md f).
+        ego_from_lidar: (4, 4) float64.
+    """
+
+    center: FloatArray
+    size: FloatArray
+    yaw: FloatArray
+    actor_id: IntArray
+    category: AnyArray
+    visible: BoolArray
+    ego_from_lidar: FloatArray
+
+    def __post_init__(self) -> None:
+        """Check and freeze; raises GeometryError."""
+        count = len(np.asarray(self.center))
+        shapes: dict[str, tuple[tuple[int, ...], type]] = {
+            "center": ((count, 3), np.float64),
+            "size": ((count, 3), np.float64),
+            "yaw": ((count,), np.float64),
+            "actor_id": ((count,), np.int64),
+            "category": ((count,), np.int64),
+            "visible": ((count,), np.bool_),
+            "ego_from_lidar": ((4, 4), np.float64),
+        }
+        for name, (shape, dtype) in shapes.items():
+            array = checked(f"FrameBoxes.{name}", getattr(self, name), shape, dtype)
+            object.__setattr__(self, name, readonly(array))
+        for name in ("center", "size", "yaw"):
+            if not np.isfinite(getattr(self, name)).all():
+                row = int(np.flatnonzero(~np.isfinite(getattr(self, name).reshape(count, -1)).all(axis=1))[0])
+                raise GeometryError(f"FrameBoxes.{name}: row {row} is not finite; leave such rows out")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FramePolygons:
+    """What is drawn at one moment, in the order drawn; arrays are read-only.
+
+    Attributes:
+        corners: (n, 4, 2) float32, x and y of the footprints' corners in the moment's ego frame, metres,
+            right-handed.
+        key: (n,) int64, actor ids; the ego's own box is −101.
+    """
+
+    corners: AnyArray
+    key: IntArray
+
+    def __post_init__(self) -> None:
+        """Check and freeze; raises GeometryError."""
+        corners = checked("FramePolygons.corners", self.corners, (None, 4, 2), np.float32)
+        object.__setattr__(self, "corners", readonly(corners))
+        object.__setattr__(self, "key", readonly(checked("FramePolygons.key", self.key, (len(corners),), np.int64)))
+
+
+def box_polygons(
+    frames: Sequence[FrameBoxes | None], config: MotionLabelConfig, *, is_vehicle: bool = True
+) -> list[FramePolygons | None]:
+    """What labels show of boxes, frame by frame from the present on.
+
+    Args:
+        frames: the boxes of each label frame; None where there is no recording.
+        config: what is drawn.
+        is_vehicle: whether the agent is one and has a box of its own to draw (the roadside pole has none).
+
+    Returns:
+        A frame's polygons, the ego's own first and the others in the order of their rows; None for None.
+    """
+    there = [number for number, frame in enumerate(frames) if frame is not None]
+    known = [frame for frame in frames if frame is not None]
+    result: list[FramePolygons | None] = [None] * len(frames)
+    if not known:
+        return result
+    boxes, number = _Joined.of(known), np.arange(len(known))
+    moved = _moved(boxes.values, boxes.pose[boxes.frame])
+    own, own_frame = (
+        _own_boxes(known, moved, boxes.pose, config) if config.draw_ego and is_vehicle else (moved[:0], number[:0])
+    )
+    drawn = _drawn(boxes, first=there[0], config=config)
+    others = moved[drawn]
+    if config.augmentation is not None:
+        others = _augmented(others, config.augmentation)
+        if not config.rules.own_box_not_augmented:
+            own = _augmented(own, config.augmentation)
+    frame = np.concatenate([own_frame, boxes.frame[drawn]])
+    order = np.argsort(frame, kind="stable")
+    key = np.concatenate([np.full(len(own), OWN_BOX_ID, dtype=np.int64), boxes.actor_id[drawn]])[order]
+    corners = _corners(np.concatenate([own, others])[order])
+    ends = frame[order].searchsorted(number, side="right").tolist()
+    for index, start, end in zip(there, [0, *ends], ends, strict=False):
+        result[index] = FramePolygons(corners=corners[start:end], key=key[start:end])
+    return result
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Joined:
+    """The rows of several frames, M in all, as the released code holds them.
+
+    Attributes:
+        frame: (M,) which of the frames.
+        values: (M, 7) float32, `_constructed`'s.
+        actor_id: (M,) int64.
+        category: (M,) int64.
+        visible: (M,) bool.
+        pose: (frames, 4, 4) float32, `ego_from_lidar`, left-handed.
+    """
+
+    frame: IntArray
+    values: Float32Array
+    actor_id: IntArray
+    category: AnyArray
+    visible: BoolArray
+    pose: Float32Array
+
+    @classmethod
+    def of(cls, frames: Sequence[FrameBoxes]) -> _Joined:
+        center, size, yaw, actor_id, category, visible = (
+            np.concatenate([getattr(frame, name) for frame in frames])
+            for name in ("center", "size", "yaw", "actor_id", "category", "visible")
+        )
+        return cls(
+            frame=np.repeat(np.arange(len(frames)), [len(frame.actor_id) for frame in frames]),
+            values=_constructed(center, size, yaw),
+            actor_id=actor_id,
+            category=category,
+            visible=visible,
+            pose=flip_pose([frame.ego_from_lidar for frame in frames]).astype(np.float32),
+        )
+
+
+def _drawn(boxes: _Joined, first: int, config: MotionLabelConfig) -> BoolArray:
+    """Which rows are drawn, where frame 0 is number `first`; own rows are not: the ego has a box of its own."""
+    rows: BoolArray = boxes.actor_id != OWN_ACTOR_ID
+    if config.only_vehicle:
+        rows &= boxes.category != _PEDESTRIAN
+    if not config.filter_invisible:
+        return rows
+    ids, actor = np.unique(boxes.actor_id, return_inverse=True)
+    seen = np.zeros((len(boxes.pose), len(ids)), dtype=bool)
+    seen[boxes.frame[boxes.visible], actor[boxes.visible]] = True
+    if config.rules.drawn_when == "present":
+        seen[:] = seen[0] if first == 0 else False
+    elif config.rules.drawn_when == "since":
+        seen = np.logical_or.accumulate(seen)
+    by_id: BoolArray = seen[boxes.frame, actor]
+    if not config.rules.untracked_share_an_id:
+        by_id = np.where(boxes.actor_id == UNTRACKED_ID, boxes.visible, by_id)
+    return rows & by_id
+
+
+def _own_boxes(
+    frames: Sequence[FrameBoxes], moved: Float32Array, pose: Float32Array, config: MotionLabelConfig
+) -> tuple[Float32Array, IntArray]:
+    """The ego's own boxes in the ego frames, at most one a frame, and which frames they are of."""
+    rules, own, of_frame, to_move = config.rules, [], [], []
+    start = 0
+    for number, frame in enumerate(frames):
+        rows = np.flatnonzero(frame.actor_id == OWN_ACTOR_ID)
+        default = rules.own_box_default and len(rows) != 1
+        if default:
+            z = frame.center[0, 2] if len(frame.center) else 0.0
+            own.append(_constructed(np.array([[0, 0, z]]), np.array([_DEFAULT_SIZE]), np.zeros(1))[0])
+        elif len(rows):
+            own.append(moved[start + rows[0]])
+            if rules.own_box_moved_twice:
+                own[-1] = own[-1] - own[-1][5] / 2 * _UP
+        if default or len(rows):
+            of_frame.append(number)
+            to_move.append(default or rules.own_box_moved_twice)
+        start += len(frame.actor_id)
+    boxes, which = np.array(own, dtype=np.float32).reshape(-1, 7), np.array(to_move, dtype=bool)
+    numbers = np.array(of_frame, dtype=np.int64)
+    boxes[which] = _moved(boxes[which], pose[numbers[which]])
+    return boxes, numbers
+
+
+def _constructed(center: FloatArray, size: FloatArray, yaw: FloatArray) -> Float32Array:
+    """mmdet3d's boxes of right-handed ones: (N, 7) float32 x, y (right), z of the bottom, l, w, h, yaw."""
+    boxes = np.column_stack([center * (1, -1, 1), size, yaw]).astype(np.float32)
+    boxes[:, 2] -= boxes[:, 5] / 2
+    return boxes
+
+
+def _moved(boxes: Float32Array, pose: Float32Array) -> Float32Array:
+    """mmdet3d's rotate by the transposed rotations of left-handed poses (N, 4, 4), then translate."""
+    xyz = product(pose[:, :3, :3], boxes[:, :3, None])[..., 0] + pose[:, :3, 3]
+    yaw = boxes[:, 6] + np.arctan2(pose[:, 0, 1], pose[:, 0, 0])
+    return np.column_stack([xyz, boxes[:, 3:6], yaw])
+
+
+def _augmented(boxes: Float32Array, augmentation: Augmentation) -> Float32Array:
+    """mmdet3d's boxes turned, scaled and flipped; the flip swaps front and rear as old mmdet3d does."""
+    turn = replace(augmentation, scale=1.0, flip=False).matrix
+    moved = _moved(boxes, np.broadcast_to(flip_pose(turn).astype(np.float32), (len(boxes), 4, 4)))
+    moved[:, :6] *= np.float32(augmentation.scale)
+    if augmentation.flip:
+        moved[:, 1] *= -1
+        moved[:, 6] = np.float32(np.pi) - moved[:, 6]
+    return moved
+
+
+def _corners(boxes: Float32Array) -> Float32Array:
+    """(N, 4, 2) float32 x forward, y left of mmdet3d's boxes' bottom corners 0, 3, 7, 4."""
+    around = _CORNERS * boxes[:, None, 3:5]
+    cosine, sine = np.cos(boxes[:, 6, None]), np.sin(boxes[:, 6, None])
+    x = around[..., 0] * cosine + around[..., 1] * sine + boxes[:, 0, None]
+    y = around[..., 0] * -sine + around[..., 1] * cosine + boxes[:, 1, None]
+    return np.stack([x, -y], axis=-1)

@@ -1,0 +1,148 @@
+"""From the cells that instances cover to the maps of `MotionLabels`: centres, peaks, offsets and flow.
+
+Counting is done in the protocol's native orientation, in which the released code rounds; the maps are written where
+the configuration's orientation has their cells.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, BoolArray, IntArray
+from deepaccident_devkit.motion.config import MotionLabelConfig
+from deepaccident_devkit.motion.orientations import cells_in, vectors_in
+from deepaccident_devkit.motion.warps.single_precision import Float32Array
+from deepaccident_devkit.motion.warps.warping import native_orientation
+
+_VANISHED: Final = 104.0
+"""exp(−x) is 0 in float32 from here on."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CoveredCells:
+    """The cells that instances cover at some frames, P in all, in one orientation.
+
+    Attributes:
+        frame: (P,) int64, number of the frame.
+        row: (P,) int64.
+        column: (P,) int64.
+        identity: (P,) int64, ids from 1.
+        frames: number of frames.
+        ids: highest id, of whatever frame.
+    """
+
+    frame: IntArray
+    row: IntArray
+    column: IntArray
+    identity: IntArray
+    frames: int
+    ids: int
+
+    def centers(self) -> Float32Array:
+        """(frames, 1 + ids, 2) the cell nearest to the mean of each instance's cells, half to even; NaN without any."""
+        slot, slots = self.frame * (1 + self.ids) + self.identity, self.frames * (1 + self.ids)
+        count = np.bincount(slot, minlength=slots).astype(np.float32)
+        # sums of whole numbers, which float32 holds exactly on all but huge grids: as torch's mean
+        sums = [
+            np.bincount(slot, weights=values, minlength=slots).astype(np.float32) for values in (self.row, self.column)
+        ]
+        with np.errstate(invalid="ignore"):
+            means: Float32Array = np.rint(np.stack(sums, axis=-1) / count[:, None])
+        return means.reshape(self.frames, 1 + self.ids, 2)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LabelMaps:
+    """The maps of `MotionLabels`, T frames in the configuration's orientation."""
+
+    segmentation: AnyArray
+    instance: AnyArray
+    centerness: AnyArray
+    offset: AnyArray
+    flow: AnyArray
+
+    @classmethod
+    def empty(cls, config: MotionLabelConfig) -> LabelMaps:
+        """Maps of frames in which nobody is.
+
+        All in one piece of memory: five pieces of a megabyte each would go back to the system with every sample, and
+        fetching them again takes as long as all the drawing.
+        """
+        frames, (height, width) = config.label_frames, config.grid.shape
+        count = frames * height * width
+        memory = np.empty(count * 25, dtype=np.uint8)
+        memory[: 16 * count].view(np.float32)[:] = config.ignore_index
+        memory[16 * count :] = 0
+        two, one = (frames, 2, height, width), (frames, height, width)
+        return cls(
+            offset=memory[: 8 * count].view(np.float32).reshape(two),
+            flow=memory[8 * count : 16 * count].view(np.float32).reshape(two),
+            centerness=memory[16 * count : 20 * count].view(np.float32).reshape(frames, 1, height, width),
+            instance=memory[20 * count : 24 * count].view(np.int32).reshape(one),
+            segmentation=memory[24 * count :].reshape(one),
+        )
+
+
+def label_maps(
+    covered: CoveredCells, centers: Float32Array, following: Float32Array, missing: BoolArray, config: MotionLabelConfig
+) -> LabelMaps:
+    """What instances and their centres look like as maps.
+
+    Args:
+        covered: what is drawn, native.
+        centers: (T, 1 + ids, 2) each instance's centre, row and column, native; NaN where there is none.
+        following: (T, 1 + ids, 2) where it is at the next frame, seen from this one; NaN where that is not known.
+        missing: (T,) which frames are not in the recording.
+        config: of the labels.
+    """
+    maps, target = LabelMaps.empty(config), config.grid.orientation
+    native = config.grid.with_orientation(native_orientation(config.rules.warp))
+    source, shape = native.orientation, native.shape
+    row, column = cells_in(covered.row, covered.column, shape, source, target)
+    cell = row * config.grid.shape[1] + column
+    maps.segmentation.reshape(-1)[covered.frame * native.cells + cell] = 1
+    maps.instance.reshape(-1)[covered.frame * native.cells + cell] = covered.identity
+    slot = covered.frame * (1 + covered.ids) + covered.identity
+    own, next_one = (places.reshape(-1, 2)[slot].T for places in (centers, following))
+    for raster, vector in (
+        (maps.offset, (own[0] - covered.row, own[1] - covered.column)),
+        (maps.flow, (next_one[0] - own[0], next_one[1] - own[1])),
+    ):
+        down, along = vectors_in(*vector, source, target)
+        known = np.flatnonzero(~np.isnan(down))
+        index = covered.frame[known] * (2 * native.cells) + cell[known]
+        raster.reshape(-1)[index] = down[known]
+        raster.reshape(-1)[index + native.cells] = along[known]
+    frame, identity = np.nonzero(~np.isnan(centers[..., 0]))
+    peak_row, peak_column = centers[frame, identity].astype(np.int64).T
+    peak_row, peak_column = cells_in(peak_row, peak_column, shape, source, target)
+    _draw_peaks(maps.centerness, frame, np.stack([peak_row, peak_column], axis=1), config.sigma)
+    if not config.rules.missing_frames_are_empty:
+        for mark in (maps.segmentation, maps.instance, maps.centerness):
+            mark[missing] = config.ignore_index
+    return maps
+
+
+def _draw_peaks(centerness: AnyArray, frame: IntArray, center: IntArray, sigma: float) -> None:
+    """Draw peaks around centres (n, 2), row and column, of frames (n,) into (T, 1, H, W); the higher one counts."""
+    peak = _peak(sigma)
+    reach, shape = len(peak) // 2, centerness.shape[-2:]
+    first, last = np.maximum(center - reach, 0), np.minimum(center + reach + 1, shape)
+    bounds = np.hstack([first, last, first - center + reach, last - center + reach]).tolist()
+    for number, (top, left, bottom, right, above, before, below, behind) in zip(frame.tolist(), bounds, strict=True):
+        part = centerness[number, 0, top:bottom, left:right]
+        np.maximum(part, peak[above:below, before:behind], out=part)
+
+
+@functools.lru_cache(maxsize=8)
+def _peak(sigma: float) -> Float32Array:
+    """(2 r + 1, 2 r + 1) exp(−d² / σ²) around a centre, in float32 as far as it is above 0."""
+    radius = math.ceil(sigma * math.sqrt(_VANISHED))
+    steps = np.arange(-radius, radius + 1, dtype=np.float32)
+    squares = np.add.outer(steps**2, steps**2) / np.float32(sigma**2)
+    return np.exp(-squares.astype(np.float64)).astype(np.float32)

@@ -1,0 +1,137 @@
+"""`MotionLabels`: the maps that a motion model learns, as one record."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from types import MappingProxyType
+from typing import Any, Final
+
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays
+from deepaccident_devkit.errors import NotAvailableError
+from deepaccident_devkit.motion.config import MotionLabelConfig
+from deepaccident_devkit.motion.names import MAPS, BatchNames, from_batch, to_batch
+from deepaccident_devkit.motion.warps.to_present import maps_to_present
+from deepaccident_devkit.motion.warps.warping import WarpMode
+
+OWN_BOX_ID: Final = -101
+"""Key of the ego's own box in `MotionLabels.id_map`, as the released code has it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MotionLabels(FrozenArrays):
+    """Labels of T = `config.label_frames` frames on H × W cells in `config.orientation`; arrays are read-only.
+
+    Attributes:
+        config: how they were made.
+        segmentation: (T, H, W) uint8: 1 where an actor is, 0 elsewhere.
+        instance: (T, H, W) int32: ids from 1 in the order drawn, 0 elsewhere.
+        centerness: (T, 1, H, W) float32 in [0, 1].
+        offset: (T, 2, H, W) float32, cells (down the rows, along the columns) from a cell to its instance's centre;
+            `ignore_index` elsewhere.
+        flow: (T, 2, H, W) float32, cells (rows, columns) from an instance's centre to where it is at the next frame,
+            seen from this frame's ego; `ignore_index` elsewhere, and all of the last frame.
+        future_egomotion: (R, 6) float32, R = `config.frames`: `next_from_this` ego poses as right-handed 6-vectors,
+            from the first past frame on; zero where either frame is not in the recording.
+        valid: (R,) bool: which frames, from the first past one on, are in the recording.
+        id_map: actor id → id in `instance`; the ego's own box is −101, and untracked actors that are each their own
+            instance are not in it.
+        at_present: whether all frames were warped to the present ego frame; else each is in its own.
+    """
+
+    config: MotionLabelConfig
+    segmentation: AnyArray
+    instance: AnyArray
+    centerness: AnyArray
+    offset: AnyArray
+    flow: AnyArray
+    future_egomotion: AnyArray
+    valid: BoolArray
+    id_map: Mapping[int, int]
+    at_present: bool = False
+
+    def __post_init__(self) -> None:
+        """Freeze arrays and map."""
+        FrozenArrays.__post_init__(self)
+        object.__setattr__(self, "id_map", MappingProxyType(dict(self.id_map)))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A view of a dict cannot be pickled; the dict can."""
+        return _remade, (
+            {field.name: getattr(self, field.name) for field in fields(self)} | {"id_map": dict(self.id_map)},
+        )
+
+    @property
+    def label_valid(self) -> BoolArray:
+        """(T,) bool: which label frames, from the present on, are in the recording."""
+        return self.valid[self.config.receptive_field - 1 :]
+
+    @property
+    def label_egomotion(self) -> FloatArray:
+        """(T, 6) float32: the egomotion from the present on."""
+        return self.future_egomotion[self.config.receptive_field - 1 :]
+
+    def to_present(self, centerness: WarpMode = "nearest") -> MotionLabels:
+        """The labels with every frame in the present ego frame, as models are trained on and evaluated against them.
+
+        `motion.warps.to_present` says how.
+
+        Args:
+            centerness: how to sample the centres' peaks: the released code trains with `nearest` and evaluates with
+                `bilinear`. All other maps take the nearest cell's value.
+
+        Raises:
+            NotAvailableError: the labels are at the present already.
+            ChoiceError: no such mode.
+        """
+        if self.at_present:
+            raise NotAvailableError("labels: they are in the present frame already; warp the labels of `motion_labels`")
+        maps = {name: getattr(self, name) for name in MAPS}
+        warped: dict[str, Any] = maps_to_present(maps, self.label_egomotion, self.config, centerness)
+        return replace(self, **warped, at_present=True)
+
+    @property
+    def instance_center(self) -> AnyArray:
+        """`centerness`, as the models' outputs are named."""
+        return self.centerness
+
+    @property
+    def instance_offset(self) -> AnyArray:
+        """`offset`, as the models' outputs are named."""
+        return self.offset
+
+    @property
+    def instance_flow(self) -> AnyArray:
+        """`flow`, as the models' outputs are named."""
+        return self.flow
+
+    def as_batch(self, names: BatchNames) -> dict[str, AnyArray]:
+        """The labels as a sample of FIERY's, BEVerse's or DeepAccident's own loader: names, axes, orientation, types.
+
+        `motion.names` has the table. Raises ChoiceError.
+        """
+        arrays = {name: getattr(self, name) for name in (*MAPS, "future_egomotion", "valid")}
+        return to_batch(arrays, self.config, names)
+
+    @classmethod
+    def from_batch(
+        cls, batch: Mapping[str, Any], config: MotionLabelConfig, names: BatchNames, *, at_present: bool = False
+    ) -> MotionLabels:
+        """Labels from a sample of another code's loader, `as_batch` the other way; whose ids they are is not known.
+
+        Args:
+            batch: arrays or tensors of one sample, without a batch axis.
+            config: what they were made with; its orientation is that of the result.
+            names: whose names they have.
+            at_present: whether they were warped to the present.
+
+        Raises:
+            ChoiceError: no such code.
+            FieldError: the batch lacks an array.
+            GeometryError: an array has another shape than the configuration says.
+        """
+        return cls(config=config, id_map={}, at_present=at_present, **from_batch(batch, config, names))
+
+
+def _remade(values: dict[str, Any]) -> MotionLabels:
+    return MotionLabels(**values)

@@ -1,0 +1,95 @@
+"""Instances of one frame from a model's maps: peaks of the centerness, and each foreground cell to its nearest one.
+
+The rules are the released ones (evaluation.md c), FIERY's: everything in float32, first come first served on ties, and
+cells in row-major order. Arrays here lie in the orientation that the rules count in; see `postprocessing`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, FloatArray, IntArray
+from deepaccident_devkit.motion.postprocessing.nearest_peaks import nearest_peaks
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FrameGroups:
+    """The instances of one frame; ids run from 1 to I without gaps, (row, column) are cells.
+
+    Attributes:
+        ids: (P,) int64 the instance of each cell of the foreground; 0 for what counts as background all the same.
+        count: (I + 1,) cells of each id.
+        position_sum: (2, I + 1) float64 sums of their rows and columns.
+        moved_sum: (2, I + 1) float64 sums of where the flow takes them.
+    """
+
+    ids: IntArray
+    count: FloatArray
+    position_sum: FloatArray
+    moved_sum: FloatArray
+
+    @property
+    def instances(self) -> int:
+        """How many instances there are: the highest id."""
+        return len(self.count) - 1
+
+
+def find_peaks(centerness: AnyArray, threshold: float, most: int) -> IntArray:
+    """Cells of one frame above `threshold` that no neighbour of the eight exceeds; all cells of a plateau are peaks.
+
+    Args:
+        centerness: (H, W) float32.
+        threshold: strict, not negative.
+        most: how many are kept: the first ones in row-major order, not the highest ones.
+
+    Returns:
+        (K, 2) int64 rows and columns, in row-major order.
+    """
+    height, width = centerness.shape
+    framed = np.full((height + 2, width + 2), -np.inf, dtype=np.float32)
+    framed[1:-1, 1:-1] = centerness
+    highest = np.maximum(framed[:-2], framed[2:])
+    np.maximum(highest, framed[1:-1], out=highest)
+    around = np.maximum(highest[:, :-2], highest[:, 2:])
+    np.maximum(around, highest[:, 1:-1], out=around)
+    return np.argwhere((centerness == around) & (centerness > np.float32(threshold)))[:most]
+
+
+def group_cells(
+    peaks: IntArray, position: AnyArray, offset: AnyArray, flow: AnyArray, *, all_cells: bool
+) -> FrameGroups:
+    """Instances of one frame: the foreground's cells by the peak nearest to where their offset points.
+
+    Where no background is left, the lowest instance becomes it: ids are the ranks of what occurs, from 0.
+
+    Args:
+        peaks: (K, 2) rows and columns; at least one unless there are no cells.
+        position: (2, P) float32 rows and columns of the foreground's cells.
+        offset: (2, P) float32 rows and columns from each to its instance's centre.
+        flow: (2, P) float32 rows and columns to where each is at the next frame.
+        all_cells: whether these are all cells that there are.
+    """
+    nearest = nearest_peaks(position + offset, peaks.astype(np.float32)) + 1
+    occurs = np.bincount(nearest, minlength=len(peaks) + 1) > 0
+    occurs[0] = not all_cells
+    ids = (np.cumsum(occurs) - 1)[nearest]
+    length = max(int(occurs.sum()), 1)
+    moved = position + flow
+    return FrameGroups(
+        ids=ids,
+        count=np.bincount(ids, minlength=length).astype(np.float64),
+        position_sum=np.stack([sums_by(ids, along, length) for along in position]),
+        moved_sum=np.stack([sums_by(ids, along, length) for along in moved]),
+    )
+
+
+def sums_by(ids: IntArray, values: AnyArray, length: int) -> FloatArray:
+    """(length,) float64 sums of `values` by `ids`; ids from `length` on are left out."""
+    return np.bincount(ids, values, length)[:length].astype(np.float64, copy=False)
+
+
+def means(sums: FloatArray, counts: FloatArray) -> AnyArray:
+    """(2, N) sums over (N,) counts → (N, 2) float32 means, as torch's of float32 values."""
+    return (sums / counts).T.astype(np.float32)

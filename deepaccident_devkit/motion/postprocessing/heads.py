@@ -1,0 +1,150 @@
+"""`MotionHeads`: what a motion model says of one sample, as plain arrays of any framework."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, checked, readonly
+from deepaccident_devkit.errors import ChoiceError, GeometryError
+from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
+from deepaccident_devkit.motion.labels import MotionLabels
+from deepaccident_devkit.motion.orientations import to_orientation
+
+LABEL_LOGIT: Final = 10.0
+"""What the released evaluation gives the right class when it treats labels as a prediction; the other one gets 0."""
+_LARGEST: Final = 1e15
+"""Cells: no offset or flow is longer, and the squares of longer ones would soon overflow in float32."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MotionHeads:
+    """The maps of one prediction, T frames from the present on, H × W cells; arrays are read-only.
+
+    Attributes:
+        segmentation: (T, 2, H, W) float32 logits: background, actor.
+        centerness: (T, 1, H, W) float32: how much a cell is an instance's centre; also taken as (T, H, W).
+        offset: (T, 2, H, W) float32 cells (down the rows, along the columns) to the instance's centre.
+        flow: (T, 2, H, W) float32 cells (rows, columns) to where the instance is at the next frame.
+        orientation: how the cells lie; the vectors' channels follow the rows and columns of that orientation.
+        ignore_index: what stands in offset and flow where they are undefined, as in labels, and is therefore no vector
+            that turns with the orientation; None where all values are vectors.
+    """
+
+    segmentation: AnyArray
+    centerness: AnyArray
+    offset: AnyArray
+    flow: AnyArray
+    orientation: Orientation = "devkit"
+    ignore_index: int | None = None
+
+    def __post_init__(self) -> None:
+        """Check and freeze; raises GeometryError, or ChoiceError for an unknown orientation."""
+        if self.orientation not in ORIENTATIONS:
+            raise ChoiceError(f"orientation: expected one of {', '.join(ORIENTATIONS)}, found {self.orientation!r}")
+        segmentation = checked("segmentation", self.segmentation, (None, 2, None, None), np.float32)
+        frames, _, height, width = segmentation.shape
+        if segmentation.size == 0:
+            raise GeometryError(f"segmentation: expected at least one frame of one cell, found {segmentation.shape}")
+        centerness = np.asarray(self.centerness)
+        if centerness.ndim == 3:
+            centerness = centerness[:, None]
+        centerness = checked("centerness", centerness, (frames, 1, height, width), np.float32)
+        shape = frames, 2, height, width
+        maps = {
+            "segmentation": segmentation,
+            "centerness": centerness,
+            "offset": checked("offset", self.offset, shape, np.float32),
+            "flow": checked("flow", self.flow, shape, np.float32),
+        }
+        for name, values in maps.items():
+            _check_values(name, values, np.inf if name in {"segmentation", "centerness"} else _LARGEST)
+            object.__setattr__(self, name, readonly(values))
+
+    @classmethod
+    def from_arrays(
+        cls,
+        segmentation: object,
+        centerness: object,
+        offset: object,
+        flow: object,
+        orientation: Orientation = "devkit",
+    ) -> MotionHeads:
+        """Heads from anything that holds an array: numpy, torch, JAX, lists; shapes as the attributes'.
+
+        float32 arrays in the processor's memory are not copied.
+
+        Raises:
+            GeometryError: another shape, NaN, or an array that cannot be read from here (see the message's remedy).
+            ChoiceError: no such orientation.
+        """
+        return cls(
+            segmentation=_read("segmentation", segmentation),
+            centerness=_read("centerness", centerness),
+            offset=_read("offset", offset),
+            flow=_read("flow", flow),
+            orientation=orientation,
+        )
+
+    @classmethod
+    def from_labels(cls, labels: MotionLabels) -> MotionHeads:
+        """Labels as the prediction of a model that is right: what the released evaluation compares with.
+
+        Segmentation is 10 for the right class and 0 for the other; centerness, offset and flow are as they are.
+        """
+        actor = np.asarray(labels.segmentation) == 1
+        return cls(
+            segmentation=np.stack([~actor, actor], axis=1) * np.float32(LABEL_LOGIT),
+            centerness=labels.centerness,
+            offset=labels.offset,
+            flow=labels.flow,
+            orientation=labels.config.grid.orientation,
+            ignore_index=labels.config.ignore_index,
+        )
+
+    def in_orientation(self, orientation: Orientation) -> MotionHeads:
+        """The same prediction with its cells, and its vectors, in another orientation. Raises ChoiceError."""
+        if orientation == self.orientation:
+            return self
+
+        def turned(values: AnyArray, *, vectors: bool) -> AnyArray:
+            return to_orientation(
+                values, vectors=vectors, source=self.orientation, target=orientation, ignore=self.ignore_index
+            )
+
+        return MotionHeads(
+            segmentation=turned(self.segmentation, vectors=False),
+            centerness=turned(self.centerness, vectors=False),
+            offset=turned(self.offset, vectors=True),
+            flow=turned(self.flow, vectors=True),
+            orientation=orientation,
+            ignore_index=self.ignore_index,
+        )
+
+
+def _read(name: str, values: object) -> AnyArray:
+    """Whatever holds an array as one of numbers; raises GeometryError with the remedy."""
+    try:
+        if not hasattr(values, "__array__") and hasattr(values, "__dlpack__"):
+            array: AnyArray = np.from_dlpack(values)
+        else:
+            array = np.asarray(values)
+    except (TypeError, ValueError, RuntimeError, BufferError) as error:
+        raise GeometryError(
+            f"{name}: a {type(values).__name__} cannot be read as an array here ({error}); "
+            "pass a torch tensor as tensor.detach().cpu().float(), another framework's as a numpy array"
+        ) from error
+    if array.dtype.kind not in "fiub":
+        raise GeometryError(f"{name}: expected an array of numbers, found {array.dtype} of shape {array.shape}")
+    return array
+
+
+def _check_values(name: str, values: AnyArray, most: float) -> None:
+    lowest, highest = values.min(), values.max()
+    if not (lowest >= -most and highest <= most):  # NaN is neither
+        at = tuple(np.argwhere(~(np.abs(values) <= most))[0].tolist())
+        raise GeometryError(
+            f"{name}: {values[at]} at {at} is no value to work with; a model that diverged, or a mask in its output?"
+        )

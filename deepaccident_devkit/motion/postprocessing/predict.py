@@ -1,0 +1,293 @@
+"""From a model's maps to instances with the same id in all frames, and their paths."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from types import MappingProxyType
+from typing import Final, Literal, get_args
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, readonly
+from deepaccident_devkit.errors import ChoiceError, ConfigError, GeometryError
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
+from deepaccident_devkit.motion.orientations import cells_in, to_orientation
+from deepaccident_devkit.motion.postprocessing.grouping import FrameGroups, find_peaks, group_cells, sums_by
+from deepaccident_devkit.motion.postprocessing.heads import LABEL_LOGIT, MotionHeads
+from deepaccident_devkit.motion.postprocessing.linking import link_frames
+from deepaccident_devkit.motion.postprocessing.redrawing import first_hulls, redrawn_cells
+
+Foreground = Literal["argmax", "sigmoid"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PostProcessing:
+    """How instances are read off a model's maps; the defaults are the released ones for VPQ (evaluation.md c).
+
+    Attributes:
+        foreground: which cells are actors: `argmax` of both logits (background where they are equal), or `sigmoid`:
+            those whose actor logit's sigmoid exceeds the threshold, whatever the background's is.
+        foreground_threshold: of `sigmoid`, strict.
+        labels_bypass_sigmoid: with `sigmoid`, where the highest of all logits is 10 and the lowest 0 they are taken for
+            labels (`MotionHeads.from_labels`), and the actor's logit itself is compared: the sigmoid of its 0 would be
+            above the released threshold.
+        center_threshold: centerness that a centre must exceed.
+        max_centers: how many centres a frame can have; of more, the first ones in row-major order are kept, not the
+            highest.
+        scan: the orientation in which that order runs, and in which the first of several equally near centres is
+            chosen; heads in another one are turned there and the result back.
+        link_distance: cells; how near an instance must be to where the flow takes one of the frame before to share its
+            id.
+        redraw: draw boxes along the paths of the first frame's instances, for the accident evaluation.
+    """
+
+    foreground: Foreground = "argmax"
+    foreground_threshold: float = 0.4
+    labels_bypass_sigmoid: bool = True
+    center_threshold: float = 0.1
+    max_centers: int = 100
+    scan: Orientation = "released"
+    link_distance: float = 10.0
+    redraw: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the values; raises ChoiceError or ConfigError."""
+        for name, allowed in {"foreground": get_args(Foreground), "scan": ORIENTATIONS}.items():
+            if getattr(self, name) not in allowed:
+                found = getattr(self, name)
+                raise ChoiceError(f"post-processing: {name} is one of {', '.join(allowed)}, found {found!r}")
+        if not 0 < self.foreground_threshold < 1:
+            raise ConfigError(
+                f"post-processing: foreground_threshold is a probability between 0 and 1, "
+                f"found {self.foreground_threshold!r}"
+            )
+        for name in ("center_threshold", "link_distance"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise ConfigError(f"post-processing: {name} is a number from 0, found {getattr(self, name)!r}")
+        if type(self.max_centers) is not int or self.max_centers < 1:
+            raise ConfigError(f"post-processing: max_centers is a whole number from 1, found {self.max_centers!r}")
+
+
+POST_PROCESSING: Final[Mapping[str, PostProcessing]] = MappingProxyType(
+    {
+        "motion": PostProcessing(),
+        "accident": PostProcessing(foreground="sigmoid", link_distance=8.0, redraw=True),
+        "fiery": PostProcessing(link_distance=3.0, scan="fiery"),
+    }
+)
+"""The released evaluation's of motion (IoU, VPQ) and of accidents, and FIERY's."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class InstancePath:
+    """One instance of the first frame; arrays are read-only.
+
+    Attributes:
+        frames: (n,) int64 in which it is, rising from 0.
+        centers: (n, 2) float64 row and column of the mean of its cells there (a float32's value).
+        cell_counts: (T,) int64 how many cells it has in each frame, 0 where it is not.
+    """
+
+    frames: IntArray
+    centers: FloatArray
+    cell_counts: IntArray
+
+    def __post_init__(self) -> None:
+        """Freeze the arrays."""
+        for item in fields(self):
+            object.__setattr__(self, item.name, readonly(getattr(self, item.name)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LinkedInstances:
+    """The instances of one prediction over T frames of H × W cells in `orientation`; arrays are read-only.
+
+    Attributes:
+        settings: how they were found.
+        orientation: how the cells lie; that of the heads.
+        instance: (T, H, W) int32: ids that are the same in all frames, 0 elsewhere.
+        frame_instance: (T, H, W) int32: each frame's own ids before linking, 1 to I without gaps, 0 elsewhere.
+        redrawn: (T, H, W) int32: the ids of boxes drawn along the paths, 0 elsewhere; None unless the settings ask.
+        frame_centers: T times (K, 2) int64: rows and columns of the centres that cells were grouped around.
+        paths: by id, ascending, the instances of the first frame.
+    """
+
+    settings: PostProcessing
+    orientation: Orientation
+    instance: AnyArray
+    frame_instance: AnyArray
+    redrawn: AnyArray | None
+    frame_centers: Sequence[IntArray]
+    paths: Mapping[int, InstancePath]
+
+    def __post_init__(self) -> None:
+        """Freeze arrays and maps."""
+        object.__setattr__(self, "instance", readonly(self.instance))
+        object.__setattr__(self, "frame_instance", readonly(self.frame_instance))
+        object.__setattr__(self, "redrawn", None if self.redrawn is None else readonly(self.redrawn))
+        object.__setattr__(self, "frame_centers", tuple(readonly(centers) for centers in self.frame_centers))
+        object.__setattr__(self, "paths", MappingProxyType(dict(self.paths)))
+
+    @property
+    def centers(self) -> dict[int, FloatArray]:
+        """Id → (n, 2) row and column in each frame of `paths[id].frames`."""
+        return {identity: path.centers for identity, path in self.paths.items()}
+
+
+def predict_instances(heads: MotionHeads, settings: PostProcessing | str = "motion") -> LinkedInstances:
+    """Instances with the same id in all frames, as the released code finds them (evaluation.md c and h).
+
+    Args:
+        heads: a model's maps, or `MotionHeads.from_labels`.
+        settings: of `POST_PROCESSING` by name, or your own.
+
+    Raises:
+        ChoiceError: no settings have that name.
+    """
+    rules = post_processing(settings)
+    turn = _Turn(heads.segmentation.shape[-2:], heads.orientation, rules.scan)
+    centerness = turn.maps(heads.centerness[:, 0])
+    peaks = [find_peaks(frame, rules.center_threshold, rules.max_centers) for frame in centerness]
+    foreground = turn.maps(_foreground(heads.segmentation, rules))
+    positions = [np.stack(np.nonzero(here & (len(found) > 0))) for here, found in zip(foreground, peaks, strict=True)]
+    groups = [
+        group_cells(
+            found,
+            position.astype(np.float32),
+            turn.vectors_at(position, offset, heads.ignore_index),
+            turn.vectors_at(position, flow, heads.ignore_index),
+            all_cells=position.shape[1] == offset[0].size,
+        )
+        for found, position, offset, flow in zip(peaks, positions, heads.offset, heads.flow, strict=True)
+    ]
+    names = link_frames(groups, rules.link_distance)
+    centers, counts = _paths(groups, names)
+    frame_ids = [group.ids for group in groups]
+    ids = [name[group.ids] for name, group in zip(names, groups, strict=True)]
+    redrawn = None
+    if rules.redraw:
+        hulls = first_hulls(positions[0], groups[0].ids, groups[0].instances)
+        redrawn = turn.raster(*redrawn_cells(hulls, centers, counts > 0, turn.scanned_shape))
+    return LinkedInstances(
+        settings=rules,
+        orientation=heads.orientation,
+        instance=turn.raster(positions, ids),
+        frame_instance=turn.raster(positions, frame_ids),
+        redrawn=redrawn,
+        frame_centers=[turn.points(frame) for frame in peaks],
+        paths={
+            identity: InstancePath(frames=np.flatnonzero(cells), centers=points[cells > 0], cell_counts=cells)
+            for identity, (points, cells) in enumerate(zip(turn.points(centers), counts, strict=True), start=1)
+        },
+    )
+
+
+def post_processing(settings: PostProcessing | str) -> PostProcessing:
+    """Settings by their name, or as they are given; raises ChoiceError."""
+    if isinstance(settings, PostProcessing):
+        return settings
+    if settings not in POST_PROCESSING:
+        raise ChoiceError(f"post-processing: expected one of {', '.join(POST_PROCESSING)}, found {settings!r}")
+    return POST_PROCESSING[settings]
+
+
+def trajectories(linked: LinkedInstances, grid: BevGrid, *, half_cell_shift: bool = True) -> dict[int, FloatArray]:
+    """The paths of the first frame's instances in metres.
+
+    Args:
+        linked: from `predict_instances`.
+        grid: what the cells cover, in any orientation.
+        half_cell_shift: undo what `LabelProtocol.half_cell_shift` does to labels: cell i stands for the edge between
+            cells i - 1 and i of the settings' `scan` orientation. Say False for a model that learned labels without it.
+
+    Returns:
+        Id → (n, 2) x forward, y left, metres in the ego frame that the maps are in, at `linked.paths[id].frames`.
+
+    Raises:
+        GeometryError: the grid has other rows and columns than the instances.
+    """
+    shape = grid.with_orientation(linked.orientation).shape
+    if linked.instance.shape[1:] != shape:
+        raise GeometryError(f"grid: has {shape} cells, but the instances have {linked.instance.shape[1:]}")
+    scan = linked.settings.scan
+    (x_low, _, x_size), (y_low, _, y_size) = grid.x, grid.y
+    within = np.full(2, 0.5)
+    if half_cell_shift:
+        within = np.array([1.0 if scan == "released" else 0.0, 0.0])
+    low, size = np.array([y_low, x_low]), np.array([y_size, x_size])
+    return {
+        name: (low + (_points_in(points, shape, linked.orientation, "devkit") + within) * size)[:, ::-1]
+        for name, points in linked.centers.items()
+    }
+
+
+def _foreground(segmentation: AnyArray, rules: PostProcessing) -> BoolArray:
+    """(T, H, W) the cells that are actors, of logits (T, 2, H, W)."""
+    background, actor = segmentation[:, 0], segmentation[:, 1]
+    if rules.foreground == "argmax":
+        return np.asarray(actor > background)
+    threshold = np.float32(rules.foreground_threshold)
+    if rules.labels_bypass_sigmoid and segmentation.max() == LABEL_LOGIT and segmentation.min() == 0:
+        return np.asarray(actor > threshold)
+    # A float32 sigmoid exceeds the threshold from half-way to the next float32 on. That point's own logit is compared
+    # with instead, which needs no exponential of every cell.
+    beyond = (float(threshold) + float(np.nextafter(threshold, np.float32(1)))) / 2
+    return np.asarray(actor > np.float32(np.log(beyond / (1 - beyond))))
+
+
+def _paths(groups: Sequence[FrameGroups], names: Sequence[IntArray]) -> tuple[FloatArray, IntArray]:
+    """(I, T, 2) mean rows and columns of the first frame's ids 1 to I, 0 where there are none, and (I, T) counts."""
+    length = groups[0].instances + 1
+    pairs = list(zip(groups, names, strict=True))
+    counts = np.stack([sums_by(name, group.count, length) for group, name in pairs])
+    sums = np.stack([[sums_by(name, along, length) for along in group.position_sum] for group, name in pairs])
+    centers = (sums / np.maximum(counts, 1)[:, None]).astype(np.float32).astype(np.float64)
+    return centers.transpose(2, 0, 1)[1:], counts.T[1:].astype(np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class _Turn:
+    """The way from the heads' orientation, `shape` its rows and columns, to the one that is scanned, and back."""
+
+    shape: tuple[int, int]
+    heads: Orientation
+    scan: Orientation
+
+    @property
+    def scanned_shape(self) -> tuple[int, int]:
+        """Rows and columns of the scanned orientation."""
+        return self.shape[::-1] if (self.heads == "fiery") != (self.scan == "fiery") else self.shape
+
+    def maps(self, maps: AnyArray) -> AnyArray:
+        """The heads' maps (…, H, W), as scanned."""
+        return to_orientation(maps, vectors=False, source=self.heads, target=self.scan)
+
+    def vectors_at(self, position: IntArray, vectors: AnyArray, ignore: int | None) -> AnyArray:
+        """The heads' vectors (2, H, W) at scanned rows and columns (2, P), as (2, P) scanned ones."""
+        taken = np.take(vectors.reshape(2, -1), self._flat(position), axis=1)
+        rasters = taken.T[..., None, None]  # of one cell each: only what they hold can turn
+        turned = to_orientation(rasters, vectors=True, source=self.heads, target=self.scan, ignore=ignore)
+        return turned[..., 0, 0].T
+
+    def raster(self, positions: Sequence[IntArray], ids: Sequence[IntArray]) -> AnyArray:
+        """(T, H, W) int32 as the heads lie, with `ids` (P,) at each frame's scanned rows and columns (2, P)."""
+        result = np.zeros((len(positions), math.prod(self.shape)), dtype=np.int32)
+        for frame, position, values in zip(result, positions, ids, strict=True):
+            frame[self._flat(position)] = values
+        return result.reshape(-1, *self.shape)
+
+    def points(self, points: AnyArray) -> AnyArray:
+        """Scanned rows and columns (…, 2), as the heads lie."""
+        return _points_in(points, self.scanned_shape, self.scan, self.heads)
+
+    def _flat(self, position: IntArray) -> IntArray:
+        row, column = cells_in(position[0], position[1], self.scanned_shape, self.scan, self.heads)
+        return np.asarray(row * self.shape[1] + column)
+
+
+def _points_in(points: AnyArray, shape: tuple[int, int], source: Orientation, target: Orientation) -> AnyArray:
+    """Rows and columns (…, 2) of one orientation, `shape` its cells, in another."""
+    return np.stack(cells_in(points[..., 0], points[..., 1], shape, source, target), axis=-1)

@@ -1,0 +1,86 @@
+"""Which samples models are trained on and evaluated at (evaluation.md 0)."""
+
+from __future__ import annotations
+
+import os
+from typing import Final, Literal, get_args
+
+import numpy as np
+
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
+
+Purpose = Literal["train", "evaluate", "all", "every"]
+SampleProtocol = Literal["released", "paper"]
+Scope = Literal["accident", "all"]
+_KEY_STEP: Final = 5
+"""Recorded frames between key frames, counted back from a scenario's last."""
+_STEPS: Final = {"train": 10, "evaluate": _KEY_STEP, "all": _KEY_STEP, "every": 1}
+_RELEASED_HORIZON: Final = 2.0
+
+
+def samples(
+    dataset: Dataset,
+    split: str | os.PathLike[str],
+    purpose: Purpose = "train",
+    protocol: SampleProtocol = "released",
+    *,
+    horizon: float = _RELEASED_HORIZON,
+    scope: Scope = "accident",
+) -> list[str]:
+    """The labelled samples of a split that a model is trained on or evaluated at, of all agents.
+
+    Frames are counted back from a scenario's last one, which in an accident scenario is the collision:
+
+    - `train`: one a second, of normal and accident scenarios;
+    - `evaluate`: two a second within the last `horizon` seconds but the very last frame. Of scenarios designed to end
+      in an accident (`_accident` in their folder); `scope="all"` adds the normal ones;
+    - `all`: two a second, the whole of every scenario;
+    - `every`: all there are, ten a second.
+
+    The released V2X class stops after 50 samples of a list made in an order that nobody knows; nothing here does.
+
+    Args:
+        dataset: the release.
+        split: `train`, `val`, … or a split file, as `Dataset.split_scenarios` takes it.
+        purpose: `train`, `evaluate`, `all` or `every`.
+        protocol: `released` has a horizon of 2 s and accident scenarios alone; `paper` leaves both open.
+        horizon: seconds before the end, a multiple of 0.5; only to `evaluate`.
+        scope: `accident` or `all`; only to `evaluate`.
+
+    Returns:
+        Tokens by scenario, agent and time.
+
+    Raises:
+        ChoiceError: no such split, purpose, protocol or scope.
+        ConfigError: a horizon that no frames fit, or one that the released protocol does not have.
+        NotAvailableError: the split is unknown, or none of its samples has labels (the test split ships without).
+    """
+    for name, value, choices in (
+        ("purpose", purpose, Purpose),
+        ("protocol", protocol, SampleProtocol),
+        ("scope", scope, Scope),
+    ):
+        if value not in get_args(choices):
+            raise ChoiceError(f"{name}: expected one of {', '.join(get_args(choices))}, found {value!r}")
+    steps = horizon / (_KEY_STEP * FRAME_PERIOD)
+    if not (steps >= 1 and abs(steps - round(steps)) < 1e-6):
+        raise ConfigError(f"horizon: {horizon} s is no number of steps of 0.5 s; choose 0.5, 1, 1.5, …")
+    if protocol == "released" and (horizon != _RELEASED_HORIZON or scope != "accident"):
+        raise ConfigError("the released protocol looks 2 s ahead in accident scenarios; choose protocol='paper'")
+
+    scenario_tokens = dataset.split_scenarios(split)
+    wanted = np.isin(np.arange(len(dataset.scenario)), [dataset.getind("scenario", one) for one in scenario_tokens])
+    columns, scenarios = dataset.columns("sample"), dataset.columns("scenario")
+    row = columns["scenario_row"]
+    in_split = wanted[row] & columns["labelled"][:]
+    if not in_split.any():
+        raise NotAvailableError(f"{split}: none of its samples here has labels (the test split ships without them)")
+    to_end = scenarios["num_frames"][row] - (columns["frame_row"] - scenarios["first_frame_row"][row] + 1)
+    chosen = to_end % _STEPS[purpose] == 0
+    if purpose == "evaluate":
+        chosen &= (to_end > 0) & (to_end <= round(horizon / FRAME_PERIOD))
+        if scope == "accident":
+            chosen &= scenarios["designed_accident"][:][row]
+    return [dataset.sample[index]["token"] for index in np.flatnonzero(in_split & chosen).tolist()]

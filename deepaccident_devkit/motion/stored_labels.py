@@ -1,0 +1,125 @@
+"""What is stored of one sample's motion labels, from which all maps are made again (schema/motion_labels.md)."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from dataclasses import dataclass, fields
+from typing import Final
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, IntArray
+from deepaccident_devkit.motion.config import MotionLabelConfig
+from deepaccident_devkit.motion.drawing.label_maps import CoveredCells, label_maps
+from deepaccident_devkit.motion.labels import MotionLabels
+from deepaccident_devkit.motion.orientations import cells_in, vectors_in
+from deepaccident_devkit.motion.warps.warping import native_orientation
+from deepaccident_devkit.taxonomy import UNTRACKED_ID
+
+NOWHERE: Final = -32768
+"""Centre and flow of an instance that a frame does not show."""
+_FIRST_DATE: Final = (1980, 1, 1, 0, 0, 0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StoredLabels:
+    """The arrays of one sample, in the configuration's orientation; K = highest id.
+
+    Attributes:
+        instance: (T, H, W) uint8 or uint16; 0 in missing frames.
+        center: (T, 1 + K, 2) int16 row and column of each instance's centre, `NOWHERE` if the frame does not show it.
+        flow: (T, 1 + K, 2) int16 how far it moves along them up to the next frame; `NOWHERE` where unknown.
+        actor: (1 + K,) int64 actor ids; −1 for the background and untracked ones.
+        future_egomotion: (R, 6) float32.
+        valid: (R,) bool.
+    """
+
+    instance: AnyArray
+    center: AnyArray
+    flow: AnyArray
+    actor: AnyArray
+    future_egomotion: AnyArray
+    valid: AnyArray
+
+    @classmethod
+    def of(cls, labels: MotionLabels) -> StoredLabels:
+        """The members of labels whose frames are in their own ego frames."""
+        instance = np.where(labels.label_valid[:, None, None], labels.instance, 0)
+        frame, row, column = np.nonzero(instance)
+        identity = instance[frame, row, column]
+        highest = max(int(identity.max(initial=0)), *labels.id_map.values(), 0)
+        center = np.full((len(instance), 1 + highest, 2), NOWHERE, dtype=np.int16)
+        flow = center.copy()
+        cells = np.stack([row, column], axis=1)
+        center[frame, identity] = cells + labels.offset[frame, :, row, column]
+        vectors = labels.flow[frame, :, row, column]
+        known = (vectors != labels.config.ignore_index).any(axis=1)
+        flow[frame[known], identity[known]] = vectors[known]
+        actor = np.full(1 + highest, UNTRACKED_ID, dtype=np.int64)
+        actor[list(labels.id_map.values())] = list(labels.id_map)
+        return cls(
+            instance=instance.astype(np.uint8 if highest < 256 else np.uint16),
+            center=center,
+            flow=flow,
+            actor=actor,
+            future_egomotion=labels.future_egomotion,
+            valid=labels.valid,
+        )
+
+    def labels(self, config: MotionLabelConfig) -> MotionLabels:
+        """The labels again, all maps of them."""
+        shape, given = config.grid.shape, config.grid.orientation
+        native = native_orientation(config.rules.warp)
+        flat = np.flatnonzero(self.instance)
+        frame, cell = np.divmod(flat, config.grid.cells)
+        row, column = cells_in(cell // shape[1], cell % shape[1], shape, given, native)
+        identity: IntArray = self.instance.reshape(-1)[flat].astype(np.int64)
+        covered = CoveredCells(
+            frame=frame, row=row, column=column, identity=identity, frames=len(self.instance), ids=len(self.actor) - 1
+        )
+        center, flow = (
+            np.where(table == NOWHERE, np.float32(np.nan), table.astype(np.float32))
+            for table in (self.center, self.flow)
+        )
+        center = np.stack(cells_in(center[..., 0], center[..., 1], shape, given, native), axis=-1)
+        flow = np.stack(vectors_in(flow[..., 0], flow[..., 1], given, native), axis=-1)
+        missing = ~self.valid[config.receptive_field - 1 :]
+        maps = label_maps(covered, center, center + flow, missing, config)
+        known = np.flatnonzero(self.actor != UNTRACKED_ID)
+        return MotionLabels(
+            config=config,
+            segmentation=maps.segmentation,
+            instance=maps.instance,
+            centerness=maps.centerness,
+            offset=maps.offset,
+            flow=maps.flow,
+            future_egomotion=self.future_egomotion,
+            valid=self.valid,
+            id_map=dict(zip(self.actor[known].tolist(), known.tolist(), strict=True)),
+        )
+
+    def write(self, archive: zipfile.ZipFile, folder: str) -> None:
+        """Add the arrays to an archive, as `<folder>/<name>.npy`."""
+        for field in fields(self):
+            write_array(archive, f"{folder}/{field.name}", getattr(self, field.name))
+
+    @classmethod
+    def read(cls, archive: zipfile.ZipFile, folder: str) -> StoredLabels:
+        """The arrays of a folder of an archive; raises what zipfile and numpy raise for damaged ones."""
+        return cls(**{field.name: read_array(archive, f"{folder}/{field.name}") for field in fields(cls)})
+
+
+def write_array(archive: zipfile.ZipFile, name: str, array: AnyArray) -> None:
+    """Add `<name>.npy` to an archive that numpy can load; the same bytes whenever that is."""
+    buffer = io.BytesIO()
+    np.lib.format.write_array(buffer, np.asarray(array, order="C"), allow_pickle=False)
+    entry = zipfile.ZipInfo(f"{name}.npy", _FIRST_DATE)
+    entry.external_attr = 0o644 << 16
+    archive.writestr(entry, buffer.getvalue(), zipfile.ZIP_DEFLATED, compresslevel=1)
+
+
+def read_array(archive: zipfile.ZipFile, name: str) -> AnyArray:
+    """The array `<name>.npy` of an archive; never unpickles."""
+    array: AnyArray = np.lib.format.read_array(io.BytesIO(archive.read(f"{name}.npy")), allow_pickle=False)
+    return array

@@ -1,0 +1,301 @@
+"""Warping a raster into another ego frame: which source cell or point each target cell takes its value from.
+
+Three rules (`WarpRule`), each in its code's own orientation, its *native* one:
+
+- `stretched`: the released `FeatureWarper` (evaluation.md a). Rows lie left-handed (orientation `released`). Sample
+  points stand at linspace(−49.75, 50, 200) instead of at the cells' centres, and the outermost of them are taken for
+  the grid's ends: without motion, cell i samples 0.4975 + 0.9975 i, which nearest sampling rounds to i, and which blurs
+  bilinear sampling by up to half a cell. In float32, rounding for rounding, since the last bit decides for points that
+  lie on the border between two cells. Grids that are not centred on the ego, where the released code has no meaning,
+  are stretched about their own middle.
+- `exact`: cell centres, in float64; without motion every cell gets its own value, in either mode. Orientation
+  `released` too.
+- `fiery`: FIERY's (evaluation.md h). Right-handed, row = x. Cell centres, but of the motion only yaw and planar
+  translation as the 6-vector has them count, and they are put together as
+  source = Rot(−yaw) · target + (−tx, +ty): the sideways shift has the wrong sign, and neither shift is turned.
+  FIERY knows square grids centred on the ego; on others we measure in metres from the ego.
+
+The transform is rigid (or A · rigid · A⁻¹ with an augmentation A); points lie on the plane z = 0, of whose images x and
+y count. `source_from_target` maps points of the frame that the result is in to points of the frame that the raster is
+in: `sampling_matrix` gets it from the released code's arguments, which go the other way.
+"""
+
+import functools
+from typing import Final, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from deepaccident_devkit.arrays import AnyArray, FloatArray, checked
+from deepaccident_devkit.errors import ChoiceError, GeometryError
+from deepaccident_devkit.geometry import BevGrid, six_vectors
+from deepaccident_devkit.geometry.bev_grid import Axis, Orientation
+from deepaccident_devkit.motion import single_precision
+from deepaccident_devkit.motion.protocols import WarpRule
+from deepaccident_devkit.motion.single_precision import Float32Array
+
+WarpMode = Literal["nearest", "bilinear"]
+CellIndices = NDArray[np.intp]
+OUTSIDE: Final = -1
+"""In `nearest_indices`: nothing there to take a value from."""
+_COUNTABLE: Final = 2**24
+"""Cells that float32 can number."""
+
+
+def native_orientation(rule: WarpRule) -> Orientation:
+    """The orientation that a rule's indices and rasters have: `fiery` for `fiery`, `released` for the others."""
+    return "fiery" if rule == "fiery" else "released"
+
+
+def sampling_matrix(target_from_source: ArrayLike, rule: WarpRule) -> AnyArray:
+    """`source_from_target` of transforms (N, 4, 4), as the rule computes it: float32 and by elimination, or float64.
+
+    Raises:
+        GeometryError: another shape.
+    """
+    if rule == "stretched":
+        return single_precision.inverse(checked("target_from_source", target_from_source, (None, 4, 4), np.float32))
+    result: FloatArray = np.linalg.inv(checked("target_from_source", target_from_source, (None, 4, 4)))
+    return result
+
+
+def nearest_indices(
+    source_from_target: ArrayLike, grid: BevGrid, rule: WarpRule, *, orientation: Orientation | None = None
+) -> CellIndices:
+    """The source cell of each target cell.
+
+    Points half-way between two cells go to the even one.
+
+    Args:
+        source_from_target: (4, 4) metres, in the rule's handedness.
+        grid: the cells of both rasters; its own orientation does not matter.
+        rule: how to sample.
+        orientation: how the rasters lie that the indices are for; None for the rule's native orientation.
+
+    Returns:
+        (H·W,) intp, row · W + column of the source cell, in the order of the target's cells; −1 (`OUTSIDE`) where the
+        sample point is beside the grid.
+
+    Raises:
+        GeometryError: the matrix has another shape or is not finite, or the grid has more than 2²⁴ cells.
+    """
+    return rounded_points(sample_points(source_from_target, grid, rule), grid, rule, orientation)
+
+
+def rounded_points(
+    points: tuple[AnyArray, AnyArray], grid: BevGrid, rule: WarpRule, orientation: Orientation | None = None
+) -> CellIndices:
+    """`nearest_indices` from the sample points."""
+    if grid.cells > _COUNTABLE:
+        raise GeometryError(f"grid: {grid.cells} cells are more than a warp can number; choose at most {_COUNTABLE}")
+    row, column = (np.rint(point) for point in points)
+    rows, columns = row.shape
+    beside = (row < 0) | (row >= rows)
+    beside |= column < 0
+    beside |= column >= columns
+    native = native_orientation(rule)
+    lying = native if orientation is None else orientation
+    first, down, along = _numbering(grid.with_orientation(lying), native)
+    row *= down
+    column *= along
+    row += column
+    row += first
+    np.copyto(row, OUTSIDE, where=beside)
+    cells = row.astype(np.int32)  # on the way to intp: three times as fast
+    return grid.with_orientation(native).reorient(cells, lying).astype(np.intp).ravel()
+
+
+def warp(
+    raster: ArrayLike,
+    source_from_target: ArrayLike,
+    grid: BevGrid,
+    rule: WarpRule,
+    mode: WarpMode = "nearest",
+    *,
+    fill: float = 0,
+    orientation: Orientation | None = None,
+) -> AnyArray:
+    """Rasters in another frame; all of them (leading axes) the same way.
+
+    Args:
+        raster: (…, H, W) in `orientation`.
+        source_from_target: (4, 4) metres, in the rule's handedness.
+        grid: the cells; its own orientation does not matter.
+        rule: how to sample.
+        mode: the value of the nearest cell, or of the four around the sample point, weighted.
+        fill: what stands beside the grid; it mixes with the border's cells where the mode is bilinear.
+        orientation: how the rasters lie; None for the rule's native orientation. Only cells change places.
+
+    Returns:
+        The same shape and orientation; of the same dtype if `nearest`, float32 if `bilinear`.
+
+    Raises:
+        GeometryError: a shape that does not fit, or a matrix that is not finite.
+        ChoiceError: no such mode.
+    """
+    native = native_orientation(rule)
+    lying = grid.with_orientation(orientation or native)
+    source = np.asarray(raster)
+    by_native_rows = lying.reorient(source, native)  # a view; refuses other shapes
+    if checked_mode(mode) == "nearest":
+        indices = nearest_indices(source_from_target, grid, rule, orientation=orientation)
+        return take_cells(source.reshape(*source.shape[:-2], -1), indices, fill).reshape(source.shape)
+    result = np.empty(source.shape, dtype=np.float32)
+    points = sample_points(source_from_target, grid, rule)
+    lying.reorient(result, native)[...] = blend_cells(by_native_rows, points, fill)
+    return result
+
+
+def take_cells(cells: AnyArray, indices: CellIndices, fill: float = 0) -> AnyArray:
+    """The cells (…, H·W) that `nearest_indices` says, `fill` where it says `OUTSIDE`."""
+    padded = np.empty((*cells.shape[:-1], cells.shape[-1] + 1), dtype=cells.dtype)
+    padded[..., :-1] = cells
+    padded[..., OUTSIDE] = fill
+    taken: AnyArray = padded.take(indices, axis=-1)
+    return taken
+
+
+def blend_cells(raster: AnyArray, points: tuple[AnyArray, AnyArray], fill: float = 0) -> Float32Array:
+    """The values (…, H, W) of a raster at sample points, each the weighted mean of the four cells around."""
+    rows, columns = raster.shape[-2:]
+    wide = columns + 3
+    padded = np.full((*raster.shape[:-2], rows + 3, wide), fill, dtype=np.float32)
+    padded[..., 1:-2, 1:-2] = raster
+    cells = padded.reshape(*raster.shape[:-2], -1)
+    above, down = _parted(points[0], rows)
+    left, right = _parted(points[1], columns)
+    above *= wide
+    above += left
+    above += wide + 1
+    index = above.astype(np.int32).astype(np.intp)  # in two steps: three times as fast
+    up, back = 1 - down, 1 - right
+    result: Float32Array = cells.take(index, axis=-1, mode="clip")
+    value = np.empty_like(result)
+    result *= up * back
+    for shift, weight in ((1, up * right), (wide, down * back), (wide + 1, down * right)):
+        cells[..., shift:].take(index, axis=-1, mode="clip", out=value)
+        value *= weight
+        result += value
+    return result
+
+
+def checked_mode(mode: WarpMode) -> WarpMode:
+    """`mode`, or ChoiceError."""
+    if mode not in get_args(WarpMode):
+        raise ChoiceError(f"mode: expected nearest or bilinear, found {mode!r}")
+    return mode
+
+
+def sample_points(source_from_target: ArrayLike, grid: BevGrid, rule: WarpRule) -> tuple[AnyArray, AnyArray]:
+    """Where in the source each target cell samples: rows and columns (H, W), in cells, 0 the first cell's centre.
+
+    Native orientation; float32, but float64 if `exact`. Raises GeometryError.
+    """
+    matrix = checked("source_from_target", source_from_target, (4, 4))
+    if not np.isfinite(matrix).all():
+        raise GeometryError("source_from_target: not all numbers are finite; leave out frames without a pose")
+    if rule == "stretched":
+        return _stretched_points(matrix.astype(np.float32), grid)
+    return _exact_points(matrix, grid) if rule == "exact" else _fiery_points(matrix, grid)
+
+
+def _stretched_points(matrix: Float32Array, grid: BevGrid) -> tuple[AnyArray, AnyArray]:
+    axes = _left_handed_y(grid), grid.x
+    y, x = (_released_coordinates(axis) for axis in axes)
+    points = []
+    for (low, high, _), values, (mx, my, _, shift) in zip(axes, (y, x), (matrix[1], matrix[0]), strict=True):
+        point = np.add.outer(my * y, mx * x)
+        point += shift
+        middle, half = (low + high) / 2, (high - low) / 2
+        if middle:
+            point -= np.float32(middle)
+        point /= np.float32(half)
+        point += np.float32(1)
+        point *= np.float32((len(values) - 1) / 2)
+        points.append(point)
+    return points[0], points[1]
+
+
+def _exact_points(matrix: FloatArray, grid: BevGrid) -> tuple[AnyArray, AnyArray]:
+    axes = _left_handed_y(grid), grid.x
+    y, x = (_centers(axis) for axis in axes)
+    points = []
+    for (low, _, size), (mx, my, _, shift) in zip(axes, (matrix[1], matrix[0]), strict=True):
+        point = np.add.outer(my / size * y, mx / size * x)
+        point += (shift - low) / size - 0.5
+        points.append(point)
+    return points[0], points[1]
+
+
+def _fiery_points(matrix: FloatArray, grid: BevGrid) -> tuple[AnyArray, AnyArray]:
+    tx, ty, _, _, _, yaw = six_vectors.from_matrices(np.linalg.inv(matrix)).astype(np.float32)
+    cosine, sine = single_precision.cosine(yaw), single_precision.sine(yaw)
+    half = np.float32((grid.x[1] - grid.x[0]) / 2)
+    x, y = (_fiery_coordinates(axis, float(half)) for axis in (grid.x, grid.y))
+    points = []
+    for (low, _, size), along_x, along_y, shift in (
+        (grid.x, cosine, sine, -tx / half),
+        (grid.y, -sine, cosine, ty / half),
+    ):
+        point = np.add.outer(along_x * x, along_y * y)
+        point += shift
+        point -= np.float32(low / half)
+        # torch fuses these two steps: one rounding
+        points.append((point.astype(np.float64) * float(half / size) - 0.5).astype(np.float32))
+    return points[0], points[1]
+
+
+def _parted(points: AnyArray, count: int) -> tuple[AnyArray, Float32Array]:
+    """The cell before each point, from −1 (padding) to `count` (padding), and how far beyond it the point is."""
+    clipped = np.clip(points, -1, count)
+    before = np.floor(clipped)
+    clipped -= before
+    return before, clipped.astype(np.float32, copy=False)
+
+
+@functools.lru_cache(maxsize=64)
+def _numbering(grid: BevGrid, native: Orientation) -> tuple[int, int, int]:
+    """How `grid`'s orientation numbers the cells of the native one: the first, the step of a row, of a column."""
+    numbers = grid.reorient(np.arange(grid.cells).reshape(grid.shape), native)
+    first, below, beside = (int(corner) for corner in (numbers[0, 0], numbers[-1, 0], numbers[0, -1]))
+    rows, columns = (max(count - 1, 1) for count in numbers.shape)
+    return first, (below - first) // rows, (beside - first) // columns
+
+
+def _left_handed_y(grid: BevGrid) -> Axis:
+    low, high, size = grid.y
+    return -high, -low, size
+
+
+@functools.lru_cache(maxsize=64)
+def _released_coordinates(axis: Axis) -> Float32Array:
+    """(n,) metres: from the first cell's centre to the last one's *end*, evenly."""
+    low, high, size = axis
+    return _linspace(low + size / 2, high, round((high - low) / size))
+
+
+@functools.lru_cache(maxsize=64)
+def _centers(axis: Axis) -> FloatArray:
+    """(n,) metres: the cells' centres."""
+    low, high, size = axis
+    centers: FloatArray = low + (np.arange(round((high - low) / size), dtype=np.float64) + 0.5) * size
+    return centers
+
+
+@functools.lru_cache(maxsize=64)
+def _fiery_coordinates(axis: Axis, half: float) -> Float32Array:
+    """(n,) the cells' centres in units of `half` metres; if −1 to 1, as torch's affine_grid makes them in float32."""
+    low, high, size = axis
+    count = round((high - low) / size)
+    if (low, high) != (-half, half):
+        return (_centers(axis) / half).astype(np.float32)
+    return _linspace(-1, 1, count) * np.float32(count - 1) / np.float32(count)
+
+
+def _linspace(start: float, end: float, count: int) -> Float32Array:
+    """(count,) as torch makes it in float32: a rounded step, from either end to the middle with one rounding each."""
+    first, last = np.float32(start), np.float32(end)
+    step = np.float64((last - first) / np.float32(max(count - 1, 1)))
+    index = np.arange(count)
+    rising, falling = first + index * step, last - (count - 1 - index) * step
+    return np.where(index < max(count // 2, 1), rising, falling).astype(np.float32)

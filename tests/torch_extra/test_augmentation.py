@@ -1,0 +1,189 @@
+"""A = flip · scale · rotation: everything that stands in an ego frame moves together."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.export.torch import ImageConfig, RandomAugmentation, V2XConfig, V2XDataset
+from deepaccident_devkit.export.torch.augmentation import augmented_boxes, augmented_pose, augmented_six_vectors
+from deepaccident_devkit.geometry import BevGrid, Boxes, six_vectors
+from deepaccident_devkit.motion import Augmentation, MotionLabelConfig, bev_segmentation
+from deepaccident_devkit.motion.sample_labels import motion_labels
+
+AUGMENTATIONS = [
+    Augmentation(rotation=0.4),
+    Augmentation(flip=True),
+    Augmentation(rotation=-1.1, scale=1.2, flip=True),
+]
+augmentations = st.builds(Augmentation, rotation=st.floats(-3.2, 3.2), scale=st.floats(0.5, 2), flip=st.booleans())
+LABELS = MotionLabelConfig(receptive_field=2, future_frames=2, step=1, protocol="clean")
+
+
+@pytest.fixture(params=AUGMENTATIONS, ids=["turned", "mirrored", "all"])
+def augmentation(request: pytest.FixtureRequest) -> Augmentation:
+    return request.param
+
+
+def boxes_of(rows: torch.Tensor, margin: float = 0.0) -> Boxes:
+    rows = rows.double().numpy()
+    return Boxes.from_arrays(rows[:, :3], np.maximum(rows[:, 3:6] + margin, 0), rows[:, 6], frame="ego")
+
+
+@given(augmentations, st.floats(-3, 3), st.floats(0.5, 20))
+def test_a_box_heads_where_it_drives(augmentation: Augmentation, yaw: float, speed: float) -> None:
+    velocity = [[speed * np.cos(yaw), speed * np.sin(yaw), 0]]
+    boxes = Boxes.from_arrays([[5.0, 2, 1]], [[4.0, 2, 1.5]], [yaw], frame="ego", velocity=velocity)
+    [row] = augmented_boxes(boxes, augmentation)
+    assert_allclose(row[7:], np.hypot(*row[7:]) * np.array([np.cos(row[6]), np.sin(row[6])]), atol=1e-9)
+    assert_allclose(np.hypot(*row[7:]), speed * augmentation.scale)
+    assert_allclose(row[3:6], np.array([4, 2, 1.5]) * augmentation.scale)
+
+
+@given(augmentations)
+def test_a_box_is_the_hull_of_its_augmented_corners(augmentation: Augmentation) -> None:
+    boxes = Boxes.from_arrays([[5.0, 2, 1], [-7, 3, 0]], [[4.0, 2, 1.5], [9, 3, 4]], [0.3, 2.5], frame="ego")
+    moved = augmented_boxes(boxes, augmentation)
+    after = Boxes.from_arrays(moved[:, :3], moved[:, 3:6], moved[:, 6], frame="ego").corners()
+    before = boxes.corners() @ augmentation.matrix[:3, :3].T
+    for one, other in zip(before, after, strict=True):  # a mirror swaps left and right corners
+        apart = np.linalg.norm(one[:, None] - other[None], axis=-1)
+        assert apart.min(axis=1).max() < 1e-9
+
+
+@given(augmentations, st.lists(st.floats(-1, 1), min_size=6, max_size=6))
+def test_six_vectors_are_those_of_the_augmented_poses(augmentation: Augmentation, six: list[float]) -> None:
+    pose = augmented_pose(six_vectors.to_matrices(six), augmentation)
+    assert_allclose(six_vectors.to_matrices(augmented_six_vectors(six, augmentation)), pose, atol=1e-9)
+    point = np.array([3.0, -2, 1, 1])
+    there = six_vectors.to_matrices(six) @ point
+    assert_allclose(pose @ (augmentation.matrix @ point), augmentation.matrix @ there, atol=1e-9)
+
+
+def test_points_stay_in_their_boxes(da: DeepAccident, sample: str, augmentation: Augmentation) -> None:
+    plain, moved = (
+        V2XDataset(da, [sample], V2XConfig(visible=None, augmentation=chosen))[0] for chosen in (None, augmentation)
+    )
+    margin = 0.02  # points lie on the faces
+    before = boxes_of(plain["boxes"], margin).contains(plain["points"][0][0][:, :3].double())
+    after = boxes_of(moved["boxes"], margin * augmentation.scale).contains(moved["points"][0][0][:, :3].double())
+    assert before.sum() > 200
+    assert (before != after).sum() <= 0.001 * before.sum()
+    assert_array_equal(plain["points"][0][0][:, 3], moved["points"][0][0][:, 3])
+
+
+def test_points_hit_the_pixels_that_they_hit(da: DeepAccident, sample: str, augmentation: Augmentation) -> None:
+    config = {"agents": "+other", "images": ImageConfig(resize=(18, 40), crop=(2, 3, 14, 30))}
+    plain, moved = (
+        V2XDataset(da, [sample], V2XConfig(**config, augmentation=chosen))[0] for chosen in (None, augmentation)
+    )
+    assert_array_equal(plain["images"], moved["images"])
+    assert_array_equal(plain["intrinsics"], moved["intrinsics"])
+    for a in range(2):
+        for c in range(6):
+            hits = []
+            for item in (plain, moved):
+                xyz1 = item["points"][a][0].double().clone()
+                xyz1[:, 3] = 1
+                hits.append(xyz1 @ item["image_from_ego"][a, 0, c].double().T)
+            ahead = hits[0][:, 2] > 1
+            assert_allclose(hits[0][:, 2], hits[1][:, 2], atol=1e-3)
+            pixels = [hit[ahead, :2] / hit[ahead, 2:3] for hit in hits]
+            inside = (pixels[0].abs() < 100).all(dim=1)
+            assert_allclose(pixels[0][inside], pixels[1][inside], atol=0.01)
+            camera = torch.linalg.inv(moved["ego_from_camera"][a, 0, c].double())
+            by_parts = moved["intrinsics"][a, 0, c].double() @ camera[:3]
+            assert_allclose(by_parts, moved["image_from_ego"][a, 0, c][:3], rtol=1e-4, atol=0.02)
+
+
+def test_poses_lead_between_augmented_frames(da: DeepAccident, sample: str, augmentation: Augmentation) -> None:
+    plain, moved = (
+        V2XDataset(da, [sample], V2XConfig(agents="all", past=2, step=2, augmentation=chosen))[0]
+        for chosen in (None, augmentation)
+    )
+    matrix = torch.from_numpy(augmentation.matrix).float()
+    assert_allclose(moved["augmentation"], matrix)
+    for a in range(5):
+        for p in range(2):
+            there = [
+                item["points"][a][p][:50, :3] @ item["ego_from_agent"][a, p][:3, :3].T
+                + item["ego_from_agent"][a, p][:3, 3]
+                for item in (plain, moved)
+            ]
+            assert_allclose(there[0] @ matrix[:3, :3].T, there[1], atol=2e-3)
+    world = [item["boxes"][:, :3].double() for item in (plain, moved)]
+    placed = [
+        points @ item["world_from_ego"][:3, :3].T + item["world_from_ego"][:3, 3]
+        for points, item in zip(world, (plain, moved), strict=True)
+    ]
+    assert_allclose(placed[0], placed[1], atol=1e-3)
+
+
+def test_egomotion_leads_between_augmented_frames(da: DeepAccident, sample: str, augmentation: Augmentation) -> None:
+    item = V2XDataset(da, [sample], V2XConfig(points=False, labels=LABELS, augmentation=augmentation))[0]
+    plain = motion_labels(da, sample, LABELS).future_egomotion
+    assert np.abs(plain).max() > 0.1
+    assert_allclose(item["future_egomotion"], augmented_six_vectors(plain, augmentation), atol=1e-5)
+
+
+def test_boxes_lie_on_their_labels(da: DeepAccident, sample: str, augmentation: Augmentation) -> None:
+    """The cells of an augmented box are those of its instance in the augmented labels, up to the border's cells."""
+    config = V2XConfig(points=False, labels=LABELS, augmentation=augmentation)
+    item = V2XDataset(da, [sample], config)[0]
+    id_map = motion_labels(da, sample, replace(LABELS, augmentation=augmentation)).id_map
+    centers = LABELS.grid.centers().reshape(-1, 2)
+    flat = np.column_stack([centers, np.zeros(len(centers))])
+    rows, tested = item["boxes"].clone(), 0
+    rows[:, 2] = 0  # from above
+    instance = item["instance"][0].reshape(-1).numpy()
+    wide, narrow = (boxes_of(rows, margin).contains(flat) for margin in (1.5, -1.0))
+    for box, actor in enumerate(item["actor_ids"].tolist()):
+        mine = instance == id_map[actor]
+        assert not (mine & ~wide[box]).any()
+        assert (instance[narrow[box]] > 0).all()
+        tested += int(mine.sum())
+    assert tested > 100
+
+
+def test_segmentation_targets_are_augmented(da: DeepAccident, sample: str, augmentation: Augmentation) -> None:
+    config = V2XConfig(points=False, bev_segmentation=BevGrid(), augmentation=augmentation)
+    expected = bev_segmentation(da, sample, BevGrid(), augmentation=augmentation)
+    assert_array_equal(V2XDataset(da, [sample], config)[0]["bev_segmentation"], expected.masks)
+
+
+def test_draws_depend_on_seed_epoch_and_index_alone(da: DeepAccident, tokens: list[str]) -> None:
+    config = {"points": False, "boxes": None, "augmentation": RandomAugmentation()}
+    data = V2XDataset(da, tokens, V2XConfig(**config))
+    drawn = torch.stack([item["augmentation"] for item in data])
+    assert len({tuple(matrix.flatten().tolist()) for matrix in drawn}) == len(tokens)
+    assert_array_equal(data[3]["augmentation"], drawn[3])
+    data.set_epoch(1)
+    assert not torch.equal(data[3]["augmentation"], drawn[3])
+    data.set_epoch(0)
+    assert_array_equal(data[3]["augmentation"], drawn[3])
+    other = V2XDataset(da, tokens, V2XConfig(**config, seed=1))
+    assert not torch.equal(other[3]["augmentation"], drawn[3])
+
+
+def test_random_augmentations_stay_in_their_ranges() -> None:
+    draw, generator = RandomAugmentation(rotation=0.2, scale=(0.9, 1.3), flip=0.25), np.random.default_rng(0)
+    drawn = [draw(generator) for _ in range(2000)]
+    assert 0.19 < max(abs(one.rotation) for one in drawn) <= 0.2
+    assert 0.9 <= min(one.scale for one in drawn) < 0.91
+    assert 1.29 < max(one.scale for one in drawn) <= 1.3
+    assert 0.2 < np.mean([one.flip for one in drawn]) < 0.3
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [({"rotation": -1}, "rotation is -1"), ({"scale": (1.1, 0.9)}, "scale is"), ({"flip": 2}, "flip is 2")],
+)
+def test_random_augmentations_that_cannot_be(fields: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        RandomAugmentation(**fields)

@@ -1,0 +1,145 @@
+"""Batches, workers and a training loop."""
+
+import pickle
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+from torch.utils.data import DataLoader
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import MissingFileError
+from deepaccident_devkit.export.torch import (
+    ImageConfig,
+    RandomAugmentation,
+    V2XConfig,
+    V2XDataset,
+    collate,
+    collate_fusion,
+)
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.motion import MotionLabelConfig
+from deepaccident_devkit.v2x import Link
+
+EVERYTHING = V2XConfig(
+    agents="all",
+    link=Link(latency=0.1, pose_noise=0.3, packet_loss=0.3),
+    past=2,
+    images=ImageConfig(resize=(18, 32)),
+    labels=MotionLabelConfig(grid=BevGrid(x=(-50, 50, 1), y=(-50, 50, 1)), receptive_field=2, future_frames=2, step=1),
+    bev_segmentation=BevGrid(x=(-30, 30, 1), y=(-30, 30, 1)),
+    augmentation=RandomAugmentation(),
+)
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two batches, or what stands in them, are equal."""
+    if isinstance(one, torch.Tensor):
+        return torch.equal(one, other)
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, list | tuple):
+        return len(one) == len(other) and all(same(left, right) for left, right in zip(one, other, strict=True))
+    return one == other
+
+
+def test_agents_side_by_side(da: DeepAccident, tokens: list[str]) -> None:
+    one, two = (
+        V2XDataset(da, tokens[:1], V2XConfig(images=ImageConfig()))[0],
+        V2XDataset(da, tokens[1:2], V2XConfig(agents="all", images=ImageConfig()))[0],
+    )
+    batch = collate([one, two])
+    assert batch["token"] == tokens[:2]
+    assert batch["agents"] == [one["agents"], two["agents"]]
+    assert batch["agent_valid"].tolist() == [[[True]] + [[False]] * 4, [[True]] * 5]
+    assert batch["images"].shape == (2, 5, 1, 6, 3, 36, 64)
+    assert_array_equal(batch["images"][0, :1], one["images"])
+    assert not batch["images"][0, 1:].any()
+    assert_array_equal(batch["intrinsics"][0, 1:], np.broadcast_to(np.eye(3), (4, 1, 6, 3, 3)))
+    assert_array_equal(batch["ego_from_agent"][1], two["ego_from_agent"])
+    assert [len(boxes) for boxes in batch["boxes"]] == [len(one["boxes"]), len(two["boxes"])]
+    assert [len(agents) for agents in batch["points"]] == [1, 5]
+    assert batch["world_from_ego"].shape == (2, 4, 4)
+    assert "record_len" not in batch
+
+
+def test_agents_one_after_another(da: DeepAccident, tokens: list[str]) -> None:
+    items = [V2XDataset(da, [tokens[0]], V2XConfig(agents=agents))[0] for agents in ("+other", "single", "all")]
+    batch = collate_fusion(items)
+    assert batch["record_len"].tolist() == [2, 1, 5]
+    assert batch["record_len"].dtype == torch.int64
+    assert batch["ego_from_agent"].shape == (8, 1, 4, 4)
+    assert len(batch["points"]) == 8
+    pairwise = batch["pairwise_t_matrix"]
+    assert pairwise.shape == (3, 5, 5, 4, 4)
+    assert_array_equal(pairwise[1], np.broadcast_to(np.eye(4), (5, 5, 4, 4)))
+    assert_array_equal(pairwise[0, 2:], np.broadcast_to(np.eye(4), (3, 5, 4, 4)))
+    for i, source in enumerate(items[2]["agents"]):
+        for j, target in enumerate(items[2]["agents"]):
+            frames = [da.get_sample(da.scenario[0], name, 4) for name in (target, source)]
+            assert_allclose(pairwise[2, i, j], da.transform(*frames).matrix, atol=1e-3)
+
+
+def test_opencoods_own_formula_gives_the_same_matrices(da: DeepAccident, sample: str) -> None:
+    """Its t_list holds the poses to the ego's frame; pairwise[i, j] = inv(t_list[j]) · t_list[i]."""
+    item = V2XDataset(da, [sample], V2XConfig(agents="all", augmentation=RandomAugmentation()))[0]
+    t_list = item["ego_from_agent"][:, -1].double().numpy()
+    found = collate_fusion([item])["pairwise_t_matrix"][0]
+    for i in range(5):
+        for j in range(5):
+            assert_allclose(found[i, j], np.dot(np.linalg.inv(t_list[j]), t_list[i]), atol=1e-4)
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+@pytest.mark.parametrize("start", ["fork", "spawn"])
+def test_workers_give_what_one_process_gives(da: DeepAccident, tokens: list[str], start: str) -> None:
+    data = V2XDataset(da, tokens[:4], EVERYTHING)
+    arguments = {"batch_size": 2, "collate_fn": collate_fusion}
+    alone = list(DataLoader(data, **arguments))
+    shared = list(DataLoader(data, num_workers=2, multiprocessing_context=start, **arguments))
+    assert same(alone, shared)
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+@pytest.mark.parametrize("start", ["fork", "spawn"])
+def test_workers_that_stay_hear_of_the_epoch(da: DeepAccident, tokens: list[str], start: str) -> None:
+    data = V2XDataset(da, tokens[:3], V2XConfig(points=False, boxes=None, augmentation=RandomAugmentation()))
+    loader = DataLoader(data, collate_fn=collate, num_workers=1, persistent_workers=True, multiprocessing_context=start)
+    epochs = []
+    for epoch in range(2):
+        data.set_epoch(epoch)
+        epochs.append(torch.cat([batch["augmentation"] for batch in loader]))
+        assert same(epochs[-1], torch.stack([item["augmentation"] for item in data]))
+    assert not torch.equal(epochs[0], epochs[1])
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_errors_come_out_of_workers_as_they_are(da_b: DeepAccident) -> None:
+    data = V2XDataset(da_b, [da_b.sample[0]["token"]])
+    with pytest.raises(MissingFileError, match="no such file"):
+        next(iter(DataLoader(data, num_workers=1, collate_fn=collate)))
+
+
+def test_a_dataset_pickles_cheaply(da: DeepAccident) -> None:
+    data = V2XDataset(da, [record["token"] for record in da.sample], V2XConfig(points=False))
+    data.set_epoch(7)
+    text = pickle.dumps(data)
+    assert len(text) < 8 * len(data) + 10_000
+    assert same(pickle.loads(text)[5], data[5])
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_the_documented_training_loop_learns(da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The code of docs/training.md as it stands there; the session's release takes the place of its own."""
+    page = Path(__file__).parents[2] / "docs" / "training.md"
+    [code] = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    (tmp_path / "training_release").symlink_to(da.dataroot)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec(compile(code, str(page), "exec"), names)  # noqa: S102
+    assert len(names["losses"]) == 5
+    assert names["losses"][-1] < 0.8 * names["losses"][0]

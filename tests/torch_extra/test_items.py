@@ -1,0 +1,275 @@
+"""Items without an augmentation: what the devkit's own calls give, as tensors."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import (
+    ChoiceError,
+    ConfigError,
+    MissingFileError,
+    NotAvailableError,
+    SensorFileError,
+    TokenError,
+)
+from deepaccident_devkit.export.torch import ImageConfig, V2XConfig, V2XDataset
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.motion import Augmentation, MotionLabelConfig, bev_segmentation
+from deepaccident_devkit.motion.sample_labels import motion_labels
+from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
+from deepaccident_devkit.v2x import AGENT_CONFIGS, cooperating_agents
+
+LABELS = MotionLabelConfig(receptive_field=2, future_frames=3, step=1)
+
+
+def test_a_sample_alone(da: DeepAccident, sample: str) -> None:
+    [item] = list(V2XDataset(da, [sample]))
+    assert item["token"] == sample
+    assert item["agents"] == ("ego_vehicle",)
+    assert item["agent_valid"].tolist() == [[True]]
+    assert_array_equal(item["ego_from_agent"], np.eye(4)[None, None])
+    assert_array_equal(item["augmentation"], np.eye(4))
+    assert_allclose(item["world_from_ego"], da.world_from(sample, "ego").matrix)
+    cloud = da.load_point_cloud(sample, "ego")
+    assert_array_equal(item["points"][0][0], cloud.points.astype(np.float32))
+    boxes = da.boxes(sample, "ego", visible="released")
+    expected = np.column_stack([boxes.center, boxes.size, boxes.yaw, boxes.velocity[:, :2]])
+    assert len(boxes) > 3
+    assert_allclose(item["boxes"], expected, atol=1e-4)
+    assert_array_equal(item["categories"], boxes.category)
+    assert_array_equal(item["actor_ids"], boxes.actor_id)
+    assert item["velocity_known"].all()
+    assert not {"images", "segmentation", "bev_segmentation"} & set(item)
+
+
+def test_unknown_velocities_are_zero_and_say_so(da: DeepAccident, sample: str) -> None:
+    item = V2XDataset(da, [sample], V2XConfig(points=False, visible=None))[0]
+    boxes = da.boxes(sample, "ego")
+    unknown = np.isnan(boxes.velocity).any(axis=1)
+    assert_array_equal(item["velocity_known"], ~unknown)
+    assert torch.isfinite(item["boxes"]).all()
+    assert not item["boxes"][torch.from_numpy(unknown), 7:].any()
+
+
+@pytest.mark.parametrize("agents", [*AGENT_CONFIGS, ["infrastructure", "other_vehicle"], None])
+@pytest.mark.parametrize("ego", AGENTS)
+def test_each_agent_sends_its_own_frame(da: DeepAccident, ego: str, agents: str | list[str] | None) -> None:
+    token = f"{da.scenario[1]['token']}/{ego}/004"
+    item = V2XDataset(da, [token], V2XConfig(agents=agents, boxes="cooperative"))[0]
+    assert item["agents"][0] == ego
+    assert set(item["agents"]) == {ego, *cooperating_agents(da, token, agents)}
+    for a, name in enumerate(item["agents"]):
+        other = da.get_sample(da.scenario[1], name, 4)
+        assert_allclose(item["ego_from_agent"][a, 0], da.transform(token, other).matrix, atol=1e-4)
+        assert_allclose(item["points"][a][0][:, :3], da.load_point_cloud(other, "ego").xyz, atol=1e-4)
+    boxes = da.cooperative_boxes(token, agents=item["agents"], frame="ego", visible="released")
+    assert_allclose(item["boxes"][:, :3], boxes.center, atol=1e-4)
+    assert_array_equal(item["actor_ids"], boxes.actor_id)
+
+
+def test_past_frames_end_with_the_present(da: DeepAccident, sample: str) -> None:
+    item = V2XDataset(da, [sample], V2XConfig(past=3, step=2, agents="+other", images=ImageConfig(resize=(9, 16))))[0]
+    assert item["agent_valid"].tolist() == [[False, True, True]] * 2
+    scenario = da.scenario[0]
+    for a, name in enumerate(item["agents"]):
+        assert len(item["points"][a][0]) == 0
+        assert not item["images"][a, 0].any()
+        for key in ("ego_from_agent", "intrinsics", "ego_from_camera", "image_from_ego"):
+            blank = item[key][a, 0]
+            assert_array_equal(blank, np.broadcast_to(np.eye(blank.shape[-1]), blank.shape))
+        for p, frame in ((1, 2), (2, 4)):
+            then = da.get_sample(scenario, name, frame)
+            assert_allclose(item["points"][a][p][:, :3], da.load_point_cloud(then, "ego").xyz, atol=1e-4)
+            assert_allclose(item["ego_from_agent"][a, p], da.transform(sample, then).matrix, atol=1e-4)
+
+
+def test_images_and_cameras_are_the_devkits(da: DeepAccident, sample: str) -> None:
+    item = V2XDataset(da, [sample], V2XConfig(agents="+infrastructure", images=ImageConfig(dtype="uint8")))[0]
+    assert item["images"].shape == (2, 1, 6, 3, 36, 64)
+    assert item["images"].dtype == torch.uint8
+    points = da.load_point_cloud(sample, "ego").xyz
+    for c, channel in enumerate(CAMERAS):
+        camera = f"{sample}/{channel}"
+        assert_array_equal(item["images"][0, 0, c].permute(1, 2, 0), da.load_image(camera))
+        expected = da.project_to_image(points, sample, camera, frame="ego", colors=False)
+        pixels, depth = projected(item["image_from_ego"][0, 0, c], points)
+        ahead = expected.depth > 0.5
+        assert_allclose(depth, expected.depth, atol=1e-3)
+        assert_allclose(pixels[expected.mask & ahead], expected.pixels[expected.mask & ahead], atol=0.01)
+        optical = da.world_from(sample, "ego").inverse() @ da.world_from(sample, channel)
+        assert_allclose(item["ego_from_camera"][0, 0, c], optical.matrix, atol=1e-5)
+        assert_allclose(item["intrinsics"][0, 0, c], da.get_sample_data(camera)[2], atol=1e-4)
+
+
+def test_a_resized_and_cropped_image_hits_the_same_pixels(da: DeepAccident, sample: str) -> None:
+    config = ImageConfig(resize=(18, 48), crop=(3, 5, 12, 40), cameras=("Camera_Back", "Camera_Front"))
+    item = V2XDataset(da, [sample], V2XConfig(images=config))[0]
+    assert item["images"].shape == (1, 1, 2, 3, 12, 40)
+    points = da.load_point_cloud(sample, "ego").xyz
+    whole = da.project_to_image(points, sample, f"{sample}/Camera_Front", frame="ego", colors=False)
+    seen = whole.mask & (whole.depth > 0.5)
+    expected = whole.pixels * [48 / 64, 18 / 36] - [5, 3]
+    assert_allclose(projected(item["image_from_ego"][0, 0, 1], points)[0][seen], expected[seen], atol=0.01)
+    by_parts = np.eye(4)
+    by_parts[:3] = item["intrinsics"][0, 0, 1].numpy() @ np.linalg.inv(item["ego_from_camera"][0, 0, 1].numpy())[:3]
+    assert_allclose(projected(torch.from_numpy(by_parts), points)[0][seen], expected[seen], atol=0.01)
+
+
+def test_what_an_image_shows_moves_with_its_intrinsic(
+    da: DeepAccident, sample: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A picture whose colours say where they are: each pixel of the result is what stood where its centre maps to."""
+    u, v = np.meshgrid(np.arange(64) + 0.5, np.arange(36) + 0.5)
+    ramp = np.stack([2 * u, 4 * v, 0 * u], axis=-1).round().astype(np.uint8)
+    monkeypatch.setattr(type(da), "load_image", lambda *_: ramp)
+    image, intrinsic = ImageConfig(resize=(18, 32), crop=(2, 4, 12, 20)).load(da, f"{sample}/Camera_Front")
+    old = da.get_sample_data(f"{sample}/Camera_Front")[2]
+    back = old @ np.linalg.inv(intrinsic)
+    rows, columns = np.mgrid[0:12, 0:20] + 0.5
+    was = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ back.T
+    assert np.abs(image[..., 0] - 2 * was[..., 0]).max() <= 1.5
+    assert np.abs(image[..., 1] - 4 * was[..., 1]).max() <= 1.5
+
+
+def test_values_of_images(da: DeepAccident, sample: str) -> None:
+    raw, plain, scaled = (
+        V2XDataset(da, [sample], V2XConfig(points=False, boxes=None, images=config))[0]["images"]
+        for config in (
+            ImageConfig(dtype="uint8"),
+            ImageConfig(),
+            ImageConfig(mean=(0.5, 0.4, 0.3), std=(0.2, 0.3, 0.4)),
+        )
+    )
+    assert plain.dtype == torch.float32
+    assert_allclose(plain, raw.numpy() / 255, atol=1e-6)
+    mean, std = (torch.tensor(three)[:, None, None] for three in ((0.5, 0.4, 0.3), (0.2, 0.3, 0.4)))
+    assert_allclose(scaled, (plain - mean) / std, atol=1e-5)
+
+
+@pytest.mark.parametrize("to_present", ["nearest", "bilinear", None])
+def test_labels_are_the_devkits(da: DeepAccident, sample: str, to_present: str | None) -> None:
+    item = V2XDataset(da, [sample], V2XConfig(points=False, labels=LABELS, to_present=to_present))[0]
+    labels = motion_labels(da, sample, LABELS)
+    if to_present is not None:
+        labels = labels.to_present(centerness=to_present)
+    for name in ("segmentation", "instance", "centerness", "offset", "flow", "label_valid"):
+        assert_array_equal(item[name], getattr(labels, name), err_msg=name)
+    assert_allclose(item["future_egomotion"], labels.future_egomotion, atol=1e-6)
+    assert item["label_valid"].tolist() == [True, True, True, False]
+    assert item["segmentation"].dtype == item["instance"].dtype == torch.int64
+    assert item["segmentation"][0].any()
+
+
+def test_segmentation_targets_are_the_devkits(da: DeepAccident, sample: str) -> None:
+    grid = BevGrid(x=(-20, 40, 1), y=(-30, 30, 1), orientation="fiery")
+    item = V2XDataset(da, [sample], V2XConfig(points=False, bev_segmentation=grid))[0]
+    expected = bev_segmentation(da, sample, grid)
+    assert_array_equal(item["bev_segmentation"], expected.masks)
+    assert_array_equal(item["bev_known"], expected.known)
+
+
+def test_items_are_counted_as_a_sequences(da: DeepAccident, tokens: list[str]) -> None:
+    data = V2XDataset(da, tokens, V2XConfig(points=False, boxes=None))
+    assert len(data) == len(tokens) == 20
+    assert [item["token"] for item in data] == tokens
+    assert data[-1]["token"] == tokens[-1]
+    with pytest.raises(IndexError):
+        data[20]
+    assert isinstance(data, torch.utils.data.Dataset)
+
+
+def test_samples_that_cannot_be(da: DeepAccident, tokens: list[str]) -> None:
+    with pytest.raises(TokenError, match="nowhere"):
+        V2XDataset(da, ["nowhere"])
+    with pytest.raises(ChoiceError, match="agents: expected one of"):
+        V2XDataset(da, tokens, V2XConfig(agents="everybody"))[0]
+
+
+def test_a_missing_file_is_named(da_b: DeepAccident) -> None:
+    token = da_b.sample[0]["token"]
+    with pytest.raises(MissingFileError, match=r"lidar01.*no such file"):
+        V2XDataset(da_b, [token])[0]
+    with pytest.raises(MissingFileError, match=r"Camera_Front.*no such file"):
+        V2XDataset(da_b, [token], V2XConfig(points=False, images=ImageConfig()))[0]
+    with pytest.raises(MissingFileError, match=r"BEV_instance_camera.*no such file"):
+        V2XDataset(da_b, [token], V2XConfig(points=False, bev_segmentation=BevGrid()))[0]
+
+
+def test_a_broken_file_is_named(da: DeepAccident, sample: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    broken = tmp_path / "broken.jpg"
+    broken.write_bytes(b"no image")
+    monkeypatch.setattr(type(da), "get_sample_data_path", lambda *_: broken)
+    with pytest.raises(SensorFileError, match=r"broken\.jpg: not a readable image"):
+        V2XDataset(da, [sample], V2XConfig(points=False, images=ImageConfig()))[0]
+
+
+def test_labels_of_a_sample_without(own_release: Path) -> None:
+    for label in next(own_release.glob("*/*/ego_vehicle/label/*")).iterdir():
+        label.unlink()
+    da = DeepAccident("v1", own_release, verbose=False)
+    token = next(record["token"] for record in da.sample if not record["labelled"])
+    with pytest.raises(NotAvailableError, match=rf"1 of the 1 samples have no label, such as {token}.*labels=None"):
+        V2XDataset(da, [token], V2XConfig(labels=LABELS))
+    assert V2XDataset(da, [token], V2XConfig(points=False))[0]["boxes"].shape == (0, 9)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"past": 0}, "past: expected a whole number from 1, found 0"),
+        ({"step": 0}, "step: expected a whole number from 1, found 0"),
+        ({"seed": -1}, "seed: expected a whole number from 0"),
+        ({"boxes": "all"}, "boxes: expected None or one of sample, cooperative, found 'all'"),
+        ({"visible": "all"}, "visible: expected None or one of camera, released"),
+        ({"to_present": "cubic"}, "to_present: expected None or one of nearest, bilinear"),
+        ({"labels": MotionLabelConfig(augmentation=Augmentation())}, r"give V2XConfig\(augmentation=…\) alone"),
+        ({"augmentation": 0.3}, "augmentation: expected an Augmentation or a function that draws one, found 0.3"),
+    ],
+)
+def test_configurations_that_cannot_be(fields: dict[str, object], message: str) -> None:
+    with pytest.raises((ConfigError, ChoiceError), match=message):
+        V2XConfig(**fields)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"resize": (0, 5)}, r"resize: expected height and width in pixels, found \(0, 5\)"),
+        ({"crop": (0, 0, 5)}, "crop: expected top, left, height and width"),
+        (
+            {"resize": (10, 20), "crop": (4, 0, 7, 20)},
+            "rows 4 to 11 and columns 0 to 20 reach beyond an image of 10 × 20",
+        ),
+        ({"dtype": "float16"}, "dtype: expected one of float32, uint8"),
+        ({"std": (1.0, 1.0, 0.0)}, "std above 0"),
+        ({"dtype": "uint8", "mean": (0.5, 0.5, 0.5)}, "uint8 images are as decoded"),
+        ({"cameras": ("Front",)}, "cameras: expected some of Camera_Front"),
+        ({"cameras": ("Camera_Front", "Camera_Front")}, "each once"),
+    ],
+)
+def test_image_configurations_that_cannot_be(fields: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        ImageConfig(**fields)
+
+
+def test_a_crop_beyond_the_stored_image(da: DeepAccident, sample: str) -> None:
+    with pytest.raises(ConfigError, match="reach beyond an image of 36 × 64"):
+        V2XDataset(da, [sample], V2XConfig(images=ImageConfig(crop=(30, 0, 10, 64))))[0]
+
+
+def test_images_of_different_sizes(da: DeepAccident) -> None:
+    images = [np.zeros((4, 5, 3), dtype=np.uint8), np.zeros((4, 6, 3), dtype=np.uint8)]
+    with pytest.raises(ConfigError, match=r"different sizes, \(4, 5\) and \(4, 6\); choose resize="):
+        ImageConfig().stacked(images)
+
+
+def projected(image_from_ego: torch.Tensor, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (N, 2) and depths (N,) of points of the ego frame."""
+    matrix = image_from_ego.double().numpy()
+    scaled = points @ matrix[:3, :3].T + matrix[:3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return scaled[:, :2] / scaled[:, 2:], scaled[:, 2]

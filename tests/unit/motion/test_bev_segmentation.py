@@ -1,0 +1,103 @@
+"""BEV segmentation targets: the camera's pixels in the cells of a grid."""
+
+import math
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError, ConfigError
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.motion import BEV_CLASSES, Augmentation, bev_segmentation, segmentation_of
+from deepaccident_devkit.release import BevImage
+from deepaccident_devkit.taxonomy import BEV_SHAPE
+
+ROAD, LANE_LINE, VEHICLE = 7, 6, 10
+
+
+def _image(*painted: tuple[int, slice, slice]) -> BevImage:
+    semantic = np.zeros(BEV_SHAPE, dtype=np.uint8)
+    for tag, rows, columns in painted:
+        semantic[rows, columns] = tag
+    return BevImage(semantic, np.zeros(BEV_SHAPE, dtype=np.uint16))
+
+
+def _pixel(x: float, y: float) -> tuple[slice, slice]:
+    """A square of 1 m about a point x forward, y left, in the camera's pixels."""
+    row, column = round(599.5 - x / 0.1), round(599.5 - y / 0.1)
+    return slice(row - 5, row + 5), slice(column - 5, column + 5)
+
+
+@pytest.mark.parametrize("orientation", ["devkit", "released", "fiery"])
+def test_what_lies_ahead_on_the_left_is_there_in_every_orientation(orientation: str) -> None:
+    grid = BevGrid(orientation=orientation)  # type: ignore[arg-type]
+    targets = segmentation_of(_image((VEHICLE, *_pixel(20.25, 10.25))), grid)
+    (cell,), _ = grid.index_of([[20.25, 10.25]])
+    mask = targets.mask("vehicle")
+    assert mask[tuple(cell)]
+    assert 1 <= mask.sum() <= 9
+    centers = grid.centers()[mask]
+    np.testing.assert_allclose(centers.mean(axis=0), [20.25, 10.25], atol=0.3)
+
+
+def test_wide_classes_need_half_a_cell_and_thin_ones_a_pixel() -> None:
+    # the cell of x 0…0.5, y 0…0.5 covers rows 595…599 and columns 595…599
+    few = _image((ROAD, slice(595, 600), slice(595, 597)), (LANE_LINE, slice(599, 600), slice(599, 600)))
+    grid = BevGrid()
+    (cell,), _ = grid.index_of([[0.25, 0.25]])
+    targets = segmentation_of(few, grid)
+    assert not targets.mask("road")[tuple(cell)]
+    assert targets.mask("lane_line")[tuple(cell)]
+    assert targets.mask("lane_line").sum() == 1
+    lower = segmentation_of(few, grid, coverage={"road": 0.4})
+    assert lower.mask("road")[tuple(cell)]
+
+
+def test_cells_beyond_the_camera_are_unknown_and_empty() -> None:
+    everywhere = _image((ROAD, slice(None), slice(None)))
+    targets = segmentation_of(everywhere, BevGrid((-80, 80, 0.5), (-70, 70, 0.5)))
+    assert targets.known.sum() == 240 * 240
+    np.testing.assert_array_equal(targets.mask("road"), targets.known)
+
+
+def test_cells_finer_than_pixels_take_the_nearest() -> None:
+    targets = segmentation_of(_image((ROAD, slice(0, 600), slice(None))), BevGrid((-1, 1, 0.05), (-1, 1, 0.05)))
+    np.testing.assert_array_equal(targets.mask("road"), np.broadcast_to(np.arange(40) >= 20, (40, 40)))
+
+
+def test_an_augmentation_moves_the_ground_as_it_moves_points() -> None:
+    augmentation = Augmentation(rotation=math.radians(90), scale=1.1, flip=True)
+    place = np.array([20.25, 10.25, 0.0, 1.0])
+    moved = augmentation.matrix @ place
+    targets = segmentation_of(_image((VEHICLE, *_pixel(20.25, 10.25))), BevGrid(), augmentation=augmentation)
+    centers = BevGrid().centers()[targets.mask("vehicle")]
+    np.testing.assert_allclose(centers.mean(axis=0), moved[:2], atol=0.3)
+
+
+def test_boxes_of_a_sample_lie_on_vehicle_cells(da: DeepAccident) -> None:
+    sample = da.sample[3]
+    targets = bev_segmentation(da, sample)
+    boxes = da.boxes(sample, "ego")
+    large = boxes.select(np.flatnonzero(boxes.category < 3))
+    index, inside = targets.grid.index_of(large.center)
+    painted = targets.mask("vehicle")[index[inside, 0], index[inside, 1]]
+    assert len(painted) >= 3
+    assert painted.mean() > 0.6  # the rest are hidden under others or parked beyond the drawn ground
+    assert targets.mask("road").any()
+
+
+def test_unknown_classes_and_shares_are_refused(da: DeepAccident) -> None:
+    image = _image()
+    with pytest.raises(ConfigError, match="expected classes of road, lane_line"):
+        segmentation_of(image, BevGrid(), coverage={"tram": 0.5})
+    with pytest.raises(ConfigError, match="choose a share"):
+        segmentation_of(image, BevGrid(), coverage={"road": 1.0})
+    with pytest.raises(ChoiceError, match="expected one of"):
+        segmentation_of(image, BevGrid()).mask("tram")
+
+
+def test_results_are_read_only() -> None:
+    targets = segmentation_of(_image(), BevGrid())
+    assert targets.masks.shape == (len(BEV_CLASSES), 200, 200)
+    with pytest.raises(ValueError, match="read-only"):
+        targets.masks[0, 0, 0] = True

@@ -1,0 +1,87 @@
+"""Which samples count: one a second to train, the last two seconds of accidents to evaluate."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
+from deepaccident_devkit.motion import samples
+from deepaccident_devkit.taxonomy import AGENTS
+
+
+def _frames(tokens: list[str], scenario: str, agent: str) -> list[int]:
+    return [int(one.rsplit("/", 1)[1]) for one in tokens if one.startswith(f"{scenario}/{agent}/")]
+
+
+@pytest.fixture
+def every_scenario(da_motion: DeepAccident, tmp_path: Path) -> Path:
+    split = tmp_path / "mine.txt"
+    split.write_text("".join(f"{record['token'].replace('/', ' ')}\n" for record in da_motion.scenario))
+    return split
+
+
+def test_training_takes_a_sample_a_second_counted_from_the_end(da_motion: DeepAccident, every_scenario: Path) -> None:
+    tokens = samples(da_motion, every_scenario, "train")
+    for scenario in da_motion.scenario:
+        for agent in AGENTS:
+            assert _frames(tokens, scenario["token"], agent) == [5, 15, 25, 35]
+
+
+def test_evaluation_takes_the_last_two_seconds_of_accidents_but_the_end(
+    da_motion: DeepAccident, every_scenario: Path
+) -> None:
+    tokens = samples(da_motion, every_scenario, "evaluate")
+    for scenario in da_motion.scenario:
+        expected = [15, 20, 25, 30] if scenario["designed_accident"] else []
+        for agent in AGENTS:
+            assert _frames(tokens, scenario["token"], agent) == expected
+
+
+def test_the_paper_leaves_horizon_and_scope_open(da_motion: DeepAccident, every_scenario: Path) -> None:
+    tokens = samples(da_motion, every_scenario, "evaluate", "paper", horizon=3.0, scope="all")
+    for scenario in da_motion.scenario:
+        assert _frames(tokens, scenario["token"], "infrastructure") == [5, 10, 15, 20, 25, 30]
+    assert len(samples(da_motion, every_scenario, "all")) == 2 * 5 * 7
+
+
+def test_a_split_belongs_to_its_scenarios_alone(da_motion: DeepAccident, tmp_path: Path) -> None:
+    one = da_motion.scenario[1]["token"]
+    (tmp_path / "one.txt").write_text(one.replace("/", " ") + "\n")
+    assert {token.rsplit("/", 2)[0] for token in samples(da_motion, tmp_path / "one.txt", "all")} == {one}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ({"purpose": "testing"}, "purpose: expected one of train, evaluate, all, every"),
+        ({"protocol": "boxes"}, "protocol: expected one of released, paper"),
+        ({"protocol": "paper", "scope": "some"}, "scope: expected one of accident, all"),
+    ],
+)
+def test_unknown_choices_name_those_there_are(da_motion: DeepAccident, arguments: dict[str, str], told: str) -> None:
+    with pytest.raises(ChoiceError, match=re.escape(told)):
+        samples(da_motion, "train", **arguments)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("horizon", [0.0, 0.7, -1.0, float("nan")])
+def test_a_horizon_is_a_number_of_half_seconds(da_motion: DeepAccident, horizon: float) -> None:
+    with pytest.raises(ConfigError, match=r"choose 0\.5, 1, 1\.5"):
+        samples(da_motion, "train", "evaluate", "paper", horizon=horizon)
+
+
+def test_the_released_protocol_has_one_horizon(da_motion: DeepAccident) -> None:
+    with pytest.raises(ConfigError, match="protocol='paper'"):
+        samples(da_motion, "train", "evaluate", horizon=3.0)
+
+
+def test_a_split_without_labels_says_so(own_release: Path) -> None:
+    for folder in own_release.glob("**/label"):
+        for path in folder.rglob("*.txt"):
+            path.unlink()
+    unlabelled = DeepAccident("v1", own_release, verbose=False)
+    split = own_release / "mine.txt"
+    split.write_text(unlabelled.scenario[0]["token"].replace("/", " ") + "\n")
+    with pytest.raises(NotAvailableError, match="labels"):
+        samples(unlabelled, split)
