@@ -1,19 +1,29 @@
-"""Motion labels of a sample from boxes, on golden-like input: 5 frames, 30 objects, 200 × 200 cells."""
+"""Motion labels: from boxes, at the present, read off predictions, written for a split; 5 frames, 30 objects."""
+
+import functools
+import tempfile
+from pathlib import Path
 
 import numpy as np
 
+from benchmarks import labels_postprocess, labels_warp
 from benchmarks.measure import Figure, best_of, one_core
-from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionLabelConfig
+from benchmarks.releases import labels_only_release
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.motion import LABEL_PROTOCOLS, LabelFiles, MotionLabelConfig, write_label_files
 from deepaccident_devkit.motion.drawing.from_boxes import FrameBoxes, motion_labels_from_boxes
 from deepaccident_devkit.motion.drawing.polygon_fill import filled_cells
 
 OBJECTS, STEP = 30, 0.5
 REPEATS = 200
-RELEASED_MS = 112.0
-"""The released code on 30 objects took 112 to 136 ms on two cores (design.md 6)."""
+SCENARIOS, FRAMES = 8, 40
 
 
 def measure() -> list[Figure]:
+    return [*labels_ms(), *labels_warp.measure(), *labels_postprocess.measure(), *split_samples_per_s()]
+
+
+def labels_ms() -> list[Figure]:
     frames, motion = make_frames(np.random.default_rng(0)), make_motion()
     quads, image = make_quads(np.random.default_rng(1))
     configs = {name: MotionLabelConfig(protocol=name) for name in LABEL_PROTOCOLS}
@@ -25,10 +35,32 @@ def measure() -> list[Figure]:
         filling = 1e3 * best_of(REPEATS, lambda: filled_cells(quads, (200, 200), image, 5))
     released = milliseconds.pop("released")
     return [
-        Figure(name="labels_ms", value=released, unit="ms", bound=3.0),
-        Figure(name="labels_against_released", value=RELEASED_MS / released, unit="times", higher_is_better=True),
+        Figure(name="labels_ms", value=released, unit="ms", bound=3.0, reference=112),
         Figure(name="labels_fill_150_quads_ms", value=filling, unit="ms", bound=0.6),
         *(Figure(name=f"labels_{name}_ms", value=value, unit="ms") for name, value in milliseconds.items()),
+    ]
+
+
+def split_samples_per_s() -> list[Figure]:
+    """Label files of a whole release, from its tables; and one sample from tables and files."""
+    with tempfile.TemporaryDirectory() as folder:
+        root = labels_only_release(Path(folder), scenarios=SCENARIOS, frames=FRAMES)
+        dataset = DeepAccident(dataroot=root, verbose=False)
+        tokens = [sample["token"] for sample in dataset.sample]
+        rates = {}
+        for workers in (1, 2):
+            work = functools.partial(write_label_files, dataset, Path(folder) / f"{workers}", tokens, workers=workers)
+            rates[workers] = len(tokens) / best_of(1, work)
+        files, token = LabelFiles(Path(folder) / "1"), tokens[len(tokens) // 2]
+        with one_core():
+            from_tables, from_files = (
+                1e3 * best_of(REPEATS, work) for work in (lambda: dataset.motion_labels(token), lambda: files[token])
+            )
+    return [
+        Figure(name="labels_from_tables_ms", value=from_tables, unit="ms", bound=4.0),
+        Figure(name="labels_from_files_ms", value=from_files, unit="ms"),
+        Figure(name="split_samples_per_s_1_worker", value=rates[1], unit="samples/s"),
+        Figure(name="split_samples_per_s_2_workers", value=rates[2], unit="samples/s"),
     ]
 
 

@@ -15,16 +15,18 @@ def measure() -> list[Figure]:
     clear, noisy = clear_heads(), noisy_heads()
     with one_core():
         return [
-            figure("postprocess_ms", clear, "motion", REPEATS, 6.0),
+            figure("postprocess_ms", clear, "motion", REPEATS, 6.0, 497),
             figure("postprocess_noisy_ms", noisy, "motion", NOISY_REPEATS, 20.0),
-            figure("postprocess_accident_ms", clear, "accident", REPEATS, 10.0),
+            figure("postprocess_accident_ms", clear, "accident", REPEATS, 10.0, 499),
             figure("postprocess_accident_noisy_ms", noisy, "accident", NOISY_REPEATS, 60.0),
         ]
 
 
-def figure(name: str, heads: MotionHeads, settings: str, repeats: int, bound: float) -> Figure:
+def figure(
+    name: str, heads: MotionHeads, settings: str, repeats: int, bound: float, reference: float | None = None
+) -> Figure:
     seconds = best_of(repeats, lambda: predict_instances(heads, settings))
-    return Figure(name=name, value=1e3 * seconds, unit="ms", bound=bound)
+    return Figure(name=name, value=1e3 * seconds, unit="ms", bound=bound, reference=reference)
 
 
 def clear_heads(seed: int = 0) -> MotionHeads:

@@ -17,6 +17,7 @@ class Figure:
         unit: of value and bound.
         bound: what it should not be worse than, None for a figure that only informs.
         higher_is_better: whether the bound is a lower one.
+        reference: what the released code takes (design.md 6), in the same unit; None where it has no like.
     """
 
     name: str
@@ -24,6 +25,7 @@ class Figure:
     unit: str = ""
     bound: float | None = None
     higher_is_better: bool = False
+    reference: float | None = None
 
     @property
     def ratio(self) -> float | None:
@@ -54,16 +56,21 @@ def one_core() -> Iterator[None]:
 
 def table(figures: Sequence[Figure]) -> str:
     """The figures as aligned text."""
-    rows = [("figure", "measured", "bound", "times better")]
+    rows = [["figure", "measured", "bound", "times better", "released code", "times faster"]]
     for figure in figures:
-        bound = "" if figure.bound is None else f"{_number(figure.bound)} {figure.unit}"
-        ratio = "" if figure.ratio is None else f"{figure.ratio:.2f}"
-        rows.append((figure.name, f"{_number(figure.value)} {figure.unit}".strip(), bound, ratio))
-    widths = [max(len(row[column]) for row in rows) for column in range(4)]
-    return "\n".join(
-        f"{name:<{widths[0]}}  {value:>{widths[1]}}  {bound:>{widths[2]}}  {ratio:>{widths[3]}}".rstrip()
-        for name, value, bound, ratio in rows
-    )
+        row = [figure.name, f"{_number(figure.value)} {figure.unit}".strip(), "", "", "", ""]
+        if figure.bound is not None:
+            row[2:4] = f"{_number(figure.bound)} {figure.unit}", f"{figure.ratio:.2f}"
+        if figure.reference is not None:
+            row[4:6] = f"{_number(figure.reference)} {figure.unit}", f"{figure.reference / figure.value:.0f}"
+        rows.append(row)
+    columns = [column for column in zip(*rows, strict=True) if any(column[1:])]
+    widths = [max(map(len, column)) for column in columns]
+    lines = []
+    for name, *words in zip(*columns, strict=True):
+        aligned = (f"{word:>{width}}" for word, width in zip(words, widths[1:], strict=True))
+        lines.append("  ".join([f"{name:<{widths[0]}}", *aligned]).rstrip())
+    return "\n".join(lines)
 
 
 def _seconds(work: Callable[[], object]) -> float:
