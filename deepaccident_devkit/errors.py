@@ -94,5 +94,9 @@ class ConfigError(DeepAccidentError, ValueError):
     """A configuration cannot be carried out."""
 
 
+class EvaluationError(DeepAccidentError, ValueError):
+    """Predictions cannot be evaluated together: a sample twice, other settings, samples that are missing."""
+
+
 class MissingExtraError(DeepAccidentError, ImportError):
     """An optional dependency is needed and not installed."""

@@ -3,14 +3,16 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from tiny import write_tiny_release
+from tiny import NAME, TYPE, write_tiny_release
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.motion import LABEL_PROTOCOLS, LabelFiles, MotionLabelConfig
 from deepaccident_devkit.release import read_split_file
 from deepaccident_devkit.splits import official_split
 from deepaccident_devkit.synth import SynthConfig
@@ -68,7 +70,7 @@ def test_a_broken_release_is_listed_and_may_be_skipped(own_release: Path) -> Non
     assert "WARNING: left out" in skipped.stderr
 
 
-@pytest.mark.parametrize("verb", ["info", "index", "split", "stats"])
+@pytest.mark.parametrize("verb", ["info", "index", "labels", "split", "stats"])
 def test_every_verb_on_a_release_has_the_same_grammar(verb: str) -> None:
     text = CliRunner().invoke(deepaccident, [verb, "--help"]).output
     assert "DATAROOT" in text
@@ -79,7 +81,7 @@ def test_every_verb_on_a_release_has_the_same_grammar(verb: str) -> None:
 def test_help_names_the_verbs_and_wrong_usage_is_status_2() -> None:
     runner = CliRunner()
     text = runner.invoke(deepaccident, ["--help"]).output
-    for verb in ("demo", "synth", "index", "info", "split"):
+    for verb in ("demo", "synth", "index", "info", "labels", "split"):
         assert verb in text
     assert runner.invoke(deepaccident, ["info"]).exit_code == 2
     assert runner.invoke(deepaccident, ["dance"]).exit_code == 2
@@ -104,7 +106,12 @@ def test_demo_draws_its_accident(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     result = CliRunner().invoke(deepaccident, ["demo", str(out)], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     pictures = sorted(path.name for path in out.glob("*.png"))
-    assert pictures == ["ego_cameras_1s_before.png", "five_agents_1s_before.png", "five_agents_impact.png"]
+    assert pictures == [
+        "ego_cameras_1s_before.png",
+        "five_agents_1s_before.png",
+        "five_agents_impact.png",
+        "motion_labels_1s_before.png",
+    ]
     assert all((out / name).stat().st_size > 20_000 for name in pictures)
     assert "annotation" in result.output
     assert "Try next:" in result.output
@@ -200,3 +207,85 @@ def test_stats_of_nothing(own_release: Path, tmp_path: Path) -> None:
     assert (failed.returncode, failed.stdout) == (2, "")
     assert "no scenario meets --where, so there is nothing to write" in failed.stderr
     assert not (tmp_path / "new").exists()
+
+
+def test_labels_writes_a_split_and_goes_on_where_it_stopped(own_release: Path, tmp_path: Path) -> None:
+    out, agents = tmp_path / "new" / "labels", ("ego_vehicle", "infrastructure")
+    verb = ("labels", own_release, "--split", "train", "--out", out, "--workers", 2)
+    made = run(*verb, "--agents", ",".join(agents), "--switch", "half_cell_shift=no", "--switch", "own_box_default=no")
+    release = DeepAccident(dataroot=own_release)
+    scenarios = release.split_scenarios("train")
+    assert (made.returncode, made.stdout) == (
+        0,
+        f"{8 * len(scenarios)} samples in {out}: {2 * len(scenarios)} files written, 0 were there\n",
+    ), made.stderr
+    assert "motion labels: 100%" in made.stderr
+    rules = replace(LABEL_PROTOCOLS["released"], half_cell_shift=False, own_box_default=False)
+    files = LabelFiles(out, MotionLabelConfig(protocol=rules))
+    assert {token.rsplit("/", 1)[0] for token in files} == {f"{one}/{agent}" for one in scenarios for agent in agents}
+    kept = run(*verb, "--agents", "infrastructure", "--switch", "half_cell_shift=no", "--switch", "own_box_default=no")
+    assert (kept.returncode, f"0 files written, {len(scenarios)} were there" in kept.stdout) == (0, True)
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    other = run(*verb, "--protocol", "clean")
+    assert (other.returncode, other.stdout) == (2, "")
+    assert other.stderr.startswith(f"error: {out}: holds labels of another configuration (")
+    assert "drawn_when: 'present', asked for 'since'" in other.stderr
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("--agents", "ego_vehicle,pole"), "--agents: expected all or some of ego_vehicle, ego_vehicle_behind,"),
+        (("--agents", ""), "found ''"),
+        (("--agents", "ego_vehicle,"), "found ''"),
+        (("--switch", "half_cell_shift"), "--switch: expected NAME=yes or NAME=no, NAME one of own_box_moved_twice,"),
+        (("--switch", "half_cell_shift=maybe"), "found 'half_cell_shift=maybe'"),
+        (("--switch", "warp=exact"), "found 'warp=exact'"),
+        (("--preset", "lift-splat"), "'lift-splat' is not one of"),
+        (("--orientation", "north"), "'north' is not one of"),
+        (("--seen-by", "nobody"), "'nobody' is not one of"),
+        (("--samples", "some"), "'some' is not one of"),
+        (("--workers", "0"), "0 is not in the range"),
+        (("--split", "tset"), "error: split: expected one of train, val, test, train_mini, val_mini, found 'tset'"),
+        (("--split", "mine.txt"), "error: mine.txt: "),
+        (("--out", ""), "error: expected a folder of motion labels, found an empty path; give '.' for the current one"),
+        (("--out", "/proc/nowhere"), "no labels can be written there"),
+    ],
+)
+def test_labels_says_what_is_wrong_and_writes_nothing(
+    own_release: Path, tmp_path: Path, options: tuple[str, str], told: str
+) -> None:
+    failed = run("labels", own_release, "--split", "train", "--out", tmp_path / "labels", *options)
+    assert (failed.returncode, failed.stdout) == (2, "")
+    assert told in " ".join(failed.stderr.split())
+    assert "Traceback" not in failed.stderr
+    assert not (tmp_path / "labels").exists()
+
+
+def test_labels_looks_at_its_folder_before_it_indexes(own_release: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for out, told in {
+        tmp_path / "file": "file: is a file; give a folder",
+        own_release: "is not empty and holds no motion labels; choose a new folder",
+    }.items():
+        failed = run("labels", own_release, "--split", "train", "--out", out)
+        assert (failed.returncode, failed.stdout, told in failed.stderr) == (2, "", True), failed.stderr
+    assert not (own_release / ".deepaccident").exists()
+
+
+def test_labels_of_what_has_none(tmp_path: Path) -> None:
+    write_tiny_release(tmp_path / "test", labelled=False)
+    (tmp_path / "mine.txt").write_text(f"{TYPE} {NAME}\n")
+    failed = run("labels", tmp_path / "test", "--split", tmp_path / "mine.txt", "--out", tmp_path / "labels")
+    assert (failed.returncode, "none of its samples here has labels" in failed.stderr) == (2, True), failed.stderr
+    write_tiny_release(tmp_path / "partial", agents=("ego_vehicle",))
+    verb = ("labels", tmp_path / "partial", "--split", tmp_path / "mine.txt", "--out", tmp_path / "labels")
+    for options, told in {
+        ("--agents", "infrastructure"): "has no such samples of infrastructure with labels",
+        ("--seen-by", "+other"): "agents: other_vehicle is not in this release",
+    }.items():
+        failed = run(*verb, *options)
+        assert (failed.returncode, told in failed.stderr) == (2, True), failed.stderr
+    assert not (tmp_path / "labels").exists()
+    assert run(*verb, "--seen-by", "single").returncode == 0

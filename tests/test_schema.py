@@ -33,7 +33,8 @@ def test_the_files_are_not_stale(generate: ModuleType) -> None:
 
 
 def test_no_file_is_left_over(generate: ModuleType) -> None:
-    assert {path.name for path in SCHEMA.iterdir() if path.is_file()} == {*generate.generated_files(), "generate.py"}
+    by_hand = {"generate.py", "motion_labels.md"}  # tests/unit/motion/test_label_files.py runs what the page says
+    assert {path.name for path in SCHEMA.iterdir() if path.is_file()} == {*generate.generated_files(), *by_hand}
 
 
 @pytest.mark.parametrize("table", list(table_specs()))

@@ -1,16 +1,23 @@
 """`deepaccident demo`: everything once, on a small synthetic release."""
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import click
 
+from deepaccident_devkit.dataset import RowArgument
 from deepaccident_devkit.deepaccident import DeepAccident
+from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.overview import overview
 from deepaccident_devkit.render import detached_figure
 from deepaccident_devkit.synth import SynthConfig, make_release
 
 _RELEASE = SynthConfig(scenarios=2, frames=40, image_size=(320, 180))
 _SECONDS_BEFORE = 1.0
+_LABELS = MotionLabelConfig(future_frames=2)
+"""The released ones up to the impact."""
 
 
 @click.command()
@@ -32,7 +39,7 @@ def demo(out: Path, workers: int | None) -> None:
 
 
 def draw_accident(release: DeepAccident, out: Path) -> list[Path]:
-    """Draw the first accident: the five agents a second before the impact and at it, and the ego's six cameras.
+    """Draw the first accident: the five agents a second before the impact and at it, the ego's cameras and labels.
 
     Returns:
         The pictures written.
@@ -41,10 +48,11 @@ def draw_accident(release: DeepAccident, out: Path) -> list[Path]:
     impact = release.get("frame", accident["last_frame_token"])
     before = release.frame[release.getind("frame", impact) - round(_SECONDS_BEFORE * 10)]
     ego = release.samples_of(before)[0]
-    drawings = {
+    drawings: dict[str, tuple[tuple[float, float], Callable[..., Any], RowArgument]] = {
         "five_agents_1s_before.png": ((20.0, 6.5), release.render_frame, before),
         "five_agents_impact.png": ((20.0, 6.5), release.render_frame, impact),
         "ego_cameras_1s_before.png": ((16.0, 5.5), release.render_sample, ego),
+        "motion_labels_1s_before.png": ((11.0, 12.0), partial(release.render_motion_labels, config=_LABELS), ego),
     }
     paths = []
     for name, (size, render, record) in drawings.items():

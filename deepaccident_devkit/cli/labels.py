@@ -1,7 +1,6 @@
 """`deepaccident labels`: the motion labels of a split, written into a folder."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, get_args
 
 import click
@@ -11,6 +10,7 @@ from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, PRESETS, LabelProtocol, MotionLabelConfig, write_label_files
+from deepaccident_devkit.motion.label_folder import Manifest, folder_path
 from deepaccident_devkit.motion.protocols import slip_names
 from deepaccident_devkit.motion.sample_lists import Purpose
 from deepaccident_devkit.taxonomy import AGENTS
@@ -22,7 +22,7 @@ _CONFIG_OPTIONS = ("preset", "protocol", "switches", "orientation", "seen_by", "
 @click.command()
 @release_parameters
 @click.option("--split", required=True, help="train, val, train_mini, val_mini, or a split file (….txt).")
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="Folder for the labels.")
+@click.option("--out", required=True, metavar="FOLDER", help="Where the labels go: new, or with such labels.")
 @click.option("--agents", multiple=True, metavar="NAME[,NAME…]", help="Whose samples; all if not given.")
 @click.option(
     "--samples",
@@ -38,13 +38,14 @@ _CONFIG_OPTIONS = ("preset", "protocol", "switches", "orientation", "seen_by", "
 @click.option("--orientation", type=click.Choice(ORIENTATIONS), help="How cells lie; the preset's own if not given.")
 @click.option("--seen-by", type=click.Choice(list(AGENT_CONFIGS)), help="Draw what these agents see; all if not given.")
 @click.option("--only-vehicle", is_flag=True, help="Leave out pedestrians.")
-def labels(split: str, out: Path, agents: tuple[str, ...], purpose: Purpose, **options: Any) -> None:
+def labels(split: str, out: str, agents: tuple[str, ...], purpose: Purpose, **options: Any) -> None:
     """Write the motion labels of a split of the release under DATAROOT.
 
     One file a scenario and agent. A call that was broken off goes on where it stopped.
     """
     config = _config(**{name: options.pop(name) for name in _CONFIG_OPTIONS})
     chosen = _agents(agents)
+    Manifest.of(folder_path(out), config)  # before the release is indexed
     dataset = DeepAccident(**options)
     tokens = [token for token in dataset.samples(split, purpose) if token.rsplit("/", 2)[1] in chosen]
     if not tokens:

@@ -7,13 +7,13 @@ and offset come from the instances' centres, flow from one vector an instance.
 from __future__ import annotations
 
 import hashlib
-import json
 import os
-import re
+import struct
 import zipfile
 import zlib
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -21,25 +21,34 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray
-from deepaccident_devkit.errors import ConfigError, LabelFilesError, TokenError
-from deepaccident_devkit.files import replacing, write_bytes
+from deepaccident_devkit.errors import ChoiceError, LabelFilesError, NotAvailableError, TokenError
+from deepaccident_devkit.files import replacing
 from deepaccident_devkit.motion.config import MotionLabelConfig
+from deepaccident_devkit.motion.label_folder import FORMAT_VERSION, Manifest, folder_path, label_path, writing_to
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.sample_labels import motion_labels
 from deepaccident_devkit.motion.stored_labels import StoredLabels, read_array, write_array
 from deepaccident_devkit.parallel import run_batch
-from deepaccident_devkit.taxonomy import CHANNELS
+from deepaccident_devkit.tables.tokens import parse_number
+from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, LIDAR
+from deepaccident_devkit.v2x import cooperating_agents
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from deepaccident_devkit.dataset import Dataset, RowArgument
 
-FORMAT: Final = "DeepAccident motion labels"
-FORMAT_VERSION: Final = 1
-MANIFEST: Final = "manifest.json"
 _OPEN_FILES: Final = 8
-_DAMAGED: Final = (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error)
+_DAMAGED: Final = (
+    OSError,
+    KeyError,
+    ValueError,
+    EOFError,
+    RuntimeError,
+    struct.error,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 """What reading a damaged archive raises."""
 
 
@@ -84,31 +93,35 @@ def write_label_files(
 
     Raises:
         ConfigError: the folder holds labels of another configuration; it is left as it is.
-        LabelFilesError: the folder holds something else, or its manifest cannot be read.
+        LabelFilesError: the folder holds something else, its manifest cannot be read, or it cannot be written to.
         TokenError: no such sample.
-        NotAvailableError: a sample has no label.
+        ChoiceError: no sample at all, or no such agent or configuration of agents.
+        NotAvailableError: a sample has no label, or an agent whose sight counts is not in this (partial) release.
     """
-    root, chosen = Path(folder).expanduser(), config or MotionLabelConfig()
+    root, chosen = folder_path(folder), config or MotionLabelConfig()
     wanted = _by_recording(dataset, tokens)
-    manifest = _Manifest.read(root) if (root / MANIFEST).exists() else _Manifest.new(root, chosen)
-    manifest.check(root, chosen)
-    manifest.write(root)
-    tasks = [
-        _Task(dataset, root, recording, tuple(sorted({*frames, *manifest.samples.get(recording, ())})), chosen)
-        for recording, frames in wanted.items()
-    ]
-    made = run_batch(
-        _write_recording, tasks, workers=workers, executor=executor, label="motion labels", progress=progress
-    )
-    manifest.samples.update({task.recording: list(task.frames) for task in tasks})
-    manifest.write(root)
+    _check_agents(dataset, wanted, chosen)
+    Manifest.of(root, chosen)
+    with writing_to(root):
+        manifest = Manifest.of(root, chosen)
+        manifest.write(root)
+        tasks = [
+            _Task(dataset, root, recording, _with_kept(dataset, root, recording, frames, manifest), manifest.config)
+            for recording, frames in wanted.items()
+        ]
+        made = run_batch(
+            _write_recording, tasks, workers=workers, executor=executor, label="motion labels", progress=progress
+        )
+        manifest.samples.update({task.recording: list(task.frames) for task in tasks})
+        manifest.write(root)
     return LabelsWritten(samples=sum(map(len, wanted.values())), written=sum(made), kept=len(made) - sum(made))
 
 
 class LabelFiles(Mapping[str, MotionLabels]):
     """Motion labels in a folder, by sample token; a read takes some milliseconds.
 
-    Cheap to pickle and safe in forked workers: each process opens its own files, a few at a time.
+    Cheap to pickle, and safe in threads and in forked workers: each process opens its own files, a few at a time. What
+    is added to the folder later is seen by who opens it anew.
     """
 
     def __init__(self, folder: str | os.PathLike[str], config: MotionLabelConfig | None = None) -> None:
@@ -119,17 +132,20 @@ class LabelFiles(Mapping[str, MotionLabels]):
             config: what the labels must show; None for whatever they do.
 
         Raises:
-            LabelFilesError: there is no such folder, or its making was broken off.
+            LabelFilesError: there is no such folder, its making was broken off, or its manifest cannot be read.
             ConfigError: the labels are of another configuration.
         """
-        self.folder = Path(folder).expanduser()
-        manifest = _Manifest.read(self.folder)
-        if not manifest.samples:
-            raise LabelFilesError(f"{self.folder}: its making was broken off; run `deepaccident labels` on it again")
+        self.folder = folder_path(folder)
+        manifest = Manifest.read(self.folder)
         if config is not None:
             manifest.check(self.folder, config)
+        if not manifest.samples:
+            raise LabelFilesError(f"{self.folder}: its making was broken off; run `deepaccident labels` on it again")
         self.config = manifest.config
-        self._frames = {recording: frozenset(frames) for recording, frames in manifest.samples.items()}
+        self._digest = manifest.config.digest
+        self._frames = {
+            recording: frozenset(manifest.samples[recording]) for recording in sorted(manifest.samples, key=_order)
+        }
         self._open: OrderedDict[str, zipfile.ZipFile] = OrderedDict()
         self._process = os.getpid()
 
@@ -137,13 +153,18 @@ class LabelFiles(Mapping[str, MotionLabels]):
         """Everything but open files."""
         return {**self.__dict__, "_open": OrderedDict()}
 
+    __eq__, __hash__ = object.__eq__, object.__hash__  # a mapping's would read all files
+
+    def __repr__(self) -> str:
+        return f"<motion labels: {len(self):,} samples in {self.folder}>"
+
     def __len__(self) -> int:
         """Number of samples."""
         return sum(map(len, self._frames.values()))
 
     def __iter__(self) -> Iterator[str]:
         """Sample tokens by scenario, agent and time."""
-        for recording, frames in sorted(self._frames.items()):
+        for recording, frames in self._frames.items():
             yield from (f"{recording}/{frame:03d}" for frame in sorted(frames))
 
     def __contains__(self, token: object) -> bool:
@@ -156,28 +177,34 @@ class LabelFiles(Mapping[str, MotionLabels]):
 
         Raises:
             TokenError: the sample is not here.
-            LabelFilesError: its file is missing or damaged.
+            LabelFilesError: its file is missing, damaged or of other labels.
         """
         if token not in self:
             raise TokenError(f"{self.folder}: has no labels of {token!r}; `deepaccident labels` can add them")
         recording, number = _parts(token)
-        path = _path(self.folder, recording)
         try:
             stored = StoredLabels.read(self._archive(recording), f"{number:03d}")
+            return stored.labels(self.config)
         except _DAMAGED as error:
             self._open.pop(recording, None)
+            path = label_path(self.folder, recording)
             raise LabelFilesError(f"{path}: {error}; remove it and run `deepaccident labels` again") from error
-        return stored.labels(self.config)
 
     def _archive(self, recording: str) -> zipfile.ZipFile:
+        """The open file of a scenario and agent; threads may ask at once, so what leaves is left to the collector."""
         if self._process != os.getpid():  # a fork shares positions in open files with its parent
             self._open, self._process = OrderedDict(), os.getpid()
-        if recording not in self._open:
-            self._open[recording] = zipfile.ZipFile(_path(self.folder, recording))
-            if len(self._open) > _OPEN_FILES:
-                self._open.popitem(last=False)[1].close()
-        self._open.move_to_end(recording)
-        return self._open[recording]
+        archive = self._open.get(recording)
+        if archive is None:
+            archive = zipfile.ZipFile(label_path(self.folder, recording))
+            if read_array(archive, "config").item() != self._digest:
+                raise ValueError("holds labels of another configuration")
+            self._open[recording] = archive
+            while len(self._open) > _OPEN_FILES:
+                self._open.popitem(last=False)
+        with suppress(KeyError):
+            self._open.move_to_end(recording)
+        return archive
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,11 +220,12 @@ class _Task:
 
 def _write_recording(task: _Task) -> bool:
     """Write the labels of one scenario and agent; False if they are there already."""
-    path = _path(task.root, task.recording)
+    path = label_path(task.root, task.recording)
     source = _source(task)
     if _source_of(path) == source:
         return False
     with replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+        write_array(archive, "config", np.array(task.config.digest))
         write_array(archive, "source", np.array(source))
         for frame in task.frames:
             labels = motion_labels(task.dataset, f"{task.recording}/{frame:03d}", task.config)
@@ -219,8 +247,10 @@ def _scenario_arrays(dataset: Dataset, scenario: str) -> Iterator[AnyArray]:
     row, samples = dataset.getind("scenario", scenario), dataset.columns("sample")
     first, last = samples["scenario_row"].searchsorted((row, row + 1))
     yield dataset.columns("ego_pose")["matrix"][first:last]
-    used = dataset.columns("sample_data")["calibrated_sensor_row"][first * len(CHANNELS) : last * len(CHANNELS)]
-    yield dataset.columns("calibrated_sensor")["matrix"][np.unique(used)]
+    lidars = slice(first * len(CHANNELS) + CHANNELS.index(LIDAR), last * len(CHANNELS), len(CHANNELS))
+    used = dataset.columns("sample_data")["calibrated_sensor_row"][lidars]
+    yield dataset.columns("calibrated_sensor")["matrix"][used]
+    yield samples["agent"][first:last]
     counts = samples["num_annotations"][first:last]
     yield counts
     if counts.any():
@@ -238,82 +268,52 @@ def _source_of(path: Path) -> str | None:
         return None
 
 
-@dataclass(frozen=True, slots=True)
-class _Manifest:
-    """What a folder of labels says of itself: the configuration, and once it is whole, which samples it has."""
-
-    config: MotionLabelConfig
-    samples: dict[str, list[int]]
-
-    @classmethod
-    def new(cls, root: Path, config: MotionLabelConfig) -> _Manifest:
-        if root.exists() and (not root.is_dir() or any(root.iterdir())):
-            raise LabelFilesError(f"{root}: is not empty and holds no motion labels; choose a new folder")
-        return cls(config, {})
-
-    @classmethod
-    def read(cls, root: Path) -> _Manifest:
-        path = root / MANIFEST
-        if not path.is_file():
-            raise LabelFilesError(
-                f"{root}: holds no motion labels (no {MANIFEST}); make them with `deepaccident labels`"
-            )
-        try:
-            told = json.loads(path.read_text(encoding="utf-8"))
-            if told["format"] != FORMAT or told["version"] != FORMAT_VERSION:
-                raise LabelFilesError(
-                    f"{path}: expected {FORMAT} of version {FORMAT_VERSION}, found {told['format']} of version "
-                    f"{told['version']}; another version of the devkit made it"
-                )
-            samples = {
-                str(recording): [int(frame) for frame in frames] for recording, frames in told["samples"].items()
-            }
-            return cls(MotionLabelConfig.from_dict(told["config"]), samples)
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            if isinstance(error, LabelFilesError):
-                raise
-            raise LabelFilesError(
-                f"{path}: cannot be read ({error}); make the labels anew in an empty folder"
-            ) from error
-
-    def check(self, root: Path, config: MotionLabelConfig) -> None:
-        """Refuse another configuration; raises ConfigError that names what differs."""
-        mine, others = (_flat(one.as_dict()) for one in (self.config, config))
-        changed = sorted(name for name in {*mine, *others} if mine.get(name) != others.get(name))
-        if changed:
-            told = "; ".join(f"{name}: {mine.get(name)!r}, asked for {others.get(name)!r}" for name in changed)
-            raise ConfigError(f"{root}: holds labels of another configuration ({told}); choose another folder")
-
-    def write(self, root: Path) -> None:
-        told = {
-            "format": FORMAT,
-            "version": FORMAT_VERSION,
-            "config_digest": self.config.digest,
-            "config": self.config.as_dict(),
-            "samples": dict(sorted(self.samples.items())),
-        }
-        lists_in_a_line = re.sub(r"\[[^][{}]*\]", lambda found: " ".join(found[0].split()), json.dumps(told, indent=1))
-        write_bytes(root / MANIFEST, f"{lists_in_a_line}\n".encode())
-
-
-def _flat(described: Mapping[str, Any]) -> dict[str, Any]:
-    """A configuration's description with the switches of its protocol beside the other settings."""
-    return {**described, **described["protocol"], "protocol": None}
-
-
 def _by_recording(dataset: Dataset, tokens: Iterable[RowArgument]) -> dict[str, list[int]]:
     """Scenario and agent → frame numbers, each once, ascending."""
+    if isinstance(tokens, str | Mapping):
+        raise ChoiceError(f"tokens: expected samples' tokens or records, found {tokens!r}; put it into a list")
     found: dict[str, set[int]] = {}
-    for token in tokens:
-        recording, number = _parts(dataset.get("sample", token)["token"])
+    labelled = dataset.columns("sample")["labelled"]
+    for given in tokens:
+        row = dataset.getind("sample", given)
+        token = given if isinstance(given, str) else given["token"]
+        if not labelled[row]:
+            raise NotAvailableError(f"{token} has no label to draw (the test split ships without them)")
+        recording, number = _parts(token)
         found.setdefault(recording, set()).add(number)
-    return {recording: sorted(frames) for recording, frames in sorted(found.items())}
+    if not found:
+        raise ChoiceError("tokens: expected at least one sample, found none")
+    return {recording: sorted(found[recording]) for recording in sorted(found, key=_order)}
+
+
+def _check_agents(dataset: Dataset, wanted: Mapping[str, list[int]], config: MotionLabelConfig) -> None:
+    """Raise NotAvailableError or ChoiceError now where a worker would later, in the midst of the work."""
+    if config.filter_invisible and config.agents is not None:
+        for recording, frames in wanted.items():
+            cooperating_agents(dataset, f"{recording}/{frames[0]:03d}", config.agents)
+
+
+def _with_kept(dataset: Dataset, root: Path, recording: str, frames: list[int], manifest: Manifest) -> tuple[int, ...]:
+    """The frames to be in a file: those asked for, and those it has; raises LabelFilesError."""
+    kept = manifest.samples.get(recording, [])
+    try:
+        for frame in kept:
+            dataset.getind("sample", f"{recording}/{frame:03d}")
+    except TokenError as error:
+        raise LabelFilesError(
+            f"{label_path(root, recording)}: has frames that are not in {dataset.dataroot} any more ({error}); choose "
+            "another folder"
+        ) from error
+    return tuple(sorted({*frames, *kept}))
+
+
+def _order(recording: str) -> tuple[str, int]:
+    """By scenario, then agent as the tables have them."""
+    scenario, agent = recording.rsplit("/", 1)
+    return scenario, AGENTS.index(agent)
 
 
 def _parts(token: object) -> tuple[str, int]:
+    """A sample token's scenario and agent, and its frame number; 0 for what is none."""
     recording, _, number = str(token).rpartition("/")
-    return recording, int(number) if number.isdecimal() else 0
-
-
-def _path(root: Path, recording: str) -> Path:
-    return root / f"{recording}.npz"
+    return recording, parse_number(number, 3) or 0

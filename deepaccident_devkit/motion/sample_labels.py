@@ -1,20 +1,28 @@
-"""Motion labels of a sample of a release: what the tables hold, gathered for `motion_labels_from_boxes`."""
+"""Motion labels of a sample of a release: what the tables hold, gathered for `motion_labels_from_boxes`.
+
+The columns are read as they are, all frames at once: records and `Boxes` would cost as much as the drawing.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
+from deepaccident_devkit.geometry.se3 import LAST_ROW
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.drawing.from_boxes import FrameBoxes, motion_labels_from_boxes
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.warps.chains import egomotion
-from deepaccident_devkit.taxonomy import INFRASTRUCTURE, LIDAR
-from deepaccident_devkit.v2x.cooperation import visible_actors
+from deepaccident_devkit.tables import visible_mask
+from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, INFRASTRUCTURE, LIDAR, OWN_ACTOR_ID, UNTRACKED_ID
+from deepaccident_devkit.v2x import cooperating_agents
+
+_VISIBILITY_COLUMNS: Final = ("translation", "category", "num_lidar_pts", "camera_visible")
 
 
 def motion_labels(
@@ -25,6 +33,10 @@ def motion_labels(
     id_map: Mapping[int, int] | None = None,
 ) -> MotionLabels:
     """The motion labels of a sample, each frame in its own ego frame; `MotionLabels.to_present` warps them.
+
+    The agent's own row (−100) shows only as the ego's own box, and not at all with `draw_ego=False`. So it is in the
+    released code too, where nobody ever sees that row; but with `filter_invisible=False` that code would draw it
+    again, over the ego's box and under an id of its own. Here it does not.
 
     Args:
         dataset: the release.
@@ -42,41 +54,97 @@ def motion_labels(
         ChoiceError: no such agent or configuration of agents.
     """
     chosen = config or MotionLabelConfig()
-    record = dataset.get("sample", sample)
-    if not record["labelled"]:
-        raise NotAvailableError(f"{record['token']} has no label to draw (the test split ships without them)")
-    recording, number = record["token"].rsplit("/", 1)
-    length = dataset.columns("scenario")["num_frames"].item(dataset.getind("scenario", record["scenario_token"]))
-    indices = [int(number) + offset for offset in chosen.offsets]
-    tokens = [_sample_at(recording, index, length) for index in indices]
-    beyond = _sample_at(recording, indices[-1] + chosen.step, length)
-    poses = np.stack([np.eye(4) if one is None else dataset.world_from(one, "ego").matrix for one in [*tokens, beyond]])
-    there: BoolArray = np.array([one is not None for one in [*tokens, beyond]])
+    row, samples = dataset.getind("sample", sample), dataset.columns("sample")
+    if not samples["labelled"][row]:
+        token = dataset.sample[row]["token"]
+        raise NotAvailableError(f"{token} has no label to draw (the test split ships without them)")
+    length = dataset.columns("scenario")["num_frames"].item(samples["scenario_row"].item(row))
+    first_row = dataset.columns("agent")["first_sample_row"].item(samples["agent_row"].item(row))
+    present = row - first_row
+    index: IntArray = present + np.array([*chosen.offsets, chosen.offsets[-1] + chosen.step])
+    there = (index >= 0) & (index < length)
+    past = chosen.receptive_field - 1
+    known = index[past:-1][there[past:-1]]
+    frames = iter(_frames(dataset, sample, first_row, known, chosen))
     return motion_labels_from_boxes(
-        [None if one is None else _frame_boxes(dataset, one, chosen) for one in tokens[chosen.receptive_field - 1 :]],
-        egomotion(poses, there, chosen.rules.warp),
+        [next(frames) if one else None for one in there[past:-1]],
+        egomotion(_world_from_ego(dataset, first_row + index, there), there, chosen.rules.warp),
         chosen,
         valid=there[:-1],
-        is_vehicle=record["agent"] != INFRASTRUCTURE,
+        is_vehicle=AGENTS[samples["agent"].item(row)] != INFRASTRUCTURE,
         id_map=id_map,
     )
 
 
-def _sample_at(recording: str, index: int, length: int) -> str | None:
-    return f"{recording}/{index:03d}" if 1 <= index <= length else None
+def _world_from_ego(dataset: Dataset, rows: IntArray, there: BoolArray) -> FloatArray:
+    """(len(rows), 4, 4) poses of samples; the identity for rows that are not `there`."""
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[there] = _transforms(dataset.columns("ego_pose")["matrix"][rows[there]])
+    return poses
 
 
-def _frame_boxes(dataset: Dataset, token: str, config: MotionLabelConfig) -> FrameBoxes:
-    boxes, columns = dataset.boxes(token, "lidar"), dataset.columns("annotation")
-    visible = np.ones(len(boxes), dtype=bool)
+def _frames(
+    dataset: Dataset, sample: RowArgument, first_row: int, index: IntArray, config: MotionLabelConfig
+) -> list[FrameBoxes]:
+    """What the sample's agent, whose samples begin at `first_row`, annotated at the frames `index`, from 0."""
+    boxes, rows = dataset.columns("annotation"), first_row + index
+    slices = _annotations(dataset, rows)
+    actors = [boxes["actor_id"][one] for one in slices]
+    visible = [np.ones(len(actor), dtype=bool) for actor in actors]
     if config.filter_invisible:
-        visible = np.isin(boxes.actor_id, visible_actors(dataset, token, agents=config.agents))
-    return FrameBoxes(
-        center=boxes.center,
-        size=boxes.size,
-        yaw=columns["yaw"][dataset.annotation_rows(token)],
-        actor_id=boxes.actor_id,
-        category=boxes.category,
-        visible=visible,
-        ego_from_lidar=dataset.ego_from(token, LIDAR).matrix,
-    )
+        mask = np.isin(_pairs(actors), _seen(dataset, sample, index, config))
+        visible = np.split(mask, np.cumsum([len(actor) for actor in actors])[:-1])
+    lidars = dataset.columns("sample_data")["calibrated_sensor_row"][rows * len(CHANNELS) + CHANNELS.index(LIDAR)]
+    ego_from_lidar = _transforms(dataset.columns("calibrated_sensor")["matrix"][lidars])
+    return [
+        FrameBoxes(
+            center=boxes["translation"][one],
+            size=boxes["size"][one],
+            yaw=boxes["yaw"][one],
+            actor_id=actor,
+            category=boxes["category"][one],
+            visible=is_visible,
+            ego_from_lidar=pose,
+        )
+        for one, actor, is_visible, pose in zip(slices, actors, visible, ego_from_lidar, strict=True)
+    ]
+
+
+def _seen(dataset: Dataset, sample: RowArgument, index: IntArray, config: MotionLabelConfig) -> IntArray:
+    """The `_pairs` of actors and frames at which an agent whose sight counts sees them (evaluation.md f)."""
+    boxes, scenario = dataset.columns("annotation"), dataset.get("sample", sample)["scenario_token"]
+    pairs = []
+    for agent in cooperating_agents(dataset, sample, config.agents):
+        first_row = dataset.columns("agent")["first_sample_row"].item(dataset.getind("agent", f"{scenario}/{agent}"))
+        slices = _annotations(dataset, first_row + index)
+        actors = [boxes["actor_id"][one] for one in slices]
+        center, category, points, camera = (
+            np.concatenate([boxes[name][one] for one in slices]) for name in _VISIBILITY_COLUMNS
+        )
+        actor = np.concatenate(actors)
+        mask = visible_mask(center[:, :2], category, points, camera, infrastructure=agent == INFRASTRUCTURE)
+        mask &= (actor != OWN_ACTOR_ID) & (actor != UNTRACKED_ID)
+        pairs.append(_pairs(actors)[mask])
+    return np.concatenate(pairs)
+
+
+def _annotations(dataset: Dataset, rows: IntArray) -> list[slice]:
+    """Where the boxes of samples are in the annotation table; empty without a label."""
+    samples = dataset.columns("sample")
+    first = np.maximum(samples["first_annotation_row"][rows], 0).tolist()
+    count = samples["num_annotations"][rows].tolist()
+    return [slice(start, start + length) for start, length in zip(first, count, strict=True)]
+
+
+def _pairs(actors: list[AnyArray]) -> IntArray:
+    """Of actors frame by frame: one number a row for the pair of actor and frame."""
+    number = np.repeat(np.arange(len(actors)), [len(actor) for actor in actors])
+    pairs: IntArray = np.concatenate(actors) * len(actors) + number
+    return pairs
+
+
+def _transforms(numbers: FloatArray) -> FloatArray:
+    """Stored transforms (N, 16) as a new array (N, 4, 4), as `Dataset.world_from` gives them."""
+    transforms = numbers.reshape(-1, 4, 4).copy()
+    transforms[:, 3] = LAST_ROW
+    return transforms

@@ -7,6 +7,7 @@ from typing import Final, Literal, get_args
 
 import numpy as np
 
+from deepaccident_devkit.arrays import checked_number
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
@@ -64,10 +65,11 @@ def samples(
     ):
         if value not in get_args(choices):
             raise ChoiceError(f"{name}: expected one of {', '.join(get_args(choices))}, found {value!r}")
-    steps = horizon / (_KEY_STEP * FRAME_PERIOD)
-    if not (steps >= 1 and abs(steps - round(steps)) < 1e-6):
+    seconds = checked_number("horizon", horizon, "a number of seconds", ConfigError)
+    steps = seconds / (_KEY_STEP * FRAME_PERIOD)
+    if not (1 <= steps < float("inf") and abs(steps - round(steps)) < 1e-6):
         raise ConfigError(f"horizon: {horizon} s is no number of steps of 0.5 s; choose 0.5, 1, 1.5, …")
-    if protocol == "released" and (horizon != _RELEASED_HORIZON or scope != "accident"):
+    if protocol == "released" and (seconds != _RELEASED_HORIZON or scope != "accident"):
         raise ConfigError("the released protocol looks 2 s ahead in accident scenarios; choose protocol='paper'")
 
     scenario_tokens = dataset.split_scenarios(split)
@@ -80,7 +82,7 @@ def samples(
     to_end = scenarios["num_frames"][row] - (columns["frame_row"] - scenarios["first_frame_row"][row] + 1)
     chosen = to_end % _STEPS[purpose] == 0
     if purpose == "evaluate":
-        chosen &= (to_end > 0) & (to_end <= round(horizon / FRAME_PERIOD))
+        chosen &= (to_end > 0) & (to_end <= round(seconds / FRAME_PERIOD))
         if scope == "accident":
             chosen &= scenarios["designed_accident"][:][row]
     return [dataset.sample[index]["token"] for index in np.flatnonzero(in_split & chosen).tolist()]

@@ -9,16 +9,18 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, IntArray
+from deepaccident_devkit.arrays import AnyArray, IntArray, checked
+from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.drawing.label_maps import CoveredCells, label_maps
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.orientations import cells_in, vectors_in
 from deepaccident_devkit.motion.warps.warping import native_orientation
-from deepaccident_devkit.taxonomy import UNTRACKED_ID
 
 NOWHERE: Final = -32768
 """Centre and flow of an instance that a frame does not show."""
+NOBODY: Final = -(2**63)
+"""Actor of an id that is no actor's: the background's, and those of untracked rows that are each their own instance."""
 _FIRST_DATE: Final = (1980, 1, 1, 0, 0, 0)
 
 
@@ -30,7 +32,8 @@ class StoredLabels:
         instance: (T, H, W) uint8 or uint16; 0 in missing frames.
         center: (T, 1 + K, 2) int16 row and column of each instance's centre, `NOWHERE` if the frame does not show it.
         flow: (T, 1 + K, 2) int16 how far it moves along them up to the next frame; `NOWHERE` where unknown.
-        actor: (1 + K,) int64 actor ids; −1 for the background and untracked ones.
+        actor: (1 + K,) int64 actor ids, `NOBODY` without one; −101 for the ego's own box, and −1 for all untracked
+            rows where they are one instance.
         future_egomotion: (R, 6) float32.
         valid: (R,) bool.
     """
@@ -56,7 +59,7 @@ class StoredLabels:
         vectors = labels.flow[frame, :, row, column]
         known = (vectors != labels.config.ignore_index).any(axis=1)
         flow[frame[known], identity[known]] = vectors[known]
-        actor = np.full(1 + highest, UNTRACKED_ID, dtype=np.int64)
+        actor = np.full(1 + highest, NOBODY, dtype=np.int64)
         actor[list(labels.id_map.values())] = list(labels.id_map)
         return cls(
             instance=instance.astype(np.uint8 if highest < 256 else np.uint16),
@@ -68,7 +71,8 @@ class StoredLabels:
         )
 
     def labels(self, config: MotionLabelConfig) -> MotionLabels:
-        """The labels again, all maps of them."""
+        """The labels again, all maps of them; raises GeometryError if the arrays cannot be theirs."""
+        self._check(config)
         shape, given = config.grid.shape, config.grid.orientation
         native = native_orientation(config.rules.warp)
         flat = np.flatnonzero(self.instance)
@@ -86,7 +90,7 @@ class StoredLabels:
         flow = np.stack(vectors_in(flow[..., 0], flow[..., 1], given, native), axis=-1)
         missing = ~self.valid[config.receptive_field - 1 :]
         maps = label_maps(covered, center, center + flow, missing, config)
-        known = np.flatnonzero(self.actor != UNTRACKED_ID)
+        known = np.flatnonzero(self.actor != NOBODY)
         return MotionLabels(
             config=config,
             segmentation=maps.segmentation,
@@ -98,6 +102,16 @@ class StoredLabels:
             valid=self.valid,
             id_map=dict(zip(self.actor[known].tolist(), known.tolist(), strict=True)),
         )
+
+    def _check(self, config: MotionLabelConfig) -> None:
+        frames, ids = config.label_frames, len(self.actor)
+        checked("instance", self.instance, (frames, *config.grid.shape), self.instance.dtype)
+        for name in ("center", "flow"):
+            checked(name, getattr(self, name), (frames, ids, 2), np.int16)
+        checked("future_egomotion", self.future_egomotion, (config.frames, 6), np.float32)
+        checked("valid", self.valid, (config.frames,), np.bool_)
+        if self.instance.max() >= ids:
+            raise GeometryError(f"instance: expected ids below {ids}, found {self.instance.max()}")
 
     def write(self, archive: zipfile.ZipFile, folder: str) -> None:
         """Add the arrays to an archive, as `<folder>/<name>.npy`."""

@@ -1,0 +1,1 @@
+"""The official metrics, and those that the paper describes: motion, accidents, detection."""

@@ -1,0 +1,238 @@
+"""Accident metrics for those who would rely on the alarm: against what happens, not against rasters (protocol `boxes`).
+
+The truth is the pair and the moment that the scenario's meta file names, at the places where the labels have them.
+Every alarm counts, nothing of the truth helps to choose one, and what a recording cannot refute is not judged.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any, Final
+
+import numpy as np
+
+from deepaccident_devkit.errors import ConfigError, EvaluationError
+from deepaccident_devkit.evaluation.accident.box_truth import BoxTruth
+from deepaccident_devkit.evaluation.accident.matching import match_tracks
+from deepaccident_devkit.evaluation.accident.protocol import AccidentContext, Prediction
+from deepaccident_devkit.evaluation.accident.reading import AccidentReading, InstanceAccident, accident_of
+from deepaccident_devkit.evaluation.accident.result import AccidentResult
+from deepaccident_devkit.evaluation.accident.scoring import (
+    Alarm,
+    Scoring,
+    accident_result,
+    foreseen,
+    named,
+    position_difference,
+)
+from deepaccident_devkit.evaluation.evaluator import Counts
+from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
+from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
+
+_RELEASED_LABELS: Final = MotionLabelConfig()
+_SLACK: Final = FRAME_PERIOD / 2
+"""Seconds: half a recorded frame, so that decimal moments compare as they are meant."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BoxAccidentResult(AccidentResult):
+    """Accident metrics, and what one would ask of an alarm; the latter at the distance of `Scoring.errors_at`.
+
+    Attributes:
+        precision: share of the alarms that foresee a true accident; None without alarms.
+        recall: share of the true accidents that are foreseen; None without any.
+        average_precision: the mean of the precision over the recall, alarms taken from the surest on; None likewise.
+        false_alarm_rate: share of the samples without an accident to come that raise an alarm; None without any.
+        lateness: seconds, mean over the true positives by which the predicted moment is later than the true one,
+            negative if it is earlier; None without any.
+        unjudged: alarms that nothing can refute: no accident is known, and they are for later than the recording shows.
+    """
+
+    precision: float | None
+    recall: float | None
+    average_precision: float | None
+    false_alarm_rate: float | None
+    lateness: float | None
+    unjudged: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BoxAccidents:
+    """Accident metrics against the labels' boxes.
+
+    A list of `Accident`s is a list of alarms: each is true or false, and the surest one that is near enough to the true
+    accident (the earliest of equally sure ones) is the true positive. K motion predictions are one alarm, as sure as
+    the share of them that have an accident; where and when is said by the mean sample (the last) or else by the first
+    that has one. They are not cut at the recording's end, which a model cannot know.
+
+    Attributes:
+        reading: how an accident is read off maps.
+        min_score: alarms less sure than this are none.
+        match_distance: metres: gate of the match of instances with actors, which decides whether a prediction in maps
+            names the right ones. (An explicit accident names actors by `ids`, or nobody.)
+        unjudged_are_false: alarms that the recording cannot refute are false ones; else they are left out and counted
+            aside.
+        scoring: when an accident counts as foreseen.
+    """
+
+    reading: AccidentReading = field(default_factory=AccidentReading)
+    min_score: float = 0.0
+    match_distance: float = 4.0
+    unjudged_are_false: bool = False
+    scoring: Scoring = field(default_factory=Scoring)
+
+    def __post_init__(self) -> None:
+        """Check the values; raises ConfigError."""
+        if not math.isfinite(self.min_score):
+            raise ConfigError(f"min_score: expected a number, found {self.min_score!r}")
+        if not 0 < self.match_distance < math.inf:
+            raise ConfigError(f"match_distance: expected metres above 0, found {self.match_distance!r}")
+
+    def settings(self) -> dict[str, Any]:
+        """All choices, as JSON can hold them."""
+        return asdict(self)
+
+    def variants(self) -> dict[str, BoxAccidents]:
+        """These metrics with one choice made otherwise, by `name=value`; for explanations."""
+        own: Mapping[str, tuple[Any, ...]] = {
+            "min_score": (0.5,),
+            "match_distance": (2.0, 8.0),
+            "unjudged_are_false": (not self.unjudged_are_false,),
+        }
+        return {
+            **{name: replace(self, reading=reading) for name, reading in self.reading.variants().items()},
+            **{f"{name}={value}": replace(self, **{name: value}) for name, values in own.items() for value in values},
+            **{name: replace(self, scoring=scoring) for name, scoring in self.scoring.variants().items()},
+        }
+
+    def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
+        """What one sample adds.
+
+        Args:
+            prediction: motion in maps, or explicit accidents; an empty list for no alarm.
+            label: says how far apart in time maps are and how they lie in their cells; None for the released way.
+            context: with `truth`, from `accident_context(dataset, sample, horizon)`.
+
+        Returns:
+            `positive`: whether an accident comes; `named`: whom the boxes bring nearer to each other than the danger
+            distance (of `NAMED`); `alarms`: the surest first; `unjudged`: how many were left out.
+
+        Raises:
+            EvaluationError: the context has no truth, or the prediction is neither.
+        """
+        truth = context.truth
+        if not isinstance(truth, BoxTruth):
+            raise EvaluationError(
+                "context: the accident protocol 'boxes' compares with boxes; give "
+                "context=accident_context(dataset, sample, horizon=2.0)"
+            )
+        if isinstance(prediction, MotionOutput):
+            alarms = self._of_maps(prediction, label.config if label else _RELEASED_LABELS, truth)
+        else:
+            alarms = [(each, _id_error(each.ids, truth)) for each in _accidents(prediction)]
+        raised = sorted(
+            (alarm for alarm in alarms if alarm[0].score >= self.min_score),
+            key=lambda alarm: (-alarm[0].score, alarm[0].time),
+        )
+        judged = [alarm for alarm in raised if self._is_judged(alarm[0], truth)]
+        nearest = truth.nearest_pair(self.reading.danger_distance)
+        return {
+            "positive": truth.accident is not None,
+            "named": named(nearest, context),
+            "alarms": [_alarm(accident, id_error, truth) for accident, id_error in judged],
+            "unjudged": len(raised) - len(judged),
+        }
+
+    def result(self, counts: Collection[Counts]) -> BoxAccidentResult:
+        """The metrics of some samples' counts, in any order."""
+        samples = list(counts)
+        alarms: list[Sequence[Alarm]] = [sample["alarms"] for sample in samples]
+        base = accident_result(samples, alarms, self.scoring)
+        at = base.within[self.scoring.errors_at]
+        hits = [
+            self.scoring.hit(each, at.distance) if sample["positive"] else None
+            for sample, each in zip(samples, alarms, strict=True)
+        ]
+        lateness = [alarm["time"] for alarm in hits if alarm is not None]
+        calm = [each for sample, each in zip(samples, alarms, strict=True) if not sample["positive"]]
+        return BoxAccidentResult(
+            **{each.name: getattr(base, each.name) for each in fields(AccidentResult)},
+            precision=_share(at.tp, at.tp + at.fp),
+            recall=_share(at.tp, base.positives),
+            average_precision=_average_precision(alarms, hits, base.positives),
+            false_alarm_rate=_share(sum(map(bool, calm)), len(calm)),
+            lateness=_share(math.fsum(lateness), len(lateness)),
+            unjudged=sum(sample["unjudged"] for sample in samples),
+        )
+
+    def _is_judged(self, accident: Accident, truth: BoxTruth) -> bool:
+        seen = truth.accident is not None or accident.time <= float(truth.time[-1]) + _SLACK
+        return seen or self.unjudged_are_false
+
+    def _of_maps(
+        self, output: MotionOutput, config: MotionLabelConfig, truth: BoxTruth
+    ) -> list[tuple[Accident, int | None]]:
+        """At most one alarm of K predictions, and whether it names others than meta."""
+        maps = output.instances if output.heads is None else [self.reading.instances(heads) for heads in output.heads]
+        read = [accident_of(each, output.grid, config.rules, self.reading) for each in (() if maps is None else maps)]
+        found = [each for each in (*read[-1:], *read[:-1]) if each.contact is not None]
+        if not found:
+            return []
+        return [self._most_likely(found[0], len(found) / len(read), config.step * FRAME_PERIOD, truth)]
+
+    def _most_likely(
+        self, found: InstanceAccident, share: float, seconds: float, truth: BoxTruth
+    ) -> tuple[Accident, int | None]:
+        frame, ids = (0, (0, 0)) if found.contact is None else (found.contact.frame, found.contact.ids)
+        actors = truth.tracks(seconds, len(found.tracks.center))
+        match = match_tracks(found.tracks, actors, self.match_distance)
+        accident = Accident(positions=found.positions, time=frame * seconds, score=share)
+        return accident, _id_error((match.get(ids[0]), match.get(ids[1])), truth)
+
+
+def _accidents(prediction: Sequence[Accident]) -> Sequence[Accident]:
+    for each in prediction:
+        if not isinstance(each, Accident):
+            raise EvaluationError(f"prediction: expected a MotionOutput or a list of Accidents, found {each!r} in it")
+    return prediction
+
+
+def _id_error(ids: tuple[int | None, int | None] | None, truth: BoxTruth) -> int | None:
+    """1 if these are not the two that collide; None if nobody is named, or nobody collides."""
+    if ids is None or truth.accident is None or truth.accident.ids is None:
+        return None
+    return int(set(ids) != set(truth.accident.ids))
+
+
+def _alarm(accident: Accident, id_error: int | None, truth: BoxTruth) -> dict[str, Any]:
+    if truth.accident is None:
+        return foreseen(score=accident.score)
+    return foreseen(
+        position=position_difference(accident.positions, truth.accident.positions),
+        time=accident.time - truth.accident.time,
+        id_error=id_error,
+        score=accident.score,
+    )
+
+
+def _average_precision(alarms: Sequence[Sequence[Alarm]], hits: Sequence[Alarm | None], positives: int) -> float | None:
+    """The area under the steps of precision over recall; equally sure alarms are one step, so that no order counts."""
+    if not positives:
+        return None
+    pairs = [(alarm["score"], alarm is hit) for each, hit in zip(alarms, hits, strict=True) for alarm in each]
+    if not pairs:
+        return 0.0
+    score, true = (np.array(column) for column in zip(*pairs, strict=True))
+    steps = np.unique(-score)
+    place = np.searchsorted(steps, -score)
+    raised = np.bincount(place, minlength=len(steps))
+    right = np.bincount(place, true, len(steps))
+    precision = np.cumsum(right) / np.cumsum(raised)
+    return math.fsum((right / positives * precision).tolist())
+
+
+def _share(part: float, whole: float) -> float | None:
+    return part / whole if whole else None

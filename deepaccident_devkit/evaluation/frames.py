@@ -1,0 +1,52 @@
+"""The frames that are evaluated: all at the present, and only those that the recording has (evaluation.md a)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from deepaccident_devkit.errors import EvaluationError
+from deepaccident_devkit.evaluation.predictions import MotionOutput
+from deepaccident_devkit.motion import MotionHeads, MotionLabels
+
+
+def labels_at_present(label: MotionLabels) -> MotionLabels:
+    """Labels with every frame in the present ego frame, warped with bilinear centres where they are not yet."""
+    return label if label.at_present else label.to_present(centerness="bilinear")
+
+
+def frames_there(label: MotionLabels) -> int:
+    """How many label frames, from the present on, are in the recording; raises EvaluationError if none is."""
+    valid = label.label_valid
+    count = len(valid) if valid.all() else int(np.argmin(valid))
+    if not count:
+        raise EvaluationError("labels: the present frame is not in the recording; choose another sample")
+    return count
+
+
+def check_output(output: MotionOutput, label: MotionLabels, frames: int) -> None:
+    """Whether a prediction covers a label's ground and its first frames; raises EvaluationError."""
+    grid = label.config.grid
+    if (output.grid.x, output.grid.y) != (grid.x, grid.y):
+        raise EvaluationError(
+            f"prediction: its cells cover x {output.grid.x}, y {output.grid.y}; expected those of the labels, "
+            f"x {grid.x}, y {grid.y}: make both with the same grid"
+        )
+    heads, maps = output.heads or (), () if output.instances is None else output.instances
+    predicted = min([*(len(each.segmentation) for each in heads), *map(len, maps)])
+    if predicted < frames:
+        raise EvaluationError(f"prediction: expected at least {frames} frames from the present on, found {predicted}")
+
+
+def first_frames(heads: MotionHeads, frames: int) -> MotionHeads:
+    """Heads without the frames from `frames` on."""
+    if len(heads.segmentation) == frames:
+        return heads
+    return replace(
+        heads,
+        segmentation=heads.segmentation[:frames],
+        centerness=heads.centerness[:frames],
+        offset=heads.offset[:frames],
+        flow=heads.flow[:frames],
+    )

@@ -1,0 +1,204 @@
+"""A folder of motion labels: its manifest, whose configuration it keeps to, and its lock (schema/motion_labels.md)."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from deepaccident_devkit.errors import ConfigError, DeepAccidentError, LabelFilesError
+from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.motion.config import MotionLabelConfig
+from deepaccident_devkit.taxonomy import AGENTS
+
+logger = logging.getLogger(__name__)
+
+FORMAT: Final = "DeepAccident motion labels"
+FORMAT_VERSION: Final = 1
+"""Counted up with what files hold, and with what labels of the same configuration and release look like."""
+MANIFEST: Final = "manifest.json"
+_LOCK: Final = ".lock"
+_HALF_WRITTEN: Final = re.compile(rf"\.({re.escape(MANIFEST)}|({'|'.join(AGENTS)})\.npz)\.\d+\.tmp")
+_RECORDING: Final = re.compile(rf"(?!\.)[^/\\\0]+/(?!\.)[^/\\\0]+/({'|'.join(AGENTS)})")
+
+
+@dataclass(frozen=True, slots=True)
+class Manifest:
+    """What a folder of labels says of itself.
+
+    Attributes:
+        config: what its labels show.
+        samples: scenario and agent → numbers of the frames whose labels are there for sure; none until the first call
+            that wrote there was through.
+    """
+
+    config: MotionLabelConfig
+    samples: dict[str, list[int]]
+
+    @classmethod
+    def of(cls, root: Path, config: MotionLabelConfig) -> Manifest:
+        """The manifest of a folder that labels of a configuration are to go to; touches nothing.
+
+        Raises:
+            ConfigError: it holds labels of another configuration.
+            LabelFilesError: it holds something else, is a file, or cannot be read.
+        """
+        try:
+            if (root / MANIFEST).exists():
+                manifest = cls.read(root)
+                manifest.check(root, config)
+                return manifest
+            if root.exists() and not root.is_dir():
+                raise LabelFilesError(f"{root}: is a file; give a folder")
+            if root.exists() and any(not _is_own(path.name) for path in root.iterdir()):
+                raise LabelFilesError(f"{root}: is not empty and holds no motion labels; choose a new folder")
+        except OSError as error:
+            if isinstance(error, LabelFilesError):
+                raise
+            raise LabelFilesError(f"{root}: cannot be read ({error}); choose another folder") from error
+        return cls(config, {})
+
+    @classmethod
+    def read(cls, root: Path) -> Manifest:
+        """The manifest that a folder has; raises LabelFilesError."""
+        path = root / MANIFEST
+        if not path.is_file():
+            raise LabelFilesError(
+                f"{root}: holds no motion labels (no {MANIFEST}); make them with `deepaccident labels`"
+            )
+        try:
+            told = json.loads(path.read_text(encoding="utf-8"))
+            _check_version(path, told["format"], told["version"])
+            config, samples = MotionLabelConfig.from_dict(told["config"]), _samples(told["samples"])
+            if config.digest != told["config_digest"]:
+                raise ValueError("the digest of its configuration is another one")
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            if isinstance(error, LabelFilesError):
+                raise
+            raise LabelFilesError(
+                f"{path}: cannot be read ({error}); make the labels anew in an empty folder"
+            ) from error
+        return cls(config, samples)
+
+    def check(self, root: Path, config: MotionLabelConfig) -> None:
+        """Refuse another configuration; raises ConfigError that names what differs."""
+        mine, others = (_flat(one.as_dict()) for one in (self.config, config))
+        changed = sorted(name for name in {*mine, *others} if mine.get(name) != others.get(name))
+        if changed:
+            told = "; ".join(f"{name}: {mine.get(name)!r}, asked for {others.get(name)!r}" for name in changed)
+            raise ConfigError(f"{root}: holds labels of another configuration ({told}); choose another folder")
+
+    def write(self, root: Path) -> None:
+        """Put the manifest into its folder."""
+        told = {
+            "format": FORMAT,
+            "version": FORMAT_VERSION,
+            "config_digest": self.config.digest,
+            "config": self.config.as_dict(),
+            "samples": dict(sorted(self.samples.items())),
+        }
+        lists_in_a_line = re.sub(r"\[[^][{}]*\]", lambda found: " ".join(found[0].split()), json.dumps(told, indent=1))
+        write_bytes(root / MANIFEST, f"{lists_in_a_line}\n".encode())
+
+
+@contextmanager
+def writing_to(root: Path) -> Iterator[None]:
+    """Hold the lock of a folder while labels are written into it; make it, and clear up what killed processes left.
+
+    The system takes the lock back when a process ends, however it ends.
+
+    Raises:
+        LabelFilesError: the folder cannot be made, locked or written to, or a worker was killed.
+    """
+    from concurrent.futures import BrokenExecutor
+
+    from filelock import FileLock
+
+    lock = FileLock(root / _LOCK)
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        _acquire(lock, root)
+    except (OSError, NotImplementedError) as error:  # the latter: a file system without locks
+        raise LabelFilesError(f"{root}: no labels can be written there ({error}); choose another folder") from error
+    try:
+        _remove_half_written(root)
+        yield
+    except DeepAccidentError:
+        raise
+    except OSError as error:
+        remedy = "make room there, or choose another folder, and run it again"
+        raise LabelFilesError(f"{root}: labels cannot be written ({error}); {remedy}") from error
+    except BrokenExecutor as error:
+        remedy = "if memory ran out, give fewer workers, and run it again"
+        raise LabelFilesError(f"{root}: a process that wrote labels was killed ({error}); {remedy}") from error
+    finally:
+        _remove_half_written(root)
+        lock.release()
+
+
+def folder_path(folder: str | os.PathLike[str]) -> Path:
+    """The absolute path of a folder that somebody named; raises LabelFilesError where it is empty."""
+    if not os.fspath(folder):
+        raise LabelFilesError("expected a folder of motion labels, found an empty path; give '.' for the current one")
+    return Path(folder).expanduser().absolute()
+
+
+def label_path(root: Path, recording: str) -> Path:
+    """The file of a scenario and agent."""
+    return root / f"{recording}.npz"
+
+
+def _acquire(lock: Any, root: Path) -> None:
+    from filelock import Timeout
+
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        logger.warning("%s: another process writes labels there; waiting for it", root)
+        lock.acquire()
+
+
+def _remove_half_written(root: Path) -> None:
+    """Remove the temporary files of stopped processes; what resists is left to the next time."""
+    with suppress(OSError):
+        for path in [*root.glob(".*.tmp"), *root.glob("*/*/.*.tmp")]:
+            if _HALF_WRITTEN.fullmatch(path.name):
+                path.unlink(missing_ok=True)
+
+
+def _is_own(name: str) -> bool:
+    """Whether a call that was killed before it wrote a manifest may have left a file of this name."""
+    return name == _LOCK or _HALF_WRITTEN.fullmatch(name) is not None
+
+
+def _check_version(path: Path, form: object, version: object) -> None:
+    if form != FORMAT or not isinstance(version, int):
+        raise ValueError(f"expected the manifest of {FORMAT}, found that of {form!r}, version {version!r}")
+    if version != FORMAT_VERSION:
+        kind, remedy = (
+            ("a newer", "update the devkit, or") if version > FORMAT_VERSION else ("an older", "use that one, or")
+        )
+        raise LabelFilesError(
+            f"{path}: {kind} devkit's labels (format version {version}, this devkit's is {FORMAT_VERSION}); {remedy} "
+            "make the labels anew in an empty folder"
+        )
+
+
+def _samples(told: Mapping[str, Any]) -> dict[str, list[int]]:
+    """Scenario and agent → frame numbers; raises ValueError."""
+    for recording, frames in told.items():
+        good = _RECORDING.fullmatch(recording) and isinstance(frames, list)
+        if not good or not all(type(frame) is int and frame > 0 for frame in frames):
+            raise ValueError(f"samples of {recording!r}: expected a scenario, agent and frame numbers")
+    return {recording: list(frames) for recording, frames in told.items()}
+
+
+def _flat(described: Mapping[str, Any]) -> dict[str, Any]:
+    """A configuration's description with the switches of its protocol beside the other settings."""
+    return {**described, **described["protocol"], "protocol": None}

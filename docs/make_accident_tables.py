@@ -1,0 +1,118 @@
+"""Measure the accident tables of docs/protocols.md: `python docs/make_accident_tables.py`, from a checkout."""
+
+import re
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.evaluation.accident import AccidentEvaluator, AccidentResult
+from deepaccident_devkit.evaluation.accident.box_truth import accident_context
+from deepaccident_devkit.evaluation.predictions import MotionOutput
+from deepaccident_devkit.motion import MotionHeads
+from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.taxonomy import AGENTS
+
+HERE = Path(__file__).parent
+PAGE, TESTS = HERE / "protocols.md", HERE.parent / "tests"
+RELEASE = SynthConfig(scenarios=6, frames=40, seed=12, sensors=False)
+HORIZON = 2.0
+
+
+def main() -> None:
+    """Write all tables into the page."""
+    put("accident-golden", golden_table())
+    put("accident-perfect", perfect_table())
+
+
+def golden_table() -> str:
+    """Golden d through each protocol of rasters, and `paper` with each choice made otherwise."""
+    sys.path.insert(0, str(TESTS))
+    from parity.conftest import GoldenCase
+    from parity.test_accident import heads_of, label_of
+
+    folder = TESTS / "data" / "golden"
+    released, paper = AccidentEvaluator("released"), AccidentEvaluator("paper", explain=True)
+    for index in range(len(GoldenCase(folder, "d_accident", "samples", None).whole["samples"])):
+        case = GoldenCase(folder, "d_accident", "samples", index)
+        label = label_of(case, "devkit")
+        output = MotionOutput(grid=label.config.grid, heads=heads_of(case, "devkit"))
+        for evaluator in (released, paper):
+            evaluator.update(f"sample {index}", output, label)
+    rows = {"`released`": released.compute(), "**`paper`**": paper.compute()}
+    rows |= {f"`{name}`": result for name, result in paper.explained().items()}
+    return table(rows, "protocol, or the choice of `paper` that is made otherwise")
+
+
+def perfect_table() -> str:
+    """The labels themselves as predictions, through the protocols."""
+    evaluators = {
+        (name, given): AccidentEvaluator(name) for name in ("released", "paper", "boxes") for given in ("maps", "heads")
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        dataset = DeepAccident("v1", make_release(folder, RELEASE), verbose=False)
+        for token in _evaluated(dataset):
+            label = dataset.motion_labels(token).to_present("bilinear")
+            context = accident_context(dataset, token, horizon=HORIZON)
+            outputs = {
+                "maps": MotionOutput(grid=label.config.grid, instances=label.instance[None]),
+                "heads": MotionOutput(grid=label.config.grid, heads=(MotionHeads.from_labels(label),)),
+            }
+            for (_, given), evaluator in evaluators.items():
+                evaluator.update(token, outputs[given], label, context)
+    rows = {f"`{name}`, {given}": each.compute() for (name, given), each in evaluators.items()}
+    return table(rows, "protocol, and how the labels are given")
+
+
+def table(rows: dict[str, AccidentResult], what: str) -> str:
+    """One line a result."""
+    lines = [
+        f"| {what} | truths | TP | FP | FN at 10 m | APA (%) | id | position (m) | time (s) | meta's pair | another |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for name, result in rows.items():
+        at = result.within[10.0]
+        numbers = [
+            result.positives,
+            at.tp,
+            at.fp,
+            at.fn,
+            _number(100 * result.apa, 1),
+            *(_number(value, 2) for value in (result.id_error, result.position_error, result.time_error)),
+            result.truths["meta"],
+            result.truths["another"],
+        ]
+        lines.append(f"| {name} | {' | '.join(map(str, numbers))} |")
+    return "\n".join(lines)
+
+
+def put(marker: str, text: str) -> None:
+    """Replace what stands between two markers of the page."""
+    begin, end = f"<!-- {marker} -->", f"<!-- end of {marker} -->"
+    page = PAGE.read_text(encoding="utf-8")
+    pattern = re.compile(f"{re.escape(begin)}.*?{re.escape(end)}", re.DOTALL)
+    if not pattern.search(page):
+        raise SystemExit(f"{PAGE}: has no {begin}")
+    PAGE.write_text(pattern.sub(lambda _: f"{begin}\n{text}\n{end}", page), encoding="utf-8")
+
+
+def _evaluated(dataset: DeepAccident) -> list[str]:
+    """The samples of the released test mode, of every split."""
+    result = []
+    for scenario in dataset.scenario:
+        if not scenario["designed_accident"]:
+            continue
+        for back in (5, 10, 15, 20):
+            frame = f"{scenario['num_frames'] - back:03d}"
+            result += [f"{scenario['token']}/{agent}/{frame}" for agent in AGENTS]
+    return result
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "–" if value is None or np.isnan(value) else f"{value:.{digits}f}"
+
+
+if __name__ == "__main__":
+    main()

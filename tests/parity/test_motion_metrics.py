@@ -1,0 +1,95 @@
+"""Golden b: IoU and VPQ of linked instances, at both ranges, of each sequence and over all of them.
+
+Made by the released functions (FIERY's panoptic metric, torchmetrics' IoU) under numpy 1.23.5 and torch 2.13 on the CPU
+(golden/README.md, b_vpq; evaluation.md b). Counts equal; rates and sums of intersections over unions to 2e-6, since the
+released code sums in float32. `test_trajectories` has the errors of the paths, `test_motion_end_to_end` the evaluator.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from deepaccident_devkit.evaluation.segmentation import iou, segmentation_counts
+from deepaccident_devkit.evaluation.vpq import (
+    PanopticQuality,
+    VpqRules,
+    separate_selected_as_released,
+    vpq,
+    vpq_counts,
+)
+
+RANGES = ("30x30", "100x100")
+TOLERANCE = 2e-6
+by_range = pytest.mark.parametrize("name", RANGES)
+
+
+def crop(golden, name: str, maps: np.ndarray) -> np.ndarray:
+    cells = slice(*golden.whole["ranges"][name])
+    return maps[:, cells, cells]
+
+
+def instances(golden, name: str) -> tuple[np.ndarray, np.ndarray]:
+    return crop(golden, name, golden["pred"]), crop(golden, name, golden["gt"])
+
+
+def segmentations(golden, name: str) -> tuple[np.ndarray, np.ndarray]:
+    return crop(golden, name, golden["seg_pred"]), crop(golden, name, golden["seg_gt"])
+
+
+def assert_quality(found: Sequence[PanopticQuality], expected: dict) -> None:
+    for key in ("pq", "sq", "rq", "denominator"):
+        assert_allclose([getattr(each, key) for each in found], expected[key], rtol=0, atol=TOLERANCE)
+
+
+@by_range
+@pytest.mark.golden_cases("b_vpq", "sequences")
+def test_vpq_of_a_sequence(golden, name: str) -> None:
+    found, expected = vpq_counts(*instances(golden, name)), golden.entry[name]
+    assert len(found.iou) == golden.entry["S"]
+    for key in ("true_positive", "false_positive", "false_negative"):
+        assert_array_equal(getattr(found, key), [frame[key] for frame in expected["per_frame"]])
+    assert_allclose(found.iou, [frame["iou"] for frame in expected["per_frame"]], rtol=TOLERANCE, atol=TOLERANCE)
+    assert_quality(vpq([found]), expected)
+
+
+@by_range
+@pytest.mark.golden_cases("b_vpq", "sequences")
+def test_panoptic_quality_of_a_sequence_frame_by_frame(golden, name: str) -> None:
+    found = vpq_counts(*instances(golden, name), VpqRules(ids_must_stay=False))
+    assert_quality(vpq([found]), golden.entry[name]["not_temporally_consistent"])
+
+
+@by_range
+@pytest.mark.golden_cases("b_vpq", "sequences")
+def test_iou_of_a_sequence(golden, name: str) -> None:
+    found, expected = segmentation_counts(*segmentations(golden, name)), golden.entry[name]
+    for key in ("true_positive", "false_positive", "false_negative"):
+        assert [getattr(each, key) for each in found] == expected["seg_counts"][key]
+    support = [each.true_positive + each.false_negative for each in found]
+    assert support == expected["seg_counts"]["support"]
+    assert_allclose([iou([each]) for each in found], expected["iou"], rtol=0, atol=TOLERANCE)
+
+
+@pytest.mark.golden_cases("b_vpq", "aggregate")
+def test_all_sequences(golden) -> None:
+    """Sums over everything, and over the sequences `selected_index`, as a breakdown takes them; and the mistake."""
+    name = list(golden.whole["aggregate"])[golden.index]
+    expected, selected = golden.whole["aggregate"][name], golden.whole["selected_index"]
+    cases = [replace(golden, key="sequences", index=number) for number in range(len(golden.whole["sequences"]))]
+    counts = [vpq_counts(*instances(case, name)) for case in cases]
+    cells = [segmentation_counts(*segmentations(case, name)) for case in cases]
+
+    assert_quality(vpq(counts), expected["separate"])
+    assert_quality(vpq(counts), expected["plain"])
+    assert_quality(separate_selected_as_released(counts, selected), expected["separate_selected_as_released"])
+    for key in ("iou_separate", "iou_plain"):
+        assert_allclose(
+            [iou([each[index] for each in cells]) for index in (0, 1)], expected[key], rtol=0, atol=TOLERANCE
+        )
+    chosen = [cells[number] for number in selected]
+    assert_allclose(
+        [iou([each[index] for each in chosen]) for index in (0, 1)], expected["iou_selected"], rtol=0, atol=TOLERANCE
+    )

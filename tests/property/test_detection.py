@@ -1,0 +1,177 @@
+"""Detection metrics against plain implementations of the rules, and laws of sums over samples."""
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS, DetectedBoxes, DetectionEvaluator
+from deepaccident_devkit.evaluation.detection.matching import nearest_by_truth
+from deepaccident_devkit.geometry import Boxes
+
+SIZE = (4.0, 2.0, 1.5)
+Sample = tuple[DetectedBoxes, Boxes]
+
+
+@st.composite
+def samples(draw: st.DrawFn, protocol_scale: float = 1.0) -> list[Sample]:
+    """A few samples of cars and vans, close together and with equal scores, some beyond the released range."""
+    result = []
+    for _ in range(draw(st.integers(1, 4))):
+        truth, detections = (draw(st.integers(0, 6)) for _ in range(2))
+        place = st.tuples(st.sampled_from([0.0, 84.0]), st.integers(0, 12), st.integers(0, 12))
+        columns = []
+        for count in (truth, detections):
+            places = [draw(place) for _ in range(count)]
+            center = np.array([(start + a / 3, b / 3, 0.75) for start, a, b in places]).reshape(count, 3)
+            columns.append(
+                Boxes.from_arrays(
+                    center,
+                    np.tile(SIZE, (count, 1)),
+                    [draw(st.sampled_from([0.0, 0.3, 3.0, -3.0])) for _ in range(count)],
+                    frame="lidar",
+                    category=np.array([draw(st.integers(0, 1)) * 2 for _ in range(count)], dtype=int),
+                    velocity=np.full((count, 3), 1.0),
+                )
+            )
+        scores = [draw(st.integers(1, 5)) / 8 for _ in range(detections)]
+        result.append((DetectedBoxes(boxes=columns[1], scores=np.array(scores)), columns[0]))
+    return result
+
+
+def evaluator_of(protocol: str, chosen: Sequence[tuple[int, Sample]], **switches) -> DetectionEvaluator:
+    evaluator = DetectionEvaluator(protocol, **switches)
+    for number, (prediction, truth) in chosen:
+        evaluator.update(f"{number:03d}", prediction, truth)
+    return evaluator
+
+
+@given(samples(), st.randoms())
+@pytest.mark.parametrize("protocol", sorted(DETECTION_PROTOCOLS))
+def test_any_order_and_any_workers_give_the_same_bits(protocol: str, drawn: list[Sample], random) -> None:
+    numbered = list(enumerate(drawn))
+    whole = evaluator_of(protocol, numbered).compute()
+    random.shuffle(numbered)
+    cut = random.randint(0, len(numbered))
+    parts = evaluator_of(protocol, numbered[:cut]).merge(evaluator_of(protocol, numbered[cut:])).compute()
+    for name in ("average_precision", "precision", "recall", "errors", "truths", "detections"):
+        assert getattr(whole, name).tobytes() == getattr(parts, name).tobytes()
+
+
+reaches = st.lists(
+    st.lists(st.tuples(st.integers(0, 5), st.integers(0, 9)), unique_by=lambda pair: pair[0], max_size=4).map(sorted),
+    max_size=7,
+)
+
+
+@given(reaches, st.lists(st.booleans(), min_size=7, max_size=7), st.lists(st.booleans(), min_size=6, max_size=6))
+def test_arrivals_give_what_matching_anew_gives(drawn, counts, truth_counts) -> None:
+    """After each arrival: what the rule gives over all that are there, truth by truth."""
+    ranks = itertools.count()
+    keyed = sorted(
+        (not counts[candidate], distance, candidate, truth)
+        for candidate, pairs in enumerate(drawn)
+        for truth, distance in pairs
+    )
+    rank = {(candidate, truth): next(ranks) for _, _, candidate, truth in keyed}
+    reach = {
+        candidate: [(truth, rank[candidate, truth]) for truth, _ in pairs]
+        for candidate, pairs in enumerate(drawn)
+        if pairs
+    }
+    steps = nearest_by_truth(reach, dict(enumerate(counts)), truth_counts)
+    for there in range(len(drawn) + 1):
+        free, anew = set(range(there)), {}
+        for truth in range(6):
+            wanting = [(rank[one, truth], one) for one in free if (one, truth) in rank]
+            if wanting:
+                anew[truth] = min(wanting)[1]
+                free.remove(anew[truth])
+        pairs = [(truth_counts[truth], counts[one]) for truth, one in anew.items()]
+        assert sum(one < there for one in steps.tp) == pairs.count((True, True))
+        assert sum(one < there for one in steps.spent) == pairs.count((False, True))
+        assert sum(change for one, change in steps.excused if one < there) == pairs.count((True, False))
+        if there == len(drawn):
+            assert steps.holder == anew
+
+
+def in_score_order(drawn: Sequence[Sample], category: int) -> list[tuple[float, int, int]]:
+    """Score, sample and row of a class's detections, falling; equal ones in the order given."""
+    rows = [
+        (-score, number, row)
+        for number, (prediction, _) in enumerate(drawn)
+        for row, score in enumerate(prediction.scores.tolist())
+        if prediction.boxes.category[row] == category and abs(prediction.boxes.center[row, 0]) <= 51.2
+    ]
+    return sorted(rows)
+
+
+@given(samples())
+def test_the_papers_precision_is_nuscenes(drawn: list[Sample]) -> None:
+    """Written out from the rules of nuScenes' accumulate and calc_ap, a loop a step."""
+    result = evaluator_of("paper", list(enumerate(drawn))).compute()
+    for position, category in ((0, 0), (2, 2)):
+        truths = sum(
+            int(((truth.category == category) & (np.abs(truth.center[:, 0]) <= 51.2)).sum()) for _, truth in drawn
+        )
+        if not truths:
+            assert np.isnan(result.average_precision[position]).all()
+            continue
+        for level, threshold in enumerate((1.0, 2.0, 4.0)):
+            taken: set[tuple[int, int]] = set()
+            hits = []
+            for _, number, row in in_score_order(drawn, category):
+                prediction, truth = drawn[number]
+                distances = prediction.boxes.select([row]).center_distance(truth)[0]
+                free = [
+                    (distances[one], one)
+                    for one in range(len(truth))
+                    if truth.category[one] == category and (number, one) not in taken and truth.center[one, 0] <= 51.2
+                ]
+                nearest = min(free, default=(np.inf, -1))
+                hits.append(bool(nearest[0] < threshold))
+                if hits[-1]:
+                    taken.add((number, nearest[1]))
+            expected = 0.0
+            if any(hits):
+                found = np.cumsum(hits)
+                precision = np.interp(
+                    np.linspace(0, 1, 101), found / truths, found / np.arange(1, len(hits) + 1), right=0
+                )
+                expected = np.clip(precision[11:] - 0.1, 0, None).mean() / 0.9
+            assert result.average_precision[position, 0, level] == pytest.approx(100 * expected, abs=1e-9)
+
+
+@given(samples(), st.booleans())
+def test_opencoods_precision_is_vocs(drawn: list[Sample], everywhere: bool) -> None:
+    """Detections by score take the truth they overlap most; the area under the envelope, over all rises of recall."""
+    result = evaluator_of("opencood", list(enumerate(drawn)), global_sort=everywhere).compute()
+    for level, threshold in enumerate((0.3, 0.5, 0.7)):
+        rows, truths = [], 0
+        for number, (prediction, truth) in enumerate(drawn):
+            overlap = prediction.boxes.iou_bev(truth)
+            free = list(range(len(truth)))
+            truths += len(truth)
+            for row in np.argsort(-prediction.scores, kind="stable").tolist():
+                best = max(free, key=lambda one: overlap[row, one], default=None)
+                hit = best is not None and overlap[row, best] >= threshold
+                if hit:
+                    free.remove(best)
+                rows.append((-prediction.scores[row] if everywhere else 0.0, number, hit))
+        if not truths:
+            assert np.isnan(result.average_precision[0, 0, level])
+            continue
+        hits = [hit for _, _, hit in sorted(rows, key=lambda each: each[:1])]
+        recall, precision, found = [0.0], [0.0], 0
+        for seen, hit in enumerate(hits, start=1):
+            found += hit
+            recall.append(found / truths)
+            precision.append(found / seen)
+        recall.append(1.0)
+        precision.append(0.0)
+        envelope = np.maximum.accumulate(precision[::-1])[::-1]
+        expected = float(np.sum(np.diff(recall) * envelope[1:]))
+        assert result.average_precision[0, 0, level] == pytest.approx(100 * expected, abs=1e-9)

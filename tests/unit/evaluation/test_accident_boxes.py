@@ -1,0 +1,233 @@
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from accident_scenes import as_heads, as_maps, scene, standing
+from numpy.testing import assert_allclose
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ConfigError, EvaluationError, NotAvailableError
+from deepaccident_devkit.evaluation.accident.box_truth import BoxTruth, accident_context, box_truth
+from deepaccident_devkit.evaluation.accident.boxes import BoxAccidents
+from deepaccident_devkit.evaluation.accident.evaluator import AccidentEvaluator
+from deepaccident_devkit.evaluation.accident.protocol import AccidentContext
+from deepaccident_devkit.evaluation.accident.scoring import Scoring
+from deepaccident_devkit.evaluation.predictions import Accident
+
+BOXES = BoxAccidents()
+STEPS = 21
+FIRST, SECOND, THIRD = 11, 22, 33
+
+
+def truth_of(gaps, pair=(FIRST, SECOND), seconds=2.0, at=None) -> BoxTruth:
+    """A car at (20, 10), one behind it with these gaps every tenth of a second, and others that stand `at` places."""
+    count = len(gaps)
+    rows = {
+        FIRST: np.tile([20.0, 10.0], (count, 1)),
+        SECOND: np.column_stack([20.0 - 4.0 - np.array(gaps), np.full(count, 10.0)]),
+        **{actor: np.tile(place, (count, 1)) for actor, place in (at or {}).items()},
+    }
+    centers = np.stack([rows[actor] for actor in sorted(rows)], axis=1)
+    boxes = np.concatenate([centers, np.broadcast_to([4.0, 2.0, 0.0], (*centers.shape[:2], 3))], axis=-1)
+    accident = None
+    if pair:
+        accident = Accident(positions=np.array([rows[actor][-1] for actor in pair]), time=seconds, ids=pair)
+    return BoxTruth(time=np.arange(count) / 10, actor_id=np.array(sorted(rows)), footprint=boxes, accident=accident)
+
+
+CRASH = truth_of(np.linspace(10, 0, STEPS))
+PASSING = truth_of(np.linspace(20, 10, STEPS), pair=None)
+META = AccidentContext(pair=(SECOND, FIRST), known=True)
+
+
+def alarm(x=0.0, time=2.0, score=1.0, ids=None) -> Accident:
+    """Of the crash, both `x` metres farther ahead than they are."""
+    return Accident(positions=np.array([[16.0 + x, 10.0], [20.0 + x, 10.0]]), time=time, score=score, ids=ids)
+
+
+def counted(prediction, truth, protocol=BOXES, context=META):
+    return protocol.counts(prediction, None, replace(context, truth=truth))
+
+
+def result(prediction, truth, protocol=BOXES):
+    return protocol.result([counted(prediction, truth, protocol)])
+
+
+def tallies(made):
+    return [(each.tp, each.fp, each.fn) for each in made.within.values()]
+
+
+def test_the_right_alarm() -> None:
+    made = result([alarm(ids=(FIRST, SECOND))], CRASH)
+    assert (made.apa, made.precision, made.recall, made.average_precision) == (1, 1, 1, 1)
+    assert (made.id_error, made.position_error, made.time_error, made.lateness) == (0, 0, 0, 0)
+    assert made.truths["meta"] == 1
+    assert made.false_alarm_rate is None
+
+
+def test_no_alarm_and_nothing_to_warn_of() -> None:
+    missed, calm = result([], CRASH), result([], PASSING)
+    assert tallies(missed) == [(0, 0, 1)] * 3
+    assert (missed.recall, missed.average_precision, missed.precision) == (0, 0, None)
+    assert tallies(calm) == [(0, 0, 0)] * 3
+    assert math.isnan(calm.apa)
+    assert (calm.recall, calm.false_alarm_rate, calm.negatives) == (None, 0, 1)
+
+
+@pytest.mark.parametrize(("x", "tp"), [(2, [1, 1, 1]), (2.5, [0, 1, 1]), (5, [0, 0, 1]), (7.5, [0, 0, 0])])
+def test_an_alarm_elsewhere(x, tp) -> None:
+    made = result([alarm(x)], CRASH)
+    assert tallies(made) == [(hit, 1 - hit, 1 - hit) for hit in tp]
+
+
+def test_every_alarm_counts_and_the_surest_of_those_near_enough_is_the_right_one() -> None:
+    alarms = [alarm(1, time=1.5, score=0.6), alarm(40, score=0.9), alarm(2, time=2.5, score=0.7)]
+    made = result(alarms, CRASH)
+    assert tallies(made) == [(1, 2, 0)] * 3
+    assert made.position_error == 4
+    assert (made.time_error, made.lateness) == (0.5, 0.5)
+    assert made.average_precision == 0.5  # the surer alarm was false
+    assert made.precision == pytest.approx(1 / 3)
+    surer = replace(BOXES, min_score=0.8)
+    assert tallies(result(alarms, CRASH, surer)) == [(0, 1, 1)] * 3
+
+
+def test_equally_sure_alarms_are_one_step_of_the_precision() -> None:
+    made = result([alarm(40, time=1.0, score=0.5), alarm(0, score=0.5)], CRASH)
+    assert made.average_precision == 0.5
+
+
+def test_ids_count_only_where_somebody_is_named() -> None:
+    assert result([alarm()], CRASH).id_error is None
+    assert result([alarm(ids=(FIRST, THIRD))], CRASH).id_error == 1
+    assert result([alarm(ids=(SECOND, FIRST))], CRASH).id_error == 0
+
+
+def test_moments_can_be_asked_for() -> None:
+    late = [alarm(time=2.6)]
+    strict = replace(BOXES, scoring=Scoring(time_tolerance=0.5))
+    assert tallies(result(late, CRASH)) == [(1, 0, 0)] * 3
+    assert tallies(result(late, CRASH, strict)) == [(0, 1, 1)] * 3
+    assert tallies(result([alarm(time=2.5)], CRASH, strict)) == [(1, 0, 0)] * 3
+
+
+def test_what_the_recording_cannot_refute_is_not_judged() -> None:
+    calm = result([alarm(time=2.1)], PASSING)
+    assert (tallies(calm)[0], calm.unjudged) == ((0, 0, 0), 1)
+    refuted = result([alarm(time=2.0)], PASSING)
+    assert (tallies(refuted)[0], refuted.unjudged, refuted.false_alarm_rate) == ((0, 1, 0), 0, 1)
+    harsh = result([alarm(time=2.1)], PASSING, replace(BOXES, unjudged_are_false=True))
+    assert tallies(harsh)[0] == (0, 1, 0)
+
+
+def test_whom_the_boxes_bring_near() -> None:
+    def named(truth, context=META):
+        return counted([], truth, context=context)["named"]
+
+    assert named(CRASH) == "meta"
+    assert named(CRASH, AccidentContext(pair=(FIRST, THIRD), known=True)) == "another"
+    assert named(CRASH, AccidentContext()) == "unknown"
+    assert named(PASSING) == "none"
+    assert truth_of(np.linspace(10, 1, STEPS)).nearest_pair(1.0) is None
+    assert truth_of(np.linspace(10, 0.9, STEPS)).nearest_pair(1.0) == (FIRST, SECOND)
+    parked = truth_of(np.linspace(10, 0.9, STEPS), at={THIRD: (40.0, 30.0), 44: (40.0, 32.5)})
+    assert parked.nearest_pair(1.0) == (FIRST, SECOND)  # the two that stand side by side are none
+    touched_first = truth_of(np.linspace(5, 0, STEPS), at={THIRD: (11.0, 12.1)})
+    assert touched_first.nearest_pair(1.0) == (FIRST, SECOND)
+
+
+def test_maps_are_one_alarm_as_sure_as_the_share_of_them_that_see_it() -> None:
+    cars = {1: standing(20, 10), 2: [(20.0 - 4.5 - gap, 10.0) for gap in (10, 7.5, 5, 2.5, 0)]}
+    right, calm = scene(cars), scene({1: standing(20, 10)})
+    for output in (as_maps(calm, right, right, calm), as_heads(calm, right, right, calm)):
+        counts = counted(output, CRASH)
+        assert [(one["score"], one["time"], one["id"]) for one in counts["alarms"]] == [(0.5, 0, 0)]
+        assert counts["alarms"][0]["position"] == pytest.approx(0.5)
+    assert counted(as_maps(calm), CRASH)["alarms"] == []
+    strangers = {1: standing(20, 30), 2: [(15.5 - gap, 30.0) for gap in (10, 7.5, 5, 2.5, 0)]}
+    assert counted(as_maps(scene(strangers)), CRASH)["alarms"][0]["id"] == 1
+
+
+def test_maps_are_not_cut_at_the_end_of_the_recording() -> None:
+    """The impact is half a second ahead; the model sees it a second ahead."""
+    soon = truth_of(np.linspace(2, 0, 6), seconds=0.5)
+    cars = {1: standing(20, 10), 2: [(15.5 - gap, 10.0) for gap in (2, 1.0, 0, 0.5, 1)]}
+    made = result(as_maps(scene(cars)), soon)
+    assert (made.recall, made.lateness) == (1, 0.5)
+
+
+def test_the_labels_of_a_release(da_motion: DeepAccident) -> None:
+    scenario = next(each for each in da_motion.scenario if each["collision"])
+    token = f"{scenario['token']}/other_vehicle/{scenario['num_frames'] - 15:03d}"
+    truth = box_truth(da_motion, token)
+    contact = da_motion.collision(scenario)
+    assert truth.accident.time == pytest.approx(1.5)
+    assert truth.accident.ids == contact.actor_ids
+    assert len(truth.time) == 16
+    world_from_ego = da_motion.world_from(token, "ego")
+    for actor, position in zip(contact.actor_ids, truth.accident.positions, strict=True):
+        path = da_motion.trajectory(f"{scenario['token']}/actor/{actor}", token, "ego")
+        assert_allclose(position, path.center[-1, :2], atol=1e-9)
+        assert_allclose(
+            world_from_ego @ path.center, da_motion.trajectory(f"{scenario['token']}/actor/{actor}").center, atol=1e-6
+        )
+    assert set(truth.nearest_pair(1.0)) == set(contact.actor_ids)
+    context = accident_context(da_motion, token, horizon=2.0)
+    perfect = [Accident(positions=truth.accident.positions[::-1], time=1.5, ids=contact.actor_ids)]
+    made = BOXES.result([BOXES.counts(perfect, None, context)])
+    assert (made.apa, made.truths["meta"]) == (1, 1)
+    assert box_truth(da_motion, token, horizon=1.0).accident is None
+    assert len(box_truth(da_motion, token, horizon=1.0).time) == 11
+
+
+def test_normal_scenarios_have_no_accident(da_motion: DeepAccident) -> None:
+    scenario = next(each for each in da_motion.scenario if not each["collision"])
+    context = accident_context(da_motion, f"{scenario['token']}/infrastructure/010", horizon=2.0)
+    assert context.truth.accident is None
+    assert context.known
+    assert context.pair is None
+    assert context.own_actor_id is None
+    assert accident_context(da_motion, f"{scenario['token']}/ego_vehicle/010").truth is None
+
+
+def test_label_maps_against_the_boxes_of_a_release(da_motion: DeepAccident) -> None:
+    """From where only the colliding pair comes near: nothing is lost in the rasters but half a cell of place."""
+    evaluator = AccidentEvaluator(protocol=BOXES, explain=True)
+    scenario = next(each for each in da_motion.scenario if each["collision"])
+    for agent in ("other_vehicle", "infrastructure"):
+        token = f"{scenario['token']}/{agent}/{scenario['num_frames'] - 10:03d}"
+        label = da_motion.motion_labels(token).to_present("bilinear")
+        evaluator.update(token, as_maps(label), label, accident_context(da_motion, token, horizon=2.0))
+    made = evaluator.compute()
+    json.dumps([made.as_dict(), evaluator.settings, dict(evaluator.counts)])
+    assert made.recall == 1
+    assert made.id_error == 0
+    assert made.position_error < 0.71
+    assert set(evaluator.explained()) == set(BOXES.variants())
+
+
+def test_what_cannot_be_evaluated(da_motion: DeepAccident) -> None:
+    with pytest.raises(EvaluationError, match="accident_context"):
+        BOXES.counts([alarm()], None, META)
+    with pytest.raises(EvaluationError, match="list of Accidents"):
+        counted([(1, 2)], CRASH)
+    with pytest.raises(ConfigError, match="min_score"):
+        BoxAccidents(min_score=math.nan)
+
+
+def test_a_pair_that_no_label_shows(da_motion: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:
+    scenario = next(each for each in da_motion.scenario if each["collision"])
+    token = f"{scenario['token']}/ego_vehicle/{scenario['num_frames'] - 10:03d}"
+    given = da_motion.get
+
+    def get(table, row):
+        record = given(table, row)
+        if table == "scenario":
+            record["collision"] = {**record["collision"], "ids": [999_999, 999_998]}
+        return record
+
+    monkeypatch.setattr(da_motion, "get", get)
+    with pytest.raises(NotAvailableError, match="no label shows actor 999999"):
+        box_truth(da_motion, token)

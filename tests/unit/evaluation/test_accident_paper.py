@@ -1,0 +1,347 @@
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from accident_scenes import FRAMES, as_heads, as_maps, scene, standing
+from numpy.testing import assert_allclose
+
+from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
+from deepaccident_devkit.evaluation.accident.evaluator import AccidentEvaluator
+from deepaccident_devkit.evaluation.accident.paper import PaperAccidents
+from deepaccident_devkit.evaluation.accident.protocol import AccidentContext
+from deepaccident_devkit.evaluation.accident.reading import AccidentReading, accident_of
+from deepaccident_devkit.evaluation.accident.scoring import Scoring, position_difference
+from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
+from deepaccident_devkit.motion import LABEL_PROTOCOLS
+
+PAPER = PaperAccidents()
+RELEASED = LABEL_PROTOCOLS["released"]
+
+
+def follower(*gaps: float, y: float = 10.0):
+    """A car whose front is so far behind the rear of one that stands at (20, y)."""
+    return [(20.0 - 4.0 - gap, y) for gap in gaps]
+
+
+HIT = {1: standing(20, 10), 2: follower(4, 3, 2, 0.5, 1.5)}
+"""0.5 m apart 1.5 s ahead, at (20, 10) and (15.5, 10)."""
+CALM = {1: standing(20, 10), 2: follower(9, 8, 7, 6, 5)}
+
+
+def moved(cars, x: float = 0.0, y: float = 0.0):
+    return {actor: [at and (at[0] + x, at[1] + y) for at in path] for actor, path in cars.items()}
+
+
+def read(label, reading=PAPER.reading):
+    return accident_of(label.instance, label.config.grid, label.config.rules, reading)
+
+
+def result(prediction, label, protocol=PAPER, context=None):
+    return protocol.result([protocol.counts(prediction, label, context or AccidentContext())])
+
+
+def tallies(made) -> list[tuple[int, int, int]]:
+    return [(each.tp, each.fp, each.fn) for each in made.within.values()]
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+def test_two_boxes_at_a_known_gap_and_time(orientation) -> None:
+    label = scene(HIT, orientation=orientation)
+    found = read(label)
+    assert found.contact.frame == 3
+    assert found.contact.ids == (1, 2)
+    assert found.contact.distance == 0.5
+    assert_allclose(found.positions, [[20, 10], [15.5, 10]])
+
+
+def test_a_metre_apart_is_no_accident_and_less_is() -> None:
+    assert read(scene({1: standing(20, 10), 2: follower(4, 3, 2, 1, 1.5)})).contact is None
+    assert read(scene({1: standing(20, 10), 2: follower(4, 3, 2, 0.5, 1.5)})).contact is not None
+
+
+def test_positions_of_labels_without_the_half_cell_shift() -> None:
+    """Corners on cell edges belong to the cell beyond, so that a car lies a quarter metre ahead and to the right."""
+    label = scene(HIT, protocol="clean")
+    assert_allclose(read(label).positions, [[20.25, 9.75], [15.75, 9.75]])
+
+
+def test_perfect_instance_maps_score_all_and_say_what_they_were_compared_with() -> None:
+    label = scene(HIT)
+    made = result(as_maps(*[label] * 6), label)
+    assert made.apa == 1
+    assert (made.id_error, made.position_error, made.time_error) == (0, 0, 0)
+    assert tallies(made) == [(1, 0, 0)] * 3
+    assert "given as instance maps" in made.notes[0]
+    assert made.beside["sample_choice=mean_first"].apa == 1
+
+
+def test_perfect_heads_score_all_and_are_compared_with_what_the_released_grouping_makes_of_labels() -> None:
+    label = scene(HIT)
+    made = result(as_heads(*[label] * 6), label)
+    assert made.apa == 1
+    assert (made.id_error, made.position_error, made.time_error) == (0, 0, 0)
+    assert made.notes == ()
+
+
+def test_an_empty_prediction_scores_nothing() -> None:
+    label = scene(HIT)
+    nothing = MotionOutput(grid=label.config.grid, instances=np.zeros((6, FRAMES, 200, 200), dtype=np.int32))
+    made = result(nothing, label)
+    assert made.apa == 0
+    assert tallies(made) == [(0, 0, 1)] * 3
+    assert (made.id_error, made.position_error, made.time_error) == (None, None, None)
+    empty = scene({})
+    assert result(as_heads(empty), label).apa == 0
+
+
+@pytest.mark.parametrize(
+    ("shift", "expected"),
+    [
+        (2, [(1, 0, 0), (1, 0, 0), (1, 0, 0)]),  # each of the two is 2 m off: 4 m
+        (2.5, [(0, 1, 1), (1, 0, 0), (1, 0, 0)]),  # 5 m is not less than 5 m
+        (6, [(0, 1, 1), (0, 1, 1), (1, 0, 0)]),
+        (9, [(0, 1, 1), (0, 1, 1), (0, 1, 1)]),
+    ],
+)
+def test_an_accident_elsewhere_is_false_and_leaves_the_true_one_missed(shift, expected) -> None:
+    label = scene(HIT)
+    made = result(as_maps(scene(moved(HIT, y=shift))), label)
+    assert tallies(made) == expected
+    assert made.position_error == (2 * shift if shift < 5 else None)
+    assert made.within[15.0].position_error == (2 * shift if shift < 7.5 else None)
+
+
+def test_the_better_pairing_of_positions_counts() -> None:
+    here = np.array([[0.0, 0.0], [4.0, 3.0]])
+    assert position_difference(here, here[::-1]) == 0
+    assert position_difference(here, here + np.array([3, 4])) == 10
+    label = scene(HIT)
+    assert result(as_maps(scene({2: HIT[2], 1: HIT[1]})), label).position_error == 0
+
+
+def test_the_limit_and_the_missed_one_are_choices() -> None:
+    label, predicted = scene(HIT), as_maps(scene(moved(HIT, y=2.5)))
+    assert tallies(result(predicted, label, replace(PAPER, scoring=Scoring(limit_counts=True))))[0] == (1, 0, 0)
+    assert tallies(result(predicted, label, replace(PAPER, scoring=Scoring(far_is_missed=False))))[0] == (0, 1, 0)
+
+
+def test_one_seen_only_by_the_third_of_six_predictions() -> None:
+    label, calm = scene(HIT), scene(CALM)
+    samples = [calm, calm, scene(moved(HIT, y=1)), calm, calm, calm]
+    for output in (as_maps(*samples), as_heads(*samples)):
+        made = result(output, label)
+        assert made.apa == 1
+        assert made.position_error == 2
+        assert made.beside["sample_choice=mean_first"].position_error == 2
+        assert tallies(result(output, label, replace(PAPER, predicted_by="mean"))) == [(0, 0, 1)] * 3
+        assert tallies(result(output, calm)) == [(0, 1, 0)] * 3
+
+
+def test_which_of_several_predictions_is_compared() -> None:
+    label, calm = scene(HIT), scene(CALM)
+    near, far, farther = scene(moved(HIT, y=1)), scene(moved(HIT, y=3)), scene(moved(HIT, y=4))
+    made = result(as_maps(far, near, calm, farther), label)
+    assert made.position_error == 2
+    assert made.beside["sample_choice=mean_first"].position_error == 8
+    made = result(as_maps(far, near, farther, calm), label, replace(PAPER, sample_choice="mean_first"))
+    assert made.position_error == 6  # the mean has none, so the first that has one
+    assert made.beside["sample_choice=best"].position_error == 2
+
+
+def test_time_error_and_each_sides_own_time() -> None:
+    """Predicted half a second early, while the follower is 1 m behind where it will be."""
+    label = scene(HIT)
+    early = scene({1: standing(20, 10), 2: follower(4, 3, 0.5, 1.5, 2)})
+    made = result(as_maps(early), label)
+    assert (made.time_error, made.position_error, made.id_error) == (0.5, 0, 0)
+    made = result(as_maps(early), label, replace(PAPER, position_time="truth"))
+    assert (made.time_error, made.position_error) == (0.5, 1.0)
+
+
+def test_ids_are_judged_by_a_match_of_all_instances() -> None:
+    """The right two collide in one prediction; in the other one, a third car collides with the first."""
+    third = {3: standing(20, 30)}
+    label = scene(HIT | third)
+    assert result(as_maps(scene({7: HIT[2], 8: third[3], 9: HIT[1]})), label).id_error == 0
+    calm = {2: follower(4, 3, 2, 1.5, 1.5), 1: standing(20, 10), 3: standing(20, 12.5)}
+    wrong = result(as_maps(scene(calm)), scene(HIT | {3: standing(20, 15)}))
+    assert wrong.within[5.0].tp == 0
+    assert wrong.within[15.0].tp == 1
+    assert wrong.within[15.0].id_error == 1
+
+
+def test_instances_beyond_the_gate_are_no_match() -> None:
+    label = scene(HIT)
+    near, far = as_maps(scene(moved(HIT, y=4))), as_maps(scene(moved(HIT, y=4.5)))
+    assert result(near, label).id_error == 0
+    assert result(far, label).id_error == 1
+    assert result(far, label, replace(PAPER, match_distance=5.0)).id_error == 0
+
+
+def test_ties() -> None:
+    """Pairs that come to within 0.5 m: the earlier; at one time, those with the nearer centres; then lower ids."""
+    ahead = lambda gap, y: [(0.0, y), (4.0 + gap, y)]  # noqa: E731
+    beside = lambda gap, y: [(0.0, y), (0.0, y + 2 + gap)]  # noqa: E731
+
+    def contact(*pairs):
+        cars = {}
+        for number, path in enumerate(pairs):
+            for which in (0, 1):
+                cars[2 * number + which + 1] = [at[which] for at in path]
+        return read(scene(cars)).contact
+
+    late = [ahead(gap, -20) for gap in (2, 2, 2, 2, 0.5)]
+    early = [ahead(gap, 0) for gap in (2, 2, 0.5, 2, 0.5)]
+    assert (contact(late, early).frame, contact(late, early).ids) == (2, (3, 4))
+    near_centers = [beside(gap, 20) for gap in (2, 2, 0.5, 2, 2)]
+    assert contact(early, near_centers).ids == (3, 4)
+    again = [ahead(gap, -40) for gap in (2, 2, 0.5, 2, 2)]
+    assert contact(again, early).ids == (1, 2)
+
+
+def test_no_accident_anywhere() -> None:
+    label = scene(CALM)
+    made = result(as_maps(*[label] * 6), label)
+    assert tallies(made) == [(0, 0, 0)] * 3
+    assert math.isnan(made.apa)
+    assert (made.positives, made.negatives, made.samples) == (0, 1, 1)
+    assert made.truths["none"] == 1
+    assert math.isnan(result(as_maps(scene({})), scene({})).apa)
+    assert math.isnan(PAPER.result([]).apa)
+
+
+def test_an_instance_that_leaves_the_grid() -> None:
+    """It is half out when it collides, so that its mean cell is nearer; beyond it is nowhere, and matched before."""
+    leaving = [(46.0, 0.0), (48.0, 0.0), (50.0, 0.0), None, None]
+    cars = {1: leaving, 2: [(x - 4.5 + 0.5 * (t != 2) * -4, 0.0) for t, (x, _) in enumerate(leaving[:3])] + [None] * 2}
+    label = scene(cars)
+    found = read(label)
+    assert found.contact.frame == 2
+    assert found.contact.distance == 0.5
+    assert found.positions[0, 0] == pytest.approx((48.0 + 49.5) / 2)
+    assert np.isnan(found.tracks.center[3:]).all()
+    made = result(as_maps(label), label)
+    assert (made.apa, made.id_error) == (1, 0)
+    never = read(scene({1: standing(100, 0), 2: standing(20, 0)}))
+    assert never.tracks.identity.tolist() == [2]
+
+
+def test_points_and_lines_have_distances_too() -> None:
+    grid = BevGrid()
+    maps = np.zeros((1, 200, 200), dtype=np.int32)
+    maps[0, 100, 100:104] = 5
+    maps[0, 101, 105] = 7
+    found = accident_of(maps, grid, RELEASED, AccidentReading(danger_distance=2.0))
+    assert found.contact.ids == (5, 7)
+    assert found.contact.distance == pytest.approx(math.sqrt(5) / 2)
+
+
+def test_whole_cells_are_nearer_by_a_cell() -> None:
+    label = scene({1: standing(20, 10), 2: follower(4, 3, 2, 1, 1.5)})
+    assert read(label, AccidentReading(outline="cells")).contact.distance == 0.5
+    touching = scene({1: standing(20, 10), 2: follower(4, 3, 2, 0.5, 1.5)})
+    assert read(touching, AccidentReading(outline="cells")).contact.distance == 0
+
+
+def test_moments() -> None:
+    label = scene({1: standing(20, 10), 2: follower(1, 2, 1, 0.5, 1)})
+    readings = {name: AccidentReading(moment=name, danger_distance=1.5) for name in ("closest", "first", "last")}
+    contacts = {name: read(label, reading).contact for name, reading in readings.items()}
+    assert {name: (each.frame, each.distance) for name, each in contacts.items()} == {
+        "closest": (3, 0.5),
+        "first": (0, 1),
+        "last": (4, 1),
+    }
+    assert read(label, replace(readings["first"], present=False)).contact.frame == 2
+
+
+def test_boxes_that_touch_share_their_outermost_cells() -> None:
+    """The one drawn later has them: in rasters even those that touch are a cell apart."""
+    assert read(scene({1: standing(20, 10), 2: follower(4, 3, 2, 0, 1.5)})).contact.distance == 0.5
+
+
+def test_only_frames_that_exist_count() -> None:
+    """The recording ends after three frames: the accident that is predicted later is not seen."""
+    cars = {1: standing(20, 10), 2: follower(4, 3, 2, 0.5, 1.5)}
+    label = scene(cars, frames=3)
+    made = result(as_maps(scene(cars)), label)
+    assert tallies(made) == [(0, 0, 0)] * 3
+    assert tallies(result(as_heads(scene(cars)), label)) == [(0, 0, 0)] * 3
+
+
+def test_whom_the_truth_names() -> None:
+    label = scene(HIT | {3: standing(20, 30)})
+
+    def named(*contexts, of=label):
+        outputs = as_maps(of)
+        return PAPER.result([PAPER.counts(outputs, of, context) for context in contexts]).truths
+
+    meta, another = (AccidentContext(pair=pair, known=True) for pair in ((2, 1), (1, 3)))
+    normal, silent = AccidentContext(known=True), AccidentContext()
+    assert named(meta, another, normal, silent) == {"meta": 1, "another": 2, "none": 0, "unknown": 1}
+    assert named(meta, of=scene(CALM))["none"] == 1
+
+
+def test_the_ego_s_own_box_is_the_agent_itself() -> None:
+    label = scene({5: [(20 - 4 * t, 0.0) for t in range(4)] + [(4.5, 0.0)]}, draw_ego=True)
+    own = AccidentContext(pair=(5, 77), known=True, own_actor_id=77)
+    for output in (as_maps(label), as_heads(label)):
+        assert PAPER.counts(output, label, own)["named"] == "meta"
+        assert PAPER.counts(output, label, replace(own, own_actor_id=None))["named"] == "unknown"
+
+
+def test_what_cannot_be_compared() -> None:
+    label = scene(HIT)
+    explicit = [Accident(positions=np.zeros((2, 2)), time=1.0)]
+    with pytest.raises(EvaluationError, match="explicit accidents with protocol='boxes'"):
+        PAPER.counts(explicit, label, AccidentContext())
+    with pytest.raises(EvaluationError, match="needs the sample's motion labels"):
+        PAPER.counts(as_maps(label), None, AccidentContext())
+    with pytest.raises(EvaluationError, match="not made by the label protocol 'released'"):
+        PAPER.counts(as_maps(label), scene(HIT, protocol="clean"), AccidentContext())
+    assert result(as_maps(label), scene(HIT, protocol="clean"), PaperAccidents(labels="clean")).positives == 1
+    with pytest.raises(EvaluationError, match="expected at least 5 frames from the present on, found 3"):
+        PAPER.counts(MotionOutput(grid=label.config.grid, instances=label.instance[None, :3]), label, AccidentContext())
+    other = BevGrid(x=(-25, 25, 0.25), y=(-25, 25, 0.25))
+    with pytest.raises(EvaluationError, match="make both with the same grid"):
+        PAPER.counts(MotionOutput(grid=other, instances=label.instance[None]), label, AccidentContext())
+    with pytest.raises(EvaluationError, match="present frame is not in the recording"):
+        PAPER.counts(as_maps(label), scene(HIT, frames=0), AccidentContext())
+    with pytest.raises(ChoiceError, match="sample_choice: expected one of best, mean_first"):
+        PaperAccidents(sample_choice="worst")
+    with pytest.raises(ChoiceError, match="outline: expected one of centers, cells"):
+        AccidentReading(outline="contour")
+    with pytest.raises(ConfigError, match="danger_distance"):
+        AccidentReading(danger_distance=0)
+    with pytest.raises(ConfigError, match="errors_at"):
+        Scoring(errors_at=7)
+
+
+def test_orientations_of_prediction_and_label_may_differ() -> None:
+    label, predicted = scene(HIT), scene(moved(HIT, y=1))
+    expected = PAPER.counts(as_maps(predicted), label, AccidentContext())
+    for orientation in ORIENTATIONS:
+        lying = scene(moved(HIT, y=1), orientation=orientation)
+        assert PAPER.counts(as_maps(lying), label, AccidentContext()) == expected
+
+
+def test_counts_are_json_and_each_choice_is_explained() -> None:
+    evaluator = AccidentEvaluator(protocol=PAPER, explain=True)
+    label = scene(HIT)
+    evaluator.update("one", as_heads(*[scene(moved(HIT, y=2.5))] * 2), label)
+    evaluator.update("two", as_maps(label), label)
+    assert json.loads(json.dumps(evaluator.counts["one"])) == evaluator.counts["one"]
+    json.dumps(evaluator.settings)
+    json.dumps(evaluator.compute().as_dict())
+    explained = evaluator.explained()
+    assert set(explained) == set(PAPER.variants())
+    assert evaluator.compute().within[5.0].tp == 1
+    assert explained["limit_counts=True"].within[5.0].tp == 2
+    assert explained["far_is_missed=False"].within[5.0].fn == 0
+    assert explained["danger_distance=0.5"].positives == 0
+    names = {name.split("=")[0] for name in explained}
+    assert {"moment", "outline", "present", "redraw", "foreground", "link_distance", "sample_choice"} <= names

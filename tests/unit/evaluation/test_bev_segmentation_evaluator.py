@@ -1,0 +1,68 @@
+"""Intersection over union of BEV targets."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit.errors import EvaluationError, GeometryError
+from deepaccident_devkit.evaluation.bev_segmentation import BevSegmentationEvaluator
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.motion import BEV_CLASSES, BevSegmentation
+
+GRID = BevGrid((0, 4, 1), (0, 4, 1))
+
+
+def targets(known: bool = True, **cells) -> BevSegmentation:
+    masks = np.zeros((len(BEV_CLASSES), 4, 4), dtype=bool)
+    for name, rows in cells.items():
+        masks[BEV_CLASSES.index(name), rows] = True
+    return BevSegmentation(grid=GRID, masks=masks, known=np.full((4, 4), known))
+
+
+def test_cells_are_summed_over_samples() -> None:
+    evaluator = BevSegmentationEvaluator()
+    evaluator.update("a", targets(road=slice(0, 2)), targets(road=slice(1, 3)))
+    evaluator.update("b", targets(road=slice(0, 4)).masks.astype(np.uint8), targets(road=slice(0, 4)))
+    result = evaluator.compute()
+    assert result.cells["road"] == (20, 4, 4)
+    assert result.iou["road"] == pytest.approx(100 * 20 / 28)
+    assert math.isnan(result.iou["vehicle"])
+    assert result.mean_iou == result.iou["road"]
+    assert json.dumps(result.to_dict(), allow_nan=False)
+
+
+def test_perfect_and_empty_predictions() -> None:
+    truth = targets(road=slice(0, 2), vehicle=slice(3, 4))
+    for prediction, score in ((truth, 100), (targets(), 0)):
+        evaluator = BevSegmentationEvaluator()
+        evaluator.update("a", prediction, truth)
+        assert evaluator.compute().mean_iou == score
+
+
+def test_unknown_cells_do_not_count() -> None:
+    evaluator = BevSegmentationEvaluator()
+    evaluator.update("a", targets(road=slice(0, 4)), targets(known=False))
+    assert math.isnan(evaluator.compute().mean_iou)
+    assert math.isnan(BevSegmentationEvaluator().compute().mean_iou)
+
+
+def test_merging_is_adding() -> None:
+    one, other = BevSegmentationEvaluator(), BevSegmentationEvaluator()
+    one.update("a", targets(road=slice(0, 2)), targets(road=slice(1, 3)))
+    other.update("b", targets(), targets(road=slice(1, 3)))
+    assert one.merge(other).compute().cells["road"] == (4, 4, 12)
+    with pytest.raises(EvaluationError, match="evaluated twice"):
+        one.update("a", targets(), targets(road=slice(1, 3)))
+
+
+def test_predictions_that_do_not_fit() -> None:
+    evaluator, truth = BevSegmentationEvaluator(), targets()
+    with pytest.raises(GeometryError, match="expected shape"):
+        evaluator.update("a", np.zeros((5, 3, 4), dtype=bool), truth)
+    with pytest.raises(GeometryError, match="compare scores with a threshold"):
+        evaluator.update("a", np.full((5, 4, 4), 0.4), truth)
+    moved = BevSegmentation(grid=GRID.with_orientation("fiery"), masks=truth.masks, known=truth.known)
+    with pytest.raises(GeometryError, match="use one grid"):
+        evaluator.update("a", moved, truth)

@@ -1,0 +1,279 @@
+"""Results by attribute, of any evaluator, with intervals over scenarios."""
+
+import math
+import pickle
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from typing import Any
+
+import pytest
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
+from deepaccident_devkit.evaluation.breakdown import Bootstrap, breakdown, numbers_of
+from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio, total
+from deepaccident_devkit.evaluation.motion import MotionEvaluator
+from deepaccident_devkit.evaluation.predictions import instances_of
+from deepaccident_devkit.evaluation.sample_attributes import (
+    ATTRIBUTES,
+    NO_IMPACT,
+    SampleAttributes,
+    ScenarioAttributes,
+    sample_attributes,
+    scenario_attributes,
+    time_bin,
+    tokens_by_value,
+)
+from deepaccident_devkit.motion import samples
+from deepaccident_devkit.taxonomy import INFRASTRUCTURE
+
+STORY = ScenarioAttributes(
+    scenario_type="type1_subtype1_accident",
+    town="Town03",
+    weather="HardRain",
+    weather_group="Rainy",
+    time_of_day="Noon",
+    time_of_day_group="Daytime",
+    collision_status="collides_between_vehicles",
+    junction="four_way_junction",
+    trajectory_type="straight_straight",
+)
+RECORD: dict[str, Any] = {
+    "scenario_type": "type1_subtype1_accident",
+    "town": "Town03",
+    "weather": "HardRain",
+    "time_of_day": "Noon",
+    "collision": {"classes": ["car", "van"]},
+    "road_type": "four-way junction",
+    "ego_direction": "straight",
+    "other_direction": "straight",
+}
+
+
+@dataclass(frozen=True)
+class Share:
+    hits: int
+    share: float
+    unknown: float | None = None
+
+
+class Shares(Evaluator[Share]):
+    """The share of hits."""
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return {}
+
+    def result_of(self, counts: Collection[Counts]) -> Share:
+        hits = total(counts, "hit")
+        return Share(hits=int(hits), share=ratio(hits, len(counts)))
+
+
+class PooledShares(Shares):
+    """The same from sums."""
+
+    def pooled(self, counts: Collection[Counts]) -> list[Counts]:
+        return [{"hit": total(counts, "hit"), "samples": sum(each.get("samples", 1) for each in counts)}]
+
+    def result_of(self, counts: Collection[Counts]) -> Share:
+        hits, samples = total(counts, "hit"), sum(each.get("samples", 1) for each in counts)
+        return Share(hits=int(hits), share=ratio(hits, samples))
+
+
+def attributes_of(number: int, **changes: Any) -> SampleAttributes:
+    """Of a sample of scenario `number // 10`."""
+    values: dict[str, Any] = {
+        "scenario": f"s{number // 10}",
+        "agent": "ego_vehicle",
+        "story": replace(STORY, town=f"Town0{number // 10 % 3}"),
+        "accident_visibility": "visible",
+        "time_to_impact": f"{number % 10 // 2} s",
+        "impact_step": f"{number % 10 / 2:g} s",
+        "time_to_end": "2.0",
+    }
+    return SampleAttributes(**(values | changes))
+
+
+def filled(numbers: range = range(100), kind: type[Shares] = Shares) -> Shares:
+    evaluator = kind()
+    for number in numbers:
+        evaluator.add(f"{number:03d}", {"hit": float(number % 7 == 0 or number // 10 == 3)})
+    return evaluator
+
+
+MANY = {f"{number:03d}": attributes_of(number) for number in range(100)}
+
+
+def test_groups_are_the_results_of_their_samples() -> None:
+    evaluator = filled()
+    found = breakdown(evaluator, MANY, "town")
+    assert [group.value for group in found.groups] == ["Town00", "Town01", "Town02"]
+    for index, group in enumerate(found.groups):
+        tokens = [token for token in MANY if int(token) // 10 % 3 == index]
+        assert group.result == evaluator.compute(tokens)
+        assert (group.samples, group.scenarios) == (len(tokens), len(tokens) // 10)
+        low, high = group.intervals["share"]
+        assert low <= group.result.share <= high
+        assert set(group.intervals) == {"share"}
+    assert sum(group.result.hits for group in found.groups) == evaluator.compute().hits
+
+
+def test_everything_is_a_breakdown_too() -> None:
+    (group,) = breakdown(filled(), MANY, "all").groups
+    assert (group.value, group.samples, group.scenarios) == ("all", 100, 10)
+    assert group.result == filled().compute()
+
+
+def test_times_are_in_order_and_what_is_unknown_comes_last() -> None:
+    changed = {"time_to_impact": None, "impact_step": NO_IMPACT}
+    attributes = MANY | {token: attributes_of(int(token), **changed) for token in ("000", "013")}
+    by_second = breakdown(filled(), attributes, "time_to_impact", Bootstrap(resamples=0))
+    assert [group.value for group in by_second.groups] == ["0 s", "1 s", "2 s", "3 s", "4 s", None]
+    by_step = breakdown(filled(), attributes, "impact_step", Bootstrap(resamples=0))
+    values = [group.value for group in by_step.groups]
+    assert values == ["0 s", "0.5 s", "1 s", "1.5 s", "2 s", "2.5 s", "3 s", "3.5 s", "4 s", "4.5 s", NO_IMPACT]
+    assert by_step.groups[-1].samples == 2
+    assert not by_step.groups[0].intervals
+
+
+def test_the_pole_is_left_out_beside() -> None:
+    poles = {token: replace(each, agent=INFRASTRUCTURE) for token, each in MANY.items() if int(token) % 10 < 4}
+    found = breakdown(filled(), MANY | poles, "town", Bootstrap(resamples=0))
+    assert [group.samples for group in found.groups] == [40, 30, 30]
+    assert [group.samples for group in found.without_infrastructure] == [24, 18, 18]
+    by_agent = breakdown(filled(), MANY | poles, "agent", Bootstrap(resamples=0))
+    assert [group.value for group in by_agent.groups] == ["ego_vehicle", INFRASTRUCTURE]
+    assert [group.value for group in by_agent.without_infrastructure] == ["ego_vehicle"]
+
+
+@pytest.mark.parametrize("kind", [Shares, PooledShares])
+def test_no_order_makes_a_difference(kind: type[Shares]) -> None:
+    expected = breakdown(filled(kind=kind), MANY, "town")
+    backwards = dict(reversed(list(MANY.items())))
+    assert breakdown(filled(range(99, -1, -1), kind), backwards, "town") == expected
+    parts = filled(range(50, 100), kind).merge(filled(range(60), kind))
+    assert breakdown(parts, backwards, "town") == expected
+    assert [group.intervals for group in expected.groups] == [
+        group.intervals for group in breakdown(filled(), MANY, "town").groups
+    ]
+
+
+def test_intervals_are_drawn_by_scenario_and_seed() -> None:
+    """Ten scenarios of equal samples: whole scenarios are drawn, so that shares are tenths."""
+    evaluator = Shares()
+    for number in range(100):
+        evaluator.add(f"{number:03d}", {"hit": float(number // 10 < 4)})
+    (group,) = breakdown(evaluator, MANY, "all", Bootstrap(resamples=400)).groups
+    low, high = group.intervals["share"]
+    assert 0.0 <= low < 0.3
+    assert 0.5 < high <= 0.9
+    assert {round(10 * bound, 9) % 1 for bound in (low, high)} == {0.0}
+    again = [breakdown(evaluator, MANY, "all", Bootstrap(resamples=5, seed=seed)).groups[0] for seed in (1, 1, 2, 3)]
+    assert again[0].intervals == again[1].intervals
+    assert len({tuple(each.intervals["share"]) for each in again}) > 1
+    narrow = breakdown(evaluator, MANY, "all", Bootstrap(resamples=400, confidence=0.5)).groups[0].intervals["share"]
+    assert low < narrow[0] <= narrow[1] < high
+
+
+def test_one_scenario_has_no_interval() -> None:
+    (group,) = breakdown(filled(range(10)), MANY, "all").groups
+    assert (group.scenarios, dict(group.intervals)) == (1, {})
+
+
+def test_a_number_that_is_often_nan() -> None:
+    class Ratios(Shares):
+        def result_of(self, counts: Collection[Counts]) -> Share:
+            hits = total(counts, "hit")
+            return Share(hits=int(hits), share=ratio(hits, hits), unknown=math.nan)
+
+    (group,) = breakdown(filled(range(20), Ratios), MANY, "all").groups
+    assert group.intervals["share"] == (1.0, 1.0)
+    assert all(math.isnan(bound) for bound in group.intervals["unknown"])
+
+
+def test_the_numbers_of_a_result() -> None:
+    numbers = numbers_of(MotionEvaluator().compute())
+    assert numbers["ranges/30x30/iou"] == 0.0
+    assert {"min_ade", "min_fde", "miss_rate", "path_accuracy", "ranges/100x100/pq"} <= set(numbers)
+    assert "samples" not in numbers
+    assert numbers_of({5.0: [Share(1, 0.5)]}) == {"5/0/share": 0.5}
+
+
+def test_what_cannot_be_broken_down() -> None:
+    with pytest.raises(EvaluationError, match="1 samples have no attributes, such as 099"):
+        breakdown(filled(), dict(list(MANY.items())[:-1]), "town")
+    with pytest.raises(ChoiceError, match=r"by: expected one of all, scenario_type, town.* found 'moon'"):
+        breakdown(filled(), MANY, "moon")
+    with pytest.raises(ConfigError, match="resamples: expected a whole number from 0"):
+        Bootstrap(resamples=-1)
+    with pytest.raises(ConfigError, match="confidence: expected a share between 0 and 1"):
+        Bootstrap(confidence=95)
+
+
+def test_attributes_of_scenarios() -> None:
+    def story(**changes: Any) -> ScenarioAttributes:
+        return scenario_attributes(RECORD | changes)  # type: ignore[arg-type]
+
+    assert story() == STORY
+    assert story(weather="WetCloudy").weather_group == "Cloudy"
+    assert story(weather="Wet").weather_group == "Wet"
+    assert story(time_of_day="Sunset").time_of_day_group == "Daytime"
+    assert story(time_of_day="Night").time_of_day_group == "Night"
+    assert story(collision=None).collision_status == "no_collision"
+    assert story(collision={"classes": ["car", "pedestrian"]}).collision_status == "collides_with_pedestrian"
+    assert story(road_type="three-way junction").junction == "three_way_junction"
+    assert story(road_type="three-way junction").trajectory_type == "one_of_the_agents_turning"
+    assert story(other_direction="left").trajectory_type == "one_of_the_agents_turning"
+    assert story(other_direction=None).trajectory_type is None
+    unknown = story(weather=None, time_of_day=None, collision=None, road_type=None)
+    names = ("weather_group", "time_of_day_group", "collision_status", "junction", "trajectory_type")
+    assert [getattr(unknown, name) for name in names] == [None] * 5
+
+
+@pytest.mark.parametrize(
+    ("frames", "second", "step"), [(0, "0 s", "0 s"), (1, "1 s", "0.5 s"), (5, "1 s", "0.5 s"), (6, "1 s", "1 s")]
+)
+def test_bins_of_time_have_their_upper_edge(frames: int, second: str, step: str) -> None:
+    assert (time_bin(frames, 10), time_bin(frames, 5)) == (second, step)
+    assert (time_bin(frames + 30, 10), time_bin(frames + 30, 5)) == tuple(
+        f"{float(text.split()[0]) + 3:g} s" for text in (second, step)
+    )
+
+
+def test_attributes_of_a_releases_samples(da_motion: DeepAccident) -> None:
+    tokens = samples(da_motion, "train", "evaluate")
+    attributes = sample_attributes(da_motion, tokens)
+    assert list(attributes) == tokens
+    by_end = tokens_by_value(attributes, "time_to_end")
+    assert sorted(value or "" for value in by_end) == ["0.5", "1.0", "1.5", "2.0"]
+    assert {len(each) for each in by_end.values()} == {5}
+    by_second = tokens_by_value(attributes, "time_to_impact")
+    assert {value: len(each) for value, each in by_second.items()} == {"2 s": 10, "1 s": 10}
+    for name in ATTRIBUTES:
+        assert sum(map(len, tokens_by_value(attributes, name).values())) == len(tokens)
+    everywhere = sample_attributes(
+        da_motion, [f"{record['token']}/infrastructure/005" for record in da_motion.scenario]
+    )
+    assert set(tokens_by_value(everywhere, "impact_step")) == {"3 s", NO_IMPACT}
+
+
+def test_a_breakdown_of_motion_metrics(da_motion: DeepAccident) -> None:
+    evaluator = MotionEvaluator(trajectories=False)
+    tokens = [
+        f"{record['token']}/{agent}/030" for record in da_motion.scenario for agent in ("ego_vehicle", INFRASTRUCTURE)
+    ]
+    for token in tokens:
+        label = da_motion.motion_labels(token)
+        evaluator.update(token, instances_of(label.to_present().instance, label.config.grid), label)
+    found = breakdown(evaluator, sample_attributes(da_motion, tokens), "collision_status")
+    assert [(group.value, group.samples) for group in found.groups] == [
+        ("collides_between_vehicles", 2),
+        ("no_collision", 2),
+    ]
+    assert [group.samples for group in found.without_infrastructure] == [1, 1]
+    (everything,) = breakdown(evaluator, sample_attributes(da_motion, tokens), "all").groups
+    assert everything.intervals["ranges/30x30/pq"] == (100.0, 100.0)
+    copied = pickle.loads(pickle.dumps(found))
+    assert str(copied) == str(found)
+    with pytest.raises(TypeError):
+        copied.groups[0].result.ranges["30x30"] = None

@@ -1,0 +1,326 @@
+"""Detection metrics on cases whose numbers can be told by hand, and the evaluator around them."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError, GeometryError, NotAvailableError
+from deepaccident_devkit.evaluation.detection import (
+    DETECTION_PROTOCOLS,
+    DetectedBoxes,
+    DetectionEvaluator,
+    detection_protocol,
+    detection_truth,
+    nuscenes_summary,
+    released_dict,
+    released_text,
+)
+from deepaccident_devkit.evaluation.detection.curves import recall_scores
+from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
+
+SIZE = (4.0, 2.0, 1.5)
+PROTOCOLS = sorted(DETECTION_PROTOCOLS)
+
+
+def truth_at(*places: tuple[float, float], category: str = "car", **columns) -> Boxes:
+    count = len(places)
+    center = np.array([(*place, 0.75) for place in places]).reshape(count, 3)
+    columns = {"velocity": np.zeros((count, 3)), **columns}
+    return Boxes.from_arrays(
+        center, np.tile(SIZE, (count, 1)), np.zeros(count), frame="lidar", category=[category] * count, **columns
+    )
+
+
+def found_at(*places: tuple[float, float, float], category: str = "car", **columns) -> DetectedBoxes:
+    """Boxes at x, y with a score each."""
+    boxes = truth_at(*(place[:2] for place in places), category=category, **columns)
+    return DetectedBoxes(boxes=boxes, scores=np.array([place[2] for place in places]))
+
+
+def evaluated(protocol: str, *samples: tuple[DetectedBoxes, Boxes], **switches) -> DetectionEvaluator:
+    evaluator = DetectionEvaluator(protocol, **switches)
+    for number, (prediction, truth) in enumerate(samples):
+        evaluator.update(f"s/ego_vehicle/{number:03d}", prediction, truth)
+    return evaluator
+
+
+def perfect(truth: Boxes) -> DetectedBoxes:
+    return DetectedBoxes(boxes=truth, scores=np.linspace(0.9, 0.1, len(truth)))
+
+
+def two_samples(protocol: str = "released") -> DetectionEvaluator:
+    first = found_at((10, 0, 0.9), (20, 0, 0.5)), truth_at((10.3, 0), (20.2, 0))
+    second = found_at((10, 0, 0.8), (-20, 0, 0.7)), truth_at((10.2, 0))
+    return evaluated(protocol, first, second)
+
+
+@pytest.mark.parametrize("protocol", ["paper", "opencood"])
+def test_perfect_predictions_score_100(protocol: str) -> None:
+    truths = [truth_at((10, 0), (20, 5), (-30, -8)), truth_at((5, 5))]
+    result = evaluated(protocol, *((perfect(truth), truth) for truth in truths)).compute()
+    assert result.class_average_precision[result.classes[0]] == 100
+    assert result.mean_average_precision == 100
+    if protocol == "paper":
+        assert nuscenes_summary(result).score_without_attributes == 100
+        assert list(result.mean_errors.values()) == [0, 0, 0, 0]
+
+
+def test_the_released_code_gives_perfect_predictions_less_than_100() -> None:
+    """Sums of 1/40 in double precision end above 1, which no recall exceeds: the last of 36 points is never reached."""
+    truth = truth_at((10, 0), (20, 5), (-30, -8))
+    result = evaluated("released", (perfect(truth), truth)).compute()
+    assert result.average_precision[0, 0].tolist() == pytest.approx([100 * 35 / 36] * 4)
+    assert result.errors[0].tolist() == pytest.approx([1 / 36] * 4)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_nothing_predicted_scores_0(protocol: str) -> None:
+    result = evaluated(protocol, (found_at(), truth_at((10, 0)))).compute()
+    assert result.class_average_precision[result.classes[0]] == 0
+    assert result.mean_average_precision == 0
+    assert result.truths[0].sum() == 1
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_nothing_there_and_no_samples(protocol: str) -> None:
+    zero = DETECTION_PROTOCOLS[protocol].absent_class_is_zero
+    for evaluator in (evaluated(protocol, (found_at(), truth_at())), DetectionEvaluator(protocol)):
+        mean = evaluator.compute().mean_average_precision
+        assert mean == 0 if zero else math.isnan(mean)
+        assert json.dumps(evaluator.compute().to_dict(), allow_nan=False)
+
+
+def test_levels_of_recall_are_sums_in_double_precision() -> None:
+    """A score for each level that recall exceeds: 7 of 56 is just 5/40, and does not exceed the sum of five 0.025."""
+    assert len(recall_scores(np.linspace(1, 0.5, 7), 56, 40)) == 4
+    assert len(recall_scores(np.linspace(1, 0.5, 40), 40, 40)) == 39
+    assert recall_scores(np.array([0.2, 0.9]), 2, 4).tolist() == [0.9, 0.2, 0.2]
+
+
+def test_an_ignored_detection_uses_up_the_truth() -> None:
+    """Beyond |x| = 84.85 m nothing counts, but it takes part: the near truth is neither found nor missed."""
+    truth = truth_at((84.0, 0), (10, 0))
+    taken = evaluated("released", (found_at((85.0, 0, 0.9), (10, 0, 0.5)), truth)).compute()
+    assert taken.detections[0, 0] == 1
+    # at 2 m and 4 m recall is 1 of 1: of two truths one is excused
+    assert taken.recall[0, 0, 2, 0] == 1.0
+    assert taken.recall[0, 0, 1, 0] == 0.5
+    assert taken.precision[0, 0, :, 0].tolist() == [1, 1, 1, 1]
+
+
+def test_a_detection_that_counts_goes_before_an_ignored_one() -> None:
+    truth = truth_at((84.0, 0))
+    both = found_at((85.0, 0, 0.9), (83.0, 1.0, 0.5))
+    result = evaluated("released", (both, truth)).compute()
+    # at 2 m the score pass gives the truth to the ignored one: no match, no points
+    assert result.average_precision[0, 0, 2] == 0
+    one = evaluated("released", (found_at((85.0, 0, 0.4), (83.0, 1.0, 0.5)), truth)).compute()
+    assert one.recall[0, 0, 2, 0] == 1.0
+
+
+def test_the_released_range_is_of_x_alone() -> None:
+    truth = truth_at((10, 200))
+    assert evaluated("released", (perfect(truth), truth)).compute().truths[0, 0] == 1
+    assert evaluated("released", (perfect(truth), truth), range_from_x_alone=False).compute().truths[0, 0] == 0
+
+
+def test_the_paper_counts_within_its_area_and_without_the_own_box() -> None:
+    truth = truth_at((10, 0), (51.3, 0), (0, -51.3), (0, 0), actor_id=[1, 2, 3, OWN_ACTOR_ID])
+    result = evaluated("paper", (found_at((10, 0, 0.5), (60, 0, 0.9)), truth)).compute()
+    assert (result.truths[0, 0], result.detections[0, 0]) == (1, 1)
+    assert result.mean_average_precision == 100
+    assert evaluated("paper", (found_at(), truth), own_box=True).compute().truths[0, 0] == 2
+    assert evaluated("paper", (found_at(), truth), area=None).compute().truths[0, 0] == 3
+
+
+def test_the_papers_thresholds_are_strict_and_on_the_ground() -> None:
+    high = Boxes.from_arrays([[10, 1.0, 9]], [SIZE], [0.0], frame="lidar")
+    prediction = DetectedBoxes(boxes=high, scores=[1.0])
+    result = evaluated("paper", (prediction, truth_at((10, 0)))).compute()
+    assert result.average_precision[0, 0].tolist() == [0, 100, 100]
+    assert evaluated("released", (prediction, truth_at((10, 0)))).compute().average_precision[0].max() == 0
+
+
+def test_errors_of_the_paper() -> None:
+    truth = truth_at((10, 0), velocity=[[3.0, 0, 0]])
+    boxes = Boxes.from_arrays(
+        [[10.3, 0.4, 0.75]], [[4, 2, 3.0]], [-3.0], frame="lidar", velocity=[[0.0, 4.0, 0]], category=["car"]
+    )
+    result = evaluated("paper", (DetectedBoxes(boxes=boxes, scores=[0.5]), truth)).compute()
+    assert result.errors[0].tolist() == pytest.approx([0.5, 0.5, 3.0, 5.0])
+    wrapped = Boxes.from_arrays([[10, 0, 0.75]], [SIZE], [3.0], frame="lidar", velocity=[[0.0, 0, 0]])
+    other = evaluated("paper", (DetectedBoxes(boxes=boxes, scores=[0.5]), wrapped)).compute()
+    assert other.errors[0, 2] == pytest.approx(2 * math.pi - 6)
+
+
+def test_the_released_heading_error_is_not_wrapped_and_its_scale_error_not_aligned() -> None:
+    truth = Boxes.from_arrays([[10, 0, 0.75]], [SIZE], [0.1], frame="lidar", velocity=[[math.nan] * 3])
+    prediction = DetectedBoxes.from_arrays([[11, 0, 0.75]], [SIZE], [-0.1], [0.5], velocity=[[3.0, 4.0]])
+    errors = evaluated("released", (prediction, truth)).compute().errors[0]
+    reached = errors - 1 / 36  # one point of 36 is never reached, and counts as 1
+    overlap = 1 - 1.0 * 36 / 35 * reached[1]
+    assert reached[0] * 36 / 35 == pytest.approx(1.0)
+    assert 0.4 < overlap < 0.65
+    assert reached[2] * 36 / 35 == pytest.approx(6.2831852 - 0.2, abs=1e-6)
+    assert reached[3] * 36 / 35 == pytest.approx(5.0)  # an unknown true velocity is one of 0
+
+
+def test_velocities_that_a_detector_does_not_give() -> None:
+    truth = truth_at((10, 0))
+    prediction = DetectedBoxes.from_arrays(truth.center, truth.size, truth.yaw, [0.5])
+    evaluator = evaluated("paper", (prediction, truth))
+    result = evaluator.compute()
+    assert math.isnan(result.mean_errors["AVE"])
+    summary = nuscenes_summary(result)
+    assert summary.score_without_attributes == pytest.approx(100 * 8 / 9)
+    assert summary.to_dict()["mAVE"] is None
+    assert "–" in summary.to_text()
+    evaluator.update("s/ego_vehicle/000", prediction, truth)  # the same once more: unknown equals unknown
+    assert evaluator.repeated == {"s/ego_vehicle/000"}
+
+
+def test_opencood_has_one_vehicle_class_and_includes_the_threshold() -> None:
+    truth = truth_at((10, 0), category="truck")
+    half = DetectedBoxes(
+        boxes=Boxes.from_arrays([[10, 0, 0.75]], [[2, 2, 1.5]], [0.0], frame="lidar", category=["van"]), scores=[0.5]
+    )
+    result = evaluated("opencood", (half, truth)).compute()
+    assert result.classes == ("vehicle",)
+    assert result.average_precision[0, 0].tolist() == [100, 100, 0]
+    people = truth_at((10, 0), category="pedestrian")
+    assert evaluated("opencood", (perfect(people), people)).compute().truths[0, 0] == 0
+
+
+def test_opencood_counts_boxes_that_are_wholly_in_range() -> None:
+    truth = truth_at((138.1, 0), (137.9, 0))
+    assert evaluated("opencood", (perfect(truth), truth)).compute().truths[0, 0] == 1
+
+
+def test_scores_sorted_over_all_samples_or_by_sample() -> None:
+    """A bad detection of low score in the first sample stands before a good one of the second."""
+    first = found_at((10, 0, 0.9), (30, 0, 0.1)), truth_at((10, 0))
+    second = found_at((10, 0, 0.8)), truth_at((10, 0))
+    assert evaluated("opencood", first, second).compute().average_precision[0, 0, 1] == 100
+    by_sample = evaluated("opencood", first, second, global_sort=False).compute()
+    assert by_sample.average_precision[0, 0, 1] == pytest.approx(100 * (1 / 2 + 2 / 3 / 2))
+
+
+def test_classes_that_are_nowhere() -> None:
+    truth = truth_at((10, 0))
+    prediction = found_at((10, 0, 0.5), (20, 0, 0.5))
+    left_out = evaluated("paper", (prediction, truth)).compute()
+    assert math.isnan(left_out.class_average_precision["van"])
+    counted = evaluated("paper", (prediction, truth), absent_class_is_zero=True).compute()
+    assert counted.mean_average_precision == pytest.approx(left_out.mean_average_precision / 6)
+
+
+def test_the_released_names_and_text() -> None:
+    names = list(released_dict(two_samples().compute()))
+    assert names[:2] == ["CARLA/car_3D_average_distance_mAP", "CARLA/car_mATE"]
+    assert released_text(two_samples("released_iou").compute()).count("IOU matching threshold") == 12
+    with pytest.raises(ChoiceError, match="no report of 1 ranges and 3 thresholds"):
+        released_text(two_samples("paper").compute())
+    with pytest.raises(ChoiceError, match="of one range"):
+        nuscenes_summary(two_samples("released_iou").compute())
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_saved_counts_go_on(protocol: str, tmp_path: Path) -> None:
+    whole = two_samples(protocol)
+    whole.save(tmp_path / "counts.json")
+    again = DetectionEvaluator(protocol).resume(tmp_path / "counts.json")
+    assert again.counts == whole.counts
+    assert again.merge(whole).compute().to_dict() == whole.compute().to_dict()
+    assert again.repeated == whole.tokens
+    with pytest.raises(EvaluationError, match="other settings"):
+        DetectionEvaluator(protocol, thresholds=(0.25,), error_threshold=None, small_thresholds=None).resume(
+            tmp_path / "counts.json"
+        )
+
+
+def test_a_sample_with_two_results_is_an_error() -> None:
+    evaluator = two_samples()
+    with pytest.raises(EvaluationError, match="evaluated twice"):
+        evaluator.update("s/ego_vehicle/000", found_at(), truth_at((1, 1)))
+
+
+def test_boxes_of_another_frame_are_refused() -> None:
+    with pytest.raises(GeometryError, match="the protocol counts in 'lidar'"):
+        DetectionEvaluator().update("a", found_at(), Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), []))
+
+
+def test_protocols_and_switches_that_cannot_be() -> None:
+    with pytest.raises(ChoiceError, match="expected one of released"):
+        DetectionEvaluator("kitti")
+    with pytest.raises(ChoiceError, match="no switch 'treshold'"):
+        DetectionEvaluator("paper", treshold=1)
+    with pytest.raises(ChoiceError, match="curve: expected one of"):
+        DetectionEvaluator("paper", curve="coco")
+    for switches, said in (
+        ({"thresholds": (1.0,)}, "error_threshold"),
+        ({"thresholds": (), "error_threshold": None}, "at least one"),
+        ({"frame": "world"}, "around the agent"),
+        ({"classes": [["road", ["lane"]]]}, "expected names with categories"),
+        ({"small_thresholds": (1.0,)}, "as many as thresholds"),
+        ({"global_sort": False}, "curve='voc'"),
+        ({"min_precision": 1.0}, "below 1"),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            detection_protocol("paper", **switches)
+    assert detection_protocol("paper", thresholds=[1, 2, 4]).thresholds == (1, 2, 4)
+
+
+def test_detected_boxes_are_checked_and_read_only() -> None:
+    with pytest.raises(GeometryError, match="scores"):
+        DetectedBoxes(boxes=truth_at((1, 1)), scores=[0.5, 0.6])
+    with pytest.raises(GeometryError, match="not all numbers are finite"):
+        found_at((1, 1, math.nan))
+    detected = found_at((1, 1, 0.5))
+    with pytest.raises(ValueError, match="read-only"):
+        detected.scores[0] = 1
+    assert len(detected) == 1
+
+
+def test_the_truth_of_each_protocol(da: DeepAccident) -> None:
+    sample = da.get_sample(da.scenario[0]["token"], "ego_vehicle", 3)
+    every = da.boxes(sample, "lidar")
+    released = detection_truth(da, sample)
+    assert released.actor_id.tolist() == every.actor_id.tolist()
+    rows = da.annotation_rows(sample)
+    np.testing.assert_array_equal(released.velocity[:, :2], da.columns("annotation")["velocity_label"][rows])
+    paper = detection_truth(da, sample, "paper")
+    assert paper.actor_id.tolist() == da.boxes(sample, "lidar", "released").actor_id.tolist()
+    cooperative = detection_truth(da, sample, "opencood")
+    alone = detection_truth(da, sample, "opencood", agents="single")
+    own = da.get("agent", sample["agent_token"])["actor_id"]
+    assert own not in cooperative.actor_id
+    assert own in detection_truth(da, sample, detection_protocol("opencood", own_box=True)).actor_id
+    assert set(alone.actor_id.tolist()) <= set(cooperative.actor_id.tolist())
+    assert {each.frame for each in (released, paper, cooperative)} == {"lidar"}
+    with pytest.raises(ConfigError, match="choose truth='cooperative'"):
+        detection_truth(da, sample, "paper", agents="single")
+    with pytest.raises(ConfigError, match="label_velocity"):
+        detection_truth(da, sample, detection_protocol("opencood", label_velocity=True))
+
+
+@pytest.mark.parametrize("protocol", ["paper", "opencood"])
+def test_the_truth_of_a_release_scores_100(da: DeepAccident, protocol: str) -> None:
+    evaluator = DetectionEvaluator(protocol)
+    for sample in da.sample[:20]:
+        truth = detection_truth(da, sample, protocol)
+        evaluator.update(sample["token"], DetectedBoxes(boxes=truth, scores=np.ones(len(truth))), truth)
+    assert evaluator.compute().mean_average_precision == 100
+
+
+def test_a_sample_without_label_has_no_truth(own_release: Path) -> None:
+    for path in own_release.rglob("label"):
+        for file in path.rglob("*.txt"):
+            file.unlink()
+    opened = DeepAccident("v1", own_release, verbose=False, on_error="skip")
+    with pytest.raises(NotAvailableError, match="has no label"):
+        detection_truth(opened, opened.sample[0])

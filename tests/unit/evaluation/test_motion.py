@@ -1,0 +1,350 @@
+"""MotionEvaluator on labels of a synthetic release and on maps with known answers."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError, EvaluationError, GeometryError
+from deepaccident_devkit.evaluation.instance_paths import instance_paths
+from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS, MotionEvaluator, MotionProtocol, motion_counts
+from deepaccident_devkit.evaluation.predictions import MotionOutput, instances_of
+from deepaccident_devkit.evaluation.ranges import cells_within
+from deepaccident_devkit.evaluation.segmentation import SegmentationCounts, iou, segmentation_counts
+from deepaccident_devkit.evaluation.trajectory_errors import TrajectoryRules
+from deepaccident_devkit.evaluation.vpq import VpqRules, separate_selected_as_released, vpq, vpq_counts
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
+from deepaccident_devkit.motion import MotionHeads, MotionLabelConfig, MotionLabels, samples
+from deepaccident_devkit.motion.orientations import to_orientation
+
+CONFIG = MotionLabelConfig()
+SCALES = ("iou", "pq", "sq", "rq")
+
+
+@pytest.fixture(scope="module")
+def labels(da_motion: DeepAccident) -> dict[str, MotionLabels]:
+    """Of samples whose recording ends after 1 to 5 label frames, each frame in its own frame."""
+    scenario = next(record["token"] for record in da_motion.scenario if record["designed_accident"])
+    tokens = [
+        f"{scenario}/{agent}/{index:03d}" for agent in ("ego_vehicle", "infrastructure") for index in (15, 25, 35)
+    ]
+    return {token: da_motion.motion_labels(token) for token in tokens}
+
+
+def boxes_label(*frames: np.ndarray, config: MotionLabelConfig = CONFIG, recorded: int = 5) -> MotionLabels:
+    """Labels at the present with these instance maps; the first `recorded` frames are in the recording."""
+    instance = np.zeros((config.label_frames, *config.grid.shape), dtype=np.int32)
+    instance[: len(frames)] = np.reshape(frames, (-1, *config.grid.shape))
+    vectors = np.full((len(instance), 2, *config.grid.shape), 255, dtype=np.float32)
+    return MotionLabels(
+        config=config,
+        segmentation=(instance > 0).astype(np.uint8),
+        instance=instance,
+        centerness=np.zeros((len(instance), 1, *config.grid.shape), dtype=np.float32),
+        offset=vectors,
+        flow=vectors,
+        future_egomotion=np.zeros((config.frames, 6), dtype=np.float32),
+        valid=np.arange(config.frames) < config.receptive_field - 1 + recorded,
+        id_map={},
+        at_present=True,
+    )
+
+
+def boxes(**columns: int) -> np.ndarray:
+    """A map with boxes of 4 × 4 cells in row 100: `_7=50` is instance 7 from column 50 on."""
+    result = np.zeros((200, 200), dtype=np.int32)
+    for name, column in columns.items():
+        result[100:104, column : column + 4] = int(name[1:])
+    return result
+
+
+def still(*maps: np.ndarray) -> MotionOutput:
+    """Predictions in which nothing moves, one a map."""
+    return MotionOutput(grid=CONFIG.grid, instances=np.stack([np.stack([each] * 5) for each in maps]))
+
+
+def evaluated(prediction: MotionOutput, label: MotionLabels, protocol: str | MotionProtocol = "released"):
+    evaluator = MotionEvaluator(protocol)
+    evaluator.update("a", prediction, label)
+    return evaluator.compute()
+
+
+def test_perfect_instance_maps_score_100(labels: dict[str, MotionLabels]) -> None:
+    evaluator = MotionEvaluator()
+    for token, label in labels.items():
+        evaluator.update(token, instances_of(label.to_present().instance, label.config.grid), label)
+    result = evaluator.compute()
+    for each in result.ranges.values():
+        assert [getattr(each, name) for name in SCALES] == [100.0] * 4
+        assert each.true_positive > 0
+        assert (each.false_positive, each.false_negative) == (0, 0)
+    assert (result.min_ade, result.min_fde, result.miss_rate, result.path_accuracy) == (0.0, 0.0, 0.0, 1.0)
+    assert result.samples == len(labels)
+    assert result.frames == 2 * (5 + 3 + 1)
+    assert f"{len(labels)} of {len(labels)} predictions: given as instance maps" in result.notes[0]
+
+
+def test_the_labels_as_heads_find_most(labels: dict[str, MotionLabels]) -> None:
+    """What the grouping loses of the truth itself: some of it, as in the released evaluation."""
+    evaluator = MotionEvaluator()
+    for token, label in labels.items():
+        heads = MotionHeads.from_labels(label.to_present(centerness="bilinear"))
+        evaluator.update(token, MotionOutput(grid=label.config.grid, heads=(heads,)), label)
+    result = evaluator.compute()
+    assert result.ranges["100x100"].iou == 100.0
+    assert result.ranges["100x100"].pq > 60
+    assert (result.min_ade, result.path_accuracy) == (0.0, 1.0)
+    assert result.notes == ()
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+@pytest.mark.parametrize("as_heads", [False, True])
+def test_the_orientation_of_a_prediction_makes_no_difference(labels, orientation, as_heads: bool) -> None:
+    label, other = labels[next(iter(labels))], labels[list(labels)[3]]
+    grid = CONFIG.grid.with_orientation(orientation)
+    if as_heads:
+        heads = MotionHeads.from_labels(other.to_present())
+        first = MotionOutput(grid=CONFIG.grid, heads=(heads, heads))
+        second = MotionOutput(grid=grid, heads=(heads.in_orientation(orientation),) * 2)
+    else:
+        maps = other.to_present().instance
+        turned = to_orientation(maps, vectors=False, source=CONFIG.grid.orientation, target=orientation)
+        first, second = instances_of(maps, CONFIG.grid), instances_of(turned, grid)
+    assert motion_counts(second, label) == motion_counts(first, label)
+
+
+def test_no_prediction_scores_0() -> None:
+    empty = np.zeros((200, 200), dtype=np.int32)
+    result = evaluated(still(empty, empty), boxes_label(*[boxes(_1=100)] * 5))
+    for each in result.ranges.values():
+        assert [getattr(each, name) for name in SCALES] == [0.0] * 4
+        assert each.false_negative == 5
+    assert math.isnan(result.min_ade)
+    assert (result.paths, result.path_false_negative, result.path_accuracy) == (0, 1, 0.0)
+
+
+@pytest.mark.parametrize(("protocol", "nothing"), [("released", 0.0), ("paper", math.nan)])
+def test_nothing_to_count(protocol: str, nothing: float) -> None:
+    empty = np.zeros((200, 200), dtype=np.int32)
+    for result in (evaluated(still(empty), boxes_label(), protocol), MotionEvaluator(protocol).compute()):
+        for each in result.ranges.values():
+            np.testing.assert_array_equal([getattr(each, name) for name in SCALES], [nothing] * 4)
+        assert math.isnan(result.path_accuracy)
+
+
+def test_a_range_counts_what_is_in_it() -> None:
+    """A box 45 m ahead is only within 100 m; one across the border of the 30 m counts with its part inside."""
+    label = boxes_label(*[boxes(_1=190, _2=127)] * 5)
+    result = evaluated(still(boxes(_2=128)), label)
+    near, far = result.ranges["30x30"], result.ranges["100x100"]
+    assert (near.true_positive, near.false_negative) == (5, 0)
+    assert near.iou == pytest.approx(100 * 2 / 3)
+    assert (far.true_positive, far.false_negative) == (5, 5)
+    assert far.sq == pytest.approx(100 * 12 / 20)
+    assert far.pq == pytest.approx(100 * (5 * 12 / 20) / 7.5)
+
+
+def test_frames_beyond_the_recording_do_not_count() -> None:
+    label = boxes_label(*[boxes(_1=100)] * 5, recorded=2)
+    result = evaluated(instances_of(np.stack([boxes(_1=100)] * 2 + [boxes()] * 3), CONFIG.grid), label)
+    assert result.frames == 2
+    assert result.ranges["100x100"].pq == 100.0
+
+
+def test_an_id_that_changes_is_a_miss_and_a_false_alarm() -> None:
+    label = boxes_label(*[boxes(_1=100)] * 5)
+    maps = instances_of(np.stack([boxes(_1=100), boxes(_1=100), *[boxes(_2=100)] * 3]), CONFIG.grid)
+    each = evaluated(maps, label).ranges["100x100"]
+    assert (each.true_positive, each.false_positive, each.false_negative) == (4, 1, 1)
+    assert each.rq == pytest.approx(80.0)
+    lenient = evaluated(maps, label, MotionProtocol(vpq=VpqRules(ids_must_stay=False)))
+    assert lenient.ranges["100x100"].pq == 100.0
+
+
+def test_a_predicted_id_that_jumps_to_another_is_not_punished() -> None:
+    label = boxes_label(boxes(_1=50), boxes(_2=120), recorded=2)
+    result = evaluated(instances_of(np.stack([boxes(_9=50), boxes(_9=120)]), CONFIG.grid), label)
+    assert result.ranges["100x100"].pq == 100.0
+
+
+def test_half_of_the_union_is_no_match() -> None:
+    label, prediction = np.zeros((2, 1, 6, 6), dtype=np.int64)
+    label[0, :2, :4], prediction[0, :2, :2] = 3, 5
+    assert vpq_counts(prediction, label).true_positive.tolist() == [[1, 0]]
+    prediction[0, 0, 2] = 5
+    assert vpq_counts(prediction, label).iou[0, 1] == 5 / 8
+
+
+def test_large_ids_are_numbered_anew() -> None:
+    small = np.stack([boxes(_1=100, _2=60, _3=20)] * 3)
+    large = np.array([0, 7, 10**9, 2 * 10**9])[small]
+    assert vpq([vpq_counts(large, small)])[1].pq == 1.0
+    assert vpq_counts(large, large).true_positive[:, 1].tolist() == [3, 3, 3]
+
+
+def test_paths_of_the_best_prediction() -> None:
+    """1 m aside, 3 m aside: the nearer of the two counts, and no other's id matters."""
+    label = boxes_label(*[boxes(_4=100)] * 5)
+    result = evaluated(still(boxes(_1=106), boxes(_7=102)), label)
+    assert (result.min_ade, result.min_fde, result.miss_rate, result.paths) == (1.0, 1.0, 0.0, 1)
+    assert evaluated(still(boxes(_1=106)), label).min_fde == 3.0
+
+
+def test_a_path_too_far_away_is_no_partner() -> None:
+    label = boxes_label(*[boxes(_4=100)] * 5)
+    result = evaluated(still(boxes(_1=109)), label)
+    assert (result.paths, result.path_false_positive, result.path_false_negative) == (0, 1, 1)
+    wide = evaluated(still(boxes(_1=109)), label, MotionProtocol(gate=5.0))
+    assert (wide.paths, wide.min_fde, wide.path_accuracy) == (1, 4.5, 1.0)
+
+
+def test_a_path_that_ends_early_goes_on_ever_faster() -> None:
+    """Two cells a frame, then gone: 2, 4, 6 cells a frame as released, where the truth keeps to 2."""
+    label = boxes_label(*[boxes(_1=100 + 2 * frame) for frame in range(5)])
+    lost = instances_of(np.stack([boxes(_1=100), boxes(_1=102), *[boxes()] * 3]), CONFIG.grid)
+    assert evaluated(lost, label).min_fde == (2 + 4 + 6 - 6) * 0.5
+    assert evaluated(lost, label, MotionProtocol(accelerating_paths=False)).min_fde == 0.0
+
+
+def test_an_empty_first_prediction_ends_the_test() -> None:
+    label, found = boxes_label(*[boxes(_1=100)] * 5), still(boxes(), boxes(_1=100))
+    result = evaluated(found, label)
+    assert (result.paths, result.path_true_positive) == (0, 1)
+    fair = MotionProtocol(trajectories=TrajectoryRules(first_prediction_empty_ends=False))
+    assert evaluated(found, label, fair).paths == 1
+
+
+def test_large_errors_are_cut_off() -> None:
+    label = boxes_label(*[boxes(_1=20)] * 5)
+    far = instances_of(np.stack([boxes(_1=20), boxes(_1=20), boxes(_1=20), boxes(_1=20), boxes(_1=55)]), CONFIG.grid)
+    result = evaluated(far, label)
+    assert (result.min_ade, result.min_fde, result.miss_rate) == (3.5, 10.0, 1.0)
+    rules = TrajectoryRules(ade_limit=2.0, fde_limit=20.0, miss_distance=18.0)
+    result = evaluated(far, label, MotionProtocol(trajectories=rules))
+    assert (result.min_ade, result.min_fde, result.miss_rate) == (2.0, 17.5, 0.0)
+
+
+def test_paths_can_be_left_out() -> None:
+    evaluator = MotionEvaluator(trajectories=False)
+    evaluator.update("a", still(boxes(_1=100)), boxes_label(*[boxes(_1=100)] * 5))
+    assert evaluator.counts["a"]["paths"] is None
+    result = evaluator.compute()
+    assert result.ranges["30x30"].pq == 100.0
+    assert math.isnan(result.min_ade)
+
+
+def test_pooled_counts_have_the_same_result(labels: dict[str, MotionLabels]) -> None:
+    evaluator = filled(labels)
+    assert len(evaluator.pooled(list(evaluator.counts.values()))) == 1
+    pooled = evaluator.result_of(evaluator.pooled(list(evaluator.counts.values())))
+    assert pooled.as_dict() == evaluator.compute().as_dict()
+
+
+def filled(labels: dict[str, MotionLabels], order: int = 1) -> MotionEvaluator:
+    """Each sample's labels taken for a prediction of the next one's."""
+    evaluator, tokens = MotionEvaluator(), list(labels)
+    for token, other in list(zip(tokens, [*tokens[1:], tokens[0]], strict=True))[::order]:
+        evaluator.update(token, instances_of(labels[other].to_present().instance, CONFIG.grid), labels[token])
+    return evaluator
+
+
+def test_order_parts_and_a_stop_make_no_difference(labels: dict[str, MotionLabels], tmp_path: Path) -> None:
+    expected = filled(labels).compute()
+    assert filled(labels, order=-1).compute() == expected
+    parts = [MotionEvaluator(), MotionEvaluator()]
+    for index, (token, counts) in enumerate(filled(labels).counts.items()):
+        parts[index % 2].add(token, counts)
+    assert parts[1].merge(parts[0]).compute() == expected
+    resumed = MotionEvaluator().resume(filled(labels).save(tmp_path / "state.json"))
+    assert resumed.compute() == expected
+    assert resumed.settings == json.loads(json.dumps(resumed.settings))
+
+
+def test_the_released_breakdown_takes_other_samples_frames() -> None:
+    """Sample 2 is perfect, but frame 2 of the list of all frames is sample 0's, which has nothing right."""
+    evaluator, label = MotionEvaluator(), boxes_label(*[boxes(_1=100)] * 5)
+    for token, prediction in {"a": boxes(), "b": boxes(_1=100), "c": boxes(_1=100)}.items():
+        evaluator.update(token, still(prediction), label)
+    order = ["a", "b", "c"]
+    wrong, right = evaluator.selected_as_released(order, {"c"}), evaluator.compute({"c"})
+    assert (right.ranges["100x100"].pq, wrong.ranges["100x100"].pq) == (100.0, 0.0)
+    assert (right.ranges["100x100"].iou, wrong.ranges["100x100"].iou) == (100.0, 100.0)
+    with pytest.raises(EvaluationError, match="1 samples have no prediction, such as d"):
+        evaluator.selected_as_released(["a", "d"], {"a"})
+    counts = [vpq_counts(np.stack([maps] * 5), label.instance) for maps in (boxes(), boxes(_1=100), boxes(_1=100))]
+    assert separate_selected_as_released(counts, [2])[1].pq == 0.0
+    assert separate_selected_as_released(counts, [2, 7])[1].pq == 1 / 1.5
+
+
+def test_what_cannot_be_compared_is_refused() -> None:
+    label = boxes_label(*[boxes(_1=100)] * 5)
+    with pytest.raises(EvaluationError, match="grid"):
+        motion_counts(instances_of(np.zeros((5, 100, 100)), BevGrid((-50, 50, 1), (-50, 50, 1))), label)
+    with pytest.raises(EvaluationError, match="frames"):
+        motion_counts(instances_of(np.zeros((4, 200, 200)), CONFIG.grid), label)
+    with pytest.raises(EvaluationError, match="present"):
+        motion_counts(still(boxes()), boxes_label(recorded=0))
+    with pytest.raises(GeometryError, match=r"expected \(T, H, W\) as the label's"):
+        vpq_counts(np.zeros((2, 4, 4)), np.zeros((3, 4, 4)))
+    with pytest.raises(GeometryError, match="expected the label's shape"):
+        segmentation_counts(np.zeros((2, 4)), np.zeros((3, 4)))
+    with pytest.raises(ChoiceError, match="protocol: expected one of released, paper, found 'clean'"):
+        MotionEvaluator("clean")
+
+
+def test_iou_of_classes() -> None:
+    prediction, label = np.array([0, 1, 2, 2, 7]), np.array([0, 2, 2, 1, 2])
+    counts = segmentation_counts(prediction, label, classes=3)
+    assert counts[2] == SegmentationCounts(true_positive=1, false_positive=1, false_negative=2)
+    assert [iou([each]) for each in counts] == [1.0, 0.0, 0.25]
+    assert iou([counts[2], counts[0]]) == 2 / 5
+    assert iou([]) == 0.0
+    assert math.isnan(iou([], absent=math.nan))
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+def test_the_cells_of_a_range(orientation) -> None:
+    grid = BevGrid((-20.0, 60.0, 0.5), (-30.0, 10.0, 0.25), orientation)
+    for extent in (30.0, 41.0, 1.0, 300.0):
+        inside = np.abs(grid.centers()) < extent / 2
+        expected = inside.all(axis=-1)
+        found = np.zeros(grid.shape, dtype=bool)
+        found[cells_within(grid, extent)] = True
+        np.testing.assert_array_equal(found, expected)
+    away = BevGrid((20.0, 60.0, 0.5), (-30.0, 10.0, 0.25), orientation)
+    assert not np.zeros(away.shape)[cells_within(away, 30.0)].size
+
+
+def test_the_released_ranges_are_the_released_cells() -> None:
+    assert cells_within(CONFIG.grid, 30.0) == (slice(70, 130), slice(70, 130))
+    assert cells_within(CONFIG.grid, 100.0) == (slice(0, 200), slice(0, 200))
+    assert MOTION_PROTOCOLS["released"].range_names == ("30x30", "100x100")
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+def test_paths_of_instances(orientation) -> None:
+    """Those of the first frame alone, with a point for each frame that they are in."""
+    grid = BevGrid()
+    maps = np.stack([boxes(_1=100, _2=40), boxes(_2=42, _3=10), boxes(_1=104)])
+    turned = to_orientation(maps, vectors=False, source="devkit", target=orientation)
+    paths = instance_paths(turned, grid.with_orientation(orientation))
+    assert {name: path.tolist() for name, path in paths.items()} == {
+        1: [[1.0, 1.0], [3.0, 1.0]],
+        2: [[-29.0, 1.0], [-28.0, 1.0]],
+    }
+    assert instance_paths(np.zeros((2, 200, 200), dtype=int), grid) == {}
+
+
+def test_the_samples_of_an_evaluation(da_motion: DeepAccident, labels) -> None:
+    """The last four key frames before the collision, of all agents: 20 samples a scenario, evaluated one by one."""
+    tokens = [token for token in samples(da_motion, "train", "evaluate") if "/infrastructure/" in token]
+    evaluator = MotionEvaluator("paper", trajectories=False)
+    for token in tokens:
+        label = da_motion.motion_labels(token)
+        evaluator.update(token, instances_of(label.to_present().instance, CONFIG.grid), label)
+    assert evaluator.tokens == set(tokens)
+    assert evaluator.compute().ranges["30x30"].pq == 100.0

@@ -1,0 +1,695 @@
+"""Folders of motion labels: what is read back, what stops and damage leave, and whom a folder refuses."""
+
+import json
+import operator
+import os
+import pickle
+import random
+import re
+import shutil
+import subprocess
+import sys
+import time
+import zipfile
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError, ConfigError, LabelFilesError, NotAvailableError, TokenError
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.motion import (
+    LABEL_PROTOCOLS,
+    PRESETS,
+    Augmentation,
+    FrameBoxes,
+    LabelFiles,
+    LabelsWritten,
+    MotionLabelConfig,
+    MotionLabels,
+    label_files,
+    motion_labels,
+    motion_labels_from_boxes,
+    write_label_files,
+)
+from deepaccident_devkit.motion.label_folder import FORMAT_VERSION, MANIFEST
+from deepaccident_devkit.motion.stored_labels import NOBODY, NOWHERE, StoredLabels
+from deepaccident_devkit.taxonomy import AGENTS
+
+PAGE = Path(__file__).parents[3] / "schema" / "motion_labels.md"
+MAPS = ("segmentation", "instance", "centerness", "offset", "flow", "future_egomotion", "valid")
+OBLONG = BevGrid((-20.0, 60.0, 0.5), (-30.0, 10.0, 0.25))
+CONFIGS = {
+    **PRESETS,
+    "clean": MotionLabelConfig(protocol="clean"),
+    "clean, everybody, untracked too": MotionLabelConfig(protocol="clean", filter_invisible=False),
+    "everybody": MotionLabelConfig(filter_invisible=False),
+    "released orientation": MotionLabelConfig(orientation="released"),
+    "clean, as fiery": MotionLabelConfig(protocol="clean", orientation="fiery", draw_ego=False),
+    "fiery, as released": MotionLabelConfig.preset("fiery", orientation="released", ignore_index=1),
+    "oblong": MotionLabelConfig(grid=OBLONG, receptive_field=1, future_frames=2, step=2),
+    "oblong, as fiery": MotionLabelConfig(grid=OBLONG, orientation="fiery", protocol="clean"),
+    "large": MotionLabelConfig(grid=BevGrid((-100.0, 100.0, 0.5), (-100.0, 100.0, 0.5)), future_frames=1),
+    "augmented": MotionLabelConfig(augmentation=Augmentation(rotation=0.3, scale=1.04, flip=True)),
+    "slips of one's own": MotionLabelConfig(protocol=replace(LABEL_PROTOCOLS["clean"], untracked_share_an_id=True)),
+    "one agent's sight": MotionLabelConfig(agents=("ego_vehicle",)),
+}
+
+
+def assert_same(one: MotionLabels, other: MotionLabels) -> None:
+    """Equal to the bit, the type and the zero's sign."""
+    for name in MAPS:
+        mine, theirs = getattr(one, name), getattr(other, name)
+        assert (mine.dtype, mine.shape) == (theirs.dtype, theirs.shape), name
+        differing = int((mine != theirs).sum())
+        assert mine.tobytes() == theirs.tobytes(), f"{name}: {differing} cells differ"
+    assert dict(one.id_map) == dict(other.id_map)
+    assert (one.config.digest, one.at_present) == (other.config.digest, other.at_present)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """All files but the lock."""
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != ".lock")
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def two_people(agent: str, frame: int) -> list[str]:
+    """tiny's boxes, and two untracked people, seen."""
+    people = [f"pedestrian {x} {4 + frame / 5} -0.9 0.6 0.6 1.86 0 0.0 0.0 -1 9 True" for x in (8.0, 11.0)]
+    return [*tiny.label_lines(agent, frame), *people]
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return tiny.write_tiny_release(tmp_path / "release", frames=12, lines_of=two_people)
+
+
+@pytest.fixture
+def small(root: Path) -> DeepAccident:
+    return opened(root)
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    return tmp_path / "labels"
+
+
+def opened(root: Path) -> DeepAccident:
+    return DeepAccident(dataroot=root, verbose=False, workers=1)
+
+
+def tokens_of(release: DeepAccident, *frames: int, agents: tuple[str, ...] = AGENTS) -> list[str]:
+    """By scenario, agent and time."""
+    ends = tuple(f"/{agent}/{frame:03d}" for agent in agents for frame in frames)
+    return [record["token"] for record in release.sample if record["token"].endswith(ends)]
+
+
+def write(release: DeepAccident, folder: Path, tokens: list[str], config: MotionLabelConfig | None = None, **more: int):
+    return write_label_files(release, folder, tokens, config, workers=more.get("workers", 1))
+
+
+class TestRoundTrip:
+    def test_every_sample_reads_as_it_is_made(self, da_motion: DeepAccident, tmp_path: Path) -> None:
+        tokens = [record["token"] for record in da_motion.sample]
+        done = write(da_motion, tmp_path / "a" / "new folder", tokens, workers=2)
+        assert done == LabelsWritten(samples=350, written=10, kept=0)
+        files = LabelFiles(tmp_path / "a" / "new folder", MotionLabelConfig())
+        assert (list(files), len(files)) == (tokens, len(tokens))
+        for token in tokens[::3]:
+            assert_same(files[token], motion_labels(da_motion, token))
+
+    @pytest.mark.parametrize("name", CONFIGS)
+    def test_every_configuration(self, da_motion: DeepAccident, tmp_path: Path, name: str) -> None:
+        tokens = tokens_of(da_motion, 1, 27, agents=("ego_vehicle", "infrastructure"))
+        write(da_motion, tmp_path, tokens, CONFIGS[name])
+        files = LabelFiles(tmp_path)
+        for token in random.Random(0).sample(tokens, len(tokens)):  # noqa: S311 - any order
+            assert_same(files[token], motion_labels(da_motion, token, CONFIGS[name]))
+
+    @pytest.mark.parametrize("name", ["clean, everybody, untracked too", "everybody", "slips of one's own"])
+    def test_untracked_actors(self, small: DeepAccident, tmp_path: Path, name: str) -> None:
+        """Each row is an instance without an actor, or all are actor −1."""
+        config = replace(CONFIGS[name], filter_invisible=False)
+        tokens = tokens_of(small, 1, 9, 12)
+        write(small, tmp_path / "labels", tokens, config)
+        files, shared = LabelFiles(tmp_path / "labels", config), config.rules.untracked_share_an_id
+        for token in tokens:
+            assert_same(files[token], motion_labels(small, token, config))
+            assert (-1 in files[token].id_map) == shared
+
+    @pytest.mark.parametrize("count", [255, 256, 300])
+    def test_more_instances_than_a_byte_counts(self, tmp_path: Path, count: int) -> None:
+        x, y = np.meshgrid(np.arange(20) * 4.5 - 45, np.arange(15) * 4.5 - 30)
+        center = np.column_stack([x.ravel(), y.ravel(), np.zeros(300)])[:count]
+        frame = FrameBoxes(
+            center=center,
+            size=np.tile([3.0, 3.0, 1.5], (count, 1)),
+            yaw=np.zeros(count),
+            actor_id=1000 + np.arange(count),
+            category=np.zeros(count),
+            visible=np.ones(count),
+            ego_from_lidar=np.eye(4),
+        )
+        config = MotionLabelConfig(draw_ego=False)
+        labels = motion_labels_from_boxes([frame] * 5, np.zeros((7, 6)), config)
+        assert labels.instance.max() == count
+        with zipfile.ZipFile(tmp_path / "one.npz", "w") as archive:
+            StoredLabels.of(labels).write(archive, "007")
+        with zipfile.ZipFile(tmp_path / "one.npz") as archive:
+            stored = StoredLabels.read(archive, "007")
+        assert stored.instance.dtype == (np.uint8 if count < 256 else np.uint16)
+        assert_same(stored.labels(config), labels)
+
+    def test_ids_that_came_from_a_sample_before(self, small: DeepAccident) -> None:
+        before = motion_labels(small, tokens_of(small, 1)[0]).id_map
+        labels = motion_labels(small, tokens_of(small, 12)[0], id_map={**before, 77: 400})
+        assert_same(StoredLabels.of(labels).labels(labels.config), labels)
+
+    def test_bytes_do_not_depend_on_time_workers_or_order(self, da_motion: DeepAccident, tmp_path: Path) -> None:
+        tokens = tokens_of(da_motion, 5, 30)
+        write(da_motion, tmp_path / "one", tokens)
+        write(da_motion, tmp_path / "two", tokens[::-1], workers=2)
+        records = [da_motion.get("sample", token) for token in tokens]
+        with ThreadPoolExecutor(2) as executor:
+            write_label_files(da_motion, tmp_path / "three", [*records, *records], executor=executor)
+        assert contents(tmp_path / "one") == contents(tmp_path / "two") == contents(tmp_path / "three")
+
+
+class TestPage:
+    """schema/motion_labels.md."""
+
+    @pytest.mark.parametrize("name", ["deepaccident", "fiery", "clean", "released orientation", "oblong, as fiery"])
+    def test_its_lines_rebuild_the_maps(self, da_motion: DeepAccident, tmp_path: Path, name: str) -> None:
+        """With numpy alone, to the bit; a sample in the midst and one whose future is beyond the recording."""
+        _, _, rest = PAGE.read_text(encoding="utf-8").partition("```python\n")
+        lines, fence, _ = rest.partition("```")
+        assert fence
+        assert "deepaccident" not in lines
+        tokens = tokens_of(da_motion, 15, 27, agents=("other_vehicle",))
+        write(da_motion, tmp_path, tokens, CONFIGS[name])
+        for token in tokens:
+            rebuilt = {"folder": str(tmp_path), "token": token}
+            exec(compile(lines, PAGE, "exec"), rebuilt)  # noqa: S102 - our own page
+            labels = LabelFiles(tmp_path)[token]
+            for one in ("segmentation", "instance", "centerness", "offset", "flow"):
+                ours, theirs = getattr(labels, one), rebuilt[one]
+                assert (ours.dtype, ours.shape) == (theirs.dtype, theirs.shape)
+                assert ours.tobytes() == theirs.tobytes(), f"{one}: {int((ours != theirs).sum())} cells differ"
+
+    def test_it_names_every_member_and_key(self, da_motion: DeepAccident, tmp_path: Path) -> None:
+        page, token = PAGE.read_text(encoding="utf-8"), tokens_of(da_motion, 15)[0]
+        write(da_motion, tmp_path, [token])
+        recording, frame = token.rsplit("/", 1)
+        with zipfile.ZipFile(tmp_path / f"{recording}.npz") as archive:
+            for name in archive.namelist():
+                assert f"| `{name.replace(frame, '<NNN>').removesuffix('.npy')}` |" in page
+        for key in json.loads((tmp_path / MANIFEST).read_text()):
+            assert f"| `{key}` |" in page
+        assert f"| `version` | {FORMAT_VERSION};" in page
+        assert {str(NOWHERE).replace("-", "−"), "−2⁶³"} <= set(re.split(r"[ ;:,]", page))
+        assert NOBODY == -(2**63)
+
+
+class TestAdding:
+    def test_what_is_whole_is_kept_and_fewer_samples_remove_nothing(self, small: DeepAccident, out: Path) -> None:
+        some, others = tokens_of(small, 2, 7), tokens_of(small, 7, 12, agents=("ego_vehicle",))
+        assert write(small, out, some) == LabelsWritten(samples=10, written=5, kept=0)
+        assert write(small, out, others) == LabelsWritten(samples=2, written=1, kept=0)
+        before = contents(out)
+        assert write(small, out, some[:1]) == LabelsWritten(samples=1, written=0, kept=1)
+        assert write(small, out, some) == LabelsWritten(samples=10, written=0, kept=5)
+        assert contents(out) == before
+        files = LabelFiles(out)
+        assert set(files) == {*some, *others}
+        for token in files:
+            assert_same(files[token], motion_labels(small, token))
+
+    def test_what_the_release_changed_is_made_again(self, root: Path, tmp_path: Path) -> None:
+        tokens = tokens_of(opened(root), 1, agents=("ego_vehicle", "infrastructure"))
+        write(opened(root), tmp_path / "labels", tokens)
+        label = root / tiny.TYPE / "other_vehicle" / "label" / tiny.NAME / f"{tiny.NAME}_006.txt"
+        label.write_text("\n".join(label.read_text().splitlines()[:-1]) + "\n")
+        os.utime(label.parent)
+        changed = opened(root)
+        assert write(changed, tmp_path / "labels", tokens) == LabelsWritten(samples=2, written=2, kept=0)
+        assert write(changed, tmp_path / "labels", tokens) == LabelsWritten(samples=2, written=0, kept=2)
+        calib = root / tiny.TYPE / "ego_vehicle" / "calib" / tiny.NAME / f"{tiny.NAME}_006.pkl"
+        pose = tiny.calib(tiny.ego_to_world("ego_vehicle", 6), height=1.5)
+        calib.write_bytes(tiny.old_pickle(pose))
+        os.utime(calib.parent)
+        lifted = opened(root)
+        assert write(lifted, tmp_path / "labels", tokens).written == 2
+        calib.with_name(f"{tiny.NAME}_007.pkl").write_bytes(tiny.old_pickle(pose))
+        os.utime(calib.parent)
+        assert write(opened(root), tmp_path / "labels", tokens).written == 2
+
+    def test_frames_that_the_release_has_no_more(self, root: Path, tmp_path: Path) -> None:
+        write(opened(root), tmp_path / "labels", tokens_of(opened(root), 1, 12))
+        shorter = opened(tiny.write_tiny_release(tmp_path / "shorter", frames=6))
+        before = contents(tmp_path / "labels")
+        with pytest.raises(LabelFilesError, match=r"ego_vehicle\.npz: has frames that are not in .*shorter any more"):
+            write(shorter, tmp_path / "labels", tokens_of(shorter, 1))
+        assert contents(tmp_path / "labels") == before
+
+
+class TestRefusing:
+    def test_another_configuration_leaves_the_folder_as_it_is(self, small: DeepAccident, out: Path) -> None:
+        tokens = tokens_of(small, 3)
+        write(small, out, tokens)
+        before = contents(out)
+        others = {
+            "draw_ego: True, asked for False": MotionLabelConfig(draw_ego=False),
+            "half_cell_shift: True, asked for False": MotionLabelConfig(
+                protocol=replace(LABEL_PROTOCOLS["released"], half_cell_shift=False)
+            ),
+            "agents: None, asked for 'single'": MotionLabelConfig(agents="single"),
+            "orientation: 'devkit', asked for 'released'": MotionLabelConfig(orientation="released"),
+        }
+        for told, config in others.items():
+            with pytest.raises(ConfigError, match=f"another configuration .*{told}.*choose another folder"):
+                write(small, out, tokens, config)
+            with pytest.raises(ConfigError, match=told):
+                LabelFiles(out, config)
+        assert contents(out) == before
+
+    def test_numbers_of_another_type_are_the_same_configuration(self, small: DeepAccident, out: Path) -> None:
+        write(small, out, tokens_of(small, 3))
+        write(small, out, tokens_of(small, 4), MotionLabelConfig(sigma=3))
+        files = LabelFiles(out, MotionLabelConfig(sigma=3))
+        assert all(files[token].config.sigma == 3 for token in files)
+
+    def test_folders_that_are_something_else(self, small: DeepAccident, tmp_path: Path) -> None:
+        (tmp_path / "file").write_text("mine")
+        (tmp_path / "photos").mkdir()
+        (tmp_path / "photos" / "cat.jpg").write_text("mine")
+        (tmp_path / "odd" / MANIFEST).mkdir(parents=True)
+        (tmp_path / "empty").mkdir()
+        for folder, told in {
+            "": "found an empty path; give '.' for the current one",
+            tmp_path / "file": "file: is a file; give a folder",
+            tmp_path / "photos": "photos: is not empty and holds no motion labels; choose a new folder",
+            tmp_path / "odd": "holds no motion labels",
+            tmp_path / "file" / "below": "below: no labels can be written there .*; choose another folder",
+            "/proc/nowhere": "nowhere: no labels can be written there .*; choose another folder",
+        }.items():
+            with pytest.raises(LabelFilesError, match=told):
+                write_label_files(small, folder, tokens_of(small, 3))
+        assert contents(tmp_path / "photos") == {"cat.jpg": b"mine"}
+        for folder in ("nowhere", "empty", "photos", "file"):
+            with pytest.raises(LabelFilesError, match=r"holds no motion labels .*make them with `deepaccident labels`"):
+                LabelFiles(tmp_path / folder)
+        assert write(small, tmp_path / "empty", tokens_of(small, 3)).written == 5
+
+    def test_what_cannot_be_drawn_is_said_before_anything_is_written(self, root: Path, tmp_path: Path) -> None:
+        small, out = opened(root), tmp_path / "labels"
+        unlabelled = opened(tiny.write_tiny_release(tmp_path / "test", labelled=False))
+        with pytest.raises(NotAvailableError, match="ego_vehicle/003 has no label to draw"):
+            write(unlabelled, out, tokens_of(unlabelled, 3))
+        with pytest.raises(TokenError, match="no token 'nothing'"):
+            write(small, out, [*tokens_of(small, 3), "nothing"])
+        with pytest.raises(ChoiceError, match="expected at least one sample, found none"):
+            write(small, out, [])
+        for one in (tokens_of(small, 3)[0], small.sample[3]):
+            with pytest.raises(ChoiceError, match="put it into a list"):
+                write_label_files(small, out, one)
+        partial = opened(tiny.write_tiny_release(tmp_path / "partial", agents=("ego_vehicle", "infrastructure")))
+        with pytest.raises(NotAvailableError, match="other_vehicle is not in this release"):
+            write(partial, out, tokens_of(partial, 3), MotionLabelConfig(agents="+other"))
+        assert not out.exists()
+
+
+class TestReading:
+    @pytest.fixture
+    def files(self, da_motion: DeepAccident, tmp_path: Path) -> LabelFiles:
+        write(da_motion, tmp_path / "labels", tokens_of(da_motion, 4, 19))
+        return LabelFiles(tmp_path / "labels")
+
+    def test_it_is_a_mapping_by_token(self, files: LabelFiles, da_motion: DeepAccident) -> None:
+        tokens = tokens_of(da_motion, 4, 19)
+        assert list(files) == tokens
+        assert all(token in files for token in tokens)
+        recording = tokens[0].removesuffix("/004")
+        for other in (
+            *(f"{recording}/{number}" for number in ("4", "0004", "005", "٠٠٤", "-04", "+04", " 04", "", "004/")),
+            recording,
+            f"/{tokens[0]}",
+            "",
+            4,
+            None,
+            da_motion.get("sample", tokens[0]),
+        ):
+            assert other not in files
+            with pytest.raises(TokenError, match=r"has no labels of .*; `deepaccident labels` can add them"):
+                files[other]
+        assert repr(files) == f"<motion labels: 20 samples in {files.folder}>"
+        assert files == files  # noqa: PLR0124 - without reading twenty samples
+        assert files != LabelFiles(files.folder)
+
+    def test_results_cannot_be_written_to(self, files: LabelFiles) -> None:
+        labels = files[next(iter(files))]
+        for name in MAPS:
+            with pytest.raises(ValueError, match="read-only"):
+                getattr(labels, name)[...] = 1
+        with pytest.raises(TypeError, match="does not support item assignment"):
+            labels.id_map[3] = 4
+
+    def test_few_files_are_open_at_a_time(self, files: LabelFiles) -> None:
+        for token in [*files, *files]:
+            assert files[token].valid[2]
+        assert len(files._open) == label_files._OPEN_FILES < 10
+
+    def test_it_outlives_a_change_of_folder(
+        self, files: LabelFiles, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.chdir(tmp_path)
+        relative = LabelFiles("labels")
+        monkeypatch.chdir("/")
+        assert_same(relative[next(iter(files))], files[next(iter(files))])
+
+    def test_threads_and_spawned_processes_read_the_same(self, files: LabelFiles) -> None:
+        tokens = random.Random(1).choices(list(files), k=60)  # noqa: S311
+        expected = {token: files[token] for token in files}
+        with ThreadPoolExecutor(8) as threads:
+            for token, labels in zip(tokens, threads.map(files.__getitem__, tokens), strict=True):
+                assert_same(labels, expected[token])
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as processes:
+            assert_same(processes.submit(operator.getitem, files, tokens[0]).result(), expected[tokens[0]])
+        assert_same(pickle.loads(pickle.dumps(files))[tokens[1]], expected[tokens[1]])
+
+    def test_forked_processes_read_at_once(self, files: LabelFiles) -> None:
+        script = """
+import os, sys
+from deepaccident_devkit.motion import LabelFiles
+files = LabelFiles(sys.argv[1])
+tokens = list(files)[:4]
+expected = [files[token].instance.sum() for token in tokens]
+children = []
+for _ in range(3):
+    child = os.fork()
+    if not child:
+        good = all(files[token].instance.sum() == one for _ in range(20) for token, one in zip(tokens, expected))
+        os._exit(0 if good else 1)
+    children.append(child)
+print([os.waitpid(child, 0)[1] for child in children])
+"""
+        said = python(script, files.folder)
+        assert (said.returncode, said.stdout.strip()) == (0, "[0, 0, 0]"), said.stderr
+
+    def test_numpy_alone_opens_a_file(self, files: LabelFiles) -> None:
+        token = next(iter(files))
+        with np.load(files.folder / f"{token.removesuffix('/004')}.npz", allow_pickle=False) as archive:
+            assert archive["004/instance"].dtype == np.uint8
+            assert archive["config"].item() == files.config.digest
+
+
+class TestDamage:
+    @pytest.fixture
+    def folder(self, small: DeepAccident, tmp_path: Path) -> Path:
+        write(small, tmp_path / "labels", tokens_of(small, 3, 7, agents=("ego_vehicle",)))
+        return tmp_path / "labels"
+
+    @pytest.fixture
+    def path(self, folder: Path) -> Path:
+        return folder / f"{tiny.TOKEN}" / "ego_vehicle.npz"
+
+    def test_any_byte_of_a_file(self, small: DeepAccident, folder: Path, path: Path) -> None:
+        """The labels or our error, whatever byte is another."""
+        whole, token = path.read_bytes(), tokens_of(small, 3)[0]
+        expected, source, told, refused = LabelFiles(folder)[token], random.Random(2), "", 0  # noqa: S311
+        for _ in range(150):
+            place = source.choice([source.randrange(len(whole)), -source.randrange(1, 700)])
+            content = bytearray(whole)
+            content[place] ^= source.randrange(1, 256)
+            path.write_bytes(content)
+            try:
+                assert_same(LabelFiles(folder)[token], expected)
+            except LabelFilesError as error:
+                told, refused = str(error), refused + 1
+        assert told.startswith(f"{path}: ")
+        assert told.endswith("; remove it and run `deepaccident labels` again")
+        assert refused > 20
+
+    @pytest.mark.parametrize("keep", [0, 1, 500, -1, None])
+    def test_a_file_cut_short_or_gone_is_made_again(
+        self, small: DeepAccident, folder: Path, path: Path, keep: int | None
+    ) -> None:
+        before, tokens = contents(folder), list(LabelFiles(folder))
+        if keep is None:
+            path.unlink()
+        else:
+            path.write_bytes(path.read_bytes()[:keep])
+        files = LabelFiles(folder)
+        for token in tokens:
+            with pytest.raises(LabelFilesError, match=r"ego_vehicle\.npz.*; remove it and run"):
+                files[token]
+        assert write(small, folder, tokens[:1]) == LabelsWritten(samples=1, written=1, kept=0)
+        assert contents(folder) == before
+        assert_same(files[tokens[1]], motion_labels(small, tokens[1]))
+
+    def test_a_file_of_another_folder(self, small: DeepAccident, folder: Path, path: Path, tmp_path: Path) -> None:
+        token = tokens_of(small, 3)[0]
+        write(small, tmp_path / "clean", [token], MotionLabelConfig(protocol="clean"))
+        shutil.copy(tmp_path / "clean" / path.relative_to(folder), path)
+        with pytest.raises(LabelFilesError, match="holds labels of another configuration; remove it"):
+            LabelFiles(folder)[token]
+        assert write(small, folder, [token]).written == 1
+        assert_same(LabelFiles(folder)[token], motion_labels(small, token))
+
+    @pytest.mark.parametrize("member", ["instance", "center", "flow", "actor", "future_egomotion", "valid"])
+    def test_arrays_that_cannot_be_the_samples(
+        self, small: DeepAccident, path: Path, folder: Path, member: str
+    ) -> None:
+        with zipfile.ZipFile(path) as archive:
+            others = {name: archive.read(name) for name in archive.namelist() if name != f"003/{member}.npy"}
+            with archive.open(f"003/{member}.npy") as file:
+                array = np.lib.format.read_array(file)
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, content in others.items():
+                archive.writestr(name, content)
+            with archive.open(f"003/{member}.npy", "w") as file:
+                np.lib.format.write_array(file, array[:-1])
+        with pytest.raises(LabelFilesError, match=r"ego_vehicle\.npz: .*expected .*found"):
+            LabelFiles(folder)[tokens_of(small, 3)[0]]
+
+    @pytest.mark.parametrize(
+        "text",
+        ["", "{", "[]", "null", "3", "\0", "[" * 100_000, "\xff", '{"format": "DeepAccident motion labels"}'],
+    )
+    def test_a_manifest_that_is_none(self, small: DeepAccident, folder: Path, text: str) -> None:
+        (folder / MANIFEST).write_text(text, encoding="latin-1")
+        before = contents(folder)
+        for use in (lambda: LabelFiles(folder), lambda: write(small, folder, tokens_of(small, 3))):
+            with pytest.raises(LabelFilesError, match=r"manifest\.json: cannot be read .*; make the labels anew in an"):
+                use()
+        assert contents(folder) == before
+
+    @pytest.mark.parametrize(
+        "change",
+        [
+            {"format": "something"},
+            {"version": "1"},
+            {"version": None},
+            {"config": {}},
+            {"config": None},
+            {"config_digest": "0" * 16},
+            {"samples": []},
+            {"samples": {"a/b/ego_vehicle": 3}},
+            {"samples": {"a/b/ego_vehicle": [0]}},
+            {"samples": {"a/b/ego_vehicle": [True]}},
+            {"samples": {"a/b/ego_vehicle": ["3"]}},
+            {"samples": {"a/b/nobody": [3]}},
+            {"samples": {"../../ego_vehicle": [3]}},
+            {"samples": {"/etc/ego_vehicle": [3]}},
+        ],
+    )
+    def test_a_manifest_with_a_wrong_value(self, folder: Path, change: dict[str, object]) -> None:
+        path = folder / MANIFEST
+        path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+        with pytest.raises(LabelFilesError, match=r"manifest\.json: cannot be read"):
+            LabelFiles(folder)
+
+    def test_a_configuration_changed_by_hand(self, folder: Path) -> None:
+        path = folder / MANIFEST
+        told = json.loads(path.read_text())
+        told["config"]["draw_ego"] = False
+        path.write_text(json.dumps(told))
+        with pytest.raises(LabelFilesError, match="the digest of its configuration is another one"):
+            LabelFiles(folder)
+
+    @pytest.mark.parametrize(("version", "kind"), [(FORMAT_VERSION + 1, "newer"), (0, "older")])
+    def test_another_devkits_labels_are_refused_and_kept(
+        self, small: DeepAccident, folder: Path, version: int, kind: str
+    ) -> None:
+        path = folder / MANIFEST
+        path.write_text(json.dumps({**json.loads(path.read_text()), "version": version, "new": 1}))
+        before = contents(folder)
+        sentence = (
+            rf"{kind} devkit's labels \(format version {version}, this devkit's is {FORMAT_VERSION}\); .* or make"
+        )
+        for use in (lambda: LabelFiles(folder), lambda: write(small, folder, tokens_of(small, 3))):
+            with pytest.raises(LabelFilesError, match=sentence):
+                use()
+        assert contents(folder) == before
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.motion import write_label_files
+
+release = DeepAccident(dataroot=sys.argv[1], verbose=False, workers=1)
+tokens = [f"{sys.argv[3]}/{agent}/{frame:03d}" for agent in ("ego_vehicle", "infrastructure") for frame in (3, 7)]
+replace = os.replace
+for step in range(4):
+    for after in (False, True):
+        child = os.fork()
+        if child:
+            assert os.waitpid(child, 0)[1] == signal.SIGKILL
+            continue
+        calls = iter(range(step, -1, -1))
+        def watched(*arguments):
+            last = next(calls) == 0
+            if last and not after:
+                os.kill(os.getpid(), signal.SIGKILL)
+            replace(*arguments)
+            if last:
+                os.kill(os.getpid(), signal.SIGKILL)
+        os.replace = watched
+        write_label_files(release, Path(sys.argv[2]) / f"{step} {after}", tokens, workers=1)
+        os._exit(0)
+"""
+FULL = """
+import resource, sys
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import LabelFilesError
+from deepaccident_devkit.motion import write_label_files
+
+release = DeepAccident(dataroot=sys.argv[1], verbose=False, workers=1)
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]),) * 2)
+try:
+    write_label_files(release, sys.argv[2], [record["token"] for record in release.sample], workers=1)
+except LabelFilesError as error:
+    print(error)
+"""
+
+
+def python(script: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", script, *map(str, arguments)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=environment)
+
+
+def labels_verb(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "deepaccident_devkit.cli", "labels", *map(str, arguments)]
+
+
+class TestStops:
+    def test_killed_around_every_renaming(self, root: Path, tmp_path: Path) -> None:
+        small = opened(root)
+        tokens = tokens_of(small, 3, 7, agents=("ego_vehicle", "infrastructure"))
+        write(small, tmp_path / "fresh", tokens)
+        said = python(KILLED, root, tmp_path / "killed", tiny.TOKEN)
+        assert said.returncode == 0, said.stderr
+        kept = 0
+        for step in range(4):
+            for after in (False, True):
+                folder = tmp_path / "killed" / f"{step} {after}"
+                if (step, after) != (3, True):
+                    with pytest.raises(LabelFilesError, match=r"broken off; run|holds no motion labels"):
+                        LabelFiles(folder)
+                done = write(small, folder, tokens)
+                assert done.kept == max(0, min(2, step - (not after))), folder
+                kept += done.kept
+                assert contents(folder) == contents(tmp_path / "fresh")
+        assert kept
+
+    @pytest.mark.parametrize("workers", [1, 2])
+    def test_killed_at_any_moment(self, da_motion: DeepAccident, tmp_path: Path, workers: int) -> None:
+        verb = labels_verb(
+            da_motion.dataroot,
+            "--split",
+            "train",
+            "--out",
+            tmp_path / "labels",
+            "--workers",
+            workers,
+            "--samples",
+            "all",
+        )
+        write(da_motion, tmp_path / "fresh", da_motion.samples("train", "all"))
+        for files in (1, 3):
+            with subprocess.Popen(verb, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+                wait_for(lambda least=files: len(list((tmp_path / "labels").glob("*/*/*.npz"))) >= least)
+                process.kill()
+        done = write(da_motion, tmp_path / "labels", da_motion.samples("train", "all"))
+        assert done.samples == 70
+        assert done.kept > 0
+        assert contents(tmp_path / "labels") == contents(tmp_path / "fresh")
+
+    def test_a_full_disk(self, root: Path, tmp_path: Path) -> None:
+        small, out = opened(root), tmp_path / "labels"
+        for limit, there in ((100, 0), (12_000, 1)):
+            said = python(FULL, root, out, limit)
+            assert "labels: labels cannot be written ([Errno 27]" in said.stdout, said.stderr
+            assert "make room there, or choose another folder, and run it again" in said.stdout
+            assert len(contents(out)) == there, contents(out).keys()
+        write(small, out, tokens_of(small, 3))
+        assert len(LabelFiles(out)) == 5
+
+    def test_a_killed_worker_is_our_error(
+        self, small: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def broken(*_arguments: object, **_options: object) -> None:
+            raise BrokenProcessPool("a child process terminated abruptly")
+
+        monkeypatch.setattr(label_files, "run_batch", broken)
+        with pytest.raises(LabelFilesError, match=r"was killed .*if memory ran out, give fewer workers"):
+            write(small, tmp_path / "labels", tokens_of(small, 3))
+
+    def test_a_folder_that_cannot_be_locked(self, small: DeepAccident, tmp_path: Path) -> None:
+        (tmp_path / "labels" / ".lock").mkdir(parents=True)
+        with pytest.raises(LabelFilesError, match=r"no labels can be written there .*; choose another folder"):
+            write(small, tmp_path / "labels", tokens_of(small, 3))
+
+    def test_only_its_own_leftovers_are_removed(self, small: DeepAccident, out: Path) -> None:
+        write(small, out, tokens_of(small, 3))
+        folder = out / tiny.TOKEN
+        own = [out / f".{MANIFEST}.123.tmp", folder / ".ego_vehicle.npz.456.tmp"]
+        foreign = [out / ".mine.tmp", folder / ".notes.npz.456.tmp", folder / "ego_vehicle.npz.456.tmp"]
+        for path in (*own, *foreign):
+            path.touch()
+        write(small, out, tokens_of(small, 3))
+        assert not any(path.exists() for path in own)
+        assert all(path.exists() for path in foreign)
+
+    def test_two_processes_that_write_at_once(self, da_motion: DeepAccident, tmp_path: Path) -> None:
+        """Other frames of the same agents: nothing of either is lost."""
+        purposes = ("train", "evaluate")
+        wanted = [
+            labels_verb(da_motion.dataroot, "--split", "train", "--out", tmp_path / "labels", "--samples", purpose)
+            for purpose in purposes
+        ]
+        processes = [
+            subprocess.Popen([*verb, "--workers", "1"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+            for verb in wanted
+        ]
+        said = [process.communicate(timeout=120) for process in processes]
+        assert [process.returncode for process in processes] == [0, 0], said
+        tokens = {token for purpose in purposes for token in da_motion.samples("train", purpose)}
+        write(da_motion, tmp_path / "fresh", sorted(tokens))
+        assert contents(tmp_path / "labels") == contents(tmp_path / "fresh")
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.001)
