@@ -6,7 +6,7 @@ import operator
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from numbers import Real
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -18,6 +18,9 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 ByteArray = NDArray[np.uint8]
 AnyArray = NDArray[Any]
+_FLOAT64: Final = np.dtype(np.float64)
+_NUMBERS: Final = "biuf"
+"""Kinds of element types."""
 
 
 class FrozenArrays:
@@ -37,15 +40,17 @@ class FrozenArrays:
         return _restored, (type(self), {name: getattr(self, name) for name in _field_names(type(self))})
 
 
-def checked(name: str, values: ArrayLike, shape: Sequence[int | None], dtype: DTypeLike = np.float64) -> AnyArray:
+def checked(
+    name: str, values: ArrayLike, shape: Sequence[int | None], dtype: DTypeLike | None = np.float64
+) -> AnyArray:
     """Return `values` as an array of `dtype`, or raise GeometryError if they are no numbers or of another shape.
 
     Args:
         name: how the error names the array.
         values: what the caller passed.
         shape: the expected shape, None where any length is good.
-        dtype: the element type wanted; an array that has it already is not copied. Of an integer type, numbers must be
-            whole and in its range.
+        dtype: the element type wanted, None for that of `values`; an array that has it already is not copied. Of an
+            integer type, numbers must be whole and in its range.
     """
     array = as_numbers(name, values, f"an array of shape {_shape_text(shape)}", dtype)
     if array.ndim != len(shape) or any(
@@ -55,18 +60,42 @@ def checked(name: str, values: ArrayLike, shape: Sequence[int | None], dtype: DT
     return array
 
 
-def as_numbers(name: str, values: ArrayLike, expected: str = "numbers", dtype: DTypeLike = np.float64) -> AnyArray:
-    """`checked` for any shape; `expected` says in the error what the caller should have passed."""
-    try:
-        given = np.asarray(values)
-        if given.dtype.kind not in "biuf":
-            raise TypeError(f"no numbers: {given.dtype}")
-        with np.errstate(invalid="ignore"):
-            array = given.astype(dtype, copy=False)
-    except (TypeError, ValueError) as error:
-        raise GeometryError(f"{name}: expected {expected}, found {type(values).__name__} ({error})") from error
-    if array.dtype.kind in "iu" and not np.array_equal(array, given):
-        raise GeometryError(f"{name}: expected whole numbers of {array.dtype}, found {given}")
+def as_numbers(
+    name: str, values: ArrayLike, expected: str = "numbers", dtype: DTypeLike | None = np.float64
+) -> AnyArray:
+    """`checked` for any shape: the one way in for a caller's arrays, of whatever framework.
+
+    What numpy can read without being asked to copy from another device is taken: its own arrays, sequences, and what
+    offers `__array__` or DLPack, such as torch tensors on the processor. Nothing is detached, fetched from an
+    accelerator or unmasked silently; the error says how.
+
+    Args:
+        name: how the error names the array.
+        values: what the caller passed.
+        expected: what the caller should have passed, for the error.
+        dtype: the element type wanted, None for that of `values`; an array that has it already is not copied. Of an
+            integer type, numbers must be whole and in its range, of a float type in its range (NaN and inf pass).
+
+    Raises:
+        GeometryError: no numbers, masked ones, numbers that the type cannot hold, or an array that cannot be read.
+    """
+    given = _read(name, values, expected)
+    wanted = given.dtype if dtype is None else np.dtype(dtype)
+    if given.dtype.kind not in _NUMBERS:
+        raise GeometryError(
+            f"{name}: expected {expected}, found {type(values).__name__} (no numbers: {given.dtype}){_remedy(values)}"
+        )
+    if given.dtype == wanted:
+        return given
+    with np.errstate(invalid="ignore", over="ignore"):
+        array = given.astype(wanted)
+    if wanted.kind in "iu":
+        if not np.array_equal(array, given):
+            raise GeometryError(f"{name}: expected whole numbers of {wanted}, found {given}")
+    elif wanted.kind == "f" and wanted.itemsize < given.dtype.itemsize and not np.isfinite(array).all():
+        lost = np.isinf(array) & np.isfinite(given)
+        if lost.any():
+            raise GeometryError(f"{name}: expected numbers within {wanted}'s range, found {given[lost][0]}")
     return array
 
 
@@ -93,8 +122,13 @@ def checked_whole(
 
 def as_floats(values: ArrayLike) -> FloatArray:
     """`values` as float64; arrays that are float64 already are not copied. Raises GeometryError."""
+    given = _read("", values, "numbers")
+    if given.dtype == _FLOAT64:
+        return given
     try:
-        return np.asarray(values, dtype=np.float64)
+        if given.dtype.kind == "c":
+            raise TypeError(f"no real numbers: {given.dtype}")
+        return given.astype(_FLOAT64)
     except (TypeError, ValueError) as error:
         raise GeometryError(f"expected numbers, found {type(values).__name__} ({error})") from error
 
@@ -104,6 +138,33 @@ def readonly(array: AnyArray) -> AnyArray:
     view = array.view()
     view.flags.writeable = False
     return view
+
+
+def _read(name: str, values: Any, expected: str) -> AnyArray:
+    """`values` as an array of whatever type, or GeometryError with the remedy."""
+    if type(values) is np.ndarray:
+        return values
+    prefix = f"{name}: " if name else ""
+    if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
+        raise GeometryError(
+            f"{prefix}expected {expected}, found {np.count_nonzero(values.mask)} masked values; pass "
+            "array.filled(value) with the value that is to stand there"
+        )
+    try:
+        if hasattr(values, "__dlpack__") and not hasattr(values, "__array__"):
+            return np.from_dlpack(values)
+        return np.asarray(values)
+    except (TypeError, ValueError, RuntimeError, BufferError) as error:
+        raise GeometryError(
+            f"{prefix}expected {expected}, found {type(values).__name__} ({error}){_remedy(values)}"
+        ) from error
+
+
+def _remedy(values: object) -> str:
+    """What to do with another framework's array that numpy does not read; nothing for what is no array."""
+    if isinstance(values, np.ndarray) or not (hasattr(values, "__array__") or hasattr(values, "__dlpack__")):
+        return ""
+    return "; pass a torch tensor as tensor.detach().cpu().float(), another framework's as a float32 numpy array"
 
 
 def _restored(kind: type[FrozenArrays], values: Mapping[str, Any]) -> FrozenArrays:

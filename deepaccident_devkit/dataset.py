@@ -216,6 +216,8 @@ class Dataset:
         """
         if missing not in get_args(OnError):
             raise ChoiceError(f"missing: expected one of {', '.join(get_args(OnError))}, found {missing!r}")
+        if not isinstance(split, str | os.PathLike):
+            raise ChoiceError(f"split: expected the name of one, or the path of a split file, found {split!r}")
         if not isinstance(split, str) or split.endswith(".txt"):
             return self._listed_scenarios(Path(split).expanduser(), missing)
         if split in MINI_SPLITS:

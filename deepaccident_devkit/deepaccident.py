@@ -114,6 +114,7 @@ class DeepAccident(Dataset):
         motion_labels = motion.motion_labels
         bev_segmentation = motion.bev_segmentation
         samples = motion.samples
+        evaluation_samples = motion.evaluation_samples
         findings = validation.findings
         render_sample = render.render_sample
         render_frame = render.render_frame
@@ -124,6 +125,7 @@ class DeepAccident(Dataset):
         motion_labels = _Later("motion")
         bev_segmentation = _Later("motion")
         samples = _Later("motion")
+        evaluation_samples = _Later("motion")
         findings = _Later("validation")
         render_sample = _Later("render")
         render_frame = _Later("render")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from typing import TYPE_CHECKING, TypeVar
 
 from deepaccident_devkit.errors import ChoiceError
 
@@ -40,20 +40,40 @@ def run_batch(
     Raises:
         ChoiceError: `workers` is less than 1.
     """
+    results = dict(run_unordered(work, items, workers=workers, executor=executor, label=label, progress=progress))
+    return [results[position] for position in range(len(items))]
+
+
+def run_unordered(
+    work: Callable[[Item], Result],
+    items: Sequence[Item],
+    *,
+    workers: int | None = None,
+    executor: Executor | None = None,
+    label: str = "",
+    progress: bool = False,
+    sizes: Sequence[int] | None = None,
+) -> Generator[tuple[int, Result], None, None]:
+    """Apply `work` to every item; yields each one's position and result as soon as it is there.
+
+    Closing the generator cancels what has not begun. Arguments and errors are those of `run_batch`, and `sizes`: how
+    far each item moves the progress bar; None for one step each.
+    """
     from tqdm.auto import tqdm  # here: with asyncio and multiprocessing, a third of the package's import time
 
-    count = _worker_count(workers, len(items))
-    with tqdm(total=len(items), desc=label, disable=not progress, unit="") as bar:
-        if executor is not None:
-            return _on_executor(executor, work, items, bar)
-        if count == 1:
-            return [_counted(work(item), bar) for item in items]
-        import multiprocessing
-        from concurrent.futures import ProcessPoolExecutor
+    count, steps = _worker_count(workers, len(items)), sizes or [1] * len(items)
+    with tqdm(total=sum(steps), desc=label, disable=not progress, unit="") as bar, ExitStack() as stack:
+        if executor is None and count > 1:
+            import multiprocessing
+            from concurrent.futures import ProcessPoolExecutor
 
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(count, mp_context=context, initializer=_end_with_parent) as pool:
-            return _on_executor(pool, work, items, bar)
+            context = multiprocessing.get_context("spawn")
+            pool = ProcessPoolExecutor(count, mp_context=context, initializer=_end_with_parent)
+            executor = stack.enter_context(pool)
+        results = ((n, work(item)) for n, item in enumerate(items)) if executor is None else _on(executor, work, items)
+        for position, result in stack.enter_context(closing(results)):
+            bar.update(steps[position])
+            yield position, result
 
 
 def _worker_count(workers: int | None, items: int) -> int:
@@ -69,20 +89,19 @@ def _worker_count(workers: int | None, items: int) -> int:
     return max(1, min(os.cpu_count() or 1, items // enough_work))
 
 
-def _on_executor(executor: Executor, work: Callable[[Item], Result], items: Sequence[Item], bar: Any) -> list[Result]:
+def _on(
+    executor: Executor, work: Callable[[Item], Result], items: Sequence[Item]
+) -> Generator[tuple[int, Result], None, None]:
     from concurrent.futures import as_completed
 
     with _main_module_hidden():
         futures = {executor.submit(work, item): position for position, item in enumerate(items)}
-    results: dict[int, Result] = {}
     try:
         for future in as_completed(futures):
-            results[futures[future]] = _counted(future.result(), bar)
-    except BaseException:
+            yield futures.pop(future), future.result()
+    finally:
         for future in futures:
             future.cancel()
-        raise
-    return [results[position] for position in range(len(items))]
 
 
 def _end_with_parent() -> None:
@@ -99,11 +118,6 @@ def _end_with_parent() -> None:
         os._exit(1)
 
     threading.Thread(target=watch, name="end-with-parent", daemon=True).start()
-
-
-def _counted(result: Result, bar: Any) -> Result:
-    bar.update()
-    return result
 
 
 @contextmanager

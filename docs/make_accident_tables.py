@@ -52,7 +52,7 @@ def perfect_table() -> str:
         (name, given): AccidentEvaluator(name) for name in ("released", "paper", "boxes") for given in ("maps", "heads")
     }
     with tempfile.TemporaryDirectory() as folder:
-        dataset = DeepAccident("v1", make_release(folder, RELEASE), verbose=False)
+        dataset = DeepAccident("v1", make_release(Path(folder) / "release", RELEASE), verbose=False)
         for token in _evaluated(dataset):
             label = dataset.motion_labels(token).to_present("bilinear")
             context = accident_context(dataset, token, horizon=HORIZON)
@@ -63,27 +63,18 @@ def perfect_table() -> str:
             for (_, given), evaluator in evaluators.items():
                 evaluator.update(token, outputs[given], label, context)
     rows = {f"`{name}`, {given}": each.compute() for (name, given), each in evaluators.items()}
-    return table(rows, "protocol, and how the labels are given")
+    return table(rows, "protocol, and how the labels are given", ("meta", "another", "none"))
 
 
-def table(rows: dict[str, AccidentResult], what: str) -> str:
-    """One line a result."""
-    lines = [
-        f"| {what} | truths | TP | FP | FN at 10 m | APA (%) | id | position (m) | time (s) | meta's pair | another |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
+def table(rows: dict[str, AccidentResult], what: str, names: tuple[str, ...] = ()) -> str:
+    """One line a result, with the truths that name somebody of `names`."""
+    head = [what, "truths", "TP", "FP", "FN at 10 m", "APA (%)", "id", "position (m)", "time (s)", *names]
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     for name, result in rows.items():
         at = result.within[10.0]
-        numbers = [
-            result.positives,
-            at.tp,
-            at.fp,
-            at.fn,
-            _number(100 * result.apa, 1),
-            *(_number(value, 2) for value in (result.id_error, result.position_error, result.time_error)),
-            result.truths["meta"],
-            result.truths["another"],
-        ]
+        errors = (_number(value, 2) for value in (result.id_error, result.position_error, result.time_error))
+        named = (result.truths[each] for each in names)
+        numbers = (result.positives, at.tp, at.fp, at.fn, _number(100 * result.apa, 1), *errors, *named)
         lines.append(f"| {name} | {' | '.join(map(str, numbers))} |")
     return "\n".join(lines)
 

@@ -88,6 +88,7 @@ def turn(
     ego_from_lidar: SE3 | None = None,
     own_row: bool = True,
     frames: int | None = None,
+    earlier_ids: bool = False,
 ) -> MotionLabels:
     """Labels of the made moment: a left turn of the ego.
 
@@ -96,6 +97,7 @@ def turn(
         ego_from_lidar: where the LiDAR is; above the ego frame's origin, along its axes, if None.
         own_row: whether the label files have the agent's own row.
         frames: label frames until the recording ends; all if None.
+        earlier_ids: whether a sample before this one has numbered the colliding pair, where the protocol keeps ids.
     """
     mount = ego_from_lidar or SE3.identity()
     actors = [actor for actor in ACTORS if own_row or actor is not EGO]
@@ -106,7 +108,9 @@ def turn(
     motion = future_egomotion(
         np.stack([EGO.pose(number).matrix for number in numbers]), [number < recorded for number in numbers]
     )
-    return motion_labels_from_boxes(moments, motion, config)
+    kept = dict(zip(reversed(COLLIDING), (1, 2), strict=True)) if earlier_ids else None
+    id_map = kept if config.rules.ids_kept_between_samples else None
+    return motion_labels_from_boxes(moments, motion, config, id_map=id_map)
 
 
 def _boxes(actors: list[Actor], frame: int, ego_from_lidar: SE3) -> FrameBoxes:
@@ -145,6 +149,9 @@ CIRCUMSTANCES = {
         "`filter_invisible=False`, so that untracked actors are drawn", config={"filter_invisible": False}
     ),
     "missing_frames_are_empty": Circumstance("the recording ends 1 s after the present", moment={"frames": 3}),
+    "ids_kept_between_samples": Circumstance(
+        "an earlier sample's `id_map` with the colliding pair", moment={"earlier_ids": True}
+    ),
     "outside_is_zero": Circumstance(),
     "half_cell_shift": Circumstance(),
     "drawn_when": Circumstance(),
@@ -247,8 +254,9 @@ def table_of_the_release(release: DeepAccident) -> str:
 
 
 def switches() -> list[str]:
-    """The names of all switches."""
-    return [one.name for one in fields(LabelProtocol)]
+    """The names of the switches in which the two protocols differ."""
+    one, other = LABEL_PROTOCOLS["released"], LABEL_PROTOCOLS["clean"]
+    return [item.name for item in fields(LabelProtocol) if getattr(one, item.name) != getattr(other, item.name)]
 
 
 def without(switch: str) -> LabelProtocol:

@@ -22,21 +22,17 @@ class BevSegmentationResult:
     """Shares of the cells that prediction and truth have in common.
 
     Attributes:
+        mean_iou: the mean over the classes that there are, in %; NaN if there is none.
         iou: class of `motion.BEV_CLASSES` → intersection over union in %, of the cells of all samples together; NaN
             where neither side has any.
         cells: class → how many cells are hit, predicted in vain and missed.
         samples: number of samples.
     """
 
+    mean_iou: float
     iou: Mapping[str, float]
     cells: Mapping[str, tuple[int, int, int]]
     samples: int
-
-    @property
-    def mean_iou(self) -> float:
-        """The mean over the classes that there are, in %; NaN if there is none."""
-        known = [value for value in self.iou.values() if not isnan(value)]
-        return fsum(known) / len(known) if known else nan
 
     def to_dict(self) -> dict[str, Any]:
         """All of it, as JSON holds it; None for classes that are nowhere."""
@@ -82,8 +78,11 @@ class BevSegmentationEvaluator(Evaluator[BevSegmentationResult]):
             one: tuple(sum(each[name][position] for each in counts) for name in names)
             for position, one in enumerate(BEV_CLASSES)
         }
+        iou = {one: 100 * ratio(numbers[0], sum(numbers)) for one, numbers in cells.items()}
+        known = [value for value in iou.values() if not isnan(value)]
         return BevSegmentationResult(
-            iou=MappingProxyType({one: 100 * ratio(numbers[0], sum(numbers)) for one, numbers in cells.items()}),
+            mean_iou=fsum(known) / len(known) if known else nan,
+            iou=MappingProxyType(iou),
             cells=MappingProxyType({one: (hit, vain, missed) for one, (hit, vain, missed) in cells.items()}),
             samples=len(counts),
         )
@@ -94,7 +93,7 @@ def _layers(token: str, prediction: BevSegmentation | ArrayLike, truth: BevSegme
         if prediction.grid != truth.grid:
             raise GeometryError(f"{token}: prediction on {prediction.grid}, truth on {truth.grid}; use one grid")
         return prediction.masks
-    given = checked(f"{token}: prediction", prediction, truth.masks.shape, np.asarray(prediction).dtype)
+    given = checked(f"{token}: prediction", prediction, truth.masks.shape, None)
     if given.dtype != np.bool_ and not np.isin(given, (0, 1)).all():
         raise GeometryError(f"{token}: prediction holds other numbers than 0 and 1; compare scores with a threshold")
     return given.astype(bool)

@@ -6,6 +6,7 @@ alone, and any selection of the samples can be summed (see `breakdown`).
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import os
@@ -15,6 +16,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Generic, TypeVar
 
+from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.files import write_bytes
 
@@ -52,6 +54,38 @@ class Evaluator(ABC, Generic[Result]):
         A subclass whose counts are sums adds them up; others keep them apart, as here.
         """
         return list(counts)
+
+    @abstractmethod
+    def update(self, token: str, *arguments: Any) -> None:
+        """Count one sample: its token, then prediction, truth and what else the evaluator takes."""
+
+    def update_batch(self, tokens: Sequence[str], *columns: Sequence[Any]) -> None:
+        """Count several samples, such as those of a data loader's batch, one after another.
+
+        Args:
+            tokens: of the samples.
+            *columns: what `update` takes after the token, one sequence an argument, one entry a sample.
+
+        Raises:
+            EvaluationError: a column is not as long as the tokens, or as of `update`; then the samples before the one
+                that cannot be counted are.
+        """
+        if isinstance(tokens, str):
+            raise EvaluationError(f"tokens: expected a sequence of them, found the text {tokens!r}; see `update`")
+        for number, column in enumerate(columns):
+            if len(column) != len(tokens):
+                raise EvaluationError(
+                    f"batch: {len(tokens)} tokens, and column {number} after them has {len(column)} entries; give one "
+                    "for each sample"
+                )
+        for token, *arguments in zip(tokens, *columns, strict=True):
+            self.update(token, *arguments)
+
+    def fresh(self: EvaluatorT) -> EvaluatorT:
+        """An evaluator of the same settings without samples."""
+        other = copy.copy(self)
+        other._counts, other.repeated = {}, set()  # noqa: SLF001 - its own kind
+        return other
 
     def add(self, token: str, counts: Counts) -> None:
         """Take a sample's counts.
@@ -114,30 +148,54 @@ class Evaluator(ABC, Generic[Result]):
         return self.result_of([self._counts[token] for token in chosen])
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write all counts to a JSON file, from which a broken-off run goes on; returns its path."""
+        """Write all counts to a JSON file, from which a broken-off run goes on; returns its path.
+
+        The file is the old one or the new one at any moment, never half of it.
+
+        Raises:
+            EvaluationError: it cannot be written.
+        """
         target = Path(path).expanduser()
-        state = {"settings": self.settings, "repeated": sorted(self.repeated), "counts": self._counts}
-        write_bytes(target, json.dumps(state).encode())
+        state = {
+            "made_by": self._maker,
+            "settings": self.settings,
+            "repeated": sorted(self.repeated),
+            "counts": self._counts,
+        }
+        try:
+            write_bytes(target, json.dumps(state).encode())
+        except OSError as error:
+            remedy = "make room there, or choose another file"
+            raise EvaluationError(f"{target}: the evaluation cannot be saved ({error}); {remedy}") from error
         return target
 
     def resume(self: EvaluatorT, path: str | os.PathLike[str]) -> EvaluatorT:
         """Take the counts that `save` wrote; returns this one.
 
         Raises:
-            EvaluationError: there is no such file, it cannot be read, or it is of other settings.
+            EvaluationError: there is no such file, it cannot be read, or it is of other settings, another evaluator or
+                another version of the devkit.
         """
         source = Path(path).expanduser()
         try:
             state = json.loads(source.read_text(encoding="utf-8"))
-            settings, counts, repeated = state["settings"], dict(state["counts"]), set(state["repeated"])
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            maker, settings, repeated = state["made_by"], state["settings"], set(state["repeated"])
+            counts = {token: dict(each) for token, each in state["counts"].items()}
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise EvaluationError(f"{source}: no saved evaluation ({error}); begin anew") from error
+        if maker != self._maker:
+            raise EvaluationError(f"{source}: was saved by {maker}, this is {self._maker}; begin anew")
         if settings != self.settings:
             raise EvaluationError(f"{source}: was saved with other settings ({settings}); begin anew, or use those")
         for token, each in counts.items():
             self.add(token, each)
         self.repeated |= repeated
         return self
+
+    @property
+    def _maker(self) -> str:
+        """Whose counts these are: another version may count differently."""
+        return f"{type(self).__name__} of devkit {__version__}"
 
 
 def ratio(part: float, whole: float) -> float:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, FloatArray, FrozenArrays, checked
+from deepaccident_devkit.arrays import AnyArray, FloatArray, FrozenArrays, as_numbers, checked
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import MotionHeads
@@ -94,5 +94,5 @@ def _checked_heads(heads: Sequence[MotionHeads], grid: BevGrid) -> tuple[MotionH
 
 def instances_of(values: ArrayLike, grid: BevGrid) -> MotionOutput:
     """One prediction (T, H, W), or K of them (K, T, H, W), given as instance maps; raises GeometryError."""
-    maps = np.asarray(values)
+    maps = as_numbers("instances", values, dtype=None)
     return MotionOutput(grid=grid, instances=maps[None] if maps.ndim == 3 else maps)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray
+from deepaccident_devkit.arrays import AnyArray, BoolArray, as_numbers
 from deepaccident_devkit.errors import GeometryError
 
 
@@ -40,7 +40,7 @@ def segmentation_counts(prediction: AnyArray, label: AnyArray, classes: int = 2)
     Raises:
         GeometryError: other shapes.
     """
-    predicted, true = np.asarray(prediction), np.asarray(label)
+    predicted, true = as_numbers("prediction", prediction, dtype=None), as_numbers("label", label, dtype=None)
     if predicted.shape != true.shape:
         raise GeometryError(f"prediction: expected the label's shape {true.shape}, found {predicted.shape}")
     return tuple(mask_counts(predicted == index, true == index) for index in range(classes))

@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray, as_numbers
 from deepaccident_devkit.errors import GeometryError
 
 CLASSES: Final = ("background", "instances")
@@ -80,7 +80,7 @@ def vpq_counts(prediction: AnyArray, label: AnyArray, rules: VpqRules = VpqRules
     Raises:
         GeometryError: other shapes.
     """
-    predicted, true = np.asarray(prediction), np.asarray(label)
+    predicted, true = as_numbers("prediction", prediction, dtype=None), as_numbers("label", label, dtype=None)
     if predicted.shape != true.shape or true.ndim != 3:
         raise GeometryError(f"prediction: expected (T, H, W) as the label's {true.shape}, found {predicted.shape}")
     shared = _shared_cells(predicted, true)

@@ -89,7 +89,8 @@ class BevGrid:
             cell = np.floor((np.where(within, values, low) - low) / size).astype(np.int64)
             steps.append(np.minimum(cell, count - 1))
             inside &= within
-        index = np.stack(self._arranged(*steps), axis=1)
+        along_x, along_y = steps
+        index = np.stack(cells_in(along_y, along_x, self._counts[::-1], "devkit", self.orientation), axis=1)
         index[~inside] = -1
         return index, inside
 
@@ -112,17 +113,10 @@ class BevGrid:
             ChoiceError: there is no such orientation.
         """
         target = self.with_orientation(orientation)
-        array = np.asarray(raster)
+        array = as_numbers("raster", raster, dtype=None)
         if array.shape[-2:] != self.shape:
             raise GeometryError(f"raster: expected shape (…, {self.shape[0]}, {self.shape[1]}), found {array.shape}")
-        devkit = _turned(array, self.orientation)
-        return _turned(devkit, target.orientation)
-
-    def _arranged(self, column: IntArray, row: IntArray) -> tuple[IntArray, IntArray]:
-        """Row and column in this orientation of cells counted along x and y."""
-        if self.orientation == "fiery":
-            return column, row
-        return (row if self.orientation == "devkit" else self._counts[1] - 1 - row), column
+        return turned(turned(array, self.orientation), target.orientation)
 
     def _laid_out(self, devkit: FloatArray) -> FloatArray:
         """An array (rows, columns, …) of the devkit's orientation in this one."""
@@ -131,11 +125,23 @@ class BevGrid:
         return devkit if self.orientation == "devkit" else devkit[::-1]
 
 
-def _turned(raster: AnyArray, orientation: Orientation) -> AnyArray:
-    """The devkit's orientation → `orientation`, or back: each is its own way back."""
+def turned(raster: AnyArray, orientation: Orientation) -> AnyArray:
+    """A raster (…, rows, columns) of the devkit's orientation in another, or back: each is its own way back."""
     if orientation == "fiery":
         return raster.swapaxes(-1, -2)
     return raster if orientation == "devkit" else raster[..., ::-1, :]
+
+
+def cells_in(
+    row: AnyArray, column: AnyArray, shape: tuple[int, int], source: Orientation, target: Orientation
+) -> tuple[AnyArray, AnyArray]:
+    """Where cells of one orientation, `shape` its rows and columns, are in another: row and column."""
+    rows, columns = shape
+    if source == "fiery":
+        row, column, rows, columns = column, row, columns, rows
+    if (source == "released") != (target == "released"):
+        row = rows - 1 - row
+    return (column, row) if target == "fiery" else (row, column)
 
 
 def _axis(name: str, given: Axis) -> Axis:

@@ -1,6 +1,28 @@
-"""Motion labels and model outputs: FIERY-style maps of the bird's-eye view, and what is read off them."""
+"""Motion labels and model outputs: FIERY-style maps of the bird's-eye view, and what is read off them.
+
+The way of a label, from a release to a model, and of a model's outputs to instances:
+
+| step | from → to | where |
+|---|---|---|
+| what a sample shows | tables → `FrameBoxes`, ego motion | `sample_labels` (and `sample_lists`: which samples) |
+| who is drawn, and where | boxes → `FramePolygons` | `drawing.box_polygons` |
+| which cells those are | polygons → cells | `drawing.polygon_fill` |
+| ids, centres, flow | cells → centres here and at the next frame | `drawing.from_boxes` |
+| maps | cells and centres → `MotionLabels` | `drawing.label_maps`, `labels` |
+| all frames in the present one | `MotionLabels` → the same, warped | `warps.to_present` |
+| to another code, to disk | `MotionLabels` → batches; files | `batch_names`; `label_files` |
+| a prediction | arrays → `MotionHeads` | `postprocessing.heads` |
+| instances of a frame | heads → centres, and cells by centre | `postprocessing.grouping` |
+| the same id in all frames | instances → `LinkedInstances` | `postprocessing.linking`, `postprocessing.predict` |
+| boxes along the paths | linked instances → their redrawn maps | `postprocessing.redrawing` |
+
+What is drawn is said by a `MotionLabelConfig` (`config`), how by a `LabelProtocol` (`protocols`: every slip of the
+released code a switch), how cells lie by a grid's orientation (`orientations`). `warps.feature_warps` moves a model's
+own maps as labels are moved.
+"""
 
 from deepaccident_devkit.motion.augmentation import Augmentation
+from deepaccident_devkit.motion.batch_names import config_from_names
 from deepaccident_devkit.motion.bev_segmentation import (
     BEV_CLASSES,
     BevSegmentation,
@@ -16,7 +38,6 @@ from deepaccident_devkit.motion.drawing.from_boxes import (
 )
 from deepaccident_devkit.motion.label_files import LabelFiles, LabelsWritten, write_label_files
 from deepaccident_devkit.motion.labels import OWN_BOX_ID, MotionLabels
-from deepaccident_devkit.motion.names import config_from_names
 from deepaccident_devkit.motion.postprocessing.heads import MotionHeads
 from deepaccident_devkit.motion.postprocessing.predict import (
     POST_PROCESSING,
@@ -28,7 +49,7 @@ from deepaccident_devkit.motion.postprocessing.predict import (
 )
 from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS, LabelProtocol
 from deepaccident_devkit.motion.sample_labels import motion_labels
-from deepaccident_devkit.motion.sample_lists import samples
+from deepaccident_devkit.motion.sample_lists import evaluation_samples, samples
 from deepaccident_devkit.motion.warps.feature_warps import agents_to_ego, past_to_present
 
 __all__ = [
@@ -53,6 +74,7 @@ __all__ = [
     "agents_to_ego",
     "bev_segmentation",
     "config_from_names",
+    "evaluation_samples",
     "labels_from_polygons",
     "motion_labels",
     "motion_labels_from_boxes",

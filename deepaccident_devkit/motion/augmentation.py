@@ -9,6 +9,7 @@ import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.motion.settings import flag, number
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,11 +27,14 @@ class Augmentation:
     flip: bool = False
 
     def __post_init__(self) -> None:
-        """Check the numbers; raises ConfigError."""
-        if not math.isfinite(self.rotation):
-            raise ConfigError(f"augmentation: rotation is {self.rotation}; choose finite radians")
-        if not 0 < self.scale < math.inf:
-            raise ConfigError(f"augmentation: scale is {self.scale}; choose a factor above 0, 1 for none")
+        """Check the values; raises ConfigError."""
+        rotation = number("augmentation: rotation", self.rotation, "finite radians")
+        scale = number("augmentation: scale", self.scale, "a factor above 0, 1 for none")
+        if scale <= 0:
+            raise ConfigError(f"augmentation: scale: expected a factor above 0, 1 for none, found {self.scale!r}")
+        object.__setattr__(self, "rotation", rotation)
+        object.__setattr__(self, "scale", scale)
+        object.__setattr__(self, "flip", flag("augmentation: flip", self.flip))
 
     @property
     def matrix(self) -> FloatArray:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
+from types import MappingProxyType
 from typing import Any, Final
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError
@@ -13,10 +14,19 @@ from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import Orientation
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS, LabelProtocol, label_protocol
-from deepaccident_devkit.v2x import AgentConfig, Agents
+from deepaccident_devkit.motion.settings import choice, count, flag, number
+from deepaccident_devkit.taxonomy import AGENTS
+from deepaccident_devkit.v2x import AGENT_CONFIGS, AgentConfig, Agents
 
 _STEPS_PER_SECOND: Final = 2
 _BYTE: Final = 255
+_MOST_FRAMES: Final = 1000
+_COUNTS: Final = {
+    "receptive_field": "frames up to the present, itself included",
+    "future_frames": "frames to come, of which labels of motion need one at least",
+    "step": "recorded frames from one label frame to the next, 5 for 2 Hz",
+}
+_SIGMAS: Final = (0.01, 10_000.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,18 +34,22 @@ class MotionLabelConfig:
     """What motion labels show; the defaults are the released ones in the devkit's orientation.
 
     Attributes:
-        grid: the cells, right-handed metres. Its orientation is `orientation`.
+        grid: the cells, right-handed metres, and how they lie in arrays (`grid.orientation`).
         receptive_field: frames up to the present that a model sees, the present included.
         future_frames: frames after the present that labels show.
         step: recorded frames (0.1 s) from one label frame to the next; 5 is 2 Hz.
         only_vehicle: leave out pedestrians (two-wheelers are vehicles, as in all three codes).
         filter_invisible: draw only what the cooperating agents see by the released rule (evaluation.md f).
-        agents: whose sight counts; None for all that are there, whoever cooperates: the released way.
+        agents: whose sight counts; None for all that are there, whoever cooperates: the released way. Names are kept
+            as a tuple.
         draw_ego: draw the ego's own box (the roadside pole has none).
-        ignore_index: what stands in offset and flow beside instances, and in missing frames where they are ignored.
-        orientation: how the cells lie in arrays; None for the grid's own.
+        ignore_index: what stands in offset and flow beside instances, and in missing frames where they are ignored:
+            255, or any number from the grid's longer side on, in cells, which no vector can have.
+        orientation: a word to the constructor: the orientation that `grid` is laid out in, None for its own. The grid
+            keeps it: what is read here is None always.
         sigma: radius of the centres' peaks, cells: exp(−d² / σ²), as FIERY.
-        protocol: `released`, `clean`, `beverse`, `fiery`, or a `LabelProtocol` of your own.
+        protocol: `released`, `clean`, `beverse`, `fiery`, or a `LabelProtocol` of your own; one that has a name is kept
+            by its name.
         augmentation: a rotation, scale and flip in each frame's ego frame; None for none.
     """
 
@@ -55,37 +69,42 @@ class MotionLabelConfig:
 
     def __post_init__(self) -> None:
         """Check and complete; raises ConfigError or ChoiceError, each with the remedy."""
-        _check_count("receptive_field", self.receptive_field, "the present frame itself counts")
-        _check_count("future_frames", self.future_frames, "labels of motion need at least one frame to come")
-        _check_count("step", self.step, "recorded frames between label frames, 5 for 2 Hz")
-        _check_count("ignore_index", self.ignore_index, "a mark beside the maps' values, such as 255")
-        if self.ignore_index > _BYTE:
-            raise ConfigError(
-                f"ignore_index: {self.ignore_index} does not fit the maps; choose 1 to {_BYTE}, such as 255"
-            )
-        if not 0 < self.sigma < float("inf"):
-            raise ConfigError(f"sigma: {self.sigma!r} is no radius; choose a number of cells above 0, such as 3")
-        label_protocol(self.protocol)
-        orientation = self.grid.orientation if self.orientation is None else self.orientation
-        object.__setattr__(self, "grid", self.grid.with_orientation(orientation))
-        object.__setattr__(self, "orientation", orientation)
+        grid = _checked_grid(self.grid, self.orientation)
+        values: dict[str, object] = {
+            "grid": grid,
+            "orientation": None,
+            "ignore_index": _checked_mark(self.ignore_index, grid),
+            "sigma": number("sigma", self.sigma, "cells from 0.01 to 10,000, such as 3", *_SIGMAS),
+            "agents": _checked_agents(self.agents),
+            "protocol": _named(label_protocol(self.protocol)),
+            **{name: count(name, getattr(self, name), what, _MOST_FRAMES) for name, what in _COUNTS.items()},
+            **{name: flag(name, getattr(self, name)) for name in ("only_vehicle", "filter_invisible", "draw_ego")},
+        }
+        if not isinstance(self.augmentation, Augmentation | None):
+            raise ConfigError(f"augmentation: expected an Augmentation or None, found {self.augmentation!r}")
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
 
     @classmethod
     def preset(cls, name: str, **changes: Any) -> MotionLabelConfig:
         """A preset of `PRESETS`, with some fields changed.
 
+        A grid of the devkit's orientation, the default, is laid out as the preset's; another one keeps its own.
+
         Raises:
             ChoiceError: no such preset.
             ConfigError: no such field, or a value that cannot be.
         """
-        if name not in PRESETS:
-            raise ChoiceError(f"preset: expected one of {', '.join(PRESETS)}, found {name!r}")
+        preset = PRESETS[choice("preset", name, PRESETS)]
         unknown = sorted(set(changes) - set(cls.__dataclass_fields__))
         if unknown:
             raise ConfigError(
                 f"preset: there is no field {unknown[0]!r}; there are {', '.join(cls.__dataclass_fields__)}"
             )
-        return replace(PRESETS[name], **changes)
+        given = changes.get("grid")
+        if isinstance(given, BevGrid) and given.orientation == "devkit" and changes.get("orientation") is None:
+            changes["orientation"] = preset.grid.orientation
+        return replace(preset, **changes)
 
     @property
     def rules(self) -> LabelProtocol:
@@ -109,8 +128,10 @@ class MotionLabelConfig:
 
     def as_dict(self) -> dict[str, Any]:
         """All that decides the labels' values, as JSON can hold it; protocols as their switches."""
-        described = asdict(replace(self, agents=None, protocol=self.rules))
+        described = asdict(self)
         described["grid"] = {"x": list(self.grid.x), "y": list(self.grid.y)}
+        described["orientation"] = self.grid.orientation
+        described["protocol"] = asdict(self.rules)
         described["agents"] = _agents_text(self.agents)
         return described
 
@@ -126,11 +147,10 @@ class MotionLabelConfig:
             values = dict(described)
             grid = values.pop("grid")
             protocol = LabelProtocol(**values.pop("protocol"))
-            named = next((name for name, rules in LABEL_PROTOCOLS.items() if rules == protocol), None)
             augmentation, agents = values.pop("augmentation"), values.pop("agents")
             return cls(
                 grid=BevGrid(tuple(grid["x"]), tuple(grid["y"])),
-                protocol=named or protocol,
+                protocol=protocol,
                 augmentation=None if augmentation is None else Augmentation(**augmentation),
                 agents=AgentConfig(agents["name"], tuple(agents["partners"])) if isinstance(agents, dict) else agents,
                 **values,
@@ -145,27 +165,78 @@ class MotionLabelConfig:
 
 
 def _agents_text(agents: Agents) -> Any:
-    if agents is None or isinstance(agents, str):
+    if isinstance(agents, AgentConfig):
+        return {"name": agents.name, "partners": list(agents.partners)}
+    return agents if agents is None or isinstance(agents, str) else list(agents)
+
+
+def label_config(config: MotionLabelConfig | str | None) -> MotionLabelConfig:
+    """A configuration as it is given, by a preset's name, or the released one for None.
+
+    Raises:
+        ChoiceError: no such preset.
+        ConfigError: something else was given.
+    """
+    if config is None or isinstance(config, str):
+        return MotionLabelConfig() if config is None else MotionLabelConfig.preset(config)
+    if not isinstance(config, MotionLabelConfig):
+        raise ConfigError(f"config: expected a MotionLabelConfig or the name of a preset, found {config!r}")
+    return config
+
+
+def _checked_grid(grid: object, orientation: Orientation | None) -> BevGrid:
+    if not isinstance(grid, BevGrid):
+        raise ConfigError(f"grid: expected a BevGrid, found {grid!r}; BevGrid(x=(-50, 50, 0.5)) makes one")
+    return grid if orientation is None else grid.with_orientation(orientation)
+
+
+def _checked_mark(ignore_index: object, grid: BevGrid) -> int:
+    """The mark beside the maps' values: a byte, and no vector between two cells of the grid may have it twice.
+
+    Both of a vector's components are less than the longer side, so that from there on none is the mark, turned or not.
+    On grids of more than 255 cells 255 alone is left: there it is the vector over 360 cells, at 45 degrees to the
+    axes, further than an actor reaches from its centre or gets in a step.
+    """
+    mark = count("ignore_index", ignore_index, "a mark beside the maps' values, such as 255", _BYTE)
+    least = min(max(grid.shape), _BYTE)
+    if mark < least:
+        raise ConfigError(
+            f"ignore_index: {mark} may also be a number of cells in offset and flow; choose {least} to {_BYTE}"
+        )
+    return mark
+
+
+def _checked_agents(agents: object) -> AgentConfig | str | tuple[str, ...] | None:
+    if agents is None or isinstance(agents, AgentConfig):
         return agents
-    if isinstance(agents, Sequence):
-        return list(agents)
-    return {"name": agents.name, "partners": list(agents.partners)}
+    if isinstance(agents, str):
+        if agents in AGENTS:
+            raise ChoiceError(f"agents: expected a configuration, found {agents!r}; for it alone give [{agents!r}]")
+        return choice("agents", agents, AGENT_CONFIGS)
+    if not isinstance(agents, Iterable):
+        raise ChoiceError(f"agents: expected agents' names or a configuration, found {agents!r}")
+    names = tuple(choice("agents", agent, AGENTS) for agent in agents)
+    if not names:
+        raise ChoiceError("agents: expected at least one agent, found none; None stands for all that are there")
+    return names
 
 
-def _check_count(name: str, value: object, why: str) -> None:
-    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-        raise ConfigError(f"{name}: expected a whole number from 1, found {value!r}; {why}")
+def _named(protocol: LabelProtocol) -> str | LabelProtocol:
+    """The name of a protocol that has one."""
+    return next((name for name, rules in LABEL_PROTOCOLS.items() if rules == protocol), protocol)
 
 
 _DEEPACCIDENT: Final = MotionLabelConfig()
 _BEVERSE: Final = MotionLabelConfig(only_vehicle=True, draw_ego=False, protocol="beverse")
-PRESETS: Final[Mapping[str, MotionLabelConfig]] = {
-    "deepaccident": _DEEPACCIDENT,
-    **{
-        f"deepaccident-{seconds}s": replace(_DEEPACCIDENT, future_frames=seconds * _STEPS_PER_SECOND)
-        for seconds in (3, 4, 5)
-    },
-    "beverse": _BEVERSE,
-    "fiery": replace(_BEVERSE, protocol="fiery", orientation="fiery"),
-}
+PRESETS: Final[Mapping[str, MotionLabelConfig]] = MappingProxyType(
+    {
+        "deepaccident": _DEEPACCIDENT,
+        **{
+            f"deepaccident-{seconds}s": replace(_DEEPACCIDENT, future_frames=seconds * _STEPS_PER_SECOND)
+            for seconds in (3, 4, 5)
+        },
+        "beverse": _BEVERSE,
+        "fiery": replace(_BEVERSE, protocol="fiery", orientation="fiery"),
+    }
+)
 """The released labels (2 s ahead), the same 3, 4 and 5 s ahead, and those of the two codes it comes from."""

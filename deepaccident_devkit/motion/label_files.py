@@ -23,7 +23,7 @@ import numpy as np
 from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.errors import ChoiceError, LabelFilesError, NotAvailableError, TokenError
 from deepaccident_devkit.files import replacing
-from deepaccident_devkit.motion.config import MotionLabelConfig
+from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
 from deepaccident_devkit.motion.label_folder import FORMAT_VERSION, Manifest, folder_path, label_path, writing_to
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.sample_labels import motion_labels
@@ -71,7 +71,7 @@ def write_label_files(
     dataset: Dataset,
     folder: str | os.PathLike[str],
     tokens: Iterable[RowArgument],
-    config: MotionLabelConfig | None = None,
+    config: MotionLabelConfig | str | None = None,
     *,
     workers: int | None = None,
     executor: Executor | None = None,
@@ -86,7 +86,7 @@ def write_label_files(
         dataset: the release.
         folder: made where needed; or one with labels of the same configuration.
         tokens: tokens or records of labelled samples.
-        config: what labels show; None for the released ones in the devkit's orientation.
+        config: what labels show, or the name of a preset; None for the released ones in the devkit's orientation.
         workers: processes; None takes what the work is worth.
         executor: to run on instead, any of `concurrent.futures`.
         progress: whether to show a bar.
@@ -98,7 +98,7 @@ def write_label_files(
         ChoiceError: no sample at all, or no such agent or configuration of agents.
         NotAvailableError: a sample has no label, or an agent whose sight counts is not in this (partial) release.
     """
-    root, chosen = folder_path(folder), config or MotionLabelConfig()
+    root, chosen = folder_path(folder), label_config(config)
     wanted = _by_recording(dataset, tokens)
     _check_agents(dataset, wanted, chosen)
     Manifest.of(root, chosen)
@@ -124,12 +124,12 @@ class LabelFiles(Mapping[str, MotionLabels]):
     is added to the folder later is seen by who opens it anew.
     """
 
-    def __init__(self, folder: str | os.PathLike[str], config: MotionLabelConfig | None = None) -> None:
+    def __init__(self, folder: str | os.PathLike[str], config: MotionLabelConfig | str | None = None) -> None:
         """Open a folder that `write_label_files` or `deepaccident labels` made.
 
         Args:
             folder: where.
-            config: what the labels must show; None for whatever they do.
+            config: what the labels must show, or the name of a preset; None for whatever they do.
 
         Raises:
             LabelFilesError: there is no such folder, its making was broken off, or its manifest cannot be read.
@@ -138,7 +138,7 @@ class LabelFiles(Mapping[str, MotionLabels]):
         self.folder = folder_path(folder)
         manifest = Manifest.read(self.folder)
         if config is not None:
-            manifest.check(self.folder, config)
+            manifest.check(self.folder, label_config(config))
         if not manifest.samples:
             raise LabelFilesError(f"{self.folder}: its making was broken off; run `deepaccident labels` on it again")
         self.config = manifest.config

@@ -7,10 +7,12 @@ from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
 from typing import Any, Final
 
+import numpy as np
+
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.motion.config import MotionLabelConfig
-from deepaccident_devkit.motion.names import MAPS, BatchNames, from_batch, to_batch
+from deepaccident_devkit.motion.batch_names import MAPS, BatchNames, from_batch, to_batch
+from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
 from deepaccident_devkit.motion.warps.to_present import maps_to_present
 from deepaccident_devkit.motion.warps.warping import WarpMode
 
@@ -20,12 +22,15 @@ OWN_BOX_ID: Final = -101
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MotionLabels(FrozenArrays):
-    """Labels of T = `config.label_frames` frames on H × W cells in `config.orientation`; arrays are read-only.
+    """Labels of T = `config.label_frames` frames on H × W cells in `config.grid.orientation`; arrays are read-only.
+
+    The five maps share one block of memory, which is there as long as any of them is: of many samples keep copies.
 
     Attributes:
         config: how they were made.
         segmentation: (T, H, W) uint8: 1 where an actor is, 0 elsewhere.
-        instance: (T, H, W) int32: ids from 1 in the order drawn, 0 elsewhere.
+        instance: (T, H, W) int32: ids from 1 in the order drawn, 0 elsewhere. Missing frames that a protocol ignores
+            are all `ignore_index`, which is also an id where so many are drawn: `label_valid` tells which it is.
         centerness: (T, 1, H, W) float32 in [0, 1].
         offset: (T, 2, H, W) float32, cells (down the rows, along the columns) from a cell to its instance's centre;
             `ignore_index` elsewhere.
@@ -51,7 +56,9 @@ class MotionLabels(FrozenArrays):
     at_present: bool = False
 
     def __post_init__(self) -> None:
-        """Freeze arrays and map."""
+        """Freeze arrays and map; the small arrays are copied, since callers go on with theirs."""
+        for name in ("future_egomotion", "valid"):
+            object.__setattr__(self, name, np.array(getattr(self, name)))
         FrozenArrays.__post_init__(self)
         object.__setattr__(self, "id_map", MappingProxyType(dict(self.id_map)))
 
@@ -87,7 +94,7 @@ class MotionLabels(FrozenArrays):
         if self.at_present:
             raise NotAvailableError("labels: they are in the present frame already; warp the labels of `motion_labels`")
         maps = {name: getattr(self, name) for name in MAPS}
-        warped: dict[str, Any] = maps_to_present(maps, self.label_egomotion, self.config, centerness)
+        warped: dict[str, Any] = maps_to_present(maps, self.label_egomotion, ~self.label_valid, self.config, centerness)
         return replace(self, **warped, at_present=True)
 
     @property
@@ -108,20 +115,20 @@ class MotionLabels(FrozenArrays):
     def as_batch(self, names: BatchNames) -> dict[str, AnyArray]:
         """The labels as a sample of FIERY's, BEVerse's or DeepAccident's own loader: names, axes, orientation, types.
 
-        `motion.names` has the table. Raises ChoiceError.
+        `motion.batch_names` has the table; all arrays are new and writable. Raises ChoiceError.
         """
         arrays = {name: getattr(self, name) for name in (*MAPS, "future_egomotion", "valid")}
         return to_batch(arrays, self.config, names)
 
     @classmethod
     def from_batch(
-        cls, batch: Mapping[str, Any], config: MotionLabelConfig, names: BatchNames, *, at_present: bool = False
+        cls, batch: Mapping[str, Any], config: MotionLabelConfig | str, names: BatchNames, *, at_present: bool = False
     ) -> MotionLabels:
         """Labels from a sample of another code's loader, `as_batch` the other way; whose ids they are is not known.
 
         Args:
             batch: arrays or tensors of one sample, without a batch axis.
-            config: what they were made with; its orientation is that of the result.
+            config: what they were made with, or the name of a preset; its orientation is that of the result.
             names: whose names they have.
             at_present: whether they were warped to the present.
 
@@ -130,7 +137,8 @@ class MotionLabels(FrozenArrays):
             FieldError: the batch lacks an array.
             GeometryError: an array has another shape than the configuration says.
         """
-        return cls(config=config, id_map={}, at_present=at_present, **from_batch(batch, config, names))
+        chosen = label_config(config)
+        return cls(config=chosen, id_map={}, at_present=at_present, **from_batch(batch, chosen, names))
 
 
 def _remade(values: dict[str, Any]) -> MotionLabels:

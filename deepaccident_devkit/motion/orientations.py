@@ -10,7 +10,10 @@ import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.errors import ChoiceError, GeometryError
-from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Axis, Orientation, cells_in, turned
+
+__all__ = ["axes_of", "cells_in", "to_orientation", "vectors_in"]
 
 
 def to_orientation(
@@ -23,7 +26,7 @@ def to_orientation(
         vectors: whether the values point along rows and columns (offset, flow).
         source: how they lie.
         target: how they are to lie.
-        ignore: a value of `vectors` that is a mark and no number of cells; None for none.
+        ignore: what stands in both channels where there is no vector; None where all values are vectors.
 
     Returns:
         A view where no value changes, else a new array.
@@ -37,30 +40,16 @@ def to_orientation(
             raise ChoiceError(f"orientation: expected one of {', '.join(ORIENTATIONS)}, found {name!r}")
     if source == target:
         return array
-    devkit = _with_devkit(array, source)
+    devkit = turned(array, source)
     if not vectors:
-        return _with_devkit(devkit, target)
+        return turned(devkit, target)
     if array.ndim < 3 or array.shape[-3] != 2:
         raise GeometryError(f"vectors: expected shape (…, 2, H, W), found {array.shape}")
     down, along = devkit[..., 0, :, :], devkit[..., 1, :, :]
-    for name in (source, target):
-        if name == "fiery":
-            down, along = along, down
-        elif name == "released":
-            down = _negated(down, ignore)
-    return _with_devkit(np.stack([down, along], axis=-3), target)
-
-
-def cells_in(
-    row: AnyArray, column: AnyArray, shape: tuple[int, int], source: Orientation, target: Orientation
-) -> tuple[AnyArray, AnyArray]:
-    """Where cells of one orientation, `shape` its rows and columns, are in another: row and column."""
-    rows, columns = shape
-    if source == "fiery":
-        row, column, rows, columns = column, row, columns, rows
-    if (source == "released") != (target == "released"):
-        row = rows - 1 - row
-    return (column, row) if target == "fiery" else (row, column)
+    result = np.stack(vectors_in(down, along, source, target), axis=-3)
+    if ignore is not None:
+        np.copyto(result, ignore, where=((down == ignore) & (along == ignore))[..., None, :, :])
+    return turned(result, target)
 
 
 def vectors_in(down: AnyArray, along: AnyArray, source: Orientation, target: Orientation) -> tuple[AnyArray, AnyArray]:
@@ -68,17 +57,16 @@ def vectors_in(down: AnyArray, along: AnyArray, source: Orientation, target: Ori
     if source == "fiery":
         down, along = along, down
     if (source == "released") != (target == "released"):
-        down = 0 - down
+        down = 0 - down  # and not −0.0 where there was 0
     return (along, down) if target == "fiery" else (down, along)
 
 
-def _with_devkit(maps: AnyArray, orientation: Orientation) -> AnyArray:
-    """The devkit's orientation → `orientation`, or back: each is its own way back."""
-    if orientation == "fiery":
-        return maps.swapaxes(-1, -2)
-    return maps if orientation == "devkit" else maps[..., ::-1, :]
+def axes_of(grid: BevGrid) -> tuple[Axis, Axis]:
+    """Start, end and cell size, metres, of rows and of columns as the grid's orientation counts them.
 
-
-def _negated(values: AnyArray, ignore: float | None) -> AnyArray:
-    negative = 0 - values  # and not −0.0 where there was 0
-    return negative if ignore is None else np.where(values == ignore, values, negative)
+    The released rows run along a left-handed y: its start and end are the negated end and start of the grid's.
+    """
+    low, high, size = grid.y
+    if grid.orientation == "fiery":
+        return grid.x, grid.y
+    return (grid.y if grid.orientation == "devkit" else (-high, -low, size)), grid.x

@@ -4,14 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from types import MappingProxyType
 from typing import Final, Literal, get_args
 
-from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
+from deepaccident_devkit.motion.settings import choice, flag
 
 WarpRule = Literal["stretched", "exact", "fiery"]
 """How a raster is sampled when it is warped to another frame: see `motion.warps.warping`."""
 DrawnWhen = Literal["present", "since", "now"]
-_CHOICES: Final = {"warp": get_args(WarpRule), "drawn_when": get_args(DrawnWhen)}
+_CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
+    "warp": get_args(WarpRule),
+    "drawn_when": get_args(DrawnWhen),
+    "native": ORIENTATIONS,
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,8 +47,14 @@ class LabelProtocol:
             instance and centerness, and `ignore_index` in offset and flow.
         vectors_not_rotated: offset and flow keep their values when a warp turns the cells that they stand in; else
             they turn along.
+        ids_kept_between_samples: samples may go on with the ids of one before (`id_map`), as the released code keeps
+            them for a scenario and agent as long as a worker meets no other, so that ids depend on what it met; else
+            ids count from 1 in every sample.
         warp: the sampling rule: `stretched` (released and BEVerse: sample points 0.50125 m apart), `exact` (cell
             centres, whole transforms) or `fiery` (cell centres; yaw and planar translation of the 6-vector alone).
+        native: the orientation that corners are rounded, centres are counted and rasters are sampled in, and whose
+            handedness the boxes and motions have meanwhile; `fiery` for the warp of that name. It says which way halves
+            of a cell go; in which orientation the labels lie is `MotionLabelConfig.grid`'s matter.
     """
 
     own_box_moved_twice: bool
@@ -53,15 +66,33 @@ class LabelProtocol:
     missing_frames_are_empty: bool
     outside_is_zero: bool
     vectors_not_rotated: bool
+    ids_kept_between_samples: bool
     warp: WarpRule
+    native: Orientation
 
     def __post_init__(self) -> None:
-        """Check the choices; raises ChoiceError."""
+        """Check the values; raises ChoiceError or ConfigError."""
         for field in fields(self):
-            value = getattr(self, field.name)
-            allowed = _CHOICES.get(field.name, (True, False))
-            if value not in allowed:
-                raise ChoiceError(f"label protocol: {field.name} is one of {allowed}, found {value!r}")
+            name, value = f"label protocol: {field.name}", getattr(self, field.name)
+            allowed = _CHOICES.get(field.name)
+            object.__setattr__(self, field.name, flag(name, value) if allowed is None else choice(name, value, allowed))
+        if self.warp == "fiery" and self.native != "fiery":
+            raise ConfigError(f"label protocol: warp 'fiery' is counted in native 'fiery', found {self.native!r}")
+
+    @property
+    def right_handed(self) -> bool:
+        """Whether boxes and motions are right-handed in the native orientation; else y and all turns are negated."""
+        return self.native != "released"
+
+    @property
+    def place_in_cell(self) -> tuple[float, float]:
+        """The point that the middle of what is drawn at a cell stands for, in cells along x and y from its low corner.
+
+        With `half_cell_shift` it is the corner that the native orientation counts the cell from.
+        """
+        if not self.half_cell_shift:
+            return 0.5, 0.5
+        return 0.0, 0.0 if self.right_handed else 1.0
 
 
 _RELEASED: Final = LabelProtocol(
@@ -74,26 +105,32 @@ _RELEASED: Final = LabelProtocol(
     missing_frames_are_empty=True,
     outside_is_zero=True,
     vectors_not_rotated=True,
+    ids_kept_between_samples=True,
     warp="stretched",
+    native="released",
 )
-_BEVERSE: Final = replace(_RELEASED, drawn_when="now", missing_frames_are_empty=False)
-LABEL_PROTOCOLS: Final[Mapping[str, LabelProtocol]] = {
-    "released": _RELEASED,
-    "clean": LabelProtocol(
-        own_box_moved_twice=False,
-        own_box_default=False,
-        own_box_not_augmented=False,
-        half_cell_shift=False,
-        drawn_when="since",
-        untracked_share_an_id=False,
-        missing_frames_are_empty=False,
-        outside_is_zero=False,
-        vectors_not_rotated=False,
-        warp="exact",
-    ),
-    "beverse": _BEVERSE,
-    "fiery": replace(_BEVERSE, warp="fiery"),
-}
+_FIERY: Final = replace(_RELEASED, drawn_when="now", missing_frames_are_empty=False, warp="fiery", native="fiery")
+LABEL_PROTOCOLS: Final[Mapping[str, LabelProtocol]] = MappingProxyType(
+    {
+        "released": _RELEASED,
+        "clean": LabelProtocol(
+            own_box_moved_twice=False,
+            own_box_default=False,
+            own_box_not_augmented=False,
+            half_cell_shift=False,
+            drawn_when="since",
+            untracked_share_an_id=False,
+            missing_frames_are_empty=False,
+            outside_is_zero=False,
+            vectors_not_rotated=False,
+            ids_kept_between_samples=False,
+            warp="exact",
+            native="released",
+        ),
+        "beverse": replace(_FIERY, ids_kept_between_samples=False, warp="stretched", native="devkit"),
+        "fiery": _FIERY,
+    }
+)
 """By name: the released code, that without its slips, and the two codes that it comes from."""
 
 
@@ -101,9 +138,7 @@ def label_protocol(protocol: str | LabelProtocol) -> LabelProtocol:
     """A protocol by its name, or as it is given; raises ChoiceError."""
     if isinstance(protocol, LabelProtocol):
         return protocol
-    if protocol not in LABEL_PROTOCOLS:
-        raise ChoiceError(f"protocol: expected one of {', '.join(LABEL_PROTOCOLS)}, found {protocol!r}")
-    return LABEL_PROTOCOLS[protocol]
+    return LABEL_PROTOCOLS[choice("protocol", protocol, LABEL_PROTOCOLS)]
 
 
 def slip_names() -> list[str]:

@@ -14,7 +14,7 @@ from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.geometry.se3 import LAST_ROW
-from deepaccident_devkit.motion.config import MotionLabelConfig
+from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
 from deepaccident_devkit.motion.drawing.from_boxes import FrameBoxes, motion_labels_from_boxes
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.warps.chains import egomotion
@@ -28,7 +28,7 @@ _VISIBILITY_COLUMNS: Final = ("translation", "category", "num_lidar_pts", "camer
 def motion_labels(
     dataset: Dataset,
     sample: RowArgument,
-    config: MotionLabelConfig | None = None,
+    config: MotionLabelConfig | str | None = None,
     *,
     id_map: Mapping[int, int] | None = None,
 ) -> MotionLabels:
@@ -41,7 +41,7 @@ def motion_labels(
     Args:
         dataset: the release.
         sample: token or record of the present.
-        config: what labels show; None for the released ones in the devkit's orientation.
+        config: what labels show, or the name of a preset; None for the released ones in the devkit's orientation.
         id_map: actor id → id that a sample before this one had: the released code keeps them for a scenario and agent
             as long as a worker meets no other, so that ids depend on what it met. None starts at 1.
 
@@ -53,7 +53,7 @@ def motion_labels(
         NotAvailableError: the sample has no label, or an agent whose sight counts is not in this (partial) release.
         ChoiceError: no such agent or configuration of agents.
     """
-    chosen = config or MotionLabelConfig()
+    chosen = label_config(config)
     row, samples = dataset.getind("sample", sample), dataset.columns("sample")
     if not samples["labelled"][row]:
         token = dataset.sample[row]["token"]
@@ -68,7 +68,7 @@ def motion_labels(
     frames = iter(_frames(dataset, sample, first_row, known, chosen))
     return motion_labels_from_boxes(
         [next(frames) if one else None for one in there[past:-1]],
-        egomotion(_world_from_ego(dataset, first_row + index, there), there, chosen.rules.warp),
+        egomotion(_world_from_ego(dataset, first_row + index, there), there, chosen.rules),
         chosen,
         valid=there[:-1],
         is_vehicle=AGENTS[samples["agent"].item(row)] != INFRASTRUCTURE,

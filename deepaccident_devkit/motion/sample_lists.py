@@ -56,7 +56,8 @@ def samples(
     Raises:
         ChoiceError: no such split, purpose, protocol or scope.
         ConfigError: a horizon that no frames fit, or one that the released protocol does not have.
-        NotAvailableError: the split is unknown, or none of its samples has labels (the test split ships without).
+        NotAvailableError: the split is unknown, this release has no scenario of it, or none of its samples has labels
+            (the test split ships without).
     """
     for name, value, choices in (
         ("purpose", purpose, Purpose),
@@ -73,6 +74,11 @@ def samples(
         raise ConfigError("the released protocol looks 2 s ahead in accident scenarios; choose protocol='paper'")
 
     scenario_tokens = dataset.split_scenarios(split)
+    if not scenario_tokens:
+        raise NotAvailableError(
+            f"{split}: no scenario of this split is in {dataset.dataroot}; unpack that part of the release, or choose "
+            "another split"
+        )
     wanted = np.isin(np.arange(len(dataset.scenario)), [dataset.getind("scenario", one) for one in scenario_tokens])
     columns, scenarios = dataset.columns("sample"), dataset.columns("scenario")
     row = columns["scenario_row"]
@@ -86,3 +92,15 @@ def samples(
         if scope == "accident":
             chosen &= scenarios["designed_accident"][:][row]
     return [dataset.sample[index]["token"] for index in np.flatnonzero(in_split & chosen).tolist()]
+
+
+def evaluation_samples(
+    dataset: Dataset,
+    split: str | os.PathLike[str],
+    protocol: SampleProtocol = "released",
+    *,
+    horizon: float = _RELEASED_HORIZON,
+    scope: Scope = "accident",
+) -> list[str]:
+    """The samples that a model is evaluated at: `samples` for the purpose `evaluate`, which says all the rest."""
+    return samples(dataset, split, "evaluate", protocol, horizon=horizon, scope=scope)

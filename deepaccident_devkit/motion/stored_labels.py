@@ -15,7 +15,6 @@ from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.drawing.label_maps import CoveredCells, label_maps
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.orientations import cells_in, vectors_in
-from deepaccident_devkit.motion.warps.warping import native_orientation
 
 NOWHERE: Final = -32768
 """Centre and flow of an instance that a frame does not show."""
@@ -74,7 +73,7 @@ class StoredLabels:
         """The labels again, all maps of them; raises GeometryError if the arrays cannot be theirs."""
         self._check(config)
         shape, given = config.grid.shape, config.grid.orientation
-        native = native_orientation(config.rules.warp)
+        native = config.rules.native
         flat = np.flatnonzero(self.instance)
         frame, cell = np.divmod(flat, config.grid.cells)
         row, column = cells_in(cell // shape[1], cell % shape[1], shape, given, native)

@@ -17,11 +17,13 @@ from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.orientations import to_orientation
+from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS
 from deepaccident_devkit.motion.warps.chains import present_from_frames
 from deepaccident_devkit.motion.warps.feature_warps import agents_to_ego, past_to_present
 from deepaccident_devkit.motion.warps.warping import sample_points, sampling_matrix, warp
 
 RELEASED = BevGrid(orientation="released")
+PROTOCOL = LABEL_PROTOCOLS["released"]
 IGNORE = 255
 MAPS = ("segmentation", "instance", "centerness", "offset", "flow")
 VECTORS = ("offset", "flow")
@@ -64,7 +66,7 @@ def test_labels_equal_fierys(golden) -> None:
 @pytest.mark.golden_rows("g_poses", "identity_warp_nearest")
 def test_standing_still_samples_as_the_released_code(golden_row, mode) -> None:
     channel = whole(golden_row)["warp_pattern"][golden_row.index].astype(np.float32)
-    warped = warp(channel, np.eye(4), RELEASED, "stretched", mode)
+    warped = warp(channel, np.eye(4), RELEASED, PROTOCOL, mode)
     assert_warped(warped, golden_row[f"identity_warp_{mode}"], mode)
 
 
@@ -73,7 +75,7 @@ def test_sample_points_equal_the_released_codes(golden_row) -> None:
     """To the last bit: points are where M leads, and with M = 1, in units of half the grid, where they stand."""
     expected = whole(golden_row)["bev_grid_x"]
     steps = (expected / np.float32(50) + np.float32(1)) * np.float32(99.5)
-    row, column = sample_points(np.eye(4), RELEASED, "stretched")
+    row, column = sample_points(np.eye(4), RELEASED, PROTOCOL)
     assert cells_that_differ(row, np.broadcast_to(steps[:, None], row.shape)) == 0
     assert cells_that_differ(column, np.broadcast_to(steps, column.shape)) == 0
 
@@ -83,8 +85,8 @@ def test_sample_points_equal_the_released_codes(golden_row) -> None:
 def test_future_frames_are_warped_as_by_the_released_code(golden_row, mode) -> None:
     arrays, frame = whole(golden_row), golden_row.index
     pattern = arrays["warp_pattern"].astype(np.float32)
-    transform = present_from_frames(flip_six_vector(chain_of(golden_row)[2:]), "stretched")[frame]
-    warped = warp(pattern, sampling_matrix(transform[None], "stretched")[0], RELEASED, "stretched", mode)
+    transform = present_from_frames(flip_six_vector(chain_of(golden_row)[2:]), PROTOCOL)[frame]
+    warped = warp(pattern, sampling_matrix(transform[None], PROTOCOL)[0], RELEASED, PROTOCOL, mode)
     assert_warped(warped if frame else pattern, golden_row[f"future_warp_{mode}"], mode)
 
 
@@ -169,10 +171,12 @@ def augmentation_of(matrix: np.ndarray | None) -> Augmentation | None:
 
 def released(labels: MotionLabels, name: str) -> np.ndarray:
     """A map of the labels in the released orientation."""
-    orientation = labels.config.orientation
-    assert orientation is not None
     return to_orientation(
-        getattr(labels, name), vectors=name in VECTORS, source=orientation, target="released", ignore=IGNORE
+        getattr(labels, name),
+        vectors=name in VECTORS,
+        source=labels.config.grid.orientation,
+        target="released",
+        ignore=IGNORE,
     )
 
 

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS, DetectedBoxes, DetectionEvaluator
+from deepaccident_devkit.evaluation.detection.curves import recall_scores
 from deepaccident_devkit.evaluation.detection.matching import nearest_by_truth
 from deepaccident_devkit.geometry import Boxes
 
@@ -17,7 +18,7 @@ Sample = tuple[DetectedBoxes, Boxes]
 
 
 @st.composite
-def samples(draw: st.DrawFn, protocol_scale: float = 1.0) -> list[Sample]:
+def samples(draw: st.DrawFn) -> list[Sample]:
     """A few samples of cars and vans, close together and with equal scores, some beyond the released range."""
     result = []
     for _ in range(draw(st.integers(1, 4))):
@@ -59,6 +60,18 @@ def test_any_order_and_any_workers_give_the_same_bits(protocol: str, drawn: list
     parts = evaluator_of(protocol, numbered[:cut]).merge(evaluator_of(protocol, numbered[cut:])).compute()
     for name in ("average_precision", "precision", "recall", "errors", "truths", "detections"):
         assert getattr(whole, name).tobytes() == getattr(parts, name).tobytes()
+
+
+@given(samples(), st.integers(0, 4))
+@pytest.mark.parametrize("protocol", sorted(DETECTION_PROTOCOLS))
+def test_pooled_samples_give_the_same_bits(protocol: str, drawn: list[Sample], cut: int) -> None:
+    evaluator = evaluator_of(protocol, list(enumerate(drawn)))
+    counts = list(evaluator.counts.values())
+    together = evaluator.result_of([*evaluator.pooled(counts[:cut][::-1]), *evaluator.pooled(counts[cut:])])
+    apart = evaluator.compute()
+    assert together.samples == apart.samples == len(drawn)
+    for name in ("average_precision", "precision", "recall", "errors", "truths", "detections"):
+        assert getattr(together, name).tobytes() == getattr(apart, name).tobytes()
 
 
 reaches = st.lists(
@@ -175,3 +188,53 @@ def test_opencoods_precision_is_vocs(drawn: list[Sample], everywhere: bool) -> N
         envelope = np.maximum.accumulate(precision[::-1])[::-1]
         expected = float(np.sum(np.diff(recall) * envelope[1:]))
         assert result.average_precision[0, 0, level] == pytest.approx(100 * expected, abs=1e-9)
+
+
+def plain_pass(sample: Sample, category: int, threshold: float, least: float | None) -> tuple[int, int, int, list]:
+    """TP, FP, FN and the scores of the TPs of one sample and class, as evaluation.md e says; no `least`: score pass."""
+    prediction, truth = sample
+    center, true_center = (boxes.center.astype(np.float32) for boxes in (prediction.boxes, truth))
+    beyond, true_beyond = (np.sqrt(2 * each[:, 0].astype(float) ** 2) >= 120 for each in (center, true_center))
+    taking_part = [
+        row
+        for row in range(len(prediction))
+        if (beyond[row] or prediction.boxes.category[row] == category)
+        and (least is None or prediction.scores[row] >= least)
+    ]
+    used: set[int] = set()
+    missed, scores = 0, []
+    for one in np.flatnonzero(truth.category == category).tolist():
+        near = [
+            (float(distance), row)
+            for row in taking_part
+            if row not in used
+            and (distance := np.sqrt(((true_center[one] - center[row]) ** 2).sum(dtype=np.float32))) < threshold
+        ]
+        if not near:
+            missed += not true_beyond[one]
+            continue
+        if least is None:
+            row = max(near, key=lambda pair: (prediction.scores[pair[1]], -pair[1]))[1]
+        else:
+            row = min(near, key=lambda pair: (beyond[pair[1]], 0 if beyond[pair[1]] else pair[0], pair[1]))[1]
+        used.add(row)
+        if not (beyond[row] or true_beyond[one]):
+            scores.append(float(prediction.scores[row]))
+    in_vain = sum(not beyond[row] and row not in used for row in taking_part)
+    return len(scores), in_vain, missed, scores
+
+
+@given(samples())
+def test_the_released_curves_are_those_of_matching_anew_at_each_score(drawn: list[Sample]) -> None:
+    result = evaluator_of("released", list(enumerate(drawn))).compute()
+    for position, (level, threshold) in itertools.product((0, 2), enumerate((0.5, 1.0, 2.0, 4.0))):
+        scores = [score for sample in drawn for score in plain_pass(sample, position, threshold, least=None)[3]]
+        points = recall_scores(np.array(scores), int(result.truths[position, 0]), 40) if scores else []
+        precision, recall = np.zeros(40), np.zeros(40)
+        for point, least in enumerate(points):
+            passes = [plain_pass(sample, position, threshold, least)[:3] for sample in drawn]
+            found, in_vain, missed = (sum(column) for column in zip(*passes, strict=True))
+            precision[point] = found / (found + in_vain) if found + in_vain else 0
+            recall[point] = found / (found + missed) if found + missed else np.nan
+        np.testing.assert_allclose(result.precision[position, 0, level], precision, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(result.recall[position, 0, level], recall, rtol=0, atol=1e-12)

@@ -8,11 +8,13 @@ from strategies import grids
 
 from deepaccident_devkit.geometry import BevGrid, six_vectors
 from deepaccident_devkit.motion.augmentation import Augmentation
+from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS
 from deepaccident_devkit.motion.warps.chains import present_from_frames, present_from_past
 from deepaccident_devkit.motion.warps.feature_warps import agents_to_ego
 from deepaccident_devkit.motion.warps.warping import nearest_indices, sample_points, sampling_matrix, warp
 
-RULES = st.sampled_from(("stretched", "exact", "fiery"))
+RELEASED, CLEAN = LABEL_PROTOCOLS["released"], LABEL_PROTOCOLS["clean"]
+RULES = st.sampled_from(list(LABEL_PROTOCOLS.values()))
 ORIENTATIONS = st.sampled_from(("devkit", "released", "fiery"))
 STEPS = st.tuples(*(st.floats(-5, 5) for _ in range(2)), st.just(0.0), st.just(0.0), st.just(0.0), st.floats(-3, 3))
 """Motions in the plane."""
@@ -24,27 +26,27 @@ def noise(grid: BevGrid) -> np.ndarray:
 
 
 @given(grids(), RULES, ORIENTATIONS)
-def test_standing_still_keeps_every_cell(grid, rule, orientation) -> None:
+def test_standing_still_keeps_every_cell(grid, rules, orientation) -> None:
     grid = grid.with_orientation(orientation)
     raster = noise(grid)
-    assert_array_equal(warp(raster, np.eye(4), grid, rule, orientation=orientation), raster)
-    assert_array_equal(warp(raster, np.eye(4), grid, "exact", "bilinear", orientation=orientation), raster)
+    assert_array_equal(warp(raster, np.eye(4), grid, rules, orientation=orientation), raster)
+    assert_array_equal(warp(raster, np.eye(4), grid, CLEAN, "bilinear", orientation=orientation), raster)
 
 
 @given(grids())
 def test_standing_still_samples_at_most_half_a_cell_away_as_released(grid) -> None:
-    points = sample_points(np.eye(4), grid, "stretched")
+    points = sample_points(np.eye(4), grid, RELEASED)
     assert (np.abs(points - np.indices(points[0].shape)) <= 0.5 + 1e-4).all()
 
 
 @given(STEPS, RULES, ORIENTATIONS)
-def test_all_orientations_warp_alike(step, rule, orientation) -> None:
+def test_all_orientations_warp_alike(step, rules, orientation) -> None:
     grid = BevGrid((-10, 10, 0.5), (-10, 10, 0.5))
-    matrix = sampling_matrix(six_vectors.to_matrices(step)[None], rule)[0]
-    native, raster = nearest_indices(matrix, grid, rule), noise(grid)
-    lying = "fiery" if rule == "fiery" else "released"
-    expected = warp(grid.reorient(raster, lying), matrix, grid, rule)
-    found = warp(grid.reorient(raster, orientation), matrix, grid, rule, orientation=orientation)
+    matrix = sampling_matrix(six_vectors.to_matrices(step)[None], rules)[0]
+    native, raster = nearest_indices(matrix, grid, rules), noise(grid)
+    lying = rules.native
+    expected = warp(grid.reorient(raster, lying), matrix, grid, rules)
+    found = warp(grid.reorient(raster, orientation), matrix, grid, rules, orientation=orientation)
     assert_array_equal(grid.with_orientation(orientation).reorient(found, lying), expected)
     assert ((native >= -1) & (native < grid.cells)).all()
 
@@ -55,28 +57,28 @@ def test_there_and_back_brings_smooth_maps_home(step) -> None:
     grid = BevGrid((-20, 20, 0.5), (-20, 20, 0.5), "released")
     there = six_vectors.to_matrices(step)
     column = np.broadcast_to(np.arange(grid.shape[1], dtype=np.float64) + 1000, grid.shape)
-    away = warp(column, there, grid, "exact", orientation="released")
-    home = warp(away, np.linalg.inv(there), grid, "exact", orientation="released")
+    away = warp(column, there, grid, CLEAN, orientation="released")
+    home = warp(away, np.linalg.inv(there), grid, CLEAN, orientation="released")
     seen = home > 0
     assert (np.abs(home - column)[seen] <= 2).all()
     assert seen[30:50, 30:50].all()
 
 
 @given(st.lists(STEPS, min_size=1, max_size=4), AUGMENTATIONS, RULES)
-def test_past_and_future_undo_each_other(steps, augmentation, rule) -> None:
+def test_past_and_future_undo_each_other(steps, augmentation, rules) -> None:
     """Of one motion: a past frame's transform is the inverse of the future frame's; augmented or not."""
     for given_one in (None, augmentation):
-        forward = present_from_past(steps[:1], rule, given_one)[0]
-        backward = present_from_frames([steps[0], steps[0]], rule, given_one)[1]
+        forward = present_from_past(steps[:1], rules, given_one)[0]
+        backward = present_from_frames([steps[0], steps[0]], rules, given_one)[1]
         assert_allclose(forward @ backward, np.eye(4), atol=1e-4)
 
 
 @given(st.lists(STEPS, min_size=2, max_size=5))
 def test_exact_chains_are_the_products_of_their_steps(steps) -> None:
-    past = present_from_past(steps, "exact")
-    assert_allclose(past[0], past[1] @ present_from_past(steps[:1], "exact")[0], atol=1e-9)
-    future = present_from_frames(steps, "exact")
-    assert_allclose(future[-1] @ present_from_past(steps[:-1], "exact")[0], np.eye(4), atol=1e-9)
+    past = present_from_past(steps, CLEAN)
+    assert_allclose(past[0], past[1] @ present_from_past(steps[:1], CLEAN)[0], atol=1e-9)
+    future = present_from_frames(steps, CLEAN)
+    assert_allclose(future[-1] @ present_from_past(steps[:-1], CLEAN)[0], np.eye(4), atol=1e-9)
 
 
 @given(STEPS, ORIENTATIONS)

@@ -182,8 +182,27 @@ def test_random_augmentations_stay_in_their_ranges() -> None:
 
 @pytest.mark.parametrize(
     ("fields", "message"),
-    [({"rotation": -1}, "rotation is -1"), ({"scale": (1.1, 0.9)}, "scale is"), ({"flip": 2}, "flip is 2")],
+    [
+        ({"rotation": -1}, "rotation is -1"),
+        ({"rotation": "x"}, "rotation: expected radians, found 'x'"),
+        ({"scale": (1.1, 0.9)}, "scale is"),
+        ({"scale": 1.1}, r"scale is 1\.1"),
+        ({"flip": 2}, "flip is 2"),
+        ({"flip": None}, "flip: expected a probability, found None"),
+    ],
 )
 def test_random_augmentations_that_cannot_be(fields: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         RandomAugmentation(**fields)
+
+
+def test_a_function_that_draws_something_else(da: DeepAccident, sample: str) -> None:
+    data = V2XDataset(da, [sample], V2XConfig(points=False, augmentation=lambda _: 3))
+    with pytest.raises(ConfigError, match="augmentation: its function must return an Augmentation, and returned 3"):
+        data[0]
+
+
+@pytest.mark.parametrize("epoch", [-1, 0.5, "1", None])
+def test_an_epoch_is_a_whole_number(da: DeepAccident, sample: str, epoch: object) -> None:
+    with pytest.raises(ConfigError, match="epoch: expected a whole number from 0"):
+        V2XDataset(da, [sample]).set_epoch(epoch)

@@ -2,6 +2,8 @@
 
 import pickle
 import re
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from torch.utils.data import DataLoader
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import MissingFileError
+from deepaccident_devkit.errors import ConfigError, MissingFileError
 from deepaccident_devkit.export.torch import (
     ImageConfig,
     RandomAugmentation,
@@ -82,6 +84,48 @@ def test_agents_one_after_another(da: DeepAccident, tokens: list[str]) -> None:
         for j, target in enumerate(items[2]["agents"]):
             frames = [da.get_sample(da.scenario[0], name, 4) for name in (target, source)]
             assert_allclose(pairwise[2, i, j], da.transform(*frames).matrix, atol=1e-3)
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+@pytest.mark.parametrize("start", ["fork", "spawn"])
+def test_agents_that_a_partial_release_lacks(own_release: Path, start: str) -> None:
+    scenario = min(path.name for path in own_release.glob("*/*/other_vehicle/calib/*"))
+    for folder in own_release.glob(f"*/*/other_vehicle/*/{scenario}"):
+        shutil.rmtree(folder)
+    partial = DeepAccident("v1", own_release, verbose=False)
+    here = [f"{record['token']}/ego_vehicle/004" for record in partial.scenario]
+    data = V2XDataset(partial, here, V2XConfig(agents=None, points=False, past=2, step=1, labels="deepaccident"))
+    counts = [4 if scenario in token else 5 for token in here]
+    assert set(counts) == {4, 5}
+    arguments = {"batch_size": len(here), "num_workers": 1, "multiprocessing_context": start}
+    [side_by_side] = DataLoader(data, collate_fn=collate, **arguments)
+    assert side_by_side["agent_valid"].sum(dim=(1, 2)).tolist() == [2 * count for count in counts]
+    assert side_by_side["ego_from_agent"].shape == (len(here), 5, 2, 4, 4)
+    [one_after_another] = DataLoader(data, collate_fn=collate_fusion, **arguments)
+    assert one_after_another["record_len"].tolist() == counts
+    assert one_after_another["ego_from_agent"].shape == (sum(counts), 2, 4, 4)
+    assert [len(names) for names in one_after_another["agents"]] == counts
+
+
+@pytest.mark.parametrize("collated", [collate, collate_fusion])
+def test_items_that_make_no_batch(da: DeepAccident, tokens: list[str], collated: Callable[..., Any]) -> None:
+    with pytest.raises(ConfigError, match="batch: expected at least one item, found none"):
+        collated([])
+    plain, small, large, longer = (
+        V2XDataset(da, tokens[:1], V2XConfig(points=False, boxes=None, **fields))[0]
+        for fields in (
+            {},
+            {"images": ImageConfig(resize=(9, 16))},
+            {"images": ImageConfig(resize=(18, 32))},
+            {"past": 2},
+        )
+    )
+    with pytest.raises(ConfigError, match=r"only some of the items have 'ego_from_camera'; .* of one V2XConfig"):
+        collated([plain, small])
+    with pytest.raises(ConfigError, match=r"images: items of shapes .*9, 16\) and .*18, 32\) make no batch; .*resize="):
+        collated([large, small])
+    with pytest.raises(ConfigError, match=r"agent_valid: items of shapes .* make no batch"):
+        collated([plain, longer])
 
 
 def test_opencoods_own_formula_gives_the_same_matrices(da: DeepAccident, sample: str) -> None:

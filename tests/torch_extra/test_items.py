@@ -177,8 +177,11 @@ def test_items_are_counted_as_a_sequences(da: DeepAccident, tokens: list[str]) -
     assert len(data) == len(tokens) == 20
     assert [item["token"] for item in data] == tokens
     assert data[-1]["token"] == tokens[-1]
+    assert data[np.int64(3)]["token"] == data[torch.tensor(3)]["token"] == tokens[3]
     with pytest.raises(IndexError):
         data[20]
+    with pytest.raises(TypeError):
+        data[0:2]
     assert isinstance(data, torch.utils.data.Dataset)
 
 
@@ -186,7 +189,13 @@ def test_samples_that_cannot_be(da: DeepAccident, tokens: list[str]) -> None:
     with pytest.raises(TokenError, match="nowhere"):
         V2XDataset(da, ["nowhere"])
     with pytest.raises(ChoiceError, match="agents: expected one of"):
-        V2XDataset(da, tokens, V2XConfig(agents="everybody"))[0]
+        V2XDataset(da, tokens, V2XConfig(agents="everybody"))
+    for one in (tokens[0], da.sample[0]):
+        with pytest.raises(ConfigError, match="tokens: expected a list of samples, found one alone"):
+            V2XDataset(da, one)
+    with pytest.raises(ConfigError, match=r"config: expected a V2XConfig, such as .*, found \{\}"):
+        V2XDataset(da, tokens, {})
+    assert len(V2XDataset(da, [], V2XConfig(agents="all", labels=LABELS))) == 0
 
 
 def test_a_missing_file_is_named(da_b: DeepAccident) -> None:
@@ -228,11 +237,25 @@ def test_labels_of_a_sample_without(own_release: Path) -> None:
         ({"to_present": "cubic"}, "to_present: expected None or one of nearest, bilinear"),
         ({"labels": MotionLabelConfig(augmentation=Augmentation())}, r"give V2XConfig\(augmentation=…\) alone"),
         ({"augmentation": 0.3}, "augmentation: expected an Augmentation or a function that draws one, found 0.3"),
+        ({"link": "late"}, r"link: expected a Link, such as .*, found 'late'"),
+        ({"images": (224, 400)}, r"images: expected None or an ImageConfig, such as ImageConfig\(resize="),
+        ({"labels": True}, "labels: expected None or a MotionLabelConfig, or the name of a preset, found True"),
+        ({"labels": "released"}, "preset: expected one of deepaccident, .*, found 'released'"),
+        ({"bev_segmentation": True}, "bev_segmentation: expected None or the BevGrid"),
+        ({"points": "no"}, "points: expected True or False, found 'no'"),
+        ({"past": "2"}, "past: expected a whole number from 1, found '2'"),
+        ({"past": True}, "past: expected a whole number from 1, found True"),
     ],
 )
 def test_configurations_that_cannot_be(fields: dict[str, object], message: str) -> None:
     with pytest.raises((ConfigError, ChoiceError), match=message):
         V2XConfig(**fields)
+
+
+def test_labels_by_a_presets_name() -> None:
+    config = V2XConfig(labels="fiery", past=np.int64(2))
+    assert config.labels == MotionLabelConfig.preset("fiery")
+    assert (config.step, config.past) == (5, 2)
 
 
 @pytest.mark.parametrize(
@@ -245,15 +268,29 @@ def test_configurations_that_cannot_be(fields: dict[str, object], message: str) 
             "rows 4 to 11 and columns 0 to 20 reach beyond an image of 10 × 20",
         ),
         ({"dtype": "float16"}, "dtype: expected one of float32, uint8"),
-        ({"std": (1.0, 1.0, 0.0)}, "std above 0"),
+        ({"resize": 224}, "resize: expected height and width in pixels, found 224"),
+        ({"resize": (224.0, 400.0)}, "resize: expected height and width in pixels, found"),
+        ({"crop": "abcd"}, "crop: expected top, left, height and width in pixels, found 'abcd'"),
+        ({"std": (1.0, 1.0, 0.0)}, "std: expected numbers above 0"),
+        ({"mean": 0.5}, "mean: expected a number for each of R, G and B, found 0.5"),
+        ({"std": "abc"}, "std: expected a number for each of R, G and B, found 'abc'"),
+        ({"mean": (0.5, 0.5, np.nan)}, "mean: expected a number for each"),
         ({"dtype": "uint8", "mean": (0.5, 0.5, 0.5)}, "uint8 images are as decoded"),
-        ({"cameras": ("Front",)}, "cameras: expected some of Camera_Front"),
+        ({"cameras": ("Front",)}, "cameras: expected a tuple of some of Camera_Front"),
+        ({"cameras": "Camera_Front"}, "cameras: expected a tuple of some of Camera_Front"),
+        ({"cameras": 6}, "cameras: expected a tuple"),
         ({"cameras": ("Camera_Front", "Camera_Front")}, "each once"),
     ],
 )
 def test_image_configurations_that_cannot_be(fields: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         ImageConfig(**fields)
+
+
+def test_image_configurations_from_arrays_and_lists() -> None:
+    config = ImageConfig(resize=[np.int64(9), 16], crop=np.array([0, 0, 4, 4]), mean=np.zeros(3), dtype="uint8")
+    assert config == ImageConfig(resize=(9, 16), crop=(0, 0, 4, 4), dtype="uint8")
+    assert hash(config) == hash(ImageConfig(resize=(9, 16), crop=(0, 0, 4, 4), dtype="uint8"))
 
 
 def test_a_crop_beyond_the_stored_image(da: DeepAccident, sample: str) -> None:

@@ -38,6 +38,70 @@ def test_integers_must_be_whole_and_in_range() -> None:
 def test_an_array_of_the_right_type_is_not_copied() -> None:
     given = np.zeros((2, 3))
     assert checked("points", given, (None, 3)) is given
+    assert as_floats(given) is given
+    narrow = given.astype(np.float16)
+    assert as_numbers("points", narrow, dtype=None) is narrow
+
+
+class Foreign:
+    """An array of another framework; or the error with which it answers who asks for its values."""
+
+    def __init__(self, values: object, error: Exception | None = None) -> None:
+        self._values, self._error = np.asarray(values), error
+
+    def read(self) -> np.ndarray:
+        if self._error is not None:
+            raise self._error
+        return self._values
+
+
+class WithArray(Foreign):
+    def __array__(self, dtype: object = None, copy: object = None) -> np.ndarray:
+        return self.read()
+
+
+class OnlyDlpack(Foreign):
+    def __dlpack__(self, **options: object) -> object:
+        return self.read().__dlpack__()
+
+    def __dlpack_device__(self) -> tuple[int, int]:
+        return np.zeros(0).__dlpack_device__()
+
+
+@pytest.mark.parametrize("kind", [WithArray, OnlyDlpack])
+def test_arrays_of_other_frameworks_are_read(kind: type[Foreign]) -> None:
+    given = np.arange(6, dtype=np.float32).reshape(2, 3)
+    for read in (checked("x", kind(given), (2, 3)), as_floats(kind(given))):
+        assert read.dtype == np.float64
+        assert_array_equal(read, given)
+    same = checked("x", kind(given), (2, 3), np.float32)
+    assert np.shares_memory(same, given)
+
+
+@pytest.mark.parametrize("kind", [WithArray, OnlyDlpack])
+@pytest.mark.parametrize("error", [TypeError, RuntimeError, BufferError, ValueError])
+def test_arrays_that_cannot_be_read_say_what_to_do(kind: type[Foreign], error: type[Exception]) -> None:
+    given = kind([1.0], error("it is on another device"))
+    remedy = r"another device\); pass a torch tensor as tensor\.detach\(\)\.cpu\(\)\.float\(\), another framework's"
+    with pytest.raises(GeometryError, match=rf"x: expected an array of shape \(1\), found {kind.__name__} .*{remedy}"):
+        checked("x", given, (1,))
+    with pytest.raises(GeometryError, match=rf"^expected numbers, found {kind.__name__} .*{remedy}"):
+        as_floats(given)
+
+
+def test_masked_numbers_are_nobodys_to_unmask() -> None:
+    hidden = np.ma.masked_array([1.0, 2.0, 3.0], mask=[False, True, True])
+    for read in (lambda: checked("x", hidden, (3,)), lambda: as_floats(hidden)):
+        with pytest.raises(GeometryError, match=r"found 2 masked values; pass array\.filled\(value\)"):
+            read()
+    shown = np.ma.masked_array([1.0, 2.0], mask=False)
+    assert type(checked("x", shown, (2,))) is np.ndarray
+
+
+def test_numbers_beyond_a_float_type_are_refused() -> None:
+    with pytest.raises(GeometryError, match=r"x: expected numbers within float32's range, found -1e\+300"):
+        checked("x", [1.0, np.inf, np.nan, -1e300], (4,), np.float32)
+    assert_array_equal(checked("x", [1.0, np.inf, -np.inf, np.nan], (4,), np.float32), [1, np.inf, -np.inf, np.nan])
 
 
 def test_single_numbers_of_python_and_numpy() -> None:

@@ -35,7 +35,8 @@ def paths_of_heads(heads: MotionHeads, grid: BevGrid, settings: PostProcessing) 
     linked = predict_instances(heads, settings)
     drawn = linked.instance if linked.redrawn is None else linked.redrawn
     drawn = to_orientation(drawn, vectors=False, source=heads.orientation, target="released")
-    return DrawnPaths(paths=trajectories(linked, grid), drawn=drawn), linked.instance[0]
+    paths = trajectories(linked, grid, half_cell_shift=False)  # as instance maps' are: only differences count
+    return DrawnPaths(paths=paths, drawn=drawn), linked.instance[0]
 
 
 def paths_of_instances(instance: AnyArray, grid: BevGrid, *, redraw: bool) -> DrawnPaths:

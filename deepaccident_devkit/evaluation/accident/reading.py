@@ -16,7 +16,6 @@ from deepaccident_devkit.geometry.bev_grid import Orientation
 from deepaccident_devkit.motion import LabelProtocol, MotionHeads, PostProcessing, predict_instances
 from deepaccident_devkit.motion.orientations import cells_in
 from deepaccident_devkit.motion.postprocessing.predict import Foreground
-from deepaccident_devkit.motion.warps.warping import native_orientation
 
 Outline = Literal["centers", "cells"]
 Moment = Literal["closest", "first", "last"]
@@ -265,10 +264,7 @@ def _candidates(shapes: _Shapes, size: FloatArray, reading: AccidentReading) -> 
 
 def _within_cell(rules: LabelProtocol | None) -> FloatArray:
     """The point of a cell, in cells along x and y from its low corner, that its drawn place stands for."""
-    if rules is None or not rules.half_cell_shift:
-        return np.array([0.5, 0.5])
-    # the edge that the native orientation counts a cell from; there y runs to the right, but for FIERY
-    return np.array([0.0, 0.0 if native_orientation(rules.warp) == "fiery" else 1.0])
+    return np.array([0.5, 0.5] if rules is None else rules.place_in_cell)
 
 
 def _variants(reading: AccidentReading, others: Mapping[str, tuple[Any, ...]]) -> dict[str, AccidentReading]:

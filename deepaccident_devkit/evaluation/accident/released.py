@@ -17,7 +17,8 @@ from typing import Any, Final
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray
-from deepaccident_devkit.errors import EvaluationError
+from deepaccident_devkit.errors import ConfigError, EvaluationError
+from deepaccident_devkit.evaluation.accident.actors import actor_of
 from deepaccident_devkit.evaluation.accident.drawn_paths import DrawnPaths, paths_of_heads, paths_of_instances
 from deepaccident_devkit.evaluation.accident.gaps import pair_gaps
 from deepaccident_devkit.evaluation.accident.protocol import AccidentContext, AccidentProtocol, Prediction
@@ -27,7 +28,7 @@ from deepaccident_devkit.evaluation.evaluator import Counts, ratio
 from deepaccident_devkit.evaluation.frames import check_output, first_frames, frames_there, labels_at_present
 from deepaccident_devkit.evaluation.predictions import MotionOutput
 from deepaccident_devkit.evaluation.trajectory_matching import longest, match_trajectories, padded
-from deepaccident_devkit.motion import OWN_BOX_ID, POST_PROCESSING, MotionHeads, MotionLabels, PostProcessing
+from deepaccident_devkit.motion import POST_PROCESSING, MotionHeads, MotionLabels, PostProcessing
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 Pair = tuple[int, int]
@@ -74,6 +75,16 @@ class ReleasedAccidents:
     errors_filled: bool = True
     errors_at: float | None = None
 
+    def __post_init__(self) -> None:
+        """Check the values; raises ConfigError."""
+        for name, least, most in (("truth_gap", 0, math.inf), ("prediction_gap", 0, math.inf), ("level", 0, 1)):
+            if not least < getattr(self, name) < most:
+                raise ConfigError(
+                    f"{name}: expected a number between {least} and {most}, found {getattr(self, name)!r}"
+                )
+        if self.errors_at is not None and self.errors_at not in DISTANCES:
+            raise ConfigError(f"errors_at: expected one of {', '.join(map(str, DISTANCES))}, found {self.errors_at!r}")
+
     def settings(self) -> dict[str, Any]:
         """All that decides the numbers, as JSON can hold it."""
         return asdict(self)
@@ -97,7 +108,7 @@ class ReleasedAccidents:
         if not isinstance(prediction, MotionOutput) or label is None:
             raise EvaluationError(
                 "the released protocol compares motion: give a MotionOutput and the sample's motion labels; "
-                "explicit accidents are for the protocols 'paper' and 'boxes'"
+                "explicit accidents are for protocol='boxes'"
             )
         frames = frames_there(label)
         check_output(prediction, label, frames)
@@ -108,7 +119,7 @@ class ReleasedAccidents:
         matches = [match_trajectories(each.paths, truth.paths).pairs for each in predictions]
         step = label.config.step * FRAME_PERIOD
         counts, pair = accident_counts(predictions, truth, matches, self, step)
-        actors = None if pair is None else [_actor(present == name, label, context) for name in pair]
+        actors = None if pair is None else [actor_of(present == name, 0, label, context) for name in pair]
         return counts | {"named": named(actors, context)}
 
     def result(self, counts: Collection[Counts]) -> AccidentResult:
@@ -245,14 +256,6 @@ def _apart(predicted: DrawnPaths, alarm: Collision, truth: DrawnPaths, true: Col
 def _others_named(alarm: Collision, true: Collision, same: Collection[Pair]) -> int:
     """0 if both that are foreseen are the true ones, by the matches of their paths; else 1."""
     return int(not all(any((name, other) in same for other in true.pair) for name in alarm.pair))
-
-
-def _actor(here: AnyArray, label: MotionLabels, context: AccidentContext) -> int | None:
-    """The actor whose label most cells of an instance (H, W) are; None if that is not known."""
-    ids = label.instance[0][here]
-    name = int(np.bincount(ids[ids > 0]).argmax()) if (ids > 0).any() else 0
-    actor = next((actor for actor, drawn in label.id_map.items() if drawn == name), None)
-    return context.own_actor_id if actor == OWN_BOX_ID else actor
 
 
 def _within(counts: Collection[Counts], index: int) -> AccidentsWithin:

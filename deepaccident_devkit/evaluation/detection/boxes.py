@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, checked
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, as_numbers, checked
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.boxes import checked_boxes
@@ -64,7 +64,7 @@ class DetectedBoxes(FrozenArrays):
         """
         columns: dict[str, Any] = {}
         if velocity is not None:
-            given = np.asarray(velocity)
+            given = as_numbers("velocity", velocity)
             flat = given.ndim == 2 and given.shape[1] == 2
             columns["velocity"] = np.column_stack([given, np.zeros(len(given))]) if flat else given
         boxes = Boxes.from_arrays(center, size, yaw, frame=frame, category=category, **columns)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from math import fsum, nan
 from typing import Any, Final
 
@@ -12,6 +11,9 @@ import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray, IntArray
 from deepaccident_devkit.evaluation.detection.protocols import DetectionProtocol
+
+_EVENTS: Final = ("detections", "tp", "spent", "excused", "matches", "errors")
+"""The columns of `frame_counts.FrameCounts` that name detections by their rows."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,10 +74,7 @@ class Ledger:
         self._scores = scores[order]
         groups = len(protocol.classes) * len(protocol.ranges)
         self.truths = _joined([each["truths"] for each in counts], np.int64).reshape(-1, groups).sum(axis=0)
-        self._events = {
-            name: self._by_key([each[name] for each in counts])
-            for name in ("detections", "tp", "spent", "excused", "matches", "errors")
-        }
+        self._events = {name: self._by_key([each[name] for each in counts]) for name in _EVENTS}
 
     def cell(self, group: int, level: int) -> Cell:
         """A class within a range (`frame_counts.FrameCounts`) at a threshold."""
@@ -125,6 +124,27 @@ class Ledger:
         keys, rows, values = self._events[name]
         part = slice(*np.searchsorted(keys, [key, key + 1]))
         return rows[part], values[part]
+
+
+def pooled(counts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The counts of some samples as though they were one sample's, as arrays: for results that are asked for often.
+
+    The order of equal scores stays that of tokens where no other sample's token lies between theirs.
+    """
+    counts = sorted(counts, key=lambda each: each["token"])
+    first = np.cumsum([0, *(len(each["scores"]) for each in counts)])
+    result: dict[str, Any] = {
+        "token": counts[0]["token"],
+        "samples": sum(each.get("samples", 1) for each in counts),
+        "truths": np.sum([each["truths"] for each in counts], axis=0),
+        "scores": _joined([each["scores"] for each in counts], np.float64),
+    }
+    for name in _EVENTS:
+        columns = [_joined(column, np.float64) for column in zip(*(each[name] for each in counts), strict=True)]
+        keys, rows = (column.astype(np.int64) for column in columns[:2])
+        offset = np.repeat(first[:-1], [len(each[name][0]) for each in counts])
+        result[name] = [keys, rows + offset, *columns[2:]]
+    return result
 
 
 def curve(cell: Cell, protocol: DetectionProtocol) -> Points:
@@ -238,8 +258,7 @@ _CURVES: Final[Mapping[str, Callable[[Cell, DetectionProtocol], Points]]] = {
 
 def _joined(parts: Sequence[Sequence[Any]], dtype: type[np.generic]) -> Any:
     """All numbers behind one another; None is NaN."""
-    values = list(chain.from_iterable(parts))
-    return np.array(values, dtype=dtype) if values else np.zeros(0, dtype=dtype)
+    return np.concatenate([np.zeros(0, dtype=dtype), *(np.asarray(part, dtype=dtype) for part in parts)])
 
 
 def _mean(values: FloatArray) -> float:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.evaluation.detection.boxes import DetectedBoxes, columns_of
-from deepaccident_devkit.evaluation.detection.curves import Ledger, Points, curve
+from deepaccident_devkit.evaluation.detection.curves import Ledger, Points, curve, pooled
 from deepaccident_devkit.evaluation.detection.frame_counts import frame_counts
+from deepaccident_devkit.evaluation.detection.measures import ERRORS
 from deepaccident_devkit.evaluation.detection.protocols import DetectionProtocol, detection_protocol
-from deepaccident_devkit.evaluation.detection.result import DetectionResult
+from deepaccident_devkit.evaluation.detection.result import DetectionResult, mean_of
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.boxes import checked_boxes
@@ -77,9 +79,13 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
         """The metrics of some samples' counts, in any order."""
         return detection_result(counts, self.protocol)
 
+    def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
+        """One sample's counts in place of many; the same where scores are sorted by sample."""
+        return [pooled(list(counts))] if counts and self.protocol.global_sort else list(counts)
+
 
 def detection_result(counts: Collection[Counts], protocol: DetectionProtocol) -> DetectionResult:
-    """The metrics of some samples' counts (`frame_counts.FrameCounts.as_json`, each with its `token`), in any order."""
+    """The metrics of some samples' counts (`FrameCounts.as_json`, each with its `token`, or pooled), in any order."""
     ledger = Ledger(list(counts), protocol)
     names = [name for name, _ in protocol.classes]
     shape = len(names), len(protocol.ranges), len(protocol.thresholds)
@@ -96,9 +102,13 @@ def detection_result(counts: Collection[Counts], protocol: DetectionProtocol) ->
     if not protocol.absent_class_is_zero:
         average[truths == 0] = np.nan
         errors[truths.sum(axis=1) == 0] = np.nan
+    by_class = {name: mean_of(values) for name, values in zip(names, average, strict=True)}
     return DetectionResult(
+        mean_average_precision=mean_of(np.array(list(by_class.values()))),
+        class_average_precision=MappingProxyType(by_class),
+        mean_errors=MappingProxyType({name: mean_of(column) for name, column in zip(ERRORS, errors.T, strict=True)}),
         classes=tuple(names),
-        ranges=protocol.ranges,
+        ranges=np.array(protocol.ranges),
         thresholds=np.array([protocol.limits(name) for name in names]),
         average_precision=average,
         precision=_stacked(points, "precision"),
@@ -106,7 +116,7 @@ def detection_result(counts: Collection[Counts], protocol: DetectionProtocol) ->
         errors=errors,
         truths=truths,
         detections=ledger.detections.reshape(shape[:2]),
-        samples=len(counts),
+        samples=sum(each.get("samples", 1) for each in counts),
     )
 
 

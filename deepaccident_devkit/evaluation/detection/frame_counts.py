@@ -99,8 +99,8 @@ def frame_counts(detections: BoxColumns, truth: BoxColumns, protocol: DetectionP
     """Match one sample's detections with its true boxes, both in the protocol's frame, and count."""
     if protocol.single_precision:
         detections, truth = detections.rounded(), truth.rounded()
-    truth = truth.select(_there(truth, protocol) & (class_codes(truth, protocol) >= 0))
-    detections = detections.select(_inside_area(detections, protocol))
+    truth = _only(truth, _there(truth, protocol) & (class_codes(truth, protocol) >= 0))
+    detections = _only(detections, _inside_area(detections, protocol))
     if protocol.unknown_velocity_is_zero:
         truth = _standing_if_unknown(truth)
     codes, true_codes = class_codes(detections, protocol), class_codes(truth, protocol)
@@ -210,6 +210,10 @@ def _by_candidate(reach: Reach, counts: Sequence[bool], classes: int) -> dict[in
 def _extend(columns: Sequence[list[Any]], *more: Iterable[Any]) -> None:
     for column, values in zip(columns, more, strict=True):
         column.extend(values)
+
+
+def _only(boxes: BoxColumns, which: BoolArray) -> BoxColumns:
+    return boxes if which.all() else boxes.select(which)
 
 
 def _there(truth: BoxColumns, protocol: DetectionProtocol) -> BoolArray:

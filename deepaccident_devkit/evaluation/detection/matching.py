@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Final
 
 Reach = Mapping[int, Sequence[tuple[int, int]]]
 """Candidate → (true box, rank) of the pairs that are near enough."""
+_NOBODY: Final = -1
 
 
 @dataclass(slots=True)
@@ -32,7 +34,7 @@ class Steps:
     holder: dict[int, int] = field(default_factory=dict)
 
     def note(self, arriving: int, changes: Sequence[int]) -> None:
-        """Take what an arrival changed: pairs that count, with a truth that does not, a candidate that does not."""
+        """Take what an arrival changed: found, spent, excused (and pairs of which neither counts)."""
         found, spent, excused, _ = changes
         if found:
             self.tp.append(arriving)
@@ -56,22 +58,31 @@ def nearest_by_truth(reach: Reach, counts: Mapping[int, bool], truth_counts: Seq
     """
     steps, ranks = Steps(), dict[int, int]()
     for arriving in reach:
+        # pairs of which both count, of which the truth does not, the candidate does not, neither does
         changes = [0, 0, 0, 0]
         offered: int | None = arriving
-        behind = -1
+        behind = _NOBODY
         while offered is not None:
-            taken = next((pair for pair in reach[offered] if pair[0] > behind and ranks.get(*pair) >= pair[1]), None)
-            if taken is None:
+            behind, rank = _taker(reach[offered], behind, ranks)
+            if behind == _NOBODY:
                 break
-            behind, rank = taken
             handed_on = steps.holder.get(behind)
             steps.holder[behind], ranks[behind] = offered, rank
             for candidate, change in ((offered, 1), (handed_on, -1)):
                 if candidate is not None:
                     changes[2 * (not counts[candidate]) + (not truth_counts[behind])] += change
             offered = handed_on
-        steps.note(arriving, changes)
+        if any(changes):
+            steps.note(arriving, changes)
     return steps
+
+
+def _taker(pairs: Sequence[tuple[int, int]], behind: int, ranks: Mapping[int, int]) -> tuple[int, int]:
+    """The first true box after `behind` that takes a candidate with these pairs, and their rank."""
+    for truth, rank in pairs:
+        if truth > behind and ranks.get(truth, rank) >= rank:
+            return truth, rank
+    return _NOBODY, 0
 
 
 def highest_score_by_truth(reach: Reach) -> dict[int, int]:

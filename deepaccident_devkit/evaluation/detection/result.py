@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import fsum, isnan, nan
+from math import fsum, isinf, isnan, nan
 from typing import Any
 
 import numpy as np
@@ -20,8 +20,11 @@ class DetectionResult(FrozenArrays):
     C classes, R ranges, K thresholds, P points of a curve.
 
     Attributes:
+        mean_average_precision: the mean over all classes, ranges and thresholds that there are, in %.
+        class_average_precision: class → the mean over thresholds and ranges, in %.
+        mean_errors: ATE, ASE, AOE, AVE → the mean over the classes that there are; units as of `errors`.
         classes: names of the classes.
-        ranges: from and to of each range, metres.
+        ranges: (R, 2) from and to of each range, metres.
         thresholds: (C, K) of the protocol's measure: metres, or shares of overlap.
         average_precision: (C, R, K) in %.
         precision: (C, R, K, P) shares.
@@ -33,8 +36,11 @@ class DetectionResult(FrozenArrays):
         samples: number of samples.
     """
 
+    mean_average_precision: float
+    class_average_precision: Mapping[str, float]
+    mean_errors: Mapping[str, float]
     classes: tuple[str, ...]
-    ranges: tuple[tuple[float, float], ...]
+    ranges: FloatArray
     thresholds: FloatArray
     average_precision: FloatArray
     precision: FloatArray
@@ -44,28 +50,13 @@ class DetectionResult(FrozenArrays):
     detections: IntArray
     samples: int
 
-    @property
-    def class_average_precision(self) -> Mapping[str, float]:
-        """Class → the mean over thresholds and ranges, in %."""
-        return {name: mean_of(values) for name, values in zip(self.classes, self.average_precision, strict=True)}
-
-    @property
-    def mean_average_precision(self) -> float:
-        """The mean over all classes, ranges and thresholds that there are, in %."""
-        return mean_of(np.array(list(self.class_average_precision.values())))
-
-    @property
-    def mean_errors(self) -> Mapping[str, float]:
-        """ATE, ASE, AOE, AVE → the mean over the classes that there are."""
-        return {name: mean_of(column) for name, column in zip(ERRORS, self.errors.T, strict=True)}
-
     def to_dict(self) -> dict[str, Any]:
         """All but the curves, as JSON holds it; None for what there is nothing to count of."""
         by_class = {
             name: {
                 "thresholds": self.thresholds[position].tolist(),
                 "AP": _without_nan(self.average_precision[position]),
-                "mean_AP": _number(mean_of(self.average_precision[position])),
+                "mean_AP": _number(self.class_average_precision[name]),
                 **{error: _number(value) for error, value in zip(ERRORS, self.errors[position].tolist(), strict=True)},
                 "truths": self.truths[position].tolist(),
                 "detections": self.detections[position].tolist(),
@@ -74,7 +65,7 @@ class DetectionResult(FrozenArrays):
         }
         return {
             "samples": self.samples,
-            "ranges": [[_number(low), None if high == float("inf") else high] for low, high in self.ranges],
+            "ranges": [[low, None if isinf(high) else high] for low, high in self.ranges.tolist()],
             "mAP": _number(self.mean_average_precision),
             **{f"m{name}": _number(value) for name, value in self.mean_errors.items()},
             "classes": by_class,

@@ -1,12 +1,12 @@
 """Training with PyTorch: cooperative samples as tensors, and how they become batches (the extra `torch`).
 
     from torch.utils.data import DataLoader
-    from deepaccident_devkit import DeepAccident, motion
+    from deepaccident_devkit import DeepAccident
     from deepaccident_devkit.export.torch import ImageConfig, V2XConfig, V2XDataset, collate
 
     da = DeepAccident(dataroot="data/DeepAccident")
-    config = V2XConfig(agents="all", images=ImageConfig(resize=(224, 400)), labels=motion.MotionLabelConfig())
-    data = V2XDataset(da, motion.samples(da, "train"), config)
+    config = V2XConfig(agents="all", images=ImageConfig(resize=(224, 400)), labels="deepaccident")
+    data = V2XDataset(da, da.samples("train"), config)
     loader = DataLoader(data, batch_size=2, shuffle=True, num_workers=4, collate_fn=collate)
 
 `V2XDataset` says what an item holds, `collate` and `collate_fusion` what a batch does. docs/training.md has a training

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, FloatArray, as_floats
-from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.arrays import AnyArray, FloatArray, as_floats, checked, checked_number
+from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import Boxes, LidarPointCloud, six_vectors
 from deepaccident_devkit.motion import Augmentation
 
@@ -34,13 +34,21 @@ class RandomAugmentation:
 
     def __post_init__(self) -> None:
         """Check the ranges; raises ConfigError."""
-        if not 0 <= self.rotation < math.inf:
-            raise ConfigError(f"random augmentation: rotation is {self.rotation}; choose finite radians from 0")
-        smallest, largest = self.scale
-        if not 0 < smallest <= largest < math.inf:
-            raise ConfigError(f"random augmentation: scale is {self.scale}; choose (smallest, largest) above 0")
-        if not 0 <= self.flip <= 1:
-            raise ConfigError(f"random augmentation: flip is {self.flip}; choose a probability from 0 to 1")
+        name = "random augmentation: "
+        rotation = checked_number(f"{name}rotation", self.rotation, "radians", ConfigError)
+        if not 0 <= rotation < math.inf:
+            raise ConfigError(f"{name}rotation is {self.rotation}; choose finite radians from 0")
+        try:
+            scale = tuple(checked("scale", self.scale, (2,)).tolist())
+        except GeometryError:
+            scale = (math.nan, math.nan)
+        if not 0 < scale[0] <= scale[1] < math.inf:
+            raise ConfigError(f"{name}scale is {self.scale!r}; choose (smallest, largest) above 0")
+        flip = checked_number(f"{name}flip", self.flip, "a probability", ConfigError)
+        if not 0 <= flip <= 1:
+            raise ConfigError(f"{name}flip is {self.flip}; choose a probability from 0 to 1")
+        for field, value in (("rotation", rotation), ("scale", scale), ("flip", flip)):
+            object.__setattr__(self, field, value)
 
     def __call__(self, generator: np.random.Generator) -> Augmentation:
         """One draw."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
+from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.taxonomy import AGENTS
 
 if TYPE_CHECKING:
@@ -24,9 +25,11 @@ def collate(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
     Of what an item holds (`V2XDataset`), `token`, `agents`, `points` and the boxes (`boxes`, `velocity_known`,
     `categories`, `actor_ids`) become lists of B. All else is stacked, (B, …); where items have fewer agents than
     others, (B, A, …) is filled with agents whose `agent_valid` is False, whose images are 0 and matrices the identity.
-    """
-    import torch
 
+    Raises:
+        ConfigError: there are no items, or they do not fit together: other configurations, images of different sizes.
+    """
+    _check_alike(items)
     agents = max(len(item["agents"]) for item in items)
     batch: dict[str, Any] = {}
     for key in items[0]:
@@ -34,9 +37,9 @@ def collate(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
         if key in _LISTS:
             batch[key] = values
         elif key in _OF_AGENTS:
-            batch[key] = torch.stack([_with_agents(key, value, agents) for value in values])
+            batch[key] = _joined(key, [_with_agents(key, value, agents)[None] for value in values])
         else:
-            batch[key] = torch.stack(values)
+            batch[key] = _joined(key, [value[None] for value in values])
     return batch
 
 
@@ -54,14 +57,18 @@ def collate_fusion(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
       Augmented as the points are, with the link's errors. The identity on the diagonal and beyond `record_len`.
 
     OpenCOOD's own frames are the LiDARs', left-handed as CARLA's are; these are ego frames, right-handed, as all here.
+
+    Raises:
+        ConfigError: there are no items, or they do not fit together: other configurations, images of different sizes.
     """
     import torch
 
+    _check_alike(items)
     present = [item["agent_valid"][:, -1] for item in items]
     batch = collate([{key: value for key, value in item.items() if key not in _OF_AGENTS} for item in items])
     for key in _OF_AGENTS:
         if key in items[0]:
-            batch[key] = torch.cat([item[key][kept] for item, kept in zip(items, present, strict=True)])
+            batch[key] = _joined(key, [item[key][kept] for item, kept in zip(items, present, strict=True)])
     kept_rows = [kept.nonzero()[:, 0].tolist() for kept in present]
     batch["agents"] = [tuple(item["agents"][row] for row in rows) for item, rows in zip(items, kept_rows, strict=True)]
     if "points" in batch:
@@ -71,6 +78,28 @@ def collate_fusion(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
         [_pairwise(item["ego_from_agent"][kept, -1]) for item, kept in zip(items, present, strict=True)]
     )
     return batch
+
+
+def _check_alike(items: Sequence[dict[str, Any]]) -> None:
+    if not items:
+        raise ConfigError("batch: expected at least one item, found none")
+    for item in items[1:]:
+        differing = sorted(item.keys() ^ items[0].keys())
+        if differing:
+            raise ConfigError(
+                f"batch: only some of the items have {differing[0]!r}; batch items of one V2XConfig at a time"
+            )
+
+
+def _joined(key: str, parts: Sequence[Tensor]) -> Tensor:
+    """Parts (n, …) one after another (N, …); raises ConfigError if more than their number of rows differs."""
+    import torch
+
+    sizes = sorted({tuple(part.shape[1:]) for part in parts})
+    if len(sizes) > 1:
+        remedy = "choose resize=" if key == "images" else "batch items of one V2XConfig at a time"
+        raise ConfigError(f"{key}: items of shapes {sizes[0]} and {sizes[-1]} make no batch; {remedy}")
+    return torch.cat(list(parts))
 
 
 def _pairwise(ego_from_agent: Tensor) -> Tensor:

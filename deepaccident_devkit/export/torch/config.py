@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Final, Literal, get_args
 
 import numpy as np
 
+from deepaccident_devkit.arrays import checked_whole
 from deepaccident_devkit.dataset import Visible
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.export.torch.images import ImageConfig
@@ -15,11 +16,12 @@ from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import Augmentation, MotionLabelConfig
 from deepaccident_devkit.motion.warps.warping import WarpMode
 from deepaccident_devkit.v2x import Agents, Link
+from deepaccident_devkit.v2x.link import checked_link
 
 BoxSource = Literal["sample", "cooperative"]
 AugmentationSource = Augmentation | Callable[[np.random.Generator], Augmentation]
 """The same for all items, or a draw for each (`RandomAugmentation`; a lambda does not reach spawned workers)."""
-_DEFAULT_STEP = 5
+_DEFAULT_STEP: Final = 5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,8 +41,8 @@ class V2XConfig:
             annotated it), None for none.
         visible: which of them: `released`, `camera`, or None for all, own rows among them (`DeepAccident.boxes`,
             `v2x.cooperative_boxes`).
-        labels: the motion labels; None for none. Whose sight counts for them is their own `agents`, what augments
-            them is this configuration's `augmentation`.
+        labels: the motion labels, or the name of a preset (`motion.PRESETS`); None for none. Whose sight counts for
+            them is their own `agents`, what augments them is this configuration's `augmentation`.
         to_present: warp the labels to the present ego frame and sample centerness this way: `nearest` as the released
             training, `bilinear` as its evaluation. None: each frame in its own ego frame.
         bev_segmentation: cells of the segmentation targets from the BEV camera; None for none.
@@ -56,7 +58,7 @@ class V2XConfig:
     points: bool = True
     boxes: BoxSource | None = "sample"
     visible: Visible | None = "released"
-    labels: MotionLabelConfig | None = None
+    labels: MotionLabelConfig | str | None = None
     to_present: WarpMode | None = "nearest"
     bev_segmentation: BevGrid | None = None
     augmentation: AugmentationSource | None = None
@@ -64,12 +66,14 @@ class V2XConfig:
 
     def __post_init__(self) -> None:
         """Check and complete."""
+        self._check_types()
+        if isinstance(self.labels, str):
+            object.__setattr__(self, "labels", MotionLabelConfig.preset(self.labels))
         if self.step is None:
-            object.__setattr__(self, "step", _DEFAULT_STEP if self.labels is None else self.labels.step)
+            labels = self.labels
+            object.__setattr__(self, "step", labels.step if isinstance(labels, MotionLabelConfig) else _DEFAULT_STEP)
         for name, least in (("past", 1), ("step", 1), ("seed", 0)):
-            value = getattr(self, name)
-            if not isinstance(value, int) or isinstance(value, bool) or value < least:
-                raise ConfigError(f"{name}: expected a whole number from {least}, found {value!r}")
+            object.__setattr__(self, name, _count(name, getattr(self, name), least))
         for name, value, choices in (
             ("boxes", self.boxes, get_args(BoxSource)),
             ("visible", self.visible, get_args(Visible)),
@@ -77,10 +81,19 @@ class V2XConfig:
         ):
             if value is not None and value not in choices:
                 raise ChoiceError(f"{name}: expected None or one of {', '.join(choices)}, found {value!r}")
-        if self.labels is not None and self.labels.augmentation is not None:
+        if isinstance(self.labels, MotionLabelConfig) and self.labels.augmentation is not None:
             raise ConfigError(
                 "labels: their augmentation is that of boxes, points and poses; give V2XConfig(augmentation=…) alone"
             )
+
+    def _check_types(self) -> None:
+        checked_link(self.link)
+        for name, kind, example in _PARTS:
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, kind):
+                raise ConfigError(f"{name}: expected None or {example}, found {value!r}")
+        if not isinstance(self.points, bool):
+            raise ConfigError(f"points: expected True or False, found {self.points!r}")
         if not (
             self.augmentation is None or isinstance(self.augmentation, Augmentation) or callable(self.augmentation)
         ):
@@ -89,7 +102,30 @@ class V2XConfig:
             )
 
     def augmentation_of(self, epoch: int, index: int) -> Augmentation:
-        """The augmentation of an item in an epoch: it depends on these two and the seed alone."""
+        """The augmentation of an item in an epoch: it depends on these two and the seed alone.
+
+        Raises:
+            ConfigError: the function that draws it gave something else.
+        """
         if self.augmentation is None or isinstance(self.augmentation, Augmentation):
             return self.augmentation or Augmentation()
-        return self.augmentation(np.random.default_rng([self.seed, epoch, index]))
+        drawn = self.augmentation(np.random.default_rng([self.seed, epoch, index]))
+        if not isinstance(drawn, Augmentation):
+            raise ConfigError(f"augmentation: its function must return an Augmentation, and returned {drawn!r}")
+        return drawn
+
+
+_PARTS: Final = (
+    ("images", ImageConfig, "an ImageConfig, such as ImageConfig(resize=(224, 400))"),
+    ("labels", (MotionLabelConfig, str), "a MotionLabelConfig, or the name of a preset"),
+    ("bev_segmentation", BevGrid, "the BevGrid that it is resampled to, such as BevGrid()"),
+)
+"""Field, its type or types, and what the error says was expected."""
+
+
+def _count(name: str, value: object, least: int) -> int:
+    expected = f"a whole number from {least}"
+    whole = checked_whole(name, value, expected, ConfigError)
+    if isinstance(value, bool) or whole < least:
+        raise ConfigError(f"{name}: expected {expected}, found {value!r}")
+    return whole

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import operator
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
+from deepaccident_devkit.arrays import checked_whole
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, NotAvailableError
 from deepaccident_devkit.export.torch import sensor_data
@@ -87,15 +89,22 @@ class V2XDataset(TorchDataset):
 
         Raises:
             TokenError: no such sample.
+            ChoiceError: no such agents as the configuration names.
             NotAvailableError: labels are wanted of a sample that has none, or an agent is not in this (partial)
                 release.
-            ConfigError: the link's latency is longer than the past of a sample.
+            ConfigError: the link's latency is longer than the past of a sample; `tokens` is a single sample, or
+                `config` no V2XConfig.
         """
         import torch
 
-        self.config = config or V2XConfig()
+        if config is not None and not isinstance(config, V2XConfig):
+            raise ConfigError(f"config: expected a V2XConfig, such as V2XConfig(agents='all'), found {config!r}")
+        if isinstance(tokens, str | Mapping):
+            raise ConfigError(f"tokens: expected a list of samples, found one alone; pass [{tokens!r}]")
+        self.config = V2XConfig() if config is None else config
         self._dataset = dataset
         self._rows = np.array([dataset.getind("sample", token) for token in tokens], dtype=np.int64)
+        self._check_agents()
         self._check_labelled()
         self._check_latency()
         # shared, so that workers that outlive an epoch hear of the next one
@@ -106,8 +115,15 @@ class V2XDataset(TorchDataset):
         return len(self._rows)
 
     def set_epoch(self, epoch: int) -> None:
-        """Say which epoch follows, before its loader is iterated: other augmentations are drawn."""
-        self._epoch.fill_(epoch)
+        """Say which epoch follows, counted from 0, before its loader is iterated: other augmentations are drawn.
+
+        Raises:
+            ConfigError: it is no whole number from 0.
+        """
+        number = checked_whole("epoch", epoch, "a whole number from 0", ConfigError)
+        if number < 0:
+            raise ConfigError(f"epoch: expected a whole number from 0, found {epoch}")
+        self._epoch.fill_(number)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         """The item of a sample, as the class says.
@@ -116,15 +132,16 @@ class V2XDataset(TorchDataset):
             IndexError: no such item.
             MissingFileError: a sensor file was not downloaded.
             SensorFileError: one cannot be read.
-            ConfigError: images of different sizes without `resize`, or smaller than the crop.
+            ConfigError: images of different sizes without `resize`, or smaller than the crop; or the function that
+                draws augmentations gives something else.
         """
-        position = range(len(self))[index]
+        position = range(len(self))[operator.index(index)]
         sample = self._dataset.sample[int(self._rows[position])]["token"]
         augmentation = self.config.augmentation_of(int(self._epoch), position)
         item = self._received_item(sample, augmentation)
         if self.config.boxes is not None:
             item |= self._box_item(sample, augmentation)
-        if self.config.labels is not None:
+        if isinstance(self.config.labels, MotionLabelConfig):
             item |= self._label_item(sample, self.config.labels, augmentation)
         if self.config.bev_segmentation is not None:
             target = bev_segmentation(self._dataset, sample, self.config.bev_segmentation, augmentation=augmentation)
@@ -182,6 +199,12 @@ class V2XDataset(TorchDataset):
             "future_egomotion": _tensor(augmented_six_vectors(labels.future_egomotion, augmentation), np.float32),
             "label_valid": _tensor(labels.label_valid),
         }
+
+    def _check_agents(self) -> None:
+        """What `agents` names is the same for all samples: a slip shows at the first."""
+        if len(self):
+            first = self._dataset.sample[int(self._rows[0])]["token"]
+            sensor_data.participants(self._dataset, first, self.config.agents)
 
     def _check_labelled(self) -> None:
         if self.config.labels is None:

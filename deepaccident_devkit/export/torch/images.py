@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+import operator
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, get_args
+from typing import Final, Literal, SupportsIndex, get_args
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, ByteArray, FloatArray
+from deepaccident_devkit.arrays import AnyArray, ByteArray, FloatArray, checked
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.taxonomy import CAMERAS
 from deepaccident_devkit.v2x.projection import camera_of
 
@@ -41,23 +42,25 @@ class ImageConfig:
     cameras: tuple[str, ...] = CAMERAS
 
     def __post_init__(self) -> None:
-        """Check every field."""
-        if self.resize is not None and not _are_pixels(self.resize, (1, 1)):
-            raise ConfigError(f"resize: expected height and width in pixels, found {self.resize}")
+        """Check every field, and make sequences tuples."""
+        if self.resize is not None:
+            self._set("resize", _pixels("resize", self.resize, "height and width", (1, 1)))
         if self.crop is not None:
-            if not _are_pixels(self.crop, (0, 0, 1, 1)):
-                raise ConfigError(f"crop: expected top, left, height and width in pixels, found {self.crop}")
+            self._set("crop", _pixels("crop", self.crop, "top, left, height and width", (0, 0, 1, 1)))
             if self.resize is not None:
                 _check_crop(self.crop, self.resize)
         if self.dtype not in get_args(ImageDtype):
             raise ConfigError(f"dtype: expected one of {', '.join(get_args(ImageDtype))}, found {self.dtype!r}")
-        if not (_are_channels(self.mean) and _are_channels(self.std) and min(self.std) > 0):
-            raise ConfigError(f"mean and std: expected three numbers each, std above 0; found {self.mean}, {self.std}")
+        for name in ("mean", "std"):
+            self._set(name, _channels(name, getattr(self, name)))
+        if min(self.std) <= 0:
+            raise ConfigError(f"std: expected numbers above 0, found {self.std}")
         if self.dtype == "uint8" and (self.mean, self.std) != (_NO_MEAN, _NO_STD):
             raise ConfigError("mean and std: uint8 images are as decoded; choose dtype='float32', or leave them out")
-        unknown = [camera for camera in self.cameras if camera not in CAMERAS]
-        if unknown or not self.cameras or len(set(self.cameras)) != len(self.cameras):
-            raise ConfigError(f"cameras: expected some of {', '.join(CAMERAS)}, each once; found {self.cameras}")
+        self._set("cameras", _cameras(self.cameras))
+
+    def _set(self, name: str, value: object) -> None:
+        object.__setattr__(self, name, value)
 
     def load(self, dataset: Dataset, camera: RowArgument) -> tuple[ByteArray, FloatArray]:
         """An image (h, w, 3) uint8 RGB, resized and cropped, and the intrinsic (3, 3) that belongs to it.
@@ -100,14 +103,31 @@ class ImageConfig:
         return (scaled - mean) / std
 
 
-def _are_pixels(numbers: Sequence[object], least: Sequence[int]) -> bool:
-    return len(numbers) == len(least) and all(
-        isinstance(number, int) and number >= low for number, low in zip(numbers, least, strict=True)
-    )
+def _pixels(name: str, given: Iterable[SupportsIndex], meaning: str, least: Sequence[int]) -> tuple[int, ...]:
+    try:
+        numbers = tuple(operator.index(number) for number in given)
+    except TypeError:
+        numbers = ()
+    if len(numbers) != len(least) or any(number < low for number, low in zip(numbers, least, strict=True)):
+        raise ConfigError(f"{name}: expected {meaning} in pixels, found {given!r}")
+    return numbers
 
 
-def _are_channels(numbers: Sequence[float]) -> bool:
-    return len(numbers) == 3 and all(math.isfinite(number) for number in numbers)
+def _channels(name: str, given: ArrayLike) -> tuple[float, ...]:
+    try:
+        numbers = checked(name, given, (3,))
+    except GeometryError:
+        numbers = np.full(3, np.nan)
+    if not np.isfinite(numbers).all():
+        raise ConfigError(f"{name}: expected a number for each of R, G and B, found {given!r}")
+    return tuple(numbers.tolist())
+
+
+def _cameras(given: Iterable[str]) -> tuple[str, ...]:
+    names = () if isinstance(given, str) or not isinstance(given, Iterable) else tuple(given)
+    if not names or any(name not in CAMERAS for name in names) or len(set(names)) != len(names):
+        raise ConfigError(f"cameras: expected a tuple of some of {', '.join(CAMERAS)}, each once; found {given!r}")
+    return names
 
 
 def _check_crop(crop: tuple[int, int, int, int], size: tuple[int, int]) -> None:

@@ -18,7 +18,8 @@ from deepaccident_devkit.geometry.handedness import flip_pose
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.labels import OWN_BOX_ID
-from deepaccident_devkit.motion.warps.single_precision import Float32Array, product
+from deepaccident_devkit.motion.warps import single_precision
+from deepaccident_devkit.motion.warps.single_precision import Float32Array
 from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID, UNTRACKED_ID
 
 _DEFAULT_SIZE: Final = (3.99, 1.85, 1.62)
@@ -53,7 +54,7 @@ class FrameBoxes:
 
     def __post_init__(self) -> None:
         """Check and freeze; raises GeometryError."""
-        count = len(np.asarray(self.center))
+        count = len(checked("FrameBoxes.center", self.center, (None, 3)))
         shapes: dict[str, tuple[tuple[int, ...], type]] = {
             "center": ((count, 3), np.float64),
             "size": ((count, 3), np.float64),
@@ -65,11 +66,11 @@ class FrameBoxes:
         }
         for name, (shape, dtype) in shapes.items():
             array = checked(f"FrameBoxes.{name}", getattr(self, name), shape, dtype)
+            if not np.isfinite(array).all():
+                row = int(np.argwhere(~np.isfinite(array))[0, 0])
+                remedy = "a frame without a pose is None" if name == "ego_from_lidar" else "leave such rows out"
+                raise GeometryError(f"FrameBoxes.{name}: row {row} is not finite; {remedy}")
             object.__setattr__(self, name, readonly(array))
-        for name in ("center", "size", "yaw"):
-            if not np.isfinite(getattr(self, name)).all():
-                row = int(np.flatnonzero(~np.isfinite(getattr(self, name).reshape(count, -1)).all(axis=1))[0])
-                raise GeometryError(f"FrameBoxes.{name}: row {row} is not finite; leave such rows out")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -104,7 +105,13 @@ def box_polygons(
 
     Returns:
         A frame's polygons, the ego's own first and the others in the order of their rows; None for None.
+
+    Raises:
+        GeometryError: something else than boxes was given.
     """
+    for given in frames:
+        if not isinstance(given, FrameBoxes | None):
+            raise GeometryError(f"frames: expected FrameBoxes, or None beyond the recording, found {given!r}")
     there = [number for number, frame in enumerate(frames) if frame is not None]
     known = [frame for frame in frames if frame is not None]
     result: list[FramePolygons | None] = [None] * len(frames)
@@ -222,8 +229,10 @@ def _constructed(center: FloatArray, size: FloatArray, yaw: FloatArray) -> Float
 
 def _moved(boxes: Float32Array, pose: Float32Array) -> Float32Array:
     """mmdet3d's rotate by the transposed rotations of left-handed poses (N, 4, 4), then translate."""
-    xyz = product(pose[:, :3, :3], boxes[:, :3, None])[..., 0] + pose[:, :3, 3]
-    yaw = boxes[:, 6] + np.arctan2(pose[:, 0, 1], pose[:, 0, 0])
+    xyz = single_precision.product(pose[:, :3, :3], boxes[:, :3, None])[..., 0] + pose[:, :3, 3]
+    # by way of float64, whose rounding is torch's in all but a few cases; numpy's own float32 one is not
+    turned = np.arctan2(pose[:, 0, 1].astype(np.float64), pose[:, 0, 0]).astype(np.float32)
+    yaw = boxes[:, 6] + turned
     return np.column_stack([xyz, boxes[:, 3:6], yaw])
 
 
@@ -240,8 +249,8 @@ def _augmented(boxes: Float32Array, augmentation: Augmentation) -> Float32Array:
 
 def _corners(boxes: Float32Array) -> Float32Array:
     """(N, 4, 2) float32 x forward, y left of mmdet3d's boxes' bottom corners 0, 3, 7, 4."""
-    around = _CORNERS * boxes[:, None, 3:5]
-    cosine, sine = np.cos(boxes[:, 6, None]), np.sin(boxes[:, 6, None])
+    around, yaw = _CORNERS * boxes[:, None, 3:5], boxes[:, 6, None]
+    cosine, sine = single_precision.cosine(yaw), single_precision.sine(yaw)
     x = around[..., 0] * cosine + around[..., 1] * sine + boxes[:, 0, None]
     y = around[..., 0] * -sine + around[..., 1] * cosine + boxes[:, 1, None]
     return np.stack([x, -y], axis=-1)

@@ -6,31 +6,39 @@ Every frame is drawn in its own ego frame (evaluation.md a and h); `MotionLabels
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, IntArray, checked
-from deepaccident_devkit.errors import GeometryError
+from deepaccident_devkit.arrays import AnyArray, IntArray, checked, checked_whole
+from deepaccident_devkit.errors import ConfigError, GeometryError
+from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import Axis
-from deepaccident_devkit.geometry.handedness import flip_pose, flip_six_vector
-from deepaccident_devkit.motion.config import MotionLabelConfig
+from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
 from deepaccident_devkit.motion.drawing.box_polygons import FrameBoxes, FramePolygons, box_polygons
 from deepaccident_devkit.motion.drawing.label_maps import CoveredCells, label_maps
 from deepaccident_devkit.motion.drawing.polygon_fill import filled_cells
 from deepaccident_devkit.motion.labels import MotionLabels
-from deepaccident_devkit.motion.warps import single_precision
+from deepaccident_devkit.motion.orientations import axes_of
+from deepaccident_devkit.motion.protocols import LabelProtocol
+from deepaccident_devkit.motion.settings import count
+from deepaccident_devkit.motion.warps.chains import frames_from_next
 from deepaccident_devkit.motion.warps.single_precision import Float32Array
-from deepaccident_devkit.motion.warps.warping import native_orientation, nearest_indices, sampling_matrix
+from deepaccident_devkit.motion.warps.warping import nearest_indices, sampling_matrix
 from deepaccident_devkit.taxonomy import UNTRACKED_ID
 
 __all__ = ["FrameBoxes", "FramePolygons", "labels_from_polygons", "motion_labels_from_boxes"]
+_FAR: Final = 2**24
+"""Cells: corners beyond are drawn from there; the grid is far from both."""
+_MOST_IDS: Final = 2**24
+"""float32 counts no further."""
 
 
 def motion_labels_from_boxes(
     frames: Sequence[FrameBoxes | None],
     egomotion: ArrayLike,
-    config: MotionLabelConfig,
+    config: MotionLabelConfig | str | None = None,
     *,
     valid: ArrayLike | None = None,
     is_vehicle: bool = True,
@@ -43,32 +51,32 @@ def motion_labels_from_boxes(
             is no recording.
         egomotion: (R, 6) `next_from_this` ego poses, right-handed, R = `config.frames`, from the first past frame on,
             as `v2x.future_egomotion` gives them; taken as float32.
-        config: what labels show.
-        valid: (R,) bool, which frames are in the recording; those of `frames` and all past ones, if None.
+        config: what labels show, or the name of a preset; None for the released ones in the devkit's orientation.
+        valid: (R,) bool, which frames are in the recording; all but those that are None in `frames`, if None.
         is_vehicle: whether the agent is one and has a box of its own to draw (the roadside pole has none).
         id_map: actor id → id that a sample before this one had: the released code keeps them for a scenario and agent
             as long as a worker meets no other. None starts at 1.
 
     Raises:
         GeometryError: another number of frames or rows, or a motion that is not finite.
+        ConfigError: an id that is none, or any where the protocol does not keep ids between samples.
+        ChoiceError: no such preset.
     """
-    polygons = box_polygons(frames, config, is_vehicle=is_vehicle)
-    return labels_from_polygons(polygons, egomotion, config, valid=valid, id_map=id_map)
+    chosen = label_config(config)
+    polygons = box_polygons(frames, chosen, is_vehicle=is_vehicle)
+    return labels_from_polygons(polygons, egomotion, chosen, valid=valid, id_map=id_map)
 
 
 def labels_from_polygons(
     polygons: Sequence[FramePolygons | None],
     egomotion: ArrayLike,
-    config: MotionLabelConfig,
+    config: MotionLabelConfig | str | None = None,
     *,
     valid: ArrayLike | None = None,
     id_map: Mapping[int, int] | None = None,
 ) -> MotionLabels:
-    """The motion labels of footprints, each frame in its own ego frame; arguments as in `motion_labels_from_boxes`.
-
-    Raises:
-        GeometryError: another number of frames or rows, or a motion that is not finite.
-    """
+    """The motion labels of footprints, each frame in its own ego frame; as `motion_labels_from_boxes` otherwise."""
+    config = label_config(config)
     if len(polygons) != config.label_frames:
         raise GeometryError(
             f"frames: expected {config.label_frames}, the present and {config.future_frames} after it, "
@@ -78,15 +86,15 @@ def labels_from_polygons(
     if not np.isfinite(motion).all():
         raise GeometryError("egomotion: not all numbers are finite; rows without a motion are zero")
     past = config.receptive_field - 1
-    there = [True] * past + [frame is not None for frame in polygons]
-    known = checked("valid", there if valid is None else valid, (config.frames,), np.bool_)
-    ids, continued = _numbered(polygons, config, dict(id_map or {}))
+    there = np.array([True] * past + [frame is not None for frame in polygons])
+    known = there if valid is None else there & checked("valid", valid, (config.frames,), np.bool_)
+    ids, continued = _numbered(polygons, config, _checked_ids(id_map, config))
     covered = _covered(polygons, ids, config)
     centers = covered.centers()
-    following = _following_centers(covered, _flow_matrices(motion[past:-1], config), config)
+    this_from_next = frames_from_next(motion[past:-1], config.rules, config.augmentation)
+    following = _following_centers(covered, sampling_matrix(this_from_next, config.rules), config)
     following[np.isnan(centers)] = np.nan
-    missing = np.array([frame is None for frame in polygons])
-    maps = label_maps(covered, centers, following, missing, config)
+    maps = label_maps(covered, centers, following, ~known[past:], config)
     return MotionLabels(
         config=config,
         segmentation=maps.segmentation,
@@ -98,6 +106,23 @@ def labels_from_polygons(
         valid=known,
         id_map=continued,
     )
+
+
+def _checked_ids(id_map: Mapping[int, int] | None, config: MotionLabelConfig) -> dict[int, int]:
+    """A copy of the map to continue, or ConfigError."""
+    if id_map is None:
+        return {}
+    if not config.rules.ids_kept_between_samples:
+        raise ConfigError(
+            "id_map: ids of this protocol count from 1 in every sample; leave it out, or choose a protocol with "
+            "ids_kept_between_samples=True"
+        )
+    if not isinstance(id_map, Mapping):
+        raise ConfigError(f"id_map: expected a mapping of actor ids to ids, found {id_map!r}")
+    return {
+        checked_whole("id_map", actor, "actor ids", ConfigError): count("id_map", given, "an id of labels", _MOST_IDS)
+        for actor, given in id_map.items()
+    }
 
 
 def _numbered(
@@ -117,11 +142,11 @@ def _numbered(
 
 def _covered(polygons: Sequence[FramePolygons | None], ids: IntArray, config: MotionLabelConfig) -> CoveredCells:
     """The native cells of the polygons with these ids; later ones lie on top."""
-    native = config.grid.with_orientation(native_orientation(config.rules.warp))
+    native = config.grid.with_orientation(config.rules.native)
     there = [(number, frame) for number, frame in enumerate(polygons) if frame is not None]
     corners = np.concatenate([np.zeros((0, 4, 2), dtype=np.float32), *(frame.corners for _, frame in there)])
     image = np.repeat([number for number, _ in there], [len(frame.key) for _, frame in there]).astype(np.int64)
-    cells, owner = filled_cells(_vertices(corners, config), native.shape, image, len(polygons))
+    cells, owner = filled_cells(_vertices(corners, native, config.rules), native.shape, image, len(polygons))
     frame = image[owner]
     row = cells // native.shape[1]  # of all frames on end
     return CoveredCells(
@@ -134,48 +159,33 @@ def _covered(polygons: Sequence[FramePolygons | None], ids: IntArray, config: Mo
     )
 
 
-def _vertices(corners: AnyArray, config: MotionLabelConfig) -> IntArray:
+def _vertices(corners: AnyArray, native: BevGrid, rules: LabelProtocol) -> IntArray:
     """Native column and row that corners (n, 4, 2), x and y (left), metres, are drawn at."""
-    fiery, (low, high, size) = native_orientation(config.rules.warp) == "fiery", config.grid.y
-    along_x = _steps(corners[..., 0], config.grid.x, config)
-    if fiery:
-        return np.stack([_steps(corners[..., 1], config.grid.y, config), along_x], axis=-1)
-    return np.stack([along_x, _steps(-corners[..., 1], (-high, -low, size), config)], axis=-1)
+    x, y = corners[..., 0], corners[..., 1] if rules.right_handed else -corners[..., 1]
+    columns_and_rows = (y, x) if native.orientation == "fiery" else (x, y)
+    axes = reversed(axes_of(native))
+    return np.stack([_steps(values, axis, rules) for values, axis in zip(columns_and_rows, axes, strict=True)], axis=-1)
 
 
-def _steps(values: AnyArray, axis: Axis, config: MotionLabelConfig) -> IntArray:
+def _steps(values: AnyArray, axis: Axis, rules: LabelProtocol) -> IntArray:
     low, _, size = axis
-    if not config.rules.half_cell_shift:
+    if not rules.half_cell_shift:
         cells: AnyArray = np.floor((values.astype(np.float64) - low) / size)
     else:
         first_center, cell = np.float32(low + size / 2), np.float32(size)
         cells = np.rint((values - first_center + cell / np.float32(2)) / cell)
-    return cells.astype(np.int64)
-
-
-def _flow_matrices(motion: Float32Array, config: MotionLabelConfig) -> AnyArray:
-    """For each right-handed motion (n, 6): (n, 4, 4) native points of this frame in the next one's."""
-    rule = config.rules.warp
-    fiery = native_orientation(rule) == "fiery"
-    native = motion if fiery else flip_six_vector(motion)
-    backward = single_precision.inverse(single_precision.pose_matrices(native))
-    if config.augmentation is not None:
-        transform = config.augmentation.matrix if fiery else flip_pose(config.augmentation.matrix)
-        moved = np.broadcast_to(transform.astype(np.float32), backward.shape)
-        backward = single_precision.product(
-            single_precision.product(moved, backward), single_precision.inverse(moved.copy())
-        )
-    return sampling_matrix(backward, rule)
+    return np.clip(cells, -_FAR, _FAR).astype(np.int64)
 
 
 def _following_centers(covered: CoveredCells, next_from_this: AnyArray, config: MotionLabelConfig) -> Float32Array:
     """(T, 1 + ids, 2) centres of the instances at the next frame, warped to each frame; NaN where they are not seen."""
-    columns = config.grid.with_orientation(native_orientation(config.rules.warp)).shape[1]
-    identity = np.zeros((covered.frames, config.grid.cells + 1), dtype=np.int32)  # the last one for OUTSIDE, −1
-    identity[covered.frame, covered.row * columns + covered.column] = covered.identity
+    columns = config.grid.with_orientation(config.rules.native).shape[1]
+    cells = config.grid.cells + 1  # the last one for OUTSIDE, −1
+    identity = np.zeros((covered.frames, cells), dtype=np.int32)
+    identity.reshape(-1)[covered.frame * cells + covered.row * columns + covered.column] = covered.identity
     targets, sources = [], []
     for matrix, following in zip(next_from_this, identity[1:], strict=True):
-        sampled = following.take(nearest_indices(matrix, config.grid, config.rules.warp))
+        sampled = following.take(nearest_indices(matrix, config.grid, config.rules))
         seen = np.flatnonzero(sampled != 0)
         targets.append(seen)
         sources.append(sampled[seen])

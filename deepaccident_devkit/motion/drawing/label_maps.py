@@ -17,7 +17,6 @@ from deepaccident_devkit.arrays import AnyArray, BoolArray, IntArray
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.orientations import cells_in, vectors_in
 from deepaccident_devkit.motion.warps.single_precision import Float32Array
-from deepaccident_devkit.motion.warps.warping import native_orientation
 
 _VANISHED: Final = 104.0
 """exp(−x) is 0 in float32 from here on."""
@@ -101,23 +100,28 @@ def label_maps(
         config: of the labels.
     """
     maps, target = LabelMaps.empty(config), config.grid.orientation
-    native = config.grid.with_orientation(native_orientation(config.rules.warp))
+    native = config.grid.with_orientation(config.rules.native)
     source, shape = native.orientation, native.shape
     row, column = cells_in(covered.row, covered.column, shape, source, target)
     cell = row * config.grid.shape[1] + column
-    maps.segmentation.reshape(-1)[covered.frame * native.cells + cell] = 1
-    maps.instance.reshape(-1)[covered.frame * native.cells + cell] = covered.identity
+    before = covered.frame * native.cells
+    cell += before
+    maps.segmentation.reshape(-1)[cell] = 1
+    maps.instance.reshape(-1)[cell] = covered.identity
+    cell += before  # of two channels
     slot = covered.frame * (1 + covered.ids) + covered.identity
-    own, next_one = (places.reshape(-1, 2)[slot].T for places in (centers, following))
+    place = np.stack([covered.row, covered.column], axis=1).astype(np.float32)
+    own = centers.reshape(-1, 2)
     for raster, vector in (
-        (maps.offset, (own[0] - covered.row, own[1] - covered.column)),
-        (maps.flow, (next_one[0] - own[0], next_one[1] - own[1])),
+        (maps.offset, own.take(slot, axis=0) - place),
+        (maps.flow, (following.reshape(-1, 2) - own).take(slot, axis=0)),
     ):
-        down, along = vectors_in(*vector, source, target)
+        down, along = vectors_in(vector[:, 0], vector[:, 1], source, target)
         known = np.flatnonzero(~np.isnan(down))
-        index = covered.frame[known] * (2 * native.cells) + cell[known]
-        raster.reshape(-1)[index] = down[known]
-        raster.reshape(-1)[index + native.cells] = along[known]
+        index = cell[known]
+        flat = raster.reshape(-1)
+        flat[index] = down[known]
+        flat[index + native.cells] = along[known]
     frame, identity = np.nonzero(~np.isnan(centers[..., 0]))
     peak_row, peak_column = centers[frame, identity].astype(np.int64).T
     peak_row, peak_column = cells_in(peak_row, peak_column, shape, source, target)
@@ -130,8 +134,9 @@ def label_maps(
 
 def _draw_peaks(centerness: AnyArray, frame: IntArray, center: IntArray, sigma: float) -> None:
     """Draw peaks around centres (n, 2), row and column, of frames (n,) into (T, 1, H, W); the higher one counts."""
-    peak = _peak(sigma)
-    reach, shape = len(peak) // 2, centerness.shape[-2:]
+    shape = centerness.shape[-2:]
+    peak = _peak(sigma, max(shape))
+    reach = len(peak) // 2
     first, last = np.maximum(center - reach, 0), np.minimum(center + reach + 1, shape)
     bounds = np.hstack([first, last, first - center + reach, last - center + reach]).tolist()
     for number, (top, left, bottom, right, above, before, below, behind) in zip(frame.tolist(), bounds, strict=True):
@@ -140,9 +145,9 @@ def _draw_peaks(centerness: AnyArray, frame: IntArray, center: IntArray, sigma: 
 
 
 @functools.lru_cache(maxsize=8)
-def _peak(sigma: float) -> Float32Array:
-    """(2 r + 1, 2 r + 1) exp(−d² / σ²) around a centre, in float32 as far as it is above 0."""
-    radius = math.ceil(sigma * math.sqrt(_VANISHED))
+def _peak(sigma: float, farthest: int) -> Float32Array:
+    """(2 r + 1, 2 r + 1) exp(−d² / σ²) around a centre, in float32 as far as it is above 0 and the grid goes."""
+    radius = min(math.ceil(sigma * math.sqrt(_VANISHED)), farthest)
     steps = np.arange(-radius, radius + 1, dtype=np.float32)
     squares = np.add.outer(steps**2, steps**2) / np.float32(sigma**2)
     return np.exp(-squares.astype(np.float64)).astype(np.float32)

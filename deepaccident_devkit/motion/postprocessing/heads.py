@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, checked, readonly
+from deepaccident_devkit.arrays import AnyArray, as_numbers, checked, readonly
 from deepaccident_devkit.errors import ChoiceError, GeometryError
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
 from deepaccident_devkit.motion.labels import MotionLabels
@@ -48,7 +49,7 @@ class MotionHeads:
         frames, _, height, width = segmentation.shape
         if segmentation.size == 0:
             raise GeometryError(f"segmentation: expected at least one frame of one cell, found {segmentation.shape}")
-        centerness = np.asarray(self.centerness)
+        centerness = as_numbers("centerness", self.centerness, dtype=np.float32)
         if centerness.ndim == 3:
             centerness = centerness[:, None]
         centerness = checked("centerness", centerness, (frames, 1, height, width), np.float32)
@@ -66,13 +67,15 @@ class MotionHeads:
     @classmethod
     def from_arrays(
         cls,
-        segmentation: object,
-        centerness: object,
-        offset: object,
-        flow: object,
+        segmentation: ArrayLike,
+        centerness: ArrayLike,
+        offset: ArrayLike,
+        flow: ArrayLike,
         orientation: Orientation = "devkit",
+        *,
+        ignore_index: int | None = None,
     ) -> MotionHeads:
-        """Heads from anything that holds an array: numpy, torch, JAX, lists; shapes as the attributes'.
+        """The same in the order in which models give them; arrays of any framework (`arrays.as_numbers`), and lists.
 
         float32 arrays in the processor's memory are not copied.
 
@@ -81,11 +84,12 @@ class MotionHeads:
             ChoiceError: no such orientation.
         """
         return cls(
-            segmentation=_read("segmentation", segmentation),
-            centerness=_read("centerness", centerness),
-            offset=_read("offset", offset),
-            flow=_read("flow", flow),
+            segmentation=as_numbers("segmentation", segmentation, dtype=np.float32),
+            centerness=as_numbers("centerness", centerness, dtype=np.float32),
+            offset=as_numbers("offset", offset, dtype=np.float32),
+            flow=as_numbers("flow", flow, dtype=np.float32),
             orientation=orientation,
+            ignore_index=ignore_index,
         )
 
     @classmethod
@@ -122,23 +126,6 @@ class MotionHeads:
             orientation=orientation,
             ignore_index=self.ignore_index,
         )
-
-
-def _read(name: str, values: object) -> AnyArray:
-    """Whatever holds an array as one of numbers; raises GeometryError with the remedy."""
-    try:
-        if not hasattr(values, "__array__") and hasattr(values, "__dlpack__"):
-            array: AnyArray = np.from_dlpack(values)
-        else:
-            array = np.asarray(values)
-    except (TypeError, ValueError, RuntimeError, BufferError) as error:
-        raise GeometryError(
-            f"{name}: a {type(values).__name__} cannot be read as an array here ({error}); "
-            "pass a torch tensor as tensor.detach().cpu().float(), another framework's as a numpy array"
-        ) from error
-    if array.dtype.kind not in "fiub":
-        raise GeometryError(f"{name}: expected an array of numbers, found {array.dtype} of shape {array.shape}")
-    return array
 
 
 def _check_values(name: str, values: AnyArray, most: float) -> None:

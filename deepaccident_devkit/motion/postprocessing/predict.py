@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
 from typing import Final, Literal, get_args
 
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, readonly
-from deepaccident_devkit.errors import ChoiceError, ConfigError, GeometryError
+from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
 from deepaccident_devkit.motion.orientations import cells_in, to_orientation
@@ -19,8 +19,12 @@ from deepaccident_devkit.motion.postprocessing.grouping import FrameGroups, find
 from deepaccident_devkit.motion.postprocessing.heads import LABEL_LOGIT, MotionHeads
 from deepaccident_devkit.motion.postprocessing.linking import link_frames
 from deepaccident_devkit.motion.postprocessing.redrawing import first_hulls, redrawn_cells
+from deepaccident_devkit.motion.protocols import LabelProtocol, label_protocol
+from deepaccident_devkit.motion.settings import choice, count, flag, number
 
 Foreground = Literal["argmax", "sigmoid"]
+_BETWEEN: Final = (math.ulp(0.0), math.nextafter(1.0, 0.0))
+_MOST_CENTERS: Final = 2**24
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,20 +59,20 @@ class PostProcessing:
 
     def __post_init__(self) -> None:
         """Check the values; raises ChoiceError or ConfigError."""
-        for name, allowed in {"foreground": get_args(Foreground), "scan": ORIENTATIONS}.items():
-            if getattr(self, name) not in allowed:
-                found = getattr(self, name)
-                raise ChoiceError(f"post-processing: {name} is one of {', '.join(allowed)}, found {found!r}")
-        if not 0 < self.foreground_threshold < 1:
-            raise ConfigError(
-                f"post-processing: foreground_threshold is a probability between 0 and 1, "
-                f"found {self.foreground_threshold!r}"
-            )
-        for name in ("center_threshold", "link_distance"):
-            if not 0 <= getattr(self, name) < np.inf:
-                raise ConfigError(f"post-processing: {name} is a number from 0, found {getattr(self, name)!r}")
-        if type(self.max_centers) is not int or self.max_centers < 1:
-            raise ConfigError(f"post-processing: max_centers is a whole number from 1, found {self.max_centers!r}")
+        values = {
+            "foreground": choice("foreground", self.foreground, get_args(Foreground)),
+            "foreground_threshold": number(
+                "foreground_threshold", self.foreground_threshold, "a probability between 0 and 1", *_BETWEEN
+            ),
+            "labels_bypass_sigmoid": flag("labels_bypass_sigmoid", self.labels_bypass_sigmoid),
+            "center_threshold": number("center_threshold", self.center_threshold, "a number from 0", 0.0),
+            "max_centers": count("max_centers", self.max_centers, "centres of a frame", _MOST_CENTERS),
+            "scan": choice("scan", self.scan, ORIENTATIONS),
+            "link_distance": number("link_distance", self.link_distance, "a number of cells from 0", 0.0),
+            "redraw": flag("redraw", self.redraw),
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
 
 
 POST_PROCESSING: Final[Mapping[str, PostProcessing]] = MappingProxyType(
@@ -146,8 +150,14 @@ def predict_instances(heads: MotionHeads, settings: PostProcessing | str = "moti
 
     Raises:
         ChoiceError: no settings have that name.
+        ConfigError: something else than heads or settings was given.
     """
     rules = post_processing(settings)
+    if not isinstance(heads, MotionHeads):
+        raise ConfigError(
+            f"heads: expected MotionHeads, found {type(heads).__name__}; MotionHeads.from_labels takes labels, "
+            "from_arrays a model's maps"
+        )
     turn = _Turn(heads.segmentation.shape[-2:], heads.orientation, rules.scan)
     centerness = turn.maps(heads.centerness[:, 0])
     peaks = [find_peaks(frame, rules.center_threshold, rules.max_centers) for frame in centerness]
@@ -186,40 +196,47 @@ def predict_instances(heads: MotionHeads, settings: PostProcessing | str = "moti
 
 
 def post_processing(settings: PostProcessing | str) -> PostProcessing:
-    """Settings by their name, or as they are given; raises ChoiceError."""
+    """Settings by their name, or as they are given; raises ChoiceError or ConfigError."""
     if isinstance(settings, PostProcessing):
         return settings
-    if settings not in POST_PROCESSING:
-        raise ChoiceError(f"post-processing: expected one of {', '.join(POST_PROCESSING)}, found {settings!r}")
-    return POST_PROCESSING[settings]
+    if not isinstance(settings, str):
+        raise ConfigError(f"post-processing: expected PostProcessing or the name of one, found {settings!r}")
+    return POST_PROCESSING[choice("post-processing", settings, POST_PROCESSING)]
 
 
-def trajectories(linked: LinkedInstances, grid: BevGrid, *, half_cell_shift: bool = True) -> dict[int, FloatArray]:
+def trajectories(
+    linked: LinkedInstances,
+    grid: BevGrid,
+    protocol: str | LabelProtocol = "released",
+    *,
+    half_cell_shift: bool | None = None,
+) -> dict[int, FloatArray]:
     """The paths of the first frame's instances in metres.
 
     Args:
         linked: from `predict_instances`.
         grid: what the cells cover, in any orientation.
-        half_cell_shift: undo what `LabelProtocol.half_cell_shift` does to labels: cell i stands for the edge between
-            cells i - 1 and i of the settings' `scan` orientation. Say False for a model that learned labels without it.
+        protocol: of the labels, or of those that the model learned. Where it has the `half_cell_shift`, that is undone:
+            a cell stands for the corner that the protocol's native orientation counts it from.
+        half_cell_shift: in place of the protocol's own; with False a cell stands for its middle, whoever drew it.
 
     Returns:
         Id → (n, 2) x forward, y left, metres in the ego frame that the maps are in, at `linked.paths[id].frames`.
 
     Raises:
         GeometryError: the grid has other rows and columns than the instances.
+        ChoiceError: no such protocol.
     """
     shape = grid.with_orientation(linked.orientation).shape
     if linked.instance.shape[1:] != shape:
         raise GeometryError(f"grid: has {shape} cells, but the instances have {linked.instance.shape[1:]}")
-    scan = linked.settings.scan
-    (x_low, _, x_size), (y_low, _, y_size) = grid.x, grid.y
-    within = np.full(2, 0.5)
-    if half_cell_shift:
-        within = np.array([1.0 if scan == "released" else 0.0, 0.0])
-    low, size = np.array([y_low, x_low]), np.array([y_size, x_size])
+    rules = label_protocol(protocol)
+    if half_cell_shift is not None:
+        rules = replace(rules, half_cell_shift=half_cell_shift)
+    within = np.array(rules.place_in_cell)
+    low, size = np.array([(low, size) for low, _, size in (grid.x, grid.y)]).T
     return {
-        name: (low + (_points_in(points, shape, linked.orientation, "devkit") + within) * size)[:, ::-1]
+        name: low + (_points_in(points, shape, linked.orientation, "devkit")[:, ::-1] + within) * size
         for name, points in linked.centers.items()
     }
 

@@ -1,8 +1,8 @@
 """Which transform a frame, a past moment or an agent is warped with: products of the motions in between.
 
-All 6-vectors and matrices that go in are right-handed; what comes out is in the rule's own handedness, as `warping`
-takes it: left-handed for `stretched` and `exact`, right-handed for `fiery`. `stretched` and `fiery` compute in float32
-as their codes do, `exact` in float64.
+All 6-vectors and matrices that go in are right-handed; what comes out has the handedness of the protocol's native
+orientation, as `warping` takes it. The warps `stretched` and `fiery` compute in float32 as their codes do, `exact` in
+float64.
 """
 
 from collections.abc import Callable
@@ -15,9 +15,8 @@ from deepaccident_devkit.arrays import AnyArray, checked
 from deepaccident_devkit.geometry import six_vectors
 from deepaccident_devkit.geometry.handedness import flip_pose, flip_six_vector
 from deepaccident_devkit.motion.augmentation import Augmentation
-from deepaccident_devkit.motion.protocols import WarpRule
+from deepaccident_devkit.motion.protocols import LabelProtocol
 from deepaccident_devkit.motion.warps import single_precision
-from deepaccident_devkit.motion.warps.warping import native_orientation
 from deepaccident_devkit.v2x import future_egomotion
 
 
@@ -34,8 +33,8 @@ _SINGLE = _Arithmetic(
 _DOUBLE = _Arithmetic(six_vectors.to_matrices, np.linalg.inv, np.linalg.inv, np.matmul)
 
 
-def egomotion(world_from_ego: ArrayLike, valid: ArrayLike, rule: WarpRule) -> AnyArray:
-    """An agent's motion from each of its moments to the next, as `v2x.future_egomotion`, in the rule's arithmetic.
+def egomotion(world_from_ego: ArrayLike, valid: ArrayLike, rules: LabelProtocol) -> AnyArray:
+    """An agent's motion from each of its moments to the next, as `v2x.future_egomotion`, in a protocol's arithmetic.
 
     The released code has the poses in float32, and a sample point on a border between cells falls where their last
     bits say.
@@ -43,7 +42,7 @@ def egomotion(world_from_ego: ArrayLike, valid: ArrayLike, rule: WarpRule) -> An
     Args:
         world_from_ego: (T + 1, 4, 4) right-handed poses in the order of time.
         valid: (T + 1,) whether each moment is in the recording.
-        rule: whose arithmetic.
+        rules: whose arithmetic.
 
     Returns:
         (T, 6) right-handed `next_from_this`, float32; zero where a moment or the next is not in the recording.
@@ -51,7 +50,7 @@ def egomotion(world_from_ego: ArrayLike, valid: ArrayLike, rule: WarpRule) -> An
     Raises:
         GeometryError: another shape.
     """
-    if rule == "exact":
+    if rules.warp == "exact":
         return future_egomotion(world_from_ego, valid).astype(np.float32)
     poses = checked("world_from_ego", world_from_ego, (None, 4, 4)).astype(np.float32)
     known = checked("valid", valid, (len(poses),), np.bool_)
@@ -62,12 +61,14 @@ def egomotion(world_from_ego: ArrayLike, valid: ArrayLike, rule: WarpRule) -> An
     return motion
 
 
-def present_from_frames(egomotion: ArrayLike, rule: WarpRule, augmentation: Augmentation | None = None) -> AnyArray:
+def present_from_frames(
+    egomotion: ArrayLike, rules: LabelProtocol, augmentation: Augmentation | None = None
+) -> AnyArray:
     """Transforms of the present and each future frame to the present: C_i = E_0⁻¹ E_1⁻¹ … E_{i−1}⁻¹.
 
     Args:
         egomotion: (T, 6) right-handed, `next_from_this` from the present on; the last row is not used.
-        rule: whose arithmetic and handedness.
+        rules: whose arithmetic and handedness.
         augmentation: of both frames; C becomes A C A⁻¹.
 
     Returns:
@@ -76,15 +77,33 @@ def present_from_frames(egomotion: ArrayLike, rule: WarpRule, augmentation: Augm
     Raises:
         GeometryError: another shape.
     """
-    arithmetic = _arithmetic(rule)
-    this_from_next = arithmetic.rigid_inverse(_native_matrices(egomotion, rule)[:-1])
+    arithmetic = _arithmetic(rules)
+    this_from_next = arithmetic.rigid_inverse(_native_matrices(egomotion, rules)[:-1])
     chain = [np.eye(4, dtype=this_from_next.dtype)]
     for step in this_from_next:
         chain.append(arithmetic.product(chain[-1], step))
-    return _augmented(np.stack(chain), rule, augmentation)
+    return _augmented(np.stack(chain), rules, augmentation)
 
 
-def present_from_past(egomotion: ArrayLike, rule: WarpRule, augmentation: Augmentation | None = None) -> AnyArray:
+def frames_from_next(egomotion: ArrayLike, rules: LabelProtocol, augmentation: Augmentation | None = None) -> AnyArray:
+    """Transforms of each frame's next one to it; the released code inverts these motions otherwise than the chains'.
+
+    Args:
+        egomotion: (T, 6) right-handed, `next_from_this`.
+        rules: whose arithmetic and handedness.
+        augmentation: of both frames; E⁻¹ becomes A E⁻¹ A⁻¹.
+
+    Returns:
+        (T, 4, 4).
+
+    Raises:
+        GeometryError: another shape.
+    """
+    inverse = _arithmetic(rules).inverse(_native_matrices(egomotion, rules))
+    return _augmented(inverse, rules, augmentation)
+
+
+def present_from_past(egomotion: ArrayLike, rules: LabelProtocol, augmentation: Augmentation | None = None) -> AnyArray:
     """Transforms of each past moment to the present.
 
     The released code and FIERY multiply the motions in the order of time, E_0 E_1, and so are wrong from the second
@@ -92,7 +111,7 @@ def present_from_past(egomotion: ArrayLike, rule: WarpRule, augmentation: Augmen
 
     Args:
         egomotion: (P, 6) right-handed, `next_from_this` of the P moments before the present, the oldest first.
-        rule: whose arithmetic, handedness and order.
+        rules: whose arithmetic, handedness and order.
         augmentation: of both frames; the product becomes A · product · A⁻¹.
 
     Returns:
@@ -101,35 +120,36 @@ def present_from_past(egomotion: ArrayLike, rule: WarpRule, augmentation: Augmen
     Raises:
         GeometryError: another shape.
     """
-    arithmetic = _arithmetic(rule)
-    steps = _native_matrices(egomotion, rule)
+    arithmetic = _arithmetic(rules)
+    steps = _native_matrices(egomotion, rules)
     chain = list(steps[-1:])
     for step in steps[-2::-1]:
-        pair = (chain[-1], step) if rule == "exact" else (step, chain[-1])
+        pair = (chain[-1], step) if rules.warp == "exact" else (step, chain[-1])
         chain.append(arithmetic.product(*pair))
-    return _augmented(np.reshape(chain[::-1], steps.shape), rule, augmentation)
+    return _augmented(np.reshape(chain[::-1], steps.shape), rules, augmentation)
 
 
-def ego_from_agents(relative_pose: ArrayLike, rule: WarpRule, augmentation: Augmentation | None = None) -> AnyArray:
+def ego_from_agents(
+    relative_pose: ArrayLike, rules: LabelProtocol, augmentation: Augmentation | None = None
+) -> AnyArray:
     """Transforms (K, 4, 4) of agents' frames to the ego's from right-handed 6-vectors (K, 6); raises GeometryError."""
-    return _augmented(_native_matrices(relative_pose, rule), rule, augmentation)
+    return _augmented(_native_matrices(relative_pose, rules), rules, augmentation)
 
 
-def _arithmetic(rule: WarpRule) -> _Arithmetic:
-    return _DOUBLE if rule == "exact" else _SINGLE
+def _arithmetic(rules: LabelProtocol) -> _Arithmetic:
+    return _DOUBLE if rules.warp == "exact" else _SINGLE
 
 
-def _native_matrices(six: ArrayLike, rule: WarpRule) -> AnyArray:
+def _native_matrices(six: ArrayLike, rules: LabelProtocol) -> AnyArray:
     vectors = checked("egomotion", six, (None, 6))
-    right_handed = native_orientation(rule) == "fiery"
-    return _arithmetic(rule).matrices(vectors if right_handed else flip_six_vector(vectors))
+    return _arithmetic(rules).matrices(vectors if rules.right_handed else flip_six_vector(vectors))
 
 
-def _augmented(transforms: AnyArray, rule: WarpRule, augmentation: Augmentation | None) -> AnyArray:
+def _augmented(transforms: AnyArray, rules: LabelProtocol, augmentation: Augmentation | None) -> AnyArray:
+    """A · transforms · A⁻¹."""
     if augmentation is None or not len(transforms):
         return transforms
-    arithmetic = _arithmetic(rule)
-    right_handed = native_orientation(rule) == "fiery"
-    given = augmentation.matrix if right_handed else flip_pose(augmentation.matrix)
+    arithmetic = _arithmetic(rules)
+    given = augmentation.matrix if rules.right_handed else flip_pose(augmentation.matrix)
     matrix = given[None].astype(transforms.dtype)
     return arithmetic.product(arithmetic.product(matrix, transforms), arithmetic.inverse(matrix))

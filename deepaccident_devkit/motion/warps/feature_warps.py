@@ -3,11 +3,11 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray
+from deepaccident_devkit.arrays import AnyArray, as_numbers, checked
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion.augmentation import Augmentation
-from deepaccident_devkit.motion.protocols import LabelProtocol, WarpRule, label_protocol
+from deepaccident_devkit.motion.protocols import LabelProtocol, label_protocol
 from deepaccident_devkit.motion.warps.chains import ego_from_agents, present_from_past
 from deepaccident_devkit.motion.warps.warping import WarpMode, sampling_matrix, warp
 
@@ -39,12 +39,13 @@ def past_to_present(
         GeometryError: shapes that do not fit.
         ChoiceError: no such protocol or mode.
     """
-    maps, motion = np.asarray(features), np.asarray(egomotion)
-    if motion.ndim != 2 or not 0 < len(maps) <= len(motion) + 1:
+    maps = _maps(features)
+    motion = checked("egomotion", egomotion, (None, 6))
+    if len(maps) > len(motion) + 1:
         raise GeometryError(f"egomotion: expected at least {len(maps) - 1} rows for {len(maps)} maps")
-    rule = label_protocol(protocol).warp
-    transforms = present_from_past(motion[: len(maps) - 1], rule, augmentation)
-    return _warped(maps, list(range(len(maps) - 1)), transforms, rule, grid, mode)
+    rules = label_protocol(protocol)
+    transforms = present_from_past(motion[: len(maps) - 1], rules, augmentation)
+    return _warped(maps, list(range(len(maps) - 1)), transforms, rules, grid, mode)
 
 
 def agents_to_ego(
@@ -61,36 +62,35 @@ def agents_to_ego(
     Args:
         features: (K, …, H, W) maps in the orientation of `grid`, the ego's first.
         relative_pose: (K, 6) right-handed 6-vectors `ego_from_agent`, as `v2x.relative_pose_to_ego` gives them.
-        grid: the maps' cells; the released ones in the devkit's orientation if None.
+        grid: as all that follows, the result and the errors: see `past_to_present`.
         protocol: whose sampling rule.
         mode: how to sample.
         augmentation: the one that all maps have.
-
-    Returns:
-        The same shape; of the same dtype if `nearest`, float32 if `bilinear`.
-
-    Raises:
-        GeometryError: shapes that do not fit.
-        ChoiceError: no such protocol or mode.
     """
-    maps, poses = np.asarray(features), np.asarray(relative_pose)
-    if poses.shape != (len(maps), 6) or not len(maps):
-        raise GeometryError(f"relative_pose: expected shape ({len(maps)}, 6), one row a map, found {poses.shape}")
-    rule = label_protocol(protocol).warp
-    return _warped(maps, list(range(1, len(maps))), ego_from_agents(poses[1:], rule, augmentation), rule, grid, mode)
+    maps = _maps(features)
+    poses = checked("relative_pose", relative_pose, (len(maps), 6))
+    rules = label_protocol(protocol)
+    return _warped(maps, list(range(1, len(maps))), ego_from_agents(poses[1:], rules, augmentation), rules, grid, mode)
+
+
+def _maps(features: ArrayLike) -> AnyArray:
+    maps = as_numbers("features", features, "maps (K, …, H, W)", dtype=None)
+    if maps.ndim < 3 or not len(maps):
+        raise GeometryError(f"features: expected at least one map of shape (K, …, H, W), found {maps.shape}")
+    return maps
 
 
 def _warped(
     maps: AnyArray,
     moved: list[int],
     target_from_source: AnyArray,
-    rule: WarpRule,
+    rules: LabelProtocol,
     grid: BevGrid | None,
     mode: WarpMode,
 ) -> AnyArray:
     """A copy of the maps in which those numbered `moved` are warped, each with its transform."""
     cells = BevGrid() if grid is None else grid
     result = maps.astype(maps.dtype if mode == "nearest" else np.float32)
-    for index, matrix in zip(moved, sampling_matrix(target_from_source, rule), strict=True):
-        result[index] = warp(maps[index], matrix, cells, rule, mode, orientation=cells.orientation)
+    for index, matrix in zip(moved, sampling_matrix(target_from_source, rules), strict=True):
+        result[index] = warp(maps[index], matrix, cells, rules, mode, orientation=cells.orientation)
     return result

@@ -27,16 +27,20 @@ angles in [−π, π] a handful differ.
 def pose_matrices(six: ArrayLike) -> Float32Array:
     """6-vectors (…, 6) → matrices (…, 4, 4): (Rx · Ry) · Rz, what `geometry.six_vectors` does in float64."""
     vector = np.asarray(six, dtype=np.float32)
-    (cx, cy, cz), (sx, sy, sz) = (
-        np.moveaxis(values, -1, 0) for values in (cosine(vector[..., 3:]), sine(vector[..., 3:]))
-    )
+    cosines, sines = cosine(vector[..., 3:]), sine(vector[..., 3:])
+    cx, cy, cz = (cosines[..., axis] for axis in range(3))
+    sx, sy, sz = (sines[..., axis] for axis in range(3))
     xy, yx = sx * sy, cx * sy
-    rows = [
-        [cy * cz, -cy * sz, sy],
-        [xy * cz + cx * sz, cx * cz - xy * sz, -sx * cy],
-        [sx * sz - yx * cz, yx * sz + sx * cz, cx * cy],
-    ]
-    return _rigid(np.stack([np.stack(row, axis=-1) for row in rows], axis=-2), vector[..., :3])
+    rows = (
+        (cy * cz, -cy * sz, sy),
+        (xy * cz + cx * sz, cx * cz - xy * sz, -sx * cy),
+        (sx * sz - yx * cz, yx * sz + sx * cz, cx * cy),
+    )
+    result = _rigid(np.float32(0), vector[..., :3])
+    for row, values in enumerate(rows):
+        for column, value in enumerate(values):
+            result[..., row, column] = value
+    return result
 
 
 def sine(angle: ArrayLike) -> Float32Array:
@@ -104,8 +108,9 @@ def _eliminated(matrix: Float32Array) -> tuple[Float32Array, IntArray]:
     order: IntArray = np.tile(np.arange(4), (len(mixed), 1))
     for step in range(3):
         pivot = step + np.abs(mixed[:, step:, step]).argmax(axis=1)
-        for rows in (mixed, order):
-            rows[count, step], rows[count, pivot] = rows[count, pivot], rows[count, step]
+        if (pivot != step).any():
+            for rows in (mixed, order):
+                rows[count, step], rows[count, pivot] = rows[count, pivot], rows[count, step]
         below = slice(step + 1, None)
         # getrf multiplies by the reciprocal of the pivot, but divides by it in the last step
         if step < 2:
@@ -122,8 +127,8 @@ def _sine_within(radians: FloatArray, half_turns: FloatArray) -> Float32Array:
     return (radians * ratio * np.where(half_turns % 2 == 0, 1.0, -1.0)).astype(np.float32)
 
 
-def _rigid(rotation: NDArray[Any], translation: NDArray[Any]) -> Float32Array:
-    result = np.zeros((*rotation.shape[:-2], 4, 4), dtype=np.float32)
+def _rigid(rotation: NDArray[Any] | np.float32, translation: NDArray[Any]) -> Float32Array:
+    result = np.zeros((*translation.shape[:-1], 4, 4), dtype=np.float32)
     result[..., :3, :3] = rotation
     result[..., :3, 3] = translation
     result[..., 3, 3] = 1

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, FloatArray
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.handedness import flip_pose
 from deepaccident_devkit.motion.config import MotionLabelConfig
@@ -15,7 +15,6 @@ from deepaccident_devkit.motion.warps.warping import (
     WarpMode,
     blend_cells,
     checked_mode,
-    native_orientation,
     rounded_points,
     sample_points,
     sampling_matrix,
@@ -24,17 +23,23 @@ from deepaccident_devkit.motion.warps.warping import (
 
 
 def maps_to_present(
-    maps: Mapping[str, AnyArray], label_egomotion: AnyArray, config: MotionLabelConfig, centerness: WarpMode
+    maps: Mapping[str, AnyArray],
+    label_egomotion: AnyArray,
+    missing: BoolArray,
+    config: MotionLabelConfig,
+    centerness: WarpMode,
 ) -> dict[str, AnyArray]:
     """The maps of `MotionLabels` with every frame warped to the present ego frame; the present itself stays as it is.
 
     Segmentation, instance, offset and flow take the nearest cell's values. The protocol says how (`warp`), what comes
     in from beside the grid (`outside_is_zero`) and whether offset and flow turn with the frame
-    (`vectors_not_rotated`). An augmentation of the configuration counts on both sides: A C A⁻¹ (evaluation.md a).
+    (`vectors_not_rotated`). An augmentation of the configuration counts on both sides: A C A⁻¹ (evaluation.md a). A
+    missing frame that is all `ignore_index` (not `missing_frames_are_empty`) stays so: there is nothing to warp.
 
     Args:
         maps: segmentation, instance, centerness, offset and flow, each frame in its own ego frame.
         label_egomotion: (T, 6) right-handed 6-vectors from the present on.
+        missing: (T,) which frames are not in the recording.
         config: of the labels.
         centerness: how to sample it.
 
@@ -42,21 +47,24 @@ def maps_to_present(
         ChoiceError: no such mode.
     """
     checked_mode(centerness)
-    rule = config.rules.warp
-    transforms = present_from_frames(label_egomotion, rule, config.augmentation)
+    rules = config.rules
+    transforms = present_from_frames(label_egomotion, rules, config.augmentation)
+    ignored = np.zeros_like(missing) if rules.missing_frames_are_empty else missing
     warped = _empty_like(maps)
     for name, given in maps.items():
         warped[name][:1] = given[:1]
-    for frame, matrix in enumerate(sampling_matrix(transforms[1:], rule), start=1):
-        points = sample_points(matrix, config.grid, rule)
-        indices = rounded_points(points, config.grid, rule, config.orientation)
+        warped[name][ignored] = config.ignore_index
+    matrices = sampling_matrix(transforms, rules)
+    for frame in np.flatnonzero(~ignored[1:]) + 1:
+        points = sample_points(matrices[frame], config.grid, rules)
+        indices = rounded_points(points, config.grid, rules, config.grid.orientation)
         source, target = ({name: array[frame] for name, array in each.items()} for each in (maps, warped))
         _warp_instances(source, target, indices, config)
         if centerness == "nearest":
             target["centerness"][...] = _taken(source["centerness"], indices)
         else:
             _blend(source["centerness"], target["centerness"], points, config)
-        if not config.rules.vectors_not_rotated:
+        if not rules.vectors_not_rotated:
             turn = _vector_turn(transforms[frame], config)
             here = target["instance"] != 0
             for name in ("offset", "flow"):
@@ -104,15 +112,13 @@ def _taken(raster: AnyArray, indices: CellIndices) -> AnyArray:
 
 
 def _blend(source: AnyArray, target: AnyArray, points: tuple[AnyArray, AnyArray], config: MotionLabelConfig) -> None:
-    native = native_orientation(config.rules.warp)
-    given, filled = (config.grid.reorient(raster, native) for raster in (source, target))
+    given, filled = (config.grid.reorient(raster, config.rules.native) for raster in (source, target))
     filled[...] = blend_cells(given, points)
 
 
 def _vector_turn(present_from_frame: AnyArray, config: MotionLabelConfig) -> FloatArray:
     """(2, 2) how offset and flow (rows, columns) of a frame turn on the way to the present."""
-    right_handed = native_orientation(config.rules.warp) == "fiery"
-    transform = present_from_frame if right_handed else flip_pose(present_from_frame)
+    transform = present_from_frame if config.rules.right_handed else flip_pose(present_from_frame)
     metres_from_cells = _metres_from_cells(config.grid)
     turn: FloatArray = np.linalg.inv(metres_from_cells) @ transform[:2, :2] @ metres_from_cells
     return turn

@@ -1,19 +1,19 @@
 """Warping a raster into another ego frame: which source cell or point each target cell takes its value from.
 
-Three rules (`WarpRule`), each in its code's own orientation, its *native* one:
+Sampling is counted in a protocol's `native` orientation, with matrices of that orientation's handedness, by one of
+three rules (`WarpRule`):
 
-- `stretched`: the released `FeatureWarper` (evaluation.md a). Rows lie left-handed (orientation `released`). Sample
-  points stand at linspace(−49.75, 50, 200) instead of at the cells' centres, and the outermost of them are taken for
+- `stretched`: the released `FeatureWarper` (evaluation.md a), which is BEVerse's. Sample points stand at
+  linspace(−49.75, 50, 200) along either axis instead of at the cells' centres, and the outermost of them are taken for
   the grid's ends: without motion, cell i samples 0.4975 + 0.9975 i, which nearest sampling rounds to i, and which blurs
   bilinear sampling by up to half a cell. In float32, rounding for rounding, since the last bit decides for points that
   lie on the border between two cells. Grids that are not centred on the ego, where the released code has no meaning,
   are stretched about their own middle.
-- `exact`: cell centres, in float64; without motion every cell gets its own value, in either mode. Orientation
-  `released` too.
-- `fiery`: FIERY's (evaluation.md h). Right-handed, row = x. Cell centres, but of the motion only yaw and planar
-  translation as the 6-vector has them count, and they are put together as
-  source = Rot(−yaw) · target + (−tx, +ty): the sideways shift has the wrong sign, and neither shift is turned.
-  FIERY knows square grids centred on the ego; on others we measure in metres from the ego.
+- `exact`: cell centres, in float64; without motion every cell gets its own value, in either mode.
+- `fiery`: FIERY's (evaluation.md h), native in `fiery`. Cell centres, but of the motion only yaw and planar translation
+  as the 6-vector has them count, and they are put together as source = Rot(−yaw) · target + (−tx, +ty): the sideways
+  shift has the wrong sign, and neither shift is turned. FIERY knows square grids centred on the ego; on others we
+  measure in metres from the ego.
 
 The transform is rigid (or A · rigid · A⁻¹ with an augmentation A); points lie on the plane z = 0, of whose images x and
 y count. `source_from_target` maps points of the frame that the result is in to points of the frame that the raster is
@@ -30,7 +30,8 @@ from deepaccident_devkit.arrays import AnyArray, FloatArray, checked
 from deepaccident_devkit.errors import ChoiceError, GeometryError
 from deepaccident_devkit.geometry import BevGrid, six_vectors
 from deepaccident_devkit.geometry.bev_grid import Axis, Orientation
-from deepaccident_devkit.motion.protocols import WarpRule
+from deepaccident_devkit.motion.orientations import axes_of
+from deepaccident_devkit.motion.protocols import LabelProtocol
 from deepaccident_devkit.motion.warps import single_precision
 from deepaccident_devkit.motion.warps.single_precision import Float32Array
 
@@ -42,35 +43,30 @@ _COUNTABLE: Final = 2**24
 """Cells that float32 can number."""
 
 
-def native_orientation(rule: WarpRule) -> Orientation:
-    """The orientation that a rule's indices and rasters have: `fiery` for `fiery`, `released` for the others."""
-    return "fiery" if rule == "fiery" else "released"
-
-
-def sampling_matrix(target_from_source: ArrayLike, rule: WarpRule) -> AnyArray:
-    """`source_from_target` of transforms (N, 4, 4), as the rule computes it: float32 and by elimination, or float64.
+def sampling_matrix(target_from_source: ArrayLike, rules: LabelProtocol) -> AnyArray:
+    """`source_from_target` of transforms (N, 4, 4), as the protocol computes it: float32, by elimination, or float64.
 
     Raises:
         GeometryError: another shape.
     """
-    if rule == "stretched":
+    if rules.warp == "stretched":
         return single_precision.inverse(checked("target_from_source", target_from_source, (None, 4, 4), np.float32))
     result: FloatArray = np.linalg.inv(checked("target_from_source", target_from_source, (None, 4, 4)))
     return result
 
 
 def nearest_indices(
-    source_from_target: ArrayLike, grid: BevGrid, rule: WarpRule, *, orientation: Orientation | None = None
+    source_from_target: ArrayLike, grid: BevGrid, rules: LabelProtocol, *, orientation: Orientation | None = None
 ) -> CellIndices:
     """The source cell of each target cell.
 
     Points half-way between two cells go to the even one.
 
     Args:
-        source_from_target: (4, 4) metres, in the rule's handedness.
+        source_from_target: (4, 4) metres, in the protocol's handedness.
         grid: the cells of both rasters; its own orientation does not matter.
-        rule: how to sample.
-        orientation: how the rasters lie that the indices are for; None for the rule's native orientation.
+        rules: the protocol that says how to sample.
+        orientation: how the rasters lie that the indices are for; None for the protocol's native orientation.
 
     Returns:
         (H·W,) intp, row · W + column of the source cell, in the order of the target's cells; −1 (`OUTSIDE`) where the
@@ -79,11 +75,11 @@ def nearest_indices(
     Raises:
         GeometryError: the matrix has another shape or is not finite, or the grid has more than 2²⁴ cells.
     """
-    return rounded_points(sample_points(source_from_target, grid, rule), grid, rule, orientation)
+    return rounded_points(sample_points(source_from_target, grid, rules), grid, rules, orientation)
 
 
 def rounded_points(
-    points: tuple[AnyArray, AnyArray], grid: BevGrid, rule: WarpRule, orientation: Orientation | None = None
+    points: tuple[AnyArray, AnyArray], grid: BevGrid, rules: LabelProtocol, orientation: Orientation | None = None
 ) -> CellIndices:
     """`nearest_indices` from the sample points."""
     if grid.cells > _COUNTABLE:
@@ -93,7 +89,7 @@ def rounded_points(
     beside = (row < 0) | (row >= rows)
     beside |= column < 0
     beside |= column >= columns
-    native = native_orientation(rule)
+    native = rules.native
     lying = native if orientation is None else orientation
     first, down, along = _numbering(grid.with_orientation(lying), native)
     row *= down
@@ -109,7 +105,7 @@ def warp(
     raster: ArrayLike,
     source_from_target: ArrayLike,
     grid: BevGrid,
-    rule: WarpRule,
+    rules: LabelProtocol,
     mode: WarpMode = "nearest",
     *,
     fill: float = 0,
@@ -119,12 +115,12 @@ def warp(
 
     Args:
         raster: (…, H, W) in `orientation`.
-        source_from_target: (4, 4) metres, in the rule's handedness.
+        source_from_target: (4, 4) metres, in the protocol's handedness.
         grid: the cells; its own orientation does not matter.
-        rule: how to sample.
+        rules: the protocol that says how to sample.
         mode: the value of the nearest cell, or of the four around the sample point, weighted.
         fill: what stands beside the grid; it mixes with the border's cells where the mode is bilinear.
-        orientation: how the rasters lie; None for the rule's native orientation. Only cells change places.
+        orientation: how the rasters lie; None for the protocol's native orientation. Only cells change places.
 
     Returns:
         The same shape and orientation; of the same dtype if `nearest`, float32 if `bilinear`.
@@ -133,15 +129,15 @@ def warp(
         GeometryError: a shape that does not fit, or a matrix that is not finite.
         ChoiceError: no such mode.
     """
-    native = native_orientation(rule)
+    native = rules.native
     lying = grid.with_orientation(orientation or native)
     source = np.asarray(raster)
     by_native_rows = lying.reorient(source, native)  # a view; refuses other shapes
     if checked_mode(mode) == "nearest":
-        indices = nearest_indices(source_from_target, grid, rule, orientation=orientation)
+        indices = nearest_indices(source_from_target, grid, rules, orientation=orientation)
         return take_cells(source.reshape(*source.shape[:-2], -1), indices, fill).reshape(source.shape)
     result = np.empty(source.shape, dtype=np.float32)
-    points = sample_points(source_from_target, grid, rule)
+    points = sample_points(source_from_target, grid, rules)
     lying.reorient(result, native)[...] = blend_cells(by_native_rows, points, fill)
     return result
 
@@ -186,7 +182,7 @@ def checked_mode(mode: WarpMode) -> WarpMode:
     return mode
 
 
-def sample_points(source_from_target: ArrayLike, grid: BevGrid, rule: WarpRule) -> tuple[AnyArray, AnyArray]:
+def sample_points(source_from_target: ArrayLike, grid: BevGrid, rules: LabelProtocol) -> tuple[AnyArray, AnyArray]:
     """Where in the source each target cell samples: rows and columns (H, W), in cells, 0 the first cell's centre.
 
     Native orientation; float32, but float64 if `exact`. Raises GeometryError.
@@ -194,37 +190,46 @@ def sample_points(source_from_target: ArrayLike, grid: BevGrid, rule: WarpRule) 
     matrix = checked("source_from_target", source_from_target, (4, 4))
     if not np.isfinite(matrix).all():
         raise GeometryError("source_from_target: not all numbers are finite; leave out frames without a pose")
-    if rule == "stretched":
-        return _stretched_points(matrix.astype(np.float32), grid)
-    return _exact_points(matrix, grid) if rule == "exact" else _fiery_points(matrix, grid)
+    if rules.warp == "fiery":
+        return _fiery_points(matrix, grid)
+    native = grid.with_orientation(rules.native)
+    if rules.warp == "exact":
+        return _exact_points(matrix, native)
+    return _stretched_points(matrix.astype(np.float32), native)
 
 
 def _stretched_points(matrix: Float32Array, grid: BevGrid) -> tuple[AnyArray, AnyArray]:
-    axes = _left_handed_y(grid), grid.x
-    y, x = (_released_coordinates(axis) for axis in axes)
+    axes = axes_of(grid)
+    values = [_released_coordinates(axis) for axis in axes]
     points = []
-    for (low, high, _), values, (mx, my, _, shift) in zip(axes, (y, x), (matrix[1], matrix[0]), strict=True):
-        point = np.add.outer(my * y, mx * x)
+    for (low, high, _), (down, along, shift), steps in zip(axes, _plane(matrix, grid), values, strict=True):
+        point = np.add.outer(down * values[0], along * values[1])
         point += shift
         middle, half = (low + high) / 2, (high - low) / 2
         if middle:
             point -= np.float32(middle)
         point /= np.float32(half)
         point += np.float32(1)
-        point *= np.float32((len(values) - 1) / 2)
+        point *= np.float32((len(steps) - 1) / 2)
         points.append(point)
     return points[0], points[1]
 
 
 def _exact_points(matrix: FloatArray, grid: BevGrid) -> tuple[AnyArray, AnyArray]:
-    axes = _left_handed_y(grid), grid.x
-    y, x = (_centers(axis) for axis in axes)
+    axes = axes_of(grid)
+    values = [_centers(axis) for axis in axes]
     points = []
-    for (low, _, size), (mx, my, _, shift) in zip(axes, (matrix[1], matrix[0]), strict=True):
-        point = np.add.outer(my / size * y, mx / size * x)
+    for (low, _, size), (down, along, shift) in zip(axes, _plane(matrix, grid), strict=True):
+        point = np.add.outer(down / size * values[0], along / size * values[1])
         point += (shift - low) / size - 0.5
         points.append(point)
     return points[0], points[1]
+
+
+def _plane(matrix: AnyArray, grid: BevGrid) -> AnyArray:
+    """(2, 3) what the plane z = 0 keeps of a matrix, metres along rows and columns: their factors and the shift."""
+    order = [0, 1] if grid.orientation == "fiery" else [1, 0]
+    return matrix[order][:, [*order, 3]]
 
 
 def _fiery_points(matrix: FloatArray, grid: BevGrid) -> tuple[AnyArray, AnyArray]:
@@ -260,11 +265,6 @@ def _numbering(grid: BevGrid, native: Orientation) -> tuple[int, int, int]:
     first, below, beside = (int(corner) for corner in (numbers[0, 0], numbers[-1, 0], numbers[0, -1]))
     rows, columns = (max(count - 1, 1) for count in numbers.shape)
     return first, (below - first) // rows, (beside - first) // columns
-
-
-def _left_handed_y(grid: BevGrid) -> Axis:
-    low, high, size = grid.y
-    return -high, -low, size
 
 
 @functools.lru_cache(maxsize=64)

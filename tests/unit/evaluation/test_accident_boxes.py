@@ -110,7 +110,9 @@ def test_moments_can_be_asked_for() -> None:
     strict = replace(BOXES, scoring=Scoring(time_tolerance=0.5))
     assert tallies(result(late, CRASH)) == [(1, 0, 0)] * 3
     assert tallies(result(late, CRASH, strict)) == [(0, 1, 1)] * 3
-    assert tallies(result([alarm(time=2.5)], CRASH, strict)) == [(1, 0, 0)] * 3
+    decimals = truth_of(np.linspace(3, 0, 7), seconds=0.6)
+    assert tallies(result([alarm(time=1.1)], decimals, strict)) == [(1, 0, 0)] * 3
+    assert tallies(result([alarm(time=1.15)], decimals, strict)) == [(0, 1, 1)] * 3
 
 
 def test_what_the_recording_cannot_refute_is_not_judged() -> None:
@@ -146,8 +148,16 @@ def test_maps_are_one_alarm_as_sure_as_the_share_of_them_that_see_it() -> None:
         assert [(one["score"], one["time"], one["id"]) for one in counts["alarms"]] == [(0.5, 0, 0)]
         assert counts["alarms"][0]["position"] == pytest.approx(0.5)
     assert counted(as_maps(calm), CRASH)["alarms"] == []
+    other = scene({1: standing(20, 12), 2: [(x, 12.0) for x, _ in cars[2]]})
+    assert counted(as_maps(right, other), CRASH)["alarms"][0]["position"] == pytest.approx(4.5, abs=0.5)  # the mean's
+    assert counted(as_maps(other, right), CRASH)["alarms"][0]["position"] == pytest.approx(0.5)
     strangers = {1: standing(20, 30), 2: [(15.5 - gap, 30.0) for gap in (10, 7.5, 5, 2.5, 0)]}
     assert counted(as_maps(scene(strangers)), CRASH)["alarms"][0]["id"] == 1
+
+
+def test_tracks_at_the_frames_of_maps() -> None:
+    center = truth_of(np.linspace(2, 0, 16)).tracks(0.5, 5).center
+    assert_allclose(center[:, 1, 0], [14, 14 + 2 / 3, 14 + 4 / 3, 16, np.nan])
 
 
 def test_maps_are_not_cut_at_the_end_of_the_recording() -> None:

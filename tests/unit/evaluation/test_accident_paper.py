@@ -9,9 +9,10 @@ from numpy.testing import assert_allclose
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
 from deepaccident_devkit.evaluation.accident.evaluator import AccidentEvaluator
+from deepaccident_devkit.evaluation.accident.matching import match_tracks
 from deepaccident_devkit.evaluation.accident.paper import PaperAccidents
 from deepaccident_devkit.evaluation.accident.protocol import AccidentContext
-from deepaccident_devkit.evaluation.accident.reading import AccidentReading, accident_of
+from deepaccident_devkit.evaluation.accident.reading import AccidentReading, InstanceTracks, accident_of
 from deepaccident_devkit.evaluation.accident.scoring import Scoring, position_difference
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
 from deepaccident_devkit.geometry import BevGrid
@@ -126,7 +127,9 @@ def test_the_better_pairing_of_positions_counts() -> None:
 def test_the_limit_and_the_missed_one_are_choices() -> None:
     label, predicted = scene(HIT), as_maps(scene(moved(HIT, y=2.5)))
     assert tallies(result(predicted, label, replace(PAPER, scoring=Scoring(limit_counts=True))))[0] == (1, 0, 0)
-    assert tallies(result(predicted, label, replace(PAPER, scoring=Scoring(far_is_missed=False))))[0] == (0, 1, 0)
+    lenient = replace(PAPER, scoring=Scoring(far_is_missed=False))
+    assert tallies(result(predicted, label, lenient))[0] == (0, 1, 0)
+    assert tallies(result(as_maps(scene(CALM)), label, lenient))[0] == (0, 0, 1)
 
 
 def test_one_seen_only_by_the_third_of_six_predictions() -> None:
@@ -139,6 +142,8 @@ def test_one_seen_only_by_the_third_of_six_predictions() -> None:
         assert made.beside["sample_choice=mean_first"].position_error == 2
         assert tallies(result(output, label, replace(PAPER, predicted_by="mean"))) == [(0, 0, 1)] * 3
         assert tallies(result(output, calm)) == [(0, 1, 0)] * 3
+    only_mean = as_maps(calm, label)
+    assert tallies(result(only_mean, label, replace(PAPER, predicted_by="mean"))) == [(1, 0, 0)] * 3
 
 
 def test_which_of_several_predictions_is_compared() -> None:
@@ -180,6 +185,15 @@ def test_instances_beyond_the_gate_are_no_match() -> None:
     assert result(near, label).id_error == 0
     assert result(far, label).id_error == 1
     assert result(far, label, replace(PAPER, match_distance=5.0)).id_error == 0
+
+
+def test_pairs_beyond_the_gate_use_nobody_up() -> None:
+    """1 is 3 m from 7 and 5 m from 8; 2 stands on 7 and is 3 m from 8: the least sum of all would leave 1 alone."""
+    truth = InstanceTracks(identity=np.array([7, 8]), center=np.array([[[0.0, 0.0], [3.0, 0.0]]]))
+    x = -7 / 6
+    predicted = InstanceTracks(identity=np.array([1, 2]), center=np.array([[[x, math.sqrt(9 - x * x)], [0.0, 0.0]]]))
+    assert match_tracks(predicted, truth, 4.0) == {1: 7, 2: 8}
+    assert match_tracks(predicted, truth, 6.0) == {1: 8, 2: 7}
 
 
 def test_ties() -> None:
@@ -238,6 +252,16 @@ def test_points_and_lines_have_distances_too() -> None:
     found = accident_of(maps, grid, RELEASED, AccidentReading(danger_distance=2.0))
     assert found.contact.ids == (5, 7)
     assert found.contact.distance == pytest.approx(math.sqrt(5) / 2)
+
+
+def test_a_metre_across_is_no_accident_either() -> None:
+    """A line of direction (3, 4) and a cell exactly two cells from it; their bounding boxes are nearer."""
+    maps = np.zeros((1, 200, 200), dtype=np.int32)
+    maps[0, [100, 104, 108], [100, 103, 106]] = 1
+    maps[0, 102, 99] = 2
+    found = accident_of(maps, BevGrid(), RELEASED, AccidentReading(danger_distance=1.01))
+    assert found.contact.distance == 1
+    assert accident_of(maps, BevGrid(), RELEASED, AccidentReading()).contact is None
 
 
 def test_whole_cells_are_nearer_by_a_cell() -> None:

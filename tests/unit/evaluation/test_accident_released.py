@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from accident_scenes import FRAMES, as_heads, as_maps, scene, standing
 
-from deepaccident_devkit.errors import ChoiceError, EvaluationError
+from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
 from deepaccident_devkit.evaluation.accident import PROTOCOLS, AccidentContext, AccidentEvaluator
 from deepaccident_devkit.evaluation.accident.drawn_paths import DrawnPaths, paths_of_heads, paths_of_instances
 from deepaccident_devkit.evaluation.accident.released import ReleasedAccidents, accident_counts, collision
@@ -66,7 +66,9 @@ def test_instance_maps_are_drawn_like_heads() -> None:
     assert (from_maps.drawn > 0).sum() == (from_heads.drawn > 0).sum()
     np.testing.assert_array_equal(from_maps.drawn > 0, from_heads.drawn > 0)
     assert set(np.unique(present)) == {0, 1, 2, 3}
-    assert tallies(counts(as_maps(*[label] * 6), label)) == [TRUE] * 3
+    found = counts(as_maps(*[label] * 6), label)
+    assert tallies(found) == [TRUE] * 3
+    assert found["position"] == pytest.approx([0] * 3, abs=1e-5)  # means of float32 and of float64
 
 
 @pytest.mark.parametrize("given", [as_heads, as_maps])
@@ -159,23 +161,17 @@ def test_others_in_the_accident_are_an_id_error() -> None:
 
 def test_paths_go_on_faster_and_faster() -> None:
     """A path that ends in frame 2 of 5 with a step of 3 m goes 3 + 6 m further, not 3 + 3 m."""
-    cars = {**HIT, 2: [(4, 10), (7, 10), (10, 10), None, None]}
-    predicted, grid = as_heads(scene(cars)), scene(HIT).config.grid
-    [path] = [
-        path
-        for path in paths_of_heads(predicted.heads[0], grid, POST_PROCESSING["accident"])[0].paths.values()
-        if len(path) == 3
-    ]
-    truth = DrawnPaths(
-        paths={1: np.tile([20.0, 10], (FRAMES, 1)), 2: np.tile([17.0, 10], (FRAMES, 1))}, drawn=touching()
-    )
-    for accelerating, x in ((True, 19.0), (False, 16.0)):
+    heads = MotionHeads.from_labels(scene({1: [(4, 10), (7, 10), (10, 10), None, None]}))
+    ending, _ = paths_of_heads(heads, BevGrid(), POST_PROCESSING["accident"])
+    x, y = ending.paths[1][-1]
+    other = np.tile([0.0, 0.0], (FRAMES, 1))
+    truth = DrawnPaths(paths={1: np.tile([x + 6, y], (FRAMES, 1)), 2: other}, drawn=touching())
+    for accelerating, off in ((True, 3), (False, 0)):
         rules = replace(RELEASED, accelerating=accelerating)
-        ours = rules._padded(DrawnPaths(paths={1: truth.paths[1], 2: path}, drawn=touching()), FRAMES)
-        assert ours.paths[2][-1, 0] == pytest.approx(x)
-        found, pair = accident_counts([ours], truth, [[(1, 1), (2, 2)]], rules, 0.5)
+        predicted = rules._padded(DrawnPaths(paths={1: ending.paths[1], 2: other}, drawn=touching()), FRAMES)
+        found, pair = accident_counts([predicted], truth, [[(1, 1), (2, 2)]], rules, 0.5)
         assert pair == (1, 2)
-        assert found["position"] == pytest.approx([abs(x - 17)] * 3)
+        assert found["position"] == pytest.approx([off] * 3)
 
 
 def touching() -> np.ndarray:
@@ -315,6 +311,10 @@ def test_what_cannot_be_evaluated() -> None:
         counts(MotionOutput(grid=label.config.grid, instances=label.instance[None, :3]), label)
     with pytest.raises(EvaluationError, match="grid"):
         counts(MotionOutput(grid=BevGrid((-51, 49, 0.5)), instances=label.instance[None]), label)
+    with pytest.raises(ConfigError, match="errors_at: expected one of"):
+        replace(RELEASED, errors_at=7.0)
+    with pytest.raises(ConfigError, match="prediction_gap"):
+        replace(RELEASED, prediction_gap=math.nan)
     with pytest.raises(ChoiceError, match="released, paper, boxes"):
         AccidentEvaluator("official")
     assert set(PROTOCOLS) == {"released", "paper", "boxes"}

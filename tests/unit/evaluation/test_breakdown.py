@@ -64,6 +64,9 @@ class Shares(Evaluator[Share]):
     def settings(self) -> dict[str, Any]:
         return {}
 
+    def update(self, token: str, *arguments: Any) -> None:
+        self.add(token, {"hit": arguments[0]})
+
     def result_of(self, counts: Collection[Counts]) -> Share:
         hits = total(counts, "hit")
         return Share(hits=int(hits), share=ratio(hits, len(counts)))

@@ -9,6 +9,7 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError, GeometryError, NotAvailableError
+from deepaccident_devkit.evaluation.breakdown import numbers_of
 from deepaccident_devkit.evaluation.detection import (
     DETECTION_PROTOCOLS,
     DetectedBoxes,
@@ -21,7 +22,7 @@ from deepaccident_devkit.evaluation.detection import (
 )
 from deepaccident_devkit.evaluation.detection.curves import recall_scores
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
+from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID
 
 SIZE = (4.0, 2.0, 1.5)
 PROTOCOLS = sorted(DETECTION_PROTOCOLS)
@@ -241,6 +242,15 @@ def test_saved_counts_go_on(protocol: str, tmp_path: Path) -> None:
         DetectionEvaluator(protocol, thresholds=(0.25,), error_threshold=None, small_thresholds=None).resume(
             tmp_path / "counts.json"
         )
+
+
+def test_what_intervals_are_drawn_of() -> None:
+    numbers = numbers_of(two_samples().compute())
+    assert set(numbers) == {
+        "mean_average_precision",
+        *(f"class_average_precision/{name}" for name in CATEGORIES),
+        *(f"mean_errors/{name}" for name in ("ATE", "ASE", "AOE", "AVE")),
+    }
 
 
 def test_a_sample_with_two_results_is_an_error() -> None:

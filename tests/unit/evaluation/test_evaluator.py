@@ -2,32 +2,16 @@
 
 import json
 import math
-from collections.abc import Collection
 from itertools import permutations
 from pathlib import Path
-from typing import Any
 
 import pytest
+from evaluating import Sums
 
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio, total
+from deepaccident_devkit.evaluation.evaluator import Evaluator, ratio
 
 VALUES = {"a": 1e16, "b": 1.0, "c": -1e16, "d": 0.1}
-
-
-class Sums(Evaluator[float]):
-    """The sum of a number."""
-
-    def __init__(self, scale: float = 1.0) -> None:
-        super().__init__()
-        self.scale = scale
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        return {"scale": self.scale}
-
-    def result_of(self, counts: Collection[Counts]) -> float:
-        return self.scale * total(counts, "value")
 
 
 def filled(tokens: str, scale: float = 1.0) -> Sums:
@@ -92,14 +76,85 @@ def test_a_run_of_other_settings_does_not_go_on(tmp_path: Path) -> None:
         Sums(scale=2.0).resume(path)
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", json.dumps({"settings": {}, "counts": 3, "repeated": []})])
+def test_a_run_of_another_evaluator_or_version_does_not_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Others(Sums):
+        """Same settings, other counts."""
+
+    path = filled("a").save(tmp_path / "state.json")
+    with pytest.raises(EvaluationError, match=r"was saved by Sums of devkit .*, this is Others of .*; begin anew"):
+        Others().resume(path)
+    monkeypatch.setattr("deepaccident_devkit.evaluation.evaluator.__version__", "99")
+    with pytest.raises(EvaluationError, match=r"was saved by .*, this is Sums of devkit 99"):
+        Sums().resume(path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        "{}",
+        json.dumps({"made_by": "", "settings": {}, "counts": 3, "repeated": []}),
+        json.dumps({"made_by": "", "settings": {}, "counts": {"a": 3}, "repeated": []}),
+    ],
+)
 def test_a_damaged_state_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "state.json"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(EvaluationError, match=r"state\.json: no saved evaluation .*begin anew"):
         Sums().resume(path)
+    path.write_bytes(filled("abcd").save(path).read_bytes()[:-9])
+    with pytest.raises(EvaluationError, match="no saved evaluation"):
+        Sums().resume(path)
     with pytest.raises(EvaluationError, match="nowhere"):
         Sums().resume(tmp_path / "nowhere")
+
+
+def test_a_place_that_cannot_be_written_is_our_error(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(EvaluationError, match=r"cannot be saved .*choose another file"):
+        filled("a").save(tmp_path / "file" / "state.json")
+
+
+class TestBatches:
+    def test_a_batch_is_its_samples(self) -> None:
+        evaluator = Sums()
+        evaluator.update_batch(["a", "b"], [1.0, 2.0], (10.0, 20.0))
+        evaluator.update_batch(["c"], [4.0])
+        evaluator.update_batch([], [])
+        assert dict(evaluator.counts) == {"a": {"value": 11.0}, "b": {"value": 22.0}, "c": {"value": 4.0}}
+
+    @pytest.mark.parametrize("columns", [[[1.0]], [[1.0, 2.0], [3.0]], [[1.0, 2.0, 3.0]]])
+    def test_columns_of_other_lengths(self, columns: list[list[float]]) -> None:
+        evaluator = Sums()
+        with pytest.raises(EvaluationError, match=r"batch: 2 tokens, and column [01] after them has [13] entries"):
+            evaluator.update_batch(["a", "b"], *columns)
+        assert not len(evaluator)
+
+    def test_one_token_is_no_batch(self) -> None:
+        with pytest.raises(EvaluationError, match="expected a sequence of them, found the text 'ab'"):
+            Sums().update_batch("ab", [1.0, 2.0])
+
+    def test_samples_that_a_distributed_sampler_repeats(self) -> None:
+        """Each process gets as many samples: some twice, in one process or in two."""
+        first, second = Sums(), Sums()
+        first.update_batch(["a", "b", "a"], [1.0, 2.0, 1.0])
+        second.update_batch(["c", "b"], [4.0, 2.0])
+        assert first.repeated == {"a"}
+        merged = first.merge(second)
+        assert (merged.compute(), merged.repeated, len(merged)) == (7.0, {"a", "b"}, 3)
+
+    def test_a_repeated_sample_with_another_result(self) -> None:
+        evaluator = Sums()
+        with pytest.raises(EvaluationError, match="a: evaluated twice, with different results"):
+            evaluator.update_batch(["a", "b", "a", "c"], [1.0, 2.0, 3.0, 4.0])
+        assert (evaluator.tokens, evaluator.repeated) == ({"a", "b"}, set())
+
+
+def test_a_fresh_one_is_of_the_same_settings() -> None:
+    evaluator = filled("ab", scale=3.0)
+    fresh: Evaluator[float] = evaluator.fresh()
+    assert (len(fresh), len(evaluator), fresh.settings) == (0, 2, evaluator.settings)
 
 
 def test_counts_are_a_view() -> None:

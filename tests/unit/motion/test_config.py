@@ -8,11 +8,12 @@ import pytest
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, PRESETS, Augmentation, MotionLabelConfig
+from deepaccident_devkit.motion.config import label_config
 
 
 def test_the_default_is_the_released_labels_in_the_devkits_orientation() -> None:
     config = MotionLabelConfig()
-    assert (config.label_frames, config.frames, config.orientation) == (5, 7, "devkit")
+    assert (config.label_frames, config.frames, config.grid.orientation) == (5, 7, "devkit")
     assert list(config.offsets) == [-10, -5, 0, 5, 10, 15, 20]
     assert config.rules == LABEL_PROTOCOLS["released"]
     assert config == MotionLabelConfig.preset("deepaccident")
@@ -22,30 +23,50 @@ def test_presets() -> None:
     for seconds in (3, 4, 5):
         assert MotionLabelConfig.preset(f"deepaccident-{seconds}s").label_frames == 1 + 2 * seconds
     fiery = MotionLabelConfig.preset("fiery", future_frames=2)
-    assert (fiery.orientation, fiery.grid.orientation, fiery.draw_ego, fiery.label_frames) == (
-        "fiery",
-        "fiery",
-        False,
-        3,
-    )
+    assert (fiery.grid.orientation, fiery.draw_ego, fiery.label_frames) == ("fiery", False, 3)
     assert MotionLabelConfig.preset("beverse").only_vehicle
     assert {name: MotionLabelConfig.preset(name) for name in PRESETS} == dict(PRESETS)
 
 
-def test_orientation_is_the_grids_unless_it_is_given() -> None:
-    grid = BevGrid(orientation="fiery")
-    assert MotionLabelConfig(grid=grid).orientation == "fiery"
-    assert MotionLabelConfig(grid=grid, orientation="released").grid.orientation == "released"
+def test_the_orientation_is_the_grids_and_a_new_grid_brings_its_own() -> None:
+    fiery, released = BevGrid(orientation="fiery"), BevGrid(orientation="released")
+    assert MotionLabelConfig(grid=fiery).grid is fiery
+    config = MotionLabelConfig(grid=fiery, orientation="released")
+    assert (config.grid, config.orientation) == (released, None)
+    assert replace(config, grid=fiery).grid == fiery
+    assert replace(config, grid=BevGrid()).grid == BevGrid()
+    assert replace(config, orientation="fiery").grid == fiery
+    assert replace(config, future_frames=2).grid == released
+
+
+def test_a_presets_orientation_is_kept_unless_the_grid_or_the_caller_says_otherwise() -> None:
+    oblong = BevGrid((-20, 20, 0.5))
+    assert MotionLabelConfig.preset("fiery", grid=oblong).grid == oblong.with_orientation("fiery")
+    released = oblong.with_orientation("released")
+    assert MotionLabelConfig.preset("fiery", grid=released).grid == released
+    assert MotionLabelConfig.preset("fiery", grid=released, orientation="devkit").grid == oblong
+    assert MotionLabelConfig.preset("fiery", grid=oblong, orientation="devkit").grid == oblong
+    assert MotionLabelConfig.preset("deepaccident", grid=released).grid == released
 
 
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"future_frames": 0}, "future_frames: expected a whole number from 1, found 0; labels of motion need"),
-        ({"receptive_field": 0}, "receptive_field: expected a whole number from 1"),
-        ({"step": 2.5}, "step: expected a whole number from 1, found 2.5; recorded frames between label frames"),
-        ({"ignore_index": 0}, "ignore_index: expected a whole number from 1, found 0; a mark"),
-        ({"sigma": 0}, "sigma: 0 is no radius; choose"),
+        ({"future_frames": 0}, r"future_frames: expected a whole number from 1 to 1,000 \(frames to come.*found 0"),
+        ({"future_frames": 10**9}, "found 1000000000"),
+        ({"receptive_field": True}, "receptive_field: expected a whole number from 1 .* found True"),
+        ({"step": 2.5}, r"step: expected a whole number from 1 to 1,000 \(recorded frames .* found 2.5"),
+        ({"ignore_index": 0}, "ignore_index: expected a whole number from 1 to 255 .*, found 0"),
+        ({"ignore_index": 256}, "ignore_index: .* found 256"),
+        ({"ignore_index": 199}, "199 may also be a number of cells in offset and flow; choose 200 to 255"),
+        ({"sigma": 0}, "sigma: expected cells from 0.01 to 10,000, such as 3, found 0"),
+        ({"sigma": "3"}, "sigma: .* found '3'"),
+        ({"sigma": np.nan}, "sigma: .* found nan"),
+        ({"draw_ego": "no"}, "draw_ego: expected True or False, found 'no'"),
+        ({"only_vehicle": 1}, "only_vehicle: expected True or False, found 1"),
+        ({"grid": None}, "grid: expected a BevGrid, found None"),
+        ({"grid": (-50, 50, 0.5)}, r"grid: expected a BevGrid, found \(-50"),
+        ({"augmentation": "flip"}, "augmentation: expected an Augmentation or None, found 'flip'"),
     ],
 )
 def test_what_cannot_be_is_refused_with_the_remedy(changes, sentence) -> None:
@@ -60,8 +81,18 @@ def test_unknown_words_are_refused() -> None:
         MotionLabelConfig.preset("fiery", futureframes=3)
     with pytest.raises(ChoiceError, match="protocol: expected one of released, clean, beverse, fiery, found 'paper'"):
         MotionLabelConfig(protocol="paper")
-    with pytest.raises(ChoiceError, match=r"drawn_when is one of .*, found 'later'"):
+    with pytest.raises(ChoiceError, match=r"drawn_when: expected one of present, .*, found 'later'"):
         replace(LABEL_PROTOCOLS["clean"], drawn_when="later")
+    for protocol in (3, ["clean"], None):
+        with pytest.raises(ChoiceError, match="protocol: expected one of released"):
+            MotionLabelConfig(protocol=protocol)
+    with pytest.raises(ConfigError, match="half_cell_shift: expected True or False, found 1"):
+        replace(LABEL_PROTOCOLS["clean"], half_cell_shift=1)
+    with pytest.raises(ConfigError, match="warp 'fiery' is counted in native 'fiery', found 'released'"):
+        replace(LABEL_PROTOCOLS["released"], warp="fiery")
+    for agents in ("nobody", ["pole"], [], 5, "ego_vehicle"):
+        with pytest.raises(ChoiceError, match="agents: expected"):
+            MotionLabelConfig(agents=agents)
     with pytest.raises(ConfigError, match="is not a whole number of cells"):
         MotionLabelConfig(grid=BevGrid((-50, 50, 0.3)))
 
@@ -82,10 +113,64 @@ def test_a_digest_tells_configurations_apart_by_what_they_draw() -> None:
     assert pickle.loads(pickle.dumps(config)) == config
 
 
+@pytest.mark.parametrize(
+    ("mine", "theirs"),
+    [
+        ({"sigma": 3}, {"sigma": np.float32(3)}),
+        ({"ignore_index": np.uint8(255)}, {}),
+        ({"draw_ego": np.True_}, {}),
+        ({"protocol": "clean"}, {"protocol": LABEL_PROTOCOLS["clean"]}),
+        ({"protocol": replace(LABEL_PROTOCOLS["clean"], warp="exact")}, {"protocol": "clean"}),
+        ({"agents": ["ego_vehicle"]}, {"agents": ("ego_vehicle",)}),
+        ({"orientation": "fiery"}, {"grid": BevGrid(orientation="fiery")}),
+        ({"grid": BevGrid((-50, 50, 0.5))}, {}),
+        ({"augmentation": Augmentation(scale=1)}, {"augmentation": Augmentation(scale=np.float64(1))}),
+    ],
+)
+def test_the_same_said_otherwise_is_equal_and_has_the_same_digest(mine, theirs) -> None:
+    one, other = MotionLabelConfig(**mine), MotionLabelConfig(**theirs)
+    assert one == other
+    assert hash(one) == hash(other)
+    assert one.digest == other.digest
+    assert MotionLabelConfig.from_dict(json.loads(json.dumps(one.as_dict()))) == one
+
+
+def test_a_callers_list_of_agents_is_not_kept() -> None:
+    agents = ["ego_vehicle"]
+    config = MotionLabelConfig(agents=agents)
+    agents.append("infrastructure")
+    assert config.agents == ("ego_vehicle",)
+
+
+def test_presets_and_protocols_cannot_be_changed() -> None:
+    for table in (PRESETS, LABEL_PROTOCOLS):
+        with pytest.raises(TypeError, match="does not support item assignment"):
+            table["mine"] = table["fiery"]
+
+
+def test_a_configuration_may_be_named() -> None:
+    assert label_config("fiery") == PRESETS["fiery"]
+    assert label_config(None) == MotionLabelConfig()
+    assert label_config(PRESETS["beverse"]) is PRESETS["beverse"]
+    with pytest.raises(ConfigError, match="config: expected a MotionLabelConfig or the name of a preset, found 3"):
+        label_config(3)
+
+
+def test_on_grids_of_more_than_255_cells_the_mark_is_255() -> None:
+    grid = BevGrid((-100, 100, 0.5))
+    assert MotionLabelConfig(grid=grid).ignore_index == 255
+    with pytest.raises(ConfigError, match="choose 255 to 255"):
+        MotionLabelConfig(grid=grid, ignore_index=254)
+
+
 def test_an_augmentation_turns_then_scales_then_mirrors() -> None:
     moved = Augmentation(rotation=np.pi / 2, scale=2, flip=True).matrix @ [1, 0, 3, 1]
     np.testing.assert_allclose(moved, [0, -2, 6, 1], atol=1e-12)
-    with pytest.raises(ConfigError, match="augmentation: scale is 0; choose a factor above 0"):
+    with pytest.raises(ConfigError, match="augmentation: scale: expected a factor above 0, 1 for none, found 0"):
         Augmentation(scale=0)
-    with pytest.raises(ConfigError, match="augmentation: rotation is nan; choose finite radians"):
+    with pytest.raises(ConfigError, match="augmentation: rotation: expected finite radians, found nan"):
         Augmentation(rotation=np.nan)
+    with pytest.raises(ConfigError, match="augmentation: flip: expected True or False, found 'no'"):
+        Augmentation(flip="no")
+    with pytest.raises(ConfigError, match="augmentation: rotation: expected finite radians, found 'x'"):
+        Augmentation(rotation="x")

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from deepaccident_devkit.errors import GeometryError
+from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import SE3, BevGrid
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, OWN_BOX_ID, Augmentation, MotionLabelConfig
 from deepaccident_devkit.motion.drawing.box_polygons import box_polygons
 from deepaccident_devkit.motion.drawing.from_boxes import FrameBoxes, motion_labels_from_boxes
+from deepaccident_devkit.motion.orientations import to_orientation
 
 STILL = np.zeros((7, 6))
 RELEASED, CLEAN = LABEL_PROTOCOLS["released"], LABEL_PROTOCOLS["clean"]
@@ -127,6 +128,18 @@ def test_half_a_cell_more_or_less() -> None:
         assert (found[:, 0].min(), found[:, 0].max()) == rows
 
 
+def test_beverse_rounds_in_its_own_right_handed_frame() -> None:
+    """BEVerse draws corners at round((x + 50) / 0.5), round((y + 50) / 0.5); its y points left."""
+    for y in (0.3, 0.2, -0.3, 5.4):
+        drawn = labels([frame((2.2, y, 7, 0, 1))] * 5, protocol="beverse", draw_ego=False).instance[0]
+        found = np.argwhere(drawn)
+        for axis, (low, high) in enumerate(((y - 1, y + 1), (0.2, 4.2))):
+            rounded = [round((edge + 50) / 0.5) for edge in (low, high)]
+            assert [found[:, axis].min(), found[:, axis].max()] == rounded
+    released = labels([frame((2.2, 0.3, 7, 0, 1))] * 5, draw_ego=False).instance[0]
+    assert np.argwhere(released)[:, 0].min() == 199 - round((0.7 + 50) / 0.5)
+
+
 def test_untracked_rows_are_one_or_each_its_own() -> None:
     frames = [frame((0, 10, -1, 0, 1), (0, 20, -1, 0, 1), (0, 30, 5, 0, 1))] * 5
     shared = labels(frames, draw_ego=False)
@@ -149,6 +162,68 @@ def test_ids_go_on_where_another_sample_left_off() -> None:
     assert continued.id_map == {5: 1, 9: 2, 3: 3}
     assert given == {5: 1, 9: 2}
     assert set(np.unique(continued.instance)) == {0, 2, 3}
+
+
+def test_ids_go_on_only_where_the_protocol_keeps_them() -> None:
+    frames = [frame((0, 10, 9, 0, 1))] * 5
+    for protocol in ("clean", "beverse"):
+        with pytest.raises(ConfigError, match="count from 1 in every sample; leave it out, or choose a protocol with"):
+            motion_labels_from_boxes(frames, STILL, MotionLabelConfig(protocol=protocol), id_map={9: 4})
+    kept = replace(CLEAN, ids_kept_between_samples=True)
+    made = motion_labels_from_boxes(frames, STILL, MotionLabelConfig(protocol=kept), id_map={np.int64(9): np.int32(4)})
+    assert made.id_map == {9: 4}
+    for wrong in ({"a": 2}, {3: -4}, {7: 0}, {3: 1.5}, [3]):
+        with pytest.raises(ConfigError, match="id_map: expected"):
+            motion_labels_from_boxes(frames, STILL, id_map=wrong)
+
+
+@pytest.mark.parametrize("protocol", sorted(LABEL_PROTOCOLS))
+def test_missing_frames_are_the_same_at_the_present(protocol) -> None:
+    """Frames 3 and 4 are beyond the recording, and the ego turns up to there."""
+    turning = STILL.copy()
+    turning[2:4] = (-6, 0, 0, 0, 0, -0.2)
+    made = labels([*[frame((5, 5, 1, 0, 1))] * 3, None, None], turning, protocol=protocol)
+    for mode in ("nearest", "bilinear"):
+        present = made.to_present(mode)
+        assert present.instance[2].any()
+        for name in ("segmentation", "instance", "centerness"):
+            values = 0 if protocol == "released" else 255
+            assert (getattr(present, name)[3:] == values).all()
+        if protocol != "released":
+            assert (present.offset[3:] == 255).all()
+            assert (present.flow[3:] == 255).all()
+
+
+def test_a_frame_that_is_not_valid_is_missing() -> None:
+    frames = [frame((5, 5, 1, 0, 1))] * 5
+    made = motion_labels_from_boxes(frames, STILL, "beverse", valid=[True] * 6 + [False])
+    assert made.label_valid.tolist() == [True] * 4 + [False]
+    assert (made.instance[4] == 255).all()
+    gone = motion_labels_from_boxes([*frames[:4], None], STILL, valid=[True] * 7)
+    assert gone.label_valid.tolist() == [True] * 4 + [False]
+
+
+def test_a_small_mark_is_no_vector() -> None:
+    """On a grid of 8 cells the mark may be 8; a row's step of 7 and one component that is 8 beside another are kept."""
+    vectors = np.array([[[[8, 8, 7]]], [[[8, 3, 8]]]], dtype=np.float32).reshape(1, 2, 1, 3)
+    turned = to_orientation(vectors, vectors=True, source="released", target="devkit", ignore=8)
+    assert turned.reshape(2, 3).tolist() == [[8, -8, -7], [8, 3, 8]]
+
+
+def test_huge_peaks_and_far_boxes() -> None:
+    made = labels([frame((0, 0, 1, 0, 1))] * 5, sigma=10_000, draw_ego=False)
+    assert made.centerness.min() > 0.999
+    for protocol in LABEL_PROTOCOLS:
+        far = labels([frame((1e30, 0, 1, 0, 1), (0, 0, 2, 0, 1))] * 5, protocol=protocol, draw_ego=False)
+        assert np.unique(far.instance).tolist() == [0, 2]
+
+
+def test_callers_arrays_are_not_kept() -> None:
+    motion, valid = STILL.astype(np.float32), np.ones(7, dtype=bool)
+    made = motion_labels_from_boxes([frame()] * 5, motion, valid=valid)
+    motion[:], valid[:] = 7, False
+    assert not made.future_egomotion.any()
+    assert made.valid.all()
 
 
 def test_missing_frames_are_empty_or_ignored() -> None:
@@ -211,3 +286,9 @@ def test_what_does_not_fit_is_refused_with_the_remedy() -> None:
         replace(frame(), yaw=np.zeros(1))
     with pytest.raises(GeometryError, match=r"FrameBoxes.center: row 1 is not finite"):
         frame((0, 0, 1, 0, 1), (0, np.nan, 2, 0, 1))
+    with pytest.raises(GeometryError, match=r"FrameBoxes.center: expected shape \(N, 3\), found \(\)"):
+        replace(frame(), center=5)
+    with pytest.raises(GeometryError, match=r"FrameBoxes.ego_from_lidar: row 0 is not finite; a frame without"):
+        replace(frame(), ego_from_lidar=np.full((4, 4), np.nan))
+    with pytest.raises(GeometryError, match="frames: expected FrameBoxes, or None beyond the recording, found 'a'"):
+        labels(["a"] * 5)

@@ -53,7 +53,7 @@ CONFIGS = {
     "everybody": MotionLabelConfig(filter_invisible=False),
     "released orientation": MotionLabelConfig(orientation="released"),
     "clean, as fiery": MotionLabelConfig(protocol="clean", orientation="fiery", draw_ego=False),
-    "fiery, as released": MotionLabelConfig.preset("fiery", orientation="released", ignore_index=1),
+    "fiery, as released": MotionLabelConfig.preset("fiery", orientation="released", ignore_index=201),
     "oblong": MotionLabelConfig(grid=OBLONG, receptive_field=1, future_frames=2, step=2),
     "oblong, as fiery": MotionLabelConfig(grid=OBLONG, orientation="fiery", protocol="clean"),
     "large": MotionLabelConfig(grid=BevGrid((-100.0, 100.0, 0.5), (-100.0, 100.0, 0.5)), future_frames=1),

@@ -156,7 +156,15 @@ def test_trajectories_undo_the_half_cell() -> None:
     assert_array_equal(turned.centers[1], [[24, 8]])
     assert_allclose(trajectories(turned, grid)[1], [[-6.0, 7.5]])
     native = predict_instances(heads.in_orientation("fiery"), "fiery")
-    assert_allclose(trajectories(native, grid)[1], [[-6.0, 7.0]])
+    for protocol, place in {
+        "released": [-6.0, 7.5],
+        "clean": [-5.75, 7.25],
+        "beverse": [-6.0, 7.0],
+        "fiery": [-6.0, 7.0],
+    }.items():
+        for linked in (turned, native):
+            assert_allclose(trajectories(linked, grid, protocol)[1], [place])
+            assert_allclose(trajectories(linked, grid, protocol, half_cell_shift=False)[1], [[-5.75, 7.25]])
     with pytest.raises(GeometryError, match=r"grid: has \(30, 20\) cells, but the instances have \(30, 40\)"):
         trajectories(turned, BevGrid(x=(0, 10, 0.5), y=(-5, 10, 0.5)))
 
@@ -178,16 +186,23 @@ def test_settings_that_cannot_be() -> None:
     assert post_processing("motion") == PostProcessing()
     with pytest.raises(ChoiceError, match="post-processing: expected one of motion, accident, fiery, found 'vpq'"):
         predict_instances(drawn({}), "vpq")
-    with pytest.raises(ChoiceError, match="foreground is one of argmax, sigmoid, found 'softmax'"):
+    with pytest.raises(ChoiceError, match="foreground: expected one of argmax, sigmoid, found 'softmax'"):
         PostProcessing(foreground="softmax")
-    with pytest.raises(ChoiceError, match="scan is one of devkit, released, fiery, found 'left'"):
+    with pytest.raises(ChoiceError, match="scan: expected one of devkit, released, fiery, found 'left'"):
         PostProcessing(scan="left")
     with pytest.raises(ConfigError, match=r"a probability between 0 and 1, found 40"):
         PostProcessing(foreground_threshold=40)
-    with pytest.raises(ConfigError, match="link_distance is a number from 0, found nan"):
+    with pytest.raises(ConfigError, match="link_distance: expected a number of cells from 0, found nan"):
         PostProcessing(link_distance=float("nan"))
-    with pytest.raises(ConfigError, match="max_centers is a whole number from 1, found True"):
+    with pytest.raises(ConfigError, match=r"max_centers: expected a whole number from 1 .*, found True"):
         PostProcessing(max_centers=True)
+    with pytest.raises(ConfigError, match="redraw: expected True or False, found 1"):
+        PostProcessing(redraw=1)
+    with pytest.raises(ConfigError, match="expected PostProcessing or the name of one, found None"):
+        predict_instances(drawn({}), None)
+    with pytest.raises(ConfigError, match=r"heads: expected MotionHeads, found dict; MotionHeads.from_labels"):
+        predict_instances({})
+    assert PostProcessing(max_centers=np.int64(100), link_distance=10) == PostProcessing()
 
 
 class Tensor:
@@ -220,15 +235,19 @@ def test_heads_come_from_anything_that_holds_an_array() -> None:
     expected = predict_instances(heads).instance
     for wrap in (np.asarray, np.ndarray.tolist, Tensor, OnlyDlpack, lambda array: array.astype(np.float16)):
         assert_array_equal(predict_instances(MotionHeads.from_arrays(*map(wrap, maps))).instance, expected)
+        names = ("segmentation", "centerness", "offset", "flow")
+        by_name = MotionHeads(**{name: wrap(values) for name, values in zip(names, maps, strict=True)})
+        assert_array_equal(predict_instances(by_name).instance, expected)
     assert np.shares_memory(MotionHeads.from_arrays(*maps).offset, maps[2])
+    assert MotionHeads.from_arrays(*maps, ignore_index=255).ignore_index == 255
 
 
 def test_heads_that_cannot_be() -> None:
     good = np.zeros((2, 2, 3, 4), dtype=np.float32)
     heat = good[:, :1]
-    with pytest.raises(GeometryError, match=r"flow: a Tensor cannot .*detach\(\)\.cpu\(\)"):
+    with pytest.raises(GeometryError, match=r"flow: expected numbers, found Tensor .*detach\(\)\.cpu\(\)"):
         MotionHeads.from_arrays(good, heat, good, Tensor(good, RuntimeError("Can't call numpy() on Tensor that …")))
-    with pytest.raises(GeometryError, match=r"offset: expected an array of numbers, found <U1"):
+    with pytest.raises(GeometryError, match=r"offset: expected numbers, found ndarray \(no numbers: <U1\)"):
         MotionHeads.from_arrays(good, heat, good.astype("U1"), good)
     with pytest.raises(GeometryError, match=r"segmentation: expected shape \(N, 2, N, N\), found \(2, 3, 3, 4\)"):
         MotionHeads.from_arrays(np.zeros((2, 3, 3, 4)), heat, good, good)

@@ -103,7 +103,7 @@ def by_public_calls(release: DeepAccident, record: dict, config: MotionLabelConf
             )
         )
     there = [token is not None for token in tokens]
-    motion = egomotion(poses, there, config.rules.warp)
+    motion = egomotion(poses, there, config.rules)
     is_vehicle = record["agent"] != "infrastructure"
     return motion_labels_from_boxes(frames, motion, config, valid=there[:-1], is_vehicle=is_vehicle)
 

@@ -7,7 +7,7 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
-from deepaccident_devkit.motion import samples
+from deepaccident_devkit.motion import evaluation_samples, samples
 from deepaccident_devkit.taxonomy import AGENTS
 
 
@@ -52,6 +52,30 @@ def test_a_split_belongs_to_its_scenarios_alone(da_motion: DeepAccident, tmp_pat
     assert {token.rsplit("/", 2)[0] for token in samples(da_motion, tmp_path / "one.txt", "all")} == {one}
 
 
+def test_evaluation_samples_are_those_of_the_purpose_to_evaluate(da_motion: DeepAccident, every_scenario: Path) -> None:
+    tokens = samples(da_motion, every_scenario, "evaluate")
+    assert tokens
+    assert evaluation_samples(da_motion, every_scenario) == tokens
+    assert da_motion.evaluation_samples(every_scenario, "released") == tokens
+    far = samples(da_motion, every_scenario, "evaluate", "paper", horizon=3.0, scope="all")
+    assert da_motion.evaluation_samples(every_scenario, "paper", horizon=3.0, scope="all") == far
+    with pytest.raises(ConfigError, match="protocol='paper'"):
+        evaluation_samples(da_motion, every_scenario, horizon=3.0)
+
+
+def test_a_split_that_was_not_unpacked_says_so(da_motion: DeepAccident) -> None:
+    here = {record["split"] for record in da_motion.scenario}
+    [absent] = {"train", "val"} - here
+    with pytest.raises(NotAvailableError, match=rf"{absent}: no scenario of this split is in .*; unpack that part"):
+        samples(da_motion, absent)
+
+
+@pytest.mark.parametrize("horizon", ["2", None, [2.0]])
+def test_a_horizon_is_a_number(da_motion: DeepAccident, horizon: object) -> None:
+    with pytest.raises(ConfigError, match="horizon: expected a number of seconds"):
+        samples(da_motion, "train", "evaluate", "paper", horizon=horizon)  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
@@ -83,5 +107,5 @@ def test_a_split_without_labels_says_so(own_release: Path) -> None:
     unlabelled = DeepAccident("v1", own_release, verbose=False)
     split = own_release / "mine.txt"
     split.write_text(unlabelled.scenario[0]["token"].replace("/", " ") + "\n")
-    with pytest.raises(NotAvailableError, match="labels"):
+    with pytest.raises(NotAvailableError, match="none of its samples here has labels"):
         samples(unlabelled, split)

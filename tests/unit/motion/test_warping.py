@@ -11,13 +11,15 @@ from deepaccident_devkit.geometry import BevGrid, six_vectors
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.labels import MotionLabels
+from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS, LabelProtocol
 from deepaccident_devkit.motion.warps import single_precision
 from deepaccident_devkit.motion.warps.chains import present_from_frames, present_from_past
 from deepaccident_devkit.motion.warps.feature_warps import agents_to_ego, past_to_present
 from deepaccident_devkit.motion.warps.warping import nearest_indices, sampling_matrix, warp
 
 GRID = BevGrid((-4, 4, 1), (-4, 4, 1))
-RULES = pytest.mark.parametrize("rule", ["stretched", "exact", "fiery"])
+RELEASED, CLEAN, FIERY = (LABEL_PROTOCOLS[name] for name in ("released", "clean", "fiery"))
+RULES = pytest.mark.parametrize("rules", LABEL_PROTOCOLS.values(), ids=LABEL_PROTOCOLS)
 ORIENTATIONS = pytest.mark.parametrize("orientation", ["devkit", "released", "fiery"])
 ONE_AHEAD = [1.0, 0, 0, 0, 0, 0]
 QUARTER_LEFT = [0, 0, 0, 0, 0, np.pi / 2]
@@ -55,43 +57,43 @@ def test_fierys_sideways_shift_has_the_wrong_sign() -> None:
 
 
 @RULES
-def test_indices_outside_are_minus_one_and_warps_fill_there(rule: Any) -> None:
+def test_indices_outside_are_minus_one_and_warps_fill_there(rules: LabelProtocol) -> None:
     far = np.eye(4)
     far[0, 3] = 1e7
-    assert_array_equal(nearest_indices(far, GRID, rule), np.full(64, -1))
+    assert_array_equal(nearest_indices(far, GRID, rules), np.full(64, -1))
     for mode in ("nearest", "bilinear"):
-        assert_array_equal(warp(np.ones((2, 8, 8)), far, GRID, rule, mode, fill=7), np.full((2, 8, 8), 7))  # type: ignore[arg-type]
+        assert_array_equal(warp(np.ones((2, 8, 8)), far, GRID, rules, mode, fill=7), np.full((2, 8, 8), 7))  # type: ignore[arg-type]
 
 
 @RULES
-def test_oblong_grids_that_are_not_centred_keep_their_cells_where_nothing_moves(rule: Any) -> None:
+def test_oblong_grids_that_are_not_centred_keep_their_cells_where_nothing_moves(rules: LabelProtocol) -> None:
     for grid in (BevGrid((0, 30, 0.5), (-10, 20, 1.5)), BevGrid((-1, 0, 1), (-20, 20, 0.1))):
         for orientation in (None, "devkit", "released", "fiery"):
             assert_array_equal(
-                nearest_indices(np.eye(4), grid, rule, orientation=orientation), np.arange(grid.cells), str(grid)
+                nearest_indices(np.eye(4), grid, rules, orientation=orientation), np.arange(grid.cells), str(grid)
             )
 
 
 def test_released_bilinear_sampling_blurs_without_motion_and_the_exact_one_does_not() -> None:
     raster = np.random.default_rng(0).random(GRID.shape).astype(np.float32)
-    assert_array_equal(warp(raster, np.eye(4), GRID, "exact", "bilinear"), raster)
-    blurred = warp(raster, np.eye(4), GRID, "stretched", "bilinear")
+    assert_array_equal(warp(raster, np.eye(4), GRID, CLEAN, "bilinear"), raster)
+    blurred = warp(raster, np.eye(4), GRID, RELEASED, "bilinear")
     assert not np.allclose(blurred, raster, atol=0.05)
-    assert warp(raster.astype(np.int16), np.eye(4), GRID, "stretched").dtype == np.int16
+    assert warp(raster.astype(np.int16), np.eye(4), GRID, RELEASED).dtype == np.int16
 
 
 def test_what_does_not_fit_is_refused() -> None:
     raster = np.zeros(GRID.shape)
     with pytest.raises(GeometryError, match=r"raster: expected shape \(…, 8, 8\), found \(8, 7\)"):
-        warp(raster[:, :7], np.eye(4), GRID, "exact")
+        warp(raster[:, :7], np.eye(4), GRID, CLEAN)
     with pytest.raises(GeometryError, match=r"source_from_target: expected shape \(4, 4\)"):
-        warp(raster, np.eye(3), GRID, "exact")
+        warp(raster, np.eye(3), GRID, CLEAN)
     with pytest.raises(GeometryError, match="not all numbers are finite"):
-        warp(raster, np.full((4, 4), np.nan), GRID, "stretched")
+        warp(raster, np.full((4, 4), np.nan), GRID, RELEASED)
     with pytest.raises(ChoiceError, match="mode: expected nearest or bilinear, found 'cubic'"):
-        warp(raster, np.eye(4), GRID, "exact", "cubic")  # type: ignore[arg-type]
+        warp(raster, np.eye(4), GRID, CLEAN, "cubic")  # type: ignore[arg-type]
     with pytest.raises(GeometryError, match="more than a warp can number"):
-        nearest_indices(np.eye(4), BevGrid((-50, 50, 0.02), (-50, 50, 0.02)), "exact")
+        nearest_indices(np.eye(4), BevGrid((-50, 50, 0.02), (-50, 50, 0.02)), CLEAN)
     with pytest.raises(GeometryError, match="egomotion: expected at least 2 rows for 3 maps"):
         past_to_present(np.zeros((3, 8, 8)), np.zeros((1, 6)), grid=GRID)
     with pytest.raises(GeometryError, match=r"relative_pose: expected shape \(3, 6\)"):
@@ -100,13 +102,13 @@ def test_what_does_not_fit_is_refused() -> None:
 
 def test_past_motions_are_multiplied_in_the_order_of_time_as_released_and_rightly_if_exact() -> None:
     first, second = ONE_AHEAD, QUARTER_LEFT
-    exact = present_from_past([first, second], "exact")
-    released = present_from_past([first, second], "stretched")
+    exact = present_from_past([first, second], CLEAN)
+    released = present_from_past([first, second], RELEASED)
     # left-handed: turning is the other way round
     ahead, turn = six_vectors.to_matrices(first), six_vectors.to_matrices(np.negative(second))
     np.testing.assert_allclose(exact, [turn @ ahead, turn], atol=1e-12)
     np.testing.assert_allclose(released, [ahead @ turn, turn], atol=1e-6)
-    assert present_from_past(np.zeros((0, 6)), "stretched").shape == (0, 4, 4)
+    assert present_from_past(np.zeros((0, 6)), RELEASED).shape == (0, 4, 4)
 
 
 def test_one_moment_alone_and_the_ego_alone_stay_as_they_are() -> None:
@@ -133,7 +135,7 @@ def test_single_precision_inverses_are_inverses() -> None:
             single_precision.product(inverse(matrices), matrices), np.tile(np.eye(4), (50, 1, 1)), atol=1e-5
         )
     scaled = matrices * np.float32([[1.05], [-1.05], [1.05], [1]])
-    np.testing.assert_allclose(sampling_matrix(scaled, "stretched") @ scaled, np.tile(np.eye(4), (50, 1, 1)), atol=1e-5)
+    np.testing.assert_allclose(sampling_matrix(scaled, RELEASED) @ scaled, np.tile(np.eye(4), (50, 1, 1)), atol=1e-5)
 
 
 def test_sines_are_torchs_and_not_the_nearest_float32() -> None:
@@ -160,7 +162,7 @@ def make_labels(config: MotionLabelConfig, step: list[float]) -> MotionLabels:
     """One cell of an instance, 2.5 m ahead and 0.5 m to the left of each frame's own ego, which moves by `step`."""
     frames = config.label_frames
     mask = np.broadcast_to(at(2.5, 0.5, config.grid) > 0, (frames, *config.grid.shape))
-    ahead = {"devkit": (0, 1), "released": (0, 1), "fiery": (1, 0)}[str(config.orientation)]
+    ahead = {"devkit": (0, 1), "released": (0, 1), "fiery": (1, 0)}[config.grid.orientation]
     vectors = np.where(mask[:, None], np.reshape(ahead, (1, 2, 1, 1)), config.ignore_index).astype(np.float32)
     return MotionLabels(
         config=config,
@@ -221,7 +223,7 @@ def test_labels_at_the_present_are_not_warped_again() -> None:
 
 
 def test_a_chain_of_frames_starts_at_the_identity() -> None:
-    chain = present_from_frames([ONE_AHEAD, QUARTER_LEFT, ONE_AHEAD], "fiery")
+    chain = present_from_frames([ONE_AHEAD, QUARTER_LEFT, ONE_AHEAD], FIERY)
     assert chain.dtype == np.float32
     assert_array_equal(chain[0], np.eye(4))
     np.testing.assert_allclose(chain[1][:3, 3], [-1, 0, 0])

@@ -79,7 +79,7 @@ _BATCHES: Final[Mapping[str, _Batch]] = {
 
 
 def to_batch(labels: Mapping[str, AnyArray], config: MotionLabelConfig, names: BatchNames) -> dict[str, AnyArray]:
-    """Our maps, `future_egomotion` and `valid` under a code's names, as its sample has them; new or read-only arrays.
+    """Our maps, `future_egomotion` and `valid` under a code's names, as its sample has them; new, writable arrays.
 
     Raises:
         ChoiceError: no such code.
@@ -94,21 +94,19 @@ def to_batch(labels: Mapping[str, AnyArray], config: MotionLabelConfig, names: B
             target=batch.orientation,
             ignore=config.ignore_index,
         )
-        if values.dtype.kind in "iu":
-            values = values.astype(np.int64)
         if batch.past_frames:
             empty = config.ignore_index if ours in VECTOR_MAPS else 0
             past = np.full((config.receptive_field - 1, *values.shape[1:]), empty, dtype=values.dtype)
             values = np.concatenate([past, values])
             if ours == "segmentation":
                 values = values[:, None]
-        result[batch.names[ours]] = np.ascontiguousarray(values)
+        result[batch.names[ours]] = np.array(values, dtype=np.int64 if values.dtype.kind in "iu" else None, order="C")
     motion = labels["future_egomotion"]
-    result[batch.names["future_egomotion"]] = (
-        flip_six_vector(motion).astype(np.float32) if batch.left_handed else motion
+    result[batch.names["future_egomotion"]] = np.array(
+        flip_six_vector(motion) if batch.left_handed else motion, dtype=np.float32
     )
     if batch.validity:
-        result["img_is_valid"] = labels["valid"]
+        result["img_is_valid"] = np.array(labels["valid"])
         result["has_invalid_frame"] = np.array(not labels["valid"].all())
     return result
 
@@ -117,7 +115,7 @@ def from_batch(batch: Mapping[str, Any], config: MotionLabelConfig, names: Batch
     """Our maps, `future_egomotion` and `valid` of one sample of a code; what `to_batch` gives, back.
 
     Args:
-        batch: a sample, without a batch axis, of arrays or tensors on the processor.
+        batch: a sample, without a batch axis, of any framework's arrays (`arrays.as_numbers`).
         config: what the labels were made with.
         names: whose names they are.
 

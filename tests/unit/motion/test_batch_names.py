@@ -6,8 +6,8 @@ from deepaccident_devkit.errors import ChoiceError, ConfigError, FieldError, Geo
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.handedness import flip_six_vector
 from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels
+from deepaccident_devkit.motion.batch_names import HEADS, MAPS, config_from_names
 from deepaccident_devkit.motion.drawing.from_boxes import FrameBoxes, motion_labels_from_boxes
-from deepaccident_devkit.motion.names import HEADS, MAPS, config_from_names
 
 NAMES = ("fiery", "beverse", "deepaccident")
 
@@ -40,6 +40,16 @@ def test_a_batch_read_back_is_the_same_labels(names, orientation) -> None:
         assert_array_equal(getattr(back, name), getattr(labels, name))
         assert getattr(back, name).dtype == getattr(labels, name).dtype
     assert_array_equal(back.valid, labels.valid if names != "fiery" else np.ones(7))
+
+
+@pytest.mark.parametrize("orientation", ["devkit", "released", "fiery"])
+@pytest.mark.parametrize("names", NAMES)
+def test_a_batch_is_ones_own(names, orientation) -> None:
+    labels = made(orientation=orientation)
+    for array in labels.as_batch(names).values():
+        array[...] = 7
+    assert_array_equal(labels.instance, made(orientation=orientation).instance)
+    assert_array_equal(labels.future_egomotion, made(orientation=orientation).future_egomotion)
 
 
 def test_fierys_batch() -> None:

@@ -1,0 +1,61 @@
+"""`MotionProtocol`: what decides the motion metrics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Final
+
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.evaluation.trajectory_errors import TrajectoryRules
+from deepaccident_devkit.evaluation.trajectory_matching import GATE
+from deepaccident_devkit.evaluation.vpq import VpqRules
+from deepaccident_devkit.motion import POST_PROCESSING, PostProcessing
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MotionProtocol:
+    """What decides the motion metrics; the defaults are the released ones (evaluation.md b, c and d).
+
+    Attributes:
+        ranges: metres: sides of the squares around the ego in which IoU and VPQ are counted.
+        instances: how instances are read off heads for VPQ.
+        paths: how they are read off heads, and off labels, for minADE, minFDE and miss rate. The released code has
+            these errors from the accident evaluation, which links and cuts out instances by other rules.
+        vpq: which matches count.
+        accelerating_paths: the released slip of `trajectory_matching.padded`.
+        gate: metres, as of `match_trajectories`.
+        trajectories: limits of the errors, and a slip.
+        nothing_is_zero: IoU and VPQ of samples with nothing to count are 0; else NaN.
+    """
+
+    ranges: tuple[float, ...] = (30.0, 100.0)
+    instances: PostProcessing = POST_PROCESSING["motion"]
+    paths: PostProcessing = field(default_factory=lambda: replace(POST_PROCESSING["accident"], redraw=False))
+    vpq: VpqRules = field(default_factory=VpqRules)
+    accelerating_paths: bool = True
+    gate: float = GATE
+    trajectories: TrajectoryRules = field(default_factory=TrajectoryRules)
+    nothing_is_zero: bool = True
+
+    @property
+    def range_names(self) -> tuple[str, ...]:
+        """As the released code prints them: `30x30`, `100x100`."""
+        return tuple(f"{extent:g}x{extent:g}" for extent in self.ranges)
+
+
+MOTION_PROTOCOLS: Final[Mapping[str, MotionProtocol]] = MappingProxyType(
+    {"released": MotionProtocol(), "paper": MotionProtocol(nothing_is_zero=False)}
+)
+"""What the released code computes. The paper's text says no more of these metrics than their names, FIERY's and the
+ranges: so `paper` is the released code, but that it makes no 0 of nothing."""
+
+
+def motion_protocol(protocol: str | MotionProtocol) -> MotionProtocol:
+    """A protocol by its name, or as it is given; raises ChoiceError."""
+    if isinstance(protocol, MotionProtocol):
+        return protocol
+    if protocol not in MOTION_PROTOCOLS:
+        raise ChoiceError(f"protocol: expected one of {', '.join(MOTION_PROTOCOLS)}, found {protocol!r}")
+    return MOTION_PROTOCOLS[protocol]

@@ -1,0 +1,55 @@
+"""An evaluator and loaders for tests of whole runs: in a module that a spawned process can import by name."""
+
+import os
+import time
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Any
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.evaluation import instances_of
+from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, total
+
+BROKEN = -1.0
+
+
+class Sums(Evaluator[float]):
+    """The sum of a number."""
+
+    def __init__(self, scale: float = 1.0) -> None:
+        super().__init__()
+        self.scale = scale
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return {"scale": self.scale}
+
+    def update(self, token: str, prediction: float, truth: float = 0.0) -> None:
+        self.add(token, {"value": prediction + truth})
+
+    def result_of(self, counts: Collection[Counts]) -> float:
+        return self.scale * total(counts, "value")
+
+
+def number(task: float) -> Sequence[Any]:
+    if task == BROKEN:
+        raise FileNotFoundError("predictions/7.npz")
+    return (task,)
+
+
+def number_and_trace(folder: Path, task: float) -> Sequence[Any]:
+    """Leaves a file that says that this task was done, and takes its time."""
+    (folder / f"{task}.{os.getpid()}.{time.monotonic_ns()}").touch()
+    time.sleep(0.01)
+    return number(task)
+
+
+def killed(task: float) -> Sequence[Any]:
+    os._exit(9)
+
+
+def labels_as_maps(dataset: DeepAccident, token: str) -> Sequence[Any]:
+    """What MotionEvaluator takes: the labels of another moment, and the labels."""
+    label = dataset.motion_labels(token).to_present("bilinear")
+    moved = label.instance[:, ::-1]
+    return instances_of(moved, label.config.grid), label

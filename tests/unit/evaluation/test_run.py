@@ -1,0 +1,220 @@
+"""Whole runs: on workers and executors, broken off and gone on with, and what can go wrong."""
+
+import os
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+
+import evaluating
+import pytest
+from evaluating import BROKEN, Sums, labels_as_maps, number, number_and_trace
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError, EvaluationError
+from deepaccident_devkit.evaluation import MotionEvaluator, evaluate_samples, run
+from deepaccident_devkit.parallel import run_unordered
+
+VALUES = {f"{index:02d}": float(10 ** (index % 17)) + index / 10 for index in range(40)}
+
+
+@pytest.fixture
+def often_saved(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run, "_SAVE_SECONDS", 0.0)
+
+
+def done(folder: Path) -> int:
+    """How many tasks were done."""
+    return len(list(folder.iterdir()))
+
+
+class TestWorkers:
+    def test_two_workers_are_one(self, da_motion: DeepAccident) -> None:
+        tokens = {token: token for token in da_motion.samples("train", "evaluate")}
+        load = partial(labels_as_maps, da_motion)
+        alone, together = (evaluate_samples(MotionEvaluator(), tokens, load, workers=number) for number in (1, 2))
+        assert together.compute() == alone.compute()
+        assert dict(together.counts) == dict(alone.counts)
+        assert alone.tokens == tokens.keys()
+        by_hand = MotionEvaluator()
+        for token in tokens:
+            by_hand.update(token, *load(token))
+        assert alone.compute() == by_hand.compute()
+
+    def test_an_executor(self) -> None:
+        with ThreadPoolExecutor(2) as executor:
+            threads = evaluate_samples(Sums(), VALUES, lambda task: (task,), executor=executor)
+        assert threads.compute() == evaluate_samples(Sums(), VALUES, number, workers=1).compute()
+
+    def test_none_or_few_samples(self) -> None:
+        assert len(evaluate_samples(Sums(), {}, number)) == 0
+        assert evaluate_samples(Sums(), {"a": 3.0}, number, workers=2).compute() == 3.0
+
+    def test_samples_that_it_has_are_passed_over(self) -> None:
+        evaluator = Sums()
+        evaluator.update("00", 5.0)
+        evaluate_samples(evaluator, {"00": BROKEN, "01": 1.0}, number, workers=1)
+        assert evaluator.compute() == 6.0
+        assert not evaluator.repeated
+
+    def test_a_number_of_workers_that_cannot_be(self) -> None:
+        with pytest.raises(ChoiceError, match="at least 1"):
+            evaluate_samples(Sums(), VALUES, number, workers=0)
+
+    @pytest.mark.parametrize("load", [lambda task: (task,), partial(lambda task: (task,))])
+    def test_a_function_that_workers_cannot_import(self, load: Callable[[float], tuple[float]]) -> None:
+        with pytest.raises(EvaluationError, match=r"load: 2 workers cannot import it .*a module of its own, or .*=1"):
+            evaluate_samples(Sums(), VALUES, load, workers=2)
+        assert evaluate_samples(Sums(), VALUES, load).compute() == sum_of_all()
+
+    def test_a_function_of_the_script(self, tmp_path: Path) -> None:
+        script = """
+            from evaluating import Sums
+            from deepaccident_devkit.errors import EvaluationError
+            from deepaccident_devkit.evaluation import evaluate_samples
+
+            def load(task):
+                return (task,)
+
+            samples = {str(index): 1.0 for index in range(100)}
+            print(evaluate_samples(Sums(), samples, load).compute())
+            try:
+                evaluate_samples(Sums(), samples, load, workers=2)
+            except EvaluationError as error:
+                print(error)
+        """
+        lines = said(tmp_path, script).splitlines()
+        assert lines[0] == "100.0"
+        assert "something of the script or notebook that runs" in lines[1]
+
+    def test_a_killed_worker_is_our_error(self) -> None:
+        with pytest.raises(EvaluationError, match=r"a worker process was killed .*; if memory ran out, give fewer"):
+            evaluate_samples(Sums(), VALUES, evaluating.killed, workers=2)
+
+
+class TestFaults:
+    @pytest.mark.parametrize("workers", [1, 2])
+    def test_the_sample_is_named(self, workers: int) -> None:
+        with pytest.raises(EvaluationError, match=r"^x: cannot be evaluated: FileNotFoundError: predictions/7\.npz$"):
+            evaluate_samples(Sums(), {**VALUES, "x": BROKEN}, number, workers=workers)
+
+    def test_arguments_that_do_not_fit(self) -> None:
+        with pytest.raises(EvaluationError, match=r"^00: cannot be evaluated: TypeError: "):
+            evaluate_samples(Sums(), VALUES, lambda task: (task, task, task), workers=1)
+
+
+class TestCheckpoints:
+    def test_a_run_that_raises_goes_on(self, tmp_path: Path) -> None:
+        path, folder = tmp_path / "runs" / "state.json", tmp_path / "trace"
+        folder.mkdir()
+        load = partial(number_and_trace, folder)
+        with pytest.raises(EvaluationError, match="30: cannot be"):
+            evaluate_samples(Sums(), {**VALUES, "30": BROKEN}, load, workers=1, checkpoint=path)
+        before = done(folder)
+        evaluator = evaluate_samples(Sums(), VALUES, load, workers=1, checkpoint=path)
+        assert evaluator.compute() == sum_of_all()
+        assert (before, done(folder)) == (31, 31 + 40 - 24)  # the whole batches before it are kept
+        again = evaluate_samples(Sums(), VALUES, load, workers=2, checkpoint=path)
+        assert done(folder) == 31 + 40 - 24
+        assert dict(again.counts) == dict(evaluator.counts)
+        assert not again.repeated
+        assert [each.name for each in path.parent.iterdir()] == ["state.json"]
+
+    @pytest.mark.parametrize("workers", [1, 2])
+    def test_a_killed_run_goes_on(self, tmp_path: Path, workers: int) -> None:
+        path, folder = tmp_path / "state.json", tmp_path / "trace"
+        folder.mkdir()
+        values = {f"{index:03d}": 0.1 * index for index in range(160)}
+        script = f"""
+            from functools import partial
+            from pathlib import Path
+            from evaluating import Sums, number_and_trace
+            from deepaccident_devkit.evaluation import evaluate_samples, run
+
+            run._SAVE_SECONDS = 0.0
+            values = {{f"{{index:03d}}": 0.1 * index for index in range(160)}}
+            load = partial(number_and_trace, Path({str(folder)!r}))
+            evaluate_samples(Sums(), values, load, workers={workers}, checkpoint={str(path)!r})
+        """
+        process = subprocess.Popen([sys.executable, "-c", textwrap.dedent(script)], env=environment())
+        try:
+            end = time.monotonic() + 60
+            while done(folder) < 40:
+                assert process.poll() is None
+                assert time.monotonic() < end
+                time.sleep(0.005)
+        finally:
+            process.kill()
+            process.wait()
+        kept = len(Sums().resume(path))
+        assert 0 < kept < 160
+        before = done(folder)
+        evaluator = evaluate_samples(Sums(), values, partial(number_and_trace, folder), workers=1, checkpoint=path)
+        assert evaluator.compute() == evaluate_samples(Sums(), values, number, workers=1).compute()
+        assert done(folder) <= before + 160 - kept + 2 * run._BATCH  # workers of the killed run end a moment later
+
+    @pytest.mark.usefixtures("often_saved")
+    def test_counts_are_saved_on_the_way(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        sizes: list[int] = []
+        monkeypatch.setattr(Sums, "save", lambda self, _: sizes.append(len(self)))
+        evaluate_samples(Sums(), VALUES, number, workers=1, checkpoint=tmp_path / "state.json")
+        assert sizes == [0, 8, 16, 24, 32, 40, 40]
+
+    def test_of_other_settings_or_samples(self, tmp_path: Path) -> None:
+        path = Sums(scale=2.0).save(tmp_path / "state.json")
+        before = path.read_bytes()
+        with pytest.raises(EvaluationError, match="was saved with other settings"):
+            evaluate_samples(Sums(), VALUES, number, checkpoint=path)
+        assert path.read_bytes() == before
+        evaluate_samples(Sums(scale=2.0), VALUES, number, workers=1, checkpoint=path)
+        with pytest.raises(EvaluationError, match=r"has 39 samples that are not among these, such as 01; give each"):
+            evaluate_samples(Sums(scale=2.0), {"00": VALUES["00"]}, number, workers=1, checkpoint=path)
+
+    def test_a_damaged_one(self, tmp_path: Path) -> None:
+        path = tmp_path / "state.json"
+        path.write_text('{"settings": {"scale"')
+        with pytest.raises(EvaluationError, match=r"state\.json: no saved evaluation .*; begin anew"):
+            evaluate_samples(Sums(), VALUES, number, checkpoint=path)
+
+    def test_where_none_can_be_written_is_told_at_once(self, tmp_path: Path) -> None:
+        (tmp_path / "file").touch()
+        with pytest.raises(EvaluationError, match="cannot be saved"):
+            evaluate_samples(Sums(), {"x": BROKEN}, number, workers=1, checkpoint=tmp_path / "file" / "state.json")
+
+
+def test_the_bar_counts_samples(capsys: pytest.CaptureFixture[str]) -> None:
+    evaluate_samples(Sums(), VALUES, number, workers=1, progress=True)
+    assert "40/40" in capsys.readouterr().err
+
+
+def test_a_closed_run_begins_nothing_more(tmp_path: Path) -> None:
+    with ThreadPoolExecutor(1) as executor:
+        results = run_unordered(partial(number_and_trace, tmp_path), [float(n) for n in range(50)], executor=executor)
+        assert next(results)[0] == 0
+        results.close()
+    assert done(tmp_path) < 10
+
+
+def sum_of_all() -> float:
+    evaluator = Sums()
+    evaluator.update_batch(list(VALUES), list(VALUES.values()))
+    return evaluator.compute()
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(evaluating.__file__).parent), *sys.path])}
+
+
+def said(folder: Path, script: str) -> str:
+    """What a script prints."""
+    path = folder / "script.py"
+    path.write_text(textwrap.dedent(script), encoding="utf-8")
+    result = subprocess.run(
+        [sys.executable, path], env=environment(), capture_output=True, text=True, check=False, timeout=120
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout
