@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.evaluation.accident import AccidentEvaluator, AccidentResult
-from deepaccident_devkit.evaluation.accident.box_truth import accident_context
+from deepaccident_devkit.evaluation.accident import AccidentEvaluator, AccidentResult, accident_context
 from deepaccident_devkit.evaluation.predictions import MotionOutput
 from deepaccident_devkit.motion import MotionHeads
 from deepaccident_devkit.synth import SynthConfig, make_release

@@ -227,7 +227,7 @@ def golden_detection() -> str:
 
     def evaluate(protocol: DetectionProtocol) -> DetectionResult:
         counts = [
-            {"token": f"{position:06d}", **frame_counts(*frame, protocol).as_json()}
+            {"token": f"{position:06d}", **frame_counts(*frame, protocol).as_dict()}
             for position, frame in enumerate(frames(GOLDEN))
         ]
         return detection_result(counts, protocol)

@@ -16,8 +16,8 @@ from deepaccident_devkit.evaluation.accident.released import ReleasedAccidents
 from deepaccident_devkit.evaluation.accident.scoring import Scoring
 from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS, DetectionProtocol
 from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS, MotionProtocol
+from deepaccident_devkit.evaluation.panoptic import VpqRules
 from deepaccident_devkit.evaluation.trajectory_errors import TrajectoryRules
-from deepaccident_devkit.evaluation.vpq import VpqRules
 from deepaccident_devkit.motion import LabelProtocol, PostProcessing
 
 DOCS = Path(__file__).parents[1] / "docs"

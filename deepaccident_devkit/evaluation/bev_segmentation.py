@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from math import fsum, isnan, nan
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -14,11 +13,12 @@ from numpy.typing import ArrayLike
 from deepaccident_devkit.arrays import BoolArray, checked
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio
+from deepaccident_devkit.evaluation.frozen_mappings import FrozenMappings, plain
 from deepaccident_devkit.motion import BEV_CLASSES, BevSegmentation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BevSegmentationResult:
+class BevSegmentationResult(FrozenMappings):
     """Shares of the cells that prediction and truth have in common.
 
     Attributes:
@@ -34,13 +34,13 @@ class BevSegmentationResult:
     cells: Mapping[str, tuple[int, int, int]]
     samples: int
 
-    def to_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Any]:
         """All of it, as JSON holds it; None for classes that are nowhere."""
         return {
             "samples": self.samples,
-            "mIoU": None if isnan(self.mean_iou) else self.mean_iou,
-            "IoU": {name: None if isnan(value) else value for name, value in self.iou.items()},
-            "cells": {name: list(numbers) for name, numbers in self.cells.items()},
+            "mIoU": plain(self.mean_iou),
+            "IoU": plain(self.iou),
+            "cells": plain(self.cells),
         }
 
 
@@ -82,8 +82,8 @@ class BevSegmentationEvaluator(Evaluator[BevSegmentationResult]):
         known = [value for value in iou.values() if not isnan(value)]
         return BevSegmentationResult(
             mean_iou=fsum(known) / len(known) if known else nan,
-            iou=MappingProxyType(iou),
-            cells=MappingProxyType({one: (hit, vain, missed) for one, (hit, vain, missed) in cells.items()}),
+            iou=iou,
+            cells={one: (hit, vain, missed) for one, (hit, vain, missed) in cells.items()},
             samples=len(counts),
         )
 

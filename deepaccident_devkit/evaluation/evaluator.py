@@ -11,9 +11,8 @@ import json
 import math
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Generic, TypeVar
 
 from deepaccident_devkit._version import __version__
@@ -91,8 +90,10 @@ class Evaluator(ABC, Generic[Result]):
         """Take a sample's counts.
 
         Raises:
-            EvaluationError: the sample came before, with other counts.
+            EvaluationError: the token is no text, or the sample came before, with other counts.
         """
+        if not isinstance(token, str):
+            raise EvaluationError(f"token: expected the sample's token, a text, found {token!r}")
         if token not in self._counts:
             self._counts[token] = counts
         elif self._counts[token] == counts:
@@ -111,15 +112,15 @@ class Evaluator(ABC, Generic[Result]):
                 f"cannot merge: {type(self).__name__} of {self.settings} with {type(other).__name__} of "
                 f"{getattr(other, 'settings', None)}; evaluate both with the same settings"
             )
-        for token, counts in other.counts.items():
+        for token, counts in other._counts.items():  # noqa: SLF001 - its own kind
             self.add(token, counts)
         self.repeated |= other.repeated
         return self
 
     @property
     def counts(self) -> Mapping[str, Counts]:
-        """Each sample's counts by token; a view."""
-        return MappingProxyType(self._counts)
+        """Each sample's counts by token, copied when they are asked for: nobody can change what is summed."""
+        return _Copies(self._counts)
 
     @property
     def tokens(self) -> set[str]:
@@ -137,11 +138,17 @@ class Evaluator(ABC, Generic[Result]):
             tokens: which samples; None for all.
 
         Raises:
-            EvaluationError: one of them was not counted.
+            EvaluationError: one of them was not counted, or is no token.
         """
         if tokens is None:
             return self.result_of(list(self._counts.values()))
-        chosen = set(tokens)
+        if isinstance(tokens, str) or not isinstance(tokens, Iterable):
+            raise EvaluationError(f"tokens: expected several of them, found {tokens!r}; give [token] for one")
+        given: list[object] = list(tokens)
+        others = [each for each in given if not isinstance(each, str)]
+        if others:
+            raise EvaluationError(f"tokens: expected texts, found {others[0]!r} among them")
+        chosen = {str(each) for each in given}
         missing = sorted(chosen - self._counts.keys())
         if missing:
             raise EvaluationError(f"{len(missing)} samples have no prediction, such as {missing[0]}")
@@ -196,6 +203,35 @@ class Evaluator(ABC, Generic[Result]):
     def _maker(self) -> str:
         """Whose counts these are: another version may count differently."""
         return f"{type(self).__name__} of devkit {__version__}"
+
+
+class _Copies(Mapping[str, Counts]):
+    """Counts by token, of which only copies are handed out."""
+
+    def __init__(self, counts: Mapping[str, Counts]) -> None:
+        self._counts = counts
+
+    def __getitem__(self, token: str) -> Counts:
+        copied: Counts = _copied(self._counts[token])
+        return copied
+
+    def __contains__(self, token: object) -> bool:
+        return token in self._counts
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._counts)
+
+    def __len__(self) -> int:
+        return len(self._counts)
+
+
+def _copied(value: Any) -> Any:
+    """A copy of what JSON can hold; much faster than `copy.deepcopy`."""
+    if isinstance(value, Mapping):
+        return {name: _copied(each) for name, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_copied(each) for each in value]
+    return value
 
 
 def ratio(part: float, whole: float) -> float:

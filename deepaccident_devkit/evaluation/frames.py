@@ -8,7 +8,7 @@ import numpy as np
 
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.predictions import MotionOutput
-from deepaccident_devkit.motion import MotionHeads, MotionLabels
+from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionHeads, MotionLabels
 
 
 def labels_at_present(label: MotionLabels) -> MotionLabels:
@@ -23,6 +23,30 @@ def frames_there(label: MotionLabels) -> int:
     if not count:
         raise EvaluationError("labels: the present frame is not in the recording; choose another sample")
     return count
+
+
+def checked_pair(prediction: object, label: object) -> tuple[MotionOutput, MotionLabels]:
+    """A prediction of motion and the labels it is compared with, as they are; raises EvaluationError for others."""
+    if not isinstance(prediction, MotionOutput):
+        raise EvaluationError(
+            f"prediction: expected a MotionOutput, found {type(prediction).__name__}; make one with "
+            "MotionOutput.from_arrays(…), of MotionHeads with MotionOutput(…), of instance maps with instances_of(…)"
+        )
+    if not isinstance(label, MotionLabels):
+        raise EvaluationError(
+            f"label: expected MotionLabels, found {type(label).__name__}; give what dataset.motion_labels(token) or a "
+            "folder of label files has of the sample"
+        )
+    return prediction, label
+
+
+def check_protocol(label: MotionLabels, protocol: str | None) -> None:
+    """Whether labels are of a protocol, None for any; raises EvaluationError."""
+    if protocol is not None and label.config.rules != LABEL_PROTOCOLS[protocol]:
+        raise EvaluationError(
+            f"labels: expected those of the label protocol {protocol!r}, found others; make them with "
+            f"MotionLabelConfig(protocol={protocol!r}), or give the metrics' protocol another value of its field labels"
+        )
 
 
 def check_output(output: MotionOutput, label: MotionLabels, frames: int) -> None:

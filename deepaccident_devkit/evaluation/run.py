@@ -61,7 +61,8 @@ def evaluate_samples(
         if saved.exists():
             _resume(evaluator, saved, samples)
         evaluator.save(saved)  # now, and not after an hour, it shows whether it can be written
-    left = [(token, task) for token, task in samples.items() if token not in evaluator.counts]
+    counted = evaluator.tokens
+    left = [(token, task) for token, task in samples.items() if token not in counted]
     batches = [
         _Batch(evaluator.fresh(), tuple(left[first : first + _BATCH]), load) for first in range(0, len(left), _BATCH)
     ]

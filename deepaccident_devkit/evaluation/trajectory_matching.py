@@ -96,7 +96,7 @@ def match_trajectories(prediction: Paths, truth: Paths, *, gate: float = GATE) -
 
 
 def distances(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Between points (…, 2), with the same bits on every machine (np.hypot can differ in the last one)."""
+    """Between points (…, 2); without np.hypot, whose last bit is not everywhere the same."""
     apart = first - second
     result: FloatArray = np.sqrt(apart[..., 0] * apart[..., 0] + apart[..., 1] * apart[..., 1])
     return result

@@ -71,7 +71,7 @@ def frames(folder: Path) -> list[tuple[BoxColumns, BoxColumns]]:
 def result(folder: Path, mode: str) -> DetectionResult:
     protocol = DETECTION_PROTOCOLS[mode]
     counts = [
-        {"token": f"{position:06d}", **frame_counts(*frame, protocol).as_json()}
+        {"token": f"{position:06d}", **frame_counts(*frame, protocol).as_dict()}
         for position, frame in enumerate(frames(folder))
     ]
     return detection_result(json.loads(json.dumps(counts))[::-1], protocol)

@@ -22,7 +22,7 @@ def actor_of(cells: BoolArray, frame: int, label: MotionLabels, context: Acciden
         Its id; None if no cell is labelled, or if it is not known whose the label is.
     """
     drawn = label.instance[frame][cells]
-    names, counts = np.unique(drawn[drawn != 0], return_counts=True)
+    names, counts = np.unique(drawn[drawn > 0], return_counts=True)
     if not len(names):
         return None
     most = int(names[np.argmax(counts)])

@@ -8,25 +8,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Final
 
 import numpy as np
 
 from deepaccident_devkit.errors import ConfigError, EvaluationError
-from deepaccident_devkit.evaluation.accident.box_truth import BoxTruth
+from deepaccident_devkit.evaluation.accident.impact import BoxTruth
 from deepaccident_devkit.evaluation.accident.matching import match_tracks
-from deepaccident_devkit.evaluation.accident.protocol import AccidentContext, Prediction
+from deepaccident_devkit.evaluation.accident.protocol import AccidentContext, Prediction, checked_prediction
 from deepaccident_devkit.evaluation.accident.reading import AccidentReading, InstanceAccident, accident_of
 from deepaccident_devkit.evaluation.accident.result import AccidentResult
 from deepaccident_devkit.evaluation.accident.scoring import (
     Alarm,
     Scoring,
-    accident_result,
+    alarms_tally,
     foreseen,
     named,
     position_difference,
 )
+from deepaccident_devkit.evaluation.accident.tallies import exact_parts, tally_result, united
+from deepaccident_devkit.evaluation.accident.variants import with_others, with_parts
 from deepaccident_devkit.evaluation.evaluator import Counts
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
 from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels
@@ -99,13 +101,13 @@ class BoxAccidents:
         """These metrics with one choice made otherwise, by `name=value`; for explanations."""
         own: Mapping[str, tuple[Any, ...]] = {
             "min_score": (0.5,),
-            "match_distance": (2.0, 8.0),
-            "unjudged_are_false": (not self.unjudged_are_false,),
+            "match_distance": (2.0, 4.0, 8.0),
+            "unjudged_are_false": (False, True),
         }
         return {
-            **{name: replace(self, reading=reading) for name, reading in self.reading.variants().items()},
-            **{f"{name}={value}": replace(self, **{name: value}) for name, values in own.items() for value in values},
-            **{name: replace(self, scoring=scoring) for name, scoring in self.scoring.variants().items()},
+            **with_parts(self, "reading", self.reading.variants()),
+            **with_others(self, own),
+            **with_parts(self, "scoring", self.scoring.variants()),
         }
 
     def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
@@ -114,7 +116,8 @@ class BoxAccidents:
         Args:
             prediction: motion in maps, or explicit accidents; an empty list for no alarm.
             label: says how far apart in time maps are and how they lie in their cells; None for the released way.
-            context: with `truth`, from `accident_context(dataset, sample, horizon)`.
+            context: with `truth`, from `accident_context(dataset, sample, horizon)`; `AccidentEvaluator.update` takes
+                it or the truth as label, too.
 
         Returns:
             `positive`: whether an accident comes; `named`: whom the boxes bring nearer to each other than the danger
@@ -126,16 +129,17 @@ class BoxAccidents:
         truth = context.truth
         if not isinstance(truth, BoxTruth):
             raise EvaluationError(
-                "context: the accident protocol 'boxes' compares with boxes; give "
-                "context=accident_context(dataset, sample, horizon=2.0)"
+                "label: the accident protocol 'boxes' compares with boxes; give box_truth(dataset, sample), or "
+                "accident_context(dataset, sample, horizon=2.0), as label or as context"
             )
-        if isinstance(prediction, MotionOutput):
-            alarms = self._of_maps(prediction, label.config if label else _RELEASED_LABELS, truth)
+        given = checked_prediction(prediction)
+        if isinstance(given, MotionOutput):
+            alarms = self._of_maps(given, label.config if label else _RELEASED_LABELS, truth)
         else:
-            alarms = [(each, _id_error(each.ids, truth)) for each in _accidents(prediction)]
+            alarms = [(each, _id_error(each.ids, truth)) for each in given]
         raised = sorted(
             (alarm for alarm in alarms if alarm[0].score >= self.min_score),
-            key=lambda alarm: (-alarm[0].score, alarm[0].time),
+            key=lambda alarm: _rank(alarm[0]),
         )
         judged = [alarm for alarm in raised if self._is_judged(alarm[0], truth)]
         nearest = truth.nearest_pair(self.reading.danger_distance)
@@ -148,25 +152,48 @@ class BoxAccidents:
 
     def result(self, counts: Collection[Counts]) -> BoxAccidentResult:
         """The metrics of some samples' counts, in any order."""
-        samples = list(counts)
-        alarms: list[Sequence[Alarm]] = [sample["alarms"] for sample in samples]
-        base = accident_result(samples, alarms, self.scoring)
+        given = self._united(counts)
+        base = tally_result(given["tally"], self.scoring.errors_at)
         at = base.within[self.scoring.errors_at]
-        hits = [
-            self.scoring.hit(each, at.distance) if sample["positive"] else None
-            for sample, each in zip(samples, alarms, strict=True)
-        ]
-        lateness = [alarm["time"] for alarm in hits if alarm is not None]
-        calm = [each for sample, each in zip(samples, alarms, strict=True) if not sample["positive"]]
         return BoxAccidentResult(
             **{each.name: getattr(base, each.name) for each in fields(AccidentResult)},
             precision=_share(at.tp, at.tp + at.fp),
             recall=_share(at.tp, base.positives),
-            average_precision=_average_precision(alarms, hits, base.positives),
-            false_alarm_rate=_share(sum(map(bool, calm)), len(calm)),
-            lateness=_share(math.fsum(lateness), len(lateness)),
-            unjudged=sum(sample["unjudged"] for sample in samples),
+            average_precision=_average_precision(given["alarms"], base.positives),
+            false_alarm_rate=_share(given["false_samples"], base.negatives),
+            lateness=_share(math.fsum(given["lateness"]), at.tp),
+            unjudged=given["unjudged"],
         )
+
+    def pooled(self, counts: Collection[Counts]) -> list[Counts]:
+        """The sums of all counts, which have the same result; alarms stay one by one."""
+        return [self._united(counts)]
+
+    def _united(self, counts: Collection[Counts]) -> dict[str, Any]:
+        """What samples add, those of `pooled` among them.
+
+        Returns:
+            `tally`; `alarms`: [score, whether it is the right one] of each; `lateness`: in sum, of the right ones;
+            `false_samples`: how many raise an alarm without an accident to come; `unjudged`.
+        """
+        given = [each if "tally" in each else self._tallied(each) for each in counts]
+        return {
+            "tally": united(each["tally"] for each in given),
+            "alarms": [alarm for each in given for alarm in each["alarms"]],
+            "lateness": exact_parts(each["lateness"] for each in given),
+            **{name: sum(each[name] for each in given) for name in ("false_samples", "unjudged")},
+        }
+
+    def _tallied(self, sample: Counts) -> dict[str, Any]:
+        alarms: Sequence[Alarm] = sample["alarms"]
+        hit = self.scoring.hit(alarms, self.scoring.errors_at) if sample["positive"] else None
+        return {
+            "tally": alarms_tally(sample, alarms, self.scoring),
+            "alarms": [[alarm["score"], alarm is hit] for alarm in alarms],
+            "lateness": [] if hit is None else [hit["time"]],
+            "false_samples": int(bool(alarms) and not sample["positive"]),
+            "unjudged": sample["unjudged"],
+        }
 
     def _is_judged(self, accident: Accident, truth: BoxTruth) -> bool:
         seen = truth.accident is not None or accident.time <= float(truth.time[-1]) + _SLACK
@@ -193,11 +220,9 @@ class BoxAccidents:
         return accident, _id_error((match.get(ids[0]), match.get(ids[1])), truth)
 
 
-def _accidents(prediction: Sequence[Accident]) -> Sequence[Accident]:
-    for each in prediction:
-        if not isinstance(each, Accident):
-            raise EvaluationError(f"prediction: expected a MotionOutput or a list of Accidents, found {each!r} in it")
-    return prediction
+def _rank(alarm: Accident) -> tuple[Any, ...]:
+    """The surest first, of equally sure ones the earliest; the rest is so that no order of a list counts."""
+    return -alarm.score, alarm.time, alarm.positions.tolist(), alarm.ids or ()
 
 
 def _id_error(ids: tuple[int | None, int | None] | None, truth: BoxTruth) -> int | None:
@@ -218,14 +243,13 @@ def _alarm(accident: Accident, id_error: int | None, truth: BoxTruth) -> dict[st
     )
 
 
-def _average_precision(alarms: Sequence[Sequence[Alarm]], hits: Sequence[Alarm | None], positives: int) -> float | None:
+def _average_precision(alarms: Sequence[Sequence[float]], positives: int) -> float | None:
     """The area under the steps of precision over recall; equally sure alarms are one step, so that no order counts."""
     if not positives:
         return None
-    pairs = [(alarm["score"], alarm is hit) for each, hit in zip(alarms, hits, strict=True) for alarm in each]
-    if not pairs:
+    if not alarms:
         return 0.0
-    score, true = (np.array(column) for column in zip(*pairs, strict=True))
+    score, true = np.array(alarms, dtype=np.float64).T
     steps = np.unique(-score)
     place = np.searchsorted(steps, -score)
     raised = np.bincount(place, minlength=len(steps))

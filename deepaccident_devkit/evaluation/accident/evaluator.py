@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, Final
 
 from deepaccident_devkit.errors import ChoiceError, EvaluationError
 from deepaccident_devkit.evaluation.accident.boxes import BoxAccidents
+from deepaccident_devkit.evaluation.accident.impact import BoxTruth
 from deepaccident_devkit.evaluation.accident.paper import PaperAccidents
-from deepaccident_devkit.evaluation.accident.protocol import AccidentContext, AccidentProtocol, Prediction
+from deepaccident_devkit.evaluation.accident.protocol import (
+    AccidentContext,
+    AccidentProtocol,
+    Prediction,
+    Truth,
+    checked_prediction,
+)
 from deepaccident_devkit.evaluation.accident.released import ReleasedAccidents
 from deepaccident_devkit.evaluation.accident.result import AccidentResult
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
@@ -39,7 +47,7 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
                 that many times longer.
 
         Raises:
-            ChoiceError: no protocol has that name.
+            ChoiceError: no protocol has that name, or it is none.
         """
         super().__init__()
         self.protocol = _protocol(protocol)
@@ -58,7 +66,7 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
         self,
         token: str,
         prediction: Prediction,
-        label: MotionLabels | None = None,
+        label: Truth | None = None,
         context: AccidentContext | None = None,
     ) -> None:
         """Count one sample.
@@ -67,24 +75,31 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
             token: of the sample.
             prediction: what a model says.
             label: the sample's motion labels, each frame in its own frame or all at the present. Those in their own
-                frames are warped to the present with bilinear centres, as the released evaluation does.
+                frames are warped to the present with bilinear centres, as the released evaluation does. A protocol that
+                compares with boxes needs none; it takes their truth here (`box_truth` or `accident_context`), or in the
+                context.
             context: what else is known of it; None for nothing.
 
         Raises:
             EvaluationError: the protocol cannot evaluate such a prediction or label, or the sample came before with
                 another outcome.
         """
-        known = context or AccidentContext()
-        counts = dict(self.protocol.counts(prediction, label, known))
+        labels, known = _known(label, context)
+        given = checked_prediction(prediction)
+        counts = dict(self.protocol.counts(given, labels, known))
         if self._variants:
             counts["variants"] = {
-                name: variant.counts(prediction, label, known) for name, variant in self._variants.items()
+                name: variant.counts(given, labels, known) for name, variant in self._variants.items()
             }
         self.add(token, counts)
 
     def result_of(self, counts: Collection[Counts]) -> AccidentResult:
         """The metrics of some samples' counts, in any order."""
         return self.protocol.result(counts)
+
+    def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
+        """Fewer counts with the same result."""
+        return self.protocol.pooled(counts)
 
     def explained(self) -> dict[str, AccidentResult]:
         """For each choice of the protocol the result if it were made otherwise, all else equal.
@@ -95,14 +110,36 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
         if not self._variants:
             raise EvaluationError("nothing to explain: make the evaluator with explain=True")
         return {
-            name: variant.result([counts["variants"][name] for counts in self.counts.values()])
+            name: variant.result([counts["variants"][name] for counts in self._counts.values()])
             for name, variant in self._variants.items()
         }
 
 
-def _protocol(protocol: str | AccidentProtocol) -> AccidentProtocol:
-    if not isinstance(protocol, str):
+def _known(label: Truth | None, context: AccidentContext | None) -> tuple[MotionLabels | None, AccidentContext]:
+    """Motion labels, and all else that is known; raises EvaluationError."""
+    if context is not None and not isinstance(context, AccidentContext):
+        raise EvaluationError(
+            f"context: expected an AccidentContext, found {type(context).__name__}; make it with "
+            "accident_context(dataset, sample, horizon)"
+        )
+    known = context or AccidentContext()
+    if label is None or isinstance(label, MotionLabels):
+        return label, known
+    if isinstance(label, AccidentContext) and context is None:
+        return None, label
+    if isinstance(label, BoxTruth) and known.truth is None:
+        return None, replace(known, truth=label)
+    if isinstance(label, AccidentContext | BoxTruth):
+        raise EvaluationError("label, context: both say what is true; give the truth in one of them")
+    raise EvaluationError(
+        f"label: expected MotionLabels, or for protocol='boxes' a BoxTruth or an AccidentContext, found "
+        f"{type(label).__name__}; give what dataset.motion_labels(token) has of the sample"
+    )
+
+
+def _protocol(protocol: object) -> AccidentProtocol:
+    if isinstance(protocol, AccidentProtocol):
         return protocol
-    if protocol not in PROTOCOLS:
-        raise ChoiceError(f"protocol: expected one of {', '.join(PROTOCOLS)}, found {protocol!r}")
+    if not isinstance(protocol, str) or protocol not in PROTOCOLS:
+        raise ChoiceError(f"protocol: expected one of {', '.join(PROTOCOLS)}, or your own, found {protocol!r}")
     return PROTOCOLS[protocol]

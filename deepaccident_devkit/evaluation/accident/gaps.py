@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -21,7 +21,7 @@ def pair_gaps(
 
     Args:
         image: (H, W) ids, 0 elsewhere.
-        ids: (N,) int64, whose.
+        ids: (N,) int64, ascending, whose.
         level: see `outlines.LEVEL`.
         below: cells; pairs that cannot be nearer are left out.
 
@@ -29,15 +29,26 @@ def pair_gaps(
         (P, 2) pairs in the order of `ids`: 0 1, 0 2, … 1 2, …; and (P,) cells: 0 where outlines overlap, `NO_OUTLINE`
         where one has none.
     """
-    from scipy.ndimage import find_objects
-
-    found = [*find_objects(image, int(ids.max(initial=0)))]
-    places = [found[name - 1] for name in ids.tolist()]
+    places = _places(image, ids)
     first, second = np.triu_indices(len(ids), 1)
     near = _box_gaps(places)[first, second] < below
     first, second = first[near], second[near]
     shapes = _shapes(image, ids, places, np.unique([first, second]), level)
     return np.stack([ids[first], ids[second]], axis=1), _distances(shapes[first], shapes[second])
+
+
+def _places(image: AnyArray, ids: IntArray) -> list[Place | None]:
+    """Where instances are; None for those that are not in the picture. Renumbered, since ids may be of any size."""
+    from scipy.ndimage import find_objects
+
+    cells = np.flatnonzero(image > 0)
+    names = image.reshape(-1)[cells]
+    rank = np.searchsorted(ids, names)
+    known = np.append(ids, -1)[rank] == names
+    ranks = np.zeros(image.shape, dtype=np.int32)
+    ranks.reshape(-1)[cells[known]] = rank[known] + 1
+    found: list[Any] = find_objects(ranks, len(ids)) if len(ids) else []
+    return found
 
 
 def _box_gaps(places: Sequence[Place | None]) -> FloatArray:

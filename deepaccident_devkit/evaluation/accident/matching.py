@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from deepaccident_devkit.evaluation.accident.reading import InstanceTracks
+from deepaccident_devkit.evaluation.accident.reading import TIE, InstanceTracks, even
 
 
 def match_tracks(predicted: InstanceTracks, truth: InstanceTracks, gate: float) -> dict[int, int]:
@@ -24,8 +24,8 @@ def match_tracks(predicted: InstanceTracks, truth: InstanceTracks, gate: float) 
     apart = np.linalg.norm(predicted.center[:, :, None] - truth.center[:, None], axis=-1)
     common = np.isfinite(apart)
     sums = np.where(common, apart, 0).sum(axis=0)
-    distance = np.where(common.any(axis=0), sums / np.maximum(common.sum(axis=0), 1), np.inf)
-    allowed = distance <= gate
+    distance = np.where(common.any(axis=0), even(sums / np.maximum(common.sum(axis=0), 1)), np.inf)
+    allowed = distance <= gate + TIE
     # a pair more within the gate outweighs all that distances can add up to
     refused = (gate + 1) * (min(distance.shape) + 1)
     rows, columns = linear_sum_assignment(np.where(allowed, distance, refused))

@@ -13,22 +13,25 @@ import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
+from deepaccident_devkit.evaluation.accident.actors import actor_of
 from deepaccident_devkit.evaluation.accident.matching import match_tracks
 from deepaccident_devkit.evaluation.accident.protocol import AccidentContext, Prediction
-from deepaccident_devkit.evaluation.accident.reading import AccidentReading, Contact, InstanceAccident, accident_of
+from deepaccident_devkit.evaluation.accident.reading import AccidentReading, InstanceAccident, accident_of
 from deepaccident_devkit.evaluation.accident.result import AccidentResult
 from deepaccident_devkit.evaluation.accident.scoring import (
     Alarm,
     Scoring,
-    accident_result,
+    alarms_tally,
     foreseen,
     named,
     position_difference,
 )
+from deepaccident_devkit.evaluation.accident.tallies import tally_result, united
+from deepaccident_devkit.evaluation.accident.variants import with_others, with_parts
 from deepaccident_devkit.evaluation.evaluator import Counts
 from deepaccident_devkit.evaluation.frames import check_output, first_frames, frames_there, labels_at_present
 from deepaccident_devkit.evaluation.predictions import MotionOutput
-from deepaccident_devkit.motion import LABEL_PROTOCOLS, OWN_BOX_ID, LabelProtocol, MotionHeads, MotionLabels
+from deepaccident_devkit.motion import LABEL_PROTOCOLS, LabelProtocol, MotionHeads, MotionLabels
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 SampleChoice = Literal["best", "mean_first"]
@@ -89,14 +92,9 @@ class PaperAccidents:
             "match_distance": (2.0, 4.0, 8.0),
         }
         return {
-            **{name: replace(self, reading=reading) for name, reading in self.reading.variants().items()},
-            **{
-                f"{name}={value}": replace(self, **{name: value})
-                for name, values in own.items()
-                for value in values
-                if value != getattr(self, name)
-            },
-            **{name: replace(self, scoring=scoring) for name, scoring in self.scoring.variants().items()},
+            **with_parts(self, "reading", self.reading.variants()),
+            **with_others(self, own),
+            **with_parts(self, "scoring", self.scoring.variants()),
         }
 
     def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
@@ -125,7 +123,10 @@ class PaperAccidents:
         ]
         if self.predicted_by == "mean":
             alarms = alarms[-1:]
-        actors = None if truth.contact is None else _actors(truth.contact, shown, label, context)
+        actors = None
+        if truth.contact is not None:
+            frame, ids = truth.contact.frame, truth.contact.ids
+            actors = [actor_of(shown[frame] == identity, frame, label, context) for identity in ids]
         return {
             "positive": truth.contact is not None,
             "named": named(actors, context),
@@ -136,14 +137,30 @@ class PaperAccidents:
 
     def result(self, counts: Collection[Counts]) -> AccidentResult:
         """The metrics of some samples' counts, in any order."""
-        samples = list(counts)
+        given = self._united(counts)
         chosen, other = sorted(get_args(SampleChoice), key=lambda choice: choice != self.sample_choice)
-        beside = self._result(samples, other)
-        return replace(self._result(samples, chosen, _notes(samples)), beside={f"sample_choice={other}": beside})
+        result, beside = (tally_result(given[choice], self.scoring.errors_at) for choice in (chosen, other))
+        notes = _notes(given["instance_maps"], result.samples)
+        return replace(result, notes=notes, beside={f"sample_choice={other}": beside})
 
-    def _result(self, samples: Sequence[Counts], choice: str, notes: Sequence[str] = ()) -> AccidentResult:
-        alarms = [[sample[choice]] if sample[choice] else [] for sample in samples]
-        return accident_result(samples, alarms, self.scoring, notes)
+    def pooled(self, counts: Collection[Counts]) -> list[Counts]:
+        """The sums of all counts, which have the same result."""
+        return [{"tallies": self._united(counts)}]
+
+    def _united(self, counts: Collection[Counts]) -> dict[str, Any]:
+        """The tally of each choice of a sample, and how many predictions were given as instance maps."""
+        given = [each["tallies"] if "tallies" in each else self._tallies(each) for each in counts]
+        return {
+            **{choice: united(each[choice] for each in given) for choice in get_args(SampleChoice)},
+            "instance_maps": sum(each["instance_maps"] for each in given),
+        }
+
+    def _tallies(self, sample: Counts) -> dict[str, Any]:
+        alarms = {choice: [sample[choice]] if sample[choice] else [] for choice in get_args(SampleChoice)}
+        return {
+            **{choice: alarms_tally(sample, each, self.scoring) for choice, each in alarms.items()},
+            "instance_maps": int(sample["instance_maps"]),
+        }
 
     def _checked(self, prediction: Prediction, label: MotionLabels | None) -> tuple[MotionOutput, MotionLabels]:
         if not isinstance(prediction, MotionOutput):
@@ -195,31 +212,11 @@ def _nearest(alarms: Sequence[Alarm | None]) -> Alarm | None:
     return min(there, key=lambda alarm: alarm["position"] or 0.0, default=None)
 
 
-def _actors(
-    contact: Contact, shown: AnyArray, label: MotionLabels, context: AccidentContext
-) -> tuple[int | None, int | None]:
-    """The actors that two instances of the truth are, by whose label most of their cells have; None where unknown."""
-    actor_of: dict[int | None, int] = {identity: actor for actor, identity in label.id_map.items()}
-    first, second = (
-        actor_of.get(_most_frequent(label.instance[contact.frame][shown[contact.frame] == identity]))
-        for identity in contact.ids
-    )
-    own = context.own_actor_id
-    return own if first == OWN_BOX_ID else first, own if second == OWN_BOX_ID else second
-
-
-def _most_frequent(ids: AnyArray) -> int | None:
-    """The most frequent id but 0, the lowest of equally frequent ones; None if there is none."""
-    values, counts = np.unique(ids[ids != 0], return_counts=True)
-    return int(values[np.argmax(counts)]) if len(values) else None
-
-
-def _notes(samples: Sequence[Counts]) -> list[str]:
-    given_as_maps = sum(bool(sample["instance_maps"]) for sample in samples)
+def _notes(given_as_maps: int, samples: int) -> tuple[str, ...]:
     if not given_as_maps:
-        return []
+        return ()
     note = (
-        f"{given_as_maps} of {len(samples)} predictions were given as instance maps: their truth is the labels' "
+        f"{given_as_maps} of {samples} predictions were given as instance maps: their truth is the labels' "
         "instance map, not the released grouping and linking of the labels"
     )
-    return [note]
+    return (note,)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
+from deepaccident_devkit.errors import EvaluationError
+from deepaccident_devkit.evaluation.accident.impact import BoxTruth
 from deepaccident_devkit.evaluation.accident.result import AccidentResult
 from deepaccident_devkit.evaluation.evaluator import Counts
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
 from deepaccident_devkit.motion import MotionLabels
 
-Prediction = MotionOutput | Sequence[Accident]
+Prediction = MotionOutput | Iterable[Accident]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,9 +31,14 @@ class AccidentContext:
     pair: tuple[int, int] | None = None
     known: bool = False
     own_actor_id: int | None = None
-    truth: Any = None
+    truth: BoxTruth | None = None
 
 
+Truth = MotionLabels | BoxTruth | AccidentContext
+"""What an evaluator takes as label: motion labels, or for a protocol without rasters what it compares with."""
+
+
+@runtime_checkable
 class AccidentProtocol(Protocol):
     """A frozen dataclass with one field a choice; `evaluator.PROTOCOLS` has those with names."""
 
@@ -42,7 +49,26 @@ class AccidentProtocol(Protocol):
         """What one sample adds; raises EvaluationError if it cannot be evaluated so."""
 
     def result(self, counts: Collection[Counts]) -> AccidentResult:
-        """The metrics of some samples' counts, in any order."""
+        """The metrics of some samples' counts, in any order; of those that `pooled` gives, too."""
+
+    def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
+        """Fewer counts with the same result, to the last bit."""
 
     def variants(self) -> Mapping[str, AccidentProtocol]:
         """The same protocol with one choice made otherwise, by the choice's name: what `explain` compares with."""
+
+
+def checked_prediction(prediction: object) -> MotionOutput | list[Accident]:
+    """A prediction, explicit accidents as a list; raises EvaluationError if it is neither motion nor accidents."""
+    if isinstance(prediction, MotionOutput):
+        return prediction
+    alarms: list[Accident] = []
+    for each in prediction if isinstance(prediction, Iterable) else [prediction]:
+        if each is prediction or not isinstance(each, Accident):
+            raise EvaluationError(
+                f"prediction: expected a MotionOutput or a list of Accidents, found {type(prediction).__name__} with "
+                f"{type(each).__name__}; wrap a single Accident in a list, give [] for no alarm, and make an output of "
+                "instance maps with instances_of"
+            )
+        alarms.append(each)
+    return alarms

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any, Final, Literal, get_args
+from dataclasses import dataclass
+from typing import Final, Literal, get_args
 
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.evaluation.accident.hulls import convex_hulls, hull_distances
+from deepaccident_devkit.evaluation.accident.variants import with_others
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import Orientation
 from deepaccident_devkit.motion import LabelProtocol, MotionHeads, PostProcessing, predict_instances
@@ -19,6 +20,9 @@ from deepaccident_devkit.motion.postprocessing.predict import Foreground
 
 Outline = Literal["centers", "cells"]
 Moment = Literal["closest", "first", "last"]
+TIE: Final = 1e-9
+"""Metres that two lengths must differ by to be different: means of cells are off by the last bits."""
+_TIE_DECIMALS: Final = 9
 _CHOICES: Final[Mapping[str, tuple[str, ...]]] = {"outline": get_args(Outline), "moment": get_args(Moment)}
 
 
@@ -68,7 +72,7 @@ class AccidentReading:
 
     def variants(self) -> dict[str, AccidentReading]:
         """This reading with one choice made otherwise, by `name=value`; for explanations."""
-        return _variants(
+        return with_others(
             self,
             {
                 "foreground": ("argmax", "sigmoid"),
@@ -135,6 +139,11 @@ class InstanceAccident:
         return self.tracks.at(self.contact.frame, self.contact.ids)
 
 
+def even(length: FloatArray) -> FloatArray:
+    """Lengths in metres of which those that differ by less than `TIE` in their last bits are equal floats."""
+    return np.round(length, _TIE_DECIMALS)
+
+
 def accident_of(
     instance: AnyArray, grid: BevGrid, rules: LabelProtocol | None, reading: AccidentReading
 ) -> InstanceAccident:
@@ -144,7 +153,7 @@ def accident_of(
     the earlier, then that with the nearer centres, then that with the lower ids.
 
     Args:
-        instance: (T, H, W) ids from 1 that stay the same over the frames, 0 elsewhere.
+        instance: (T, H, W) ids from 1 that stay the same over the frames, 0 or less elsewhere.
         grid: its cells and orientation.
         rules: of the labels that the maps are, or were learned from: where they have the half-cell shift, it is undone
             in positions. None for maps without any.
@@ -195,13 +204,12 @@ class _Shapes:
 
 def _shapes(instance: AnyArray, orientation: Orientation) -> _Shapes:
     rows, columns = instance.shape[1:]
-    flat = np.flatnonzero(instance != 0)  # of a mask: much faster than of integers
+    flat = np.flatnonzero(instance > 0)  # of a mask: much faster than of integers
     frame, cell = np.divmod(flat, rows * columns)
     row, column = np.divmod(cell, columns)
     y, x = cells_in(row, column, (rows, columns), orientation, "devkit")
     identity = instance.reshape(-1)[flat].astype(np.int64)
-    lowest = identity.min(initial=0)
-    key, group = np.unique(frame * (identity.max(initial=0) - lowest + 1) + identity - lowest, return_inverse=True)
+    key, group = np.unique(frame * (identity.max(initial=0) + 1) + identity, return_inverse=True)
     count = np.bincount(group, minlength=len(key))
     order = np.argsort(group, kind="stable")
     begin = np.cumsum(count) - count
@@ -230,12 +238,12 @@ def _contact(shapes: _Shapes, size: FloatArray, frames: int, reading: AccidentRe
     which, place = np.unique(np.concatenate([first, second]), return_inverse=True)
     unit = size.min()  # square cells stay whole numbers
     hulls = shapes.hulls(which, reading.outline) * (size / unit)
-    distance = hull_distances(hulls[place[: len(first)]], hulls[place[len(first) :]]) * unit
+    distance = even(hull_distances(hulls[place[: len(first)]], hulls[place[len(first) :]]) * unit)
     near = np.flatnonzero(distance < reading.danger_distance)
     if not len(near):
         return None
     first, second, distance = first[near], second[near], distance[near]
-    between = np.linalg.norm((shapes.center[first] - shapes.center[second]) * size, axis=1)
+    between = even(np.linalg.norm((shapes.center[first] - shapes.center[second]) * size, axis=1))
     frame = shapes.frame[first]
     by_nearness = (shapes.identity[second], shapes.identity[first], between)
     by_moment = (distance, frame) if reading.moment == "first" else (frame, distance)
@@ -265,12 +273,3 @@ def _candidates(shapes: _Shapes, size: FloatArray, reading: AccidentReading) -> 
 def _within_cell(rules: LabelProtocol | None) -> FloatArray:
     """The point of a cell, in cells along x and y from its low corner, that its drawn place stands for."""
     return np.array([0.5, 0.5] if rules is None else rules.place_in_cell)
-
-
-def _variants(reading: AccidentReading, others: Mapping[str, tuple[Any, ...]]) -> dict[str, AccidentReading]:
-    return {
-        f"{name}={value}": replace(reading, **{name: value})
-        for name, values in others.items()
-        for value in values
-        if value != getattr(reading, name)
-    }

@@ -9,7 +9,6 @@ frame's instances alone), `outlines.first_outline` (of an instance in several pa
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
@@ -22,17 +21,24 @@ from deepaccident_devkit.evaluation.accident.actors import actor_of
 from deepaccident_devkit.evaluation.accident.drawn_paths import DrawnPaths, paths_of_heads, paths_of_instances
 from deepaccident_devkit.evaluation.accident.gaps import pair_gaps
 from deepaccident_devkit.evaluation.accident.protocol import AccidentContext, AccidentProtocol, Prediction
-from deepaccident_devkit.evaluation.accident.result import DISTANCES, NAMED, AccidentResult, AccidentsWithin
+from deepaccident_devkit.evaluation.accident.result import DISTANCES, AccidentResult
 from deepaccident_devkit.evaluation.accident.scoring import named, position_difference
-from deepaccident_devkit.evaluation.evaluator import Counts, ratio
-from deepaccident_devkit.evaluation.frames import check_output, first_frames, frames_there, labels_at_present
+from deepaccident_devkit.evaluation.accident.tallies import ERRORS, sample_tally, tally_result, united
+from deepaccident_devkit.evaluation.accident.variants import with_others
+from deepaccident_devkit.evaluation.evaluator import Counts
+from deepaccident_devkit.evaluation.frames import (
+    check_output,
+    check_protocol,
+    first_frames,
+    frames_there,
+    labels_at_present,
+)
 from deepaccident_devkit.evaluation.predictions import MotionOutput
 from deepaccident_devkit.evaluation.trajectory_matching import longest, match_trajectories, padded
 from deepaccident_devkit.motion import POST_PROCESSING, MotionHeads, MotionLabels, PostProcessing
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 Pair = tuple[int, int]
-_SUMS: Final = ("id", "position", "time")
 _NOTHING_FOUND: Final = {"id": 1.0, "position": 20.0, "time": 1.0}
 """The released code's errors where nothing is foreseen: a share, metres, seconds."""
 
@@ -42,6 +48,7 @@ class ReleasedAccidents:
     """The released rules; the defaults are as they are, slips included.
 
     Attributes:
+        labels: protocol of the labels that are the truth, others are refused; None for any.
         truth_gap: cells; the true instances that are nearer collide. 0.001 asks them to overlap.
         prediction_gap: cells; the predicted ones that are nearer do: 2.5 m. The paper has 1 m for both.
         level: where the outlines run, see `outlines.LEVEL`: 0.1 makes instances almost a cell larger all around.
@@ -62,6 +69,7 @@ class ReleasedAccidents:
             at all three. The paper says 10.
     """
 
+    labels: str | None = "released"
     truth_gap: float = 0.001
     prediction_gap: float = 5.0
     level: float = 0.1
@@ -91,13 +99,10 @@ class ReleasedAccidents:
 
     def variants(self) -> Mapping[str, AccidentProtocol]:
         """These rules with one choice made otherwise, by `name=value`."""
-        switches = {name: not value for name, value in asdict(self).items() if isinstance(value, bool)}
-        others: dict[str, Any] = {"truth_gap": 2.0, "prediction_gap": 2.0, "errors_at": 10.0, **switches}
-        return {
-            f"{name}={value}": replace(self, **{name: value})
-            for name, value in others.items()
-            if value != getattr(self, name)
-        }
+        switches = {name: (False, True) for name, value in asdict(self).items() if isinstance(value, bool)}
+        return with_others(
+            self, {"truth_gap": (2.0,), "prediction_gap": (2.0,), "level": (0.5,), "errors_at": (10.0,), **switches}
+        )
 
     def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
         """What one sample adds.
@@ -110,6 +115,7 @@ class ReleasedAccidents:
                 "the released protocol compares motion: give a MotionOutput and the sample's motion labels; "
                 "explicit accidents are for protocol='boxes'"
             )
+        check_protocol(label, self.labels)
         frames = frames_there(label)
         check_output(prediction, label, frames)
         label = labels_at_present(label)
@@ -124,23 +130,16 @@ class ReleasedAccidents:
 
     def result(self, counts: Collection[Counts]) -> AccidentResult:
         """The metrics of some samples' counts, in any order."""
-        within = {distance: _within(counts, index) for index, distance in enumerate(DISTANCES)}
-        names = Counter(each["named"] for each in counts)
-        positives = sum(each["positive"] for each in counts)
-        errors = {
-            name: self._error([getattr(each, f"{name}_error") for each in within.values()], name) for name in _SUMS
+        made = tally_result(_united(counts), DISTANCES[0])
+        errors: dict[str, Any] = {
+            f"{name}_error": self._error([getattr(each, f"{name}_error") for each in made.within.values()], name)
+            for name in ERRORS
         }
-        return AccidentResult(
-            within=within,
-            apa=math.fsum(each.accuracy for each in within.values()) / len(within),
-            id_error=errors["id"],
-            position_error=errors["position"],
-            time_error=errors["time"],
-            samples=len(counts),
-            positives=positives,
-            negatives=len(counts) - positives,
-            truths={name: names[name] for name in NAMED},
-        )
+        return replace(made, **errors)
+
+    def pooled(self, counts: Collection[Counts]) -> list[Counts]:
+        """The sum of all counts, which has the same result."""
+        return [_united(counts)]
 
     def _post_processing(self) -> PostProcessing:
         return replace(POST_PROCESSING["accident"], redraw=self.redraw)
@@ -201,7 +200,7 @@ def accident_counts(
     last = (longest(truth.paths) or len(truth.drawn)) - 1
     frames = [last] if rules.last_frame_only else [*range(last + 1)]
     true = collision(truth, frames, rules.truth_gap, rules.level)
-    counts: dict[str, Any] = {name: [0] * len(DISTANCES) for name in ("tp", "fp", "fn", *_SUMS)}
+    counts: dict[str, Any] = {name: [0] * len(DISTANCES) for name in ("tp", "fp", "fn", *ERRORS)}
     counts["positive"] = true is not None
     if not predictions[0].paths and rules.empty_first_ends:
         counts["fn"] = [int(true is not None)] * len(DISTANCES)
@@ -258,10 +257,13 @@ def _others_named(alarm: Collision, true: Collision, same: Collection[Pair]) -> 
     return int(not all(any((name, other) in same for other in true.pair) for name in alarm.pair))
 
 
-def _within(counts: Collection[Counts], index: int) -> AccidentsWithin:
-    tp, fp, fn = (sum(each[name][index] for each in counts) for name in ("tp", "fp", "fn"))
-    sums = {name: math.fsum(each[name][index] for each in counts) for name in _SUMS}
-    errors = {f"{name}_error": value / tp if tp else None for name, value in sums.items()}
-    return AccidentsWithin(
-        distance=DISTANCES[index], tp=tp, fp=fp, fn=fn, accuracy=ratio(tp, tp + fp / 2 + fn / 2), **errors
-    )
+def _united(counts: Collection[Counts]) -> Counts:
+    """The tally of samples, those of `pooled` among them."""
+    return united(each if "numbers" in each else sample_tally(each, _by_distance(each)) for each in counts)
+
+
+def _by_distance(counts: Counts) -> list[dict[str, Any]]:
+    return [
+        {"tp": tp, "fp": fp, "fn": fn} | {name: [counts[name][index]] if tp else [] for name in ERRORS}
+        for index, (tp, fp, fn) in enumerate(zip(counts["tp"], counts["fp"], counts["fn"], strict=True))
+    ]

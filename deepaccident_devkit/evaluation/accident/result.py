@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
-from types import MappingProxyType
-from typing import Any, Final
+from dataclasses import dataclass, field
+from typing import Final
+
+from deepaccident_devkit.evaluation.frozen_mappings import FrozenMappings
 
 DISTANCES: Final = (5.0, 10.0, 15.0)
 """Metres: how far off a predicted accident may be."""
@@ -39,7 +40,7 @@ class AccidentsWithin:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AccidentResult:
+class AccidentResult(FrozenMappings):
     """Accident metrics of some samples.
 
     Attributes:
@@ -67,16 +68,3 @@ class AccidentResult:
     truths: Mapping[str, int]
     notes: tuple[str, ...] = ()
     beside: Mapping[str, AccidentResult] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        """Freeze the mappings."""
-        object.__setattr__(self, "within", MappingProxyType(dict(self.within)))
-        object.__setattr__(self, "truths", MappingProxyType(dict(self.truths)))
-        object.__setattr__(self, "beside", MappingProxyType(dict(self.beside)))
-
-    def as_dict(self) -> dict[str, Any]:
-        """All of it, as JSON can hold it; `within` by the distance as text ("5")."""
-        values = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        values["within"] = {f"{distance:g}": asdict(each) for distance, each in self.within.items()}
-        beside = {name: result.as_dict() for name, result in self.beside.items()}
-        return values | {"truths": dict(self.truths), "notes": list(self.notes), "beside": beside}

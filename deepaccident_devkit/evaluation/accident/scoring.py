@@ -1,11 +1,9 @@
-"""From accidents foreseen and true to counts and means: what the protocols `paper` and `boxes` share."""
+"""From accidents foreseen and true to counts: what the protocols `paper` and `boxes` share."""
 
 from __future__ import annotations
 
-import math
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -13,8 +11,11 @@ import numpy as np
 from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.accident.protocol import AccidentContext
-from deepaccident_devkit.evaluation.accident.result import DISTANCES, NAMED, AccidentResult, AccidentsWithin
-from deepaccident_devkit.evaluation.evaluator import Counts, ratio
+from deepaccident_devkit.evaluation.accident.reading import TIE, even
+from deepaccident_devkit.evaluation.accident.result import DISTANCES
+from deepaccident_devkit.evaluation.accident.tallies import ERRORS, Tally, sample_tally
+from deepaccident_devkit.evaluation.accident.variants import with_others
+from deepaccident_devkit.evaluation.evaluator import Counts
 
 Alarm = Mapping[str, Any]
 """An accident that is foreseen, as counts hold it: `position` (metres), `time` (seconds, later than the truth is
@@ -49,18 +50,15 @@ class Scoring:
 
     def variants(self) -> dict[str, Scoring]:
         """This scoring with one choice made otherwise, by `name=value`; for explanations."""
-        others: Mapping[str, tuple[Any, ...]] = {
-            "errors_at": DISTANCES,
-            "limit_counts": (False, True),
-            "far_is_missed": (False, True),
-            "time_tolerance": (None, 0.5),
-        }
-        return {
-            f"{name}={value}": replace(self, **{name: value})
-            for name, values in others.items()
-            for value in values
-            if value != getattr(self, name)
-        }
+        return with_others(
+            self,
+            {
+                "errors_at": DISTANCES,
+                "limit_counts": (False, True),
+                "far_is_missed": (False, True),
+                "time_tolerance": (None, 0.5),
+            },
+        )
 
     def hit(self, alarms: Sequence[Alarm], distance: float) -> Alarm | None:
         """The first alarm that foresees the true accident within a distance."""
@@ -68,7 +66,7 @@ class Scoring:
 
     def _is_within(self, alarm: Alarm, distance: float) -> bool:
         position, time = alarm["position"], alarm["time"]
-        if position is None or position > distance or (position == distance and not self.limit_counts):
+        if position is None or position >= distance + (TIE if self.limit_counts else -TIE):
             return False
         return self.time_tolerance is None or abs(time) <= self.time_tolerance + _TIME_SLACK
 
@@ -76,7 +74,8 @@ class Scoring:
 def foreseen(
     position: float | None = None, time: float | None = None, id_error: int | None = None, **more: float
 ) -> dict[str, Any]:
-    """An `Alarm`; `more` is kept with it."""
+    """An `Alarm`, of whose positions those that differ by less than `TIE` are equal; `more` is kept with it."""
+    position = None if position is None else float(even(np.asarray(position)))
     return {"position": position, "time": time, "id": id_error, **more}
 
 
@@ -101,60 +100,27 @@ def named(pair: Iterable[int | None] | None, context: AccidentContext) -> str:
     return "meta" if context.pair is not None and actors == set(context.pair) else "another"
 
 
-def accident_result(
-    samples: Sequence[Counts], alarms: Sequence[Sequence[Alarm]], scoring: Scoring, notes: Iterable[str] = ()
-) -> AccidentResult:
-    """The metrics of samples.
+def alarms_tally(sample: Counts, alarms: Sequence[Alarm], scoring: Scoring) -> Tally:
+    """What one sample adds.
 
     Args:
-        samples: their counts, of which `positive` and `named` are read.
-        alarms: of each sample, the most important one first.
+        sample: its counts, of which `positive` and `named` are read.
+        alarms: its, the most important one first.
         scoring: when they count.
-        notes: for the reader.
     """
-    positive = [bool(sample["positive"]) for sample in samples]
-    within = {distance: _within(positive, alarms, distance, scoring) for distance in DISTANCES}
-    at = within[scoring.errors_at]
-    names = Counter(sample["named"] for sample in samples)
-    return AccidentResult(
-        within=within,
-        apa=math.fsum(each.accuracy for each in within.values()) / len(within),
-        id_error=at.id_error,
-        position_error=at.position_error,
-        time_error=at.time_error,
-        samples=len(samples),
-        positives=sum(positive),
-        negatives=len(samples) - sum(positive),
-        truths={name: names[name] for name in NAMED},
-        notes=tuple(notes),
-    )
+    return sample_tally(sample, [_within(sample, alarms, each, scoring) for each in DISTANCES])
 
 
-def _within(
-    positive: Sequence[bool], alarms: Sequence[Sequence[Alarm]], distance: float, scoring: Scoring
-) -> AccidentsWithin:
-    found = [scoring.hit(each, distance) if true else None for true, each in zip(positive, alarms, strict=True)]
-    hits = [alarm for alarm in found if alarm is not None]
-    tp, fp = len(hits), sum(map(len, alarms)) - len(hits)
-    fn = sum(
-        true and alarm is None and (scoring.far_is_missed or not each)
-        for true, alarm, each in zip(positive, found, alarms, strict=True)
-    )
-    return AccidentsWithin(
-        distance=distance,
-        tp=tp,
-        fp=fp,
-        fn=fn,
-        accuracy=ratio(tp, tp + fp / 2 + fn / 2),
-        id_error=_mean(alarm["id"] for alarm in hits),
-        position_error=_mean(alarm["position"] for alarm in hits),
-        time_error=_mean(None if alarm["time"] is None else abs(alarm["time"]) for alarm in hits),
-    )
-
-
-def _mean(values: Iterable[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return math.fsum(known) / len(known) if known else None
+def _within(sample: Counts, alarms: Sequence[Alarm], distance: float, scoring: Scoring) -> dict[str, Any]:
+    hit = scoring.hit(alarms, distance) if sample["positive"] else None
+    missed = sample["positive"] and hit is None and (scoring.far_is_missed or not alarms)
+    errors = {name: None if hit is None else hit[name] for name in ERRORS}
+    return {
+        "tp": int(hit is not None),
+        "fp": len(alarms) - int(hit is not None),
+        "fn": int(missed),
+        **{name: [] if error is None else [abs(error)] for name, error in errors.items()},
+    }
 
 
 _TIME_SLACK: Final = 1e-6

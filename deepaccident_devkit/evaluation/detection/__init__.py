@@ -2,7 +2,7 @@
 
 from deepaccident_devkit.evaluation.detection.boxes import DetectedBoxes
 from deepaccident_devkit.evaluation.detection.evaluator import DetectionEvaluator
-from deepaccident_devkit.evaluation.detection.nuscenes_summary import NuScenesSummary, nuscenes_summary
+from deepaccident_devkit.evaluation.detection.nuscenes import NuScenesSummary, nuscenes_summary
 from deepaccident_devkit.evaluation.detection.protocols import (
     DETECTION_PROTOCOLS,
     DetectionProtocol,

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from deepaccident_devkit.errors import GeometryError
+from deepaccident_devkit.errors import EvaluationError, GeometryError
 from deepaccident_devkit.evaluation.detection.boxes import DetectedBoxes, columns_of
 from deepaccident_devkit.evaluation.detection.curves import Ledger, Points, curve, pooled
 from deepaccident_devkit.evaluation.detection.frame_counts import frame_counts
@@ -51,7 +50,7 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
     @property
     def settings(self) -> dict[str, Any]:
         """The protocol's choices."""
-        return self.protocol.as_json()
+        return self.protocol.as_dict()
 
     def update(self, token: str, prediction: DetectedBoxes, truth: Boxes) -> None:
         """Take a sample.
@@ -63,9 +62,14 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
                 ranges are applied here.
 
         Raises:
-            GeometryError: boxes are in another frame.
-            EvaluationError: the sample came before, with another result.
+            GeometryError: the truth is no boxes, or boxes are in another frame.
+            EvaluationError: the prediction is none of boxes, or the sample came before, with another result.
         """
+        if not isinstance(prediction, DetectedBoxes):
+            raise EvaluationError(
+                f"{token}: expected DetectedBoxes as the prediction, found {type(prediction).__name__}; make them with "
+                "DetectedBoxes.from_arrays(center, size, yaw, scores), of no rows where nothing is detected"
+            )
         for name, boxes in (("prediction", prediction.boxes), ("truth", checked_boxes("truth", truth))):
             if boxes.frame != self.protocol.frame:
                 raise GeometryError(
@@ -73,7 +77,7 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
                     "transform them, or choose frame="
                 )
         counts = frame_counts(columns_of(prediction.boxes, prediction.scores), columns_of(truth), self.protocol)
-        self.add(token, {"token": token, **counts.as_json()})
+        self.add(token, {"token": token, **counts.as_dict()})
 
     def result_of(self, counts: Collection[Counts]) -> DetectionResult:
         """The metrics of some samples' counts, in any order."""
@@ -85,7 +89,7 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
 
 
 def detection_result(counts: Collection[Counts], protocol: DetectionProtocol) -> DetectionResult:
-    """The metrics of some samples' counts (`FrameCounts.as_json`, each with its `token`, or pooled), in any order."""
+    """The metrics of some samples' counts (`FrameCounts.as_dict`, each with its `token`, or pooled), in any order."""
     ledger = Ledger(list(counts), protocol)
     names = [name for name, _ in protocol.classes]
     shape = len(names), len(protocol.ranges), len(protocol.thresholds)
@@ -105,8 +109,8 @@ def detection_result(counts: Collection[Counts], protocol: DetectionProtocol) ->
     by_class = {name: mean_of(values) for name, values in zip(names, average, strict=True)}
     return DetectionResult(
         mean_average_precision=mean_of(np.array(list(by_class.values()))),
-        class_average_precision=MappingProxyType(by_class),
-        mean_errors=MappingProxyType({name: mean_of(column) for name, column in zip(ERRORS, errors.T, strict=True)}),
+        class_average_precision=by_class,
+        mean_errors={name: mean_of(column) for name, column in zip(ERRORS, errors.T, strict=True)},
         classes=tuple(names),
         ranges=np.array(protocol.ranges),
         thresholds=np.array([protocol.limits(name) for name in names]),

@@ -27,7 +27,7 @@ _CORNERS: Final = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
 
 @dataclass(slots=True)
 class FrameCounts:
-    """The columns that one sample adds; `as_json` has them by these names.
+    """The columns that one sample adds; `as_dict` has them by these names.
 
     A *group* is a class within a range (class · ranges + range); a *cell* is a group at a threshold (group · thresholds
     + threshold). Detections are rows of `scores`.
@@ -53,7 +53,7 @@ class FrameCounts:
     matches: tuple[list[int], list[int]] = field(default_factory=lambda: ([], []))
     errors: list[list[Any]] = field(default_factory=lambda: [[], [], [], [], [], []])
 
-    def as_json(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Any]:
         """Names → lists, equal after a way through JSON."""
         return {
             "truths": self.truths,

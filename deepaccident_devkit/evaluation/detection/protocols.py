@@ -144,7 +144,7 @@ class DetectionProtocol:
         small = self.small_thresholds is not None and name in SMALL_CATEGORIES
         return self.small_thresholds if small and self.small_thresholds is not None else self.thresholds
 
-    def as_json(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Any]:
         """All choices, as JSON holds them."""
         result: dict[str, Any] = json.loads(json.dumps(asdict(self)))
         return result

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import fsum, isinf, isnan, nan
+from math import fsum, isnan, nan
 from typing import Any
 
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.evaluation.detection.measures import ERRORS
+from deepaccident_devkit.evaluation.frozen_mappings import FrozenMappings, plain
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DetectionResult(FrozenArrays):
+class DetectionResult(FrozenArrays, FrozenMappings):
     """Average precisions and errors, by class; arrays are read-only. NaN: nothing to count.
 
     C classes, R ranges, K thresholds, P points of a curve.
@@ -50,14 +51,19 @@ class DetectionResult(FrozenArrays):
     detections: IntArray
     samples: int
 
-    def to_dict(self) -> dict[str, Any]:
+    def __post_init__(self) -> None:
+        """Freeze arrays and mappings."""
+        FrozenArrays.__post_init__(self)
+        FrozenMappings.__post_init__(self)
+
+    def as_dict(self) -> dict[str, Any]:
         """All but the curves, as JSON holds it; None for what there is nothing to count of."""
         by_class = {
             name: {
                 "thresholds": self.thresholds[position].tolist(),
-                "AP": _without_nan(self.average_precision[position]),
-                "mean_AP": _number(self.class_average_precision[name]),
-                **{error: _number(value) for error, value in zip(ERRORS, self.errors[position].tolist(), strict=True)},
+                "AP": plain(self.average_precision[position]),
+                "mean_AP": plain(self.class_average_precision[name]),
+                **{error: plain(value) for error, value in zip(ERRORS, self.errors[position].tolist(), strict=True)},
                 "truths": self.truths[position].tolist(),
                 "detections": self.detections[position].tolist(),
             }
@@ -65,9 +71,9 @@ class DetectionResult(FrozenArrays):
         }
         return {
             "samples": self.samples,
-            "ranges": [[low, None if isinf(high) else high] for low, high in self.ranges.tolist()],
-            "mAP": _number(self.mean_average_precision),
-            **{f"m{name}": _number(value) for name, value in self.mean_errors.items()},
+            "ranges": plain(self.ranges),
+            "mAP": plain(self.mean_average_precision),
+            **{f"m{name}": plain(value) for name, value in self.mean_errors.items()},
             "classes": by_class,
         }
 
@@ -76,11 +82,3 @@ def mean_of(values: AnyArray) -> float:
     """The exact mean of what is not NaN; NaN if there is nothing."""
     known = [value for value in np.asarray(values, dtype=np.float64).reshape(-1).tolist() if not isnan(value)]
     return fsum(known) / len(known) if known else nan
-
-
-def _without_nan(values: FloatArray) -> list[Any]:
-    return [_without_nan(row) for row in values] if values.ndim > 1 else [_number(value) for value in values.tolist()]
-
-
-def _number(value: float) -> float | None:
-    return None if isnan(value) else value

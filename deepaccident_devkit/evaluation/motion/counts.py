@@ -6,15 +6,22 @@ from dataclasses import asdict
 
 from deepaccident_devkit.arrays import AnyArray, FloatArray
 from deepaccident_devkit.evaluation.evaluator import Counts
-from deepaccident_devkit.evaluation.frames import check_output, first_frames, frames_there, labels_at_present
+from deepaccident_devkit.evaluation.frames import (
+    check_output,
+    check_protocol,
+    checked_pair,
+    first_frames,
+    frames_there,
+    labels_at_present,
+)
 from deepaccident_devkit.evaluation.instance_paths import instance_paths
 from deepaccident_devkit.evaluation.motion.protocol import MotionProtocol
+from deepaccident_devkit.evaluation.panoptic import vpq_counts
 from deepaccident_devkit.evaluation.predictions import MotionOutput
 from deepaccident_devkit.evaluation.ranges import cells_within
 from deepaccident_devkit.evaluation.segmentation import mask_counts
 from deepaccident_devkit.evaluation.trajectory_errors import trajectory_errors
 from deepaccident_devkit.evaluation.trajectory_matching import longest, match_trajectories, padded
-from deepaccident_devkit.evaluation.vpq import vpq_counts
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import MotionHeads, MotionLabels, PostProcessing, predict_instances, trajectories
 
@@ -34,6 +41,8 @@ def motion_counts(
         positives, false positives and false negatives; `paths`, sums by name, or None.
     """
     rules = protocol or MotionProtocol()
+    prediction, label = checked_pair(prediction, label)
+    check_protocol(label, rules.labels)
     frames = frames_there(label)
     check_output(prediction, label, frames)
     truth, grid = labels_at_present(label), label.config.grid

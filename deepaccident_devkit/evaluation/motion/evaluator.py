@@ -11,9 +11,9 @@ from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio, t
 from deepaccident_devkit.evaluation.motion.counts import motion_counts
 from deepaccident_devkit.evaluation.motion.protocol import MotionProtocol, motion_protocol
 from deepaccident_devkit.evaluation.motion.result import MotionResult, RangeResult
+from deepaccident_devkit.evaluation.panoptic import panoptic_quality
 from deepaccident_devkit.evaluation.predictions import MotionOutput
 from deepaccident_devkit.evaluation.segmentation import SegmentationCounts, iou
-from deepaccident_devkit.evaluation.vpq import panoptic_quality
 from deepaccident_devkit.motion import MotionLabels
 
 _PATH_COUNTS: Final = ("true_positive", "false_positive", "false_negative")
@@ -62,8 +62,8 @@ class MotionEvaluator(Evaluator[MotionResult]):
             label: the sample's labels, on the same ground; those still in their own frames are warped to the present.
 
         Raises:
-            EvaluationError: the prediction has another grid or too few frames, or the sample came before with another
-                outcome.
+            EvaluationError: there is no prediction or label, the labels are of another protocol, the prediction has
+                another grid or too few frames, or the sample came before with another outcome.
         """
         self.add(token, motion_counts(prediction, label, self.protocol, trajectories=self.trajectories))
 
@@ -85,7 +85,7 @@ class MotionEvaluator(Evaluator[MotionResult]):
     def selected_as_released(self, order: Sequence[str], selected: Collection[str]) -> MotionResult:
         """The result of some samples as the released code has it "by attribute": with the VPQ of other frames.
 
-        See `vpq.separate_selected_as_released`, whose mistake this is; `compute(selected)` is the correct result.
+        See `panoptic.separate_selected_as_released`, whose mistake this is; `compute(selected)` is the correct result.
 
         Args:
             order: all samples in the order evaluated.
@@ -96,12 +96,12 @@ class MotionEvaluator(Evaluator[MotionResult]):
         """
         self.compute(order)  # refuses samples that were not counted
         frames = [
-            [[[values[frame]] for values in each] for each in self.counts[token]["vpq"]]
+            [[[values[frame]] for values in each] for each in self._counts[token]["vpq"]]
             for token in order
-            for frame in range(self.counts[token]["frames"])
+            for frame in range(self._counts[token]["frames"])
         ]
         numbers = [number for number, token in enumerate(order) if token in set(selected)]
-        return self._result([self.counts[order[number]] for number in numbers], [frames[number] for number in numbers])
+        return self._result([self._counts[order[number]] for number in numbers], [frames[number] for number in numbers])
 
     def _result(self, counts: Collection[Counts], vpq: Sequence[Any]) -> MotionResult:
         names = self.protocol.range_names

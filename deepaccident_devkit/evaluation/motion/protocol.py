@@ -8,10 +8,10 @@ from types import MappingProxyType
 from typing import Final
 
 from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.evaluation.panoptic import VpqRules
 from deepaccident_devkit.evaluation.trajectory_errors import TrajectoryRules
 from deepaccident_devkit.evaluation.trajectory_matching import GATE
-from deepaccident_devkit.evaluation.vpq import VpqRules
-from deepaccident_devkit.motion import POST_PROCESSING, PostProcessing
+from deepaccident_devkit.motion import LABEL_PROTOCOLS, POST_PROCESSING, PostProcessing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -19,6 +19,7 @@ class MotionProtocol:
     """What decides the motion metrics; the defaults are the released ones (evaluation.md b, c and d).
 
     Attributes:
+        labels: protocol of the labels that are the truth, by name; others are refused. None for any labels.
         ranges: metres: sides of the squares around the ego in which IoU and VPQ are counted.
         instances: how instances are read off heads for VPQ.
         paths: how they are read off heads, and off labels, for minADE, minFDE and miss rate. The released code has
@@ -30,6 +31,7 @@ class MotionProtocol:
         nothing_is_zero: IoU and VPQ of samples with nothing to count are 0; else NaN.
     """
 
+    labels: str | None = "released"
     ranges: tuple[float, ...] = (30.0, 100.0)
     instances: PostProcessing = POST_PROCESSING["motion"]
     paths: PostProcessing = field(default_factory=lambda: replace(POST_PROCESSING["accident"], redraw=False))
@@ -38,6 +40,13 @@ class MotionProtocol:
     gate: float = GATE
     trajectories: TrajectoryRules = field(default_factory=TrajectoryRules)
     nothing_is_zero: bool = True
+
+    def __post_init__(self) -> None:
+        """Check the values; raises ChoiceError."""
+        if self.labels is not None and self.labels not in LABEL_PROTOCOLS:
+            raise ChoiceError(
+                f"labels: expected one of {', '.join(LABEL_PROTOCOLS)}, or None for any, found {self.labels!r}"
+            )
 
     @property
     def range_names(self) -> tuple[str, ...]:

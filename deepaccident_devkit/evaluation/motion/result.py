@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 from deepaccident_devkit.evaluation.frozen_mappings import FrozenMappings
 
@@ -63,9 +62,3 @@ class MotionResult(FrozenMappings):
     samples: int
     frames: int
     notes: tuple[str, ...] = ()
-
-    def as_dict(self) -> dict[str, Any]:
-        """All of it, as JSON can hold it (but for NaN)."""
-        values = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        values["ranges"] = {name: asdict(each) for name, each in self.ranges.items()}
-        return values | {"notes": list(self.notes)}

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError, EvaluationError, NotAvailableError
-from deepaccident_devkit.evaluation.accident.box_truth import BoxTruth, accident_context, box_truth
+from deepaccident_devkit.evaluation.accident import BoxTruth, accident_context, box_truth
 from deepaccident_devkit.evaluation.accident.boxes import BoxAccidents
 from deepaccident_devkit.evaluation.accident.evaluator import AccidentEvaluator
 from deepaccident_devkit.evaluation.accident.protocol import AccidentContext

@@ -1,28 +1,35 @@
 """What holds of every evaluator, on the labels of a synthetic release: order, parts, pauses, nothing and perfection."""
 
+import copy
+import json
 import math
+import pickle
 from collections.abc import Callable, Sequence
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import asdict, fields, is_dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import pytest
 
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import EvaluationError, GeometryError
 from deepaccident_devkit.evaluation import (
     AccidentEvaluator,
     BevSegmentationEvaluator,
+    Bootstrap,
     DetectedBoxes,
     DetectionEvaluator,
     Evaluator,
     MotionEvaluator,
     MotionOutput,
+    breakdown,
     detection_truth,
     instances_of,
+    nuscenes_summary,
+    sample_attributes,
 )
-from deepaccident_devkit.evaluation.accident.box_truth import accident_context
+from deepaccident_devkit.evaluation.accident import accident_context
 from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.motion import BEV_CLASSES, BevSegmentation, MotionHeads
@@ -169,6 +176,54 @@ def test_empty_predictions_score_0(samples: Samples, tokens: list[str], name: st
     ALL[name]().compute()
 
 
+@of_all
+def test_results_can_be_copied_and_written(samples: Samples, tokens: list[str], name: str) -> None:
+    evaluator = evaluated(name, tokens, lambda token: samples.some(name, token))
+    attributes = sample_attributes(samples.dataset, tokens)
+    whole, bootstrap = evaluator.compute(), Bootstrap(resamples=2)
+    results = [whole, ALL[name]().compute(), breakdown(evaluator, attributes, "scenario_type", bootstrap)]
+    if name == "detection paper":
+        results.append(nuscenes_summary(whole))
+    for result in results:
+        for again in (pickle.loads(pickle.dumps(result)), copy.deepcopy(result), replace(result)):
+            assert bits(again) == bits(result)
+        described = asdict(result)
+        assert described.keys() == {field.name for field in fields(result)}
+        json.dumps(result.as_dict(), allow_nan=False)
+        assert len({result, result}) == 1
+        for frozen in mappings_of(result):
+            with pytest.raises(TypeError, match="cannot be changed"):
+                frozen["more"] = 1
+            with pytest.raises(TypeError, match="cannot be changed"):
+                frozen.update(more=1)
+
+
+@of_all
+def test_counts_are_json_and_nobody_changes_them(samples: Samples, tokens: list[str], name: str) -> None:
+    evaluator = evaluated(name, tokens[:1], lambda token: samples.some(name, token))
+    [handed_out] = evaluator.counts.values()
+    assert json.loads(json.dumps(handed_out, allow_nan=False)) == handed_out
+    expected = bits(evaluator.compute())
+    handed_out.clear()
+    for value in evaluator.counts[tokens[0]].values():
+        if isinstance(value, list):
+            value.append(1)
+    assert bits(evaluator.compute()) == expected
+    assert tokens[0] in evaluator.counts
+    assert "x" not in evaluator.counts
+
+
+@pytest.mark.parametrize("name", MOTION | DETECTION)
+@pytest.mark.parametrize("given", [None, np.zeros((2, 5, 200, 200), dtype=int)])
+def test_predictions_that_are_none(samples: Samples, tokens: list[str], name: str, given: object) -> None:
+    _, truth = samples.perfect(name, tokens[0])
+    with pytest.raises(EvaluationError, match=r"expected (a MotionOutput|DetectedBoxes).* found .*from_arrays\("):
+        ALL[name]().update(tokens[0], given, truth)
+    prediction, _ = samples.perfect(name, tokens[0])
+    with pytest.raises((EvaluationError, GeometryError), match=r"expected (MotionLabels|Boxes), found (None|nd)"):
+        ALL[name]().update(tokens[0], prediction, given)
+
+
 @pytest.mark.parametrize("name", MOTION | ACCIDENT)
 def test_empty_heads_score_0(samples: Samples, tokens: list[str], name: str) -> None:
     """What a network says that sees nobody: no peak, background everywhere."""
@@ -216,13 +271,21 @@ def score(result: Any) -> float:
     return value
 
 
+def mappings_of(value: Any) -> list[Any]:
+    """All mappings in a result."""
+    parts = list(value.values()) if isinstance(value, dict) else list(value) if isinstance(value, tuple) else []
+    if is_dataclass(value):
+        parts = [getattr(value, field.name) for field in fields(value)]
+    return [*([value] if isinstance(value, dict) else []), *(each for part in parts for each in mappings_of(part))]
+
+
 def bits(value: Any) -> Any:
     """A result to its last bit, whatever the order of its mappings."""
     if is_dataclass(value):
         return type(value).__name__, [(field.name, bits(getattr(value, field.name))) for field in fields(value)]
     if isinstance(value, np.ndarray):
         return value.shape, value.dtype.str, value.tobytes()
-    if isinstance(value, dict | MappingProxyType):
+    if isinstance(value, dict):
         return sorted((str(key), bits(each)) for key, each in value.items())
     if isinstance(value, list | tuple):
         return [bits(each) for each in value]

@@ -30,7 +30,7 @@ def test_cells_are_summed_over_samples() -> None:
     assert result.iou["road"] == pytest.approx(100 * 20 / 28)
     assert math.isnan(result.iou["vehicle"])
     assert result.mean_iou == result.iou["road"]
-    assert json.dumps(result.to_dict(), allow_nan=False)
+    assert json.dumps(result.as_dict(), allow_nan=False)
 
 
 def test_perfect_and_empty_predictions() -> None:

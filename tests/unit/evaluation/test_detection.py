@@ -9,7 +9,7 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError, GeometryError, NotAvailableError
-from deepaccident_devkit.evaluation.breakdown import numbers_of
+from deepaccident_devkit.evaluation.breakdowns import numbers_of
 from deepaccident_devkit.evaluation.detection import (
     DETECTION_PROTOCOLS,
     DetectedBoxes,
@@ -93,7 +93,7 @@ def test_nothing_there_and_no_samples(protocol: str) -> None:
     for evaluator in (evaluated(protocol, (found_at(), truth_at())), DetectionEvaluator(protocol)):
         mean = evaluator.compute().mean_average_precision
         assert mean == 0 if zero else math.isnan(mean)
-        assert json.dumps(evaluator.compute().to_dict(), allow_nan=False)
+        assert json.dumps(evaluator.compute().as_dict(), allow_nan=False)
 
 
 def test_levels_of_recall_are_sums_in_double_precision() -> None:
@@ -179,7 +179,7 @@ def test_velocities_that_a_detector_does_not_give() -> None:
     assert math.isnan(result.mean_errors["AVE"])
     summary = nuscenes_summary(result)
     assert summary.score_without_attributes == pytest.approx(100 * 8 / 9)
-    assert summary.to_dict()["mAVE"] is None
+    assert summary.as_dict()["mAVE"] is None
     assert "–" in summary.to_text()
     evaluator.update("s/ego_vehicle/000", prediction, truth)  # the same once more: unknown equals unknown
     assert evaluator.repeated == {"s/ego_vehicle/000"}
@@ -236,7 +236,7 @@ def test_saved_counts_go_on(protocol: str, tmp_path: Path) -> None:
     whole.save(tmp_path / "counts.json")
     again = DetectionEvaluator(protocol).resume(tmp_path / "counts.json")
     assert again.counts == whole.counts
-    assert again.merge(whole).compute().to_dict() == whole.compute().to_dict()
+    assert again.merge(whole).compute().as_dict() == whole.compute().as_dict()
     assert again.repeated == whole.tokens
     with pytest.raises(EvaluationError, match="other settings"):
         DetectionEvaluator(protocol, thresholds=(0.25,), error_threshold=None, small_thresholds=None).resume(

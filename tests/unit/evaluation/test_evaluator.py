@@ -4,6 +4,7 @@ import json
 import math
 from itertools import permutations
 from pathlib import Path
+from typing import Any
 
 import pytest
 from evaluating import Sums
@@ -54,10 +55,22 @@ def test_evaluators_of_other_settings_do_not_merge() -> None:
 
 def test_some_samples_alone() -> None:
     evaluator = filled("abcd")
-    assert evaluator.compute("bd") == 1.1
+    assert evaluator.compute(["b", "d"]) == 1.1
     assert evaluator.compute([]) == 0.0
     with pytest.raises(EvaluationError, match="1 samples have no prediction, such as x"):
-        evaluator.compute("ax")
+        evaluator.compute(["a", "x"])
+
+
+@pytest.mark.parametrize("tokens", ["ab", 3, ["a", 1], [b"a"], [["a"]]])
+def test_what_are_no_tokens(tokens: Any) -> None:
+    with pytest.raises(EvaluationError, match=r"tokens: expected (several of them|texts), found"):
+        filled("ab").compute(tokens)
+
+
+@pytest.mark.parametrize("token", [3, None, b"a"])
+def test_what_is_no_token(token: Any) -> None:
+    with pytest.raises(EvaluationError, match="token: expected the sample's token, a text, found"):
+        Sums().add(token, {"value": 1.0})
 
 
 def test_a_broken_off_run_goes_on(tmp_path: Path) -> None:
@@ -157,10 +170,12 @@ def test_a_fresh_one_is_of_the_same_settings() -> None:
     assert (len(fresh), len(evaluator), fresh.settings) == (0, 2, evaluator.settings)
 
 
-def test_counts_are_a_view() -> None:
+def test_counts_cannot_be_changed() -> None:
     evaluator = filled("a")
     with pytest.raises(TypeError):
         evaluator.counts["b"] = {}  # type: ignore[index]
+    evaluator.counts["a"]["value"] = 2.0  # type: ignore[index]
+    assert evaluator.compute() == 1e16
     assert list(evaluator.pooled([{"value": 1.0}])) == [{"value": 1.0}]
 
 

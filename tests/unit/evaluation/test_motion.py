@@ -11,11 +11,11 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, GeometryError
 from deepaccident_devkit.evaluation.instance_paths import instance_paths
 from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS, MotionEvaluator, MotionProtocol, motion_counts
+from deepaccident_devkit.evaluation.panoptic import VpqRules, separate_selected_as_released, vpq, vpq_counts
 from deepaccident_devkit.evaluation.predictions import MotionOutput, instances_of
 from deepaccident_devkit.evaluation.ranges import cells_within
 from deepaccident_devkit.evaluation.segmentation import SegmentationCounts, iou, segmentation_counts
 from deepaccident_devkit.evaluation.trajectory_errors import TrajectoryRules
-from deepaccident_devkit.evaluation.vpq import VpqRules, separate_selected_as_released, vpq, vpq_counts
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
 from deepaccident_devkit.motion import MotionHeads, MotionLabelConfig, MotionLabels, samples
@@ -294,6 +294,20 @@ def test_what_cannot_be_compared_is_refused() -> None:
         segmentation_counts(np.zeros((2, 4)), np.zeros((3, 4)))
     with pytest.raises(ChoiceError, match="protocol: expected one of released, paper, found 'clean'"):
         MotionEvaluator("clean")
+
+
+def test_labels_of_another_protocol_are_refused() -> None:
+    config = MotionLabelConfig(protocol="clean")
+    label = boxes_label(*[boxes(_1=100)] * 5, config=config)
+    for protocol in MOTION_PROTOCOLS:
+        with pytest.raises(
+            EvaluationError, match=r"label protocol 'released'.*MotionLabelConfig\(protocol='released'\)"
+        ):
+            evaluated(still(boxes(_1=100)), label, protocol)
+    for labels in ("clean", None):
+        assert evaluated(still(boxes(_1=100)), label, MotionProtocol(labels=labels)).ranges["30x30"].pq == 100.0
+    with pytest.raises(ChoiceError, match=r"labels: expected one of released, clean, .*or None for any, found 'dirty'"):
+        MotionProtocol(labels="dirty")
 
 
 def test_iou_of_classes() -> None:

@@ -14,9 +14,9 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from deepaccident_devkit.errors import ConfigError, EvaluationError
+from deepaccident_devkit.evaluation.attributes import SampleAttributes, tokens_by_value
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.frozen_mappings import FrozenMappings
-from deepaccident_devkit.evaluation.sample_attributes import SampleAttributes, tokens_by_value
 from deepaccident_devkit.taxonomy import INFRASTRUCTURE
 
 Result = TypeVar("Result")
@@ -65,7 +65,7 @@ class Group(FrozenMappings, Generic[Result]):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Breakdown(Generic[Result]):
+class Breakdown(FrozenMappings, Generic[Result]):
     """Results by one attribute.
 
     Attributes:
@@ -133,8 +133,9 @@ def _group(
     bootstrap: Bootstrap,
 ) -> Group[Result]:
     scenarios: dict[str, list[Counts]] = {}
+    counts = evaluator.counts
     for token in tokens:
-        scenarios.setdefault(attributes[token].scenario, []).append(evaluator.counts[token])
+        scenarios.setdefault(attributes[token].scenario, []).append(counts[token])
     pooled = [evaluator.pooled(scenarios[name]) for name in sorted(scenarios)]
     return Group(
         value=value,

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import fsum, isnan
-from types import MappingProxyType
 from typing import Any, Final
 
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.detection.result import DetectionResult
+from deepaccident_devkit.evaluation.frozen_mappings import FrozenMappings, plain
 from deepaccident_devkit.text import columns_text
 
 AP_WEIGHT: Final = 5
@@ -17,7 +17,7 @@ AP_WEIGHT: Final = 5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class NuScenesSummary:
+class NuScenesSummary(FrozenMappings):
     """mAP, mean errors and one score of all, in nuScenes' manner.
 
     The score is like nuScenes' NDS and is not it: this dataset has no attributes, so that there is no AAE, and the
@@ -36,13 +36,13 @@ class NuScenesSummary:
     score_without_attributes: float
     table: Mapping[str, Mapping[str, float]]
 
-    def to_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Any]:
         """All of it, as JSON holds it; None for what is not known."""
         return {
-            "mAP": _number(self.mean_average_precision),
-            **{name: _number(value) for name, value in self.errors.items()},
-            "score_without_attributes": _number(self.score_without_attributes),
-            "classes": {name: {key: _number(value) for key, value in row.items()} for name, row in self.table.items()},
+            "mAP": plain(self.mean_average_precision),
+            **plain(self.errors),
+            "score_without_attributes": plain(self.score_without_attributes),
+            "classes": plain(self.table),
         }
 
     def to_text(self) -> str:
@@ -67,21 +67,15 @@ def nuscenes_summary(result: DetectionResult) -> NuScenesSummary:
     mean = result.mean_average_precision
     parts = [AP_WEIGHT * mean / 100, *(0.0 if isnan(value) else 1 - min(1.0, value) for value in errors.values())]
     table = {
-        name: MappingProxyType(
-            {"AP": average, **dict(zip(errors, result.errors[position].tolist(), strict=True))},
-        )
+        name: {"AP": average, **dict(zip(errors, result.errors[position].tolist(), strict=True))}
         for position, (name, average) in enumerate(result.class_average_precision.items())
     }
     return NuScenesSummary(
         mean_average_precision=mean,
-        errors=MappingProxyType(errors),
+        errors=errors,
         score_without_attributes=100 * fsum(parts) / (AP_WEIGHT + len(errors)),
-        table=MappingProxyType(table),
+        table=table,
     )
-
-
-def _number(value: float) -> float | None:
-    return None if isnan(value) else value
 
 
 def _text(value: float) -> str:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.evaluation.accident.protocol import AccidentContext
 from deepaccident_devkit.evaluation.accident.reading import InstanceTracks
 from deepaccident_devkit.evaluation.predictions import Accident
 from deepaccident_devkit.geometry.footprints import gaps
@@ -91,9 +90,10 @@ def box_truth(dataset: Dataset, sample: RowArgument, horizon: float = RELEASED_H
 
     Raises:
         TokenError: no such sample.
-        NotAvailableError: the scenario has no meta file, or no label ever shows one of the pair.
+        NotAvailableError: the sample has no label, the scenario has no meta file, or no label ever shows one of the
+            pair.
     """
-    there = dataset.get("sample", sample)
+    there = labelled_sample(dataset, sample)
     scenario = dataset.get("scenario", there["scenario_token"])
     if scenario["weather"] is None:
         raise NotAvailableError(f"{scenario['token']} has no meta file, which names the colliding pair; unpack meta")
@@ -116,27 +116,15 @@ def box_truth(dataset: Dataset, sample: RowArgument, horizon: float = RELEASED_H
     )
 
 
-def accident_context(dataset: Dataset, sample: RowArgument, horizon: float | None = None) -> AccidentContext:
-    """What a release knows of a sample beside its motion labels, for the accident metrics.
-
-    Args:
-        dataset: the release.
-        sample: token or record.
-        horizon: seconds that the protocol `boxes` looks ahead; None leaves out what it alone needs.
-
-    Raises:
-        TokenError: no such sample.
-        NotAvailableError: with a horizon, as of `box_truth`.
-    """
-    there = dataset.get("sample", sample)
-    scenario = dataset.get("scenario", there["scenario_token"])
-    collision = scenario["collision"]
-    return AccidentContext(
-        pair=None if collision is None else (collision["ids"][0], collision["ids"][1]),
-        known=scenario["weather"] is not None,
-        own_actor_id=dataset.get("agent", there["agent_token"])["actor_id"],
-        truth=None if horizon is None else box_truth(dataset, there, horizon),
-    )
+def labelled_sample(dataset: Dataset, sample: RowArgument) -> Any:
+    """A sample's record; raises TokenError, and NotAvailableError if it has no label."""
+    record = dataset.get("sample", sample)
+    if not record["labelled"]:
+        raise NotAvailableError(
+            f"{record['token']}: has no label (the test split ships without), so that nothing can be evaluated; "
+            "choose a labelled sample"
+        )
+    return record
 
 
 def _last_position(tracks: ScenarioTracks, footprints: FloatArray, actor: int, scenario: str) -> FloatArray:

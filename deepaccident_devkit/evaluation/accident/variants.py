@@ -1,0 +1,32 @@
+"""Rules with one choice made otherwise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, TypeVar
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Rules = TypeVar("Rules", bound="DataclassInstance")
+
+
+def with_others(rules: Rules, others: Mapping[str, Sequence[Any]]) -> dict[str, Rules]:
+    """A dataclass with one field changed at a time, by `name=value`.
+
+    Args:
+        rules: the dataclass.
+        others: values by field; the one that the rules have is left out.
+    """
+    return {
+        f"{name}={value}": replace(rules, **{name: value})
+        for name, values in others.items()
+        for value in values
+        if value != getattr(rules, name)
+    }
+
+
+def with_parts(rules: Rules, name: str, parts: Mapping[str, Any]) -> dict[str, Rules]:
+    """A dataclass with a field changed to each of some values, by their names."""
+    return {key: replace(rules, **{name: part}) for key, part in parts.items()}

@@ -1,0 +1,130 @@
+"""What models say: motion in maps of any framework, and explicit accidents."""
+
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit.errors import ChoiceError, GeometryError
+from deepaccident_devkit.evaluation import Accident, MotionOutput, instances_of
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.motion import MotionHeads
+
+GRID = BevGrid((-4.0, 4.0, 0.5), (-3.0, 3.0, 0.5))
+NAMES = ("segmentation", "centerness", "offset", "flow")
+
+
+def stacked(count: int = 3, shape: tuple[int, int] = GRID.shape) -> list[np.ndarray]:
+    """Heads of so many predictions of 5 frames, no two values alike."""
+    source = np.random.default_rng(0)
+    return [source.normal(size=(count, 5, channels, *shape)).astype(np.float32) for channels in (2, 1, 2, 2)]
+
+
+class TestMotionOutput:
+    def test_stacked_arrays_are_heads(self) -> None:
+        arrays = stacked()
+        output = MotionOutput.from_arrays(*arrays, grid=GRID)
+        assert len(output) == 3
+        assert output.heads is not None
+        for index, heads in enumerate(output.heads):
+            for name, values in zip(NAMES, arrays, strict=True):
+                np.testing.assert_array_equal(getattr(heads, name), values[index])
+        assert np.shares_memory(output.heads[0].flow, arrays[3])
+
+    def test_other_ways_to_give_the_same(self) -> None:
+        segmentation, centerness, offset, flow = stacked()
+        expected = MotionOutput.from_arrays(segmentation, centerness, offset, flow, grid=GRID)
+        assert expected.heads is not None
+        for some in (
+            MotionOutput.from_arrays(segmentation, centerness[:, :, 0], offset, flow, grid=GRID),
+            MotionOutput.from_arrays(segmentation.tolist(), centerness, offset.astype(float), flow, grid=GRID),
+        ):
+            assert same(some, expected)
+        one = MotionOutput(grid=GRID, heads=expected.heads[1])  # type: ignore[arg-type]  # a lone one is taken
+        for some in (
+            MotionOutput.from_arrays(segmentation[1], centerness[1], offset[1], flow[1], grid=GRID),
+            MotionOutput.from_arrays(segmentation[1], centerness[1, :, 0], offset[1], flow[1], grid=GRID),
+            MotionOutput(grid=GRID, heads=[expected.heads[1]]),  # type: ignore[arg-type]  # any sequence is
+            pickle.loads(pickle.dumps(one)),
+        ):
+            assert same(some, one)
+
+    def test_the_orientation_is_the_grids_unless_it_is_given(self) -> None:
+        arrays = stacked(shape=GRID.shape[::-1])
+        output = MotionOutput.from_arrays(*arrays, grid=GRID, orientation="fiery")
+        assert output.grid == GRID.with_orientation("fiery")
+        assert output.orientation is None
+        assert output.heads is not None
+        assert {heads.orientation for heads in output.heads} == {"fiery"}
+        assert same(MotionOutput(grid=GRID, heads=output.heads, orientation="fiery"), output)
+        maps = np.zeros((1, 5, *GRID.shape[::-1]), dtype=np.int32)
+        assert MotionOutput(grid=GRID, instances=maps, orientation="fiery").grid.orientation == "fiery"
+        with pytest.raises(GeometryError, match="orientation devkit"):
+            MotionOutput(grid=GRID, heads=output.heads)
+        with pytest.raises(ChoiceError, match="orientation: expected one of"):
+            MotionOutput(grid=GRID, instances=maps, orientation="north")  # type: ignore[arg-type]
+
+    @pytest.mark.parametrize("heads", [stacked()[0], stacked(), dict(zip(NAMES, stacked(), strict=True)), 3, [None]])
+    def test_arrays_are_no_heads(self, heads: Any) -> None:
+        with pytest.raises(GeometryError, match=r"heads: expected MotionHeads, found .*MotionOutput\.from_arrays\("):
+            MotionOutput(grid=GRID, heads=heads)
+
+    def test_what_is_no_output(self) -> None:
+        segmentation, centerness, offset, flow = stacked()
+        with pytest.raises(GeometryError, match=r"offset: expected \(K, T, channels, H, W\).* offset \(2, 5"):
+            MotionOutput.from_arrays(segmentation, centerness, offset[:2], flow, grid=GRID)
+        with pytest.raises(GeometryError, match=r"segmentation: expected \(K, T, channels, H, W\)"):
+            MotionOutput.from_arrays(segmentation[0, 0], centerness, offset, flow, grid=GRID)
+        with pytest.raises(GeometryError, match="flow: expected shape"):
+            MotionOutput.from_arrays(segmentation, centerness, offset, flow[:, :4], grid=GRID)
+        with pytest.raises(GeometryError, match="at least one prediction"):
+            MotionOutput.from_arrays(segmentation[:0], centerness[:0], offset[:0], flow[:0], grid=GRID)
+        with pytest.raises(GeometryError, match=r"grid: expected a BevGrid, .*found NoneType"):
+            MotionOutput.from_arrays(segmentation, centerness, offset, flow, grid=None)  # type: ignore[arg-type]
+        with pytest.raises(GeometryError, match="and not both"):
+            MotionOutput(grid=GRID)
+        with pytest.raises(GeometryError, match="at least one prediction"):
+            instances_of(np.zeros((0, 5, *GRID.shape), dtype=int), GRID)
+
+
+class TestAccident:
+    def test_numbers_of_numpy_become_pythons(self) -> None:
+        accident = Accident(
+            positions=[[0, 1], [2, 3]],  # type: ignore[arg-type]  # lists are taken
+            time=np.float32(0.5),  # type: ignore[arg-type]
+            score=np.array(1),  # type: ignore[arg-type]
+            ids=np.array([4, -100]),  # type: ignore[arg-type]
+        )
+        assert (accident.time, accident.score, accident.ids) == (0.5, 1.0, (4, -100))
+        assert [type(each) for each in (accident.time, accident.score, *(accident.ids or ()))] == [float] * 2 + [
+            int
+        ] * 2
+
+    @pytest.mark.parametrize(
+        ("changes", "message"),
+        [
+            ({"time": -0.1}, "expected seconds after the present, found -0.1"),
+            ({"time": None}, "accident time: expected seconds after the present, found None"),
+            ({"score": float("nan")}, "must be finite"),
+            ({"score": "high"}, "accident score: expected a number"),
+            ({"ids": (1, 2.5)}, "accident ids: expected two whole numbers"),
+            ({"ids": (1, 2, 3)}, "accident ids: expected two actor ids"),
+            ({"ids": 7}, "accident ids: expected two actor ids"),
+            ({"ids": "ab"}, "accident ids: expected two actor ids"),
+            ({"positions": np.full((2, 2), np.nan)}, "not all numbers are finite"),
+            ({"positions": np.zeros(2)}, "accident positions: expected shape"),
+        ],
+    )
+    def test_what_is_no_accident(self, changes: dict[str, Any], message: str) -> None:
+        with pytest.raises(GeometryError, match=message):
+            Accident(**{"positions": np.zeros((2, 2)), "time": 1.0, **changes})
+
+
+def same(one: MotionOutput, other: MotionOutput) -> bool:
+    mine, others = one.heads or (), other.heads or ()
+    return one.grid == other.grid and len(mine) == len(others) and all(map(same_heads, mine, others))
+
+
+def same_heads(one: MotionHeads, other: MotionHeads) -> bool:
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in NAMES)
