@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
@@ -65,7 +66,9 @@ class BevGrid:
 
     def with_orientation(self, orientation: Orientation) -> BevGrid:
         """The same cells, lying otherwise in an array. Raises ChoiceError."""
-        return replace(self, orientation=orientation)
+        if orientation in ORIENTATIONS:
+            return _with_orientation(self, orientation)
+        return replace(self, orientation=orientation)  # which refuses it
 
     def index_of(self, points: ArrayLike) -> tuple[IntArray, BoolArray]:
         """The cells that points (N, 2) or (N, 3) lie in; x forward, y left, metres.
@@ -142,6 +145,12 @@ def cells_in(
     if (source == "released") != (target == "released"):
         row = rows - 1 - row
     return (column, row) if target == "fiery" else (row, column)
+
+
+@functools.lru_cache(maxsize=256)
+def _with_orientation(grid: BevGrid, orientation: Orientation) -> BevGrid:
+    """Kept, since labels ask for the same few many times a sample."""
+    return replace(grid, orientation=orientation)
 
 
 def _axis(name: str, given: Axis) -> Axis:
