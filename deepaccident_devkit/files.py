@@ -4,11 +4,32 @@ import hashlib
 import os
 import shutil
 import stat
+import struct
 import tempfile
+import tokenize
+import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+DAMAGED_ARCHIVE = (
+    OSError,
+    ValueError,
+    EOFError,
+    KeyError,
+    MemoryError,
+    OverflowError,
+    RuntimeError,  # an encrypted member
+    SyntaxError,  # a damaged array header
+    NotImplementedError,  # an unknown compression
+    UnicodeError,
+    struct.error,  # a directory of the archive that ends early
+    tokenize.TokenError,  # an array header with an open bracket
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""What reading a damaged `.npz` archive can raise."""
 _BLOCK = 1 << 20
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,29 +21,14 @@ from deepaccident_devkit.arrays import (
     readonly,
 )
 from deepaccident_devkit.errors import GeometryError, MissingFileError, SensorFileError
-from deepaccident_devkit.files import replacing
+from deepaccident_devkit.files import DAMAGED_ARCHIVE, replacing
 from deepaccident_devkit.geometry.bev_grid import BevGrid
 from deepaccident_devkit.geometry.frames import checked_frame
 from deepaccident_devkit.geometry.se3 import SE3, checked_transform
 
 Range = tuple[float, float]
 _FIELDS = ("xyz", "intensity", "frame")
-_FAULTS = (
-    OSError,
-    ValueError,
-    TypeError,  # a bare array, which is no archive; up to Python 3.10 an AttributeError
-    AttributeError,
-    EOFError,
-    KeyError,
-    MemoryError,
-    OverflowError,
-    RuntimeError,  # an encrypted member
-    SyntaxError,  # a damaged array header
-    NotImplementedError,  # an unknown compression
-    UnicodeError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
+_FAULTS = (*DAMAGED_ARCHIVE, TypeError, AttributeError)  # the last two: a bare array, which is no archive
 """What reading a damaged or foreign file can raise."""
 
 

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-import struct
 import zipfile
-import zlib
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
@@ -22,7 +20,7 @@ import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.errors import ChoiceError, LabelFilesError, NotAvailableError, TokenError
-from deepaccident_devkit.files import replacing
+from deepaccident_devkit.files import DAMAGED_ARCHIVE, replacing
 from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
 from deepaccident_devkit.motion.label_folder import FORMAT_VERSION, Manifest, folder_path, label_path, writing_to
 from deepaccident_devkit.motion.labels import MotionLabels
@@ -39,17 +37,6 @@ if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset, RowArgument
 
 _OPEN_FILES: Final = 8
-_DAMAGED: Final = (
-    OSError,
-    KeyError,
-    ValueError,
-    EOFError,
-    RuntimeError,
-    struct.error,
-    zipfile.BadZipFile,
-    zlib.error,
-)
-"""What reading a damaged archive raises."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -185,7 +172,7 @@ class LabelFiles(Mapping[str, MotionLabels]):
         try:
             stored = StoredLabels.read(self._archive(recording), f"{number:03d}")
             return stored.labels(self.config)
-        except _DAMAGED as error:
+        except DAMAGED_ARCHIVE as error:
             self._open.pop(recording, None)
             path = label_path(self.folder, recording)
             raise LabelFilesError(f"{path}: {error}; remove it and run `deepaccident labels` again") from error
@@ -264,7 +251,7 @@ def _source_of(path: Path) -> str | None:
     try:
         with zipfile.ZipFile(path) as archive:
             return str(read_array(archive, "source"))
-    except _DAMAGED:
+    except DAMAGED_ARCHIVE:
         return None
 
 

@@ -1,16 +1,14 @@
 """The one array of an `.npz` file: read without unpickling, written with fixed bytes."""
 
 import io
-import tokenize
 import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.errors import MissingFileError, SensorFileError
-from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.files import DAMAGED_ARCHIVE, write_bytes
 from deepaccident_devkit.release._content import check_regular
 
 KEY = "data"
@@ -18,22 +16,6 @@ _ENDING = ".npy"
 _BARE_ARRAY = b"\x93NUMPY"
 """How a `.npy` file begins."""
 _REMEDY = "restore the file from its archive"
-_FAULTS = (
-    OSError,
-    ValueError,
-    EOFError,
-    KeyError,
-    MemoryError,
-    OverflowError,
-    RuntimeError,  # an encrypted member
-    SyntaxError,  # a damaged array header
-    NotImplementedError,  # an unknown compression
-    UnicodeError,
-    tokenize.TokenError,  # an array header with an open bracket
-    zipfile.BadZipFile,
-    zlib.error,
-)
-"""What reading damaged bytes can raise."""
 
 
 def read_npz(path: Path) -> AnyArray:
@@ -50,7 +32,7 @@ def read_npz(path: Path) -> AnyArray:
             return array
     except FileNotFoundError:
         raise MissingFileError(f"{path}: no such file; unpack the archive that holds it") from None
-    except _FAULTS as error:
+    except DAMAGED_ARCHIVE as error:
         if isinstance(error, SensorFileError):
             raise
         raise SensorFileError(f"{path}: {_fault(path, error)}; {_REMEDY}") from error
