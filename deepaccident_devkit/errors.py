@@ -98,5 +98,9 @@ class EvaluationError(DeepAccidentError, ValueError):
     """Predictions cannot be evaluated together: a sample twice, other settings, samples that are missing."""
 
 
+class ResultsError(DeepAccidentError, ValueError):
+    """A results file, or a bundle of an evaluation, cannot be used as it is."""
+
+
 class MissingExtraError(DeepAccidentError, ImportError):
     """An optional dependency is needed and not installed."""

@@ -1,8 +1,9 @@
-"""Write the JSON Schemas and the column tables of README.md anew: `python schema/generate.py`."""
+"""Write the JSON Schemas (also of results/) and the column tables of README.md anew: `python schema/generate.py`."""
 
 import json
 from pathlib import Path
 
+from deepaccident_devkit.evaluation.results import RESULT_SCHEMAS
 from deepaccident_devkit.tables.schema import columns_markdown, json_schemas
 
 FOLDER = Path(__file__).parent
@@ -19,6 +20,16 @@ def generated_files() -> dict[str, str]:
     return {**files, "README.md": f"{prose}{MARK}\n\n{columns_markdown()}"}
 
 
+def generated_results_files() -> dict[str, str]:
+    """File name in results/ → what it should contain."""
+    return {
+        f"{task}.json": json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
+        for task, schema in RESULT_SCHEMAS.items()
+    }
+
+
 if __name__ == "__main__":
     for name, content in generated_files().items():
         (FOLDER / name).write_text(content, encoding="utf-8")
+    for name, content in generated_results_files().items():
+        (FOLDER / "results" / name).write_text(content, encoding="utf-8")

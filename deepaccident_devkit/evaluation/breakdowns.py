@@ -7,7 +7,7 @@ the bootstrap draws whole scenarios.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, Generic, TypeVar
 
@@ -110,19 +110,21 @@ def breakdown(
     here = {token: attributes[token] for token in sorted(evaluator.tokens)}
     vehicles = {token: each for token, each in here.items() if each.agent != INFRASTRUCTURE}
     chosen = bootstrap or Bootstrap()
-    everyone, without = (
-        tuple(
-            _group(evaluator, value, tokens, part, chosen)
-            for value, tokens in sorted(tokens_by_value(part, by).items(), key=lambda item: _rank(item[0]))
-        )
-        for part in (here, vehicles)
-    )
+    everyone = _groups(evaluator, here, by, chosen)
+    without = everyone if len(vehicles) == len(here) else _groups(evaluator, vehicles, by, chosen)
     return Breakdown(by=by, groups=everyone, without_infrastructure=without, bootstrap=chosen)
 
 
 def numbers_of(result: object) -> dict[str, float]:
     """The floats of a result by their path in it: `min_ade`, `ranges/30x30/iou`; whole numbers, texts and None not."""
     return dict(_numbers(result, ""))
+
+
+def _groups(
+    evaluator: Evaluator[Result], attributes: Mapping[str, SampleAttributes], by: str, bootstrap: Bootstrap
+) -> tuple[Group[Result], ...]:
+    by_value = sorted(tokens_by_value(attributes, by).items(), key=lambda item: _rank(item[0]))
+    return tuple(_group(evaluator, value, tokens, attributes, bootstrap) for value, tokens in by_value)
 
 
 def _group(
@@ -136,36 +138,49 @@ def _group(
     counts = evaluator.counts
     for token in tokens:
         scenarios.setdefault(attributes[token].scenario, []).append(counts[token])
-    pooled = [evaluator.pooled(scenarios[name]) for name in sorted(scenarios)]
+    parts = [scenarios[name] for name in sorted(scenarios)]
     return Group(
         value=value,
         result=evaluator.compute(tokens),
         samples=len(tokens),
         scenarios=len(scenarios),
-        intervals=_intervals(evaluator.result_of, pooled, bootstrap) if len(pooled) > 1 else {},
+        intervals=_intervals(evaluator, parts, bootstrap) if len(parts) > 1 else {},
     )
 
 
-def _intervals(
-    result_of: Callable[[Collection[Counts]], object], scenarios: Sequence[Sequence[Counts]], bootstrap: Bootstrap
-) -> dict[str, tuple[float, float]]:
-    source = np.random.default_rng(bootstrap.seed)
-    drawn = source.integers(len(scenarios), size=(bootstrap.resamples, len(scenarios))).tolist()
-    values: dict[str, list[float]] = {}
-    for numbers in drawn:
-        result = result_of([counts for number in numbers for counts in scenarios[number]])
-        for name, each in numbers_of(result).items():
-            values.setdefault(name, []).append(each)
-    return {name: _middle(each, bootstrap.confidence) for name, each in values.items()}
+def resampled(
+    evaluator: Evaluator[Any], scenarios: Sequence[Sequence[Counts]], bootstrap: Bootstrap
+) -> list[dict[str, float]]:
+    """The numbers (`numbers_of`) of each resample; of as many scenarios and an equal bootstrap, the same are drawn.
+
+    Args:
+        evaluator: whose numbers.
+        scenarios: the counts of each scenario's samples.
+        bootstrap: how to draw.
+    """
+    count, source = len(scenarios), np.random.default_rng(bootstrap.seed)
+    drawn = source.integers(count, size=(bootstrap.resamples, count))
+    times = np.array([np.bincount(each, minlength=count) for each in drawn]).reshape(-1, count)
+    return [numbers_of(result) for result in evaluator.resampled(scenarios, times)]
 
 
-def _middle(values: Sequence[float], confidence: float) -> tuple[float, float]:
-    """Between which of the values their middle share lies; NaN without any."""
+def middle(values: Iterable[float], confidence: float) -> tuple[float, float]:
+    """Between which of the values their middle share lies; NaN without any. Those that are NaN do not count."""
     known = sorted(value for value in values if not math.isnan(value))
     if not known:
         return math.nan, math.nan
     beside = math.floor(len(known) * (1 - confidence) / 2)
     return known[beside], known[-1 - beside]
+
+
+def _intervals(
+    evaluator: Evaluator[Any], scenarios: Sequence[Sequence[Counts]], bootstrap: Bootstrap
+) -> dict[str, tuple[float, float]]:
+    values: dict[str, list[float]] = {}
+    for numbers in resampled(evaluator, scenarios, bootstrap):
+        for name, each in numbers.items():
+            values.setdefault(name, []).append(each)
+    return {name: middle(each, bootstrap.confidence) for name, each in values.items()}
 
 
 def _rank(value: str | None) -> tuple[bool, float, str]:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from deepaccident_devkit._version import __version__
+from deepaccident_devkit.arrays import IntArray
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.files import write_bytes
 
@@ -53,6 +54,18 @@ class Evaluator(ABC, Generic[Result]):
         A subclass whose counts are sums adds them up; others keep them apart, as here.
         """
         return list(counts)
+
+    def resampled(self, parts: Sequence[Sequence[Counts]], times: IntArray) -> Iterator[Result]:
+        """The result of each of D draws, as of samples some of which come several times, and others not at all.
+
+        Args:
+            parts: the counts of P groups of samples, each of which is drawn as a whole.
+            times: (D, P) how often each is taken.
+        """
+        pooled = [self.pooled(part) for part in parts]
+        for draw in times.tolist():
+            taken = zip(pooled, draw, strict=True)
+            yield self.result_of([each for part, often in taken for _ in range(often) for each in part])
 
     @abstractmethod
     def update(self, token: str, *arguments: Any) -> None:
@@ -167,7 +180,7 @@ class Evaluator(ABC, Generic[Result]):
             "made_by": self._maker,
             "settings": self.settings,
             "repeated": sorted(self.repeated),
-            "counts": self._counts,
+            "counts": {token: self._counts[token] for token in sorted(self._counts)},
         }
         try:
             write_bytes(target, json.dumps(state).encode())

@@ -80,15 +80,10 @@ def vpq_counts(prediction: AnyArray, label: AnyArray, rules: VpqRules = VpqRules
     Raises:
         GeometryError: other shapes.
     """
-    predicted, true = as_numbers("prediction", prediction, dtype=None), as_numbers("label", label, dtype=None)
-    if predicted.shape != true.shape or true.ndim != 3:
-        raise GeometryError(f"prediction: expected (T, H, W) as the label's {true.shape}, found {predicted.shape}")
+    predicted, true = _checked_maps(prediction, label)
     shared = _shared_cells(predicted, true)
     true_size, predicted_size = shared.sum(axis=2), shared.sum(axis=1)
-    frame, true_id, predicted_id = _matches(shared, true_size, predicted_size)
-    if rules.ids_must_stay:
-        stays = _same_partner(true_id, predicted_id)
-        frame, true_id, predicted_id = frame[stays], true_id[stays], predicted_id[stays]
+    frame, true_id, predicted_id = _kept_matches(shared, true_size, predicted_size, rules)
     inside = shared[frame, true_id, predicted_id]
     overlap = inside / (true_size[frame, true_id] + predicted_size[frame, predicted_id] - inside)
     found = np.bincount(frame, minlength=len(true))
@@ -102,6 +97,23 @@ def vpq_counts(prediction: AnyArray, label: AnyArray, rules: VpqRules = VpqRules
         false_positive=np.stack([alarms * 0, alarms], axis=1),
         false_negative=np.stack([missed * 0, missed], axis=1),
     )
+
+
+def vpq_matches(prediction: AnyArray, label: AnyArray, rules: VpqRules = VpqRules()) -> IntArray:
+    """Who is whom: the true positives of `vpq_counts`; arguments and errors as there.
+
+    Returns:
+        (N, 3) int64: frame from 0, predicted id, true id; by frame.
+    """
+    predicted, true = _checked_maps(prediction, label)
+    names, ranks = [], []
+    for maps in (predicted, true):
+        ids, rank = np.unique(np.append(np.maximum(maps, 0), 0), return_inverse=True)
+        names.append(ids.astype(np.int64))
+        ranks.append(rank.reshape(-1)[:-1].reshape(maps.shape))
+    shared = _shared_cells(ranks[0], ranks[1])
+    frame, true_id, predicted_id = _kept_matches(shared, shared.sum(axis=2), shared.sum(axis=1), rules)
+    return np.stack([frame, names[0][predicted_id], names[1][true_id]], axis=1)
 
 
 def vpq(counts: Iterable[VpqCounts]) -> tuple[PanopticQuality, PanopticQuality]:
@@ -135,6 +147,14 @@ def separate_selected_as_released(
     """
     frames = [_frame(each, frame) for each in counts for frame in range(len(each.iou))]
     return vpq([frames[number] for number in selected])
+
+
+def _checked_maps(prediction: AnyArray, label: AnyArray) -> tuple[AnyArray, AnyArray]:
+    """Two sets of instance maps (T, H, W); raises GeometryError."""
+    predicted, true = as_numbers("prediction", prediction, dtype=None), as_numbers("label", label, dtype=None)
+    if predicted.shape != true.shape or true.ndim != 3:
+        raise GeometryError(f"prediction: expected (T, H, W) as the label's {true.shape}, found {predicted.shape}")
+    return predicted, true
 
 
 def _quality_of(counts: Sequence[VpqCounts], index: int) -> PanopticQuality:
@@ -186,6 +206,17 @@ def _matches(shared: IntArray, true_size: IntArray, predicted_size: IntArray) ->
     inside = shared[frame, true_id, predicted_id]
     match = 3 * inside > true_size[frame, true_id] + predicted_size[frame, predicted_id]
     return frame[match], true_id[match], predicted_id[match]
+
+
+def _kept_matches(
+    shared: IntArray, true_size: IntArray, predicted_size: IntArray, rules: VpqRules
+) -> tuple[IntArray, IntArray, IntArray]:
+    """The matches that are true positives."""
+    frame, true_id, predicted_id = _matches(shared, true_size, predicted_size)
+    if rules.ids_must_stay:
+        stays = _same_partner(true_id, predicted_id)
+        frame, true_id, predicted_id = frame[stays], true_id[stays], predicted_id[stays]
+    return frame, true_id, predicted_id
 
 
 def _same_partner(true_id: IntArray, predicted_id: IntArray) -> BoolArray:

@@ -158,7 +158,7 @@ def _axis(name: str, given: Axis) -> Axis:
         low, high, size = (float(number) for number in given)
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{name}: expected start, end and cell size in metres, found {given!r}") from error
-    if not (math.isfinite(low) and math.isfinite(high) and low < high and 0 < size < math.inf):
+    if not (low < high and 0 < size < math.inf and math.isfinite((high - low) / size)):
         raise ConfigError(f"{name}: expected start < end and a cell size above 0 in metres, found {given!r}")
     return low, high, size
 

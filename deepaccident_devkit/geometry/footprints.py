@@ -34,12 +34,16 @@ def gaps(first: FloatArray, second: FloatArray) -> FloatArray:
     result = np.zeros((len(first), len(second)))
     step = max(1, _PAIRS_AT_ONCE // max(1, len(second)))
     for start in range(0, len(first), step):
-        some = first[start : start + step, None]
-        beside, here = _outside(some, second[None])
-        beside_too, there = _outside(second[None], some)
-        together = np.maximum(beside, beside_too) <= 0
-        result[start : start + step] = np.where(together, 0.0, np.minimum(here, there))
+        result[start : start + step] = gaps_of_pairs(first[start : start + step, None], second[None])
     return result
+
+
+def gaps_of_pairs(first: FloatArray, second: FloatArray) -> FloatArray:
+    """`gaps` between footprints (…, 5) and the others (…, 5) at the same places, which may broadcast: (…), metres."""
+    beside, here = _outside(first, second)
+    beside_too, there = _outside(second, first)
+    together = np.maximum(beside, beside_too) <= 0
+    return np.where(together, 0.0, np.minimum(here, there))
 
 
 def _areas_of_pairs(first: FloatArray, second: FloatArray) -> FloatArray:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
+
+from deepaccident_devkit.render.colors import GRID_COLOR
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,3 +34,11 @@ def detached_figure(size: tuple[float, float]) -> Figure:
     from matplotlib.figure import Figure
 
     return Figure(figsize=size, layout="constrained")
+
+
+def with_light_grid(ax: Axes, grid: Literal["x", "y", "both"]) -> Axes:
+    """The axes, with a light grid behind what is drawn, and without a frame at the top and right."""
+    ax.grid(axis=grid, color=GRID_COLOR, linewidth=0.5)
+    ax.set_axisbelow(True)
+    ax.spines[["top", "right"]].set_visible(False)
+    return ax

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, Literal, get_args
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.files import replacing
-from deepaccident_devkit.render.axes import axes_or_new, detached_figure, figure_or_new
+from deepaccident_devkit.render.axes import axes_or_new, detached_figure, figure_or_new, with_light_grid
 from deepaccident_devkit.render.colors import CATEGORY_COLORS, COLLIDER_COLOR, GRID_COLOR, SPLIT_COLORS
 from deepaccident_devkit.statistics import (
     GROUPS,
@@ -62,7 +62,7 @@ def render_counts(table: CountTable, *, ax: Axes | None = None) -> Axes:
     ax.invert_yaxis()
     ax.set(xlabel=table.counted, title=table.title, xlim=(0, 1.3 * max([1, *starts])))
     _counting(ax.xaxis)
-    return _plain(ax, "x")
+    return with_light_grid(ax, "x")
 
 
 def render_histogram(histogram: Histogram, *, ax: Axes | None = None) -> Axes:
@@ -93,7 +93,7 @@ def render_histogram(histogram: Histogram, *, ax: Axes | None = None) -> Axes:
     ax.set_xlim(histogram.edges[0], histogram.edges[-1])
     ax.set_xticks(histogram.edges[:: -(-len(histogram.edges) // 12)])
     _counting(ax.yaxis)
-    return _plain(ax, "y")
+    return with_light_grid(ax, "y")
 
 
 def render_quantiles(table: QuantileTable, field: str, *, ax: Axes | None = None) -> Axes:
@@ -188,7 +188,7 @@ def render_relative_positions(pairs: Sequence[CollisionPair], *, ax: Axes | None
     ax.set_title("Centre of the other (red: the first, as a median car)", fontsize=10)
     if pairs:
         ax.legend(fontsize=8, loc="upper right", title="the other", title_fontsize=8)
-    return _plain(ax, "both")
+    return with_light_grid(ax, "both")
 
 
 def _draw_boxes(rows: Mapping[str, QuantileRow], ax: Axes) -> None:
@@ -208,7 +208,7 @@ def _draw_boxes(rows: Mapping[str, QuantileRow], ax: Axes) -> None:
             ax.annotate(text, (position + 0.33, median), va="center", fontsize=8)
         ax.set_xlim(0.4, len(boxes) + 0.9)
     ax.set_xlabel("line: median; box: 25–75 %; whiskers: 5–95 %", fontsize=8)
-    _plain(ax, "y")
+    with_light_grid(ax, "y")
 
 
 def _scenarios(statistics: DatasetStatistics, fig: Figure) -> None:
@@ -372,14 +372,6 @@ def _title(histogram: Histogram) -> str:
         return histogram.title
     share = 100 * outside / histogram.total()
     return f"{histogram.title}\n({share:.2g} % outside of {histogram.edges[0]:g}–{histogram.edges[-1]:g})"
-
-
-def _plain(ax: Axes, grid: Literal["x", "y", "both"]) -> Axes:
-    """A light grid behind, no frame at the top and right."""
-    ax.grid(axis=grid, color=GRID_COLOR, linewidth=0.5)
-    ax.set_axisbelow(True)
-    ax.spines[["top", "right"]].set_visible(False)
-    return ax
 
 
 def _counting(axis: Axis) -> None:

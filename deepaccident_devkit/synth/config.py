@@ -1,10 +1,12 @@
 """What a synthetic release should be like."""
 
 from dataclasses import dataclass
-from typing import get_args
+from typing import Literal, get_args
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.taxonomy import Layout
+
+View = Literal["open", "hidden"]
 
 MAX_FRAMES = 999
 MIN_IMAGE_SIZE = (16, 9)
@@ -21,6 +23,8 @@ class SynthConfig:
         layout: `A`, all splits in one folder, or `B`, a folder a split.
         seed: the same seed gives the same bytes (on the same machine with the same package versions).
         sensors: whether to write images, point clouds and BEV arrays besides labels, calib and meta.
+        view: `hidden` puts a house on the kerb of the corner between ego and other, who drive a little faster than
+            where the view is `open`: they see each other about a second before they meet, the pole all the time.
     """
 
     scenarios: int = 4
@@ -29,6 +33,7 @@ class SynthConfig:
     layout: Layout = "A"
     seed: int = 0
     sensors: bool = True
+    view: View = "open"
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -37,6 +42,8 @@ class SynthConfig:
         _check_range("seed", self.seed, 0, None)
         if self.layout not in get_args(Layout):
             raise ConfigError(f"layout: expected one of {', '.join(get_args(Layout))}, found {self.layout!r}")
+        if self.view not in get_args(View):
+            raise ConfigError(f"view: expected one of {', '.join(get_args(View))}, found {self.view!r}")
         if len(self.image_size) != 2:
             raise ConfigError(f"image_size: expected (width, height), found {self.image_size!r}")
         for name, value, least in zip(("width", "height"), self.image_size, MIN_IMAGE_SIZE, strict=True):

@@ -14,7 +14,11 @@ from deepaccident_devkit.taxonomy import VEHICLE_AGENTS, AgentName
 
 Motions = Mapping[AgentName, SetOff]
 
+SPEEDS = (7.0, 11.0)
+"""m/s, between which the two drive where they see each other early."""
 _EGO, _EGO_BEHIND, _OTHER, _OTHER_BEHIND = VEHICLE_AGENTS
+_OFF_CENTER = 2.75
+"""Metres that one may be late at most where the paths cross, so that the two still meet."""
 _PASSING_GAP = 2.2
 """Metres that the twin's cars keep at least."""
 _TOUCH = 1e-9
@@ -42,12 +46,20 @@ class Encounter:
     impact: float
 
 
-def random_encounter(rng: np.random.Generator, end_time: float) -> Encounter:
-    """Design an accident of crossing paths, both straight on, whose contact is at `end_time`, seconds."""
+def random_encounter(rng: np.random.Generator, end_time: float, speeds: tuple[float, float] = SPEEDS) -> Encounter:
+    """Design an accident of crossing paths, both straight on, whose contact is at `end_time`, seconds.
+
+    Args:
+        rng: random numbers.
+        end_time: of the contact.
+        speeds: m/s, between which both drive when they meet.
+    """
     bodies = {agent: random_body(rng, "car") for agent in VEHICLE_AGENTS}
     side = str(rng.choice(["left", "right"]))
-    paths = {_EGO: _approach(rng, 0.0), _OTHER: _approach(rng, -np.pi / 2 if side == "left" else np.pi / 2)}
-    paths[_OTHER] = paths[_OTHER].delayed(rng.uniform(-0.25, 0.25))
+    from_side = -np.pi / 2 if side == "left" else np.pi / 2
+    paths = {_EGO: _approach(rng, 0.0, speeds), _OTHER: _approach(rng, from_side, speeds)}
+    delay = _OFF_CENTER / speeds[1]
+    paths[_OTHER] = paths[_OTHER].delayed(rng.uniform(-delay, delay))
     until_end = end_time - _contact_time(paths[_EGO], bodies[_EGO], paths[_OTHER], bodies[_OTHER])
     leaders = {agent: path.delayed(until_end) for agent, path in paths.items()}
     accident = {
@@ -73,9 +85,9 @@ def footprint(body: Body) -> FloatArray:
     return np.array(body.size[:2])
 
 
-def _approach(rng: np.random.Generator, yaw: float) -> SetOff:
+def _approach(rng: np.random.Generator, yaw: float, speeds: tuple[float, float]) -> SetOff:
     """Towards the junction in the right lane, passing its middle at time 0."""
-    distance, speed, acceleration = rng.uniform(60, 80), rng.uniform(7, 11), rng.uniform(2, 3)
+    distance, speed, acceleration = rng.uniform(60, 80), rng.uniform(*speeds), rng.uniform(2, 3)
     x = -np.cos(yaw) * distance + np.sin(yaw) * LANE_CENTER
     y = -np.sin(yaw) * distance - np.cos(yaw) * LANE_CENTER
     path = SetOff(float(x), float(y), float(yaw), float(speed), float(acceleration), 0.0)

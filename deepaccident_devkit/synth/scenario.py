@@ -10,9 +10,9 @@ from deepaccident_devkit.release import Collision, Meta
 from deepaccident_devkit.synth.actors import Actor, Actors, Motion
 from deepaccident_devkit.synth.bodies import Body
 from deepaccident_devkit.synth.config import SynthConfig
-from deepaccident_devkit.synth.design import Encounter, random_encounter
+from deepaccident_devkit.synth.design import SPEEDS, Encounter, random_encounter
 from deepaccident_devkit.synth.traffic import BackgroundActor, random_traffic
-from deepaccident_devkit.synth.world import World, random_world
+from deepaccident_devkit.synth.world import HidingPlace, World, random_world
 from deepaccident_devkit.taxonomy import (
     STATIC_ACTOR_ID,
     TIMES_OF_DAY,
@@ -25,6 +25,8 @@ from deepaccident_devkit.taxonomy import (
 )
 
 _FIRST_PAIRS = ("train", "val", "test")
+_HIDDEN_SPEEDS = (12.0, 14.0)
+"""m/s: with a house on the kerb between them, slower cars would see each other earlier."""
 _GOLDEN_RATIO = 0.6180339887498949
 """Its multiples fill [0, 1) evenly, whatever their number."""
 
@@ -105,9 +107,11 @@ def plan_scenarios(config: SynthConfig) -> list[ScenarioPlan]:
 def build_scenario(config: SynthConfig, plan: ScenarioPlan) -> Scenario:
     """Make up a scenario; the same seed and pair give the same scene, for the accident and for its twin."""
     random = RandomStreams.of(config.seed, plan.pair)
-    world = random_world(random.world, signalized=plan.subtype == 1)
-    encounter = random_encounter(random.design, frame_timestamp(config.frames))
-    traffic = random_traffic(random.traffic, encounter)
+    hidden, end_time = config.view == "hidden", frame_timestamp(config.frames)
+    encounter = random_encounter(random.design, end_time, _HIDDEN_SPEEDS if hidden else SPEEDS)
+    hiding = _between(encounter) if hidden else None
+    world = random_world(random.world, signalized=plan.subtype == 1, hiding=hiding)
+    traffic = random_traffic(random.traffic, encounter, [hiding.block] if hiding else [])
     actors, agents = _numbered(random.ids, encounter, traffic, accident=plan.accident)
     weather, time_of_day = str(random.weather.choice(WEATHERS)), str(random.weather.choice(TIMES_OF_DAY))
     meta = Meta(
@@ -130,6 +134,13 @@ def build_scenario(config: SynthConfig, plan: ScenarioPlan) -> Scenario:
         time_of_day=time_of_day,
         meta=meta,
     )
+
+
+def _between(encounter: Encounter) -> HidingPlace:
+    """A house between the two who meet, ego coming along x from below 0; the pole looks along the other's lane."""
+    if encounter.spawn_side == "left":
+        return HidingPlace(house=(-1, 1), pole=(-1, -1))
+    return HidingPlace(house=(-1, -1), pole=(1, 1))
 
 
 def _seed(seed: int, pair: int) -> np.random.SeedSequence:

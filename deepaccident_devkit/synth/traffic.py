@@ -11,6 +11,7 @@ from deepaccident_devkit.synth.bodies import Body, random_body
 from deepaccident_devkit.synth.collision import separation
 from deepaccident_devkit.synth.design import Encounter, footprint
 from deepaccident_devkit.synth.roads import CROSSWALK, LANE_CENTER, LANE_WIDTH, PARKING_CENTER, ROAD_EDGE
+from deepaccident_devkit.synth.solids import Block
 from deepaccident_devkit.taxonomy import VEHICLE_AGENTS
 
 _CHECK_PERIOD = 0.05
@@ -47,10 +48,20 @@ class BackgroundActor:
     parked: bool
 
 
-def random_traffic(rng: np.random.Generator, encounter: Encounter) -> list[BackgroundActor]:
-    """Background actors that stay clear of each other and of the agents, in the accident and in its twin."""
+def random_traffic(
+    rng: np.random.Generator, encounter: Encounter, walls: Sequence[Block] = ()
+) -> list[BackgroundActor]:
+    """Background actors that stay clear of each other and of the agents, in the accident and in its twin.
+
+    Args:
+        rng: random numbers.
+        encounter: the agents.
+        walls: what stands on a sidewalk, so that nobody walks or parks there.
+    """
     times = np.append(np.arange(0.0, encounter.end_time, _CHECK_PERIOD), encounter.end_time)
     placed = _Placed(times)
+    for wall in walls:
+        placed.add_block(wall)
     for motions in (encounter.accident, encounter.normal):
         for agent in VEHICLE_AGENTS:
             placed.add(encounter.bodies[agent], motions[agent])
@@ -72,6 +83,11 @@ class _Placed:
         self.times = times
         self._poses: list[FloatArray] = []
         self._sizes: list[FloatArray] = []
+
+    def add_block(self, block: Block) -> None:
+        (x0, x1), (y0, y1) = block.x, block.y
+        self._poses.append(np.tile([(x0 + x1) / 2, (y0 + y1) / 2, 0.0], (len(self.times), 1)))
+        self._sizes.append(np.array([x1 - x0, y1 - y0]))
 
     def add(self, body: Body, motion: Motion) -> None:
         self._poses.append(motion.poses(self.times))

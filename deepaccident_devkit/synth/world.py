@@ -20,6 +20,9 @@ _STEEL: Color = (92, 96, 100)
 _LAMPS: tuple[Color, ...] = ((210, 40, 36), (226, 180, 48), (48, 190, 84))
 _POLE_PLACE = roads.ROAD_EDGE + 0.3
 _LAMP_PLACE = 11.5
+_KERB_HOUSE = (_POLE_PLACE + 0.25, 27.0)
+"""From, to: metres from the junction's middle, along each arm, of a house that hides what comes round its corner;
+there is just room for a mast between it and the road."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -42,6 +45,25 @@ class World:
 
 
 @dataclass(frozen=True, slots=True)
+class HidingPlace:
+    """Which corner house stands on the kerb, so that it hides what comes round it; corners by their signs of x and y.
+
+    Attributes:
+        house: the corner of the house.
+        pole: the corner of the infrastructure's pole, which looks past it.
+    """
+
+    house: tuple[int, int]
+    pole: tuple[int, int]
+
+    @property
+    def block(self) -> Block:
+        """The house."""
+        x, y = (sorted((sign * _KERB_HOUSE[0], sign * _KERB_HOUSE[1])) for sign in self.house)
+        return Block((x[0], x[1]), (y[0], y[1]), (-0.2, 3.2 * 3 + 0.8), _WALLS[0], facade=True)
+
+
+@dataclass(frozen=True, slots=True)
 class _Prop:
     """Blocks with the code they have on the map from above."""
 
@@ -49,15 +71,24 @@ class _Prop:
     blocks: tuple[Block, ...]
 
 
-def random_world(rng: np.random.Generator, *, signalized: bool) -> World:
-    """A crossing in a town; with traffic lights if `signalized`."""
+def random_world(rng: np.random.Generator, *, signalized: bool, hiding: HidingPlace | None = None) -> World:
+    """A crossing in a town.
+
+    Args:
+        rng: random numbers; what does not concern a hiding place is the same with it and without.
+        signalized: with traffic lights.
+        hiding: a house on the kerb; None for a wide view.
+    """
     world_from_ground = _random_place(rng)
-    buildings = list(_buildings(rng))
+    buildings, trees = list(_buildings(rng)), list(_trees(rng))
+    corner = rng.choice([-1, 1], 2)
+    if hiding is not None:
+        buildings, trees = _with_house(hiding.block, buildings, trees)
+        corner = np.array(hiding.pole)
     props = [
-        *(_Prop(roads.TREE, blocks) for blocks in _trees(rng)),
+        *(_Prop(roads.TREE, blocks) for blocks in trees),
         *(_Prop(roads.FIRST_BUILDING + k, (block,)) for k, block in enumerate(buildings)),
     ]
-    corner = rng.choice([-1, 1], 2)
     height = float(rng.uniform(3.0, 5.0))
     x, y = (corner * _POLE_PLACE).tolist()
     props.append(_Prop(roads.POLE, (_mast(x, y, height - 0.4),)))
@@ -71,6 +102,18 @@ def random_world(rng: np.random.Generator, *, signalized: bool) -> World:
         props=solids.build([block for prop in props for block in prop.blocks]),
         lidar_pole=SE3.from_yaw(float(np.arctan2(-y, -x)), (x, y, height)),
     )
+
+
+def _with_house(
+    house: Block, buildings: Sequence[Block], trees: Sequence[tuple[Block, ...]]
+) -> tuple[list[Block], list[tuple[Block, ...]]]:
+    """Buildings and trees, with a house in the place of those that stand where it does."""
+    others = [block for block in buildings if not _overlap(block, house)]
+    return [house, *others], [tree for tree in trees if not any(_overlap(block, house) for block in tree)]
+
+
+def _overlap(first: Block, second: Block) -> bool:
+    return all(a[0] < b[1] and b[0] < a[1] for a, b in ((first.x, second.x), (first.y, second.y)))
 
 
 def _random_place(rng: np.random.Generator) -> SE3:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS, DetectedBoxes, DetectionEvaluator
-from deepaccident_devkit.evaluation.detection.curves import recall_scores
+from deepaccident_devkit.evaluation.detection.curves import recall_matches
 from deepaccident_devkit.evaluation.detection.matching import nearest_by_truth
 from deepaccident_devkit.geometry import Boxes
 
@@ -62,16 +62,24 @@ def test_any_order_and_any_workers_give_the_same_bits(protocol: str, drawn: list
         assert getattr(whole, name).tobytes() == getattr(parts, name).tobytes()
 
 
-@given(samples(), st.integers(0, 4))
-@pytest.mark.parametrize("protocol", sorted(DETECTION_PROTOCOLS))
-def test_pooled_samples_give_the_same_bits(protocol: str, drawn: list[Sample], cut: int) -> None:
-    evaluator = evaluator_of(protocol, list(enumerate(drawn)))
-    counts = list(evaluator.counts.values())
-    together = evaluator.result_of([*evaluator.pooled(counts[:cut][::-1]), *evaluator.pooled(counts[cut:])])
-    apart = evaluator.compute()
-    assert together.samples == apart.samples == len(drawn)
-    for name in ("average_precision", "precision", "recall", "errors", "truths", "detections"):
-        assert getattr(together, name).tobytes() == getattr(apart, name).tobytes()
+@given(samples(), st.lists(st.integers(0, 3), min_size=4, max_size=4), st.integers(0, 4))
+@pytest.mark.parametrize("protocol", [*sorted(DETECTION_PROTOCOLS), "opencood by sample"])
+def test_a_draw_is_the_result_of_that_many_copies(
+    protocol: str, drawn: list[Sample], often: list[int], cut: int
+) -> None:
+    switches = {"global_sort": False} if protocol.endswith("by sample") else {}
+    evaluator = evaluator_of(protocol.split(maxsplit=1)[0], list(enumerate(drawn)), **switches)
+    parts = [[each] for each in evaluator.counts.values()]
+    parts = [part for part in (*parts[cut:], [each for part in parts[:cut] for each in part]) if part]
+    times = np.array([often[: len(parts)], [1] * len(parts), [0] * len(parts)])
+    made = list(evaluator.resampled(parts, times))
+    for result, row in zip(made, times.tolist(), strict=True):
+        taken = [each for part, number in zip(parts, row, strict=True) for _ in range(number) for each in part]
+        copied = evaluator.result_of(taken)
+        assert result.samples == copied.samples == len(taken)
+        for name in ("average_precision", "precision", "recall", "truths", "detections"):
+            assert getattr(result, name).tobytes() == getattr(copied, name).tobytes()
+        np.testing.assert_allclose(result.errors, copied.errors, rtol=1e-12)
 
 
 reaches = st.lists(
@@ -229,7 +237,8 @@ def test_the_released_curves_are_those_of_matching_anew_at_each_score(drawn: lis
     result = evaluator_of("released", list(enumerate(drawn))).compute()
     for position, (level, threshold) in itertools.product((0, 2), enumerate((0.5, 1.0, 2.0, 4.0))):
         scores = [score for sample in drawn for score in plain_pass(sample, position, threshold, least=None)[3]]
-        points = recall_scores(np.array(scores), int(result.truths[position, 0]), 40) if scores else []
+        matches = recall_matches(result.truths[position], 40)[0]
+        points = [sorted(scores, reverse=True)[match - 1] for match in matches if match <= len(scores)]
         precision, recall = np.zeros(40), np.zeros(40)
         for point, least in enumerate(points):
             passes = [plain_pass(sample, position, threshold, least)[:3] for sample in drawn]

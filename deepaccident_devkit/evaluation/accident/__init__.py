@@ -1,6 +1,7 @@
 """How well accidents are foreseen, by three protocols."""
 
 from deepaccident_devkit.evaluation.accident.boxes import BoxAccidents
+from deepaccident_devkit.evaluation.accident.compared import ComparedAccidents, compared_accidents
 from deepaccident_devkit.evaluation.accident.context import accident_context
 from deepaccident_devkit.evaluation.accident.evaluator import PROTOCOLS, AccidentEvaluator
 from deepaccident_devkit.evaluation.accident.impact import BoxTruth, box_truth
@@ -22,10 +23,12 @@ __all__ = [
     "AccidentsWithin",
     "BoxAccidents",
     "BoxTruth",
+    "ComparedAccidents",
     "PaperAccidents",
     "Prediction",
     "ReleasedAccidents",
     "accident_context",
     "accidents_of",
     "box_truth",
+    "compared_accidents",
 ]

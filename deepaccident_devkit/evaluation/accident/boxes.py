@@ -9,15 +9,15 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 import numpy as np
 
-from deepaccident_devkit.errors import ConfigError, EvaluationError
+from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
+from deepaccident_devkit.evaluation.accident.alarms import Naming, Pair, named_alarms
 from deepaccident_devkit.evaluation.accident.impact import BoxTruth
-from deepaccident_devkit.evaluation.accident.matching import match_tracks
 from deepaccident_devkit.evaluation.accident.protocol import AccidentContext, Prediction, checked_prediction
-from deepaccident_devkit.evaluation.accident.reading import AccidentReading, InstanceAccident, accident_of
+from deepaccident_devkit.evaluation.accident.reading import AccidentReading
 from deepaccident_devkit.evaluation.accident.result import AccidentResult
 from deepaccident_devkit.evaluation.accident.scoring import (
     Alarm,
@@ -28,13 +28,12 @@ from deepaccident_devkit.evaluation.accident.scoring import (
     position_difference,
 )
 from deepaccident_devkit.evaluation.accident.tallies import exact_parts, tally_result, united
-from deepaccident_devkit.evaluation.accident.variants import with_others, with_parts
 from deepaccident_devkit.evaluation.evaluator import Counts
-from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
-from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels
+from deepaccident_devkit.evaluation.predictions import Accident
+from deepaccident_devkit.evaluation.variants import with_others, with_parts
+from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
-_RELEASED_LABELS: Final = MotionLabelConfig()
 _SLACK: Final = FRAME_PERIOD / 2
 """Seconds: half a recorded frame, so that decimal moments compare as they are meant."""
 
@@ -71,10 +70,14 @@ class BoxAccidents:
     that has one. They are not cut at the recording's end, which a model cannot know.
 
     Attributes:
-        reading: how an accident is read off maps.
+        reading: how an accident is read off maps. By the paper's 1 m, the default, traffic side by side is one, since
+            neighbouring cells are 0.5 m apart; at 0.5 m a square contact is none.
         min_score: alarms less sure than this are none.
         match_distance: metres: gate of the match of instances with actors, which decides whether a prediction in maps
-            names the right ones. (An explicit accident names actors by `ids`, or nobody.)
+            names the right ones; also how far off the `nearest` of `naming` may be.
+        naming: whom an explicit accident without `ids` (actor ids) names: the two actors whose boxes' centres are
+            `nearest` to its positions at its time (at the last moment of the truth, if it is for later), or, with
+            `given`, nobody. Where nobody is near enough, the accident names others than those who collide.
         unjudged_are_false: alarms that the recording cannot refute are false ones; else they are left out and counted
             aside.
         scoring: when an accident counts as foreseen.
@@ -83,15 +86,18 @@ class BoxAccidents:
     reading: AccidentReading = field(default_factory=AccidentReading)
     min_score: float = 0.0
     match_distance: float = 4.0
+    naming: Naming = "nearest"
     unjudged_are_false: bool = False
     scoring: Scoring = field(default_factory=Scoring)
 
     def __post_init__(self) -> None:
-        """Check the values; raises ConfigError."""
+        """Check the values; raises ChoiceError or ConfigError."""
         if not math.isfinite(self.min_score):
             raise ConfigError(f"min_score: expected a number, found {self.min_score!r}")
         if not 0 < self.match_distance < math.inf:
             raise ConfigError(f"match_distance: expected metres above 0, found {self.match_distance!r}")
+        if self.naming not in get_args(Naming):
+            raise ChoiceError(f"naming: expected one of {', '.join(get_args(Naming))}, found {self.naming!r}")
 
     def settings(self) -> dict[str, Any]:
         """All choices, as JSON can hold them."""
@@ -102,6 +108,7 @@ class BoxAccidents:
         own: Mapping[str, tuple[Any, ...]] = {
             "min_score": (0.5,),
             "match_distance": (2.0, 4.0, 8.0),
+            "naming": get_args(Naming),
             "unjudged_are_false": (False, True),
         }
         return {
@@ -132,21 +139,13 @@ class BoxAccidents:
                 "label: the accident protocol 'boxes' compares with boxes; give box_truth(dataset, sample), or "
                 "accident_context(dataset, sample, horizon=2.0), as label or as context"
             )
-        given = checked_prediction(prediction)
-        if isinstance(given, MotionOutput):
-            alarms = self._of_maps(given, label.config if label else _RELEASED_LABELS, truth)
-        else:
-            alarms = [(each, _id_error(each.ids, truth)) for each in given]
-        raised = sorted(
-            (alarm for alarm in alarms if alarm[0].score >= self.min_score),
-            key=lambda alarm: _rank(alarm[0]),
-        )
+        raised = named_alarms(checked_prediction(prediction), label, truth, self)
         judged = [alarm for alarm in raised if self._is_judged(alarm[0], truth)]
         nearest = truth.nearest_pair(self.reading.danger_distance)
         return {
             "positive": truth.accident is not None,
             "named": named(nearest, context),
-            "alarms": [_alarm(accident, id_error, truth) for accident, id_error in judged],
+            "alarms": [_alarm(accident, ids, truth) for accident, ids in judged],
             "unjudged": len(raised) - len(judged),
         }
 
@@ -199,46 +198,21 @@ class BoxAccidents:
         seen = truth.accident is not None or accident.time <= float(truth.time[-1]) + _SLACK
         return seen or self.unjudged_are_false
 
-    def _of_maps(
-        self, output: MotionOutput, config: MotionLabelConfig, truth: BoxTruth
-    ) -> list[tuple[Accident, int | None]]:
-        """At most one alarm of K predictions, and whether it names others than meta."""
-        maps = output.instances if output.heads is None else [self.reading.instances(heads) for heads in output.heads]
-        read = [accident_of(each, output.grid, config.rules, self.reading) for each in (() if maps is None else maps)]
-        found = [each for each in (*read[-1:], *read[:-1]) if each.contact is not None]
-        if not found:
-            return []
-        return [self._most_likely(found[0], len(found) / len(read), config.step * FRAME_PERIOD, truth)]
 
-    def _most_likely(
-        self, found: InstanceAccident, share: float, seconds: float, truth: BoxTruth
-    ) -> tuple[Accident, int | None]:
-        frame, ids = (0, (0, 0)) if found.contact is None else (found.contact.frame, found.contact.ids)
-        actors = truth.tracks(seconds, len(found.tracks.center))
-        match = match_tracks(found.tracks, actors, self.match_distance)
-        accident = Accident(positions=found.positions, time=frame * seconds, score=share)
-        return accident, _id_error((match.get(ids[0]), match.get(ids[1])), truth)
-
-
-def _rank(alarm: Accident) -> tuple[Any, ...]:
-    """The surest first, of equally sure ones the earliest; the rest is so that no order of a list counts."""
-    return -alarm.score, alarm.time, alarm.positions.tolist(), alarm.ids or ()
-
-
-def _id_error(ids: tuple[int | None, int | None] | None, truth: BoxTruth) -> int | None:
+def _id_error(ids: Pair | None, truth: BoxTruth) -> int | None:
     """1 if these are not the two that collide; None if nobody is named, or nobody collides."""
     if ids is None or truth.accident is None or truth.accident.ids is None:
         return None
     return int(set(ids) != set(truth.accident.ids))
 
 
-def _alarm(accident: Accident, id_error: int | None, truth: BoxTruth) -> dict[str, Any]:
+def _alarm(accident: Accident, ids: Pair | None, truth: BoxTruth) -> dict[str, Any]:
     if truth.accident is None:
         return foreseen(score=accident.score)
     return foreseen(
         position=position_difference(accident.positions, truth.accident.positions),
         time=accident.time - truth.accident.time,
-        id_error=id_error,
+        id_error=_id_error(ids, truth),
         score=accident.score,
     )
 

@@ -32,12 +32,14 @@ class BoxTruth(FrozenArrays):
         footprint: (F, A, 5) float64 x forward, y left, length, width, yaw in the present ego frame, metres and radians;
             NaN where nobody annotated the actor.
         accident: what meta says will happen within the horizon: the pair at the impact; None if nothing does.
+        impact: the same however far ahead; None also if it is beyond the horizon and no label shows one of the pair.
     """
 
     time: FloatArray
     actor_id: IntArray
     footprint: FloatArray
     accident: Accident | None
+    impact: Accident | None = None
 
     def tracks(self, seconds: float, frames: int) -> InstanceTracks:
         """The actors' centres at so many frames, so many seconds apart, from the present on; NaN beyond the window."""
@@ -106,13 +108,18 @@ def box_truth(dataset: Dataset, sample: RowArgument, horizon: float = RELEASED_H
     actors, which = np.unique(tracks.actor_id[inside], return_inverse=True)
     footprint = np.full((last - present + 1, len(actors), 5), np.nan)
     footprint[tracks.index[inside] - present, which] = footprints[inside]
-    time_to_impact, accident = there["time_to_impact"], None
-    if time_to_impact is not None and time_to_impact <= horizon + FRAME_PERIOD / 2:
+    time_to_impact, impact = there["time_to_impact"], None
+    within = time_to_impact is not None and time_to_impact <= horizon + FRAME_PERIOD / 2
+    if time_to_impact is not None and (within or np.isin(scenario["collision"]["ids"], tracks.actor_id).all()):
         first, second = scenario["collision"]["ids"]
         positions = [_last_position(tracks, footprints, actor, scenario["token"]) for actor in (first, second)]
-        accident = Accident(positions=np.array(positions), time=time_to_impact, ids=(first, second))
+        impact = Accident(positions=np.array(positions), time=time_to_impact, ids=(first, second))
     return BoxTruth(
-        time=np.arange(last - present + 1) * FRAME_PERIOD, actor_id=actors, footprint=footprint, accident=accident
+        time=np.arange(last - present + 1) * FRAME_PERIOD,
+        actor_id=actors,
+        footprint=footprint,
+        accident=impact if within else None,
+        impact=impact,
     )
 
 

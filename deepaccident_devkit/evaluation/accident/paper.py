@@ -14,8 +14,10 @@ import numpy as np
 from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
 from deepaccident_devkit.evaluation.accident.actors import actor_of
+from deepaccident_devkit.evaluation.accident.alarms import Naming, by_sureness
+from deepaccident_devkit.evaluation.accident.explicit import explicit_alarm
 from deepaccident_devkit.evaluation.accident.matching import match_tracks
-from deepaccident_devkit.evaluation.accident.protocol import AccidentContext, Prediction
+from deepaccident_devkit.evaluation.accident.protocol import AccidentContext, Prediction, checked_prediction
 from deepaccident_devkit.evaluation.accident.reading import AccidentReading, InstanceAccident, accident_of
 from deepaccident_devkit.evaluation.accident.result import AccidentResult
 from deepaccident_devkit.evaluation.accident.scoring import (
@@ -27,22 +29,33 @@ from deepaccident_devkit.evaluation.accident.scoring import (
     position_difference,
 )
 from deepaccident_devkit.evaluation.accident.tallies import tally_result, united
-from deepaccident_devkit.evaluation.accident.variants import with_others, with_parts
 from deepaccident_devkit.evaluation.evaluator import Counts
-from deepaccident_devkit.evaluation.frames import check_output, first_frames, frames_there, labels_at_present
-from deepaccident_devkit.evaluation.predictions import MotionOutput
+from deepaccident_devkit.evaluation.frames import (
+    check_output,
+    check_protocol,
+    first_frames,
+    frames_there,
+    labels_at_present,
+)
+from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
+from deepaccident_devkit.evaluation.variants import with_others, with_parts
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, LabelProtocol, MotionHeads, MotionLabels
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 SampleChoice = Literal["best", "mean_first"]
 PredictedBy = Literal["any", "mean"]
 PositionTime = Literal["own", "truth"]
-_CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
-    "labels": tuple(LABEL_PROTOCOLS),
+AlarmChoice = Literal["surest", "any"]
+_CHOICES: Final[Mapping[str, tuple[str | None, ...]]] = {
+    "labels": (None, *LABEL_PROTOCOLS),
     "predicted_by": get_args(PredictedBy),
     "sample_choice": get_args(SampleChoice),
     "position_time": get_args(PositionTime),
+    "alarm_choice": get_args(AlarmChoice),
+    "naming": get_args(Naming),
 }
+_FORMS: Final[Mapping[str, str]] = {"instance_maps": "instance maps", "explicit": "explicit accidents"}
+"""Forms of a prediction that are not heads, as counts and as notes have them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,7 +63,7 @@ class PaperAccidents:
     """The accident metrics of the paper's text.
 
     Attributes:
-        labels: protocol of the labels that are the truth; others are refused.
+        labels: protocol of the labels that are the truth; others are refused. None for any labels.
         reading: how an accident is read off maps, the truth's and the prediction's alike.
         predicted_by: whose accident counts as predicted: that of `any` of the K predictions, or the `mean` sample's
             (the last of the K) alone.
@@ -58,16 +71,28 @@ class PaperAccidents:
             nearest to the truth (as the released code; the first of equal ones), or `mean_first`: the mean sample's or
             else the first, without a look at the truth. Both are counted; this one is the result, the other is beside.
         position_time: the moment of the predicted positions: its `own` accident's, or that of the `truth`, where both
-            predicted agents are there then.
-        match_distance: metres: gate of the match of instances that decides whether a prediction names the right ones.
+            predicted agents are there then. Explicit accidents have only their own.
+        alarm_choice: which of a sample's explicit accidents are predicted: the `surest` (the earliest of equally sure
+            ones), as a prediction in maps shows one at most; or `any`, as if each were one of K predictions, the surest
+            in the mean's place.
+        alarms_cut: explicit accidents for later than the labels' last frame in the recording, by more than half a step,
+            are left out, as the frames of maps are.
+        naming: whom an explicit accident without `ids` names: the two true instances that are `nearest` to its
+            positions at its time, or, with `given`, nobody. (`ids` are actor ids, and are compared with the actors that
+            the true instances are.)
+        match_distance: metres: gate of the match of instances that decides whether a prediction names the right ones;
+            also how far off the `nearest` of `naming` may be.
         scoring: when an accident counts as foreseen.
     """
 
-    labels: str = "released"
+    labels: str | None = "released"
     reading: AccidentReading = field(default_factory=AccidentReading)
     predicted_by: PredictedBy = "any"
     sample_choice: SampleChoice = "best"
     position_time: PositionTime = "own"
+    alarm_choice: AlarmChoice = "surest"
+    alarms_cut: bool = True
+    naming: Naming = "nearest"
     match_distance: float = 4.0
     scoring: Scoring = field(default_factory=Scoring)
 
@@ -75,7 +100,8 @@ class PaperAccidents:
         """Check the values; raises ChoiceError or ConfigError."""
         for name, allowed in _CHOICES.items():
             if getattr(self, name) not in allowed:
-                raise ChoiceError(f"{name}: expected one of {', '.join(allowed)}, found {getattr(self, name)!r}")
+                possible = ", ".join(map(str, allowed))
+                raise ChoiceError(f"{name}: expected one of {possible}, found {getattr(self, name)!r}")
         if not 0 < self.match_distance < np.inf:
             raise ConfigError(f"match_distance: expected metres above 0, found {self.match_distance!r}")
 
@@ -89,6 +115,9 @@ class PaperAccidents:
             "predicted_by": get_args(PredictedBy),
             "sample_choice": get_args(SampleChoice),
             "position_time": get_args(PositionTime),
+            "alarm_choice": get_args(AlarmChoice),
+            "alarms_cut": (False, True),
+            "naming": get_args(Naming),
             "match_distance": (2.0, 4.0, 8.0),
         }
         return {
@@ -101,36 +130,46 @@ class PaperAccidents:
         """What one sample adds.
 
         Where heads are predicted, the truth is the labels as heads, through the same grouping and linking; where
-        instance maps are, it is the labels' warped instance map.
+        instance maps or explicit accidents are, it is the labels' warped instance map.
 
         Returns:
-            `positive`: whether the truth has an accident; `named`: whom it names (of `NAMED`); `instance_maps`: whether
-            those were given; `best` and `mean_first`: the alarm that each choice compares, or None.
+            `positive`: whether the truth has an accident; `named`: whom it names (of `NAMED`); `instance_maps` and
+            `explicit`: whether the prediction is those; `best` and `mean_first`: the alarm that each choice compares,
+            or None.
 
         Raises:
-            EvaluationError: explicit accidents, no labels or those of another protocol, another grid, too few frames.
+            EvaluationError: the prediction is neither motion nor accidents, no labels or those of another protocol,
+                another grid, too few frames.
         """
-        output, label = self._checked(prediction, label)
+        given, label = self._checked(prediction, label)
         frames, rules = frames_there(label), label.config.rules
-        check_output(output, label, frames)
+        if isinstance(given, MotionOutput):
+            check_output(given, label, frames)
         label = labels_at_present(label)
-        shown = self._truth_map(output, label, frames)
+        shown = self.truth_map(given, label, frames)
         truth = accident_of(shown, label.config.grid, rules, self.reading)
         seconds = label.config.step * FRAME_PERIOD
-        alarms = [
-            self._alarm(found, truth, seconds) if found.contact else None
-            for found in self._predicted(output, frames, rules)
-        ]
-        if self.predicted_by == "mean":
-            alarms = alarms[-1:]
         actors = None
         if truth.contact is not None:
             frame, ids = truth.contact.frame, truth.contact.ids
             actors = [actor_of(shown[frame] == identity, frame, label, context) for identity in ids]
+        alarms: list[Alarm | None]
+        if isinstance(given, MotionOutput):
+            read = self.read_predictions(given, frames, rules)
+            alarms = [self._alarm(found, truth, seconds) if found.contact else None for found in read]
+        else:
+            gate, naming = self.match_distance, self.naming
+            alarms = [
+                explicit_alarm(each, truth, actors, seconds=seconds, naming=naming, gate=gate)
+                for each in self.raised(given, (frames - 0.5) * seconds)
+            ]
+        if self.predicted_by == "mean":
+            alarms = alarms[-1:]
         return {
             "positive": truth.contact is not None,
             "named": named(actors, context),
-            "instance_maps": output.instances is not None,
+            "instance_maps": isinstance(given, MotionOutput) and given.instances is not None,
+            "explicit": not isinstance(given, MotionOutput),
             "best": _nearest(alarms),
             "mean_first": next((alarm for alarm in (*alarms[-1:], *alarms[:-1]) if alarm), None),
         }
@@ -140,7 +179,7 @@ class PaperAccidents:
         given = self._united(counts)
         chosen, other = sorted(get_args(SampleChoice), key=lambda choice: choice != self.sample_choice)
         result, beside = (tally_result(given[choice], self.scoring.errors_at) for choice in (chosen, other))
-        notes = _notes(given["instance_maps"], result.samples)
+        notes = _notes(given, result.samples)
         return replace(result, notes=notes, beside={f"sample_choice={other}": beside})
 
     def pooled(self, counts: Collection[Counts]) -> list[Counts]:
@@ -148,46 +187,46 @@ class PaperAccidents:
         return [{"tallies": self._united(counts)}]
 
     def _united(self, counts: Collection[Counts]) -> dict[str, Any]:
-        """The tally of each choice of a sample, and how many predictions were given as instance maps."""
+        """The tally of each choice of a sample, and how many predictions were given in which form."""
         given = [each["tallies"] if "tallies" in each else self._tallies(each) for each in counts]
         return {
             **{choice: united(each[choice] for each in given) for choice in get_args(SampleChoice)},
-            "instance_maps": sum(each["instance_maps"] for each in given),
+            **{form: sum(each[form] for each in given) for form in _FORMS},
         }
 
     def _tallies(self, sample: Counts) -> dict[str, Any]:
         alarms = {choice: [sample[choice]] if sample[choice] else [] for choice in get_args(SampleChoice)}
         return {
             **{choice: alarms_tally(sample, each, self.scoring) for choice, each in alarms.items()},
-            "instance_maps": int(sample["instance_maps"]),
+            **{form: int(sample[form]) for form in _FORMS},
         }
 
-    def _checked(self, prediction: Prediction, label: MotionLabels | None) -> tuple[MotionOutput, MotionLabels]:
-        if not isinstance(prediction, MotionOutput):
-            raise EvaluationError(
-                "prediction: the accident protocol 'paper' compares instances; give a MotionOutput, or evaluate "
-                "explicit accidents with protocol='boxes'"
-            )
+    def _checked(
+        self, prediction: Prediction, label: MotionLabels | None
+    ) -> tuple[MotionOutput | list[Accident], MotionLabels]:
         if label is None:
             raise EvaluationError("label: the accident protocol 'paper' needs the sample's motion labels")
-        if label.config.rules != LABEL_PROTOCOLS[self.labels]:
-            raise EvaluationError(
-                f"label: was not made by the label protocol {self.labels!r}, which these metrics compare with; make it "
-                f"with MotionLabelConfig(protocol={self.labels!r}), or choose PaperAccidents(labels=…)"
-            )
-        return prediction, label
+        check_protocol(label, self.labels)
+        return checked_prediction(prediction), label
 
-    def _truth_map(self, output: MotionOutput, label: MotionLabels, frames: int) -> AnyArray:
-        if output.heads is None:
+    def truth_map(self, given: MotionOutput | list[Accident], label: MotionLabels, frames: int) -> AnyArray:
+        """(T, H, W) the instances that a prediction is compared with, of labels at the present; as the labels lie."""
+        if not isinstance(given, MotionOutput) or given.heads is None:
             return label.instance[:frames]
         return self.reading.instances(first_frames(MotionHeads.from_labels(label), frames))
 
-    def _predicted(self, output: MotionOutput, frames: int, rules: LabelProtocol) -> list[InstanceAccident]:
+    def read_predictions(self, output: MotionOutput, frames: int, rules: LabelProtocol) -> list[InstanceAccident]:
+        """What is read off each of the K predictions, cut to so many frames."""
         if output.heads is not None:
             maps = [self.reading.instances(first_frames(heads, frames)) for heads in output.heads]
         else:
             maps = [] if output.instances is None else [each[:frames] for each in output.instances]
         return [accident_of(each, output.grid, rules, self.reading) for each in maps]
+
+    def raised(self, accidents: list[Accident], last: float) -> list[Accident]:
+        """The explicit accidents that count as predicted, the surest last, as the mean sample is."""
+        raised = sorted((each for each in accidents if not self.alarms_cut or each.time <= last), key=by_sureness)
+        return raised[:1] if self.alarm_choice == "surest" else [*raised[1:], *raised[:1]]
 
     def _alarm(self, found: InstanceAccident, truth: InstanceAccident, seconds: float) -> Alarm:
         """A predicted accident against the true one, if there is one; `seconds` from frame to frame."""
@@ -212,11 +251,11 @@ def _nearest(alarms: Sequence[Alarm | None]) -> Alarm | None:
     return min(there, key=lambda alarm: alarm["position"] or 0.0, default=None)
 
 
-def _notes(given_as_maps: int, samples: int) -> tuple[str, ...]:
-    if not given_as_maps:
-        return ()
-    note = (
-        f"{given_as_maps} of {samples} predictions were given as instance maps: their truth is the labels' "
-        "instance map, not the released grouping and linking of the labels"
+def _notes(given: Mapping[str, Any], samples: int) -> tuple[str, ...]:
+    """Sentences on predictions whose truth is not that of heads."""
+    return tuple(
+        f"{given[form]} of {samples} predictions were given as {words}: their truth is the labels' instance map, not "
+        "the released grouping and linking of the labels"
+        for form, words in _FORMS.items()
+        if given[form]
     )
-    return (note,)

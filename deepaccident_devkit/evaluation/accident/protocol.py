@@ -26,12 +26,19 @@ class AccidentContext:
         known: whether `pair` says anything.
         own_actor_id: the actor id of the agent whose sample it is; None for the roadside, or if not known.
         truth: what a protocol without rasters compares with (see `boxes`); None for the others.
+        time_to_impact: seconds to the recorded impact, however far ahead; None if nobody collides, or not known.
+        time_to_end: seconds to the recording's last frame; None if not known.
+        twin: whether nobody collides here, but somebody does in the scenario's twin; None if that is not known, such
+            as where the release has no twin of it.
     """
 
     pair: tuple[int, int] | None = None
     known: bool = False
     own_actor_id: int | None = None
     truth: BoxTruth | None = None
+    time_to_impact: float | None = None
+    time_to_end: float | None = None
+    twin: bool | None = None
 
 
 Truth = MotionLabels | BoxTruth | AccidentContext

@@ -11,7 +11,7 @@ import numpy as np
 from deepaccident_devkit.arrays import AnyArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.evaluation.accident.hulls import convex_hulls, hull_distances
-from deepaccident_devkit.evaluation.accident.variants import with_others
+from deepaccident_devkit.evaluation.variants import with_others
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import Orientation
 from deepaccident_devkit.motion import LabelProtocol, MotionHeads, PostProcessing, predict_instances

@@ -24,7 +24,6 @@ from deepaccident_devkit.evaluation.accident.protocol import AccidentContext, Ac
 from deepaccident_devkit.evaluation.accident.result import DISTANCES, AccidentResult
 from deepaccident_devkit.evaluation.accident.scoring import named, position_difference
 from deepaccident_devkit.evaluation.accident.tallies import ERRORS, sample_tally, tally_result, united
-from deepaccident_devkit.evaluation.accident.variants import with_others
 from deepaccident_devkit.evaluation.evaluator import Counts
 from deepaccident_devkit.evaluation.frames import (
     check_output,
@@ -35,6 +34,7 @@ from deepaccident_devkit.evaluation.frames import (
 )
 from deepaccident_devkit.evaluation.predictions import MotionOutput
 from deepaccident_devkit.evaluation.trajectory_matching import longest, match_trajectories, padded
+from deepaccident_devkit.evaluation.variants import with_others
 from deepaccident_devkit.motion import POST_PROCESSING, MotionHeads, MotionLabels, PostProcessing
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
@@ -113,15 +113,17 @@ class ReleasedAccidents:
         if not isinstance(prediction, MotionOutput) or label is None:
             raise EvaluationError(
                 "the released protocol compares motion: give a MotionOutput and the sample's motion labels; "
-                "explicit accidents are for protocol='boxes'"
+                "explicit accidents are for protocol='paper' or 'boxes'"
             )
         check_protocol(label, self.labels)
         frames = frames_there(label)
         check_output(prediction, label, frames)
         label = labels_at_present(label)
-        truth, present = self._truth(label, frames)
+        truth, present = self.truth_paths(label, frames)
         points = longest(truth.paths) or len(truth.drawn)
-        truth, *predictions = (self._padded(each, points) for each in (truth, *self._predictions(prediction, frames)))
+        truth, *predictions = (
+            self.padded_paths(each, points) for each in (truth, *self.prediction_paths(prediction, frames))
+        )
         matches = [match_trajectories(each.paths, truth.paths).pairs for each in predictions]
         step = label.config.step * FRAME_PERIOD
         counts, pair = accident_counts(predictions, truth, matches, self, step)
@@ -144,20 +146,22 @@ class ReleasedAccidents:
     def _post_processing(self) -> PostProcessing:
         return replace(POST_PROCESSING["accident"], redraw=self.redraw)
 
-    def _truth(self, label: MotionLabels, frames: int) -> tuple[DrawnPaths, AnyArray]:
+    def truth_paths(self, label: MotionLabels, frames: int) -> tuple[DrawnPaths, AnyArray]:
         """What predictions are compared with, and (H, W) its ids at the present."""
         grid = label.config.grid
         if self.truth_through_heads:
             return paths_of_heads(first_frames(MotionHeads.from_labels(label), frames), grid, self._post_processing())
         return paths_of_instances(label.instance[:frames], grid, redraw=self.redraw), label.instance[0]
 
-    def _predictions(self, output: MotionOutput, frames: int) -> list[DrawnPaths]:
+    def prediction_paths(self, output: MotionOutput, frames: int) -> list[DrawnPaths]:
+        """What is compared of each of the K predictions, cut to so many frames."""
         if output.instances is not None:
             return [paths_of_instances(maps[:frames], output.grid, redraw=self.redraw) for maps in output.instances]
         cut = [first_frames(heads, frames) for heads in output.heads or ()]
         return [paths_of_heads(heads, output.grid, self._post_processing())[0] for heads in cut]
 
-    def _padded(self, given: DrawnPaths, length: int) -> DrawnPaths:
+    def padded_paths(self, given: DrawnPaths, length: int) -> DrawnPaths:
+        """The same with paths of so many points."""
         return replace(given, paths=padded(given.paths, length, accelerating=self.accelerating))
 
     def _error(self, errors: Sequence[float | None], name: str) -> float | None:

@@ -14,8 +14,8 @@ from deepaccident_devkit.evaluation.accident.protocol import AccidentContext
 from deepaccident_devkit.evaluation.accident.reading import TIE, even
 from deepaccident_devkit.evaluation.accident.result import DISTANCES
 from deepaccident_devkit.evaluation.accident.tallies import ERRORS, Tally, sample_tally
-from deepaccident_devkit.evaluation.accident.variants import with_others
 from deepaccident_devkit.evaluation.evaluator import Counts
+from deepaccident_devkit.evaluation.variants import with_others
 
 Alarm = Mapping[str, Any]
 """An accident that is foreseen, as counts hold it: `position` (metres), `time` (seconds, later than the truth is

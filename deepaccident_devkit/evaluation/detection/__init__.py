@@ -2,6 +2,7 @@
 
 from deepaccident_devkit.evaluation.detection.boxes import DetectedBoxes
 from deepaccident_devkit.evaluation.detection.evaluator import DetectionEvaluator
+from deepaccident_devkit.evaluation.detection.matches import DetectionMatches, detection_matches
 from deepaccident_devkit.evaluation.detection.nuscenes import NuScenesSummary, nuscenes_summary
 from deepaccident_devkit.evaluation.detection.protocols import (
     DETECTION_PROTOCOLS,
@@ -16,9 +17,11 @@ __all__ = [
     "DETECTION_PROTOCOLS",
     "DetectedBoxes",
     "DetectionEvaluator",
+    "DetectionMatches",
     "DetectionProtocol",
     "DetectionResult",
     "NuScenesSummary",
+    "detection_matches",
     "detection_protocol",
     "detection_truth",
     "nuscenes_summary",

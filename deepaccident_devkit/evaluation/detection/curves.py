@@ -1,51 +1,41 @@
-"""From the counts of many samples to precision, recall and average precision, by three rules."""
+"""From the counts of many samples to precision, recall and average precision, by three rules.
+
+Each sample may be taken several times, or not at all: draws of a bootstrap share all that does not depend on how often.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from math import fsum, nan
-from typing import Any, Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray, IntArray
+from deepaccident_devkit.arrays import AnyArray, FloatArray, IntArray
+from deepaccident_devkit.evaluation.detection.ledger import Cell
 from deepaccident_devkit.evaluation.detection.protocols import DetectionProtocol
-
-_EVENTS: Final = ("detections", "tp", "spent", "excused", "matches", "errors")
-"""The columns of `frame_counts.FrameCounts` that name detections by their rows."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Cell:
-    """All of one class within one range at one threshold, in the order of scores.
-
-    Attributes:
-        truths: how many true boxes count.
-        scores: (N,) of the detections that come into it, falling; equal ones by sample token, then as given.
-        detected: (N,) 1 where the detection counts.
-        tp: (N,) how many more true boxes are found with this detection (0 or 1).
-        spent: (N,) how many more detections go to true boxes that do not count.
-        excused: (N,) how many more true boxes are neither found nor missed.
-        matched: (M,) rows of the matches that decide the points of the `released` curve.
-        error_rows: (E,) rows of the matches that have errors, in order; of one cell a class alone.
-        errors: (E, 4) in the order of `measures.ERRORS`, NaN where unknown.
-    """
-
-    truths: int
-    scores: FloatArray
-    detected: IntArray
-    tp: IntArray
-    spent: IntArray
-    excused: IntArray
-    matched: IntArray
-    error_rows: IntArray
-    errors: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Points:
-    """The curve of a cell: precision and recall (P,), average precision as a share, mean errors (4,), NaN without."""
+    """The curves of a cell in each of D draws.
+
+    Attributes:
+        precision: (D, P).
+        recall: (D, P).
+        average: (D,) average precision as a share.
+        errors: (D, 4) mean errors, NaN without.
+    """
+
+    precision: FloatArray
+    recall: FloatArray
+    average: FloatArray
+    errors: FloatArray
+
+
+class _Curve(NamedTuple):
+    """One of them."""
 
     precision: FloatArray
     recall: FloatArray
@@ -53,159 +43,142 @@ class Points:
     errors: FloatArray
 
 
-class Ledger:
-    """The columns of many samples behind one another, by token, and the cells that they make."""
-
-    truths: IntArray
-    """(groups,) how many true boxes of each group count."""
-
-    def __init__(self, counts: Sequence[Mapping[str, Any]], protocol: DetectionProtocol) -> None:
-        """Put the samples' counts (with their `token`) in order."""
-        self._protocol = protocol
-        counts = sorted(counts, key=lambda each: each["token"])
-        lengths = np.array([len(each["scores"]) for each in counts], dtype=np.int64)
-        self._first = np.cumsum(lengths) - lengths
-        scores = _joined([each["scores"] for each in counts], np.float64)
-        rows, sample = np.arange(len(scores)), np.repeat(np.arange(len(counts)), lengths)
-        keys = (rows, -scores) if protocol.global_sort else (rows, -scores, sample)
-        order = np.lexsort(keys)
-        self._position = np.empty(len(order), dtype=np.int64)
-        self._position[order] = rows
-        self._scores = scores[order]
-        groups = len(protocol.classes) * len(protocol.ranges)
-        self.truths = _joined([each["truths"] for each in counts], np.int64).reshape(-1, groups).sum(axis=0)
-        self._events = {name: self._by_key([each[name] for each in counts]) for name in _EVENTS}
-
-    def cell(self, group: int, level: int) -> Cell:
-        """A class within a range (`frame_counts.FrameCounts`) at a threshold."""
-        levels, ranges = len(self._protocol.thresholds), len(self._protocol.ranges)
-        key = group * levels + level
-        detected, tp, spent = (
-            self._of(name, which)[0] for name, which in (("detections", group), ("tp", key), ("spent", key))
-        )
-        excused, change = self._of("excused", key)
-        with_errors = self._protocol.thresholds[level] == self._protocol.error_threshold
-        error_rows, errors = self._of("errors", group // ranges) if with_errors else (tp[:0], np.zeros((0, 4)))
-        rows = np.unique(np.concatenate([detected, excused, tp, spent]))
-        return Cell(
-            truths=int(self.truths[group]),
-            scores=self._scores[rows],
-            detected=np.isin(rows, detected).astype(np.int64),
-            tp=np.isin(rows, tp).astype(np.int64),
-            spent=np.isin(rows, spent).astype(np.int64),
-            excused=np.bincount(np.searchsorted(rows, excused), change.reshape(-1), len(rows)).astype(np.int64),
-            matched=np.searchsorted(rows, self._of("matches" if self._by_truth else "tp", key)[0]),
-            error_rows=np.searchsorted(rows, error_rows),
-            errors=errors.reshape(-1, 4),
-        )
-
-    @property
-    def detections(self) -> IntArray:
-        """(groups,) how many detections of each group count."""
-        edges = np.arange(len(self._protocol.classes) * len(self._protocol.ranges) + 1)
-        return np.diff(np.searchsorted(self._events["detections"][0], edges))
-
-    @property
-    def _by_truth(self) -> bool:
-        return self._protocol.matching == "by_truth"
-
-    def _by_key(self, columns: Sequence[Sequence[Sequence[Any]]]) -> tuple[IntArray, IntArray, FloatArray]:
-        """Keys, positions in the order of scores and further values of all samples' columns, by key and position."""
-        width = max((len(each) for each in columns), default=2)
-        keys = _joined([each[0] for each in columns], np.int64)
-        offset = np.repeat(self._first, [len(each[0]) for each in columns]).astype(np.int64)
-        rows = self._position[_joined([each[1] for each in columns], np.int64) + offset]
-        values = [_joined([each[column] for each in columns], np.float64) for column in range(2, width)]
-        order = np.lexsort((rows, keys))
-        stacked = np.stack(values, axis=1) if values else np.zeros((len(keys), 0))
-        return keys[order], rows[order], stacked[order]
-
-    def _of(self, name: str, key: int) -> tuple[IntArray, FloatArray]:
-        keys, rows, values = self._events[name]
-        part = slice(*np.searchsorted(keys, [key, key + 1]))
-        return rows[part], values[part]
-
-
-def pooled(counts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The counts of some samples as though they were one sample's, as arrays: for results that are asked for often.
-
-    The order of equal scores stays that of tokens where no other sample's token lies between theirs.
-    """
-    counts = sorted(counts, key=lambda each: each["token"])
-    first = np.cumsum([0, *(len(each["scores"]) for each in counts)])
-    result: dict[str, Any] = {
-        "token": counts[0]["token"],
-        "samples": sum(each.get("samples", 1) for each in counts),
-        "truths": np.sum([each["truths"] for each in counts], axis=0),
-        "scores": _joined([each["scores"] for each in counts], np.float64),
-    }
-    for name in _EVENTS:
-        columns = [_joined(column, np.float64) for column in zip(*(each[name] for each in counts), strict=True)]
-        keys, rows = (column.astype(np.int64) for column in columns[:2])
-        offset = np.repeat(first[:-1], [len(each[name][0]) for each in counts])
-        result[name] = [keys, rows + offset, *columns[2:]]
-    return result
-
-
-def curve(cell: Cell, protocol: DetectionProtocol) -> Points:
-    """Precision, recall and average precision of a cell, and the mean errors of its matches, by the protocol's rule."""
-    return _CURVES[protocol.curve](cell, protocol)
-
-
-def recall_scores(scores: FloatArray, truths: int, points: int) -> FloatArray:
-    """The scores at which the released code reads its curve.
-
-    With the matches' scores in falling order, the (i + 1)-th is taken for each level that (i + 1)/truths exceeds for
-    the first time; levels are sums of 1/points in double precision, whose rounding decides ties.
+def curves(cell: Cell, protocol: DetectionProtocol, times: IntArray) -> Points:
+    """Precision, recall and average precision of a cell, and the mean errors of its matches, by the protocol's rule.
 
     Args:
-        scores: of all matches, in any order.
-        truths: how many true boxes there are.
-        points: how many levels up to a recall of 1.
+        cell: of S samples.
+        protocol: whose rule.
+        times: (D, S) how often each sample is taken in each draw.
     """
-    step, level, result = 1.0 / points, 1.0 / points, []
-    for found, score in enumerate(np.sort(scores)[::-1].tolist(), start=1):
-        while found / truths > level:
-            result.append(score)
-            level += step
-    return np.array(result, dtype=np.float64)
+    if protocol.curve == "released":
+        return _released(cell, protocol, times)
+    made = [_CURVES[protocol.curve](each, protocol) for each in _drawn(cell, protocol, times)]
+    columns = (np.array(column, dtype=np.float64) for column in zip(*made, strict=True))
+    return Points(**dict(zip(_Curve._fields, columns, strict=True)))
 
 
-def _released(cell: Cell, protocol: DetectionProtocol) -> Points:
-    matched = cell.scores[cell.matched]
-    thresholds = recall_scores(matched, cell.truths, protocol.points)
-    # how many rows have at least each score: equal scores come in together
-    reached = np.searchsorted(-cell.scores, -thresholds, side="right")
-    tp, spent, excused, detected = (
-        np.concatenate([[0], np.cumsum(each)])[reached] for each in (cell.tp, cell.spent, cell.excused, cell.detected)
+def recall_matches(truths: IntArray, points: int) -> IntArray:
+    """Which matches, counted from 1 by falling score, the released code reads its curve at.
+
+    For each level it takes the first of which number/truths exceeds it; levels are sums of 1/points in double
+    precision, whose rounding decides ties.
+
+    Args:
+        truths: (D,) how many true boxes there are.
+        points: P, how many levels up to a recall of 1.
+
+    Returns:
+        (D, P) rising; more than `truths` for a level that is never exceeded.
+    """
+    levels = np.cumsum(np.full(points, 1.0 / points))
+    some = np.maximum(truths, 1)[:, None]
+    number = np.maximum(np.floor(levels * some).astype(np.int64) - 1, 1)
+    for _ in range(3):
+        number += number / some <= levels
+    return np.asarray(number)
+
+
+class _Sums:
+    """How much comes of a cell's rows in each draw."""
+
+    def __init__(self, cell: Cell, times: IntArray, rows: IntArray, each: IntArray | None = None) -> None:
+        """Count some rows as often as their samples are taken, times what each adds, 1 if None."""
+        weights = np.take(times, cell.sample[rows], axis=1)
+        self._rows = rows
+        self._sums: AnyArray = np.zeros((len(times), len(rows) + 1), dtype=np.int32)
+        np.cumsum(weights if each is None else weights * each, axis=1, dtype=np.int32, out=self._sums[:, 1:])
+
+    @property
+    def all(self) -> IntArray:
+        """(D,) of all rows."""
+        return np.asarray(self._sums[:, -1])
+
+    def above(self, ends: IntArray) -> IntArray:
+        """(D, P) of the first rows of the cell, as many as `ends` (D, P) says."""
+        return np.take_along_axis(self._sums, np.searchsorted(self._rows, ends), axis=1)
+
+    def row_of(self, number: IntArray) -> IntArray:
+        """(D, P) the row with which the sum comes to `number` (D, P), from 1; any row if it never does."""
+        apart = (self.all.max(initial=0) + 1) * np.arange(len(self._sums))[:, None]
+        found = np.searchsorted((self._sums[:, 1:] + apart).reshape(-1), number + apart)
+        found -= len(self._rows) * np.arange(len(self._sums))[:, None]
+        return np.asarray(self._rows[np.minimum(found, len(self._rows) - 1)])
+
+
+def _released(cell: Cell, protocol: DetectionProtocol, times: IntArray) -> Points:
+    truths, matched = times @ cell.truths, _Sums(cell, times, cell.matched)
+    number = recall_matches(truths, protocol.points)
+    is_reached = number <= matched.all[:, None]
+    ends = np.zeros(number.shape, dtype=np.int64)
+    if is_reached.any():
+        threshold = cell.scores[matched.row_of(np.where(is_reached, number, 1))]
+        # how many rows have at least each score: equal scores come in together
+        ends = np.where(is_reached, np.searchsorted(-cell.scores, -threshold, side="right"), 0)
+    tp, spent, detected = (
+        _Sums(cell, times, np.flatnonzero(each)).above(ends) for each in (cell.tp, cell.spent, cell.detected)
     )
-    precision, recall = np.zeros(protocol.points), np.zeros(protocol.points)
-    counted, asked = detected - spent, cell.truths - excused
+    changed = np.flatnonzero(cell.excused)
+    excused = _Sums(cell, times, changed, cell.excused[changed]).above(ends)
     # at a score all of whose detections went to boxes that do not count, the released code divides 0 by 0 and stops
-    precision[: len(tp)] = np.divide(tp, counted, out=np.zeros(len(tp)), where=counted > 0)
-    recall[: len(tp)] = np.divide(tp, asked, out=np.full(len(tp), nan), where=asked > 0)
+    precision = _ratio(tp, detected - spent, 0.0)
+    recall = np.where(is_reached, _ratio(tp, truths[:, None] - excused, nan), 0.0)
     first = int(protocol.min_recall * protocol.points)
-    error_scores = cell.scores[cell.error_rows]
-    errors = np.ones((protocol.points, 4))
-    sums = np.cumsum(cell.errors, axis=0)
-    for point, threshold in enumerate(thresholds.tolist()):
-        below = int(np.searchsorted(-error_scores, -threshold, side="right"))
-        if below and point >= first:
-            errors[point] = sums[below - 1] / below
     return Points(
         precision=precision,
         recall=recall,
-        average=_mean(precision[first:]),
-        errors=np.array([_mean(column) for column in errors[first:].T]),
+        average=np.array([_mean(each[first:]) for each in precision]),
+        errors=np.array([[_mean(column) for column in each[first:].T] for each in _errors_at(cell, times, ends)]),
     )
 
 
-def _nuscenes(cell: Cell, protocol: DetectionProtocol) -> Points:
+def _errors_at(cell: Cell, times: IntArray, ends: IntArray) -> FloatArray:
+    """(D, P, 4) mean errors of the matches among the first rows of a cell, as many as `ends` (D, P) says; 1 of none."""
+    if not len(cell.errors):
+        return np.ones((*ends.shape, 4))
+    below = _Sums(cell, times, cell.error_rows).above(ends)
+    weights = np.take(times, cell.sample[cell.error_rows], axis=1)
+    rows, means = np.searchsorted(cell.error_rows, ends), []
+    for error in cell.errors.T:
+        sums = np.zeros((len(times), len(error) + 1))
+        some = weights * error
+        some[weights == 0] = 0.0  # and not NaN
+        np.cumsum(some, axis=1, out=sums[:, 1:])
+        means.append(_ratio(np.take_along_axis(sums, rows, axis=1), below, 1.0))
+    return np.stack(means, axis=-1)
+
+
+def _drawn(cell: Cell, protocol: DetectionProtocol, times: IntArray) -> Iterator[Cell]:
+    """The cell of each draw, with copies of its rows as of that many samples with one token."""
+    is_first = np.diff(cell.sample, prepend=-1) != 0
+    if protocol.global_sort:
+        is_first |= np.diff(cell.scores, prepend=np.inf) != 0
+    starts = np.flatnonzero(is_first)
+    lengths = np.diff(np.append(starts, len(cell.scores)))
+    with_error = np.full(len(cell.scores), -1)
+    with_error[cell.error_rows] = np.arange(len(cell.error_rows))
+    for each in times:
+        copies = np.repeat(np.arange(len(starts)), each[cell.sample[starts]])
+        length = lengths[copies]
+        ends = np.cumsum(length)
+        rows = np.arange(ends[-1] if ends.size else 0) + np.repeat(starts[copies] - (ends - length), length)
+        error = with_error[rows]
+        yield replace(
+            cell,
+            truths=cell.truths * each,
+            **{name: getattr(cell, name)[rows] for name in ("scores", "sample", "detected", "tp", "spent", "excused")},
+            error_rows=np.flatnonzero(error >= 0),
+            errors=cell.errors[error[error >= 0]],
+        )
+
+
+def _nuscenes(cell: Cell, protocol: DetectionProtocol) -> _Curve:
+    truths = int(cell.truths.sum())
     levels = np.linspace(0, 1, protocol.points)
     found, counted = np.cumsum(cell.tp), np.cumsum(cell.detected - cell.spent)
-    if not found.size or not found[-1] or not cell.truths:
-        return Points(precision=np.zeros(len(levels)), recall=levels, average=0.0, errors=np.ones(4))
-    recall = found / cell.truths
+    if not found.size or not found[-1] or not truths:
+        return _Curve(precision=np.zeros(len(levels)), recall=levels, average=0.0, errors=np.ones(4))
+    recall = found / truths
     precision = np.interp(
         levels, recall, np.divide(found, counted, out=np.zeros(len(found)), where=counted > 0), right=0
     )
@@ -213,7 +186,7 @@ def _nuscenes(cell: Cell, protocol: DetectionProtocol) -> Points:
     first = round(protocol.min_recall * (protocol.points - 1)) + 1
     above = np.maximum(precision[first:] - protocol.min_precision, 0)
     last = int(np.searchsorted(levels, recall[-1], side="right")) - 1
-    return Points(
+    return _Curve(
         precision=precision,
         recall=levels,
         average=_mean(above) / (1 - protocol.min_precision),
@@ -236,29 +209,27 @@ def _interpolated_errors(cell: Cell, scores: FloatArray, first: int, last: int) 
     return np.where(numbers[-1] > 0, means, nan)
 
 
-def _voc(cell: Cell, protocol: DetectionProtocol) -> Points:
+def _voc(cell: Cell, protocol: DetectionProtocol) -> _Curve:
+    truths = int(cell.truths.sum())
     levels = np.linspace(0, 1, protocol.points)
     found, counted = np.cumsum(cell.tp), np.cumsum(cell.detected - cell.spent)
     precision = np.divide(found, counted, out=np.zeros(len(found)), where=counted > 0)
     envelope = np.maximum.accumulate(precision[::-1])[::-1]
     # of as many truths as were found, the best precision with at least so many: recall rises by 1/truths at each
     at_tp = envelope[cell.tp > 0]
-    needed = np.maximum(np.ceil(levels * cell.truths - 1e-9).astype(np.int64), 1)
+    needed = np.maximum(np.ceil(levels * truths - 1e-9).astype(np.int64), 1)
     sampled = np.append(at_tp, np.zeros(1))[np.minimum(needed - 1, len(at_tp))]
-    average = fsum(at_tp.tolist()) / cell.truths if cell.truths else 0.0
-    return Points(precision=sampled, recall=levels, average=average, errors=np.full(4, nan))
+    average = fsum(at_tp.tolist()) / truths if truths else 0.0
+    return _Curve(precision=sampled, recall=levels, average=average, errors=np.full(4, nan))
 
 
-_CURVES: Final[Mapping[str, Callable[[Cell, DetectionProtocol], Points]]] = {
-    "released": _released,
-    "nuscenes": _nuscenes,
-    "voc": _voc,
-}
+_CURVES: Final[Mapping[str, Callable[[Cell, DetectionProtocol], _Curve]]] = {"nuscenes": _nuscenes, "voc": _voc}
 
 
-def _joined(parts: Sequence[Sequence[Any]], dtype: type[np.generic]) -> Any:
-    """All numbers behind one another; None is NaN."""
-    return np.concatenate([np.zeros(0, dtype=dtype), *(np.asarray(part, dtype=dtype) for part in parts)])
+def _ratio(part: AnyArray, whole: IntArray, otherwise: float) -> FloatArray:
+    """`part / whole`, and a number where there is nothing."""
+    shape = np.broadcast_shapes(part.shape, whole.shape)
+    return np.asarray(np.divide(part, whole, out=np.full(shape, otherwise), where=whole > 0))
 
 
 def _mean(values: FloatArray) -> float:

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from typing import Any
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import Any, Final
 
 import numpy as np
 
+from deepaccident_devkit.arrays import FloatArray, IntArray
 from deepaccident_devkit.errors import EvaluationError, GeometryError
 from deepaccident_devkit.evaluation.detection.boxes import DetectedBoxes, columns_of
-from deepaccident_devkit.evaluation.detection.curves import Ledger, Points, curve, pooled
+from deepaccident_devkit.evaluation.detection.curves import Points, curves
 from deepaccident_devkit.evaluation.detection.frame_counts import frame_counts
+from deepaccident_devkit.evaluation.detection.ledger import Ledger
 from deepaccident_devkit.evaluation.detection.measures import ERRORS
 from deepaccident_devkit.evaluation.detection.protocols import DetectionProtocol, detection_protocol
 from deepaccident_devkit.evaluation.detection.result import DetectionResult, mean_of
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.boxes import checked_boxes
+
+_MOST_VALUES: Final = 2**20
+"""Of one array over rows and draws: how many draws are made together."""
 
 
 class DetectionEvaluator(Evaluator[DetectionResult]):
@@ -83,26 +88,43 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
         """The metrics of some samples' counts, in any order."""
         return detection_result(counts, self.protocol)
 
-    def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
-        """One sample's counts in place of many; the same where scores are sorted by sample."""
-        return [pooled(list(counts))] if counts and self.protocol.global_sort else list(counts)
+    def resampled(self, parts: Sequence[Sequence[Counts]], times: IntArray) -> Iterator[DetectionResult]:
+        """The result of each draw (`Evaluator.resampled`); what does not depend on the draw is made once."""
+        owner = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+        ledger = Ledger([counts for part in parts for counts in part], self.protocol)
+        yield from _results(ledger, self.protocol, times[:, owner[ledger.order]].astype(np.int32))
 
 
 def detection_result(counts: Collection[Counts], protocol: DetectionProtocol) -> DetectionResult:
-    """The metrics of some samples' counts (`FrameCounts.as_dict`, each with its `token`, or pooled), in any order."""
+    """The metrics of some samples' counts (`FrameCounts.as_dict`, each with its `token`), in any order."""
     ledger = Ledger(list(counts), protocol)
+    return next(_results(ledger, protocol, np.ones((1, len(ledger)), dtype=np.int64)))
+
+
+def _results(ledger: Ledger, protocol: DetectionProtocol, times: IntArray) -> Iterator[DetectionResult]:
+    """The result of each draw; `times` (D, S) says how often it takes each sample."""
+    shape = len(protocol.classes), len(protocol.ranges), len(protocol.thresholds)
+    cells = [ledger.cell(group, level) for group in range(shape[0] * shape[1]) for level in range(shape[2])]
+    most = max(len(cell.scores) for cell in cells)
+    together = max(1, _MOST_VALUES // max(most, protocol.points, 1))
+    for first in range(0, len(times), together):
+        some = times[first : first + together]
+        points = [curves(cell, protocol, some) for cell in cells]
+        columns = {name: _by_draw(points, name, shape) for name in ("average", "precision", "recall", "errors")}
+        truths, detections = ((some @ each).reshape(-1, *shape[:2]) for each in (ledger.truths, ledger.detections))
+        for draw, samples in enumerate(some.sum(axis=1).tolist()):
+            drawn = {name: column[draw] for name, column in columns.items()}
+            yield _result(protocol, drawn, truths[draw], detections[draw], samples)
+
+
+def _result(
+    protocol: DetectionProtocol, points: Mapping[str, FloatArray], truths: IntArray, detections: IntArray, samples: int
+) -> DetectionResult:
+    """A result of what `curves` gives for all cells: (C, R, K) shares, (C, R, K, P) points and (C, R, K, 4) errors."""
     names = [name for name, _ in protocol.classes]
-    shape = len(names), len(protocol.ranges), len(protocol.thresholds)
-    points = [
-        [[curve(ledger.cell(c * shape[1] + r, k), protocol) for k in range(shape[2])] for r in range(shape[1])]
-        for c in range(shape[0])
-    ]
-    truths = ledger.truths.reshape(shape[:2])
-    average = 100 * np.array([[[each.average for each in row] for row in part] for part in points])
-    errors = np.full((shape[0], 4), np.nan)
+    average, errors = 100 * points["average"], np.full((len(names), 4), np.nan)
     if protocol.error_threshold is not None:
-        level = protocol.thresholds.index(protocol.error_threshold)
-        errors = np.stack([part[0][level].errors for part in points])
+        errors = points["errors"][:, 0, protocol.thresholds.index(protocol.error_threshold)].copy()
     if not protocol.absent_class_is_zero:
         average[truths == 0] = np.nan
         errors[truths.sum(axis=1) == 0] = np.nan
@@ -115,14 +137,16 @@ def detection_result(counts: Collection[Counts], protocol: DetectionProtocol) ->
         ranges=np.array(protocol.ranges),
         thresholds=np.array([protocol.limits(name) for name in names]),
         average_precision=average,
-        precision=_stacked(points, "precision"),
-        recall=_stacked(points, "recall"),
+        precision=points["precision"],
+        recall=points["recall"],
         errors=errors,
         truths=truths,
-        detections=ledger.detections.reshape(shape[:2]),
-        samples=sum(each.get("samples", 1) for each in counts),
+        detections=detections,
+        samples=samples,
     )
 
 
-def _stacked(points: list[list[list[Points]]], name: str) -> Any:
-    return np.array([[[getattr(each, name) for each in row] for row in part] for part in points])
+def _by_draw(points: Sequence[Points], name: str, shape: tuple[int, int, int]) -> FloatArray:
+    """A column of all cells, (D, classes, ranges, thresholds, …)."""
+    stacked = np.stack([getattr(each, name) for each in points], axis=1)
+    return stacked.reshape(len(stacked), *shape, *stacked.shape[2:])

@@ -99,8 +99,8 @@ def frame_counts(detections: BoxColumns, truth: BoxColumns, protocol: DetectionP
     """Match one sample's detections with its true boxes, both in the protocol's frame, and count."""
     if protocol.single_precision:
         detections, truth = detections.rounded(), truth.rounded()
-    truth = _only(truth, _there(truth, protocol) & (class_codes(truth, protocol) >= 0))
-    detections = _only(detections, _inside_area(detections, protocol))
+    truth = _only(truth, truth_taken(truth, protocol))
+    detections = _only(detections, inside_area(detections, protocol))
     if protocol.unknown_velocity_is_zero:
         truth = _standing_if_unknown(truth)
     codes, true_codes = class_codes(detections, protocol), class_codes(truth, protocol)
@@ -216,14 +216,16 @@ def _only(boxes: BoxColumns, which: BoolArray) -> BoxColumns:
     return boxes if which.all() else boxes.select(which)
 
 
-def _there(truth: BoxColumns, protocol: DetectionProtocol) -> BoolArray:
-    inside = _inside_area(truth, protocol)
+def truth_taken(truth: BoxColumns, protocol: DetectionProtocol) -> BoolArray:
+    """(G,) which true boxes exist for the protocol: in its area, of its classes, and its own box only if it counts."""
+    taken = inside_area(truth, protocol) & (class_codes(truth, protocol) >= 0)
     if not protocol.own_box:
-        inside &= ~truth.own
-    return inside
+        taken &= ~truth.own
+    return taken
 
 
-def _inside_area(boxes: BoxColumns, protocol: DetectionProtocol) -> BoolArray:
+def inside_area(boxes: BoxColumns, protocol: DetectionProtocol) -> BoolArray:
+    """(N,) which boxes are in the protocol's area."""
     if protocol.area is None:
         return np.ones(len(boxes), dtype=bool)
     points = boxes.center[:, None, :2]

@@ -8,15 +8,17 @@ from accident_scenes import as_heads, as_maps, scene, standing
 from numpy.testing import assert_allclose
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ConfigError, EvaluationError, NotAvailableError
+from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError, NotAvailableError
 from deepaccident_devkit.evaluation.accident import BoxTruth, accident_context, box_truth
 from deepaccident_devkit.evaluation.accident.boxes import BoxAccidents
 from deepaccident_devkit.evaluation.accident.evaluator import AccidentEvaluator
 from deepaccident_devkit.evaluation.accident.protocol import AccidentContext
+from deepaccident_devkit.evaluation.accident.reading import AccidentReading
 from deepaccident_devkit.evaluation.accident.scoring import Scoring
 from deepaccident_devkit.evaluation.predictions import Accident
 
 BOXES = BoxAccidents()
+GIVEN = BoxAccidents(naming="given")
 STEPS = 21
 FIRST, SECOND, THIRD = 11, 22, 33
 
@@ -45,6 +47,11 @@ META = AccidentContext(pair=(SECOND, FIRST), known=True)
 def alarm(x=0.0, time=2.0, score=1.0, ids=None) -> Accident:
     """Of the crash, both `x` metres farther ahead than they are."""
     return Accident(positions=np.array([[16.0 + x, 10.0], [20.0 + x, 10.0]]), time=time, score=score, ids=ids)
+
+
+def lateral(y) -> Accident:
+    """Of the crash, the second one so many metres to the left."""
+    return Accident(positions=np.array([[20.0, 10.0], [16.0, 10.0 + y]]), time=2.0)
 
 
 def counted(prediction, truth, protocol=BOXES, context=META):
@@ -100,9 +107,37 @@ def test_equally_sure_alarms_are_one_step_of_the_precision() -> None:
 
 
 def test_ids_count_only_where_somebody_is_named() -> None:
-    assert result([alarm()], CRASH).id_error is None
-    assert result([alarm(ids=(FIRST, THIRD))], CRASH).id_error == 1
-    assert result([alarm(ids=(SECOND, FIRST))], CRASH).id_error == 0
+    assert result([alarm()], CRASH, GIVEN).id_error is None
+    for protocol in (BOXES, GIVEN):
+        assert result([alarm(ids=(FIRST, THIRD))], CRASH, protocol).id_error == 1
+        assert result([alarm(ids=(SECOND, FIRST))], CRASH, protocol).id_error == 0
+
+
+def test_without_ids_the_nearest_boxes_at_that_time_are_named() -> None:
+    assert result([alarm()], CRASH).id_error == 0
+    assert result([alarm(x=-1.9)], CRASH).id_error == 0
+    beside = truth_of(np.linspace(10, 0, STEPS), at={THIRD: (16.0, 12.0)})
+    assert result([alarm()], beside).id_error == 0
+    assert result([lateral(1.1)], beside).id_error == 1  # the other car is nearer
+    left = truth_of(np.linspace(10, 0, STEPS), at={THIRD: (16.0, 10.0)})
+    boxes = left.footprint.copy()
+    boxes[-1, 2] = np.nan
+    before = replace(left, footprint=boxes)
+    assert result([alarm(time=1.9)], before).id_error == 1  # then the other was there
+    assert result([alarm(time=2.0)], before).id_error == 0
+
+
+def test_who_is_named_later_than_the_truth_goes_on_is_near_at_its_last_moment() -> None:
+    assert result([alarm(time=7.0)], CRASH).id_error == 0
+
+
+def test_two_positions_name_two_actors() -> None:
+    """The second position is nearer to the first car, which is taken; nobody else is near enough, or near at all."""
+    close = Accident(positions=np.array([[20.0, 10.0], [18.5, 10.0]]), time=2.0)
+    assert result([close], CRASH).id_error == 0
+    assert result([close], CRASH, replace(BOXES, match_distance=2.0)).id_error == 1
+    nobody = replace(CRASH, footprint=np.full_like(CRASH.footprint, np.nan))
+    assert result([alarm()], nobody).id_error == 1
 
 
 def test_moments_can_be_asked_for() -> None:
@@ -141,18 +176,28 @@ def test_whom_the_boxes_bring_near() -> None:
 
 
 def test_maps_are_one_alarm_as_sure_as_the_share_of_them_that_see_it() -> None:
-    cars = {1: standing(20, 10), 2: [(20.0 - 4.5 - gap, 10.0) for gap in (10, 7.5, 5, 2.5, 0)]}
+    cars = {1: standing(20, 10), 2: [(16.0 - gap, 10.5) for gap in (10, 7.5, 5, 2.5, 0)]}
     right, calm = scene(cars), scene({1: standing(20, 10)})
     for output in (as_maps(calm, right, right, calm), as_heads(calm, right, right, calm)):
         counts = counted(output, CRASH)
         assert [(one["score"], one["time"], one["id"]) for one in counts["alarms"]] == [(0.5, 0, 0)]
-        assert counts["alarms"][0]["position"] == pytest.approx(0.5)
+        assert counts["alarms"][0]["position"] == pytest.approx(0.5, abs=0.3)
     assert counted(as_maps(calm), CRASH)["alarms"] == []
-    other = scene({1: standing(20, 12), 2: [(x, 12.0) for x, _ in cars[2]]})
+    other = scene({1: standing(20, 12), 2: [(x, 12.5) for x, _ in cars[2]]})
     assert counted(as_maps(right, other), CRASH)["alarms"][0]["position"] == pytest.approx(4.5, abs=0.5)  # the mean's
-    assert counted(as_maps(other, right), CRASH)["alarms"][0]["position"] == pytest.approx(0.5)
-    strangers = {1: standing(20, 30), 2: [(15.5 - gap, 30.0) for gap in (10, 7.5, 5, 2.5, 0)]}
+    assert counted(as_maps(other, right), CRASH)["alarms"][0]["position"] == pytest.approx(0.5, abs=0.3)
+    strangers = {1: standing(20, 30), 2: [(16.0 - gap, 30.5) for gap in (10, 7.5, 5, 2.5, 0)]}
     assert counted(as_maps(scene(strangers)), CRASH)["alarms"][0]["id"] == 1
+
+
+def test_side_by_side_is_an_accident_in_maps_by_the_papers_reading_alone() -> None:
+    """Cells of neighbours are 0.5 m apart, and so are those of two that touch squarely along the grid."""
+    beside = {1: standing(20, 10), 2: [(15.0 + 2.5 * frame, 12.5) for frame in range(5)]}
+    squarely = {1: standing(20, 10), 2: [(16.0 - gap, 10.0) for gap in (10, 7.5, 5, 2.5, 0)]}
+    stricter = BoxAccidents(reading=AccidentReading(danger_distance=0.5))
+    for cars in (beside, squarely):
+        assert len(counted(as_maps(scene(cars)), PASSING)["alarms"]) == 1
+        assert counted(as_maps(scene(cars)), PASSING, stricter)["alarms"] == []
 
 
 def test_tracks_at_the_frames_of_maps() -> None:
@@ -163,7 +208,7 @@ def test_tracks_at_the_frames_of_maps() -> None:
 def test_maps_are_not_cut_at_the_end_of_the_recording() -> None:
     """The impact is half a second ahead; the model sees it a second ahead."""
     soon = truth_of(np.linspace(2, 0, 6), seconds=0.5)
-    cars = {1: standing(20, 10), 2: [(15.5 - gap, 10.0) for gap in (2, 1.0, 0, 0.5, 1)]}
+    cars = {1: standing(20, 10), 2: [(16.0 - gap, 10.5) for gap in (2, 1.0, 0, 1.0, 2)]}
     made = result(as_maps(scene(cars)), soon)
     assert (made.recall, made.lateness) == (1, 0.5)
 
@@ -225,6 +270,8 @@ def test_what_cannot_be_evaluated(da_motion: DeepAccident) -> None:
         counted([(1, 2)], CRASH)
     with pytest.raises(ConfigError, match="min_score"):
         BoxAccidents(min_score=math.nan)
+    with pytest.raises(ChoiceError, match="naming: expected one of nearest, given, found 'all'"):
+        BoxAccidents(naming="all")
 
 
 def test_a_pair_that_no_label_shows(da_motion: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:

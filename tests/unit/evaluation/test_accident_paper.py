@@ -1,6 +1,6 @@
 import json
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -15,6 +15,7 @@ from deepaccident_devkit.evaluation.accident.protocol import AccidentContext
 from deepaccident_devkit.evaluation.accident.reading import AccidentReading, InstanceTracks, accident_of
 from deepaccident_devkit.evaluation.accident.scoring import Scoring, position_difference
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
+from deepaccident_devkit.evaluation.switches import switch_names
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
 from deepaccident_devkit.motion import LABEL_PROTOCOLS
@@ -320,14 +321,16 @@ def test_the_ego_s_own_box_is_the_agent_itself() -> None:
 
 def test_what_cannot_be_compared() -> None:
     label = scene(HIT)
-    explicit = [Accident(positions=np.zeros((2, 2)), time=1.0)]
-    with pytest.raises(EvaluationError, match="explicit accidents with protocol='boxes'"):
-        PAPER.counts(explicit, label, AccidentContext())
+    with pytest.raises(EvaluationError, match="expected a MotionOutput or a list of Accidents"):
+        PAPER.counts([(20.0, 10.0)], label, AccidentContext())
+    with pytest.raises(EvaluationError, match="needs the sample's motion labels"):
+        PAPER.counts([alarm()], None, AccidentContext())
     with pytest.raises(EvaluationError, match="needs the sample's motion labels"):
         PAPER.counts(as_maps(label), None, AccidentContext())
-    with pytest.raises(EvaluationError, match="not made by the label protocol 'released'"):
+    with pytest.raises(EvaluationError, match="expected those of the label protocol 'released'"):
         PAPER.counts(as_maps(label), scene(HIT, protocol="clean"), AccidentContext())
     assert result(as_maps(label), scene(HIT, protocol="clean"), PaperAccidents(labels="clean")).positives == 1
+    assert result(as_maps(label), scene(HIT, protocol="clean"), PaperAccidents(labels=None)).positives == 1
     with pytest.raises(EvaluationError, match="expected at least 5 frames from the present on, found 3"):
         PAPER.counts(MotionOutput(grid=label.config.grid, instances=label.instance[None, :3]), label, AccidentContext())
     other = BevGrid(x=(-25, 25, 0.25), y=(-25, 25, 0.25))
@@ -337,12 +340,79 @@ def test_what_cannot_be_compared() -> None:
         PAPER.counts(as_maps(label), scene(HIT, frames=0), AccidentContext())
     with pytest.raises(ChoiceError, match="sample_choice: expected one of best, mean_first"):
         PaperAccidents(sample_choice="worst")
+    with pytest.raises(ChoiceError, match="alarm_choice: expected one of surest, any"):
+        PaperAccidents(alarm_choice="all")
+    with pytest.raises(ChoiceError, match="naming: expected one of nearest, given"):
+        PaperAccidents(naming="all")
     with pytest.raises(ChoiceError, match="outline: expected one of centers, cells"):
         AccidentReading(outline="contour")
     with pytest.raises(ConfigError, match="danger_distance"):
         AccidentReading(danger_distance=0)
     with pytest.raises(ConfigError, match="errors_at"):
         Scoring(errors_at=7)
+
+
+def alarm(x=0.0, score=1.0, time=1.5, ids=None) -> Accident:
+    """Of HIT, both positions `x` metres farther ahead."""
+    return Accident(positions=np.array([[15.5 + x, 10.0], [20.0 + x, 10.0]]), time=time, score=score, ids=ids)
+
+
+def test_an_explicit_accident_is_compared_with_the_labels_instance_map() -> None:
+    label = scene(HIT)
+    made = result([alarm()], label)
+    assert tallies(made) == [(1, 0, 0)] * 3
+    assert (made.id_error, made.position_error, made.time_error) == (0, 0, 0)
+    assert "1 of 1 predictions were given as explicit accidents" in made.notes[0]
+    assert tallies(result([alarm(x=3)], label)) == [(0, 1, 1), (1, 0, 0), (1, 0, 0)]
+    assert result([alarm(time=1.2)], label).time_error == pytest.approx(0.3)
+    assert tallies(result([], label)) == [(0, 0, 1)] * 3
+    assert tallies(result([alarm()], scene(CALM))) == [(0, 1, 0)] * 3
+    assert tallies(result([], scene(CALM))) == [(0, 0, 0)] * 3
+
+
+def test_the_surest_explicit_accident_counts_and_of_equally_sure_ones_the_earliest() -> None:
+    label = scene(HIT)
+    unsure, elsewhere = alarm(score=0.5), alarm(x=40)
+    for alarms in ([unsure, elsewhere], [elsewhere, unsure]):
+        assert tallies(result(alarms, label)) == [(0, 1, 1)] * 3
+        every = result(alarms, label, PaperAccidents(alarm_choice="any"))
+        assert tallies(every) == [(1, 0, 0)] * 3
+        assert tallies(every.beside["sample_choice=mean_first"]) == [(0, 1, 1)] * 3
+    early, late = alarm(x=1, time=1.0), alarm(time=1.5)
+    assert result([late, early], label).position_error == 2
+
+
+def test_explicit_accidents_after_the_labels_end_are_cut_like_maps() -> None:
+    label = scene({1: standing(20, 10), 2: follower(4, 0.5, 1.5, 9, 9)}, frames=3)
+    assert tallies(result([alarm(time=1.25)], label)) == [(1, 0, 0)] * 3
+    later = [alarm(time=1.3), alarm(score=0.5, time=1.0)]
+    assert result(later, label).time_error == 0.5
+    assert tallies(result(later[:1], label)) == [(0, 0, 1)] * 3
+    kept = PaperAccidents(alarms_cut=False)
+    assert tallies(result(later[:1], label, kept)) == [(1, 0, 0)] * 3
+
+
+def test_whom_an_explicit_accident_names() -> None:
+    label = scene(HIT | {3: standing(15.5, 13)})
+    assert result([alarm(ids=(2, 1))], label).id_error == 0
+    assert result([alarm(ids=(2, 3))], label).id_error == 1
+    given = PaperAccidents(naming="given")
+    assert result([alarm()], label, given).id_error is None
+    assert result([alarm(ids=(2, 3))], label, given).id_error == 1
+    aside = Accident(positions=np.array([[15.5, 11.6], [20.0, 10.0]]), time=1.5)
+    assert result([aside], label).id_error == 1  # the third is nearer
+    assert result([replace(aside, positions=aside.positions - [0, 0.2])], label).id_error == 0
+    assert result([alarm(time=0.2)], label).id_error == 1  # the second is still 3.5 m behind, the third there
+    assert result([alarm(x=1.5)], label, PaperAccidents(match_distance=1.0)).id_error == 1
+
+
+def test_ids_of_an_explicit_accident_are_actors_the_own_one_among_them() -> None:
+    label = scene({5: [(20 - 4 * t, 0.0) for t in range(4)] + [(4.5, 0.0)]}, draw_ego=True)
+    own = AccidentContext(pair=(5, 77), known=True, own_actor_id=77)
+    predicted = [Accident(positions=np.array([[4.5, 0.0], [0.0, 0.0]]), time=2.0, ids=(77, 5))]
+    assert result(predicted, label, context=own).id_error == 0
+    assert result(predicted, label, context=replace(own, own_actor_id=76)).id_error == 1
+    assert result(predicted, label, context=replace(own, own_actor_id=None)).id_error is None
 
 
 def test_orientations_of_prediction_and_label_may_differ() -> None:
@@ -364,8 +434,9 @@ def test_counts_are_json_and_each_choice_is_explained() -> None:
     explained = evaluator.explained()
     assert set(explained) == set(PAPER.variants())
     assert evaluator.compute().within[5.0].tp == 1
-    assert explained["limit_counts=True"].within[5.0].tp == 2
-    assert explained["far_is_missed=False"].within[5.0].fn == 0
-    assert explained["danger_distance=0.5"].positives == 0
+    assert explained["scoring.limit_counts=True"].within[5.0].tp == 2
+    assert explained["scoring.far_is_missed=False"].within[5.0].fn == 0
+    assert explained["reading.danger_distance=0.5"].positives == 0
     names = {name.split("=")[0] for name in explained}
-    assert {"moment", "outline", "present", "redraw", "foreground", "link_distance", "sample_choice"} <= names
+    assert {f"reading.{each.name}" for each in fields(AccidentReading)} | {"sample_choice"} <= names
+    assert names <= set(switch_names(PAPER))

@@ -168,7 +168,7 @@ def test_paths_go_on_faster_and_faster() -> None:
     truth = DrawnPaths(paths={1: np.tile([x + 6, y], (FRAMES, 1)), 2: other}, drawn=touching())
     for accelerating, off in ((True, 3), (False, 0)):
         rules = replace(RELEASED, accelerating=accelerating)
-        predicted = rules._padded(DrawnPaths(paths={1: ending.paths[1], 2: other}, drawn=touching()), FRAMES)
+        predicted = rules.padded_paths(DrawnPaths(paths={1: ending.paths[1], 2: other}, drawn=touching()), FRAMES)
         found, pair = accident_counts([predicted], truth, [[(1, 1), (2, 2)]], rules, 0.5)
         assert pair == (1, 2)
         assert found["position"] == pytest.approx([off] * 3)

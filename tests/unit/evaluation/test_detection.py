@@ -20,7 +20,7 @@ from deepaccident_devkit.evaluation.detection import (
     released_dict,
     released_text,
 )
-from deepaccident_devkit.evaluation.detection.curves import recall_scores
+from deepaccident_devkit.evaluation.detection.curves import recall_matches
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID
 
@@ -97,10 +97,10 @@ def test_nothing_there_and_no_samples(protocol: str) -> None:
 
 
 def test_levels_of_recall_are_sums_in_double_precision() -> None:
-    """A score for each level that recall exceeds: 7 of 56 is just 5/40, and does not exceed the sum of five 0.025."""
-    assert len(recall_scores(np.linspace(1, 0.5, 7), 56, 40)) == 4
-    assert len(recall_scores(np.linspace(1, 0.5, 40), 40, 40)) == 39
-    assert recall_scores(np.array([0.2, 0.9]), 2, 4).tolist() == [0.9, 0.2, 0.2]
+    """A match for each level that recall exceeds: 7 of 56 is just 5/40, and does not exceed the sum of five 0.025."""
+    assert (recall_matches(np.array([56]), 40) <= 7).sum() == 4
+    assert (recall_matches(np.array([40]), 40) <= 40).sum() == 39
+    assert recall_matches(np.array([2, 0]), 4).tolist() == [[1, 2, 2, 3], [1, 1, 1, 2]]
 
 
 def test_an_ignored_detection_uses_up_the_truth() -> None:

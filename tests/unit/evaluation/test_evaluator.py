@@ -83,6 +83,12 @@ def test_a_broken_off_run_goes_on(tmp_path: Path) -> None:
     assert again.repeated == {"a", "b"}
 
 
+def test_any_order_of_samples_and_parts_is_saved_as_the_same_bytes(tmp_path: Path) -> None:
+    one = filled("abc").save(tmp_path / "one.json")
+    other = filled("c").merge(filled("a")).merge(filled("b")).save(tmp_path / "other.json")
+    assert one.read_bytes() == other.read_bytes()
+
+
 def test_a_run_of_other_settings_does_not_go_on(tmp_path: Path) -> None:
     path = filled("a").save(tmp_path / "state.json")
     with pytest.raises(EvaluationError, match="was saved with other settings"):

@@ -81,6 +81,8 @@ def test_decimal_resolutions_are_whole() -> None:
         ((-50, 50, -0.5), r"x: expected start < end and a cell size above 0"),
         ((-50, np.nan, 1), r"x: expected start < end and a cell size above 0"),
         ((-50, np.inf, 1), r"x: expected start < end and a cell size above 0"),
+        ((-1e308, 1e308, 1), r"x: expected start < end and a cell size above 0"),
+        ((0, 1, 1e-320), r"x: expected start < end and a cell size above 0"),
         ((-50, 50), r"x: expected start, end and cell size in metres, found \(-50, 50\)"),
         (7, r"x: expected start, end and cell size in metres, found 7"),
     ],

@@ -28,5 +28,8 @@ def with_others(rules: Rules, others: Mapping[str, Sequence[Any]]) -> dict[str, 
 
 
 def with_parts(rules: Rules, name: str, parts: Mapping[str, Any]) -> dict[str, Rules]:
-    """A dataclass with a field changed to each of some values, by their names."""
-    return {key: replace(rules, **{name: part}) for key, part in parts.items()}
+    """A dataclass with a part changed to each of some others, by the part's name and theirs: `reading.outline=cells`.
+
+    So `switches.switched` calls these choices, too.
+    """
+    return {f"{name}.{key}": replace(rules, **{name: part}) for key, part in parts.items()}

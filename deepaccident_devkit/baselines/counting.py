@@ -1,0 +1,131 @@
+"""Counting the study's samples: the truth of a sample once, then every condition."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Final
+
+from deepaccident_devkit.baselines.collisions import accidents_ahead
+from deepaccident_devkit.baselines.conditions import Condition
+from deepaccident_devkit.baselines.drawing import label_times, motion_of
+from deepaccident_devkit.baselines.motion_models import MotionModel
+from deepaccident_devkit.baselines.outlook import outlook
+from deepaccident_devkit.baselines.predict_results import Baseline
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.evaluation import AccidentEvaluator, MotionEvaluator, accident_context
+from deepaccident_devkit.motion import motion_labels
+from deepaccident_devkit.parallel import run_unordered
+from deepaccident_devkit.taxonomy import LIDAR
+
+_BATCH: Final = 4
+"""Samples that a worker counts before it reports."""
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluators:
+    """The evaluators of one condition.
+
+    Attributes:
+        motion: of the instance maps.
+        maps: of the accidents in them, by the study's protocol.
+        boxes: of the accidents named explicitly, by the protocol `boxes`.
+    """
+
+    motion: MotionEvaluator
+    maps: AccidentEvaluator
+    boxes: AccidentEvaluator
+
+    @classmethod
+    def of(cls, protocol: str) -> Evaluators:
+        """New ones; the released protocol's motion metrics go with its accident metrics, the paper's with all else."""
+        motion = MotionEvaluator("released" if protocol == "released" else "paper", trajectories=False)
+        return cls(motion, AccidentEvaluator(protocol), AccidentEvaluator("boxes"))
+
+    def merge(self, other: Evaluators) -> None:
+        """Take all samples of others of the same condition."""
+        self.motion.merge(other.motion)
+        self.maps.merge(other.maps)
+        self.boxes.merge(other.boxes)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Counting:
+    """What is counted how; cheap to pickle.
+
+    Attributes:
+        dataset: the release.
+        model: how actors go on.
+        protocol: of the accidents in maps.
+        seed: of the links.
+    """
+
+    dataset: Dataset
+    model: MotionModel
+    protocol: str
+    seed: int
+
+
+def counted(
+    counting: Counting,
+    samples: Mapping[str, Sequence[Condition]],
+    *,
+    workers: int | None = None,
+    progress: bool = False,
+) -> dict[Condition, Evaluators]:
+    """Evaluate samples under conditions; the numbers do not depend on the number of workers.
+
+    Args:
+        counting: how.
+        samples: token → its conditions.
+        workers: processes; None takes what the work is worth.
+        progress: whether to show a bar.
+    """
+    items = list(samples.items())
+    jobs = [_Job(counting, tuple(items[at : at + _BATCH])) for at in range(0, len(items), _BATCH)]
+    sizes = [len(job.samples) for job in jobs]
+    result: dict[Condition, Evaluators] = {}
+    done = run_unordered(_count, jobs, workers=workers, label="samples", progress=progress, sizes=sizes)
+    with closing(done):
+        for _, part in done:
+            for condition, evaluators in part.items():
+                result.setdefault(condition, Evaluators.of(counting.protocol)).merge(evaluators)
+    return result
+
+
+@dataclass(frozen=True, slots=True)
+class _Job:
+    counting: Counting
+    samples: tuple[tuple[str, Sequence[Condition]], ...]
+
+
+def _count(job: _Job) -> dict[Condition, Evaluators]:
+    result: dict[Condition, Evaluators] = {}
+    for token, conditions in job.samples:
+        for horizon in sorted({condition.horizon for condition in conditions}):
+            chosen = [condition for condition in conditions if condition.horizon == horizon]
+            _count_sample(job.counting, token, horizon, chosen, result)
+    return result
+
+
+def _count_sample(
+    counting: Counting,
+    token: str,
+    horizon: float,
+    conditions: Sequence[Condition],
+    result: dict[Condition, Evaluators],
+) -> None:
+    """Add a sample to the evaluators of conditions that look equally far ahead."""
+    dataset, config = counting.dataset, Baseline(horizon=horizon).config
+    label = motion_labels(dataset, token, config).to_present("bilinear")
+    context = accident_context(dataset, token, horizon)
+    for condition in conditions:
+        ahead = outlook(
+            dataset, token, agents=condition.agents, model=counting.model, link=condition.link(counting.seed)
+        )
+        output = motion_of(ahead.seen, ahead.poses(label_times(config)), dataset.ego_from(token, LIDAR), config)
+        evaluators = result.setdefault(condition, Evaluators.of(counting.protocol))
+        evaluators.motion.update(token, output, label)
+        evaluators.maps.update(token, output, label, context)
+        evaluators.boxes.update(token, accidents_ahead(ahead, horizon), context)

@@ -1,0 +1,48 @@
+"""`StudyConfig`: how a study of V2X is made."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import get_args
+
+from deepaccident_devkit.baselines.motion_models import MotionModel
+from deepaccident_devkit.baselines.outlook import MOTION_MODELS
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.evaluation.accident import PROTOCOLS
+from deepaccident_devkit.motion.sample_lists import Scope
+from deepaccident_devkit.taxonomy import AGENTS, VEHICLE_AGENTS
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StudyConfig:
+    """How a study is made.
+
+    Attributes:
+        egos: agents whose samples are taken, kept as a tuple. The released evaluation takes all five agents'; but to
+            the pole a single vehicle is none, and the vehicles of both sides show an accident twice: so it is one here.
+        scope: `accident` for scenarios that were designed to end in one, `all` for normal ones too.
+        model: how actors go on.
+        protocol: of the accidents that are read off maps: `released`, `paper` or `boxes`. Those named explicitly are
+            always evaluated by `boxes`.
+        quick: fewer horizons and steps of noise and latency.
+        seed: of the links' draws.
+    """
+
+    egos: Sequence[str] = VEHICLE_AGENTS[:1]
+    scope: Scope = "accident"
+    model: MotionModel = "constant_velocity"
+    protocol: str = "paper"
+    quick: bool = False
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the choices; raises ChoiceError."""
+        if isinstance(self.egos, str):
+            raise ChoiceError(f"egos: expected several agents, found {self.egos!r}; give [{self.egos!r}] for one")
+        object.__setattr__(self, "egos", tuple(self.egos))
+        if not self.egos or not set(self.egos) <= set(AGENTS):
+            raise ChoiceError(f"egos: expected some of {', '.join(AGENTS)}, found {', '.join(self.egos) or 'none'}")
+        for name, choices in (("scope", get_args(Scope)), ("model", MOTION_MODELS), ("protocol", PROTOCOLS)):
+            if getattr(self, name) not in choices:
+                raise ChoiceError(f"{name}: expected one of {', '.join(choices)}, found {getattr(self, name)!r}")

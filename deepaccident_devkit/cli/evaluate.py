@@ -1,0 +1,134 @@
+"""`deepaccident evaluate motion|accident|detection|warning`: the metrics of a results file, on a release."""
+
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, get_args
+
+import click
+
+from deepaccident_devkit.cli.evaluate_bundles import compare, validate, verify
+from deepaccident_devkit.cli.evaluate_options import selection_of, selection_parameters, switches_of
+from deepaccident_devkit.cli.options import release_parameters
+from deepaccident_devkit.deepaccident import DeepAccident
+from deepaccident_devkit.evaluation import Bootstrap
+from deepaccident_devkit.evaluation.attributes import ATTRIBUTES, EVERYTHING
+from deepaccident_devkit.evaluation.explanation import explain
+from deepaccident_devkit.evaluation.results import Results, read_results
+from deepaccident_devkit.evaluation.runs import (
+    BREAKDOWNS,
+    EvaluationRun,
+    checked_target,
+    evaluate_results,
+    explanation_checkpoint,
+    save_run,
+    summary_text,
+)
+from deepaccident_devkit.evaluation.runs.text import SHOWN_BREAKDOWNS
+from deepaccident_devkit.evaluation.sanity import check_sanity
+from deepaccident_devkit.evaluation.setups import TASK_PROTOCOLS, EvaluationSetup, TaskName
+from deepaccident_devkit.render.evaluation import save_report
+
+_RESAMPLES = 200
+"""For intervals: there are ten breakdowns of each evaluation, and of detections one resample takes a while."""
+_HELP = {
+    "motion": "Tell how well motion is foreseen: IoU, VPQ and errors of paths.",
+    "accident": "Tell how well accidents are foreseen: APA, and errors of who, where and when.",
+    "detection": "Tell how well boxes are detected: AP and errors.",
+    "warning": "Tell how early accidents are warned of, and how often an alarm is false.",
+}
+_RELEASE = ("dataroot", "version", "index_dir", "workers", "on_error")
+
+
+@click.group()
+def evaluate() -> None:
+    """Evaluate results files; check and compare evaluations."""
+
+
+def _task_verb(task: TaskName) -> click.Command:
+    """The verb of one task."""
+    protocols = list(TASK_PROTOCOLS[task])
+
+    @click.command(task, help=f"{_HELP[task]}\n\nThe truth is of the release under DATAROOT.")
+    @release_parameters
+    @click.option("--results", required=True, type=click.Path(path_type=Path), help="What was predicted.")
+    @selection_parameters
+    @click.option("--protocol", type=click.Choice(protocols), default=protocols[0], show_default=True)
+    @click.option("--switch", "switches", multiple=True, metavar="NAME=VALUE", help="Make a choice of it otherwise.")
+    @click.option("--allow-partial", is_flag=True, help="Evaluate the samples there are; all is marked as partial.")
+    @click.option("--by", multiple=True, type=click.Choice(ATTRIBUTES), help="Break down by this; may be repeated.")
+    @click.option(
+        "--bootstrap",
+        type=click.IntRange(min=0),
+        default=_RESAMPLES,
+        show_default=True,
+        help="Resamples for intervals; 0 for none.",
+    )
+    @click.option("--sanity", is_flag=True, help="Look whether predictions are mirrored, turned, shifted, scaled, …")
+    @click.option("--explain", "explained", is_flag=True, help="Tell what each choice of the protocol changes.")
+    @click.option("--out", type=click.Path(path_type=Path), help="Folder for all numbers, figures and a report.")
+    @click.option("--overwrite", is_flag=True, help="Replace the evaluation in --out.")
+    @click.option("--include-results", is_flag=True, help="Copy RESULTS into --out, to check it by itself.")
+    @click.option("--json", "as_json", is_flag=True, help="One JSON object, for programs.")
+    def verb(results: Path, protocol: str, switches: tuple[str, ...], **options: Any) -> None:
+        setup = EvaluationSetup(
+            task=task, protocol=protocol, switches=switches_of(switches), horizon=options["horizon"]
+        )
+        _evaluate(setup, results, **options)
+
+    return verb
+
+
+def _evaluate(setup: EvaluationSetup, results: Path, *, by: tuple[str, ...], as_json: bool, **options: Any) -> None:
+    out: Path | None = options["out"]
+    if out is not None:
+        checked_target(out, overwrite=options["overwrite"])  # before the release is indexed
+    opened = read_results(results)
+    dataset = DeepAccident(**{name: options[name] for name in _RELEASE})
+    run = evaluate_results(
+        dataset,
+        opened,
+        setup,
+        selection_of(setup, options),
+        allow_partial=options["allow_partial"],
+        workers=options["workers"],
+        out=out,
+        progress=True,
+    )
+    drawn = Bootstrap(resamples=options["bootstrap"])
+    run = run.broken_down((EVERYTHING, *(by or BREAKDOWNS)), drawn, workers=options["workers"])
+    run, texts = _examined(run, dataset, opened, options)
+    summary = run.summary()
+    shown = summary_text(summary, by or SHOWN_BREAKDOWNS)
+    click.echo(json.dumps(summary, indent=1) if as_json else "\n\n".join([shown, *texts]))
+    if out is not None:
+        report = partial(save_report, run, dataset=dataset, results=opened)
+        kept = {name: options[name] for name in ("include_results", "overwrite")}
+        click.echo(f"written: {save_run(run, out, **kept, extras=[report])}", err=as_json)
+
+
+def _examined(
+    run: EvaluationRun, dataset: DeepAccident, results: Results, options: dict[str, Any]
+) -> tuple[EvaluationRun, list[str]]:
+    """The run with the examinations that were asked for, and their texts."""
+    texts, tokens, workers = [], sorted(run.evaluator.tokens), options["workers"]
+    if options["sanity"]:
+        report = check_sanity(dataset, results, run.setup, tokens, workers=workers)
+        run = replace(run, sanity=report.as_dict())
+        texts.append(report.to_text())
+    if options["explained"]:
+        checkpoint = None if options["out"] is None else explanation_checkpoint(run, options["out"])
+        explanation = explain(
+            dataset, results, run.setup, tokens, workers=workers, progress=True, checkpoint=checkpoint
+        )
+        run = replace(run, explanation=explanation.as_dict())
+        texts.append(explanation.to_text())
+    mark = "" if run.partial is None else f"{run.partial.text()}\n"
+    return run, [f"{mark}{text}" for text in texts]
+
+
+for name in get_args(TaskName):
+    evaluate.add_command(_task_verb(name))
+for command in (validate, verify, compare):
+    evaluate.add_command(command)

@@ -1,0 +1,96 @@
+"""`deepaccident evaluate validate|verify|compare`: results files before, and evaluations after they are made."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any, Literal
+
+import click
+
+from deepaccident_devkit.cli.evaluate_options import selection_of, selection_parameters
+from deepaccident_devkit.cli.options import on_error_parameter
+from deepaccident_devkit.deepaccident import DeepAccident
+from deepaccident_devkit.evaluation import Bootstrap
+from deepaccident_devkit.evaluation.results import read_results
+from deepaccident_devkit.evaluation.runs import compare_bundles, coverage, read_bundle, results_text, verify_bundle
+from deepaccident_devkit.evaluation.setups import EvaluationSetup
+from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.taxonomy import VERSIONS
+
+_FINDINGS_STATUS = 1
+_workers = click.option("--workers", type=click.IntRange(min=1), help="Processes to use.")
+
+
+@click.command()
+@click.argument("results", type=click.Path(path_type=Path))
+@click.option("--dataroot", type=click.Path(path_type=Path), help="A release, to see whether it has these samples.")
+@click.option("--version", type=click.Choice(VERSIONS), default="v1", show_default=True, help="Which release.")
+@selection_parameters
+@_workers
+@on_error_parameter
+def validate(results: Path, dataroot: Path | None, version: str, workers: int | None, **options: Any) -> None:
+    """Read the results file or folder RESULTS wholly and tell what it holds.
+
+    Exit status 1 if with --dataroot it has not just the samples of --split, 2 if an entry is wrong.
+    """
+    opened = read_results(results)
+    opened.check(workers=workers, progress=True)
+    click.echo(results_text(opened))
+    if dataroot is None:
+        return
+    dataset = DeepAccident(version, dataroot, workers=workers, on_error=options["on_error"])
+    selection = selection_of(EvaluationSetup(task=opened.task, horizon=options["horizon"]), options)
+    covered = coverage(dataset, opened.tokens, selection)
+    click.echo(f"{selection.text()}: {covered.to_text()}")
+    if not covered.is_complete:
+        sys.exit(_FINDINGS_STATUS)
+
+
+@click.command()
+@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+@click.option("--dataroot", type=click.Path(path_type=Path), help="The release.  [default: where it was]")
+@click.option("--results", type=click.Path(path_type=Path), help="The results.  [default: in DIR, or where they were]")
+@_workers
+@on_error_parameter
+@click.option("--json", "as_json", is_flag=True, help="One JSON object, for programs.")
+def verify(
+    folder: Path,
+    dataroot: Path | None,
+    results: Path | None,
+    workers: int | None,
+    on_error: Literal["raise", "skip"],
+    as_json: bool,
+) -> None:
+    """Evaluate again what the folder DIR is of, and list what differs from it.
+
+    Exit status 0 if nothing does, 1 if something does.
+    """
+    bundle = read_bundle(folder)
+    dataset = DeepAccident(bundle.release_version, dataroot or bundle.dataroot, workers=workers, on_error=on_error)
+    verification = verify_bundle(folder, dataset, results=results, workers=workers, progress=True)
+    click.echo(json.dumps(verification.as_dict(), indent=1) if as_json else verification.to_text())
+    if not verification.is_same:
+        sys.exit(_FINDINGS_STATUS)
+
+
+@click.command()
+@click.argument("a", type=click.Path(path_type=Path))
+@click.argument("b", type=click.Path(path_type=Path))
+@click.option("--common", is_flag=True, help="Compare the samples that both have, where one has others, too.")
+@click.option("--bootstrap", type=click.IntRange(min=0), default=1000, show_default=True, help="Resamples.")
+@click.option("--out", type=click.Path(path_type=Path), help="A file for all numbers: ….csv or ….json.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON object, for programs.")
+def compare(a: Path, b: Path, common: bool, bootstrap: int, out: Path | None, as_json: bool) -> None:
+    """Compare the evaluations in the folders A and B, and say which differences are real."""
+    if out is not None and out.suffix not in (".csv", ".json"):
+        raise click.BadParameter(f"--out: expected a file ….csv or ….json, found {str(out)!r}")
+    comparison = compare_bundles(a, b, Bootstrap(resamples=bootstrap), common=common)
+    as_text = json.dumps(comparison.as_dict(), indent=1)
+    click.echo(as_text if as_json else comparison.to_text())
+    if out is None:
+        return
+    if out.suffix == ".csv":
+        comparison.to_csv(out)
+    else:
+        write_bytes(out, as_text.encode())
+    click.echo(f"written: {out}", err=as_json)

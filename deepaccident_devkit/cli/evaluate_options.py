@@ -1,0 +1,69 @@
+"""The options that say which samples are evaluated, and by which rules."""
+
+import json
+from collections.abc import Mapping
+from typing import Any, get_args
+
+import click
+
+from deepaccident_devkit.cli.options import Verb, agent_names, agents_parameter
+from deepaccident_devkit.evaluation.runs import SampleSelection, default_selection
+from deepaccident_devkit.evaluation.runs.selection import SampleList, ScopeName
+from deepaccident_devkit.evaluation.setups import EvaluationSetup
+from deepaccident_devkit.taxonomy import AGENTS
+
+_SELECTION = (
+    click.option(
+        "--split",
+        default="val",
+        show_default=True,
+        help="train, val, test, train_mini, val_mini, or a split file (….txt).",
+    ),
+    click.option(
+        "--samples",
+        type=click.Choice(get_args(SampleList)),
+        help="Those within the horizon before the end, or two a second of whole scenarios.  [default: evaluate; of "
+        "warnings all]",
+    ),
+    click.option(
+        "--scope",
+        type=click.Choice(get_args(ScopeName)),
+        help="Scenarios designed to end in an accident, or the normal ones, too.  [default: accident, or all with "
+        "--samples all]",
+    ),
+    agents_parameter,
+    click.option("--horizon", default=2.0, show_default=True, help="Seconds that predictions look ahead."),
+)
+
+
+def selection_parameters(verb: Verb) -> Verb:
+    """Give a verb --split, --samples, --scope, --agents and --horizon."""
+    for parameter in reversed(_SELECTION):
+        verb = parameter(verb)
+    return verb
+
+
+def selection_of(setup: EvaluationSetup, options: Mapping[str, Any]) -> SampleSelection:
+    """The samples that a verb's options name."""
+    agents = agent_names(options["agents"])
+    return default_selection(
+        setup,
+        options["split"],
+        samples=options["samples"],
+        scope=options["scope"],
+        agents=None if agents == AGENTS else agents,
+    )
+
+
+def switches_of(texts: tuple[str, ...]) -> dict[str, Any]:
+    """The choices that repeated --switch NAME=VALUE name; values as JSON has them, other words as they are."""
+    switches: dict[str, Any] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not (name and equals):
+            raise click.BadParameter(f"--switch: expected NAME=VALUE, found {text!r}")
+        try:
+            switches[name] = json.loads(value)
+        except ValueError:
+            switches[name] = value
+    return switches

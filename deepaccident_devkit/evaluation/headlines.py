@@ -1,0 +1,151 @@
+"""The few numbers of each task that tables, comparisons and plots show first."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, Final, Literal
+
+from deepaccident_devkit.errors import ChoiceError
+
+Unit = Literal["%", "share", "m", "s", "rad", "m/s", "1 - overlap", "1/min"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Headline:
+    """One number of a result.
+
+    Attributes:
+        name: short, as tables print it: `iou 30x30`, `accuracy@10`, `mAP`.
+        value: None where there is nothing to count, or the result has no such number.
+        unit: `%` for percent, `share` for a share in [0, 1].
+        higher_is_better: whether more is better; None where neither is.
+        path: of the number in the result, as `breakdowns.numbers_of` has it: `ranges/30x30/iou`.
+    """
+
+    name: str
+    value: float | None
+    unit: Unit
+    higher_is_better: bool | None
+    path: str
+
+    def text(self) -> str:
+        """The value with its unit; see `value_text`."""
+        return value_text(self.value, self.unit)
+
+
+@dataclass(frozen=True, slots=True)
+class _Row:
+    """Where a number stands in a task's result; `*` is any key, and takes its place in the name."""
+
+    path: str
+    name: str
+    unit: Unit
+    better: Literal["higher", "lower", "neither"] = "lower"
+
+
+_HIGHER_IS_BETTER: Final = {"higher": True, "lower": False, "neither": None}
+_ROWS: Final[Mapping[str, tuple[_Row, ...]]] = MappingProxyType(
+    {
+        "motion": (
+            _Row("ranges/*/iou", "iou *", "%", "higher"),
+            _Row("ranges/*/pq", "pq *", "%", "higher"),
+            _Row("min_ade", "min_ade", "m"),
+            _Row("min_fde", "min_fde", "m"),
+            _Row("miss_rate", "miss_rate", "share"),
+        ),
+        "accident": (
+            _Row("apa", "apa", "share", "higher"),
+            _Row("within/*/accuracy", "accuracy@*", "share", "higher"),
+            _Row("id_error", "id_error", "share"),
+            _Row("position_error", "position_error", "m"),
+            _Row("time_error", "time_error", "s"),
+            _Row("precision", "precision", "share", "higher"),
+            _Row("recall", "recall", "share", "higher"),
+            _Row("average_precision", "average_precision", "share", "higher"),
+            _Row("false_alarm_rate", "false_alarm_rate", "share"),
+            _Row("lateness", "lateness", "s", "neither"),
+        ),
+        "detection": (
+            _Row("mean_average_precision", "mAP", "%", "higher"),
+            _Row("mean_errors/ATE", "mATE", "m"),
+            _Row("mean_errors/ASE", "mASE", "1 - overlap"),
+            _Row("mean_errors/AOE", "mAOE", "rad"),
+            _Row("mean_errors/AVE", "mAVE", "m/s"),
+            _Row("class_average_precision/*", "AP *", "%", "higher"),
+        ),
+        "warning": (
+            _Row("warned_share", "warned_share", "share", "higher"),
+            _Row("mean_warning", "mean_warning", "s", "higher"),
+            _Row("detection_rate/*", "detection_rate@*s", "share", "higher"),
+            _Row("false_alarms_per_minute/*", "false_alarms *", "1/min"),
+        ),
+    }
+)
+
+
+def headlines(task: str, result: object) -> tuple[Headline, ...]:
+    """The headline numbers of a result, the most important first.
+
+    Args:
+        task: `motion`, `accident`, `detection` or `warning`.
+        result: of that task's evaluator.
+
+    Returns:
+        Those that this result has: a protocol without a number (the released accidents have no precision) has no such
+        headline either.
+
+    Raises:
+        ChoiceError: no such task.
+    """
+    if task not in _ROWS:
+        raise ChoiceError(f"task: expected one of {', '.join(_ROWS)}, found {task!r}")
+    return tuple(
+        Headline(
+            name=row.name.replace("*", key),
+            value=_known(value),
+            unit=row.unit,
+            higher_is_better=_HIGHER_IS_BETTER[row.better],
+            path=row.path.replace("*", key),
+        )
+        for row in _ROWS[task]
+        for key, value in _found(result, row.path)
+    )
+
+
+def headline_numbers(task: str, result: object) -> dict[str, float | None]:
+    """Name → value of `headlines`; raises ChoiceError if there is no such task."""
+    return {each.name: each.value for each in headlines(task, result)}
+
+
+def value_text(value: float | None, unit: Unit, *, signed: bool = False) -> str:
+    """A number with its unit, for people: `41.20 %`, `0.875`, `1.300 m`; `–` for none.
+
+    With `signed` it is a change: `+1.300 m`, and `+0.54` of percents, in percentage points.
+    """
+    if value is None:
+        return "–"
+    number = f"{value:{'+' if signed else ''}.{2 if unit == '%' else 3}f}"
+    return number if unit in ("share", "1 - overlap") or (signed and unit == "%") else f"{number} {unit}"
+
+
+def _found(result: object, path: str) -> Iterator[tuple[str, Any]]:
+    """Keys that stand for the `*` (an empty one without) and the values there."""
+    head, _, rest = path.partition("/")
+    if not hasattr(result, head):
+        return
+    value: Any = getattr(result, head)
+    if not rest:
+        yield "", value
+        return
+    key, _, leaf = rest.partition("/")
+    for name, each in value.items():
+        text = f"{name:g}" if isinstance(name, float) else str(name)
+        if key in ("*", text):
+            yield text, getattr(each, leaf) if leaf else each
+
+
+def _known(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else float(value)

@@ -1,0 +1,22 @@
+"""Results files: what a model says of many samples, in formats that others can write and check.
+
+schema/results/README.md describes them; `ResultsWriter` writes, `read_results` reads.
+"""
+
+from deepaccident_devkit.evaluation.results.contents import Prediction
+from deepaccident_devkit.evaluation.results.form import FORMAT, FORMAT_VERSION, MotionForm, ResultsTask
+from deepaccident_devkit.evaluation.results.reader import Results, read_results
+from deepaccident_devkit.evaluation.results.schemas import RESULT_SCHEMAS
+from deepaccident_devkit.evaluation.results.writer import ResultsWriter
+
+__all__ = [
+    "FORMAT",
+    "FORMAT_VERSION",
+    "RESULT_SCHEMAS",
+    "MotionForm",
+    "Prediction",
+    "Results",
+    "ResultsTask",
+    "ResultsWriter",
+    "read_results",
+]

@@ -1,0 +1,111 @@
+"""The same field of many entries as one array, checked all at once.
+
+A check says of many entries whether all are good. Of one entry it says what is wrong: `entries.read_entries` finds it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import chain
+from typing import Any, Final
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, FloatArray, IntArray
+from deepaccident_devkit.evaluation.results.faults import ContentError, shown
+
+Entry = Mapping[str, Any]
+_NUMBERS: Final = {int, float}
+"""Python's types of JSON numbers; `bool` is another."""
+LARGEST: Final = 1e6
+"""Metres, seconds, metres a second: more is a mistake, and squares of the largest floats overflow."""
+FROM_ZERO: Final = (0.0, LARGEST)
+ANY_NUMBER: Final = (-np.inf, np.inf)
+
+
+def check_entries(entries: Sequence[object], required: Sequence[str], optional: Sequence[str]) -> None:
+    """Whether all entries are objects that have the required fields, and others only if they are optional.
+
+    Raises:
+        ContentError: of the first entry, what is wrong.
+    """
+    if set(map(type, entries)) - {dict}:
+        raise ContentError(f"expected an object, found {shown(entries[0])}")
+    layouts: set[tuple[str, ...]] = set(map(tuple, entries))  # type: ignore[arg-type]  # these are objects
+    for names in layouts:
+        missing = [name for name in required if name not in names]
+        if missing:
+            raise ContentError(f"{missing[0]}: is missing (expected {', '.join(required)})")
+        unknown = [name for name in names if name not in required and name not in optional]
+        if unknown:
+            known = ", ".join([*required, *optional])
+            raise ContentError(f"{unknown[0]}: is no field of the format (expected {known})")
+
+
+def numbers(
+    entries: Sequence[Entry],
+    name: str,
+    shape: tuple[int, ...],
+    expected: str,
+    limits: tuple[float, float] = (-LARGEST, LARGEST),
+) -> FloatArray:
+    """(N, *shape) float64 of lists in lists of numbers.
+
+    Args:
+        entries: N of them, which have the field.
+        name: of the field.
+        shape: lengths of the lists, outermost first; () for a number.
+        expected: what the field should be, for the error.
+        limits: the least and the most that a number may be.
+
+    Raises:
+        ContentError: of the first entry, what it has and what was expected.
+    """
+    flat = _flat([entry[name] for entry in entries], shape)
+    if flat is not None and not set(map(type, flat)) - _NUMBERS:
+        try:
+            array = np.array(flat, dtype=np.float64).reshape(len(entries), *shape)
+        except OverflowError:
+            array = np.array([np.inf])
+        if np.isfinite(array).all() and ((array >= limits[0]) & (array <= limits[1])).all():
+            return array
+    raise _unexpected(entries, name, expected)
+
+
+def whole_numbers(entries: Sequence[Entry], name: str, shape: tuple[int, ...], expected: str) -> IntArray:
+    """(N, *shape) int64, likewise; raises ContentError."""
+    flat = _flat([entry[name] for entry in entries], shape)
+    if flat is not None and not set(map(type, flat)) - {int}:
+        try:
+            return np.array(flat, dtype=np.int64).reshape(len(entries), *shape)
+        except OverflowError:
+            pass
+    raise _unexpected(entries, name, expected)
+
+
+def choices(entries: Sequence[Entry], name: str, possible: Sequence[str]) -> AnyArray:
+    """(N,) int8, which of the possible texts each entry has; raises ContentError."""
+    values = [entry[name] for entry in entries]
+    if set(map(type, values)) - {str} or set(values) - set(possible):
+        raise _unexpected(entries, name, f"one of {', '.join(possible)}")
+    code = {text: number for number, text in enumerate(possible)}
+    return np.array([code[value] for value in values], dtype=np.int8)
+
+
+def with_value(entries: Sequence[Entry], name: str) -> tuple[IntArray, list[Entry]]:
+    """The entries that have an optional field that is not null: their rows, and themselves."""
+    rows = [row for row, entry in enumerate(entries) if entry.get(name) is not None]
+    return np.array(rows, dtype=np.int64), [entries[row] for row in rows]
+
+
+def _flat(values: list[Any], shape: tuple[int, ...]) -> list[Any] | None:
+    """What the innermost lists hold, in order; None where something is no list of the length."""
+    for length in shape:
+        if set(map(type, values)) - {list} or set(map(len, values)) - {length}:
+            return None
+        values = list(chain.from_iterable(values))
+    return values
+
+
+def _unexpected(entries: Sequence[Entry], name: str, expected: str) -> ContentError:
+    return ContentError(f"{name}: expected {expected}, found {shown(entries[0][name])}")

@@ -1,0 +1,162 @@
+"""`Results`: what a model says of many samples, as a results file has it."""
+
+from __future__ import annotations
+
+import copy
+import os
+from pathlib import Path
+from typing import Any
+
+from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.errors import NotAvailableError, ResultsError, TokenError
+from deepaccident_devkit.evaluation.results.contents import (
+    Contents,
+    MotionContents,
+    Prediction,
+    content_fingerprint,
+    contents_of,
+)
+from deepaccident_devkit.evaluation.results.faults import told_of
+from deepaccident_devkit.evaluation.results.form import RESULTS_FILE, MotionForm, ResultsTask
+from deepaccident_devkit.files import file_checksum, irregular_text
+
+
+class Results:
+    """Predictions by sample token; `read_results` opens them.
+
+    Cheap to pickle, since copies read the file again, once a process; safe in threads and in forked workers.
+
+    Attributes:
+        path: of the file, or of the folder of motion results.
+        task: what the predictions are of.
+        fingerprint: hash of the file's bytes; those of motion results hold the shards' checksums.
+    """
+
+    def __init__(self, path: Path, task: ResultsTask, fingerprint: str) -> None:
+        """Results that `read_results` has seen; it opens new ones."""
+        self.path = path
+        self.task = task
+        self.fingerprint = fingerprint
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle without the contents."""
+        return Results, (self.path, self.task, self.fingerprint)
+
+    def __repr__(self) -> str:
+        return f"<{self.task} results: {len(self):,} samples in {self.path}>"
+
+    def __len__(self) -> int:
+        """Number of samples."""
+        return len(self._contents.tokens)
+
+    def __contains__(self, token: object) -> bool:
+        """Whether a sample has a prediction."""
+        return token in self._contents.tokens
+
+    @property
+    def tokens(self) -> tuple[str, ...]:
+        """The samples, in the file's order."""
+        return tuple(self._contents.tokens)
+
+    @property
+    def meta(self) -> dict[str, Any]:
+        """What the file's author says of it; a copy."""
+        return copy.deepcopy(dict(self._contents.header.meta))
+
+    @property
+    def form(self) -> MotionForm | None:
+        """How motion is stored; None for other tasks."""
+        return self._contents.form
+
+    def prediction(self, token: str) -> Prediction:
+        """What is predicted of a sample.
+
+        Returns:
+            For motion a MotionOutput; of accidents a list, empty if none is foreseen; of detection the boxes, in the
+            world frame.
+
+        Raises:
+            TokenError: the sample is not here.
+            ResultsError: its arrays are missing or damaged, or the file was changed.
+        """
+        return self._with(token).prediction(token)
+
+    def trajectories(self, token: str) -> dict[int, FloatArray]:
+        """Where the instances of the last prediction of a sample go, as stored, or as its maps say.
+
+        Returns:
+            Id → (T, 2) float64, x forward, y left, metres in the present ego frame; NaN in frames without it.
+
+        Raises:
+            TokenError: the sample is not here.
+            NotAvailableError: not of motion.
+            ResultsError: its arrays are missing or damaged, or the file was changed.
+        """
+        contents = self._with(token)
+        if not isinstance(contents, MotionContents):
+            raise NotAvailableError(f"{self.path}: {self.task} results have no trajectories; motion results have")
+        return contents.trajectories(token)
+
+    def check(self, *, workers: int | None = 1, progress: bool = False) -> None:
+        """Read everything, as one should before long work and before publishing.
+
+        Args:
+            workers: processes for the shards of motion; None takes what the work is worth.
+            progress: whether to show a bar.
+
+        Raises:
+            ResultsError: names the shard, the token and the array of the first fault, or the file was changed.
+        """
+        with told_of(self._file):
+            now = file_checksum(self._file)
+        if now != self.fingerprint:
+            raise ResultsError(f"{self._file}: was changed after it was opened; open it again")
+        self._contents.check(workers=workers, progress=progress)
+
+    @property
+    def _file(self) -> Path:
+        return self.path / RESULTS_FILE if self.task == "motion" else self.path
+
+    @property
+    def _contents(self) -> Contents:
+        return contents_of(self._file, self.fingerprint)
+
+    def _with(self, token: str) -> Contents:
+        contents = self._contents
+        if token not in contents.tokens:
+            raise TokenError(f"{self.path}: has no prediction of {token!r}; `tokens` lists those that it has")
+        return contents
+
+
+def read_results(path: str | os.PathLike[str]) -> Results:
+    """Open results (schema/results/README.md); accidents and boxes are checked wholly, of motion the manifest is.
+
+    Args:
+        path: a JSON file, or a folder that holds a results.json, as motion results do.
+
+    Raises:
+        ResultsError: there is none, it is of another version, or not as its format says; the message names the first
+            wrong entry by its token and field.
+    """
+    file = _file_of(Path(path).expanduser().absolute())
+    with told_of(file):
+        fingerprint = content_fingerprint(file.read_bytes())
+    task = contents_of(file, fingerprint).header.task
+    if task == "motion" and file.name != RESULTS_FILE:
+        raise ResultsError(f"{file}: is the manifest of motion results; call it {RESULTS_FILE}, as others look for it")
+    return Results(file.parent if task == "motion" else file, task, fingerprint)
+
+
+def _file_of(path: Path) -> Path:
+    file = path
+    try:
+        file = path / RESULTS_FILE if path.is_dir() else path
+        irregular = irregular_text(file.stat().st_mode)
+    except FileNotFoundError:
+        what = "no such file or folder" if file == path else f"holds no {RESULTS_FILE}"
+        raise ResultsError(f"{path}: {what}; give the results that ResultsWriter made") from None
+    except (OSError, ValueError) as error:  # a ValueError: a name with a null character
+        raise ResultsError(f"{path}: cannot be read ({error}); give a results file that can") from error
+    if irregular:
+        raise ResultsError(f"{file}: {irregular}; give a results file")
+    return file

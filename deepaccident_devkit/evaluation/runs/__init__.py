@@ -1,0 +1,58 @@
+"""Whole evaluations: from a results file to a bundle of numbers that others can check and compare.
+
+`evaluate_results` makes an `EvaluationRun`, `save_run` writes it, `verify_bundle` makes it again, `compare_bundles`
+says which differences of two are real.
+"""
+
+from deepaccident_devkit.evaluation.runs.bundle_files import Bundle, read_bundle
+from deepaccident_devkit.evaluation.runs.checkpoints import explanation_checkpoint
+from deepaccident_devkit.evaluation.runs.compare import compare_bundles
+from deepaccident_devkit.evaluation.runs.comparison import ComparedNumber, Comparison
+from deepaccident_devkit.evaluation.runs.coverage import Coverage, coverage
+from deepaccident_devkit.evaluation.runs.details import sample_rows
+from deepaccident_devkit.evaluation.runs.differences import Difference
+from deepaccident_devkit.evaluation.runs.evaluate import default_selection, evaluate_results
+from deepaccident_devkit.evaluation.runs.evaluation_run import (
+    BREAKDOWNS,
+    EvaluationRun,
+    Partial,
+    ReleaseInfo,
+    ResultsInfo,
+)
+from deepaccident_devkit.evaluation.runs.fingerprints import ScenarioHashes, scenario_hashes
+from deepaccident_devkit.evaluation.runs.parquet import read_rows
+from deepaccident_devkit.evaluation.runs.results_text import results_text
+from deepaccident_devkit.evaluation.runs.saving import checked_target, save_run
+from deepaccident_devkit.evaluation.runs.selection import SampleSelection
+from deepaccident_devkit.evaluation.runs.text import summary_text
+from deepaccident_devkit.evaluation.runs.verification import Verification, verify_bundle
+
+__all__ = [
+    "BREAKDOWNS",
+    "Bundle",
+    "ComparedNumber",
+    "Comparison",
+    "Coverage",
+    "Difference",
+    "EvaluationRun",
+    "Partial",
+    "ReleaseInfo",
+    "ResultsInfo",
+    "SampleSelection",
+    "ScenarioHashes",
+    "Verification",
+    "checked_target",
+    "compare_bundles",
+    "coverage",
+    "default_selection",
+    "evaluate_results",
+    "explanation_checkpoint",
+    "read_bundle",
+    "read_rows",
+    "results_text",
+    "sample_rows",
+    "save_run",
+    "scenario_hashes",
+    "summary_text",
+    "verify_bundle",
+]

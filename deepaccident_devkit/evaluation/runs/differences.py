@@ -1,0 +1,75 @@
+"""`Difference`: one thing that is not as a bundle says, and how two JSON values differ."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+DifferenceKind = Literal["version", "file", "scenario", "results", "number", "sample", "evaluation"]
+ABSENT: Final = "absent"
+"""Stands for what is not there at all."""
+_LONGEST: Final = 60
+"""Characters of a value that a line shows."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Difference:
+    """What a bundle says, and what is so.
+
+    Attributes:
+        kind: `version` of the devkit; `file` of the bundle; `scenario`, whose label, meta or calib files changed or are
+            gone; `results`, the predictions; `number` of the summary; `sample`, its counts or its row; `evaluation`,
+            which could not be made again.
+        where: what it is of, such as `metrics/apa` or `<scenario>: label`.
+        stored: what the bundle says.
+        found: what is so.
+    """
+
+    kind: DifferenceKind
+    where: str
+    stored: Any
+    found: Any
+
+    def text(self) -> str:
+        """In a line."""
+        if self.kind == "evaluation":
+            return f"{self.kind}: {self.where}: cannot be made again: {self.found}"
+        return f"{self.kind}: {self.where}: stored {_short(self.stored)}, found {_short(self.found)}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """By name."""
+        return {"kind": self.kind, "where": self.where, "stored": self.stored, "found": self.found}
+
+
+def differing(stored: Any, found: Any, *, without: Collection[str] = ()) -> Iterator[tuple[str, Any, Any]]:
+    """The paths at which two values differ that JSON can hold, and what is there; equal numbers must be so exactly.
+
+    Args:
+        stored: one of them.
+        found: the other.
+        without: paths that do not count, with all below them.
+    """
+    yield from _differing(stored, found, "", frozenset(without))
+
+
+def _differing(stored: Any, found: Any, path: str, without: frozenset[str]) -> Iterator[tuple[str, Any, Any]]:
+    if path in without:
+        return
+    parts: Mapping[Any, tuple[Any, Any]] | None = None
+    if isinstance(stored, Mapping) and isinstance(found, Mapping):
+        names = dict.fromkeys([*stored, *found])
+        parts = {name: (stored.get(name, ABSENT), found.get(name, ABSENT)) for name in names}
+    elif isinstance(stored, list) and isinstance(found, list) and len(stored) == len(found):
+        parts = dict(enumerate(zip(stored, found, strict=True)))
+    if parts is None:
+        if type(stored) is not type(found) or stored != found:
+            yield path, stored, found
+        return
+    for name, (one, other) in parts.items():
+        yield from _differing(one, other, f"{path}/{name}" if path else str(name), without)
+
+
+def _short(value: Any) -> str:
+    text = value if value == ABSENT else repr(value)
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"

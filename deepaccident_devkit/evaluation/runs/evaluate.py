@@ -1,0 +1,166 @@
+"""`evaluate_results`: from a results file and a release to an `EvaluationRun`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import ResultsError
+from deepaccident_devkit.evaluation.attributes import sample_attributes
+from deepaccident_devkit.evaluation.evaluator import Evaluator
+from deepaccident_devkit.evaluation.results import Results, read_results
+from deepaccident_devkit.evaluation.run import evaluate_samples
+from deepaccident_devkit.evaluation.runs.checkpoints import checkpoint_path, drop_if_damaged
+from deepaccident_devkit.evaluation.runs.coverage import Coverage, coverage
+from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun, Partial, ReleaseInfo, ResultsInfo
+from deepaccident_devkit.evaluation.runs.fingerprints import scenario_hashes
+from deepaccident_devkit.evaluation.runs.selection import SampleList, SampleSelection, ScopeName, scenario_of
+from deepaccident_devkit.evaluation.setups import EvaluationSetup, SampleLoader
+
+
+def default_selection(
+    setup: EvaluationSetup,
+    split: str | os.PathLike[str] = "val",
+    *,
+    samples: SampleList | None = None,
+    scope: ScopeName | None = None,
+    agents: Sequence[str] | None = None,
+) -> SampleSelection:
+    """The samples that a setup is evaluated at.
+
+    Args:
+        setup: its task and horizon.
+        split: `train`, `val`, … or the path of a split file.
+        samples: None for `all` of the task `warning`, which follows whole recordings, and else `evaluate`.
+        scope: None for `all` where all samples are evaluated, and else `accident`.
+        agents: whose; None for all.
+
+    Raises:
+        ChoiceError: no such list, scope or agent.
+    """
+    listed: SampleList = samples or ("all" if setup.task == "warning" else "evaluate")
+    return SampleSelection(
+        split=os.fspath(split),
+        samples=listed,
+        scope=scope or ("all" if listed == "all" else "accident"),
+        agents=None if agents is None else tuple(agents),
+        horizon=setup.horizon,
+    )
+
+
+def evaluate_results(
+    dataset: Dataset,
+    results: Results | str | os.PathLike[str],
+    setup: EvaluationSetup,
+    selection: SampleSelection | str | os.PathLike[str] = "val",
+    *,
+    allow_partial: bool = False,
+    workers: int | None = None,
+    out: str | os.PathLike[str] | None = None,
+    progress: bool = False,
+) -> EvaluationRun:
+    """Evaluate a results file. It is checked wholly before any long work; any number of workers gives the same bits.
+
+    Args:
+        dataset: the release.
+        results: opened, or their path.
+        setup: task and rules.
+        selection: which samples; the name of a split for what `default_selection` has of it.
+        allow_partial: whether to evaluate the samples that are in both where the results lack some, or have others;
+            then all that comes of it is marked as partial.
+        workers: processes; None takes what the work is worth.
+        out: the folder that the run will be saved to (`save_run`): counts are kept beside it every half minute, and a
+            run that broke off goes on with them if nothing that they depend on has changed. None for no such file.
+        progress: whether to show bars.
+
+    Returns:
+        The run, without breakdowns: `EvaluationRun.broken_down` adds them.
+
+    Raises:
+        ResultsError: the results cannot be read, an entry is wrong, or they do not have the samples of the selection.
+        EvaluationError: they are of another kind than the task is evaluated from or look less far ahead, or a sample
+            cannot be evaluated.
+        ChoiceError: no such split.
+        NotAvailableError: the release has no such samples.
+    """
+    chosen = selection if isinstance(selection, SampleSelection) else default_selection(setup, selection)
+    opened = results if isinstance(results, Results) else read_results(results)
+    loader = SampleLoader(dataset, opened, setup)
+    opened.check(workers=workers, progress=progress)
+    covered = coverage(dataset, opened.tokens, chosen)
+    tokens = _covered_tokens(dataset, opened, chosen, covered, allow_partial=allow_partial)
+    release = ReleaseInfo(
+        dataroot=os.fspath(dataset.dataroot),
+        version=dataset.version,
+        scenarios=scenario_hashes(dataset, {scenario_of(token) for token in tokens}, workers=workers),
+    )
+    evaluator = _evaluated(loader, tokens, release, workers=workers, out=out, progress=progress)
+    return EvaluationRun(
+        setup=setup,
+        selection=chosen,
+        evaluator=evaluator,
+        result=evaluator.compute(),
+        partial=None if covered.is_complete else _partial(covered),
+        attributes=sample_attributes(dataset, tokens),
+        times_to_impact={token: dataset.sample.get(token)["time_to_impact"] for token in tokens},
+        breakdowns=(),
+        release=release,
+        results=results_info(opened),
+    )
+
+
+def results_info(results: Results) -> ResultsInfo:
+    """What a run keeps of its results."""
+    return ResultsInfo(
+        path=os.fspath(Path(results.path).absolute()),
+        task=results.task,
+        fingerprint=results.fingerprint,
+        meta=results.meta,
+        form=None if results.form is None else results.form.as_dict(),
+    )
+
+
+def _covered_tokens(
+    dataset: Dataset, results: Results, selection: SampleSelection, covered: Coverage, *, allow_partial: bool
+) -> list[str]:
+    if not covered.is_complete and not allow_partial:
+        raise ResultsError(
+            f"{results.path}: {covered.to_text()}; give results of these samples, choose the list that they are of, or "
+            "evaluate what there is with allow_partial=True (--allow-partial), which marks every number as partial"
+        )
+    tokens = [token for token in selection.tokens(dataset) if token in results]
+    if not tokens:
+        raise ResultsError(f"{results.path}: {covered.to_text()}; nothing is left to evaluate")
+    return tokens
+
+
+def _partial(covered: Coverage) -> Partial:
+    missing = len(covered.missing)
+    return Partial(
+        missing=missing,
+        extra=len(covered.extra) + len(covered.unknown),
+        expected=covered.expected,
+        evaluated=covered.expected - missing,
+    )
+
+
+def _evaluated(
+    loader: SampleLoader,
+    tokens: Sequence[str],
+    release: ReleaseInfo,
+    *,
+    workers: int | None,
+    out: str | os.PathLike[str] | None,
+    progress: bool,
+) -> Evaluator[Any]:
+    evaluator = loader.setup.evaluator()
+    checkpoint = None
+    if out is not None:
+        fingerprints: Mapping[str, str] = {"results": loader.results.fingerprint, "release": release.fingerprint}
+        checkpoint = checkpoint_path(out, loader.setup, tokens, fingerprints)
+        drop_if_damaged(checkpoint, evaluator)
+    samples = {token: token for token in tokens}
+    return evaluate_samples(evaluator, samples, loader, workers=workers, checkpoint=checkpoint, progress=progress)

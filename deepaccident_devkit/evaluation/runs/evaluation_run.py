@@ -1,0 +1,228 @@
+"""`EvaluationRun`: a whole evaluation, its numbers, and all that they depend on."""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from importlib.metadata import version as installed_version
+from typing import Any, Final
+
+from deepaccident_devkit._version import __version__
+from deepaccident_devkit.evaluation.attributes import SampleAttributes
+from deepaccident_devkit.evaluation.breakdowns import Bootstrap, Breakdown, Group, breakdown
+from deepaccident_devkit.evaluation.evaluator import Evaluator
+from deepaccident_devkit.evaluation.frozen_mappings import plain
+from deepaccident_devkit.evaluation.headlines import headlines
+from deepaccident_devkit.evaluation.runs.fingerprints import ScenarioHashes, fingerprint
+from deepaccident_devkit.evaluation.runs.selection import SampleSelection
+from deepaccident_devkit.evaluation.setups import EvaluationSetup
+from deepaccident_devkit.parallel import run_batch
+
+SUMMARY_FORMAT: Final = "DeepAccident metrics summary"
+SUMMARY_VERSION: Final = 1
+BREAKDOWNS: Final = (
+    "all",
+    "time_to_impact",
+    "accident_visibility",
+    "agent",
+    "scenario_type",
+    "town",
+    "weather_group",
+    "time_of_day_group",
+    "junction",
+    "trajectory_type",
+    "collision_status",
+)
+"""What results are broken down by if nothing else is asked for; `all` for intervals of the result itself."""
+_LIBRARIES: Final = ("numpy", "scipy")
+"""Whose versions stand in a summary: arithmetic is theirs."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Partial:
+    """How much of what should be evaluated was not.
+
+    Attributes:
+        missing: samples without a prediction.
+        extra: predictions that are left out: of other samples, or of none.
+        expected: samples that should be evaluated.
+        evaluated: those that were.
+    """
+
+    missing: int
+    extra: int
+    expected: int
+    evaluated: int
+
+    def text(self) -> str:
+        """The mark that every number bears: `PARTIAL: 120 of 180 samples`."""
+        left_out = f", {self.extra} predictions left out" if self.extra else ""
+        return f"PARTIAL: {self.evaluated} of {self.expected} samples{left_out}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """By name, with the text as `mark`."""
+        return {
+            "missing": self.missing,
+            "extra": self.extra,
+            "expected": self.expected,
+            "evaluated": self.evaluated,
+            "mark": self.text(),
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReleaseInfo:
+    """Of which release the truth is.
+
+    Attributes:
+        dataroot: its folder.
+        version: `v1` or `v1-mini`.
+        scenarios: hashes of the label, meta and calib files of each scenario evaluated.
+    """
+
+    dataroot: str
+    version: str
+    scenarios: Mapping[str, ScenarioHashes]
+
+    @property
+    def fingerprint(self) -> str:
+        """One hash over all these."""
+        return fingerprint(self.scenarios)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResultsInfo:
+    """Of which results the predictions are.
+
+    Attributes:
+        path: of their file or folder.
+        task: what they hold: `motion`, `accident` or `detection`.
+        fingerprint: a hash over all of them.
+        meta: what their maker says of them.
+        form: of motion, how they are stored, as JSON holds it; None for others.
+    """
+
+    path: str
+    task: str
+    fingerprint: str
+    meta: Mapping[str, Any]
+    form: Mapping[str, Any] | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EvaluationRun:
+    """An evaluation that is done.
+
+    Attributes:
+        setup: task and rules.
+        selection: which samples.
+        evaluator: with the counts of each sample.
+        result: of all samples, as the task's evaluator computes it.
+        partial: what is missing; None for nothing.
+        attributes: of each sample evaluated, by token.
+        times_to_impact: seconds from each of them to the recorded impact; None where there is none, or none is known.
+        breakdowns: results by attribute; `all` has the intervals of the result itself.
+        release: whose labels are the truth.
+        results: whose predictions they are.
+        sanity: what the sanity check says, as JSON holds it; None without.
+        explanation: what each choice of the protocol changes, likewise.
+    """
+
+    setup: EvaluationSetup
+    selection: SampleSelection
+    evaluator: Evaluator[Any]
+    result: Any
+    partial: Partial | None
+    attributes: Mapping[str, SampleAttributes]
+    times_to_impact: Mapping[str, float | None]
+    breakdowns: tuple[Breakdown[Any], ...]
+    release: ReleaseInfo
+    results: ResultsInfo
+    sanity: Mapping[str, Any] | None = None
+    explanation: Mapping[str, Any] | None = None
+
+    @property
+    def stamp(self) -> dict[str, Any]:
+        """What every file written says: devkit, task, protocol, and whether it is partial."""
+        return {
+            "devkit_version": __version__,
+            "task": self.setup.task,
+            "protocol": self.setup.protocol,
+            "partial": None if self.partial is None else self.partial.as_dict(),
+        }
+
+    def broken_down(
+        self, by: Sequence[str] = BREAKDOWNS, bootstrap: Bootstrap | None = None, *, workers: int | None = 1
+    ) -> EvaluationRun:
+        """The same run with results by these attributes, in place of those it has.
+
+        Args:
+            by: of `attributes.ATTRIBUTES`; one that is given twice counts once.
+            bootstrap: how intervals are drawn; None for the defaults.
+            workers: processes, which share the attributes among them; None takes what the work is worth.
+
+        Raises:
+            ChoiceError: no such attribute.
+        """
+        work = partial(breakdown, self.evaluator, self.attributes, bootstrap=bootstrap)
+        return replace(self, breakdowns=tuple(run_batch(work, list(dict.fromkeys(by)), workers=workers)))
+
+    def summary(self) -> dict[str, Any]:
+        """All numbers but those of single samples, and what they depend on, as JSON holds it."""
+        made = {
+            "format": SUMMARY_FORMAT,
+            "version": SUMMARY_VERSION,
+            **self.stamp,
+            **{name: each for name, each in self.setup.as_dict().items() if name not in ("task", "protocol")},
+            **{name: each for name, each in self.selection.as_dict().items() if name != "horizon"},
+            "counts": {
+                "samples": len(self.evaluator),
+                "scenarios": len({each.scenario for each in self.attributes.values()}),
+            },
+            "release": {
+                "version": self.release.version,
+                "dataroot": self.release.dataroot,
+                "fingerprint": self.release.fingerprint,
+            },
+            "results": {
+                "path": self.results.path,
+                "task": self.results.task,
+                "fingerprint": self.results.fingerprint,
+                "meta": self.results.meta,
+                "form": self.results.form,
+            },
+            "headlines": [{**asdict(each), "text": each.text()} for each in headlines(self.setup.task, self.result)],
+            "metrics": self.result.as_dict(),
+            "breakdowns": {each.by: self._breakdown(each) for each in self.breakdowns},
+            "environment": {
+                "python": platform.python_version(),
+                **{name: installed_version(name) for name in _LIBRARIES},
+            },
+            "sanity": self.sanity,
+            "explanation": self.explanation,
+        }
+        plain_form: dict[str, Any] = json.loads(json.dumps(plain(made)))
+        return plain_form
+
+    def _breakdown(self, given: Breakdown[Any]) -> dict[str, Any]:
+        return {
+            "bootstrap": plain(given.bootstrap),
+            "groups": self._groups(given.groups),
+            "without_infrastructure": self._groups(given.without_infrastructure),
+        }
+
+    def _groups(self, groups: Sequence[Group[Any]]) -> list[dict[str, Any]]:
+        return [
+            {
+                "value": group.value,
+                "samples": group.samples,
+                "scenarios": group.scenarios,
+                "headlines": {each.path: each.value for each in headlines(self.setup.task, group.result)},
+                "metrics": group.result.as_dict(),
+                "intervals": plain(group.intervals),
+            }
+            for group in groups
+        ]

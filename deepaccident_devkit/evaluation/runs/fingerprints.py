@@ -1,0 +1,104 @@
+"""Hashes of what truth is made of: the bytes of a scenario's label, meta and calib files, as the release has them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.parallel import run_batch
+from deepaccident_devkit.release import ScenarioFolder, find_release
+from deepaccident_devkit.release.layout import frame_numbers
+from deepaccident_devkit.taxonomy import AGENTS
+
+_DIGEST_BYTES: Final = 16
+_ENDINGS: Final = {"label": "txt", "calib": "pkl"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScenarioHashes:
+    """Of one scenario's files, each a blake2b of 16 bytes in hexadecimal digits; None where it has no such file.
+
+    Files go into it by agent (`taxonomy.AGENTS`) and frame, each as its name, its length and its bytes.
+
+    Attributes:
+        label: of all agents' label files.
+        meta: of the meta file.
+        calib: of all agents' calib files.
+    """
+
+    label: str | None
+    meta: str | None
+    calib: str | None
+
+    def as_dict(self) -> dict[str, str | None]:
+        """By name."""
+        return asdict(self)
+
+
+def scenario_hashes(
+    dataset: Dataset, scenarios: Collection[str], *, workers: int | None = None
+) -> dict[str, ScenarioHashes]:
+    """The hashes of some scenarios' files, by token in order; those that the release has not are left out.
+
+    Reads the files themselves and not the index, which does not notice a file that was edited in place.
+
+    Args:
+        dataset: the release.
+        scenarios: their tokens.
+        workers: processes to read with; None takes what the work is worth.
+
+    Raises:
+        DatarootError: the release's folder is gone, or one of its folders cannot be listed.
+    """
+    folders = {each.token: each for each in reversed(find_release(dataset.dataroot, dataset.version).scenarios)}
+    here = [token for token in sorted(set(scenarios)) if token in folders]
+    found = run_batch(_hashes, [folders[token] for token in here], workers=workers)
+    return dict(zip(here, found, strict=True))
+
+
+def fingerprint(hashes: Mapping[str, ScenarioHashes]) -> str:
+    """One hash for the truth of several scenarios, in any order."""
+    return digest_of({token: each.as_dict() for token, each in hashes.items()})
+
+
+def digest_of(value: Any) -> str:
+    """A hash of what JSON can hold, whatever the order of its names."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"))
+    return hashlib.blake2b(text.encode(), digest_size=_DIGEST_BYTES).hexdigest()
+
+
+def _hashes(scenario: ScenarioFolder) -> ScenarioHashes:
+    meta = [scenario.meta_path] if scenario.meta_path.is_file() else []
+    return ScenarioHashes(
+        meta=_digest(meta, scenario.meta_path.parent),
+        **{kind: _digest(_files(scenario, kind), _base(scenario)) for kind in _ENDINGS},
+    )
+
+
+def _files(scenario: ScenarioFolder, kind: str) -> list[Path]:
+    ending = _ENDINGS[kind]
+    return [
+        scenario.file(agent, kind, frame, ending)
+        for agent in AGENTS
+        for frame in frame_numbers(scenario.kind_folder(agent, kind), ending)[0]
+    ]
+
+
+def _base(scenario: ScenarioFolder) -> Path:
+    return scenario.root / scenario.folder / scenario.scenario_type
+
+
+def _digest(paths: Collection[Path], base: Path) -> str | None:
+    if not paths:
+        return None
+    digest = hashlib.blake2b(digest_size=_DIGEST_BYTES)
+    for path in paths:
+        content = path.read_bytes()
+        digest.update(f"{path.relative_to(base).as_posix()} {len(content)}\n".encode())
+        digest.update(content)
+    return digest.hexdigest()

@@ -1,0 +1,122 @@
+"""`summary_text`: a summary for people, of a run or of a bundle on disk; every block of a partial one says so."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final
+
+from deepaccident_devkit.text import columns_text
+
+SHOWN_BREAKDOWNS: Final = ("time_to_impact", "accident_visibility")
+_COLUMNS: Final = 5
+"""Headlines that a breakdown shows."""
+_NOT_COUNTED: Final = ("beside", "notes", "curve")
+"""Parts of the metrics that hold no counts of the samples."""
+Json = Mapping[str, Any]
+
+
+def summary_text(summary: Json, by: Sequence[str] = SHOWN_BREAKDOWNS) -> str:
+    """A summary as blocks of aligned lines: what was evaluated, headlines, counts, breakdowns, notes.
+
+    Args:
+        summary: as `EvaluationRun.summary` makes it and `metrics_summary.json` has it.
+        by: which of its breakdowns to show.
+    """
+    mark = "" if summary["partial"] is None else f"   {summary['partial']['mark']}"
+    blocks = [
+        ("evaluated", _head(summary)),
+        ("results", _headlines(summary)),
+        ("counts", "\n".join(_counts(summary["metrics"]))),
+        *((f"by {name}", _breakdown(summary, name)) for name in by if name in summary["breakdowns"]),
+    ]
+    notes = "\n".join(_notes(summary["metrics"]))
+    blocks += [("notes", notes)] if notes else []
+    return "\n\n".join(f"{title}{mark}\n{_indented(text)}" for title, text in blocks)
+
+
+def _head(summary: Json) -> str:
+    switches = ", ".join(f"{name}={value!r}" for name, value in summary["switches"].items())
+    agents = "all agents" if summary["agents"] is None else ", ".join(summary["agents"])
+    release, results, counts = summary["release"], summary["results"], summary["counts"]
+    lines = {
+        "task": f"{summary['task']}, protocol {summary['protocol']}{f' with {switches}' if switches else ''}",
+        "samples": f"{counts['samples']} of {counts['scenarios']} scenarios: split {summary['split']}, list "
+        f"{summary['samples']}, scope {summary['scope']}, {agents}, horizon {summary['horizon']:g} s",
+        "predictions": f"{results['path']} ({results['fingerprint']})",
+        "release": f"{release['dataroot']} ({release['version']}, {release['fingerprint']})",
+        "devkit": summary["devkit_version"],
+    }
+    width = max(map(len, lines))
+    return "\n".join(f"{name:<{width}}  {text}" for name, text in lines.items())
+
+
+def _headlines(summary: Json) -> str:
+    everyone = summary["breakdowns"].get("all")
+    groups = everyone["groups"] if everyone else []
+    intervals = groups[0]["intervals"] if groups else {}
+    beside: Mapping[str, Any] = summary["metrics"].get("beside") or {}
+    percent = f"{everyone['bootstrap']['confidence']:.0%} interval" if intervals else ""
+    rows = [("number", "value", *([percent] if percent else []), *(f"if {name}" for name in beside))]
+    for each in summary["headlines"]:
+        interval = [_interval(intervals.get(each["path"]))] if percent else []
+        others = (_number(_at(part, each["path"])) for part in beside.values())
+        rows.append((each["name"], each["text"], *interval, *others))
+    return columns_text(rows)
+
+
+def _counts(metrics: Json) -> Iterator[str]:
+    """A line for each part of the metrics that holds whole numbers."""
+    found = dict(_whole_numbers(metrics, ""))
+    width = max(map(len, found), default=0)
+    for part, numbers in found.items():
+        yield f"{part:<{width}}  {', '.join(f'{name} {value}' for name, value in numbers.items())}".strip()
+
+
+def _whole_numbers(part: Json, path: str) -> Iterator[tuple[str, dict[str, str]]]:
+    here = {name: _whole(value) for name, value in part.items()}
+    known = {name: text for name, text in here.items() if text}
+    if known:
+        yield path, known
+    for name, value in part.items():
+        if isinstance(value, Mapping) and name not in _NOT_COUNTED:
+            yield from _whole_numbers(value, f"{path}/{name}" if path else name)
+
+
+def _whole(value: object) -> str:
+    """Text of a whole number, or of several; empty for all else."""
+    numbers = value if isinstance(value, list) else [value]
+    return "+".join(map(str, numbers)) if numbers and all(type(each) is int for each in numbers) else ""
+
+
+def _breakdown(summary: Json, name: str) -> str:
+    shown = summary["headlines"][:_COLUMNS]
+    rows = [("value", "samples", "scenarios", *(each["name"] for each in shown))]
+    for group in summary["breakdowns"][name]["groups"]:
+        values = (_number(group["headlines"].get(each["path"])) for each in shown)
+        value = "unknown" if group["value"] is None else group["value"]
+        rows.append((value, str(group["samples"]), str(group["scenarios"]), *values))
+    return columns_text(rows)
+
+
+def _notes(metrics: Json) -> Iterator[str]:
+    yield from dict.fromkeys(metrics.get("notes") or ())
+    for name, part in (metrics.get("beside") or {}).items():
+        yield from (f"if {name}: {note}" for note in part.get("notes") or () if note not in metrics["notes"])
+
+
+def _at(part: Any, path: str) -> Any:
+    for name in path.split("/"):
+        part = part.get(name) if isinstance(part, Mapping) else None
+    return part
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3f}"
+
+
+def _interval(ends: Sequence[float | None] | None) -> str:
+    return "–" if not ends or None in ends else f"[{ends[0]:.3f}, {ends[1]:.3f}]"
+
+
+def _indented(text: str) -> str:
+    return "\n".join(f"  {line}" for line in text.splitlines())

@@ -1,0 +1,245 @@
+"""`verify_bundle`: recompute an evaluation from its results, and list what differs from what was written."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import Any, Final
+
+from deepaccident_devkit._version import __version__
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import DeepAccidentError, ResultsError
+from deepaccident_devkit.evaluation.breakdowns import Bootstrap
+from deepaccident_devkit.evaluation.results import Results, read_results
+from deepaccident_devkit.evaluation.runs.bundle_files import (
+    COUNTS_FILE,
+    FILES_FILE,
+    ROWS_FILE,
+    SCENARIOS_FILE,
+    SUMMARY_FILE,
+    Bundle,
+    checksums_of,
+    read_bundle,
+    read_json,
+)
+from deepaccident_devkit.evaluation.runs.details import sample_rows
+from deepaccident_devkit.evaluation.runs.differences import ABSENT, Difference, differing
+from deepaccident_devkit.evaluation.runs.evaluate import evaluate_results
+from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
+from deepaccident_devkit.evaluation.runs.fingerprints import scenario_hashes
+from deepaccident_devkit.evaluation.runs.parquet import read_rows
+
+_SHOWN: Final = 10
+"""Differences of a kind that the text lists."""
+_NOT_COMPARED: Final = (
+    "devkit_version",
+    "environment",
+    "sanity",
+    "explanation",
+    "release/dataroot",
+    "results/path",
+    "results/fingerprint",
+)
+"""Of a summary: what is told apart, is not made again, or says where things were."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verification:
+    """A bundle against its evaluation made again.
+
+    Attributes:
+        folder: of the bundle.
+        samples: how many were evaluated again.
+        differences: all that were found.
+        notes: sentences on what could not differ, or does not matter.
+    """
+
+    folder: Path
+    samples: int
+    differences: tuple[Difference, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def is_same(self) -> bool:
+        """Whether nothing differs."""
+        return not self.differences
+
+    def to_text(self) -> str:
+        """A line a difference, the first of each kind, and how many more there are."""
+        if self.is_same:
+            head = f"{self.folder}: the same; {self.samples} samples evaluated again, all numbers are equal"
+        else:
+            head = f"{self.folder}: {len(self.differences)} differences; {self.samples} samples evaluated again"
+        by_kind: dict[str, list[Difference]] = {}
+        for each in self.differences:
+            by_kind.setdefault(each.kind, []).append(each)
+        lines = [head]
+        for kind, those in by_kind.items():
+            lines += [f"  {each.text()}" for each in those[:_SHOWN]]
+            if len(those) > _SHOWN:
+                lines.append(f"  {kind}: {len(those) - _SHOWN} more")
+        return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
+
+    def as_dict(self) -> dict[str, Any]:
+        """All of it, as JSON holds it."""
+        return {
+            "folder": os.fspath(self.folder),
+            "same": self.is_same,
+            "samples": self.samples,
+            "differences": [each.as_dict() for each in self.differences],
+            "notes": list(self.notes),
+        }
+
+
+def verify_bundle(
+    folder: str | os.PathLike[str],
+    dataset: Dataset,
+    *,
+    results: Results | str | os.PathLike[str] | None = None,
+    workers: int | None = None,
+    progress: bool = False,
+) -> Verification:
+    """Evaluate again what a bundle is of, and compare everything with it; numbers must be equal to the bit.
+
+    Args:
+        folder: of the bundle.
+        dataset: the release; where `read_bundle(folder).dataroot` says, or another copy of it.
+        results: the predictions; None for the bundle's own copy, or where they were.
+        workers: processes; None takes what the work is worth.
+        progress: whether to show bars.
+
+    Raises:
+        ResultsError: there is no bundle of this devkit's format, or no results to evaluate.
+    """
+    bundle = read_bundle(Path(folder).expanduser())
+    given = bundle.results_path if results is None else results
+    opened = given if isinstance(given, Results) else read_results(given)
+    found = [*_version(bundle), *_files(bundle), *_scenarios(bundle, dataset, workers), *_results(bundle, opened)]
+    run: EvaluationRun | None = None
+    try:
+        run = _again(bundle, dataset, opened, workers=workers, progress=progress)
+    except DeepAccidentError as error:
+        found.append(Difference(kind="evaluation", where="all numbers", stored="evaluated", found=str(error)))
+    if run is not None:
+        found += chain(_numbers(bundle, run), _unlisted(bundle, run), _counts(bundle, run), _rows(bundle, run))
+    return Verification(
+        folder=bundle.folder,
+        samples=0 if run is None else len(run.evaluator),
+        differences=tuple(found),
+        notes=tuple(_notes(bundle, run, found)),
+    )
+
+
+def _again(bundle: Bundle, dataset: Dataset, results: Results, *, workers: int | None, progress: bool) -> EvaluationRun:
+    run = evaluate_results(
+        dataset,
+        results,
+        bundle.setup,
+        bundle.selection,
+        allow_partial=bundle.summary.get("partial") is not None,
+        workers=workers,
+        progress=progress,
+    )
+    breakdowns = bundle.summary.get("breakdowns")
+    if not isinstance(breakdowns, Mapping) or not breakdowns:
+        return run
+    try:
+        drawn = Bootstrap(**next(iter(breakdowns.values()))["bootstrap"])
+    except (TypeError, KeyError) as error:
+        raise ResultsError(f"{SUMMARY_FILE}: does not say how intervals were drawn ({error})") from error
+    return run.broken_down(list(breakdowns), drawn, workers=workers)
+
+
+def _version(bundle: Bundle) -> Iterator[Difference]:
+    stored = bundle.summary.get("devkit_version", ABSENT)
+    if stored != __version__:
+        yield Difference(kind="version", where="devkit_version", stored=stored, found=__version__)
+
+
+def _files(bundle: Bundle) -> Iterator[Difference]:
+    try:
+        stored = bundle.checksums()
+    except ResultsError as error:
+        yield Difference(kind="file", where=FILES_FILE, stored="a list of all files", found=str(error))
+        return
+    for name, one, other in differing(stored, checksums_of(bundle.folder)):
+        yield Difference(kind="file", where=name, stored=one, found=other)
+
+
+def _scenarios(bundle: Bundle, dataset: Dataset, workers: int | None) -> Iterator[Difference]:
+    try:
+        stored = bundle.scenarios()
+    except ResultsError as error:
+        yield Difference(kind="file", where=SCENARIOS_FILE, stored="hashes", found=str(error))
+        return
+    found = {token: each.as_dict() for token, each in scenario_hashes(dataset, stored, workers=workers).items()}
+    for token, hashes in stored.items():
+        if token not in found:
+            yield Difference(kind="scenario", where=token, stored="in the release", found=ABSENT)
+            continue
+        for kind, one, other in differing(hashes, found[token]):
+            yield Difference(kind="scenario", where=f"{token}: {kind}", stored=one, found=other)
+
+
+def _unlisted(bundle: Bundle, run: EvaluationRun) -> Iterator[Difference]:
+    """Scenarios that are evaluated, and whose hashes the bundle does not state."""
+    try:
+        stored = bundle.scenarios()
+    except ResultsError:  # told already
+        return
+    for token in run.release.scenarios.keys() - stored.keys():
+        yield Difference(kind="scenario", where=token, stored=ABSENT, found="evaluated")
+
+
+def _results(bundle: Bundle, results: Results) -> Iterator[Difference]:
+    about = bundle.summary.get("results")
+    stored = about.get("fingerprint", ABSENT) if isinstance(about, Mapping) else ABSENT
+    if stored != results.fingerprint:
+        where = f"fingerprint of {results.path}"
+        yield Difference(kind="results", where=where, stored=stored, found=results.fingerprint)
+
+
+def _numbers(bundle: Bundle, run: EvaluationRun) -> Iterator[Difference]:
+    for where, stored, found in differing(bundle.summary, run.summary(), without=_NOT_COMPARED):
+        yield Difference(kind="number", where=where, stored=stored, found=found)
+
+
+def _counts(bundle: Bundle, run: EvaluationRun) -> Iterator[Difference]:
+    path = bundle.folder / COUNTS_FILE
+    try:
+        stored = read_json(path, None)["counts"]
+    except (ResultsError, KeyError) as error:
+        yield Difference(kind="file", where=COUNTS_FILE, stored="counts", found=str(error))
+        return
+    for where, one, other in differing(stored, dict(run.evaluator.counts)):
+        yield Difference(kind="sample", where=f"{COUNTS_FILE} {where}", stored=one, found=other)
+
+
+def _rows(bundle: Bundle, run: EvaluationRun) -> Iterator[Difference]:
+    try:
+        rows, _ = read_rows(bundle.folder / ROWS_FILE)
+        stored = {row["token"]: row for row in rows}
+    except (ResultsError, KeyError) as error:
+        yield Difference(kind="file", where=ROWS_FILE, stored="rows", found=str(error))
+        return
+    found = {row["token"]: row for row in sample_rows(run)}
+    for where, one, other in differing(stored, found):
+        yield Difference(kind="sample", where=f"{ROWS_FILE} {where}", stored=one, found=other)
+
+
+def _notes(bundle: Bundle, run: EvaluationRun | None, found: Sequence[Difference]) -> Iterator[str]:
+    if any(each.kind == "scenario" for each in found):
+        yield (
+            "numbers are made of the index, which does not see that a file was edited in place; bring it up to date "
+            "with: deepaccident index DATAROOT --check"
+        )
+    if any(bundle.summary.get(name) is not None for name in ("sanity", "explanation")):
+        yield "the sanity check and the explanation are not made again"
+    if run is None:
+        return
+    here = run.summary()["environment"]
+    for name, stored, now in differing(bundle.summary.get("environment", {}), here):
+        yield f"evaluated with {name} {stored}, verified with {now}"

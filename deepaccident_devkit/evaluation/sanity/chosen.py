@@ -1,0 +1,57 @@
+"""Which samples are looked at: spread over all, and among neighbours those that tell most."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from itertools import pairwise
+
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
+
+_LOOKED_AT = 25
+"""Neighbours among which the most telling one is taken."""
+
+
+def telling_samples(
+    dataset: Dataset,
+    tokens: Collection[str],
+    count: int,
+    horizon: float,
+    says_something: Callable[[str], bool] = lambda _: True,
+) -> list[str]:
+    """At most `count` samples, one of each of as many parts of equal length of all tokens, sorted.
+
+    Of a part that is taken which shows most: an accident to come within the horizon, then the longest future within
+    it, then the most boxes. Nothing is drawn by chance.
+
+    Args:
+        dataset: the release.
+        tokens: of the samples.
+        count: how many.
+        horizon: seconds.
+        says_something: whether a sample's prediction does; of samples with an accident to come those that do are taken
+            first.
+
+    Raises:
+        TokenError: there is no such sample.
+    """
+    ordered = sorted(tokens)
+    count = min(count, len(ordered))
+    bounds = [round(number * len(ordered) / count) for number in range(count + 1)] if count else []
+    return [
+        max(_spread(ordered[first:last]), key=lambda token: _telling(dataset, token, horizon, says_something))
+        for first, last in pairwise(bounds)
+    ]
+
+
+def _spread(tokens: list[str]) -> list[str]:
+    return tokens[:: max(1, len(tokens) // _LOOKED_AT)]
+
+
+def _telling(
+    dataset: Dataset, token: str, horizon: float, says_something: Callable[[str], bool]
+) -> tuple[bool, bool, float, int]:
+    sample = dataset.get("sample", token)
+    to_impact = sample["time_to_impact"]
+    comes = to_impact is not None and to_impact <= horizon + FRAME_PERIOD / 2
+    return comes, comes and says_something(token), min(sample["time_to_end"], horizon), sample["num_annotations"]

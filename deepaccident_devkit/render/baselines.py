@@ -1,0 +1,133 @@
+"""Figures of the study of V2X: bars by configuration, lines over noise and latency.
+
+They take plain numbers: the study itself lies above this layer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from deepaccident_devkit.files import replacing
+from deepaccident_devkit.render.axes import axes_or_new, detached_figure, figure_or_new, with_light_grid
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+CONFIGURATION_COLORS: Final[Mapping[str, str]] = {
+    "single": "#9a9a9a",
+    "+behind": "#9ecae1",
+    "+other": "#1f77b4",
+    "+infrastructure": "#e08a1e",
+    "+behind+other": "#08306b",
+    "vehicles": "#6a4fc4",
+    "all": "#1a9850",
+}
+"""Of the paper's seven."""
+_OTHER: Final = "#b5651d"
+_PANEL: Final = (4.2, 3.8)
+_LEGEND: Final = 0.6
+_DPI: Final = 120
+_BARS_WIDE: Final = 0.84
+_ABOVE: Final = 1.04
+"""Room above the largest number, as a factor."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Panel:
+    """Numbers to compare, a colour a configuration.
+
+    Attributes:
+        values: configuration → group, or number varied → result; None where there is none.
+        title: of the panel.
+        ylabel: what the results are.
+        top: the largest result that there can be.
+        xlabel: what is varied: then there are lines; None for bars in groups.
+    """
+
+    values: Mapping[str, Mapping[str | float, float | None]]
+    title: str
+    ylabel: str
+    top: float
+    xlabel: str | None = None
+
+
+def render_panel(panel: Panel, *, ax: Axes | None = None) -> Axes:
+    """Draw a panel.
+
+    Args:
+        panel: its numbers.
+        ax: axes to draw on; new ones if None.
+
+    Returns:
+        The axes drawn on.
+    """
+    ax = axes_or_new(ax, _PANEL)
+    if panel.xlabel is None:
+        _draw_bars(panel, ax)
+    else:
+        _draw_lines(panel, ax)
+        ax.set_xlabel(panel.xlabel)
+    ax.set(ylabel=panel.ylabel, title=panel.title, ylim=(0, _ABOVE * panel.top))
+    return with_light_grid(ax, "y" if panel.xlabel is None else "both")
+
+
+def render_panels(panels: Sequence[Sequence[Panel]], title: str, *, fig: Figure | None = None) -> Figure:
+    """Draw rows of panels under one title, with one legend.
+
+    Args:
+        panels: rows of equal length.
+        title: of the figure.
+        fig: an empty figure to draw on; a new one if None.
+
+    Returns:
+        The figure drawn on.
+    """
+    fig = figure_or_new(fig, _size(panels))
+    axes = fig.subplots(len(panels), len(panels[0]), squeeze=False)
+    for row, line in zip(panels, axes, strict=True):
+        for panel, ax in zip(row, line, strict=True):
+            render_panel(panel, ax=ax)
+    handles, names = axes[0, 0].get_legend_handles_labels()
+    fig.legend(handles, names, loc="outside lower center", ncols=len(names))
+    fig.suptitle(title)
+    return fig
+
+
+def save_panels(panels: Sequence[Sequence[Panel]], title: str, path: Path) -> None:
+    """Draw `render_panels` into a PNG file, over the one that is there. Raises OSError."""
+    figure = render_panels(panels, title, fig=detached_figure(_size(panels)))
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=_DPI)
+
+
+def _size(panels: Sequence[Sequence[Panel]]) -> tuple[float, float]:
+    return _PANEL[0] * len(panels[0]), _PANEL[1] * len(panels) + _LEGEND
+
+
+def _draw_bars(panel: Panel, ax: Axes) -> None:
+    groups = list(dict.fromkeys(group for bars in panel.values.values() for group in bars))
+    width = _BARS_WIDE / max(1, len(panel.values))
+    for place, (name, bars) in enumerate(panel.values.items()):
+        known = [(index, value) for index, group in enumerate(groups) if (value := bars.get(group)) is not None]
+        middle = [index + (place - (len(panel.values) - 1) / 2) * width for index, _ in known]
+        color = CONFIGURATION_COLORS.get(name, _OTHER)
+        ax.bar(middle, [value for _, value in known], width=width * 0.92, color=color, label=name)
+    ax.set_xticks(range(len(groups)), [str(group) for group in groups])
+
+
+def _draw_lines(panel: Panel, ax: Axes) -> None:
+    for place, (name, line) in enumerate(panel.values.items()):
+        known = [(x, y) for x, y in line.items() if y is not None]
+        ax.plot(
+            [x for x, _ in known],
+            [y for _, y in known],
+            color=CONFIGURATION_COLORS.get(name, _OTHER),
+            label=name,
+            linestyle=("-", "--")[place % 2],  # so that of two equal lines both are seen
+            marker="so"[place % 2],
+            markersize=6 - 2 * (place % 2),
+        )

@@ -1,0 +1,37 @@
+"""Figures of an evaluation, and the report that holds them all. One panel takes `ax=` and returns the Axes."""
+
+from deepaccident_devkit.render.evaluation.accident import (
+    render_accuracy,
+    render_alarms,
+    render_errors,
+    render_outcomes,
+)
+from deepaccident_devkit.render.evaluation.breakdowns import render_breakdown
+from deepaccident_devkit.render.evaluation.detection import render_average_precisions, render_precision_recall
+from deepaccident_devkit.render.evaluation.motion import render_quality_by_time, render_ranges
+from deepaccident_devkit.render.evaluation.report import save_report
+from deepaccident_devkit.render.evaluation.samples import draw_motion_outcome
+from deepaccident_devkit.render.evaluation.warning import (
+    render_detection_rates,
+    render_false_alarms,
+    render_warning_curve,
+    render_warning_times,
+)
+
+__all__ = [
+    "draw_motion_outcome",
+    "render_accuracy",
+    "render_alarms",
+    "render_average_precisions",
+    "render_breakdown",
+    "render_detection_rates",
+    "render_errors",
+    "render_false_alarms",
+    "render_outcomes",
+    "render_precision_recall",
+    "render_quality_by_time",
+    "render_ranges",
+    "render_warning_curve",
+    "render_warning_times",
+    "save_report",
+]

@@ -1,0 +1,131 @@
+"""Accident results as pictures: accuracy over the distance allowed, outcomes, errors, and alarms by their score."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, Literal
+
+import numpy as np
+
+from deepaccident_devkit.evaluation.accident import DISTANCES, AccidentEvaluator, AccidentResult
+from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
+from deepaccident_devkit.render.colors import ESTIMATE_COLOR, GRID_COLOR, OUTCOME_COLORS
+from deepaccident_devkit.render.evaluation.alarms import accuracy_by_distance, alarm_precision_recall, errors_of_first
+from deepaccident_devkit.render.evaluation.panels import PANEL, draw_nothing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_FARTHEST: Final = 20.0
+"""Metres: where the axis of the distance allowed ends."""
+_TIME_EDGES: Final = np.arange(-2.25, 2.3, 0.5)
+"""Seconds: half a second a bin, the middle one around no error."""
+
+
+def render_accuracy(evaluator: AccidentEvaluator, *, ax: Axes | None = None) -> Axes:
+    """Draw the accident accuracy over the distance that a prediction may be off, with the three official distances.
+
+    Args:
+        evaluator: with samples counted. Where its counts hold how far off each alarm is there is a curve from 0 to
+            20 m; the released protocol's hold the outcomes at the official distances alone.
+        ax: axes to draw on; new ones if None.
+
+    Returns:
+        The axes drawn on; the title says the mean of the three, the accident prediction accuracy (APA).
+    """
+    ax, result = axes_or_new(ax, PANEL), evaluator.compute()
+    allowed = np.linspace(0, _FARTHEST, 201)
+    curve = accuracy_by_distance(evaluator, allowed)
+    if curve is not None:
+        ax.plot(allowed, curve, drawstyle="steps-post", color=ESTIMATE_COLOR, linewidth=1.6)
+    for distance, within in result.within.items():
+        ax.axvline(distance, color=GRID_COLOR, linewidth=1, linestyle="--", zorder=0)
+        if np.isfinite(within.accuracy):
+            ax.plot(distance, within.accuracy, "o", color=ESTIMATE_COLOR, markersize=6)
+            ax.annotate(f"{within.accuracy:.3f}", (distance, within.accuracy), (6, -13), textcoords="offset points")
+    ax.set(xlim=(0, _FARTHEST), ylim=(0, 1.04), xlabel="distance allowed (m)", ylabel="tp / (tp + fp/2 + fn/2)")
+    apa = "nothing to count" if np.isnan(result.apa) else f"APA {result.apa:.3f}"
+    positives = f"{result.positives:,} of {result.samples:,} samples have an accident"
+    ax.set_title(f"{apa}: mean of the three distances; {positives}", fontsize=10)
+    return with_light_grid(ax, "y")
+
+
+def render_outcomes(result: AccidentResult, *, ax: Axes | None = None) -> Axes:
+    """Draw how many accidents are foreseen, predicted falsely and missed, at each distance allowed.
+
+    Args:
+        result: of `AccidentEvaluator.compute`.
+        ax: axes to draw on; new ones if None.
+
+    Returns:
+        The axes drawn on.
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    ax = axes_or_new(ax, PANEL)
+    kinds = {"right": ("foreseen (TP)", "tp"), "false": ("false (FP)", "fp"), "missed": ("missed (FN)", "fn")}
+    highest = 1
+    for offset, (kind, (label, field)) in enumerate(kinds.items()):
+        heights = [getattr(each, field) for each in result.within.values()]
+        places = [place + 0.27 * (offset - 1) for place in range(len(heights))]
+        parts = ax.bar(places, heights, width=0.25, color=OUTCOME_COLORS[kind], label=label)
+        ax.bar_label(parts, fontsize=8, padding=1)
+        highest = max(highest, *heights)
+    ax.set_xticks(range(len(result.within)), [f"within {distance:g} m" for distance in result.within])
+    ax.set(ylabel="accidents", ylim=(0, 1.25 * highest))
+    ax.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
+    ax.legend(fontsize=8, ncols=3, loc="upper center")
+    ax.set_title(f"Outcomes: {result.positives:,} accidents, {result.negatives:,} samples without", fontsize=10)
+    return with_light_grid(ax, "y")
+
+
+def render_errors(evaluator: AccidentEvaluator, error: Literal["position", "time"], *, ax: Axes | None = None) -> Axes:
+    """Draw a histogram of how far off the predicted accidents are, of the samples that have one to come.
+
+    Args:
+        evaluator: with samples counted, of a protocol whose counts hold it (not the released one's).
+        error: of `position`, metres; or of `time`, seconds by which the prediction is late.
+        ax: axes to draw on; new ones if None.
+
+    Returns:
+        The axes drawn on; what lies beyond the bins is in the outermost.
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    ax, values = axes_or_new(ax, PANEL), errors_of_first(evaluator, error)
+    if error == "position":
+        edges, label = np.arange(0, _FARTHEST + 1.1), "positions off in sum of the two (m); the last bin: and more"
+        for distance in DISTANCES:
+            ax.axvline(distance, color=GRID_COLOR, linestyle="--", zorder=0)
+    else:
+        edges, label = _TIME_EDGES, "predicted moment minus true one (s): late to the right"
+    ax.set_title(f"Errors of {error}: {len(values):,} accidents with a prediction", fontsize=10)
+    if not len(values):
+        return draw_nothing(ax, "no accident has a prediction")
+    middles = (edges[:-1] + edges[1:]) / 2
+    counts, _ = np.histogram(np.clip(values, middles[0], middles[-1]), edges)
+    ax.bar(edges[:-1], counts, np.diff(edges), align="edge", color=ESTIMATE_COLOR, edgecolor="white", linewidth=0.5)
+    ax.set(xlabel=label, ylabel="accidents", xlim=(edges[0], edges[-1]))
+    ax.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
+    return with_light_grid(ax, "y")
+
+
+def render_alarms(evaluator: AccidentEvaluator, *, ax: Axes | None = None) -> Axes:
+    """Draw precision over recall of alarms, from the surest on.
+
+    Args:
+        evaluator: with samples counted, of a protocol whose alarms have scores (`boxes`).
+        ax: axes to draw on; new ones if None.
+
+    Returns:
+        The axes drawn on: each point is all alarms of at least some score.
+    """
+    ax = axes_or_new(ax, PANEL)
+    ax.set_title("Alarms from the surest on", fontsize=10)
+    recall, precision = alarm_precision_recall(evaluator)
+    if not len(recall):
+        return draw_nothing(ax, "no alarms, or no accidents")
+    ax.step(recall, precision, where="pre", color=ESTIMATE_COLOR, marker="o", markersize=4)
+    ax.set(
+        xlim=(0, 1.02), ylim=(0, 1.04), xlabel="recall: accidents foreseen", ylabel="precision: alarms that are true"
+    )
+    return with_light_grid(ax, "both")

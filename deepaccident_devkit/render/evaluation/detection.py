@@ -1,0 +1,95 @@
+"""Detection results as pictures: precision over recall, and average precision by class."""
+
+from __future__ import annotations
+
+import math
+from itertools import cycle
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.evaluation.detection import DetectionResult
+from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
+from deepaccident_devkit.render.colors import CATEGORY_COLORS, ESTIMATE_COLOR, SERIES_COLORS
+from deepaccident_devkit.render.evaluation.panels import PANEL, Bar, draw_bars, draw_nothing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_DASHES: Final = ("-", "--", "-.", ":")
+"""Lines that colours alone would tell apart are told apart in print, too."""
+
+
+def render_precision_recall(result: DetectionResult, name: str, *, ring: int = 0, ax: Axes | None = None) -> Axes:
+    """Draw precision over recall of one class, a line a threshold.
+
+    Args:
+        result: of `DetectionEvaluator.compute`.
+        name: one of its classes.
+        ring: which of its ranges.
+        ax: axes to draw on; new ones if None.
+
+    Returns:
+        The axes drawn on; a line ends where the recall does, and its label says the average precision.
+
+    Raises:
+        ChoiceError: no such class, or no such range.
+    """
+    if name not in result.classes:
+        raise ChoiceError(f"name: expected one of {', '.join(result.classes)}, found {name!r}")
+    if ring not in range(len(result.ranges)):
+        raise ChoiceError(f"ring: expected 0 to {len(result.ranges) - 1}, found {ring!r}")
+    ax, row = axes_or_new(ax, PANEL), result.classes.index(name)
+    truths, found = int(result.truths[row, ring]), int(result.detections[row, ring])
+    ax.set_title(f"{name}: {truths:,} true, {found:,} detected{_ring_text(result, ring)}", fontsize=10)
+    if not truths:
+        return draw_nothing(ax, "none in the truth")
+    count = result.thresholds.shape[1]
+    styles = zip(cycle(SERIES_COLORS), cycle(_DASHES))
+    for level, (threshold, (color, dash)) in enumerate(zip(result.thresholds[row].tolist(), styles, strict=False)):
+        precision, recall = result.precision[row, ring, level], result.recall[row, ring, level]
+        reached = np.isfinite(recall) & (precision > 0)
+        average = float(result.average_precision[row, ring, level])
+        label = f"{threshold:g}: AP {average:.1f} %" if math.isfinite(average) else f"{threshold:g}: –"
+        width = 1.2 + 0.8 * (count - 1 - level)  # equal curves are all seen
+        ax.plot(recall[reached], precision[reached], dash, color=color, label=label, linewidth=width)
+    ax.set(xlim=(0, 1.02), ylim=(0, 1.02), xlabel="recall", ylabel="precision")
+    ax.legend(title="threshold", fontsize=8, title_fontsize=8, loc="best")
+    return with_light_grid(ax, "both")
+
+
+def render_average_precisions(result: DetectionResult, *, ax: Axes | None = None) -> Axes:
+    """Draw each class's average precision as a bar, the mean over thresholds and ranges.
+
+    Args:
+        result: of `DetectionEvaluator.compute`.
+        ax: axes to draw on; new ones if None.
+
+    Returns:
+        The axes drawn on, in percent; each bar has its value, and how many true boxes there are.
+    """
+    bars = [
+        Bar(
+            label=name,
+            below=f"{truths:,} true",
+            value=average if math.isfinite(average) else None,
+            text=f"{average:.1f} %",
+            color=CATEGORY_COLORS.get(name, ESTIMATE_COLOR),
+        )
+        for (name, average), truths in zip(
+            result.class_average_precision.items(), result.truths.sum(axis=1).tolist(), strict=True
+        )
+    ]
+    ax = draw_bars(bars, axes_or_new(ax, PANEL), 100.0)
+    ax.set(xlabel="average precision (%)")
+    ax.set_title("Average precision by class, mean over thresholds", fontsize=10)
+    return ax
+
+
+def _ring_text(result: DetectionResult, ring: int) -> str:
+    """Which range it is, where there are several."""
+    if len(result.ranges) == 1:
+        return ""
+    low, high = result.ranges[ring].tolist()
+    return f", {low:g} to {high:g} m"

@@ -1,0 +1,82 @@
+"""Motion results as pictures: quality by range and by time ahead."""
+
+from __future__ import annotations
+
+import math
+from itertools import cycle
+from typing import TYPE_CHECKING, Final
+
+from deepaccident_devkit.evaluation.motion import MotionEvaluator, MotionResult
+from deepaccident_devkit.evaluation.panoptic import panoptic_quality
+from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
+from deepaccident_devkit.render.colors import SERIES_COLORS
+from deepaccident_devkit.render.evaluation.panels import PANEL, draw_nothing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_PARTS: Final = {"iou": "IoU", "pq": "PQ", "sq": "SQ", "rq": "RQ"}
+
+
+def render_ranges(result: MotionResult, *, ax: Axes | None = None) -> Axes:
+    """Draw IoU and the panoptic quality with its two factors, within each range.
+
+    Args:
+        result: of `MotionEvaluator.compute`.
+        ax: axes to draw on; new ones if None.
+
+    Returns:
+        The axes drawn on, in percent; what has nothing to count has no bar.
+    """
+    ax, count = axes_or_new(ax, PANEL), len(result.ranges)
+    for offset, ((name, within), color) in enumerate(
+        zip(result.ranges.items(), cycle(SERIES_COLORS[1:]), strict=False)
+    ):
+        values = [getattr(within, part) for part in _PARTS]
+        places = [place + 0.8 / count * (offset - (count - 1) / 2) for place in range(len(_PARTS))]
+        heights = [0.0 if math.isnan(value) else value for value in values]
+        parts = ax.bar(places, heights, width=0.76 / count, color=color, label=f"{name} m")
+        labels = ["–" if math.isnan(value) else f"{value:.1f}" for value in values]
+        ax.bar_label(parts, labels, fontsize=8, padding=1)
+    ax.set_xticks(range(len(_PARTS)), list(_PARTS.values()))
+    ax.set(ylabel="%", ylim=(0, 118), yticks=range(0, 101, 20))
+    ax.legend(fontsize=8, ncols=max(1, count), loc="upper center")
+    ax.set_title(f"Within each range, {result.samples:,} samples, {result.frames:,} frames", fontsize=10)
+    return with_light_grid(ax, "y")
+
+
+def render_quality_by_time(evaluator: MotionEvaluator, step: float = 0.5, *, ax: Axes | None = None) -> Axes:
+    """Draw the panoptic quality of each frame ahead, a line a range.
+
+    Args:
+        evaluator: with samples counted.
+        step: seconds from frame to frame.
+        ax: axes to draw on; new ones if None.
+
+    Returns:
+        The axes drawn on, in percent over seconds from the present. The result's quality is that of the sums over all
+        frames.
+    """
+    ax, counts = axes_or_new(ax, PANEL), evaluator.counts.values()
+    ax.set_title("Panoptic quality by time ahead", fontsize=10)
+    frames = max((each["frames"] for each in counts), default=0)
+    if not frames:
+        return draw_nothing(ax)
+    given = [each["vpq"] for each in counts]
+    for index, (name, color) in enumerate(zip(evaluator.protocol.range_names, cycle(SERIES_COLORS[1:]), strict=False)):
+        quality = [_quality([each[index] for each in given], frame) for frame in range(frames)]
+        ax.plot([step * frame for frame in range(frames)], quality, marker="o", color=color, label=f"{name} m")
+    ax.set(xlabel="seconds from the present", ylabel="PQ (%)", ylim=(0, 104))
+    ax.set_xticks([step * frame for frame in range(frames)])
+    ax.legend(fontsize=8, loc="lower left")
+    return with_light_grid(ax, "y")
+
+
+def _quality(samples: list[list[list[float]]], frame: int) -> float:
+    """PQ in percent of one frame of samples' four lists by frame; NaN without any instance."""
+    there = [[values[frame] for values in each] for each in samples if frame < len(each[0])]
+    overlap, *numbers = (math.fsum(each[kind] for each in there) for kind in range(4))
+    found, false, missed = map(int, numbers)
+    if not found + false + missed:
+        return math.nan
+    return 100 * panoptic_quality(overlap, found, false, missed).pq

@@ -1,0 +1,96 @@
+"""What the panels of an evaluation share: their size, labelled bars with intervals, and words where nothing is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from deepaccident_devkit.evaluation.headlines import Headline
+from deepaccident_devkit.render.axes import with_light_grid
+from deepaccident_devkit.render.colors import ESTIMATE_COLOR
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+PANEL: Final = (6.4, 4.2)
+"""Inches of one panel."""
+LIMITS: Final = {"%": 100.0, "share": 1.0, "1 - overlap": 1.0}
+"""Unit → the most that a number of it can be; others have no limit."""
+_BESIDE: Final = 1.22
+"""Of the longest bar: where the axis ends, so that the words beside the bars have room."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bar:
+    """One bar of `draw_bars`.
+
+    Attributes:
+        label: beside the axis.
+        below: a smaller line below the label; empty for none.
+        value: None where there is nothing to count.
+        interval: low and high; None without.
+        text: beside the bar.
+        color: of the bar.
+    """
+
+    label: str
+    below: str = ""
+    value: float | None = None
+    interval: tuple[float, float] | None = None
+    text: str = ""
+    color: str = ESTIMATE_COLOR
+
+
+def draw_bars(bars: Sequence[Bar], ax: Axes, limit: float | None = None) -> Axes:
+    """Draw horizontal bars, the first on top, with their intervals as whiskers and their texts to the right.
+
+    Args:
+        bars: what is not known has a dash in a bar's place.
+        ax: the axes to draw on.
+        limit: where the values end; None for as far as they go.
+
+    Returns:
+        The axes drawn on.
+    """
+    if not bars:
+        return draw_nothing(ax)
+    ends = [0.0]
+    for row, bar in enumerate(bars):
+        end = 0.0
+        if bar.value is not None:
+            ax.barh(row, bar.value, height=0.66, color=bar.color)
+            end = max(end, bar.value)
+        if bar.value is not None and bar.interval is not None and all(map(math.isfinite, bar.interval)):
+            low, high = bar.interval
+            ax.plot((low, high), (row, row), color="black", linewidth=1.2, marker="|", markersize=7)
+            end = max(end, high)
+        ax.annotate(
+            "–" if bar.value is None else bar.text,
+            (end, row),
+            (5, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=8,
+        )
+        ends.append(end)
+    reach = max(ends) if limit is None else limit
+    ax.set(xlim=(min([0.0, *(bar.value or 0.0 for bar in bars)]), _BESIDE * (reach or 1.0)))
+    if limit is not None:
+        ax.set_xticks([limit * part / 5 for part in range(6)])
+    ax.set_yticks(range(len(bars)), [f"{bar.label}\n{bar.below}".strip() for bar in bars], fontsize=8, linespacing=1.15)
+    ax.set_ylim(len(bars) - 0.4, -0.6)
+    return with_light_grid(ax, "x")
+
+
+def draw_nothing(ax: Axes, why: str = "nothing to count") -> Axes:
+    """Say why a panel is empty; returns the axes."""
+    ax.text(0.5, 0.5, why, ha="center", va="center", transform=ax.transAxes, color="#555555")
+    ax.set(xticks=[], yticks=[])
+    return ax
+
+
+def with_unit(headline: Headline) -> str:
+    """What an axis says of a headline number: `position_error (m)`."""
+    return headline.name if headline.unit == "share" else f"{headline.name} ({headline.unit})"

@@ -1,0 +1,101 @@
+"""`save_report`: one HTML file that tells all of an evaluation, and its figures as PNG files."""
+
+from __future__ import annotations
+
+import base64
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.evaluation.results import Results
+from deepaccident_devkit.evaluation.runs import EvaluationRun
+from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.render.evaluation import doubts, sections
+from deepaccident_devkit.render.evaluation.figures import RunFigure, save_figure
+from deepaccident_devkit.render.evaluation.listing import run_figures
+from deepaccident_devkit.render.evaluation.markup import Markup, joined, tag
+from deepaccident_devkit.render.evaluation.page import document
+from deepaccident_devkit.render.evaluation.samples import sample_figures
+
+REPORT_FILE: Final = "report.html"
+FIGURES_FOLDER: Final = "figures"
+
+
+def save_report(
+    run: EvaluationRun,
+    folder: str | os.PathLike[str],
+    *,
+    dataset: Dataset | None = None,
+    results: Results | None = None,
+) -> Path:
+    """Write `report.html` and `figures/*.png` into a folder; the same run makes the same bytes.
+
+    The report needs no other file and asks for none: it can be sent as it is. Each section and each figure of a partial
+    run says so.
+
+    Args:
+        run: of `evaluate_results`.
+        folder: where; it is made if it is not there, and files of an earlier report there are replaced.
+        dataset: with `results`, to show the worst and the best samples, too.
+        results: the predictions that were evaluated.
+
+    Returns:
+        The report's path.
+
+    Raises:
+        ConfigError: the folder is a file.
+    """
+    target = Path(folder)
+    if target.exists() and not target.is_dir():
+        raise ConfigError(f"{target}: is a file; give a folder")
+    drawn = [*run_figures(run)]
+    if dataset is not None and results is not None:
+        drawn += sample_figures(run, dataset, results)
+    figures = [(each, save_figure(run, each, target / FIGURES_FOLDER)) for each in drawn]
+    write_bytes(target / REPORT_FILE, report_html(run, figures).encode())
+    return target / REPORT_FILE
+
+
+def report_html(run: EvaluationRun, figures: Sequence[tuple[RunFigure, Path]]) -> str:
+    """The whole page.
+
+    Args:
+        run: of `evaluate_results`.
+        figures: with their PNG files, which become part of the page.
+    """
+    title = f"{run.setup.task.capitalize()}, protocol {run.setup.protocol}"
+    parts = {
+        "Headline numbers": sections.headline_table(run),
+        "Counts": sections.counts(run),
+        "Figures": tag("div", *(_figure(*each) for each in figures), class_="figures"),
+        "Breakdowns": joined(sections.breakdowns(run)),
+        **({"Sanity": doubts.sanity(run.sanity)} if run.sanity is not None else {}),
+        **({"What each choice changes": doubts.explanation(run.explanation)} if run.explanation is not None else {}),
+        "Choices": sections.choices(run),
+        "Check these numbers": sections.checking(),
+    }
+    links = [tag("a", name, href=f"#{_anchor(name)}") for name in parts]
+    mark = _mark(run)
+    return document(
+        f"DeepAccident evaluation: {title}",
+        tag("header", tag("h1", f"DeepAccident evaluation: {title}"), mark, sections.header(run)),
+        tag("nav", *links),
+        *(tag("section", tag("h2", name), mark, body, id=_anchor(name)) for name, body in parts.items()),
+    )
+
+
+def _figure(drawn: RunFigure, path: Path) -> Markup:
+    content = base64.b64encode(path.read_bytes()).decode("ascii")
+    image = tag("img", src=f"data:image/png;base64,{content}", alt=drawn.alt)
+    return tag("figure", image, tag("figcaption", drawn.caption))
+
+
+def _mark(run: EvaluationRun) -> Markup:
+    return Markup("") if run.partial is None else tag("p", run.partial.text(), class_="partial")
+
+
+def _anchor(name: str) -> str:
+    return name.lower().replace(" ", "-")

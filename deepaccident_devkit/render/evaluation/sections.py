@@ -1,0 +1,169 @@
+"""The sections of a report, each from a run's summary or its results; all of them escaped."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final
+
+from deepaccident_devkit.evaluation.attributes import EVERYTHING
+from deepaccident_devkit.evaluation.breakdowns import Breakdown, Group
+from deepaccident_devkit.evaluation.headlines import Headline, headlines
+from deepaccident_devkit.evaluation.runs import EvaluationRun
+from deepaccident_devkit.render.evaluation.breakdowns import UNKNOWN
+from deepaccident_devkit.render.evaluation.markup import Markup, facts, joined, scalar, table, tag, tree
+
+_BETTER: Final = {True: "higher", False: "lower", None: ""}
+_PARTS: Final = {
+    "truths": "Whom the truth of the samples names",
+    "within": "By the distance allowed (m)",
+    "ranges": "By range",
+    "classes": "By class",
+    "recordings": "Recordings",
+    "minutes": "Minutes",
+    "false_alarms": "False alarms",
+    "detection_recordings": "Recordings that reach back so many seconds",
+    "beside": "With other choices, always told along",
+}
+"""Field of a result → heading of its table."""
+_SHOWN_META: Final = ("method", "name", "authors", "url", "date")
+"""Fields of the results' own words that stand at the top, where there are any."""
+
+
+def header(run: EvaluationRun) -> Markup:
+    """What was evaluated, and how."""
+    setup, selection = run.setup, run.selection
+    meta = {name: scalar(run.results.meta[name]) for name in _SHOWN_META if name in run.results.meta}
+    summary = run.summary()
+    changed = ", ".join(f"{name} = {scalar(value)}" for name, value in setup.switches.items())
+    rows = {
+        "task": setup.task,
+        "protocol": setup.protocol + (f", but {changed}" if changed else ""),
+        **meta,
+        "samples": f"{summary['counts']['samples']:,} of {summary['counts']['scenarios']:,} scenarios",
+        "selection": selection.text(),
+        **({} if setup.task == "detection" else {"horizon": f"{setup.horizon:g} s"}),
+        "results": run.results.path,
+        "results' hash": run.results.fingerprint,
+        "release": f"{run.release.version}, {run.release.dataroot}",
+        "release's hash": run.release.fingerprint,
+        "devkit": summary["devkit_version"],
+        "made with": ", ".join(f"{name} {version}" for name, version in summary["environment"].items()),
+    }
+    return facts(rows)
+
+
+def headline_table(run: EvaluationRun) -> Markup:
+    """The numbers that come first, with intervals where the run has them."""
+    everything = next((each for each in run.breakdowns if each.by == EVERYTHING), None)
+    group = everything.groups[0] if everything is not None and everything.groups else None
+    rows = [
+        [each.name, each.text(), _interval_text(each, group), _BETTER[each.higher_is_better]]
+        for each in headlines(run.setup.task, run.result)
+    ]
+    percent = f"{100 * everything.bootstrap.confidence:g} % interval" if everything is not None else "interval"
+    return tag("div", table(["number", "value", percent, "better"], rows), class_="big")
+
+
+def counts(run: EvaluationRun) -> Markup:
+    """What was counted: the whole numbers of a result, its notes, and what stands beside it."""
+    told = run.result.as_dict()
+    numbers = {name: f"{value:,}" for name, value in told.items() if isinstance(value, int)}
+    named = {title: told[name] for name, title in _PARTS.items() if told.get(name)}
+    notes = [tag("p", str(note), class_="note") for note in told.get("notes") or ()]
+    parts = [tag("div", tag("h3", title), _columns(value)) for title, value in named.items()]
+    return joined([facts(numbers), *notes, *parts])
+
+
+def breakdowns(run: EvaluationRun) -> Iterator[Markup]:
+    """A table for each attribute, vehicles alone below it where that is another number of samples.
+
+    An attribute that has the same value in all samples is only named.
+    """
+    same = {each.by: each.groups[0].value or UNKNOWN for each in run.breakdowns if len(each.groups) == 1}
+    for each in run.breakdowns:
+        if each.by not in same:
+            yield tag("h3", f"by {each.by.replace('_', ' ')}")
+            yield _groups(run.setup.task, each, each.groups, "all agents")
+            if _samples(each.without_infrastructure) != _samples(each.groups):
+                below = _groups(run.setup.task, each, each.without_infrastructure, "without the roadside")
+                yield tag("details", tag("summary", "without the roadside's samples"), below)
+    named = [f"{name.replace('_', ' ')} {value}" for name, value in same.items() if name != EVERYTHING]
+    if named:
+        yield tag("p", f"The same in all samples: {', '.join(named)}.")
+
+
+def choices(run: EvaluationRun) -> Markup:
+    """Every switch of the protocol, and what else decides the numbers; folded up."""
+    given = run.setup.as_dict()
+    said = [("Every choice of the protocol", given["settings"]), ("Selection of samples", run.selection.as_dict())]
+    if run.results.form is not None:
+        said.append(("Form of the results", run.results.form))
+    if run.results.meta:
+        said.append(("What the results say of themselves", run.results.meta))
+    return joined(
+        tag("details", tag("summary", name), tag("div", tree(value), class_="wide text")) for name, value in said
+    )
+
+
+def checking() -> Markup:
+    """How others can check the numbers."""
+    return joined(
+        [
+            tag(
+                "p",
+                "This report is one file of a bundle. Whoever has the bundle, the results and the release can "
+                "recompute all numbers, and is told each that differs:",
+            ),
+            tag("p", tag("code", "deepaccident evaluate verify DIR")),
+            tag(
+                "p",
+                "The release's hash is made of the label, meta and calib files of each scenario evaluated "
+                "(scenarios.json).",
+            ),
+        ]
+    )
+
+
+def _groups(task: str, broken: Breakdown[Any], groups: Sequence[Group[Any]], whose: str) -> Markup:
+    names = list(dict.fromkeys(each.name for group in groups for each in headlines(task, group.result)))
+    rows = []
+    for group in groups:
+        known = {each.name: each for each in headlines(task, group.result)}
+        cells = [_cell(known.get(name), group) for name in names]
+        label = UNKNOWN if group.value is None else group.value
+        rows.append([label, f"{group.samples:,}", f"{group.scenarios:,}", *cells])
+    how = f"{100 * broken.bootstrap.confidence:g} % intervals of {broken.bootstrap.resamples:,} resamples of scenarios"
+    return table([broken.by.replace("_", " "), "samples", "scenarios", *names], rows, f"{whose}; {how}")
+
+
+def _cell(headline: Headline | None, group: Group[Any]) -> Markup:
+    if headline is None:
+        return joined(["–"])
+    interval = _interval_text(headline, group)
+    return joined([headline.text(), *([tag("div", interval, class_="interval")] if interval else [])])
+
+
+def _interval_text(headline: Headline, group: Group[Any] | None) -> str:
+    low, high = (math.nan, math.nan) if group is None else group.intervals.get(headline.path, (math.nan, math.nan))
+    if math.isnan(low) or math.isnan(high):
+        return ""
+    digits = 2 if headline.unit == "%" else 3
+    return f"{low:.{digits}f} to {high:.{digits}f}"
+
+
+def _columns(value: Any) -> Markup:
+    """A mapping of mappings as a table with a row each, one of numbers as facts; else pairs: ranges from and to."""
+    if not isinstance(value, Mapping):
+        return tag(
+            "p", "; ".join(f"{low:g} m and more" if high is None else f"{low:g} to {high:g} m" for low, high in value)
+        )
+    if not all(isinstance(each, Mapping) for each in value.values()):
+        return facts({str(name): scalar(each) for name, each in value.items()})
+    names = list(dict.fromkeys(name for each in value.values() for name in each))
+    plain = [name for name in names if not any(isinstance(each.get(name), Mapping) for each in value.values())]
+    return table(["", *plain], [[key, *(tree(each.get(name)) for name in plain)] for key, each in value.items()])
+
+
+def _samples(groups: Sequence[Group[Any]]) -> int:
+    return sum(group.samples for group in groups)

@@ -1,0 +1,128 @@
+"""Warning results as pictures: how early, how often in time, how many false alarms, and all of it over the score."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from deepaccident_devkit.evaluation.warning import WarningResult
+from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
+from deepaccident_devkit.render.colors import ESTIMATE_COLOR, OUTCOME_COLORS
+from deepaccident_devkit.render.evaluation.panels import PANEL, Bar, draw_bars, draw_nothing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_BIN: Final = 0.5
+"""Seconds."""
+
+
+def render_warning_times(result: WarningResult, *, ax: Axes | None = None) -> Axes:
+    """Draw a histogram of the seconds of warning, over the recordings of accidents that are warned of.
+
+    Args:
+        result: of `WarningEvaluator.compute`.
+        ax: axes to draw on; new ones if None.
+
+    Returns:
+        The axes drawn on; a line is at the mean, the title says how many recordings have no right alarm.
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    ax, seconds = axes_or_new(ax, PANEL), result.warning_seconds
+    accidents = result.recordings.get("accident", 0)
+    ax.set_title(f"{len(seconds):,} of {accidents:,} recordings of accidents are warned of", fontsize=10)
+    if not len(seconds):
+        return draw_nothing(ax, "no recording has a right alarm")
+    bins = max(1, math.ceil(float(seconds.max()) / _BIN + 1e-6))
+    ax.hist(seconds, bins=bins, range=(0, bins * _BIN), color=ESTIMATE_COLOR, edgecolor="white", linewidth=0.5)
+    ax.axvline(
+        result.mean_warning, color="black", linestyle="--", linewidth=1, label=f"mean {result.mean_warning:.2f} s"
+    )
+    ax.set(xlabel="seconds from the first right alarm to the impact", ylabel="recordings", xlim=(0, bins * _BIN))
+    ax.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
+    ax.legend(fontsize=8)
+    return with_light_grid(ax, "y")
+
+
+def render_detection_rates(result: WarningResult, *, ax: Axes | None = None) -> Axes:
+    """Draw which share of accidents has a right alarm so many seconds before the impact, or earlier.
+
+    Args:
+        result: of `WarningEvaluator.compute`.
+        ax: axes to draw on; new ones if None.
+
+    Returns:
+        The axes drawn on; each bar has its value, and of how many recordings it is.
+    """
+    bars = [
+        Bar(
+            label=f"{seconds:g} s before",
+            below=f"{result.detection_recordings[seconds]:,} recordings",
+            value=_known(rate),
+            text=f"{rate:.3f}",
+        )
+        for seconds, rate in result.detection_rate.items()
+    ]
+    ax = draw_bars(bars, axes_or_new(ax, PANEL), 1.0)
+    ax.set(xlabel="share of the recordings of accidents")
+    ax.set_title("A right alarm is raised in time", fontsize=10)
+    return ax
+
+
+def render_false_alarms(result: WarningResult, *, ax: Axes | None = None) -> Axes:
+    """Draw the false alarms a minute of each kind of recording.
+
+    Args:
+        result: of `WarningEvaluator.compute`.
+        ax: axes to draw on; new ones if None.
+
+    Returns:
+        The axes drawn on; each bar has its value, and the alarms and minutes that it is of.
+    """
+    bars = [
+        Bar(
+            label=kind,
+            below=f"{result.false_alarms[kind]:,} in {result.minutes[kind]:.3g} min",
+            value=_known(rate),
+            text=f"{rate:.2f}",
+            color=OUTCOME_COLORS["false"],
+        )
+        for kind, rate in result.false_alarms_per_minute.items()
+    ]
+    ax = draw_bars(bars, axes_or_new(ax, PANEL))
+    ax.set(xlabel="false alarms a minute")
+    ax.set_title("False alarms by kind of recording", fontsize=10)
+    return ax
+
+
+def render_warning_curve(result: WarningResult, *, ax: Axes | None = None) -> Axes:
+    """Draw the detection rate over the false alarms a minute, a point a score from which alarms are raised.
+
+    Args:
+        result: of `WarningEvaluator.compute`.
+        ax: axes to draw on; new ones if None.
+
+    Returns:
+        The axes drawn on; some points have their score beside them.
+    """
+    ax, curve = axes_or_new(ax, PANEL), result.curve
+    ax.set_title("If only alarms of at least a score were raised", fontsize=10)
+    known = np.isfinite(curve.detection_rate) & np.isfinite(curve.false_alarms_per_minute)
+    if not known.any():
+        return draw_nothing(ax, "needs alarms, accidents and normal scenarios")
+    false, rate = curve.false_alarms_per_minute[known], curve.detection_rate[known]
+    ax.plot(false, rate, color=ESTIMATE_COLOR, marker="o", markersize=4)
+    score = curve.threshold[known]
+    for row in sorted({0, len(score) // 2, len(score) - 1}):
+        where = (false[row], rate[row])
+        ax.annotate(f"≥ {score[row]:.2g}", where, (6, -11), textcoords="offset points", fontsize=8)
+    ax.set(xlabel="false alarms a minute, where nobody collides", ylabel="accidents detected in time", ylim=(0, 1.04))
+    ax.set_xlim(0, 1.12 * max(float(false.max()), 0.1))
+    return with_light_grid(ax, "both")
+
+
+def _known(value: float) -> float | None:
+    return None if math.isnan(value) else value

@@ -1,0 +1,55 @@
+"""`Browser`: a page opened in chromium without a window; what it says, asks for, and looks like."""
+
+import base64
+import json
+from pathlib import Path
+from typing import Any
+
+OVERFLOWING = """
+const width = document.documentElement.clientWidth;
+const scrolls = (element) => element && (element.classList.contains('wide') || scrolls(element.parentElement));
+return [...document.querySelectorAll('body *')]
+  .filter((each) => each.getBoundingClientRect().right > width + 1 && !scrolls(each.parentElement))
+  .map((each) => each.outerHTML.slice(0, 200));
+"""
+
+
+class Browser:
+    """One chromium for all tests; pages are opened one after the other."""
+
+    def __init__(self, driver: Any) -> None:
+        self.driver = driver
+
+    def open(self, page: Path, width: int) -> None:
+        """Open a file in a window of a width, in pixels, as on a screen of that size."""
+        size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
+        self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        for kind in ("browser", "performance"):
+            self.driver.get_log(kind)  # what came before is not this page's
+        self.driver.get(page.resolve().as_uri())
+
+    def complaints(self) -> list[str]:
+        """What the console says since the page was opened, warnings too."""
+        return [entry["message"] for entry in self.driver.get_log("browser")]
+
+    def requests(self) -> list[str]:
+        """The addresses asked for since the page was opened, its own first; not data that stand in the page."""
+        events = [json.loads(entry["message"])["message"] for entry in self.driver.get_log("performance")]
+        asked = [each["params"] for each in events if each["method"] == "Network.requestWillBeSent"]
+        return [each["request"]["url"] for each in asked if not each["request"]["url"].startswith("data:")]
+
+    def script(self, code: str) -> Any:
+        """What JavaScript returns."""
+        return self.driver.execute_script(code)
+
+    def overflowing(self) -> list[str]:
+        """Elements that reach beyond the right edge, outside of boxes that scroll (class `wide`)."""
+        found: list[str] = self.script(OVERFLOWING)
+        return found
+
+    def screenshot(self, path: Path) -> Path:
+        """A picture of the whole page, as long as it is."""
+        shot = self.driver.execute_cdp_cmd("Page.captureScreenshot", {"captureBeyondViewport": True})
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(base64.b64decode(shot["data"]))
+        return path

@@ -1,0 +1,87 @@
+"""`deepaccident baseline`: one library call a verb."""
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.baselines import Baseline, conditions
+from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.evaluation.results import read_results
+from deepaccident_devkit.v2x import Link
+
+
+def run(*arguments: object) -> str:
+    result = CliRunner().invoke(deepaccident, ["baseline", *map(str, arguments)], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_predict_writes_all_tasks_of_the_samples_that_are_evaluated(da_motion: DeepAccident, tmp_path: Path) -> None:
+    text = run("predict", da_motion.dataroot, "--split", "train", "--agents", "all", "--workers", 1, "--out", tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["accident.json", "detection.json", "motion"]
+    for name in ("motion", "accident.json", "detection.json"):
+        results = read_results(tmp_path / name)
+        results.check()
+        assert list(results.tokens) == da_motion.samples("train", "evaluate")
+        assert results.meta["agents"] == "all"
+        assert f"{results.task}: 20 samples in" in text
+
+
+def test_predict_takes_a_link_a_model_a_horizon_and_a_scope(da_motion: DeepAccident, tmp_path: Path) -> None:
+    options = "--split train --task accident --model constant_turn_rate --latency 0.2 --pose-noise 0.3 --seed 4"
+    options += " --horizon 1.5 --scope all --workers 1"
+    run("predict", da_motion.dataroot, *options.split(), "--out", tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["accident.json"]
+    results = read_results(tmp_path / "accident.json")
+    link = Link(latency=0.2, pose_noise=0.3, seed=4)
+    assert results.meta == Baseline(model="constant_turn_rate", link=link, horizon=1.5).meta()
+    assert list(results.tokens) == da_motion.evaluation_samples("train", "paper", horizon=1.5, scope="all")
+
+
+def test_predict_takes_every_half_second_of_all_scenarios(da_motion: DeepAccident, tmp_path: Path) -> None:
+    root = da_motion.dataroot
+    run(
+        "predict",
+        root,
+        "--split",
+        "train",
+        "--task",
+        "detection",
+        "--samples",
+        "all",
+        "--workers",
+        1,
+        "--out",
+        tmp_path,
+    )
+    assert list(read_results(tmp_path / "detection.json").tokens) == da_motion.samples("train", "all")
+
+
+def test_the_study_is_printed_and_written(
+    da_motion: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(conditions, "_QUICK_HORIZONS", (2.0,))
+    monkeypatch.setattr(conditions, "_QUICK_STEPS", (0.0, 0.5))
+    out = tmp_path / "study"
+    text = run("v2x", da_motion.dataroot, "--split", "train", "--quick", "--workers", 1, "--out", out)
+    assert "Who cooperates" in text
+    assert "written: 11 files in" in text
+    names = ("configurations", "horizons", "latency", "pose_noise", "visibility")
+    files = sorted([*(f"{name}{end}" for name in names for end in (".csv", ".png")), "v2x_study.json"])
+    assert sorted(path.name for path in out.iterdir()) == files
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in out.glob("*.png"))
+    described = json.loads((out / "v2x_study.json").read_text(encoding="utf-8"))
+    assert described["config"]["protocol"] == "paper"
+    with (out / "configurations.csv").open(encoding="utf-8") as file:
+        assert next(csv.DictReader(file))["agents"] == "single"
+
+
+@pytest.mark.parametrize("verb", ["predict", "v2x"])
+def test_the_verbs_have_the_grammar_of_all_others(verb: str) -> None:
+    text = CliRunner().invoke(deepaccident, ["baseline", verb, "--help"]).output
+    for word in ("DATAROOT", "--version", "--index-dir", "--workers", "--on-error", "--out DIR"):
+        assert word in text

@@ -1,0 +1,79 @@
+"""From nothing to checked numbers by the command line alone: each step is a process of its own, as a user has it."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+TASKS = {
+    ("motion", "motion"): ("released", "paper"),
+    ("accident", "motion"): ("released", "paper", "boxes"),
+    ("accident", "accident.json"): ("paper", "boxes"),
+    ("detection", "detection.json"): ("released", "paper"),
+}
+"""Task and results → protocols."""
+
+
+def deepaccident(*arguments: object, status: int = 0) -> str:
+    command = [sys.executable, "-m", "deepaccident_devkit.cli", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == status, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def release(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("chain") / "release"
+    deepaccident("synth", root, "--scenarios", 2, "--frames", 25, "--no-sensors", "--seed", 12)
+    return root
+
+
+@pytest.fixture(scope="module")
+def folder(release: Path) -> Path:
+    """Where a single vehicle's and five agents' predictions are, and what comes of them."""
+    folder = release.parent
+    deepaccident("labels", release, "--split", "train", "--samples", "evaluate", "--out", folder / "labels")
+    for agents in ("single", "all"):
+        deepaccident("baseline", "predict", release, "--split", "train", "--agents", agents, "--out", folder / agents)
+    return folder
+
+
+@pytest.mark.parametrize("name", ["motion", "accident.json", "detection.json"])
+def test_results_are_valid_and_of_the_split(release: Path, folder: Path, name: str) -> None:
+    told = deepaccident("evaluate", "validate", folder / "all" / name, "--dataroot", release, "--split", "train")
+    assert "all 20 samples have a prediction, and nothing else has" in told
+
+
+@pytest.mark.parametrize(
+    ("task", "name", "protocol"),
+    [(task, name, protocol) for (task, name), protocols in TASKS.items() for protocol in protocols],
+)
+def test_each_evaluation_is_verified(release: Path, folder: Path, task: str, name: str, protocol: str) -> None:
+    out = folder / f"{task}_{name}_{protocol}"
+    text = deepaccident(
+        *("evaluate", task, release, "--results", folder / "all" / name, "--split", "train"),
+        *("--protocol", protocol, "--out", out, "--bootstrap", 0),
+    )
+    assert f"{task}, protocol {protocol}" in text
+    summary = json.loads((out / "metrics_summary.json").read_text())
+    assert (summary["task"], summary["protocol"], summary["counts"]["samples"]) == (task, protocol, 20)
+    assert (out / "report.html").stat().st_size > 50_000
+    assert "all numbers are equal" in deepaccident("evaluate", "verify", out)
+
+
+def test_five_agents_are_compared_with_one(release: Path, folder: Path) -> None:
+    bundles = []
+    for agents in ("single", "all"):
+        bundles.append(folder / f"compared_{agents}")
+        results = folder / agents / "motion"
+        deepaccident(
+            *("evaluate", "motion", release, "--results", results, "--split", "train", "--out", bundles[-1]),
+            *("--bootstrap", 0),
+        )
+    text = deepaccident("evaluate", "compare", *bundles, "--out", folder / "compared.json")
+    assert "motion, protocol released: 20 samples of 1 scenarios" in text
+    numbers = {each["number"]: each for each in json.loads((folder / "compared.json").read_text())["numbers"]}
+    quality = numbers["ranges/100x100/pq"]
+    assert quality["b"] > quality["a"]

@@ -1,0 +1,297 @@
+"""`deepaccident evaluate`, end to end: results in, numbers out, checked and compared again."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.errors import ChoiceError, EvaluationError, ResultsError
+from deepaccident_devkit.evaluation import Accident, DetectedBoxes, accident_context, instances_of
+from deepaccident_devkit.evaluation.results import ResultsWriter
+from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results, read_bundle, save_run
+from deepaccident_devkit.evaluation.setups import EvaluationSetup
+
+AGENTS = ("ego_vehicle", "infrastructure")
+LIST = ("--split", "train", "--agents", ",".join(AGENTS), "--bootstrap", "0")
+
+
+def evaluate(*arguments: object, status: int = 0) -> Result:
+    """Run the verb in this process; errors of the library come through."""
+    words = ["evaluate", *map(str, arguments)]
+    result = CliRunner().invoke(deepaccident, words, catch_exceptions=False)
+    assert result.exit_code == status, result.output
+    return result
+
+
+def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "deepaccident_devkit.cli", "evaluate", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder for what several tests read; with a blank in its name."""
+    return tmp_path_factory.mktemp("evaluate") / "my results"
+
+
+@pytest.fixture(scope="module")
+def tokens(da_motion: DeepAccident) -> list[str]:
+    return [token for token in da_motion.evaluation_samples("train") if token.split("/")[2] in AGENTS]
+
+
+def write_accidents(dataset: DeepAccident, path: Path, tokens: Iterable[str], moved: float = 0.1) -> Path:
+    with ResultsWriter(path, "accident") as writer:
+        for token in tokens:
+            truth = accident_context(dataset, token, 2.0).truth
+            true = None if truth is None else truth.accident
+            alarms = [] if true is None else [Accident(positions=true.positions + moved, time=true.time, ids=true.ids)]
+            writer.add(token, alarms)
+    return path
+
+
+@pytest.fixture(scope="module")
+def accidents(da_motion: DeepAccident, folder: Path, tokens: list[str]) -> Path:
+    """The true accidents, moved a little."""
+    return write_accidents(da_motion, folder / "accidents.json", tokens)
+
+
+@pytest.fixture(scope="module")
+def motion(da_motion: DeepAccident, folder: Path, tokens: list[str]) -> Path:
+    """The labels as predictions, moved by a column."""
+    with ResultsWriter(folder / "motion", "motion", meta={"method": "<b>moved</b>"}) as writer:
+        for token in tokens:
+            label = da_motion.motion_labels(token).to_present("bilinear")
+            writer.add(token, instances_of(np.roll(label.instance, 1, axis=2), label.config.grid))
+    return folder / "motion"
+
+
+@pytest.fixture(scope="module")
+def boxes(da_motion: DeepAccident, folder: Path, tokens: list[str]) -> Path:
+    """The true boxes."""
+    with ResultsWriter(folder / "boxes.json", "detection") as writer:
+        for token in tokens:
+            there = da_motion.boxes(token)
+            writer.add(token, DetectedBoxes(boxes=there, scores=np.linspace(0.1, 1, len(there))))
+    return folder / "boxes.json"
+
+
+@pytest.fixture(scope="module")
+def bundle(da_motion: DeepAccident, folder: Path, accidents: Path) -> Path:
+    """An evaluation with all that there is."""
+    out = folder / "bundle"
+    evaluate(
+        *("accident", da_motion.dataroot, "--results", accidents, *LIST, "--protocol", "boxes", "--out", out),
+        *("--sanity", "--explain", "--include-results"),
+    )
+    return out
+
+
+@pytest.mark.parametrize(
+    ("task", "results", "protocol", "headline"),
+    [
+        ("motion", "motion", "released", "iou 30x30"),
+        ("motion", "motion", "paper", "iou 30x30"),
+        ("accident", "motion", "released", "apa"),
+        ("accident", "motion", "paper", "apa"),
+        ("accident", "motion", "boxes", "average_precision"),
+        ("accident", "accidents", "boxes", "average_precision"),
+        ("accident", "accidents", "paper", "apa"),
+        ("detection", "boxes", "released", "mAP"),
+        ("detection", "boxes", "paper", "mAP"),
+        ("detection", "boxes", "opencood", "mAP"),
+        ("warning", "accidents", "boxes", "warned_share"),
+    ],
+)
+def test_every_task_and_protocol(
+    da_motion: DeepAccident, request: pytest.FixtureRequest, task: str, results: str, protocol: str, headline: str
+) -> None:
+    path = request.getfixturevalue(results)
+    words = (task, da_motion.dataroot, "--results", path, *LIST, "--protocol", protocol, "--samples", "evaluate")
+    text = evaluate(*words, "--scope", "accident").output
+    assert f"{task}, protocol {protocol}" in text
+    assert "samples      8 of 1 scenarios: split train" in text
+    assert f"\n  {headline} " in text
+    assert "PARTIAL" not in text
+
+
+def test_a_bundle_with_all_there_is(bundle: Path, accidents: Path, da_motion: DeepAccident) -> None:
+    names = {path.name for path in bundle.iterdir()}
+    assert names == {
+        *("metrics_summary.json", "counts.json", "samples.parquet", "scenarios.json", "files.json"),
+        *("report.html", "figures", "results"),
+    }
+    summary = read_bundle(bundle).summary
+    assert summary["sanity"]["samples"] == 8
+    assert summary["explanation"]["protocol"].startswith("boxes")
+    assert summary["release"]["dataroot"] == str(da_motion.dataroot)
+    assert (bundle / "results" / accidents.name).read_bytes() == accidents.read_bytes()
+    assert not bundle.with_name("bundle.unfinished").exists()
+
+
+def test_json_is_the_summary(da_motion: DeepAccident, accidents: Path, tmp_path: Path) -> None:
+    words = ("accident", da_motion.dataroot, "--results", accidents, *LIST, "--protocol", "boxes")
+    done = evaluate(*words, "--by", "town", "--switch", "scoring.limit_counts=true", "--json", "--out", tmp_path / "b")
+    summary = json.loads(done.stdout)
+    assert list(summary["breakdowns"]) == ["all", "town"]
+    assert summary["switches"] == {"scoring.limit_counts": True}
+    assert summary == read_bundle(tmp_path / "b").summary
+    assert f"written: {tmp_path / 'b'}" in done.stderr
+
+
+class TestPartial:
+    def test_refused_unless_allowed_and_marked_everywhere(
+        self, da_motion: DeepAccident, tokens: list[str], tmp_path: Path
+    ) -> None:
+        some = write_accidents(da_motion, tmp_path / "some.json", tokens[3:])
+        words = ("accident", da_motion.dataroot, "--results", some, *LIST, "--protocol", "boxes")
+        failed = run(*words, "--out", tmp_path / "bundle")
+        assert failed.returncode == 2
+        assert "3 of 8 samples have no prediction" in failed.stderr
+        assert "--allow-partial" in failed.stderr
+        assert not list(tmp_path.glob("bundle*"))
+        text = evaluate(*words, "--allow-partial", "--sanity", "--out", tmp_path / "bundle").stdout
+        titles = [block.splitlines()[0] for block in text.split("\n\n")]
+        assert len(titles) > 4
+        assert all("PARTIAL: 5 of 8 samples" in title for title in titles)
+        assert "PARTIAL: 5 of 8 samples" in (tmp_path / "bundle" / "report.html").read_text(encoding="utf-8")
+
+    def test_the_list_that_was_meant(self, da_motion: DeepAccident, tmp_path: Path) -> None:
+        meant = da_motion.evaluation_samples("train", "paper", scope="all")
+        results = write_accidents(da_motion, tmp_path / "all.json", meant)
+        with pytest.raises(
+            ResultsError, match=r"made for split train, samples evaluate \(the last 2 s\), scope all, all"
+        ):
+            evaluate("accident", da_motion.dataroot, "--results", results, "--protocol", "boxes", "--split", "train")
+
+
+class TestVerify:
+    def test_the_same(self, bundle: Path) -> None:
+        done = run("verify", bundle, "--on-error", "skip")
+        assert (done.returncode, "the same; 8 samples evaluated again" in done.stdout) == (0, True), done.stderr
+
+    def test_differences(self, bundle: Path) -> None:
+        path = bundle / "metrics_summary.json"
+        before = path.read_text()
+        summary = json.loads(before)
+        summary["metrics"]["apa"] = 0.5
+        path.write_text(json.dumps(summary))
+        try:
+            assert "number: metrics/apa: stored 0.5, found 1.0" in evaluate("verify", bundle, status=1).output
+            stated = json.loads(evaluate("verify", bundle, "--json", status=1).stdout)
+            assert [each["where"] for each in stated["differences"]] == ["metrics_summary.json", "metrics/apa"]
+        finally:
+            path.write_text(before)
+
+    def test_no_bundle_and_no_release(self, bundle: Path, tmp_path: Path) -> None:
+        for words in (("verify", tmp_path), ("verify", bundle, "--dataroot", tmp_path / "nowhere")):
+            failed = run(*words)
+            assert (failed.returncode, failed.stderr.startswith("error: ")) == (2, True)
+
+
+@pytest.fixture(scope="module")
+def two(da_motion: DeepAccident, folder: Path) -> list[Path]:
+    """Of two scenarios each; the second is worse."""
+    made, selection = [], SampleSelection(split="train", scope="all", agents=AGENTS)
+    for name, moved in (("a", 0.1), ("b", 1.0)):
+        results = write_accidents(da_motion, folder / f"{name}.json", selection.tokens(da_motion), moved)
+        setup = EvaluationSetup(task="accident", protocol="boxes")
+        made.append(save_run(evaluate_results(da_motion, results, setup, selection, workers=1), folder / name))
+    return made
+
+
+class TestCompare:
+    def test_text_and_files(self, two: list[Path], tmp_path: Path) -> None:
+        for name in ("numbers.csv", "numbers.json"):
+            text = evaluate("compare", *two, "--bootstrap", 20, "--out", tmp_path / name).output
+            # one accident says nothing of others
+            error = next(line.split() for line in text.splitlines() if line.startswith("position_error"))
+            assert (error[2:5], error[-1]) == (["0.283", "2.828", "+2.546"], "no")
+            assert f"written: {tmp_path / name}" in text
+        stated = json.loads((tmp_path / "numbers.json").read_text())
+        assert stated == json.loads(evaluate("compare", *two, "--bootstrap", 20, "--json").stdout)
+        assert (tmp_path / "numbers.csv").read_text().count("\n") == len(stated["numbers"]) + 1
+
+    def test_refused(self, two: list[Path], bundle: Path, tmp_path: Path) -> None:
+        with pytest.raises(EvaluationError, match=r"samples only in .*; evaluate both at the same samples"):
+            evaluate("compare", two[0], bundle)
+        text = evaluate("compare", *two, "--out", tmp_path / "numbers.txt", status=2).output
+        assert "--out: expected a file ….csv or ….json" in text
+
+
+class TestValidate:
+    def test_tells_what_it_holds(self, motion: Path, accidents: Path, boxes: Path) -> None:
+        for path, line in ((motion, "motion"), (accidents, "accident"), (boxes, "detection")):
+            assert evaluate("validate", path).stdout.startswith(f"results      {line}, {path}\n")
+
+    def test_against_a_release(self, da_motion: DeepAccident, motion: Path) -> None:
+        words = ("validate", motion, "--dataroot", da_motion.dataroot, "--split", "train")
+        good = evaluate(*words, "--agents", ",".join(AGENTS)).stdout
+        assert good.endswith("all 8 samples have a prediction, and nothing else has\n")
+        assert "12 of 20 samples have no prediction" in evaluate(*words, status=1).stdout
+
+    def test_the_first_wrong_entry(self, accidents: Path, tmp_path: Path, tokens: list[str]) -> None:
+        content = accidents.read_text().replace('"time":', '"tine":', 1)
+        (tmp_path / "wrong.json").write_text(content)
+        failed = run("validate", tmp_path / "wrong.json")
+        assert failed.returncode == 2
+        assert "time: is missing" in failed.stderr
+        assert any(token in failed.stderr for token in tokens)
+
+
+class TestRefused:
+    @pytest.mark.parametrize(
+        ("options", "error", "sentence"),
+        [
+            (("--switch", "gap=3"), ChoiceError, r"BoxAccidents has no switch 'gap'"),
+            (
+                ("--switch", "min_score=high"),
+                ChoiceError,
+                r"switch min_score: expected a number, such as 0.0, found 'hi",
+            ),
+            (("--split", "nowhere"), ChoiceError, r"split: expected one of train, val"),
+        ],
+    )
+    def test_choices(
+        self, da_motion: DeepAccident, accidents: Path, options: tuple[str, ...], error: type[Exception], sentence: str
+    ) -> None:
+        with pytest.raises(error, match=sentence):
+            evaluate("accident", da_motion.dataroot, "--results", accidents, *LIST, "--protocol", "boxes", *options)
+
+    @pytest.mark.parametrize(
+        ("options", "sentence"),
+        [
+            (("--switch", "min_score"), "--switch: expected NAME=VALUE, found 'min_score'"),
+            (("--agents", "ego"), "--agents: expected all or some of ego_vehicle"),
+            (("--by", "wether"), "Invalid value for '--by'"),
+            (("--protocol", "boxy"), "Invalid value for '--protocol'"),
+        ],
+    )
+    def test_words(self, da_motion: DeepAccident, accidents: Path, options: tuple[str, ...], sentence: str) -> None:
+        words = ("accident", da_motion.dataroot, "--results", accidents, *options)
+        assert sentence in evaluate(*words, status=2).output
+
+    def test_a_place_that_is_taken_before_the_release_is_read(self, accidents: Path, tmp_path: Path) -> None:
+        (tmp_path / "thesis.tex").touch()
+        with pytest.raises(ResultsError, match=r"is not empty and holds no evaluation"):
+            evaluate("accident", tmp_path / "no release", "--results", accidents, "--out", tmp_path)
+
+
+def test_tasks_have_the_grammar_of_all_verbs_on_a_release() -> None:
+    for name in ("motion", "accident", "detection", "warning"):
+        text = evaluate(name, "--help").output
+        for word in ("DATAROOT", "--version", "--index-dir", "--workers", "--on-error", "--results", "--protocol"):
+            assert word in text
+    assert "[boxes]" in evaluate("warning", "--help").output
+
+
+def test_the_group_names_its_verbs() -> None:
+    text = evaluate("--help").output
+    for name in ("motion", "accident", "detection", "warning", "validate", "verify", "compare"):
+        assert f"  {name} " in text

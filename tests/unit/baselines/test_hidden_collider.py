@@ -1,0 +1,38 @@
+from pathlib import Path
+
+import pytest
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.baselines import demo_table
+from deepaccident_devkit.errors import NotAvailableError
+from deepaccident_devkit.synth import SynthConfig, make_release
+
+
+def assert_five_agents_win(da: DeepAccident) -> None:
+    (single, five), text = demo_table(da)
+    assert (single.agents, five.agents) == ("single", "all")
+    assert five.iou > single.iou + 10
+    assert five.vpq > single.vpq + 10
+    assert five.apa > single.apa + 0.1
+    assert five.warning >= single.warning + 0.5
+    assert single.warning <= 1.2
+    heading, alone, together = text.splitlines()
+    assert heading.split() == ["IoU", "(%)", "VPQ", "(%)", "APA", "(boxes)", "warning", "(s)"]
+    assert alone.startswith("single vehicle ")
+    assert together.split()[-1] == f"{five.warning:.1f}"
+
+
+def test_five_agents_win_on_the_demos_seed(da_hidden: DeepAccident) -> None:
+    assert_five_agents_win(da_hidden)
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_five_agents_win_on_other_seeds(tmp_path: Path, seed: int) -> None:
+    config = SynthConfig(scenarios=1, frames=30, sensors=False, view="hidden", seed=seed)
+    assert_five_agents_win(DeepAccident("v1", make_release(tmp_path / "hidden", config, workers=1), verbose=False))
+
+
+def test_a_scenario_without_an_accident_is_refused(da_motion: DeepAccident) -> None:
+    normal = next(each for each in da_motion.scenario if not each["collision"])
+    with pytest.raises(NotAvailableError, match=f"{normal['token']}: nobody collides; choose a scenario with an"):
+        demo_table(da_motion, normal)

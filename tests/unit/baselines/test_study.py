@@ -1,0 +1,149 @@
+import csv
+import shutil
+from pathlib import Path
+
+import pytest
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.baselines import METRICS, StudyConfig, StudyRow, V2XStudy, v2x_study
+from deepaccident_devkit.baselines.conditions import Condition
+from deepaccident_devkit.baselines.counting import Counting, counted
+from deepaccident_devkit.baselines.figures import study_panels
+from deepaccident_devkit.baselines.study_samples import study_samples
+from deepaccident_devkit.errors import ChoiceError, NotAvailableError
+from deepaccident_devkit.v2x import AGENT_CONFIGS
+
+QUICK = StudyConfig(quick=True)
+TABLES = ["configurations", "visibility", "horizons", "pose_noise", "latency"]
+
+
+@pytest.fixture(scope="module")
+def study(da_hidden: DeepAccident) -> V2XStudy:
+    return v2x_study(da_hidden, "train", QUICK, workers=1)
+
+
+def rows(study: V2XStudy, table: str, **wanted: object) -> list[StudyRow]:
+    return [
+        row for row in study.tables[table].rows if all(getattr(row, name) == value for name, value in wanted.items())
+    ]
+
+
+def test_it_has_the_papers_tables_and_configurations(study: V2XStudy) -> None:
+    assert list(study.tables) == TABLES
+    assert [row.agents for row in study.tables["configurations"].rows] == list(AGENT_CONFIGS)
+    assert {row.group for row in study.tables["visibility"].rows} == {"visible", "invisible"}
+    assert {(row.horizon, row.group) for row in study.tables["horizons"].rows} >= {(2.0, "2 s"), (4.0, "3 s")}
+    assert {row.pose_noise for row in study.tables["pose_noise"].rows} == {0.0, 0.2, 0.5}
+    assert {row.agents for row in study.tables["latency"].rows} == {"+infrastructure", "all"}
+    assert all(row.metrics.keys() == METRICS.keys() for table in study.tables.values() for row in table.rows)
+
+
+def test_whoever_sees_more_foresees_more(study: V2XStudy) -> None:
+    single, everybody = (rows(study, "configurations", agents=name)[0].metrics for name in ("single", "all"))
+    for name in ("iou_100", "vpq_100", "apa", "boxes_apa", "boxes_recall"):
+        assert (everybody[name] or 0) > (single[name] or 0), name
+    unseen, together = (
+        rows(study, "visibility", agents=name, group="invisible")[0].metrics for name in ("single", "all")
+    )
+    assert unseen["apa"] == unseen["boxes_recall"] == 0
+    assert together["apa"] == 1
+
+
+def test_noise_and_delay_make_it_worse(study: V2XStudy) -> None:
+    for table, field in (("pose_noise", "pose_noise"), ("latency", "latency")):
+        values = [row.metrics["iou_100"] for row in rows(study, table, agents="all")]
+        assert values == sorted(values, reverse=True), field
+        assert values[0] > values[-1] + 5  # type: ignore[operator]
+
+
+def test_the_same_samples_stand_in_all_rows(study: V2XStudy) -> None:
+    perfect = rows(study, "configurations", agents="all")[0]
+    assert {row.samples for name in ("configurations", "pose_noise", "latency") for row in study.tables[name].rows} == {
+        4
+    }
+    for table in ("pose_noise", "latency"):
+        assert rows(study, table, agents="all")[0].metrics == perfect.metrics
+    parts = rows(study, "visibility", agents="single")
+    assert sum(part.samples for part in parts) == perfect.samples
+
+
+def test_samples_without_a_past_for_the_delay_are_left_out_everywhere(study: V2XStudy) -> None:
+    assert study.notes == (
+        "4 s ahead: 1 of 7 samples are left out, since their scenario lacks an agent or has no past of 0.5 s",
+    )
+    assert {row.samples for row in rows(study, "horizons", horizon=4.0, group="all")} == {6}
+
+
+def test_two_workers_give_the_same_bits(da_hidden: DeepAccident) -> None:
+    counting = Counting(dataset=da_hidden, model="constant_velocity", protocol="paper", seed=0)
+    conditions = [Condition(agents="all", pose_noise=0.3), Condition(agents="single")]
+    samples = dict.fromkeys(da_hidden.samples("train", "evaluate")[:6], conditions)
+    one, two = (counted(counting, samples, workers=workers) for workers in (1, 2))
+    for condition in conditions:
+        for name in ("motion", "maps", "boxes"):
+            assert getattr(one[condition], name).compute() == getattr(two[condition], name).compute()
+            assert len(getattr(two[condition], name)) == 6
+
+
+def test_its_forms_say_the_same(study: V2XStudy, tmp_path: Path) -> None:
+    text = study.to_text()
+    assert "accidents in maps by the protocol 'paper'" in text
+    assert all(table.title in text for table in study.tables.values())
+    assert [path.name for path in study.to_csv(tmp_path)] == [f"{name}.csv" for name in TABLES]
+    with (tmp_path / "visibility.csv").open(encoding="utf-8") as file:
+        first = next(csv.DictReader(file))
+    assert (first["agents"], first["group"], first["position_error"]) == ("single", "invisible", "")
+    assert float(first["iou_100"]) == study.tables["visibility"].rows[0].metrics["iou_100"]
+    described = study.as_dict()
+    assert described["config"]["egos"] == ["ego_vehicle"]
+    assert described["tables"]["latency"]["rows"][0]["metrics"]["apa"] == 1
+    with pytest.raises(TypeError, match="cannot be changed"):
+        study.tables["latency"] = study.tables["horizons"]  # type: ignore[index]
+
+
+def test_a_table_is_drawn_by_horizon_and_metric(study: V2XStudy) -> None:
+    assert [len(row) for row in study_panels(study.tables["horizons"])] == [4, 4]
+    (panels,) = study_panels(study.tables["latency"])
+    assert panels[0].xlabel == "latency (s)"
+    assert list(panels[0].values["all"]) == [0.0, 0.2, 0.5]
+    (bars,) = study_panels(study.tables["visibility"])
+    assert bars[2].values["single"] == {"invisible": 0.0, "visible": 1.0}
+    assert [panel.top for panel in bars] == [100, 100, 1, 1]
+
+
+def test_configurations_whose_agents_are_nowhere_are_left_out(da_hidden: DeepAccident, tmp_path: Path) -> None:
+    root = tmp_path / "partial"
+    shutil.copytree(da_hidden.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident", "other_vehicle_behind"))
+    partial = DeepAccident("v1", root, verbose=False)
+    found = study_samples(partial, "train", [2.0], egos=["ego_vehicle"])
+    assert found.agents == ("single", "+behind", "+other", "+infrastructure", "+behind+other")
+    assert found.notes == ("left out, since an agent is not in this release: vehicles, all",)
+    assert len(found.tokens[2.0]) == 4
+    with pytest.raises(NotAvailableError, match="train: no sample here of other_vehicle_behind can be compared"):
+        study_samples(partial, "train", [2.0], egos=["other_vehicle_behind"])
+
+
+@pytest.mark.parametrize("protocol", ["released", "boxes"])
+def test_other_protocols_and_egos(da_hidden: DeepAccident, monkeypatch: pytest.MonkeyPatch, protocol: str) -> None:
+    monkeypatch.setattr("deepaccident_devkit.baselines.conditions._QUICK_HORIZONS", (2.0,))
+    monkeypatch.setattr("deepaccident_devkit.baselines.conditions._QUICK_STEPS", (0.0,))
+    config = StudyConfig(quick=True, protocol=protocol, egos=["other_vehicle"])
+    study = v2x_study(da_hidden, "train", config, workers=1)
+    assert rows(study, "configurations", agents="all")[0].metrics["apa"] is not None
+    assert "ego: other_vehicle;" in study.to_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"egos": "ego_vehicle"}, r"egos: expected several agents, found 'ego_vehicle'; give \['ego_vehicle'\]"),
+        ({"egos": ["ego"]}, "egos: expected some of ego_vehicle, .*, found ego"),
+        ({"egos": []}, "egos: expected some of ego_vehicle, .*, found none"),
+        ({"model": "still"}, "model: expected one of constant_velocity, constant_turn_rate, found 'still'"),
+        ({"protocol": "mine"}, "protocol: expected one of released, paper, boxes, found 'mine'"),
+        ({"scope": "some"}, "scope: expected one of accident, all, found 'some'"),
+    ],
+)
+def test_configurations_that_cannot_be_are_refused(options: dict[str, object], sentence: str) -> None:
+    with pytest.raises(ChoiceError, match=sentence):
+        StudyConfig(**options)  # type: ignore[arg-type]

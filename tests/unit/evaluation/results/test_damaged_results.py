@@ -1,0 +1,550 @@
+"""Results that are not as their format says are refused, and the message names token and field."""
+
+import gzip
+import io
+import json
+import pickle
+import re
+import struct
+import warnings
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import plain_results as plain
+import pytest
+
+from deepaccident_devkit.errors import ResultsError
+from deepaccident_devkit.evaluation.results import read_results
+
+FIRST, SECOND, THIRD = plain.TOKENS
+Document = dict[str, Any]
+
+
+def refused(path: Path, *words: str) -> None:
+    """Reading fails, or else the check of all arrays, with a sentence that has these words in this order."""
+    pattern = ".*".join(map(re.escape, words))
+    with pytest.raises(ResultsError, match=f"(?s){pattern}"):
+        read_results(path).check()
+
+
+def with_entry(kind: str, **changes: Any) -> Document:
+    """Accidents or boxes whose second entry of the first sample is another; `...` takes the field away."""
+    told = plain.accidents() if kind == "accident" else plain.detections()
+    entry = {**told["results"][FIRST][1], **changes}
+    told["results"][FIRST][1] = {name: value for name, value in entry.items() if value is not ...}
+    return told
+
+
+HEADERS: dict[str, tuple[Any, ...]] = {
+    "another format": ({"format": "COCO"}, 'format: expected "DeepAccident results", found "COCO"'),
+    "no format": ({"format": ...}, 'has no "format" (a nuScenes results file?); put "format"'),
+    "no version": ({"version": ...}, "version: is missing"),
+    "a newer version": ({"version": 2}, "version: a newer results format (2, this devkit's is 1); update the devkit"),
+    "an older version": ({"version": 0}, "version: an older results format (0, this devkit's is 1); write it anew"),
+    "a version that is a text": ({"version": "1"}, 'version: expected 1, found "1"'),
+    "a version that is true": ({"version": True}, "version: expected 1, found true"),
+    "no task": ({"task": ...}, "task: is missing"),
+    "an unknown task": ({"task": "tracking"}, 'task: expected one of motion, accident, detection, found "tracking"'),
+    "a list of tasks": (
+        {"task": ["accident"]},
+        'task: expected one of motion, accident, detection, found ["accident"]',
+    ),
+    "no meta": ({"meta": ...}, "meta: is missing"),
+    "meta that is a text": ({"meta": "mine"}, 'meta: expected an object, {} to say nothing, found "mine"'),
+    "no results": ({"results": ...}, "results: is missing"),
+    "an unknown field": ({"result": {}}, "result: is no field of the format"),
+    "results in a list": ({"results": []}, "results: expected an object, sample token to list of entries, found []"),
+    "no sample": ({"results": {}}, "results: holds no sample"),
+    "an empty token": ({"results": {"": []}}, "results: expected a sample's token"),
+    "a token of a parent": ({"results": {"a/../b": []}}, "results: expected a sample's token", "'a/../b'"),
+    "null for no accident": ({"results": {FIRST: None}}, f"results: {FIRST}: expected a list of entries, [] for none"),
+    "an object for a list": ({"results": {FIRST: plain.accident()}}, f"results: {FIRST}: expected a list of entries"),
+    "an entry that is a number": (
+        {"results": {FIRST: [], SECOND: [3]}},
+        f"results: {SECOND}: entry 0: expected an object",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", HEADERS)
+def test_headers(tmp_path: Path, kind: str) -> None:
+    changes, *words = HEADERS[kind]
+    told = {name: value for name, value in {**plain.accidents(), **changes}.items() if value is not ...}
+    refused(plain.write_json(tmp_path / "accident.json", told), "accident.json: ", *words)
+
+
+TEXTS: dict[str, tuple[str, str, tuple[str, ...]]] = {
+    "cut off": ("]}}", "]}", ("is no JSON (",)),
+    "a token twice": (f'"{SECOND}"', f'"{FIRST}"', (f"results: {FIRST}: stands there twice",)),
+    "a field twice": ('"time": 0', '"time": 0, "score": 1', (f"results: {FIRST}: entry 1: score: stands there twice",)),
+    "results twice": ('"task": "accident"', '"task": "accident", "results": {}', ("results: stands there twice",)),
+    "NaN": ('"time": 0', '"time": NaN', (f"results: {FIRST}: entry 1: time: expected a finite number, found NaN",)),
+    "Infinity": ("[13.0,", "[-Infinity,", (f"{FIRST}: entry 0: positions: entry 1: entry 0: ", "found Infinity")),
+    "NaN in meta": ('"plain"', "[NaN]", ("meta: method: entry 0: expected a finite number, found NaN",)),
+    "beyond floats in meta": ('"plain"', "1e999", ("meta: cannot be written as JSON",)),
+    "beyond floats": ('"time": 0', '"time": 1e999', (f"results: {FIRST}: entry 1: time: expected a finite number",)),
+    "whole beyond floats": ('"time": 0', f'"time": 1{"0" * 400}', (f"results: {FIRST}: entry 1: time: expected",)),
+    "thousands of digits": ('"time": 0', f'"time": 1{"0" * 9000}', ("accident.json: ",)),
+    "other bytes than UTF-8": ('"plain"', '"\udcff"', ("is no JSON (",)),
+    "half a character in meta": (
+        '"plain"',
+        '["\\ud83d"]',
+        ("meta: method: entry 0: expected characters, found half of",),
+    ),
+    "half a character in a name": (
+        '"method"',
+        '"\\uDC00"',
+        ("meta: expected a name of characters, found half of one",),
+    ),
+    "nested deeper than reports show": ('"plain"', f"{'[' * 40}{']' * 40}", ("meta: is nested more than 30 levels",)),
+    "nested a million deep": ('"plain"', "[" * 10**6, ("is nested too deeply",)),
+}
+
+
+@pytest.mark.parametrize("kind", TEXTS)
+def test_what_is_no_json(tmp_path: Path, kind: str) -> None:
+    old, new, words = TEXTS[kind]
+    text = json.dumps(plain.accidents())
+    assert old in text
+    path = tmp_path / "accident.json"
+    path.write_text(text.replace(old, new, 1), encoding="utf-8", errors="surrogateescape")
+    refused(path, *words)
+
+
+ACCIDENTS: dict[str, tuple[dict[str, Any], str]] = {
+    "no positions": ({"positions": ...}, "positions: is missing (expected positions, time, score)"),
+    "one position": ({"positions": [[1, 2]]}, "positions: expected two points [[x, y], [x, y]]"),
+    "positions in space": ({"positions": [[1, 2, 0], [3, 4, 0]]}, "positions: expected two points"),
+    "positions that are flat": ({"positions": [1, 2, 3, 4]}, "positions: expected two points"),
+    "a position that is a text": (
+        {"positions": [[1, "2"], [3, 4]]},
+        "positions: expected two points",
+    ),
+    "a position that is true": ({"positions": [[1, True], [3, 4]]}, "positions: expected two points"),
+    "a time that is a text": (
+        {"time": "soon"},
+        'time: expected a finite number of seconds from 0 to 1,000,000, found "soon"',
+    ),
+    "a time of the past": ({"time": -0.5}, "time: expected a finite number of seconds from 0 to 1,000,000, found -0.5"),
+    "positions whose squares overflow": ({"positions": [[1e200, 0], [0, 0]]}, "positions: expected two points"),
+    "a time beyond all recordings": ({"time": 1.7e308}, "time: expected a finite number of seconds from 0"),
+    "no time": ({"time": ...}, "time: is missing"),
+    "null for a score": ({"score": None}, "score: expected a finite number, found null"),
+    "a score that is true": ({"score": True}, "score: expected a finite number, found true"),
+    "an id that is a float": ({"ids": [1236.0, 1240]}, "ids: expected two whole numbers, or null"),
+    "an id that is true": ({"ids": [True, 1240]}, "ids: expected two whole numbers, or null"),
+    "an id that is a text": ({"ids": ["1236", 1240]}, "ids: expected two whole numbers, or null"),
+    "three ids": (
+        {"ids": [1, 2, 3]},
+        "ids: expected two whole numbers, or null where they are not known, found [1, 2, 3]",
+    ),
+    "an id of 70 bits": ({"ids": [2**70, 1]}, "ids: expected two whole numbers"),
+    "a misspelt field": ({"id": [1, 2]}, "id: is no field of the format (expected positions, time, score, ids)"),
+}
+
+
+@pytest.mark.parametrize("kind", ACCIDENTS)
+def test_accidents(tmp_path: Path, kind: str) -> None:
+    changes, words = ACCIDENTS[kind]
+    path = plain.write_json(tmp_path / "accident.json", with_entry("accident", **changes))
+    refused(path, f"results: {FIRST}: entry 1: {words}")
+
+
+BOXES: dict[str, tuple[dict[str, Any], str]] = {
+    "another sample's token": (
+        {"sample_token": SECOND},
+        f"sample_token: expected {FIRST}, under which it stands, found",
+    ),
+    "no token": ({"sample_token": ...}, "sample_token: is missing"),
+    "a translation on the ground": ({"translation": [1, 2]}, "translation: expected [x, y, z] of finite numbers"),
+    "a translation beyond the world": ({"translation": [1e9, 2, 3]}, "translation: expected [x, y, z] of finite num"),
+    "a negative size": ({"size": [1, -2, 1]}, "size: expected [width, length, height] of finite numbers from 0"),
+    "a yaw": ({"rotation": 0.3}, "rotation: expected a unit quaternion [w, x, y, z], found 0.3"),
+    "a quaternion of length 2": ({"rotation": [2, 0, 0, 0]}, "rotation: expected a unit quaternion"),
+    "a quaternion beyond floats": ({"rotation": [1e300, 0, 0, 0]}, "rotation: expected a unit quaternion"),
+    "null in a velocity": (
+        {"velocity": [None, None]},
+        "velocity: expected [vx, vy] of finite numbers up to 1,000,000, m/s",
+    ),
+    "a velocity in space": ({"velocity": [1, 2, 0]}, "velocity: expected [vx, vy]"),
+    "an unknown category": (
+        {"detection_name": "bus"},
+        "detection_name: expected one of car, truck",
+    ),
+    "a category's number": ({"detection_name": 0}, "detection_name: expected one of car, truck"),
+    "a list of categories": ({"detection_name": ["car"]}, "detection_name: expected one of car, truck"),
+    "a score that is a text": ({"detection_score": "0.9"}, 'detection_score: expected a finite number, found "0.9"'),
+    "an unknown field": ({"tracking_id": "3"}, "tracking_id: is no field of the format"),
+}
+
+
+@pytest.mark.parametrize("kind", BOXES)
+def test_boxes(tmp_path: Path, kind: str) -> None:
+    changes, words = BOXES[kind]
+    path = plain.write_json(tmp_path / "detection.json", with_entry("detection", **changes))
+    refused(path, f"results: {FIRST}: entry 1: {words}")
+
+
+def test_the_first_of_several_wrong_entries_is_named(tmp_path: Path) -> None:
+    tokens = [f"{plain.SCENARIO}/ego_vehicle/{frame:03d}" for frame in range(1, 100)]
+    results = {token: [plain.accident() for _ in range(5)] for token in tokens}
+    for token, number in ((tokens[40], 3), (tokens[41], 0), (tokens[97], 4)):
+        results[token][number]["score"] = "high"
+    path = plain.write_json(tmp_path / "accident.json", plain.document("accident", results=results))
+    refused(path, f'results: {tokens[40]}: entry 3: score: expected a finite number, found "high"')
+
+
+MANIFESTS: dict[str, tuple[Callable[[Document], object], tuple[str, ...]]] = {
+    "no form": (lambda told: told.pop("form"), ("form: is missing",)),
+    "a form that is a text": (lambda told: told.update(form="instances"), ("form: expected an object",)),
+    "no step": (lambda told: told["form"].pop("step"), ("form: step: is missing",)),
+    "a step of no frame": (lambda told: told["form"].update(step=0.25), ("form: step: expected seconds",)),
+    "a step that is a text": (lambda told: told["form"].update(step="0.5"), ("form: step: expected a number",)),
+    "no prediction": (lambda told: told["form"].update(predictions=0), ("form: predictions: expected a whole",)),
+    "half a frame": (lambda told: told["form"].update(frames=2.5), ("form: frames: expected a whole number from 1",)),
+    "true frames": (lambda told: told["form"].update(frames=True), ("form: frames: expected a whole number from 1",)),
+    "more than memory": (
+        lambda told: told["form"].update(predictions=10**9),
+        (
+            "form: ",
+            "more than memory holds",
+        ),
+    ),
+    "an unknown store": (lambda told: told["form"].update(stored="logits"), ("form: stored: expected one of",)),
+    "an unknown orientation": (lambda told: told["form"].update(orientation="north"), ("form: orientation: expected",)),
+    "unknown labels": (lambda told: told["form"].update(labels="mine"), ("form: labels: expected one of",)),
+    "an axis of two numbers": (lambda told: told["form"].update(x=[-2, 2]), ("form: x: expected start, end and cell",)),
+    "an axis of texts": (lambda told: told["form"].update(y=["a", "b", "c"]), ("form: y: expected a number",)),
+    "an axis of half cells": (lambda told: told["form"].update(x=[-2, 2, 0.3]), ("form: x: ", "whole number of cells")),
+    "an unknown field": (lambda told: told["form"].update(z=1), ("form: z: is no field of the format",)),
+    "no shards": (lambda told: told.update(shards=[]), ("shards: expected a list of at least one",)),
+    "a shard that is a text": (lambda told: told["shards"].append("a.npz"), ("shards: entry 2: expected an object",)),
+    "no checksum": (lambda told: told["shards"][1].pop("checksum"), ("shards: entry 1: checksum: is missing",)),
+    "another checksum": (lambda told: told["shards"][1].update(checksum="00"), ("shards/00001.npz: ", "checksum")),
+    "another size": (
+        lambda told: told["shards"][0].update(bytes=7),
+        ("entry 0: bytes: shards/00000.npz should have 7",),
+    ),
+    "a size that is a text": (
+        lambda told: told["shards"][0].update(bytes="7"),
+        ("entry 0: bytes: expected the file's",),
+    ),
+    "a shard that is not there": (
+        lambda told: told["shards"][1].update(file="b.npz"),
+        ("entry 1: file: b.npz cannot be",),
+    ),
+    "a shard outside": (lambda told: told["shards"][1].update(file="../b.npz"), ("file: expected a path inside",)),
+    "an absolute path": (lambda told: told["shards"][1].update(file="/etc/passwd"), ("file: expected a path inside",)),
+    "a shard that is a folder": (
+        lambda told: told["shards"][1].update(file="shards"),
+        ("entry 1: file: shards is not",),
+    ),
+    "a shard twice": (
+        lambda told: told["shards"].append(told["shards"][0]),
+        ("entry 2: file: shards/00000.npz is another",),
+    ),
+    "a sample in two shards": (
+        lambda told: told["shards"][1]["tokens"].append(FIRST),
+        ("shards/00001.npz", FIRST, "stands there also in shards/00000.npz"),
+    ),
+    "a sample twice in a shard": (
+        lambda told: told["shards"][1]["tokens"].append(THIRD),
+        ("shards/00001.npz", THIRD, "stands there twice"),
+    ),
+    "a token that is a number": (
+        lambda told: told["shards"][0]["tokens"].append(3),
+        ("shards: entry 0: tokens: expected a sample's token, a text, found 3",),
+    ),
+    "no tokens": (
+        lambda told: told["shards"][0].update(tokens=[]),
+        ("entry 0: tokens: expected a list of at least one",),
+    ),
+    "a sample without arrays": (
+        lambda told: told["shards"][1]["tokens"].append("a/b/ego_vehicle/001"),
+        ("shards/00001.npz: a/b/ego_vehicle/001: instance: is missing",),
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", MANIFESTS)
+def test_manifests(tmp_path: Path, kind: str) -> None:
+    change, words = MANIFESTS[kind]
+    folder = plain.write_motion(tmp_path / "motion")
+    told = json.loads((folder / "results.json").read_text(encoding="utf-8"))
+    change(told)
+    plain.write_json(folder / "results.json", told)
+    refused(folder, "results.json: ", *words)
+
+
+def test_links_out_of_the_folder(tmp_path: Path) -> None:
+    folder = plain.write_motion(tmp_path / "motion")
+    outside = (folder / "shards" / "00001.npz").rename(tmp_path / "outside.npz")
+    (folder / "shards" / "00001.npz").symlink_to(outside)
+    refused(folder, "shards: entry 1: file: shards/00001.npz is a link that leads out of the folder")
+
+
+def heads(**changes: np.ndarray) -> dict[str, np.ndarray]:
+    return {**plain.head_arrays(), **changes}
+
+
+def maps(**changes: np.ndarray) -> dict[str, np.ndarray]:
+    return {**plain.instance_arrays(), **changes}
+
+
+def with_value(array: np.ndarray, value: float) -> np.ndarray:
+    changed = array.copy()
+    changed.flat[5] = value
+    return changed
+
+
+GOOD, GOOD_HEADS = plain.instance_arrays(), plain.head_arrays()
+ARRAYS: dict[str, tuple[str, dict[str, np.ndarray], tuple[str, ...]]] = {
+    "ids that are floats": (
+        "instances",
+        maps(instance=GOOD["instance"].astype(float)),
+        ("instance: expected unsigned whole numbers or whole numbers, found float64",),
+    ),
+    "ids that are true or false": ("instances", maps(instance=GOOD["instance"] > 0), ("instance: ", "found bool")),
+    "a negative id": (
+        "instances",
+        maps(instance=with_value(GOOD["instance"].astype(np.int16), -1)),
+        ("instance: expected ids from 0 to 2147483647, found -1 to 7",),
+    ),
+    "an id of 40 bits": (
+        "instances",
+        maps(instance=with_value(GOOD["instance"].astype(np.int64), 2**40)),
+        ("instance: expected ids from 0 to 2147483647",),
+    ),
+    "no prediction": (
+        "instances",
+        maps(instance=GOOD["instance"][:0]),
+        ("instance: expected shape (1 to 2, 3, 6, 8)",),
+    ),
+    "more predictions than stated": (
+        "instances",
+        maps(instance=np.tile(GOOD["instance"], (2, 1, 1, 1))),
+        ("instance: expected shape (1 to 2, 3, 6, 8), found (4, 3, 6, 8)",),
+    ),
+    "other frames": ("instances", maps(instance=GOOD["instance"][:, :2]), ("instance: expected shape", "(2, 2, 6, 8)")),
+    "cells that lie otherwise": (
+        "instances",
+        maps(instance=GOOD["instance"].swapaxes(2, 3)),
+        ("instance: expected shape", "(2, 3, 8, 6)"),
+    ),
+    "no axis of predictions": (
+        "instances",
+        maps(instance=GOOD["instance"][0]),
+        ("instance: expected shape", "(3, 6, 8)"),
+    ),
+    "objects": (
+        "instances",
+        maps(instance=GOOD["instance"].astype(object)),
+        ("instance: holds Python objects, a pickle; store numbers",),
+    ),
+    "complex ids": ("instances", maps(instance=GOOD["instance"].astype(complex)), ("instance: ", "found complex128")),
+    "heads among maps": ("instances", heads(), ("segmentation.npy: belongs to no sample of the shard",)),
+    "paths without ids": ("instances", maps(trajectory_id=np.zeros(0, int)), ("trajectory: expected shape (0, 3, 2)",)),
+    "an id of no instance": (
+        "instances",
+        maps(trajectory_id=np.array([1, 6])),
+        ("trajectory_id: the last prediction's instance maps have no id 6",),
+    ),
+    "a path's id twice": ("instances", maps(trajectory_id=np.array([7, 7])), ("trajectory_id: expected each id once",)),
+    "a path of the ground": (
+        "instances",
+        maps(trajectory_id=np.array([0, 7])),
+        ("trajectory_id: expected ids from 1",),
+    ),
+    "a path of float ids": (
+        "instances",
+        maps(trajectory_id=np.array([1.0, 7.0])),
+        ("trajectory_id: expected", "float64"),
+    ),
+    "a path that ends": (
+        "instances",
+        maps(trajectory=GOOD["trajectory"][:, :2]),
+        ("trajectory: expected shape (2, 3, 2)",),
+    ),
+    "half a point": (
+        "instances",
+        maps(trajectory=with_value(GOOD["trajectory"], np.nan)),
+        ("trajectory: of id 1: expected x and y in metres, or NaN for both",),
+    ),
+    "an infinite path": (
+        "instances",
+        maps(trajectory=with_value(GOOD["trajectory"], np.inf)),
+        ("trajectory: of id 1: expected x and y in metres",),
+    ),
+    "NaN in a head": ("heads", heads(centerness=with_value(GOOD_HEADS["centerness"], np.nan)), ("centerness: nan at",)),
+    "an infinite flow": ("heads", heads(flow=with_value(GOOD_HEADS["flow"], np.inf)), ("flow: inf at",)),
+    "whole logits": (
+        "heads",
+        heads(segmentation=GOOD_HEADS["segmentation"].astype(int)),
+        ("segmentation: expected floats, found int64",),
+    ),
+    "three channels": (
+        "heads",
+        heads(offset=np.repeat(GOOD_HEADS["offset"], 2, axis=2)),
+        ("offset: expected shape (1 to 2, 3, 2, 6, 8), found (2, 3, 4, 6, 8)",),
+    ),
+    "fewer offsets than logits": (
+        "heads",
+        heads(offset=GOOD_HEADS["offset"][:1]),
+        ("offset: expected (K, T, channels, H, W)",),
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", ARRAYS)
+def test_arrays(tmp_path: Path, kind: str) -> None:
+    """The fault is in the second sample of the first shard."""
+    stored, arrays, words = ARRAYS[kind]
+    folder = plain.write_motion(tmp_path / "motion", stored)
+    good = plain.instance_arrays() if stored == "instances" else plain.head_arrays()
+    plain.write_shard(folder / "shards" / "00000.npz", {FIRST: good, SECOND: arrays})
+    plain.relist(folder)
+    where = () if "belongs to no sample" in words[0] else (f"{SECOND}: ",)
+    refused(folder, "results.json: shards/00000.npz: ", *where, *words)
+
+
+@pytest.mark.parametrize("missing", ["centerness", "flow"])
+def test_heads_that_are_missing(tmp_path: Path, missing: str) -> None:
+    folder = plain.write_motion(tmp_path / "motion", "heads")
+    arrays = plain.head_arrays()
+    del arrays[missing]
+    plain.write_shard(folder / "shards" / "00000.npz", {FIRST: arrays, SECOND: plain.head_arrays()})
+    plain.relist(folder)
+    refused(folder, f"shards/00000.npz: {FIRST}: {missing}: is missing; expected the member {FIRST}/{missing}.npy")
+
+
+@pytest.mark.parametrize("missing", ["trajectory", "trajectory_id"])
+def test_half_of_the_paths(tmp_path: Path, missing: str) -> None:
+    folder = plain.write_motion(tmp_path / "motion")
+    arrays = plain.instance_arrays()
+    del arrays[missing]
+    plain.write_shard(folder / "shards" / "00000.npz", {FIRST: arrays, SECOND: plain.instance_arrays()})
+    plain.relist(folder)
+    refused(folder, f"shards/00000.npz: {FIRST}: {missing}: is missing")
+
+
+def npy(array: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array)
+    return buffer.getvalue()
+
+
+def claiming(shape: tuple[int, ...]) -> bytes:
+    """The header of a larger array before the bytes of a good one."""
+    good, buffer = plain.instance_arrays()["instance"], io.BytesIO()
+    header = {"descr": "|u1", "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(buffer, header)
+    return buffer.getvalue() + good.tobytes()
+
+
+MEMBER = f"{FIRST}/instance.npy"
+CONTENTS: dict[str, tuple[bytes, str]] = {
+    "a pickle": (pickle.dumps([1, 2]), "instance: cannot be read"),
+    "an empty member": (b"", "instance: cannot be read"),
+    "a header that is cut": (npy(plain.instance_arrays()["instance"])[:40], "instance: cannot be read"),
+    "numbers that are cut": (npy(plain.instance_arrays()["instance"])[:-9], "instance: expected 288 bytes of numbers"),
+    "more numbers": (
+        npy(plain.instance_arrays()["instance"]) + b"\0",
+        "instance: expected 288 bytes of numbers, found 289",
+    ),
+    "the claim of a giant": (claiming((10**6, 3, 6, 8)), "instance: expected shape (1 to 2, 3, 6, 8), found (1000000,"),
+    "a negative shape": (claiming((-2, 3, 6, 8)), "instance: expected shape (1 to 2, 3, 6, 8), found (-2, 3, 6, 8)"),
+    "a header of 4 GB": (b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**32 - 1), "instance: expected npy format 1.0"),
+}
+
+
+@pytest.mark.parametrize("kind", CONTENTS)
+def test_members(tmp_path: Path, kind: str) -> None:
+    content, words = CONTENTS[kind]
+    folder = plain.write_motion(tmp_path / "motion")
+    rewritten(folder, {MEMBER: content})
+    refused(folder, f"shards/00000.npz: {FIRST}: {words}")
+    with pytest.raises(ResultsError, match=re.escape(words)):
+        read_results(folder).prediction(FIRST)
+
+
+def test_a_member_that_is_too_much(tmp_path: Path) -> None:
+    folder = plain.write_motion(tmp_path / "motion")
+    rewritten(folder, {"evil.pkl": pickle.dumps([1])})
+    refused(folder, "shards/00000.npz: evil.pkl: belongs to no sample of the shard")
+
+
+def test_a_member_twice(tmp_path: Path) -> None:
+    folder = plain.write_motion(tmp_path / "motion")
+    with warnings.catch_warnings(), zipfile.ZipFile(folder / "shards" / "00000.npz", "a") as archive:
+        warnings.simplefilter("ignore")
+        archive.writestr(MEMBER, npy(plain.instance_arrays()["instance"]))
+    plain.relist(folder)
+    refused(folder, f"shards/00000.npz: {MEMBER}: stands there 2 times")
+
+
+def rewritten(folder: Path, members: dict[str, bytes]) -> None:
+    """Put other members into the first shard."""
+    path = folder / "shards" / "00000.npz"
+    with zipfile.ZipFile(path) as archive:
+        contents = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in {**contents, **members}.items():
+            archive.writestr(name, content)
+    plain.relist(folder)
+
+
+def test_shards_that_are_cut_or_changed(tmp_path: Path) -> None:
+    folder = plain.write_motion(tmp_path / "motion")
+    path = folder / "shards" / "00000.npz"
+    content = path.read_bytes()
+    path.write_bytes(content[:-1])
+    with pytest.raises(ResultsError, match=r"bytes: shards/00000\.npz should have \d+, found \d+; copy it again"):
+        read_results(folder)
+    plain.relist(folder)
+    refused(folder, "shards/00000.npz: is no npz archive that can be read")
+    with pytest.raises(ResultsError, match=r"shards/00000\.npz: is no npz archive that can be read"):
+        read_results(folder).prediction(FIRST)
+    path.write_bytes(b"\0" + content[1:])
+    told = json.loads((folder / "results.json").read_text(encoding="utf-8"))
+    told["shards"][0]["bytes"] = len(content)
+    plain.write_json(folder / "results.json", told)
+    refused(folder, "shards/00000.npz: its bytes are not those that the checksum is of")
+
+
+def test_no_bit_of_a_shard_is_read_wrongly(tmp_path: Path) -> None:
+    """A shard whose checksum was made after the damage: the archive's own sums say it, or nothing is changed."""
+    folder = plain.write_motion(tmp_path / "motion")
+    path, expected = folder / "shards" / "00000.npz", plain.instance_arrays()["instance"]
+    content = path.read_bytes()
+    outcomes = set()
+    for position in range(0, len(content), 29):
+        path.write_bytes(content[:position] + bytes([content[position] ^ 0x5A]) + content[position + 1 :])
+        plain.relist(folder)
+        try:
+            read = read_results(folder).prediction(FIRST)
+        except ResultsError:
+            outcomes.add("refused")
+        else:
+            np.testing.assert_array_equal(read.instances, expected)
+            outcomes.add("unharmed")
+    assert outcomes == {"refused", "unharmed"}
+
+
+def test_what_is_no_results_file(tmp_path: Path) -> None:
+    refused(tmp_path / "none.json", "none.json: no such file or folder; give the results that ResultsWriter made")
+    refused(tmp_path, "holds no results.json")
+    (tmp_path / "results.json").mkdir()
+    refused(tmp_path, "results.json: not a regular file (a folder)")
+    np.save(tmp_path / "array.npy", np.arange(3))
+    refused(tmp_path / "array.npy", "array.npy: is no JSON")
+    (tmp_path / "packed.json.gz").write_bytes(gzip.compress(b"{}"))
+    refused(tmp_path / "packed.json.gz", "packed.json.gz: is compressed with gzip; unpack it")
+    refused(tmp_path / ("long" * 100), "cannot be read (", "File name too long")
+    refused(tmp_path / "a\0b", "cannot be read (embedded null byte)")
+    folder = plain.write_motion(tmp_path / "motion")
+    (folder / "results.json").rename(folder / "manifest.json")
+    refused(folder / "manifest.json", "is the manifest of motion results; call it results.json")
+    refused(plain.write_json(tmp_path / "list.json", [1]), "list.json: expected a JSON object, found [1]")  # type: ignore[arg-type]

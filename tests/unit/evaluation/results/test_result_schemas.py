@@ -1,0 +1,160 @@
+"""schema/results: the schemas are the code's, their examples are read, and the page's code writes valid files."""
+
+import importlib.util
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import jsonschema
+import numpy as np
+import plain_results as plain
+import pytest
+
+from deepaccident_devkit.errors import ResultsError
+from deepaccident_devkit.evaluation import DetectedBoxes, MotionOutput
+from deepaccident_devkit.evaluation.results import RESULT_SCHEMAS, read_results
+
+SCHEMA = Path(__file__).parents[4] / "schema"
+PAGE = SCHEMA / "results" / "README.md"
+TASKS = ("motion", "accident", "detection")
+STRANGE: tuple[Any, ...] = (None, True, "a", -1, 0.5, 10**30, [], {}, [[1, 2], [3, 4]], ...)
+"""What stands in place of each value in turn; `...` takes it away."""
+
+
+@pytest.fixture(scope="module")
+def generate() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("generate", SCHEMA / "generate.py")
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def validator(task: str) -> Any:
+    return jsonschema.Draft202012Validator(
+        json.loads((SCHEMA / "results" / f"{task}.json").read_text(encoding="utf-8"))
+    )
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+
+
+def document(task: str, folder: Path) -> dict[str, Any]:
+    if task == "motion":
+        told: dict[str, Any] = json.loads((plain.write_motion(folder) / "results.json").read_text(encoding="utf-8"))
+        return told
+    return plain.accidents() if task == "accident" else plain.detections()
+
+
+def places(value: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """The ways to everything in a JSON value, without meta's inside."""
+    if place:
+        yield place
+    inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, each in inside if place != ("meta",) else ():
+        yield from places(each, (*place, key))
+
+
+def changed(told: dict[str, Any], place: tuple[Any, ...], value: Any) -> dict[str, Any]:
+    copy = json.loads(json.dumps(told))
+    inside = copy
+    for key in place[:-1]:
+        inside = inside[key]
+    if value is ...:
+        del inside[place[-1]]
+    else:
+        inside[place[-1]] = value
+    return copy
+
+
+def test_the_files_are_not_stale(generate: ModuleType) -> None:
+    files = generate.generated_results_files()
+    for name, content in files.items():
+        assert (SCHEMA / "results" / name).read_text(encoding="utf-8") == content, "run python schema/generate.py"
+    assert {path.name for path in (SCHEMA / "results").iterdir()} == {*files, "README.md"}
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_page_names_every_field(task: str) -> None:
+    page = PAGE.read_text(encoding="utf-8")
+
+    def names(schema: Any) -> Iterator[str]:
+        if isinstance(schema, dict):
+            yield from schema.get("properties", {})
+            for each in schema.values():
+                yield from names(each)
+
+    named = set(names(RESULT_SCHEMAS[task])) - {"form", "shards"}
+    assert len(named) > 7
+    assert [name for name in named if f"`{name}`" not in page and f".{name}`" not in page] == []
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_good_results_are_valid(task: str, tmp_path: Path) -> None:
+    jsonschema.Draft202012Validator.check_schema(dict(RESULT_SCHEMAS[task]))
+    validator(task).validate(document(task, tmp_path / "m"))
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_what_the_schema_refuses_the_reader_refuses(task: str, tmp_path: Path) -> None:
+    """Every value of good results in turn made another one; the reader may know better, never less."""
+    folder = tmp_path / "m"
+    told, schema = document(task, folder), validator(task)
+    path = folder / "results.json"
+    refused = 0
+    for place in list(places(told)):
+        for value in STRANGE:
+            strange = changed(told, place, value)
+            plain.write_json(path, strange)
+            if schema.is_valid(strange):
+                continue
+            refused += 1
+            with pytest.raises(ResultsError, match=r"(?s)results\.json: ."):
+                read_results(path)
+    assert refused > 100
+
+
+def test_the_examples_of_the_page(tmp_path: Path) -> None:
+    found = [json.loads(block) for block in blocks("json")]
+    assert [example["task"] for example in found] == ["accident", "detection", "motion"]
+    for example in found:
+        validator(example["task"]).validate(example)
+        if example["task"] != "motion":
+            assert len(read_results(plain.write_json(tmp_path / "x.json", example))) == 2
+
+
+def test_the_code_of_the_page_writes_valid_files(tmp_path: Path) -> None:
+    token = plain.TOKENS[0]
+    ids = np.zeros((6, 5, 200, 200), dtype=int)
+    ids[:, :, 120:124, 90:99] = 3
+    given = {
+        "folder": str(tmp_path),
+        "predictions": {token: [plain.accident()], plain.TOKENS[1]: []},
+        "detections": {token: [(100.0, -20.0, 0.8, 4.5, 1.9, 1.6, 0.3, "car", 0.9)], plain.TOKENS[1]: []},
+        "maps": {token: ids, plain.TOKENS[1]: 0 * ids},
+    }
+    codes = blocks("python")
+    assert len(codes) == 3
+    for code in codes:
+        exec(compile(code, str(PAGE), "exec"), dict(given))  # noqa: S102
+    accidents, detections, motion = (
+        read_results(tmp_path / name) for name in ("accident.json", "detection.json", "motion")
+    )
+    for results in (accidents, detections, motion):
+        results.check()
+        assert results.tokens == plain.TOKENS[:2]
+    (accident,) = accidents.prediction(token)  # type: ignore[misc]
+    assert accident.ids == (1236, 1240)
+    detected = detections.prediction(token)
+    assert isinstance(detected, DetectedBoxes)
+    np.testing.assert_array_equal(detected.boxes.size, [[4.5, 1.9, 1.6]])
+    np.testing.assert_allclose(detected.boxes.yaw, [0.3])
+    output = motion.prediction(token)
+    assert isinstance(output, MotionOutput)
+    np.testing.assert_array_equal(output.instances, ids)  # type: ignore[arg-type]
+    np.testing.assert_allclose(motion.trajectories(token)[3], [[-2.75, 11.0]] * 5)

@@ -1,0 +1,295 @@
+"""What is written is what is read, in the form that the page says, and small."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import plain_results as plain
+import pytest
+from accident_scenes import scene
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ResultsError
+from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput, instances_of
+from deepaccident_devkit.evaluation.results import MotionForm, Results, ResultsWriter, read_results
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.motion import MotionHeads, predict_instances, trajectories
+from deepaccident_devkit.taxonomy import CATEGORIES
+
+FIRST, SECOND, THIRD = plain.TOKENS
+GRID = BevGrid((-2.0, 2.0, 0.5), (-1.5, 1.5, 0.5))
+LARGE = BevGrid()
+FINITE = {"allow_nan": False, "allow_infinity": False}
+numbers = st.floats(-1e6, 1e6, **FINITE)
+accidents = st.builds(
+    lambda points, time, score, ids: Accident(positions=np.reshape(points, (2, 2)), time=time, score=score, ids=ids),
+    st.lists(numbers, min_size=4, max_size=4),
+    st.floats(0, 1e3, **FINITE),
+    st.floats(**FINITE),
+    st.none() | st.tuples(st.integers(-(2**63), 2**63 - 1), st.integers(-100, 10**6)),
+)
+
+
+@st.composite
+def boxes(draw: Callable[[Any], Any]) -> DetectedBoxes:
+    count = draw(st.integers(0, 5))
+    source = np.random.default_rng(draw(st.integers(0, 2**32)))
+    velocity = source.normal(0, 10, (count, 3)) * [1, 1, 0]
+    velocity[source.random(count) < 0.3] = np.nan
+    return DetectedBoxes.from_arrays(
+        source.normal(0, 1e3, (count, 3)),
+        source.exponential(3, (count, 3)),
+        source.uniform(-9, 9, count),
+        source.normal(0, 1, count),
+        category=source.integers(0, len(CATEGORIES), count),
+        velocity=velocity,
+        frame="world",
+    )
+
+
+def as_plain(accident: Accident) -> tuple[Any, ...]:
+    return tuple(map(tuple, accident.positions.tolist())), accident.time, accident.score, accident.ids
+
+
+def written(path: Path, task: Any, predictions: dict[str, Any], **options: Any) -> Results:
+    with ResultsWriter(path, task, **options) as writer:
+        for token, prediction in predictions.items():
+            writer.add(token, prediction)
+    return read_results(path)
+
+
+def heads(seed: int = 0, count: int = 2, orientation: Any = "devkit", grid: BevGrid = GRID) -> MotionOutput:
+    source, laid = np.random.default_rng(seed), grid.with_orientation(orientation)
+    maps = [source.normal(size=(count, 3, channels, *laid.shape)).astype(np.float32) for channels in (2, 1, 2, 2)]
+    return MotionOutput.from_arrays(*maps, grid=laid)
+
+
+def thirty_cars(seed: int, noise: float = 2.0) -> MotionOutput:
+    """Five predictions of thirty cars by a model that is not sure of their edges, with wrong cells here and there."""
+    source = np.random.default_rng(seed)
+    starts, steps = source.uniform(-45, 45, (30, 2)), source.uniform(-3, 3, (30, 2))
+    labels = scene({100 + n: [tuple(starts[n] + t * steps[n]) for t in range(5)] for n in range(30)})
+    good = MotionHeads.from_labels(labels)
+    actor = np.pad(labels.segmentation == 1, ((0, 0), (1, 1), (1, 1)))
+    sides = [actor[:, 2:, 1:-1], actor[:, :-2, 1:-1], actor[:, 1:-1, 2:], actor[:, 1:-1, :-2], actor[:, 1:-1, 1:-1]]
+    edge = np.logical_or.reduce(sides) & ~np.logical_and.reduce(sides)
+    predictions = []
+    for _ in range(5):
+        segmentation = good.segmentation + source.normal(0, noise, good.segmentation.shape)
+        flipped = edge & (source.random(edge.shape) < 0.3)
+        segmentation = np.where(flipped[:, None], segmentation[:, ::-1], segmentation)
+        offset, flow = (maps + source.normal(0, 0.7, maps.shape) for maps in (good.offset, good.flow))
+        predictions.append((segmentation, good.centerness, offset, flow))
+    stacked = [np.stack(each).astype(np.float32) for each in zip(*predictions, strict=True)]
+    return MotionOutput.from_arrays(*stacked, grid=LARGE)
+
+
+def labelled(ignore: int | None = None, frames: int = 3) -> MotionHeads:
+    maps = [np.ones((frames, channels, *GRID.shape), dtype=np.float32) for channels in (2, 1, 2, 2)]
+    return MotionHeads.from_arrays(*maps, ignore_index=ignore)
+
+
+class TestEntries:
+    @settings(max_examples=25)
+    @given(st.lists(st.lists(accidents, max_size=4), min_size=1, max_size=4))
+    def test_accidents_come_back(self, tmp_path_factory: pytest.TempPathFactory, lists: list[list[Accident]]) -> None:
+        predictions = {f"a/b/ego_vehicle/{number:03d}": each for number, each in enumerate(lists)}
+        results = written(tmp_path_factory.mktemp("accidents") / "accident.json", "accident", predictions)
+        assert results.tokens == tuple(predictions)
+        for token, given_ones in predictions.items():
+            read = results.prediction(token)
+            assert isinstance(read, list)
+            assert list(map(as_plain, read)) == list(map(as_plain, given_ones))
+
+    @settings(max_examples=25)
+    @given(st.lists(boxes(), min_size=1, max_size=4))
+    def test_boxes_come_back(self, tmp_path_factory: pytest.TempPathFactory, lists: list[DetectedBoxes]) -> None:
+        predictions = {f"a/b/ego_vehicle/{number:03d}": each for number, each in enumerate(lists)}
+        results = written(tmp_path_factory.mktemp("boxes") / "detection.json", "detection", predictions)
+        for token, given_ones in predictions.items():
+            read = results.prediction(token)
+            assert isinstance(read, DetectedBoxes)
+            np.testing.assert_array_equal(read.scores, given_ones.scores)
+            assert read.boxes.frame == "world"
+            for name in ("center", "size", "rotation", "velocity", "category", "actor_id", "row"):
+                np.testing.assert_array_equal(getattr(read.boxes, name), getattr(given_ones.boxes, name))
+
+    def test_the_plain_accidents(self, tmp_path: Path) -> None:
+        results = read_results(plain.write_json(tmp_path / "accident.json", plain.accidents()))
+        assert (results.task, results.meta, results.form) == ("accident", {"method": "plain"}, None)
+        read = results.prediction(FIRST)
+        assert isinstance(read, list)
+        positions = ((12.5, 0.5), (13.0, -2.0))
+        assert list(map(as_plain, read)) == [(positions, 1.5, 0.75, (1236, 1240)), (positions, 0.0, 0.75, None)]
+        assert results.prediction(THIRD) == []
+
+    def test_the_plain_boxes(self, tmp_path: Path) -> None:
+        results = read_results(plain.write_json(tmp_path / "detection.json", plain.detections()))
+        read = results.prediction(FIRST)
+        assert isinstance(read, DetectedBoxes)
+        assert read.boxes.frame == "world"
+        np.testing.assert_array_equal(read.boxes.size, [[4.5, 1.9, 1.6]] * 2)  # length, width, height
+        np.testing.assert_array_equal(read.boxes.center, [[105.25, -33.0, 0.75]] * 2)
+        np.testing.assert_allclose(read.boxes.yaw, 2 * np.arctan2(0.8, 0.6), atol=1e-12)
+        np.testing.assert_array_equal(read.boxes.velocity, [[0, 8.25, 0], [np.nan] * 3])
+        np.testing.assert_array_equal(read.scores, [0.9, 0.9])
+        assert CATEGORIES[read.boxes.category[0]] == "van"
+        assert len(results.prediction(THIRD)) == 0
+
+    def test_a_sample_a_line(self, tmp_path: Path) -> None:
+        predictions = {FIRST: [Accident(positions=np.zeros((2, 2)), time=1.0)], SECOND: []}
+        written(tmp_path / "accident.json", "accident", predictions, meta={"b": 1, "a": [None]})
+        lines = (tmp_path / "accident.json").read_text(encoding="utf-8").splitlines()
+        header = ['"format": "DeepAccident results",', '"version": 1,', '"task": "accident",']
+        assert lines[:6] == ["{", *header, '"meta": {"b": 1, "a": [null]},', '"results": {']
+        assert lines[7:] == [f'"{SECOND}": []', "}", "}"]
+
+    def test_boxes_of_a_release(self, da: DeepAccident, tmp_path: Path) -> None:
+        """The labels as detections: the world's boxes lead back to the LiDAR frame's."""
+        token = da.sample[0]["token"]
+        boxes, world_from_lidar = da.boxes(token, frame="lidar"), da.world_from(token, "lidar")
+        detected = DetectedBoxes(boxes=boxes.transform(world_from_lidar, "world"), scores=np.ones(len(boxes)))
+        read = written(tmp_path / "d.json", "detection", {token: detected}).prediction(token)
+        assert isinstance(read, DetectedBoxes)
+        back = read.boxes.transform(world_from_lidar.inverse(), "lidar")
+        assert len(back) > 3
+        np.testing.assert_allclose(back.center, boxes.center, atol=1e-9)
+        np.testing.assert_allclose(np.exp(1j * back.yaw), np.exp(1j * boxes.yaw), atol=1e-9)
+        np.testing.assert_array_equal(back.size, boxes.size)
+        np.testing.assert_array_equal(back.category, boxes.category)
+
+
+class TestMotion:
+    @pytest.mark.parametrize("orientation", ["devkit", "released", "fiery"])
+    def test_of_heads_their_instances_are_stored(self, tmp_path: Path, orientation: Any) -> None:
+        outputs = {FIRST: heads(1, 2, orientation), SECOND: heads(2, 1, orientation)}
+        results = written(tmp_path / "motion", "motion", outputs, step=0.3, labels="clean")
+        assert results.form == MotionForm(
+            stored="instances",
+            grid=GRID.with_orientation(orientation),
+            predictions=2,
+            frames=3,
+            step=0.3,
+            labels="clean",
+        )
+        for token, output in outputs.items():
+            linked = [predict_instances(each, "motion") for each in output.heads or ()]
+            read = results.prediction(token)
+            assert isinstance(read, MotionOutput)
+            np.testing.assert_array_equal(read.instances, [each.instance for each in linked])  # type: ignore[arg-type]
+            assert read.grid == output.grid
+            paths, expected = results.trajectories(token), trajectories(linked[-1], GRID, "clean")
+            assert paths
+            assert paths.keys() == expected.keys()
+            for name, path in paths.items():
+                frames = linked[-1].paths[name].frames
+                np.testing.assert_allclose(path[frames], expected[name], atol=1e-6)
+                assert np.isnan(np.delete(path, frames, axis=0)).all()
+        results.check()
+
+    @pytest.mark.parametrize(("highest", "dtype"), [(255, "u1"), (256, "u2"), (65536, "i4")])
+    def test_instance_maps_are_stored_as_given(self, tmp_path: Path, highest: int, dtype: str) -> None:
+        maps = plain.instance_arrays()["instance"].astype(np.int32)
+        maps[maps == 7] = highest
+        maps[-1, 2] = 0  # both instances are gone in the last frame
+        results = written(tmp_path / "m", "motion", {FIRST: instances_of(maps, GRID)})
+        read = results.prediction(FIRST)
+        assert isinstance(read, MotionOutput)
+        np.testing.assert_array_equal(read.instances, maps)  # type: ignore[arg-type]
+        with np.load(tmp_path / "m" / "shards" / "00000.npz") as file:
+            assert file[f"{FIRST}/instance"].dtype == dtype
+        paths = results.trajectories(FIRST)
+        # rows 1 and 2, columns 0 and 1 of cells of 0.5 m from x = -2, y = -1.5 on; in the next frame a cell ahead
+        np.testing.assert_array_equal(paths[1], [[-1.5, -0.5], [-1.0, -0.5], [np.nan, np.nan]])
+        np.testing.assert_array_equal(paths[highest], [[-0.25, 0.75], [0.25, 0.75], [np.nan, np.nan]])
+        results.check()
+
+    def test_heads_on_request(self, tmp_path: Path) -> None:
+        output = heads(3)
+        results = written(tmp_path / "motion", "motion", {FIRST: output}, store="heads", labels=None)
+        read = results.prediction(FIRST)
+        assert isinstance(read, MotionOutput)
+        assert read.heads
+        assert output.heads
+        for one, other in zip(read.heads, output.heads, strict=True):
+            for name in ("segmentation", "centerness", "offset", "flow"):
+                np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+        expected = trajectories(predict_instances(output.heads[-1]), GRID, half_cell_shift=False)
+        assert results.trajectories(FIRST).keys() == expected.keys()
+        for name, path in results.trajectories(FIRST).items():
+            np.testing.assert_array_equal(path[~np.isnan(path[:, 0])], expected[name])
+        results.check()
+
+    def test_paths_that_are_not_stored_are_those_of_the_maps(self, tmp_path: Path) -> None:
+        maps = plain.instance_arrays()["instance"]
+        expected = written(tmp_path / "a", "motion", {FIRST: instances_of(maps, GRID)}).trajectories(FIRST)
+        folder = plain.write_motion(tmp_path / "b")
+        plain.write_shard(folder / "shards" / "00000.npz", {FIRST: {"instance": maps}, SECOND: {"instance": maps}})
+        plain.relist(folder)
+        results = read_results(folder)
+        results.check()
+        found = results.trajectories(FIRST)
+        assert found.keys() == expected.keys() == {1, 7}
+        for name, path in found.items():
+            np.testing.assert_allclose(path, expected[name], atol=1e-6)
+        np.testing.assert_array_equal(results.trajectories(THIRD)[7], plain.instance_arrays()["trajectory"][1])
+
+    def test_a_sample_is_small(self, tmp_path: Path) -> None:
+        """Issue 8: at most 50 KB for five predictions; here of thirty cars whose edges are noise."""
+        tokens = [f"a/b/ego_vehicle/{number:03d}" for number in range(3)]
+        results = written(tmp_path / "m", "motion", {token: thirty_cars(seed) for seed, token in enumerate(tokens)})
+        for token in tokens:
+            read = results.prediction(token)
+            assert isinstance(read, MotionOutput)
+            assert len(read) == 5
+            assert len(np.unique(read.instances)) > 25  # type: ignore[arg-type]
+        size = sum(path.stat().st_size for path in (tmp_path / "m").rglob("*") if path.is_file())
+        assert size / len(tokens) < 50_000
+
+    def test_shards_of_64_samples(self, tmp_path: Path) -> None:
+        maps = instances_of(plain.instance_arrays()["instance"], GRID)
+        tokens = [f"a/b/ego_vehicle/{number:03d}" for number in range(130)]
+        results = written(tmp_path / "m", "motion", dict.fromkeys(tokens, maps))
+        told = json.loads((tmp_path / "m" / "results.json").read_text(encoding="utf-8"))
+        assert [len(shard["tokens"]) for shard in told["shards"]] == [64, 64, 2]
+        assert len(list((tmp_path / "m" / "shards").iterdir())) == 3
+        results.check()
+        assert results.tokens == tuple(tokens)
+
+    def test_shards_of_some_megabytes(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("deepaccident_devkit.evaluation.results.shard_writer._MOST_BYTES", 2000)
+        written(tmp_path / "m", "motion", {token: heads(1) for token in plain.TOKENS}, store="heads")
+        assert len(list((tmp_path / "m" / "shards").iterdir())) == 3
+
+    @pytest.mark.parametrize(
+        ("output", "words"),
+        [
+            (heads(orientation="fiery"), "expected a prediction on BevGrid"),
+            (heads(grid=BevGrid((-2.0, 2.0, 0.25), GRID.y)), "expected a prediction on BevGrid"),
+            (instances_of(plain.instance_arrays()["instance"], GRID), "expected heads, found instance maps"),
+            (MotionOutput(grid=GRID, heads=(labelled(ignore=255),)), "found those of labels, which hold values to"),
+            (MotionOutput(grid=GRID, heads=(labelled(frames=2),)), "expected 3 frames as of the samples before, found"),
+        ],
+    )
+    def test_predictions_that_do_not_go_together(self, tmp_path: Path, output: MotionOutput, words: str) -> None:
+        with ResultsWriter(tmp_path / "m", "motion", store="heads") as writer:
+            writer.add(FIRST, heads())
+            with pytest.raises(ResultsError, match=f"m: {SECOND}: .*{words}"):
+                writer.add(SECOND, output)
+        assert read_results(tmp_path / "m").tokens == (FIRST,)
+
+    def test_the_grid_that_was_asked_for(self, tmp_path: Path) -> None:
+        with ResultsWriter(tmp_path / "m", "motion", grid=LARGE) as writer:
+            with pytest.raises(ResultsError, match="expected a prediction on BevGrid"):
+                writer.add(FIRST, heads())
+            writer.add(FIRST, instances_of(np.zeros((1, 2, 200, 200)), LARGE))
+
+    def test_negative_ids(self, tmp_path: Path) -> None:
+        with ResultsWriter(tmp_path / "m", "motion") as writer:
+            with pytest.raises(ResultsError, match="instances: expected ids from 1, and 0 elsewhere, found -7"):
+                writer.add(FIRST, instances_of(-plain.instance_arrays()["instance"].astype(int), GRID))
+            writer.add(FIRST, heads())

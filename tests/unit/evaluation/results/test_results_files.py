@@ -1,0 +1,258 @@
+"""Files of results: whole or absent when written, and read by copies, threads and other processes."""
+
+import multiprocessing
+import pickle
+import re
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import plain_results as plain
+import pytest
+
+from deepaccident_devkit.errors import ChoiceError, NotAvailableError, ResultsError, TokenError
+from deepaccident_devkit.evaluation import Accident, DetectedBoxes, instances_of
+from deepaccident_devkit.evaluation.results import Results, ResultsWriter, contents, read_results
+from deepaccident_devkit.geometry import BevGrid
+
+FIRST, SECOND, THIRD = plain.TOKENS
+GRID = BevGrid((-2.0, 2.0, 0.5), (-1.5, 1.5, 0.5))
+OTHER = "a/b/ego_vehicle/001"
+PREDICTIONS: dict[str, Callable[[], Any]] = {
+    "motion": lambda: instances_of(plain.instance_arrays()["instance"], GRID),
+    "accident": lambda: [Accident(positions=np.ones((2, 2)), time=0.5)],
+    "detection": lambda: DetectedBoxes.from_arrays(np.ones((2, 3)), np.ones((2, 3)), [0, 1], [0.5, 1], frame="world"),
+}
+
+
+def files_under(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def write(path: Path, task: Any, **options: Any) -> Results:
+    with ResultsWriter(path, task, **options) as writer:
+        for token in plain.TOKENS:
+            writer.add(token, PREDICTIONS[task]())
+    return read_results(path)
+
+
+@pytest.mark.parametrize("task", PREDICTIONS)
+class TestWriter:
+    def test_the_same_predictions_are_the_same_bytes(self, tmp_path: Path, task: Any) -> None:
+        one, other = (write(tmp_path / name / "x", task) for name in ("a", "b"))
+        assert files_under(tmp_path / "a") == files_under(tmp_path / "b")
+        assert len(files_under(tmp_path / "a")) == (2 if task == "motion" else 1)
+        assert one.fingerprint == other.fingerprint
+
+    def test_an_exception_leaves_nothing(self, tmp_path: Path, task: Any) -> None:
+        with pytest.raises(KeyboardInterrupt), ResultsWriter(tmp_path / "in" / "x", task) as writer:  # noqa: PT012
+            writer.add(FIRST, PREDICTIONS[task]())
+            assert list((tmp_path / "in").iterdir())
+            assert not (tmp_path / "in" / "x").exists()
+            raise KeyboardInterrupt
+        assert list((tmp_path / "in").iterdir()) == []
+
+    def test_a_full_disk_leaves_nothing(self, tmp_path: Path, task: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+        def full(*arguments: object, **options: object) -> None:
+            raise OSError(28, "No space left on device")
+
+        where = "shard_writer.put_array" if task == "motion" else "entry_writer.EntryWriter.add"
+        writer = ResultsWriter(tmp_path / "x", task)
+        with pytest.raises(ResultsError, match="x: a prediction could not be written, so that none is kept"), writer:  # noqa: PT012
+            writer.add(FIRST, PREDICTIONS[task]())
+            monkeypatch.setattr(f"deepaccident_devkit.evaluation.results.{where}", full)
+            with pytest.raises(ResultsError, match=r"x: results cannot be written \(.*No space left.*make room"):
+                writer.add(SECOND, PREDICTIONS[task]())
+            with pytest.raises(ResultsError, match="x: is not open"):
+                writer.add(SECOND, PREDICTIONS[task]())
+        assert list(tmp_path.iterdir()) == []
+
+    def test_nothing_is_replaced(self, tmp_path: Path, task: Any) -> None:
+        (tmp_path / "file").write_text("mine", encoding="utf-8")
+        (tmp_path / "folder").mkdir()
+        (tmp_path / "folder" / "mine").touch()
+        for name in ("file", "folder"):
+            with pytest.raises(ResultsError, match=f"{name}: is there already; choose another path, or remove it"):
+                ResultsWriter(tmp_path / name, task)
+        writer = ResultsWriter(tmp_path / "late", task)
+        (tmp_path / "late").touch()
+        with pytest.raises(ResultsError, match="late: is there already"), writer:
+            pass
+        with pytest.raises(ResultsError, match=r"x: results cannot be written \(.*choose another path"):
+            ResultsWriter(tmp_path / "file" / "x", task).__enter__()
+        assert (tmp_path / "file").read_text(encoding="utf-8") == "mine"
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder", "late"]
+
+    def test_a_sample_is_written_once(self, tmp_path: Path, task: Any) -> None:
+        with ResultsWriter(tmp_path / "x", task) as writer:
+            writer.add(FIRST, PREDICTIONS[task]())
+            with pytest.raises(ResultsError, match=f"x: {FIRST}: was added before; give each sample one prediction"):
+                writer.add(FIRST, PREDICTIONS[task]())
+            for token in ("", "a/../b", "/a", "a\\b", "a\nb", "a/\ud800", 3, b"a"):
+                with pytest.raises(ResultsError, match="expected a sample's token"):
+                    writer.add(token, PREDICTIONS[task]())  # type: ignore[arg-type]
+        assert read_results(tmp_path / "x").tokens == (FIRST,)
+
+    def test_without_any_sample(self, tmp_path: Path, task: Any) -> None:
+        with pytest.raises(ResultsError, match="x: no prediction was added"), ResultsWriter(tmp_path / "x", task):
+            pass
+        assert list(tmp_path.iterdir()) == []
+        with pytest.raises(ResultsError, match=r"is not open; add predictions inside `with ResultsWriter\("):
+            ResultsWriter(tmp_path / "x", task).add(FIRST, PREDICTIONS[task]())
+
+    def test_predictions_of_another_kind(self, tmp_path: Path, task: Any) -> None:
+        lidar = DetectedBoxes.from_arrays(np.zeros((1, 3)), np.ones((1, 3)), [0.0], [0.5])
+        wrong: dict[str, list[tuple[Any, str]]] = {
+            "motion": [([], "expected a MotionOutput, found list; make one with")],
+            "accident": [
+                (PREDICTIONS["motion"](), "expected a list of Accidents, found a MotionOutput; write that to results"),
+                ([1], "expected a MotionOutput or a list of Accidents, found list with int"),
+                ([Accident(positions=np.ones((2, 2)), time=0.5, ids=(2**70, 1))], "ids: expected two whole numbers"),
+            ],
+            "detection": [
+                ([], "expected DetectedBoxes, found list; DetectedBoxes.from_arrays makes some"),
+                (lidar, "expected boxes in the world frame, found lidar; give those of boxes.transform("),
+            ],
+        }
+        with ResultsWriter(tmp_path / "x", task) as writer:
+            for prediction, words in wrong[task]:
+                with pytest.raises(ResultsError, match=f"x: {FIRST}: .*{re.escape(words)}"):
+                    writer.add(FIRST, prediction)
+            writer.add(FIRST, PREDICTIONS[task]())
+        assert len(read_results(tmp_path / "x")) == 1
+
+    def test_an_empty_folder_is_free_for_motion_alone(self, tmp_path: Path, task: Any) -> None:
+        (tmp_path / "x").mkdir()
+        if task == "motion":
+            assert len(write(tmp_path / "x", task)) == 3
+        else:
+            with pytest.raises(ResultsError, match="x: is there already"):
+                ResultsWriter(tmp_path / "x", task)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"meta": {"score": float("nan")}}, "meta: cannot be written as JSON"),
+        ({"meta": {"model": object()}}, "meta: cannot be written as JSON"),
+        ({"meta": {1: "a", "1": "b"}}, "meta: 1: stands there twice"),
+        ({"meta": ["a"]}, "meta: expected a mapping"),
+        ({"step": 0}, "step: expected seconds, a whole number of recorded frames"),
+        ({"store": "logits"}, "stored: expected one of instances, heads"),
+        ({"labels": "mine"}, "labels: expected one of"),
+        ({"grid": (200, 200)}, "grid: expected a BevGrid, found tuple"),
+    ],
+)
+def test_what_a_writer_refuses_at_once(tmp_path: Path, options: dict[str, Any], words: str) -> None:
+    with pytest.raises(ResultsError, match=words):
+        ResultsWriter(tmp_path / "x", "motion", **options)
+
+
+def test_tasks_without_results(tmp_path: Path) -> None:
+    with pytest.raises(ChoiceError, match="task: expected one of motion, accident, detection, found 'warning'"):
+        ResultsWriter(tmp_path / "x", "warning")  # type: ignore[arg-type]
+
+
+def test_meta_is_a_copy(tmp_path: Path) -> None:
+    meta: dict[str, Any] = {"runs": [1]}
+    writer = ResultsWriter(tmp_path / "x.json", "accident", meta=meta)
+    meta["runs"].append(2)
+    with writer:
+        writer.add(FIRST, [])
+    results = read_results(tmp_path / "x.json")
+    results.meta["runs"].append(3)
+    assert results.meta == {"runs": [1]}
+
+
+@pytest.fixture(params=PREDICTIONS)
+def results(request: pytest.FixtureRequest, tmp_path: Path) -> Results:
+    return write(tmp_path / ("m" if request.param == "motion" else "results.json"), request.param)
+
+
+class TestResults:
+    def test_samples(self, results: Results) -> None:
+        assert len(results) == 3
+        assert results.tokens == plain.TOKENS
+        assert FIRST in results
+        assert OTHER not in results
+        assert 3 not in results
+        assert repr(results) == f"<{results.task} results: 3 samples in {results.path}>"
+        for call in (results.prediction, results.trajectories):
+            with pytest.raises(TokenError, match=f"has no prediction of '{OTHER}'"):
+                call(OTHER)
+        if results.task != "motion":
+            with pytest.raises(NotAvailableError, match="results have no trajectories; motion results have"):
+                results.trajectories(FIRST)
+
+    def test_ways_to_name_them(self, results: Results) -> None:
+        folder = results.path if results.task == "motion" else results.path.parent
+        for path in (folder, str(folder), folder / "results.json"):
+            again = read_results(path)
+            assert (again.path, again.fingerprint) == (results.path, results.fingerprint)
+
+    def test_a_copy_reads_again(self, results: Results) -> None:
+        content = pickle.dumps(results)
+        assert len(content) < 1000
+        contents.contents_of.cache_clear()
+        copy = pickle.loads(content)
+        assert (copy.task, copy.path, copy.fingerprint) == (results.task, results.path, results.fingerprint)
+        assert (copy.tokens, copy.meta, copy.form) == (results.tokens, results.meta, results.form)
+        assert len(copy.prediction(SECOND)) == len(results.prediction(SECOND))
+
+    def test_a_process_parses_once(self, results: Results, monkeypatch: pytest.MonkeyPatch) -> None:
+        def parsed(content: bytes) -> None:
+            raise AssertionError("parsed again")
+
+        monkeypatch.setattr(contents, "parsed_json", parsed)
+        for _ in range(3):
+            pickle.loads(pickle.dumps(results)).prediction(FIRST)
+        read_results(results.path).prediction(FIRST)
+
+    def test_in_threads_and_forked_processes(self, results: Results) -> None:
+        expected = [len(results.prediction(token)) for token in plain.TOKENS]
+        with ThreadPoolExecutor(8) as pool:
+            assert list(pool.map(lambda number: length(results, plain.TOKENS[number % 3]), range(60))) == expected * 20
+        with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("fork")) as pool:
+            assert list(pool.map(length, [results] * 6, plain.TOKENS * 2)) == expected * 2
+
+    def test_a_change_is_noticed(self, results: Results) -> None:
+        file = results.path / "results.json" if results.task == "motion" else results.path
+        copy = pickle.dumps(results)
+        results.check()
+        file.write_bytes(file.read_bytes().replace(b'"meta": {}', b'"meta": {"a": 1}'))
+        with pytest.raises(ResultsError, match="was changed after it was opened; open it again"):
+            results.check()
+        contents.contents_of.cache_clear()
+        with pytest.raises(ResultsError, match="was changed after it was opened; open it again"):
+            pickle.loads(copy).prediction(FIRST)
+        assert read_results(results.path).fingerprint != results.fingerprint
+        file.unlink()
+        with pytest.raises(ResultsError, match=r"results\.json: cannot be read \("):
+            results.check()
+
+
+def length(results: Results, token: str) -> int:
+    return len(results.prediction(token))
+
+
+def test_the_fingerprint_changes_with_any_cell(tmp_path: Path) -> None:
+    prints = []
+    for number, value in enumerate((0, 3, 0)):
+        maps = plain.instance_arrays()["instance"]
+        maps[0, 0, 0, 0] = value
+        with ResultsWriter(tmp_path / str(number), "motion") as writer:
+            writer.add(FIRST, instances_of(maps, GRID))
+        prints.append(read_results(tmp_path / str(number)).fingerprint)
+    assert prints[0] == prints[2] != prints[1]
+
+
+def test_a_check_with_progress_and_workers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    results = read_results(plain.write_motion(tmp_path / "m"))
+    results.check(progress=True)
+    assert "shards: 100%" in capsys.readouterr().err
+    path = tmp_path / "m" / "shards" / "00001.npz"
+    path.write_bytes(path.read_bytes()[::-1])
+    with pytest.raises(ResultsError, match=r"shards/00001\.npz: its bytes are not those that the checksum is of"):
+        results.check(workers=2)

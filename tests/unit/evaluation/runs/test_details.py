@@ -1,0 +1,111 @@
+"""Rows of single samples: their sums are the result's, of every task."""
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ResultsError
+from deepaccident_devkit.evaluation import DetectedBoxes
+from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
+from deepaccident_devkit.evaluation.runs import EvaluationRun, SampleSelection, evaluate_results, read_rows, sample_rows
+from deepaccident_devkit.evaluation.runs.parquet import write_rows
+from deepaccident_devkit.evaluation.setups import EvaluationSetup
+
+Write = Callable[..., Results]
+
+
+def column(rows: list[dict[str, Any]], name: str) -> list[Any]:
+    return [row[name] for row in rows]
+
+
+def test_which_sample(run: EvaluationRun, da_b: DeepAccident) -> None:
+    rows = sample_rows(run)
+    assert column(rows, "token") == sorted(run.evaluator.tokens)
+    assert {row["time_to_impact"] for row in rows} == {0.0, None}
+    for row in rows:
+        sample = da_b.sample.get(row["token"])
+        assert (row["scenario"], row["agent"], row["frame"]) == (sample["scenario_token"], sample["agent"], 4)
+        assert row["time_to_impact"] == sample["time_to_impact"]
+        assert row["accident_visibility"] == run.attributes[row["token"]].accident_visibility
+
+
+def test_accidents(run: EvaluationRun) -> None:
+    rows = sample_rows(run)
+    assert sum(column(rows, "positive")) == run.result.positives == 3
+    for distance, within in run.result.within.items():
+        sums = [sum(column(rows, f"{case}_{distance:g}m")) for case in ("tp", "fp", "fn")]
+        assert sums == [within.tp, within.fp, within.fn]
+    errors = [each for each in column(rows, "position_error") if each is not None]
+    assert math.fsum(errors) / len(errors) == pytest.approx(run.result.position_error)
+    assert len(errors) == run.result.within[15.0].tp
+    assert Counter(column(rows, "truth")) == {name: count for name, count in run.result.truths.items() if count}
+
+
+def test_motion(da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_motion: Write) -> None:
+    results = write_motion(tmp_path / "motion", selection.tokens(da_b))
+    run = evaluate_results(da_b, results, EvaluationSetup(task="motion"), selection, workers=1)
+    rows = sample_rows(run)
+    for name, part in run.result.ranges.items():
+        sums = [sum(column(rows, f"{case}_{name}")) for case in ("tp", "fp", "fn")]
+        assert sums == [part.true_positive, part.false_positive, part.false_negative]
+        both, mine, true = (sum(column(rows, f"cells_{case}_{name}")) for case in ("tp", "fp", "fn"))
+        assert 100 * both / (both + mine + true) == pytest.approx(part.iou)
+    assert sum(column(rows, "paths")) == run.result.paths
+    assert column(rows, "min_ade") == pytest.approx([0.5] * len(rows), abs=0.05)  # moved by a cell
+
+
+@pytest.mark.parametrize("protocol", ["released", "opencood"])
+def test_detection(da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, protocol: str) -> None:
+    tokens = selection.tokens(da_b)
+    with ResultsWriter(tmp_path / "boxes.json", "detection") as writer:
+        for token in tokens:
+            boxes = da_b.boxes(token)
+            writer.add(token, DetectedBoxes(boxes=boxes, scores=np.ones(len(boxes))))
+    setup = EvaluationSetup(task="detection", protocol=protocol)
+    run = evaluate_results(da_b, read_results(tmp_path / "boxes.json"), setup, selection, workers=1)
+    rows = sample_rows(run)
+    assert sum(column(rows, "truths")) == run.result.truths.sum()
+    assert sum(column(rows, "detections")) == run.result.detections.sum()
+    for threshold in run.setup.rules.thresholds:
+        assert 0 < sum(column(rows, f"tp_{threshold:g}")) <= run.result.truths.sum()
+
+
+def test_warning(da_b: DeepAccident, results: Results, selection: SampleSelection) -> None:
+    run = evaluate_results(da_b, results, EvaluationSetup(task="warning", protocol="boxes"), selection, workers=1)
+    rows = sample_rows(run)
+    assert column(rows, "alarms_count") == [len(results.prediction(token)) for token in sorted(selection.tokens(da_b))]
+    assert len(rows) == 6
+
+
+class TestParquet:
+    def test_columns_of_any_row_and_nothing(self, tmp_path: Path) -> None:
+        rows = [{"a": 1, "b": None, "c": True}, {"a": 2, "b": None, "d": "x"}, {"a": None, "e": 1}, {"e": 0.5}]
+        write_rows(tmp_path / "rows.parquet", rows, {"partial": None})
+        names = ("a", "b", "c", "d", "e")
+        read, stamp = read_rows(tmp_path / "rows.parquet")
+        assert read == [{name: row.get(name) for name in names} for row in rows]
+        assert stamp == {"partial": None}
+
+    def test_no_rows(self, tmp_path: Path) -> None:
+        write_rows(tmp_path / "rows.parquet", [], {})
+        assert read_rows(tmp_path / "rows.parquet") == ([], {})
+
+    @pytest.mark.parametrize("content", [b"", b"PAR1 and no more"])
+    def test_what_is_no_table(self, tmp_path: Path, content: bytes) -> None:
+        (tmp_path / "rows.parquet").write_bytes(content)
+        with pytest.raises(ResultsError, match=r"rows.parquet: is no table of samples"):
+            read_rows(tmp_path / "rows.parquet")
+
+    def test_a_table_of_somebody_else(self, tmp_path: Path) -> None:
+        import pyarrow as pa
+        from pyarrow import parquet
+
+        parquet.write_table(pa.table({"token": ["a"]}), tmp_path / "rows.parquet")
+        with pytest.raises(ResultsError, match=r"rows.parquet: is no table of samples \(b'deepaccident'\)"):
+            read_rows(tmp_path / "rows.parquet")

@@ -1,0 +1,249 @@
+"""From a results file to an evaluation: what is refused early, what is partial, what a broken-off run goes on with."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError, EvaluationError, ResultsError
+from deepaccident_devkit.evaluation import AccidentEvaluator, Bootstrap, accident_context, sample_attributes
+from deepaccident_devkit.evaluation.results import Results, ResultsWriter
+from deepaccident_devkit.evaluation.runs import (
+    BREAKDOWNS,
+    EvaluationRun,
+    SampleSelection,
+    evaluate,
+    evaluate_results,
+    scenario_hashes,
+)
+from deepaccident_devkit.evaluation.runs.checkpoints import checkpoint_path, remove_checkpoints
+from deepaccident_devkit.evaluation.setups import EvaluationSetup
+
+SETUP = EvaluationSetup(task="accident", protocol="boxes")
+Write = Callable[..., Results]
+
+
+@pytest.fixture
+def nothing_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fails a test that comes to the long work."""
+
+    def refused(*_arguments: Any, **_named: Any) -> None:
+        pytest.fail("was evaluated")
+
+    monkeypatch.setattr(evaluate, "evaluate_samples", refused)
+
+
+class TestRun:
+    def test_equals_the_evaluator_by_hand(self, da_b: DeepAccident, results: Results, run: EvaluationRun) -> None:
+        by_hand = AccidentEvaluator("boxes")
+        for token in results.tokens:
+            by_hand.update(token, results.prediction(token), None, accident_context(da_b, token, 2.0))
+        assert run.result == by_hand.compute()
+        assert run.result.positives == 3
+        assert run.partial is None
+        assert run.attributes == sample_attributes(da_b, results.tokens)
+        assert set(run.times_to_impact.values()) == {0.0, None}
+
+    def test_says_what_it_depends_on(self, da_b: DeepAccident, results: Results, run: EvaluationRun) -> None:
+        assert run.release.scenarios == scenario_hashes(da_b, da_b.split_scenarios("val"))
+        assert (run.results.fingerprint, run.results.form) == (results.fingerprint, None)
+        assert run.results.meta == {"method": "truth", "moved": 0.1}
+
+    def test_a_path_and_the_name_of_a_split_will_do(self, da_motion: DeepAccident, tmp_path: Path) -> None:
+        with ResultsWriter(tmp_path / "none.json", "accident") as writer:
+            for token in da_motion.evaluation_samples("train"):
+                writer.add(token, [])
+        run = evaluate_results(da_motion, tmp_path / "none.json", SETUP, "train", workers=1)
+        assert (len(run.evaluator), run.result.apa) == (20, 0.0)
+
+    def test_two_workers_give_the_same_bits(
+        self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_motion: Write
+    ) -> None:
+        every = replace(selection, agents=None)
+        results = write_motion(tmp_path / "motion", every.tokens(da_b))
+        one, two = (
+            evaluate_results(da_b, results, EvaluationSetup(task="motion"), every, workers=workers)
+            for workers in (1, 2)
+        )
+        assert one.summary() == two.summary()
+        assert dict(one.evaluator.counts) == dict(two.evaluator.counts)
+        assert 0 < one.result.ranges["100x100"].iou < 100
+
+    def test_breakdowns_on_two_workers_are_the_same(self, run: EvaluationRun) -> None:
+        one, two = (run.broken_down(["all", "agent"], Bootstrap(resamples=20), workers=workers) for workers in (1, 2))
+        assert one.summary() == two.summary() != run.summary()
+
+    def test_breakdowns(self, run: EvaluationRun) -> None:
+        broken = run.broken_down(["agent", "all", "agent"], Bootstrap(resamples=5))
+        assert [each.by for each in broken.breakdowns] == ["agent", "all"]
+        assert broken.breakdowns[1].groups[0].result == run.result
+        assert [each.by for each in run.broken_down(bootstrap=Bootstrap(resamples=0)).breakdowns] == list(BREAKDOWNS)
+        with pytest.raises(ChoiceError, match=r"by: expected one of all, .*, found 'wether'"):
+            run.broken_down(["wether"])
+
+
+@pytest.mark.usefixtures("nothing_long")
+class TestRefused:
+    def test_a_kind_that_the_task_does_not_take(
+        self, da_b: DeepAccident, results: Results, selection: SampleSelection
+    ) -> None:
+        with pytest.raises(EvaluationError, match=r"holds accident results; motion is evaluated from motion results"):
+            evaluate_results(da_b, results, EvaluationSetup(task="motion"), selection)
+
+    def test_predictions_that_do_not_look_far_enough(
+        self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_motion: Write
+    ) -> None:
+        results = write_motion(tmp_path / "motion", selection.tokens(da_b))
+        with pytest.raises(EvaluationError, match=r"its predictions look 2 s ahead \(5 frames, 0.5 s apart\)"):
+            evaluate_results(da_b, results, EvaluationSetup(task="motion", horizon=3.0), selection)
+
+    def test_a_damaged_shard(
+        self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_motion: Write
+    ) -> None:
+        results = write_motion(tmp_path / "motion", selection.tokens(da_b))
+        shard = next((tmp_path / "motion" / "shards").iterdir())
+        shard.write_bytes(shard.read_bytes()[:-100])
+        with pytest.raises(ResultsError, match=shard.name):
+            evaluate_results(da_b, results, EvaluationSetup(task="motion"), selection)
+
+    def test_missing_samples(
+        self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_accidents: Write
+    ) -> None:
+        results = write_accidents(tmp_path / "some.json", selection.tokens(da_b)[1:])
+        missing = selection.tokens(da_b)[0]
+        with pytest.raises(ResultsError, match=rf"some.json: 1 of 6 samples have no prediction \({missing}\); give"):
+            evaluate_results(da_b, results, SETUP, selection)
+
+    def test_nothing_in_common(
+        self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_accidents: Write
+    ) -> None:
+        other = write_accidents(tmp_path / "other.json", replace(selection, split="train").tokens(da_b))
+        with pytest.raises(ResultsError, match=r"made for split train.*; nothing is left to evaluate"):
+            evaluate_results(da_b, other, SETUP, selection, allow_partial=True)
+
+
+class TestPartial:
+    def test_only_what_is_in_both_and_marked(
+        self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_accidents: Write
+    ) -> None:
+        tokens = selection.tokens(da_b)
+        extra = replace(selection, agents=("other_vehicle_behind",)).tokens(da_b)
+        results = write_accidents(tmp_path / "some.json", [*tokens[2:], *extra])
+        run = evaluate_results(da_b, results, SETUP, selection, allow_partial=True, workers=1)
+        assert run.evaluator.tokens == set(tokens[2:])
+        assert run.partial is not None
+        assert run.partial.text() == "PARTIAL: 4 of 6 samples, 2 predictions left out"
+        assert run.summary()["partial"] == {
+            "missing": 2,
+            "extra": 2,
+            "expected": 6,
+            "evaluated": 4,
+            "mark": run.partial.text(),
+        }
+
+    def test_complete_results_are_not_partial(
+        self, da_b: DeepAccident, results: Results, selection: SampleSelection
+    ) -> None:
+        run = evaluate_results(da_b, results, SETUP, selection, allow_partial=True, workers=1)
+        assert run.partial is None
+
+
+class TestBrokenOff:
+    @pytest.fixture
+    def broken_after(self, monkeypatch: pytest.MonkeyPatch) -> Callable[[int | None], list[str]]:
+        """Break a run off after so many samples; gives the tokens that were loaded."""
+        original = evaluate.SampleLoader.__call__
+
+        def start(count: int | None) -> list[str]:
+            loaded: list[str] = []
+
+            def load(loader: Any, token: str) -> tuple[Any, ...]:
+                if len(loaded) == count:
+                    raise KeyboardInterrupt
+                loaded.append(token)
+                return original(loader, token)
+
+            monkeypatch.setattr(evaluate.SampleLoader, "__call__", load)
+            return loaded
+
+        return start
+
+    def run_of(self, dataset: DeepAccident, results: Results, out: Path, **changes: Any) -> EvaluationRun:
+        setup = EvaluationSetup(task="accident", protocol="boxes", **changes)
+        every = SampleSelection(split="train", samples="all", scope="all")
+        return evaluate_results(dataset, results, setup, every, workers=1, out=out)
+
+    @pytest.fixture
+    def ten(self, da_b: DeepAccident, tmp_path: Path, write_accidents: Write) -> Results:
+        """Results of ten samples, of which eight are one batch."""
+        tokens = SampleSelection(split="train", samples="all", scope="all").tokens(da_b)
+        return write_accidents(tmp_path / "accidents.json", tokens)
+
+    def test_goes_on_where_it_stopped(
+        self, da_b: DeepAccident, ten: Results, tmp_path: Path, broken_after: Callable[[int | None], list[str]]
+    ) -> None:
+        first = broken_after(9)
+        with pytest.raises(KeyboardInterrupt):
+            self.run_of(da_b, ten, tmp_path / "out")
+        then = broken_after(None)
+        run = self.run_of(da_b, ten, tmp_path / "out")
+        assert [*first[:8], *then] == list(ten.tokens)
+        assert run.summary() == self.run_of(da_b, ten, tmp_path / "elsewhere").summary()
+
+    def test_other_rules_or_results_or_labels_begin_anew(
+        self,
+        da_b: DeepAccident,
+        ten: Results,
+        tmp_path: Path,
+        broken_after: Callable[[int | None], list[str]],
+        write_accidents: Write,
+    ) -> None:
+        out = tmp_path / "out"
+        self.run_of(da_b, ten, out)
+        loaded = broken_after(None)
+        self.run_of(da_b, ten, out)
+        assert loaded == []
+        self.run_of(da_b, ten, out, switches={"min_score": 0.5})
+        assert len(loaded) == 10
+        self.run_of(da_b, write_accidents(tmp_path / "more.json", ten.tokens, moved=3.0), out)
+        assert len(loaded) == 20
+
+    def test_a_damaged_checkpoint_begins_anew(
+        self, da_b: DeepAccident, ten: Results, tmp_path: Path, broken_after: Callable[[int | None], list[str]]
+    ) -> None:
+        out = tmp_path / "out"
+        self.run_of(da_b, ten, out)
+        (kept,) = (tmp_path / "out.unfinished").iterdir()
+        kept.write_text(kept.read_text()[:-9])
+        loaded = broken_after(None)
+        self.run_of(da_b, ten, out)
+        assert len(loaded) == 10
+
+    def test_the_name_says_all_that_counts(self, tmp_path: Path) -> None:
+        prints = {"results": "a", "release": "b"}
+        names = {
+            checkpoint_path(tmp_path / "out", setup, tokens, {**prints, **other}, *purpose)
+            for setup, tokens, other, purpose in (
+                (SETUP, ["x"], {}, ()),
+                (replace(SETUP, horizon=3.0), ["x"], {}, ()),
+                (SETUP, ["y"], {}, ()),
+                (SETUP, ["x"], {"release": "c"}, ()),
+                (SETUP, ["x"], {}, ("explanation",)),
+            )
+        }
+        assert len(names) == 5
+        assert {name.parent for name in names} == {tmp_path / "out.unfinished"}
+
+    def test_removing_leaves_what_is_not_its_own(self, tmp_path: Path) -> None:
+        path = checkpoint_path(tmp_path / "out", SETUP, ["x"], {})
+        path.parent.mkdir()
+        path.touch()
+        (path.parent / "mine.txt").touch()
+        remove_checkpoints(tmp_path / "out")
+        assert [each.name for each in path.parent.iterdir()] == ["mine.txt"]
+        (path.parent / "mine.txt").unlink()
+        remove_checkpoints(tmp_path / "out")
+        assert not path.parent.exists()

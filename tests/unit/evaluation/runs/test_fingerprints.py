@@ -1,0 +1,74 @@
+"""Hashes of a scenario's label, meta and calib files."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.evaluation.runs import ScenarioHashes, scenario_hashes
+from deepaccident_devkit.evaluation.runs.fingerprints import digest_of, fingerprint
+
+Find = Callable[[Path], Path]
+
+
+def first(root: Path, kind: str, ending: str) -> Path:
+    return min(root.glob(f"train/*_accident/ego_vehicle/{kind}/*/*.{ending}"))
+
+
+@pytest.fixture
+def scenario(da_b: DeepAccident) -> str:
+    return min(da_b.split_scenarios("train"))
+
+
+def test_one_file_changes_one_hash(own_release: Path, scenario: str) -> None:
+    opened = DeepAccident(dataroot=own_release, verbose=False)
+    before = scenario_hashes(opened, [scenario])[scenario]
+    meta = min(own_release.glob("train/*_accident/meta/*.txt"))
+    for kind, path in {
+        "label": first(own_release, "label", "txt"),
+        "calib": first(own_release, "calib", "pkl"),
+    }.items():
+        content = path.read_bytes()
+        path.write_bytes(content[:-1] + b"0")
+        changed = scenario_hashes(opened, [scenario])[scenario].as_dict()
+        assert [name for name, value in before.as_dict().items() if changed[name] != value] == [kind]
+        path.write_bytes(content)
+    meta.write_bytes(meta.read_bytes() + b"\n")
+    changed = scenario_hashes(opened, [scenario])[scenario].as_dict()
+    assert [name for name, value in before.as_dict().items() if changed[name] != value] == ["meta"]
+
+
+def test_bytes_that_move_to_the_next_file_are_a_change(own_release: Path, scenario: str) -> None:
+    opened = DeepAccident(dataroot=own_release, verbose=False)
+    before = scenario_hashes(opened, [scenario])[scenario]
+    one, other = sorted(first(own_release, "label", "txt").parent.iterdir())[:2]
+    joined = one.read_bytes() + other.read_bytes()
+    one.write_bytes(joined[:10])
+    other.write_bytes(joined[10:])
+    assert scenario_hashes(opened, [scenario])[scenario].label != before.label
+
+
+def test_no_meta_and_no_such_scenario(own_release: Path, scenario: str) -> None:
+    opened = DeepAccident(dataroot=own_release, verbose=False)
+    for meta in own_release.glob("train/*/meta/*.txt"):
+        meta.unlink()
+    found = scenario_hashes(opened, [scenario, "type1_subtype1_accident/gone"])
+    assert list(found) == [scenario]
+    assert found[scenario].meta is None
+
+
+def test_the_place_does_not_matter(own_release: Path, da_b: DeepAccident) -> None:
+    tokens = da_b.split_scenarios("val")
+    elsewhere = DeepAccident(dataroot=own_release, verbose=False)
+    here = scenario_hashes(da_b, tokens)
+    assert here == scenario_hashes(elsewhere, tokens)
+    assert list(here) == sorted(tokens)
+
+
+def test_fingerprint_of_all_in_any_order() -> None:
+    one = ScenarioHashes(label="a", meta=None, calib="c")
+    other = ScenarioHashes(label="b", meta="m", calib="c")
+    assert fingerprint({"x": one, "y": other}) == fingerprint({"y": other, "x": one})
+    assert fingerprint({"x": one, "y": other}) != fingerprint({"x": other, "y": one})
+    assert digest_of({"a": 1, "b": [2.5]}) == digest_of({"b": [2.5], "a": 1})

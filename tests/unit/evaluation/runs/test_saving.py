@@ -1,0 +1,200 @@
+"""Bundles on disk: what they hold, and that a folder is whole or as it was."""
+
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet
+import pytest
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit._version import __version__
+from deepaccident_devkit.errors import ResultsError
+from deepaccident_devkit.evaluation.results import Results, read_results
+from deepaccident_devkit.evaluation.runs import (
+    EvaluationRun,
+    Partial,
+    SampleSelection,
+    evaluate_results,
+    read_bundle,
+    read_rows,
+    save_run,
+)
+from deepaccident_devkit.evaluation.setups import EvaluationSetup
+from deepaccident_devkit.files import file_checksum
+
+FILES = {"metrics_summary.json", "counts.json", "samples.parquet", "scenarios.json", "files.json"}
+JSON_FILES = sorted(name for name in FILES if name.endswith(".json"))
+
+
+def read(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def test_holds_all_and_reads_back(run: EvaluationRun, results: Results, tmp_path: Path) -> None:
+    folder = save_run(run, tmp_path / "new" / "bundle")
+    assert {path.name for path in folder.iterdir()} == FILES
+    bundle = read_bundle(folder)
+    assert bundle.summary == run.summary() == read(folder / "metrics_summary.json")
+    assert (bundle.setup, bundle.selection) == (run.setup, run.selection)
+    assert (str(bundle.dataroot), bundle.release_version) == (run.release.dataroot, "v1")
+    assert bundle.results_path == results.path
+    assert bundle.scenarios() == {token: each.as_dict() for token, each in run.release.scenarios.items()}
+    assert bundle.checksums() == {name: file_checksum(folder / name) for name in FILES - {"files.json"}}
+    assert run.evaluator.fresh().resume(folder / "counts.json").compute() == run.result
+
+
+def test_every_file_says_version_protocol_and_partial(run: EvaluationRun, tmp_path: Path) -> None:
+    mark = Partial(missing=1, extra=0, expected=7, evaluated=6)
+    folder = save_run(replace(run, partial=mark), tmp_path / "bundle")
+    stamps = [read(folder / name) for name in JSON_FILES] + [read_rows(folder / "samples.parquet")[1]]
+    for stamp in stamps:
+        assert (stamp["devkit_version"], stamp["task"], stamp["protocol"]) == (__version__, "accident", "boxes")
+        assert stamp["partial"]["mark"] == "PARTIAL: 6 of 7 samples"
+
+
+def test_the_summary_says_every_choice(run: EvaluationRun) -> None:
+    switched = replace(run, setup=replace(run.setup, switches={"scoring.limit_counts": True}))
+    summary = switched.summary()
+    assert summary["switches"] == {"scoring.limit_counts": True}
+    assert summary["settings"]["choices"]["scoring"]["limit_counts"] is True
+    assert summary["counts"] == {"samples": 6, "scenarios": 2}
+    assert summary["metrics"]["positives"] == 3
+    assert {"python", "numpy"} <= summary["environment"].keys()
+    assert summary["headlines"][0]["name"] == "apa"
+
+
+def test_a_copy_of_the_results_goes_along(run: EvaluationRun, results: Results, tmp_path: Path) -> None:
+    folder = save_run(run, tmp_path / "bundle", include_results=True)
+    inside = read_bundle(folder).results_path
+    assert inside == folder / "results" / results.path.name
+    assert read_results(inside).fingerprint == results.fingerprint
+
+
+def test_a_folder_of_results_is_copied_whole(
+    da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_motion: Any
+) -> None:
+    results = write_motion(tmp_path / "motion", selection.tokens(da_b))
+    run = evaluate_results(da_b, results, EvaluationSetup(task="motion"), selection, workers=1)
+    folder = save_run(run, tmp_path / "bundle", include_results=True)
+    copy = read_results(read_bundle(folder).results_path)
+    copy.check()
+    assert copy.fingerprint == results.fingerprint
+    (folder / "results" / "another").mkdir()
+    with pytest.raises(ResultsError, match=r"results: expected one results file or folder, found 2"):
+        _ = read_bundle(folder).results_path
+
+
+def test_rows_are_plain_columns(run: EvaluationRun, tmp_path: Path) -> None:
+    folder = save_run(run, tmp_path / "bundle")
+    schema = pyarrow.parquet.read_schema(folder / "samples.parquet")
+    kinds = {name: str(schema.field(name).type) for name in ("token", "frame", "time_to_impact", "positive", "tp_10m")}
+    assert list(kinds.values()) == ["string", "int64", "double", "bool", "int64"]
+
+
+class TestPlaces:
+    def test_an_extra_that_fails_leaves_nothing(self, run: EvaluationRun, tmp_path: Path) -> None:
+        def fails(folder: Path) -> None:
+            assert FILES - {"files.json"} <= {path.name for path in folder.iterdir()}
+            raise KeyError("plot")
+
+        with pytest.raises(KeyError, match="plot"):
+            save_run(run, tmp_path / "bundle", extras=[fails])
+        assert not list(tmp_path.glob("*bundle*"))
+
+    def test_what_extras_write_belongs_to_it(self, run: EvaluationRun, tmp_path: Path) -> None:
+        folder = save_run(run, tmp_path / "bundle", extras=[lambda folder: (folder / "report.html").write_text("!")])
+        assert "report.html" in read_bundle(folder).checksums()
+        save_run(run, folder, overwrite=True)
+        assert {path.name for path in folder.iterdir()} == FILES
+
+    def test_replaced_only_when_told(self, run: EvaluationRun, tmp_path: Path) -> None:
+        folder = save_run(run, tmp_path / "bundle")
+        with pytest.raises(ResultsError, match=r"bundle: holds an evaluation; pass overwrite=True \(--overwrite\)"):
+            save_run(run, folder)
+        save_run(replace(run, sanity={"warnings": []}), folder, overwrite=True)
+        assert read_bundle(folder).summary["sanity"] == {"warnings": []}
+        assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["bundle"]
+
+    def test_the_earlier_one_stays_if_the_new_one_fails(
+        self, run: EvaluationRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        folder = save_run(run, tmp_path / "bundle")
+        before = {name: file_checksum(folder / name) for name in FILES}
+
+        replace_file = os.replace
+
+        def full(source: Path, target: Path) -> None:
+            if target == folder:
+                raise OSError(28, "No space left on device")
+            replace_file(source, target)
+
+        monkeypatch.setattr("deepaccident_devkit.files.os.replace", full)
+        with pytest.raises(ResultsError, match=r"bundle: cannot be written \(.*No space left"):
+            save_run(replace(run, sanity={}), folder, overwrite=True)
+        assert {name: file_checksum(folder / name) for name in FILES} == before
+
+    def test_foreign_files_are_never_removed(self, run: EvaluationRun, tmp_path: Path) -> None:
+        folder = save_run(run, tmp_path / "bundle")
+        (folder / "thoughts.txt").write_text("mine")
+        with pytest.raises(ResultsError, match=r"bundle: holds thoughts.txt, which is not of its evaluation; move it"):
+            save_run(run, folder, overwrite=True)
+
+    @pytest.mark.parametrize("overwrite", [False, True])
+    def test_another_folder_is_never_replaced(self, run: EvaluationRun, tmp_path: Path, overwrite: bool) -> None:
+        (tmp_path / "work" / "deep").mkdir(parents=True)
+        (tmp_path / "work" / "deep" / "thesis.tex").touch()
+        with pytest.raises(ResultsError, match=r"work: is not empty and holds no evaluation"):
+            save_run(run, tmp_path / "work", overwrite=overwrite)
+        with pytest.raises(ResultsError, match=r"thesis.tex: is a file; choose a folder that is new"):
+            save_run(run, tmp_path / "work" / "deep" / "thesis.tex", overwrite=overwrite)
+        with pytest.raises(ResultsError, match=r"out: expected a folder, found an empty path"):
+            save_run(run, "", overwrite=overwrite)
+
+    def test_an_empty_folder_is_fine_and_checkpoints_go(
+        self, da_b: DeepAccident, results: Results, selection: SampleSelection, run: EvaluationRun, tmp_path: Path
+    ) -> None:
+        out = tmp_path / "bundle"
+        out.mkdir()
+        again = evaluate_results(da_b, results, run.setup, selection, workers=1, out=out)
+        assert (tmp_path / "bundle.unfinished").is_dir()
+        save_run(again, out)
+        assert not (tmp_path / "bundle.unfinished").exists()
+
+
+class TestDamaged:
+    @pytest.mark.parametrize(
+        ("content", "sentence"),
+        [
+            (None, r"metrics_summary.json: is missing; give a folder that"),
+            ("{", r"metrics_summary.json: cannot be read \(Expecting"),
+            ("[]", r"metrics_summary.json: expected an object, found list"),
+            ('{"format": "nuScenes"}', r"expected the format 'DeepAccident metrics summary', found 'nuScenes'"),
+            (
+                '{"format": "DeepAccident metrics summary", "version": 9, "devkit_version": "7.0"}',
+                r"is of version 9, this devkit reads 1; use the devkit that wrote it \(7.0\)",
+            ),
+        ],
+    )
+    def test_no_summary(self, run: EvaluationRun, tmp_path: Path, content: str | None, sentence: str) -> None:
+        path = save_run(run, tmp_path / "bundle") / "metrics_summary.json"
+        if content is None:
+            path.unlink()
+        else:
+            path.write_text(content)
+        with pytest.raises(ResultsError, match=sentence):
+            read_bundle(path.parent)
+
+    @pytest.mark.parametrize("part", ["setup", "selection", "dataroot", "results_path"])
+    def test_a_summary_without_parts(self, tmp_path: Path, part: str) -> None:
+        head = {"format": "DeepAccident metrics summary", "version": 1, "agents": 3, "release": {"dataroot": 3}}
+        (tmp_path / "metrics_summary.json").write_text(json.dumps(head))
+        bundle = read_bundle(tmp_path)
+        with pytest.raises(ResultsError, match=r"metrics_summary.json: does not say what was evaluated"):
+            getattr(bundle, part)
+
+    def test_no_folder(self, tmp_path: Path) -> None:
+        with pytest.raises(ResultsError, match=r"nowhere: no such folder"):
+            read_bundle(tmp_path / "nowhere")

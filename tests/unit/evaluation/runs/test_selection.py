@@ -1,0 +1,78 @@
+"""Which samples an evaluation is of."""
+
+import pytest
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
+from deepaccident_devkit.evaluation.runs import SampleSelection, default_selection
+from deepaccident_devkit.evaluation.runs.selection import agent_of, scenario_of
+from deepaccident_devkit.evaluation.setups import EvaluationSetup
+
+
+def test_the_released_list(da_motion: DeepAccident) -> None:
+    assert SampleSelection(split="train").tokens(da_motion) == da_motion.evaluation_samples("train")
+
+
+def test_scope_agents_and_horizon_choose(da_motion: DeepAccident) -> None:
+    one = SampleSelection(split="train", scope="all", agents=("infrastructure",), horizon=1.0).tokens(da_motion)
+    both = {f"type1_subtype1_{end}" for end in ("accident", "normal")}
+    assert {token.split("/")[0] for token in one} == both
+    assert {agent_of(token) for token in one} == {"infrastructure"}
+    assert [int(token[-3:]) for token in one] == [25, 30] * 2
+
+
+def test_whole_scenarios_of_accidents_alone(da_motion: DeepAccident) -> None:
+    every, accidents = (
+        SampleSelection(split="train", samples="all", scope=scope, horizon=0.3).tokens(da_motion)
+        for scope in ("all", "accident")
+    )
+    assert accidents == [token for token in every if "_accident/" in token]
+    assert len(every) == 2 * len(accidents) == 2 * 5 * 7
+
+
+def test_defaults_by_task() -> None:
+    motion, warning = (
+        default_selection(EvaluationSetup(task=task, protocol=protocol, horizon=3.0))
+        for task, protocol in (("motion", "paper"), ("warning", "boxes"))
+    )
+    assert motion == SampleSelection(split="val", horizon=3.0)
+    assert warning == SampleSelection(split="val", samples="all", scope="all", horizon=3.0)
+
+
+def test_agents_are_put_in_order() -> None:
+    given = SampleSelection(split="val", agents=("infrastructure", "ego_vehicle"))
+    assert given.agents == ("ego_vehicle", "infrastructure")
+    assert given.text() == (
+        "split val, samples evaluate (the last 2 s), scope accident, agents ego_vehicle, infrastructure"
+    )
+
+
+def test_parts_of_tokens() -> None:
+    scenario = "type1_subtype1_accident/Town01_type001_subtype0001_scenario00001"
+    sample = f"{scenario}/ego_vehicle/003"
+    assert (scenario_of(sample), agent_of(sample)) == (scenario, "ego_vehicle")
+    assert agent_of("nonsense") == ""
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"samples": "some"}, r"samples: expected one of evaluate, all, found 'some'"),
+        ({"scope": "normal"}, r"scope: expected one of accident, all, found 'normal'"),
+        ({"agents": ("ego",)}, r"agents: expected some of ego_vehicle, .*, or None for all, found 'ego'"),
+        ({"agents": ()}, r"agents: expected some of .* found \[\]"),
+    ],
+)
+def test_wrong_choices(changes: dict[str, object], sentence: str) -> None:
+    with pytest.raises(ChoiceError, match=sentence):
+        SampleSelection(split="val", **changes)
+
+
+def test_a_horizon_between_samples(da_b: DeepAccident) -> None:
+    with pytest.raises(ConfigError, match=r"horizon: samples to evaluate are 0.5 s apart, so that 1.2 s does not say"):
+        SampleSelection(split="val", horizon=1.2).tokens(da_b)
+
+
+def test_nothing_to_evaluate(da_b: DeepAccident) -> None:
+    with pytest.raises(NotAvailableError, match=r"val: this release has no labelled samples of ego_vehicle there"):
+        SampleSelection(split="val", agents=("ego_vehicle",)).tokens(da_b)  # 0.4 s long

@@ -1,0 +1,88 @@
+"""A summary for people: of a run and of a stored bundle alike, marked where it is partial."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.evaluation import Bootstrap
+from deepaccident_devkit.evaluation.results import Results
+from deepaccident_devkit.evaluation.runs import (
+    EvaluationRun,
+    Partial,
+    SampleSelection,
+    evaluate_results,
+    read_bundle,
+    results_text,
+    save_run,
+    summary_text,
+)
+from deepaccident_devkit.evaluation.setups import EvaluationSetup
+
+Write = Callable[..., Results]
+
+
+def lines_of(text: str) -> list[str]:
+    return [" ".join(line.split()) for line in text.splitlines()]
+
+
+def test_what_it_tells(run: EvaluationRun) -> None:
+    lines = lines_of(summary_text(run.broken_down(["all", "agent"], Bootstrap(resamples=10)).summary(), ["agent"]))
+    assert lines[:2] == ["evaluated", "task accident, protocol boxes"]
+    assert lines[2].startswith(
+        "samples 6 of 2 scenarios: split val, list all, scope all, ego_vehicle, other_vehicle, inf"
+    )
+    assert "number value 95% interval" in lines
+    assert "apa 1.000 [1.000, 1.000]" in lines
+    assert "position_error 0.283 m [0.283, 0.283]" in lines
+    assert "samples 6, positives 3, negatives 3, unjudged 0" in lines
+    assert "within/5 tp 3, fp 0, fn 0" in lines
+    assert lines[lines.index("by agent") + 1].startswith("value samples scenarios apa accuracy@5")
+    assert "ego_vehicle 2 2 1.000 1.000 1.000 1.000 0.000" in lines
+
+
+def test_switches_and_no_intervals(run: EvaluationRun) -> None:
+    switched = replace(run, setup=replace(run.setup, switches={"min_score": 0.5}))
+    lines = lines_of(summary_text(switched.summary()))
+    assert "task accident, protocol boxes with min_score=0.5" in lines
+    assert "number value" in lines
+
+
+def test_the_bundle_on_disk_reads_alike(run: EvaluationRun, tmp_path: Path) -> None:
+    broken = run.broken_down(["all", "agent"], Bootstrap(resamples=10))
+    stored = read_bundle(save_run(broken, tmp_path / "bundle")).summary
+    assert summary_text(stored) == summary_text(broken.summary())
+
+
+def test_results_of_other_choices_stand_beside(
+    da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_motion: Write
+) -> None:
+    results = write_motion(tmp_path / "motion", selection.tokens(da_b))
+    run = evaluate_results(da_b, results, EvaluationSetup(task="accident", protocol="paper"), selection, workers=1)
+    text = summary_text(run.summary())
+    assert "number value if sample_choice=mean_first" in lines_of(text)
+    assert "6 of 6 predictions were given as instance maps" in text
+
+
+def test_every_block_of_a_partial_one_says_so(run: EvaluationRun) -> None:
+    partial = replace(run, partial=Partial(missing=2, extra=0, expected=8, evaluated=6))
+    text = summary_text(partial.broken_down(["all", "agent"], Bootstrap(resamples=0)).summary(), ["agent"])
+    titles = [block.splitlines()[0] for block in text.split("\n\n")]
+    assert titles == [f"{name}   PARTIAL: 6 of 8 samples" for name in ("evaluated", "results", "counts", "by agent")]
+
+
+def test_what_a_results_file_holds(
+    da_b: DeepAccident, results: Results, tmp_path: Path, write_motion: Write, selection: SampleSelection
+) -> None:
+    lines = lines_of(results_text(results))
+    assert lines[0] == f"results accident, {results.path}"
+    assert lines[2:] == [
+        "samples 6 of 2 scenarios",
+        "agents ego_vehicle 2, infrastructure 2, other_vehicle 2",
+        f"meta {json.dumps(results.meta)}",
+    ]
+    motion = write_motion(tmp_path / "motion", selection.tokens(da_b)[:1])
+    assert lines_of(results_text(motion))[-1].startswith(
+        "form instances, up to 1 predictions of 5 frames, 0.5 s apart, cells x (-50.0, 50.0, 0.5), y (-50.0, 50.0, 0.5)"
+    )

@@ -1,0 +1,163 @@
+"""Maps that were mirrored, turned, shifted or scaled are named as exactly that, and no others are."""
+
+import functools
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.arrays import AnyArray
+from deepaccident_devkit.evaluation.predictions import MotionOutput, instances_of
+from deepaccident_devkit.evaluation.sanity.motion import ids_kept, motion_suspicions, motion_tallies
+from deepaccident_devkit.evaluation.sanity.probes import SCALES, candidates_of
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.motion import MotionHeads, MotionLabelConfig, MotionLabels
+
+Labels = dict[str, MotionLabels]
+Change = Callable[[AnyArray], AnyArray]
+
+
+@pytest.fixture(scope="module")
+def few_labels(da_motion: DeepAccident) -> Labels:
+    """Of five samples at the present, 2 s before the accident."""
+    tokens = da_motion.samples("train", "evaluate")[::4]
+    return {token: da_motion.motion_labels(token).to_present("bilinear") for token in tokens}
+
+
+def scaled(maps: AnyArray, scale: float) -> AnyArray:
+    """Maps (…, 200, 200) with all so many times as far from the middle; what leaves them is lost."""
+    cell = np.floor((np.arange(200) - 99.5) / scale + 100).astype(int)
+    there = (cell >= 0) & (cell < 200)
+    inside = np.where(there, cell, 0)
+    return np.where(there[:, None] & there, maps[..., inside[:, None], inside], 0)
+
+
+MISTAKES: dict[str, Change] = {
+    "mirrored x": lambda maps: maps[..., ::-1],
+    "mirrored y": lambda maps: maps[..., ::-1, :],
+    "transposed": lambda maps: maps.swapaxes(-1, -2),
+    "anti-transposed": lambda maps: maps[..., ::-1, ::-1].swapaxes(-1, -2),
+    "turned by 90°": lambda maps: np.rot90(maps, -1, axes=(-2, -1)),  # rows rise to the left, not down
+    "turned by 180°": lambda maps: maps[..., ::-1, ::-1],
+    "turned by 270°": lambda maps: np.rot90(maps, 1, axes=(-2, -1)),
+    "one step late": lambda maps: np.concatenate([maps[:1], maps[:-1]]),
+    "one step early": lambda maps: np.concatenate([maps[1:], maps[-1:]]),
+    **{name: lambda maps, scale=scale: scaled(maps, scale) for name, scale in SCALES.items()},
+}
+
+
+@functools.lru_cache(maxsize=64)
+def rolled_out(label: MotionLabels) -> AnyArray:
+    """(T, H, W) where everybody would be who goes on as from the first frame to the second."""
+    result = np.zeros_like(label.instance)
+    for name in np.unique(label.instance[0][label.instance[0] > 0]):
+        cells = np.argwhere(label.instance[0] == name)
+        then = np.argwhere(label.instance[1] == name)
+        step = then.mean(axis=0) - cells.mean(axis=0) if len(then) else np.zeros(2)
+        for frame in range(len(result)):
+            row, column = (cells + np.round(frame * step).astype(int)).T
+            inside = (row >= 0) & (row < result.shape[1]) & (column >= 0) & (column < result.shape[2])
+            result[frame, row[inside], column[inside]] = name
+    return result
+
+
+def noisy(maps: AnyArray, seed: int) -> AnyArray:
+    """A tenth of the cells is lost, and as many of the others are taken for somebody."""
+    source = np.random.default_rng(seed)
+    lost = source.uniform(size=maps.shape) < 0.1
+    extra = source.uniform(size=maps.shape) < 0.1 * (maps > 0).mean()
+    return np.where(extra, 1, np.where(lost, 0, maps)).astype(np.int32)
+
+
+GOOD: dict[str, Callable[[MotionLabels], AnyArray]] = {
+    "perfect": lambda label: label.instance,
+    "constant velocity": rolled_out,
+    "noisy": lambda label: noisy(rolled_out(label), 0),
+}
+BAD: dict[str, Callable[[MotionLabels], AnyArray]] = {
+    "empty": lambda label: np.zeros_like(label.instance),
+    "nobody moves": lambda label: label.instance[:1].repeat(5, axis=0),
+    "twice as fast": lambda label: rolled_out(label)[[0, 2, 4, 4, 4]],
+    **{f"random {seed}": lambda label, seed=seed: noisy(np.zeros_like(label.instance) + 1, seed) for seed in (1, 2)},
+    **{
+        f"anywhere {seed}": lambda label, seed=seed: np.roll(
+            label.instance, np.random.default_rng([seed, label.instance.sum()]).integers(20, 180, 2), axis=(1, 2)
+        )
+        for seed in (1, 2)
+    },
+}
+
+
+def suspected(labels: Labels, predict: Callable[[MotionLabels], AnyArray]) -> list[str]:
+    tallies = [motion_tallies(instances_of(predict(label), label.config.grid), label) for label in labels.values()]
+    return [each.name for each in candidates_of(motion_suspicions("devkit", heads=False), tallies) if each.suspected]
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+@pytest.mark.parametrize("prediction", ["perfect", "constant velocity"])
+def test_each_mistake_is_named_as_exactly_that(crossing_labels: Labels, prediction: str, mistake: str) -> None:
+    change, good = MISTAKES[mistake], GOOD[prediction]
+    assert suspected(crossing_labels, lambda label: change(good(label))) == [mistake]
+
+
+@pytest.mark.parametrize("prediction", [*GOOD, *BAD])
+def test_nothing_else_is_suspected(crossing_labels: Labels, prediction: str) -> None:
+    assert suspected(crossing_labels, (GOOD | BAD)[prediction]) == []
+
+
+def channels(heads: MotionHeads, head: str, change: Change) -> MotionHeads:
+    return replace(heads, **{head: change(getattr(heads, head))})
+
+
+@pytest.mark.parametrize(
+    ("head", "mistake", "change"),
+    [
+        ("offset", "offset: its channels swapped", lambda maps: maps[:, ::-1]),
+        ("offset", "offset: both channels negated", lambda maps: -maps),
+        ("offset", "offset: channel 0 negated", lambda maps: maps * np.array([-1, 1])[:, None, None]),
+        ("flow", "flow: both channels negated", lambda maps: -maps),
+        ("flow", "flow: channel 1 negated", lambda maps: maps * np.array([1, -1])[:, None, None]),
+        (
+            "flow",
+            "flow: its channels swapped, then channel 0 negated",
+            lambda maps: np.stack([-maps[:, 1], maps[:, 0]], 1),
+        ),
+        ("flow", None, lambda maps: maps + 0.4),
+    ],
+)
+def test_vectors_in_other_channels_are_named(
+    few_labels: Labels, head: str, mistake: str | None, change: Change
+) -> None:
+    tallies = []
+    for label in few_labels.values():
+        wrong = channels(replace(MotionHeads.from_labels(label), ignore_index=None), head, change)
+        tallies.append(motion_tallies(MotionOutput(grid=label.config.grid, heads=(wrong,)), label))
+    found = [each.name for each in candidates_of(motion_suspicions("devkit", heads=True), tallies) if each.suspected]
+    assert found == ([] if mistake is None else [mistake])
+
+
+def test_maps_longer_than_wide_cannot_be_turned_by_90_degrees(da_motion: DeepAccident) -> None:
+    grid = BevGrid((-40.0, 40.0, 0.5), (-20.0, 20.0, 0.5), "fiery")
+    label = da_motion.motion_labels(da_motion.samples("train", "evaluate")[0], MotionLabelConfig(grid=grid))
+    at_present = label.to_present()
+    tallies = [motion_tallies(instances_of(at_present.instance[:, :, ::-1], grid), label)]
+    found = candidates_of(motion_suspicions("fiery", heads=False), tallies)
+    assert [each.name for each in found if each.suspected] == ["mirrored y"]
+    assert [each.name for each in found if each.score is None] == [
+        "transposed",
+        "anti-transposed",
+        "turned by 90°",
+        "turned by 270°",
+    ]
+
+
+def test_ids_are_counted_that_stay_from_frame_to_frame(few_labels: Labels) -> None:
+    label = next(iter(few_labels.values()))
+    kept, pairs = ids_kept(instances_of(label.instance, label.config.grid), label)
+    assert kept == pairs > 10
+    anew = label.instance + 100 * np.arange(5)[:, None, None] * (label.instance > 0)
+    assert ids_kept(instances_of(anew, label.config.grid), label) == [0, pairs]
+    heads = MotionOutput(grid=label.config.grid, heads=(MotionHeads.from_labels(label),))
+    assert ids_kept(heads, label) == [0, 0]

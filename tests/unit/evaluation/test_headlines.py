@@ -1,0 +1,50 @@
+"""The headline numbers stand in the results where they say."""
+
+import math
+
+import pytest
+
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.evaluation.breakdowns import numbers_of
+from deepaccident_devkit.evaluation.headlines import headline_numbers, headlines, value_text
+from deepaccident_devkit.evaluation.motion import MotionEvaluator
+from deepaccident_devkit.evaluation.setups import TASK_PROTOCOLS, EvaluationSetup
+
+RUNS = [(task, protocol) for task, protocols in TASK_PROTOCOLS.items() for protocol in protocols]
+
+
+@pytest.mark.parametrize(("task", "protocol"), RUNS)
+def test_each_headline_is_a_number_of_the_result_by_its_path(task: str, protocol: str) -> None:
+    result = EvaluationSetup(task=task, protocol=protocol).evaluator().compute()
+    known = numbers_of(result)
+    found = headlines(task, result)
+    assert len({each.name for each in found}) == len(found) > 2
+    for each in found:
+        value = known.get(each.path, math.nan)
+        assert each.value == (None if math.isnan(value) else value)
+
+
+def test_names() -> None:
+    result = MotionEvaluator().compute()
+    names = ["iou 30x30", "iou 100x100", "pq 30x30", "pq 100x100", "min_ade", "min_fde", "miss_rate"]
+    assert headline_numbers("motion", result) == dict(zip(names, [0.0] * 4 + [None] * 3, strict=True))
+    assert [each.higher_is_better for each in headlines("motion", result)] == [True] * 4 + [False] * 3
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "signed", "text"),
+    [
+        (41.2, "%", False, "41.20 %"),
+        (0.5, "%", True, "+0.50"),
+        (0.875, "share", False, "0.875"),
+        (-1.3, "m", True, "-1.300 m"),
+        (None, "m", False, "–"),
+    ],
+)
+def test_texts(value: float | None, unit: str, signed: bool, text: str) -> None:
+    assert value_text(value, unit, signed=signed) == text
+
+
+def test_an_unknown_task_is_refused() -> None:
+    with pytest.raises(ChoiceError, match="task: expected one of motion, accident, detection, warning, found 'maps'"):
+        headlines("maps", None)

@@ -1,0 +1,80 @@
+"""Who is matched with whom: the same numbers as the evaluators count."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError, EvaluationError, GeometryError
+from deepaccident_devkit.evaluation import AccidentEvaluator, DetectedBoxes, detection_truth, vpq_counts
+from deepaccident_devkit.evaluation.accident import PROTOCOLS, AccidentContext, compared_accidents
+from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS, detection_matches
+from deepaccident_devkit.evaluation.detection.boxes import columns_of
+from deepaccident_devkit.evaluation.detection.frame_counts import frame_counts
+from deepaccident_devkit.evaluation.panoptic import VpqRules, vpq_matches
+
+
+@pytest.mark.parametrize("stay", [True, False])
+@pytest.mark.parametrize("large", [0, 7_000_000])
+def test_instances_match_as_vpq_counts(stay: bool, large: int) -> None:
+    rng = np.random.default_rng(3)
+    label = np.kron(rng.integers(0, 5, (3, 5, 5)), np.ones((4, 4), dtype=np.int64))
+    prediction = np.roll(np.where(label > 0, label + 10, 0), 1, axis=2)
+    prediction[2] = np.where(prediction[2] == 12, 40, prediction[2])
+    prediction = np.where(prediction > 0, prediction + large, -1)
+    rules = VpqRules(ids_must_stay=stay)
+    matches, counts = vpq_matches(prediction, label, rules), vpq_counts(prediction, label, rules)
+    assert_array_equal(np.bincount(matches[:, 0], minlength=3), counts.true_positive[:, 1])
+    for frame, predicted, true in matches.tolist():
+        mine, theirs = prediction[frame] == predicted, label[frame] == true
+        assert 2 * (mine & theirs).sum() > (mine | theirs).sum()
+    with pytest.raises(GeometryError, match=r"prediction: expected \(T, H, W\) as the label's"):
+        vpq_matches(prediction[0], label)
+
+
+@pytest.mark.parametrize("protocol", DETECTION_PROTOCOLS)
+def test_detections_match_as_they_are_counted(da_b: DeepAccident, protocol: str) -> None:
+    """All detections arrived, so the counted sums of arrivals are the matches."""
+    rules = DETECTION_PROTOCOLS[protocol]
+    token = da_b.sample[0]["token"]
+    truth = detection_truth(da_b, token, rules)
+    rng = np.random.default_rng(1)
+    keep = np.flatnonzero(rng.random(len(truth)) < 0.7)
+    off = rng.normal(0, 0.4, (len(keep), 3)) * (1, 1, 0)
+    columns: dict[str, Any] = {"category": np.tile(truth.category[keep], 2), "frame": rules.frame}
+    center = np.vstack([truth.center[keep] + off, truth.center[keep] + (9.0, 9.0, 0.0)])
+    size, yaw = np.tile(truth.size[keep], (2, 1)), np.tile(truth.yaw[keep], 2)
+    detected = DetectedBoxes.from_arrays(center, size, yaw, rng.random(len(center)), **columns)
+    counts = frame_counts(columns_of(detected.boxes, detected.scores), columns_of(truth), rules)
+    for level, threshold in enumerate(rules.thresholds):
+        found = detection_matches(detected, truth, rules, threshold)
+        cells = np.array(counts.tp[0], dtype=int)
+        assert len(found.detection) == np.sum(cells % len(rules.thresholds) == level)
+        if rules.matching == "by_score":
+            assert len(found.detection) + len(found.missed) == sum(counts.truths)
+            assert len(found.detection) + len(found.false) == len(counts.detections[0])
+        assert_array_equal(detected.boxes.category[found.detection], truth.category[found.truth])
+        assert len(np.unique(found.truth)) == len(found.truth)
+        assert not np.isin(found.truth, found.missed).any()
+        assert not np.isin(found.detection, found.false).any()
+    with pytest.raises(ChoiceError, match=r"threshold: expected one of .*, found 77"):
+        detection_matches(detected, truth, rules, 77)
+
+
+def test_protocols_that_compare_with_nothing_are_refused() -> None:
+    for name, words in (("released", "compares motion"), ("paper", "motion labels"), ("boxes", "needs its truth")):
+        with pytest.raises(EvaluationError, match=words):
+            compared_accidents([], None, AccidentContext(), PROTOCOLS[name])
+
+
+def test_a_protocol_of_ones_own_has_its_accidents_as_given() -> None:
+    class Own:
+        """Not one of the devkit's."""
+
+        settings = counts = result = pooled = variants = lambda *_: {}
+
+    assert AccidentEvaluator(Own()).protocol is not None
+    compared = compared_accidents([], None, AccidentContext(), Own())
+    assert (compared.true, compared.predicted) == (None, ())

@@ -1,0 +1,205 @@
+"""What is evaluated and by which rules, the choices by their names, and what an evaluator is given of a sample."""
+
+import json
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
+from deepaccident_devkit.evaluation import (
+    Accident,
+    AccidentContext,
+    AccidentEvaluator,
+    DetectedBoxes,
+    DetectionEvaluator,
+    MotionEvaluator,
+    detection_truth,
+    instances_of,
+)
+from deepaccident_devkit.evaluation.accident import PaperAccidents
+from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS
+from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
+from deepaccident_devkit.evaluation.setups import TASK_PROTOCOLS, EvaluationSetup, SampleLoader
+from deepaccident_devkit.evaluation.switches import switch_names, switched
+from deepaccident_devkit.evaluation.warning import WarningEvaluator
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.motion import MotionLabels
+
+ALL = [(task, protocol) for task, protocols in TASK_PROTOCOLS.items() for protocol in protocols]
+
+
+class TestSwitches:
+    def test_names_of_parts_too(self) -> None:
+        names = switch_names(PaperAccidents())
+        assert {"predicted_by", "reading.danger_distance", "scoring.far_is_missed"} <= set(names)
+        assert "reading" not in names
+
+    def test_each_name_of_every_protocol_can_be_given(self) -> None:
+        for task, protocol in ALL:
+            rules = TASK_PROTOCOLS[task][protocol]
+            for name in switch_names(rules):
+                value: Any = rules
+                for part in name.split("."):
+                    value = getattr(value, part)
+                assert switched(rules, {name: json.loads(json.dumps(value)) if value != np.inf else value}) == rules
+
+    def test_a_choice_within_a_part(self) -> None:
+        changed = switched(PaperAccidents(), {"scoring.far_is_missed": False, "match_distance": 2})
+        assert (changed.scoring.far_is_missed, changed.match_distance) == (False, 2)
+        assert changed.reading == PaperAccidents().reading
+
+    def test_null_only_where_a_choice_takes_it(self) -> None:
+        assert (
+            switched(DETECTION_PROTOCOLS["released"], {"area": None, "error_threshold": None}).error_threshold is None
+        )
+        with pytest.raises(ChoiceError, match=r"switch min_score: expected a number, such as 0.0, found None"):
+            switched(TASK_PROTOCOLS["accident"]["boxes"], {"min_score": None})
+
+    def test_lists_are_tuples_and_choices_that_go_together_alone_are_made_together(self) -> None:
+        rules = DETECTION_PROTOCOLS["paper"]
+        assert switched(rules, {"ranges": [[0, 30], [30, 50]], "error_threshold": None}).ranges == ((0, 30), (30, 50))
+
+    @pytest.mark.parametrize(
+        ("switches", "sentence"),
+        [
+            (
+                {"scoring.far_is_mised": 1},
+                r"PaperAccidents has no switch 'scoring.far_is_mised'; there are scoring.far_i",
+            ),
+            ({"reading": {}}, r"PaperAccidents has no switch 'reading'"),
+            ({"scoring.far_is_missed": 1}, r"switch far_is_missed: expected true or false, such as True, found 1"),
+            ({"match_distance": "2"}, r"switch match_distance: expected a number, such as 4.0, found '2'"),
+            ({"match_distance": True}, r"switch match_distance: expected a number, such as 4.0, found True"),
+            ({"predicted_by": 3}, r"switch predicted_by: expected a word, such as 'any', found 3"),
+            ({"predicted_by": "all"}, r"predicted_by: expected one of any, mean, found 'all'"),
+        ],
+    )
+    def test_refused(self, switches: dict[str, Any], sentence: str) -> None:
+        with pytest.raises(ChoiceError, match=sentence):
+            switched(PaperAccidents(), switches)
+
+
+class TestSetup:
+    @pytest.mark.parametrize(("task", "protocol"), ALL)
+    def test_every_task_and_protocol(self, task: Any, protocol: str) -> None:
+        kinds = {
+            "motion": MotionEvaluator,
+            "accident": AccidentEvaluator,
+            "detection": DetectionEvaluator,
+            "warning": WarningEvaluator,
+        }
+        setup = EvaluationSetup(task=task, protocol=protocol)
+        evaluator = setup.evaluator()
+        assert type(evaluator) is kinds[task]
+        assert setup.rules == TASK_PROTOCOLS[task][protocol]
+        assert setup.as_dict()["settings"] == evaluator.settings
+        assert pickle.loads(pickle.dumps(setup)) == setup
+
+    def test_switches_come_to_the_evaluator_and_cannot_be_changed(self) -> None:
+        given = {"scoring.far_is_missed": False}
+        setup = EvaluationSetup(task="accident", protocol="paper", switches=given)
+        given["scoring.far_is_missed"] = True
+        assert setup.evaluator().settings["choices"]["scoring"]["far_is_missed"] is False
+        assert setup.as_dict()["switches"] == {"scoring.far_is_missed": False}
+        assert pickle.loads(pickle.dumps(setup)) == setup
+        with pytest.raises(TypeError):
+            setup.switches["x"] = 1  # type: ignore[index]
+
+    @pytest.mark.parametrize(
+        ("named", "error", "sentence"),
+        [
+            (
+                {"task": "motions"},
+                ChoiceError,
+                r"task: expected one of motion, accident, detection, warning, found 'mo",
+            ),
+            (
+                {"task": "motion", "protocol": "boxes"},
+                ChoiceError,
+                r"protocol: expected one of released, paper for motion, found 'boxes'",
+            ),
+            ({"task": "motion", "horizon": 0.0}, ConfigError, r"horizon: expected seconds above 0, found 0.0"),
+            ({"task": "motion", "horizon": float("nan")}, ConfigError, r"horizon: expected seconds above 0, found nan"),
+            ({"task": "motion", "switches": {"gap": 1}}, ChoiceError, r"MotionProtocol has no switch 'gap'"),
+        ],
+    )
+    def test_refused(self, named: dict[str, Any], error: type[Exception], sentence: str) -> None:
+        with pytest.raises(error, match=sentence):
+            EvaluationSetup(**named)
+
+
+class TestLoader:
+    @pytest.fixture
+    def token(self, da_motion: DeepAccident) -> str:
+        return da_motion.evaluation_samples("train")[1]
+
+    @pytest.fixture
+    def motion(self, token: str, tmp_path: Path) -> Results:
+        """Nothing predicted, on cells of 1 m, every second of a second."""
+        grid = BevGrid((-50, 50, 1.0), (-50, 50, 1.0), "fiery")
+        with ResultsWriter(tmp_path / "motion", "motion", grid=grid, step=1.0, labels="clean") as writer:
+            writer.add(token, instances_of(np.zeros((3, *grid.shape), int), grid))
+        return read_results(tmp_path / "motion")
+
+    def test_motion_has_labels_of_its_form(self, da_motion: DeepAccident, motion: Results, token: str) -> None:
+        setup = EvaluationSetup(task="motion", switches={"labels": "clean"}, horizon=1.0)
+        prediction, label = SampleLoader(da_motion, motion, setup)(token)
+        assert isinstance(label, MotionLabels)
+        config = label.config
+        assert (config.grid, config.step, config.future_frames) == (motion.form.grid, 10, 1)
+        assert config.grid == prediction.grid
+
+    def test_the_protocol_says_which_labels_and_else_the_results(
+        self, da_motion: DeepAccident, motion: Results
+    ) -> None:
+        for task, protocol, expected in (("accident", "paper", "released"), ("accident", "boxes", "clean")):
+            loader = SampleLoader(da_motion, motion, EvaluationSetup(task=task, protocol=protocol))
+            assert loader.label_config().protocol == expected
+
+    def test_accidents_have_their_context(self, da_motion: DeepAccident, token: str, tmp_path: Path) -> None:
+        alarm = Accident(positions=np.zeros((2, 2)), time=1.0)
+        with ResultsWriter(tmp_path / "accidents.json", "accident") as writer:
+            writer.add(token, [alarm])
+        loader = SampleLoader(
+            da_motion,
+            read_results(tmp_path / "accidents.json"),
+            EvaluationSetup(task="accident", protocol="boxes", horizon=3.0),
+        )
+        prediction, label, context = loader(token)
+        assert (len(prediction), label) == (1, None)
+        assert isinstance(context, AccidentContext)
+        assert context.truth is not None
+
+    def test_boxes_come_from_world_into_the_protocols_frame(
+        self, da_motion: DeepAccident, token: str, tmp_path: Path
+    ) -> None:
+        boxes = da_motion.boxes(token)
+        with ResultsWriter(tmp_path / "boxes.json", "detection") as writer:
+            writer.add(token, DetectedBoxes(boxes=boxes, scores=np.ones(len(boxes))))
+        setup = EvaluationSetup(task="detection", protocol="released")
+        found, truth = SampleLoader(da_motion, read_results(tmp_path / "boxes.json"), setup)(token)
+        assert found.boxes.frame == truth.frame == "lidar"
+        np.testing.assert_allclose(found.boxes.center, da_motion.boxes(token, "lidar").center, atol=1e-6)
+        assert truth.center.tolist() == detection_truth(da_motion, token, setup.rules).center.tolist()
+
+    def test_explicit_accidents_are_refused_before_any_sample_is_loaded(
+        self, da_motion: DeepAccident, token: str, tmp_path: Path
+    ) -> None:
+        with ResultsWriter(tmp_path / "a.json", "accident") as writer:
+            writer.add(token, [])
+        with pytest.raises(
+            EvaluationError, match=r"a.json: holds explicit accidents; the protocol 'released' compares"
+        ):
+            SampleLoader(da_motion, read_results(tmp_path / "a.json"), EvaluationSetup(task="accident"))
+
+    def test_refused(self, da_motion: DeepAccident, motion: Results) -> None:
+        with pytest.raises(
+            EvaluationError, match=r"holds motion results; detection is evaluated from detection results"
+        ):
+            SampleLoader(da_motion, motion, EvaluationSetup(task="detection"))
+        with pytest.raises(EvaluationError, match=r"look 2 s ahead \(3 frames, 1 s apart\); .*, not 2.5 s"):
+            SampleLoader(da_motion, motion, EvaluationSetup(task="motion", horizon=2.5))
