@@ -119,8 +119,19 @@ class DeepAccident(Dataset):
         render_sample = render.render_sample
         render_frame = render.render_frame
         render_sample_data = render.render_sample_data
+        render_annotation = render.render_annotation
+        render_instance = render.render_instance
+        render_pointcloud_in_image = render.render_pointcloud_in_image
         render_bev = render.render_bev
+        render_calibration = render.render_calibration
         render_motion_labels = render.render_motion_labels
+        render_visibility = render.render_visibility
+        render_visibility_matrix = render.render_visibility_matrix
+        render_accident = render.render_accident
+        render_link = render.render_link
+        render_evaluation = render.render_evaluation
+        render_scenario_video = render.render_scenario_video
+        render_replay = render.render_replay
     else:
         motion_labels = _Later("motion")
         bev_segmentation = _Later("motion")
@@ -130,8 +141,19 @@ class DeepAccident(Dataset):
         render_sample = _Later("render")
         render_frame = _Later("render")
         render_sample_data = _Later("render")
+        render_annotation = _Later("render")
+        render_instance = _Later("render")
+        render_pointcloud_in_image = _Later("render")
         render_bev = _Later("render")
+        render_calibration = _Later("render")
         render_motion_labels = _Later("render")
+        render_visibility = _Later("render")
+        render_visibility_matrix = _Later("render")
+        render_accident = _Later("render")
+        render_link = _Later("render")
+        render_evaluation = _Later("render")
+        render_scenario_video = _Later("render")
+        render_replay = _Later("render")
 
     def list_scenarios(self) -> None:
         """Print a line for each scenario."""

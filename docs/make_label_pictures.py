@@ -223,7 +223,7 @@ def _draw_outlines(frame: int, ax: Any) -> None:
         length, width, _ = actor.size
         corners = np.array([[-1, -1, 0], [-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]) * (length, width, 0) / 2
         x, y, _ = (actor.pose(frame) @ corners).T
-        ax.plot(x, y, color="black", linewidth=1.2, zorder=2)
+        ax.plot(x, y, color="#f5a000", linewidth=1.2, zorder=2)
 
 
 def table_of_the_turn() -> str:

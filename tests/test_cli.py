@@ -1,6 +1,7 @@
 """The command line, end to end: the verbs on real folders, their grammar, their errors."""
 
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -101,7 +102,9 @@ def test_index_check_sees_an_edit_that_folder_times_hide(own_release: Path) -> N
 
 def test_demo_draws_its_accident(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     demo_module = sys.modules["deepaccident_devkit.cli.demo"]  # the package's `demo` is the verb
-    monkeypatch.setattr(demo_module, "_RELEASE", SynthConfig(scenarios=2, frames=12, image_size=(64, 36)))
+    monkeypatch.setattr(
+        demo_module, "_RELEASE", SynthConfig(scenarios=2, frames=12, image_size=(64, 36), view="hidden")
+    )
     out = tmp_path / "demo"
     result = CliRunner().invoke(deepaccident, ["demo", str(out)], catch_exceptions=False)
     assert result.exit_code == 0, result.output
@@ -115,6 +118,10 @@ def test_demo_draws_its_accident(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert all((out / name).stat().st_size > 20_000 for name in pictures)
     assert "annotation" in result.output
     assert "Try next:" in result.output
+    rows = re.findall(r"^(single vehicle|five agents) +([\d.]+)", result.output, re.MULTILINE)
+    assert [name for name, _ in rows] == ["single vehicle", "five agents"]
+    single, five = (float(number) for _, number in rows)
+    assert five > single
     again = CliRunner().invoke(deepaccident, ["demo", str(out)], catch_exceptions=False)
     assert "using the release that is in" in again.output
 

@@ -9,10 +9,15 @@ import sys
 import click
 
 from deepaccident_devkit._version import __version__
+from deepaccident_devkit.cli.baseline import baseline
 from deepaccident_devkit.cli.demo import demo
+from deepaccident_devkit.cli.evaluate import evaluate
+from deepaccident_devkit.cli.export import export
 from deepaccident_devkit.cli.index import index
 from deepaccident_devkit.cli.info import info
 from deepaccident_devkit.cli.labels import labels
+from deepaccident_devkit.cli.render import render
+from deepaccident_devkit.cli.replay import replay
 from deepaccident_devkit.cli.split import split
 from deepaccident_devkit.cli.stats import stats
 from deepaccident_devkit.cli.synth import synth
@@ -28,7 +33,8 @@ def deepaccident() -> None:
     """Tools for the DeepAccident V2X accident dataset."""
 
 
-for verb in (demo, synth, index, info, labels, split, stats, validate):
+_VERBS = (demo, synth, index, info, labels, split, stats, validate, evaluate, baseline, render, replay, export)
+for verb in _VERBS:
     deepaccident.add_command(verb)
 
 

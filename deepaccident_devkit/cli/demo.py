@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from deepaccident_devkit.baselines import demo_table
 from deepaccident_devkit.dataset import RowArgument
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.motion import MotionLabelConfig
@@ -14,17 +15,21 @@ from deepaccident_devkit.overview import overview
 from deepaccident_devkit.render import detached_figure
 from deepaccident_devkit.synth import SynthConfig, make_release
 
-_RELEASE = SynthConfig(scenarios=2, frames=40, image_size=(320, 180))
+_RELEASE = SynthConfig(scenarios=2, frames=40, image_size=(320, 180), view="hidden")
 _SECONDS_BEFORE = 1.0
 _LABELS = MotionLabelConfig(future_frames=2)
 """The released ones up to the impact."""
+_HIDDEN = """\
+A house hides the other car from the ego vehicle. What either foresees of the crash if all that it sees goes on at its
+speed (a baseline, docs/baselines.md; warning: from when on every moment has the right alarm):
+"""
 
 
 @click.command()
 @click.argument("out", type=click.Path(path_type=Path), default="deepaccident_demo")
 @click.option("--workers", type=click.IntRange(min=1), help="Processes to use.")
 def demo(out: Path, workers: int | None) -> None:
-    """Make a small synthetic release in OUT, index it, print its tables, draw its accident."""
+    """Make a small synthetic release in OUT, index it, print its tables, draw its accident, foresee it."""
     root = out / "release"
     if root.is_dir():
         click.echo(f"using the release that is in {root}")
@@ -36,6 +41,7 @@ def demo(out: Path, workers: int | None) -> None:
     for path in draw_accident(release, out):
         click.echo(f"drawn: {path}")
     click.echo(_what_next(out, root))
+    click.echo(f"\n{_HIDDEN}\n{demo_table(release)[1]}")
 
 
 def draw_accident(release: DeepAccident, out: Path) -> list[Path]:
@@ -69,5 +75,7 @@ Look at the pictures in {out}{"/" if str(out) != "." else ""}: the colliding pai
 Try next:
   deepaccident info {root} --where collision=true
   deepaccident validate {root} --deep
+  deepaccident baseline predict {root} --split train --agents all --out {out}/results
+  deepaccident evaluate accident {root} --results {out}/results/accident.json --split train --protocol boxes
   python -c "from deepaccident_devkit import DeepAccident; DeepAccident(dataroot='{root}').list_scenarios()"
   deepaccident synth my_release --scenarios 6 --layout B"""

@@ -5,7 +5,7 @@ from typing import Any, get_args
 
 import click
 
-from deepaccident_devkit.cli.options import release_parameters
+from deepaccident_devkit.cli.options import agent_names, agents_parameter, release_parameters
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
@@ -13,7 +13,6 @@ from deepaccident_devkit.motion import LABEL_PROTOCOLS, PRESETS, LabelProtocol, 
 from deepaccident_devkit.motion.label_folder import Manifest, folder_path
 from deepaccident_devkit.motion.protocols import slip_names
 from deepaccident_devkit.motion.sample_lists import Purpose
-from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x import AGENT_CONFIGS
 
 _CONFIG_OPTIONS = ("preset", "protocol", "switches", "orientation", "seen_by", "only_vehicle")
@@ -23,7 +22,7 @@ _CONFIG_OPTIONS = ("preset", "protocol", "switches", "orientation", "seen_by", "
 @release_parameters
 @click.option("--split", required=True, help="train, val, train_mini, val_mini, or a split file (….txt).")
 @click.option("--out", required=True, metavar="FOLDER", help="Where the labels go: new, or with such labels.")
-@click.option("--agents", multiple=True, metavar="NAME[,NAME…]", help="Whose samples; all if not given.")
+@agents_parameter
 @click.option(
     "--samples",
     "purpose",
@@ -44,7 +43,7 @@ def labels(split: str, out: str, agents: tuple[str, ...], purpose: Purpose, **op
     One file a scenario and agent. A call that was broken off goes on where it stopped.
     """
     config = _config(**{name: options.pop(name) for name in _CONFIG_OPTIONS})
-    chosen = _agents(agents)
+    chosen = agent_names(agents)
     Manifest.of(folder_path(out), config)  # before the release is indexed
     dataset = DeepAccident(**options)
     tokens = [token for token in dataset.samples(split, purpose) if token.rsplit("/", 2)[1] in chosen]
@@ -66,14 +65,6 @@ def _config(
     changes: dict[str, Any] = {name: value for name, value in named.items() if value is not None}
     config = MotionLabelConfig.preset(preset, **changes, **{name: value for name, value in flags.items() if value})
     return replace(config, protocol=_switched(config.rules, switches)) if switches else config
-
-
-def _agents(given: tuple[str, ...]) -> tuple[str, ...]:
-    names = [name for text in given for name in text.split(",")]
-    unknown = [name for name in names if name not in (*AGENTS, "all")]
-    if unknown:
-        raise click.BadParameter(f"--agents: expected all or some of {', '.join(AGENTS)}; found {unknown[0]!r}")
-    return AGENTS if not names or "all" in names else tuple(names)
 
 
 def _switched(rules: LabelProtocol, switches: tuple[str, ...]) -> LabelProtocol:

@@ -1,27 +1,30 @@
 """The arguments that every verb on a release takes, in one grammar."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 
-from deepaccident_devkit.taxonomy import VERSIONS
+from deepaccident_devkit.taxonomy import AGENTS, VERSIONS
+from deepaccident_devkit.v2x import AGENT_CONFIGS
 
 Verb = TypeVar("Verb", bound=Callable[..., Any])
 
+on_error_parameter = click.option(
+    "--on-error",
+    type=click.Choice(["raise", "skip"]),
+    default="raise",
+    show_default=True,
+    help="List broken scenarios and stop, or leave them out.",
+)
 _PARAMETERS = (
     click.argument("dataroot", type=click.Path(path_type=Path)),
     click.option("--version", type=click.Choice(VERSIONS), default="v1", show_default=True, help="Which release."),
     click.option("--index-dir", type=click.Path(path_type=Path), help="Where the index lies or goes."),
-    click.option("--workers", type=click.IntRange(min=1), help="Processes to index with."),
-    click.option(
-        "--on-error",
-        type=click.Choice(["raise", "skip"]),
-        default="raise",
-        show_default=True,
-        help="List broken scenarios and stop, or leave them out.",
-    ),
+    click.option("--workers", type=click.IntRange(min=1), help="Processes to use."),
+    on_error_parameter,
 )
 
 
@@ -42,3 +45,44 @@ def where_parameter(verb: Verb) -> Verb:
         "several --where must hold.",
     )
     return option(verb)
+
+
+def agents_parameter(verb: Verb) -> Verb:
+    """Give a verb `agents`, the texts of repeated --agents (`agent_names` reads them)."""
+    option = click.option("--agents", multiple=True, metavar="NAME[,NAME…]", help="Whose samples; all if not given.")
+    return option(verb)
+
+
+def agent_names(given: tuple[str, ...]) -> tuple[str, ...]:
+    """The agents that --agents names, each text one or several with commas; all for `all`, or for nothing."""
+    names = [name for text in given for name in text.split(",")]
+    unknown = [name for name in names if name not in (*AGENTS, "all")]
+    if unknown:
+        raise click.BadParameter(f"--agents: expected all or some of {', '.join(AGENTS)}; found {unknown[0]!r}")
+    return AGENTS if not names or "all" in names else tuple(names)
+
+
+def names_or_configuration(given: tuple[str, ...]) -> str | list[str] | None:
+    """What repeated --agents means where agents cooperate: one configuration, names, or None if it was not given."""
+    names = [name for text in given for name in text.split(",")]
+    return names[0] if len(names) == 1 and names[0] in AGENT_CONFIGS else names or None
+
+
+def pixel_size(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[int, int] | None:
+    """Parse `WxH` to (width, height); None stays."""
+    if value is None:
+        return None
+    match = re.fullmatch(r"(\d+)x(\d+)", value.strip(), re.IGNORECASE)
+    if match is None:
+        raise click.BadParameter(f"expected width x height such as 480x270, found {value!r}", context, parameter)
+    return int(match[1]), int(match[2])
+
+
+def frame_range(context: click.Context, parameter: click.Parameter, value: str | None) -> range | None:
+    """Parse `FIRST..LAST`, or one number; None stays."""
+    if value is None:
+        return None
+    match = re.fullmatch(r"(\d+)(?:\.\.(\d+))?", value.strip())
+    if match is None or int(match[1]) > int(match[2] or match[1]):
+        raise click.BadParameter(f"expected frame numbers such as 20..40, found {value!r}", context, parameter)
+    return range(int(match[1]), int(match[2] or match[1]) + 1)

@@ -1,23 +1,16 @@
 """`deepaccident synth`: make a synthetic release."""
 
-import re
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import click
 
+from deepaccident_devkit.cli.options import pixel_size
 from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.synth.config import View
 from deepaccident_devkit.taxonomy import Layout
 
 _DEFAULTS = SynthConfig()
-
-
-def _image_size(context: click.Context, parameter: click.Parameter, value: str) -> tuple[int, int]:
-    """Parse `WxH` to (width, height)."""
-    match = re.fullmatch(r"(\d+)x(\d+)", value.strip(), re.IGNORECASE)
-    if match is None:
-        raise click.BadParameter(f"expected width x height such as 480x270, found {value!r}", context, parameter)
-    return int(match[1]), int(match[2])
 
 
 @click.command()
@@ -26,7 +19,7 @@ def _image_size(context: click.Context, parameter: click.Parameter, value: str) 
 @click.option("--frames", default=_DEFAULTS.frames, show_default=True, help="Recorded frames a scenario, at 10 Hz.")
 @click.option(
     "--image-size",
-    callback=_image_size,
+    callback=pixel_size,
     metavar="WxH",
     default="{}x{}".format(*_DEFAULTS.image_size),
     show_default=True,
@@ -41,26 +34,19 @@ def _image_size(context: click.Context, parameter: click.Parameter, value: str) 
 )
 @click.option("--seed", default=_DEFAULTS.seed, show_default=True, help="The same seed gives the same bytes.")
 @click.option("--no-sensors", is_flag=True, help="Only labels, calib and meta: no images, point clouds, BEV arrays.")
+@click.option(
+    "--view",
+    type=click.Choice(get_args(View)),
+    default=_DEFAULTS.view,
+    show_default=True,
+    help="hidden: a house on the street corner hides the two who will collide from each other.",
+)
 @click.option("--workers", type=click.IntRange(min=1), default=None, help="Processes to use.  [default: as it pays]")
-def synth(
-    out: Path,
-    scenarios: int,
-    frames: int,
-    image_size: tuple[int, int],
-    layout: Layout,
-    seed: int,
-    no_sensors: bool,
-    workers: int | None,
-) -> None:
+def synth(out: Path, *, no_sensors: bool, workers: int | None, **options: Any) -> None:
     """Make a complete synthetic release in the new folder OUT."""
-    config = SynthConfig(
-        scenarios=scenarios,
-        frames=frames,
-        image_size=image_size,
-        layout=layout,
-        seed=seed,
-        sensors=not no_sensors,
-    )
+    config = SynthConfig(sensors=not no_sensors, **options)
     made = make_release(out, config, workers=workers, progress=True)
-    click.echo(f"{made}: {scenarios} scenarios of {frames} frames and five agents, layout {layout}")
+    click.echo(
+        f"{made}: {config.scenarios} scenarios of {config.frames} frames and five agents, layout {config.layout}"
+    )
     click.echo(f"next: deepaccident info {made}")

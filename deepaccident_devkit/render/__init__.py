@@ -1,20 +1,54 @@
 """All that draws. One panel takes `ax=` and returns the Axes; nothing here shows a window."""
 
+from deepaccident_devkit.render.accident import render_accident
+from deepaccident_devkit.render.annotation import render_annotation
 from deepaccident_devkit.render.axes import detached_figure
 from deepaccident_devkit.render.bev import render_bev
 from deepaccident_devkit.render.boxes import draw_box
+from deepaccident_devkit.render.calibration import render_calibration
 from deepaccident_devkit.render.camera import render_sample_data
+from deepaccident_devkit.render.instance import render_instance
+from deepaccident_devkit.render.layers import LAYERS, Layer
+from deepaccident_devkit.render.link import render_link
 from deepaccident_devkit.render.moments import render_frame, render_sample
-from deepaccident_devkit.render.motion import draw_motion_labels, draw_motion_map, render_motion_labels
+from deepaccident_devkit.render.motion import (
+    draw_motion_labels,
+    draw_motion_map,
+    draw_motion_output,
+    draw_motion_trail,
+    render_motion_labels,
+)
+from deepaccident_devkit.render.outcomes import draw_accident_outcome, draw_detection_outcome, render_evaluation
+from deepaccident_devkit.render.pointcloud import render_pointcloud_in_image
+from deepaccident_devkit.render.replay import render_replay
+from deepaccident_devkit.render.video import render_scenario_video
+from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix
 
 __all__ = [
+    "LAYERS",
+    "Layer",
     "detached_figure",
+    "draw_accident_outcome",
     "draw_box",
+    "draw_detection_outcome",
     "draw_motion_labels",
     "draw_motion_map",
+    "draw_motion_output",
+    "draw_motion_trail",
+    "render_accident",
+    "render_annotation",
     "render_bev",
+    "render_calibration",
+    "render_evaluation",
     "render_frame",
+    "render_instance",
+    "render_link",
     "render_motion_labels",
+    "render_pointcloud_in_image",
+    "render_replay",
     "render_sample",
     "render_sample_data",
+    "render_scenario_video",
+    "render_visibility",
+    "render_visibility_matrix",
 ]

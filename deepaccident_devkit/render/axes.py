@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Literal
 
+from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render.colors import GRID_COLOR
 
 if TYPE_CHECKING:
@@ -27,6 +29,17 @@ def figure_or_new(fig: Figure | None, size: tuple[float, float]) -> Figure:
     from matplotlib import pyplot as plt
 
     return plt.figure(figsize=size, layout="constrained")
+
+
+def axis_words(frame: str) -> tuple[str, str]:
+    """What the axes of a view from above say, in metres of `ego`, `lidar` or `world`."""
+    return ("x, world (m)", "y, world (m)") if frame == "world" else ("x forward (m)", "y left (m)")
+
+
+def check_view_range(metres: float) -> None:
+    """Raise ChoiceError unless so many metres can be shown to each side."""
+    if not (math.isfinite(metres) and metres > 0):
+        raise ChoiceError(f"view_range: expected metres above 0, found {metres!r}")
 
 
 def detached_figure(size: tuple[float, float]) -> Figure:

@@ -2,59 +2,218 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, get_args
 
 import numpy as np
 
+from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.render.axes import axes_or_new
-from deepaccident_devkit.render.boxes import box_colors, draw_boxes_from_above
-from deepaccident_devkit.render.colors import GRID_COLOR
-from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.render.axes import axes_or_new, axis_words, check_view_range
+from deepaccident_devkit.render.boxes import draw_actors_from_above, write_beside
+from deepaccident_devkit.render.colors import AGENT_COLORS, GRID_COLOR, OWN_COLOR, POINT_COLOR
+from deepaccident_devkit.render.layers import Layer, layers_of
+from deepaccident_devkit.render.legends import agent_handles, box_handles, draw_legend
+from deepaccident_devkit.render.points import draw_points_from_above
+from deepaccident_devkit.render.roles import at_once, role_colors, short_name
+from deepaccident_devkit.render.trails import draw_trails
+from deepaccident_devkit.render.underlay import draw_underlay
+from deepaccident_devkit.taxonomy import BEV_CAMERA, LIDAR, AgentName, Frame
+from deepaccident_devkit.v2x import (
+    Agents,
+    Link,
+    aggregate_point_cloud,
+    cooperating_agents,
+    cooperative_boxes,
+    transform,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from deepaccident_devkit.tables.records import SampleRecord
 
-def render_bev(
-    dataset: Dataset, sample: RowArgument, *, view_range: float = 50.0, points: bool = True, ax: Axes | None = None
+BEV_LAYERS: Final[tuple[Layer, ...]] = ("bev", "points", "boxes", "ids", "velocities", "trajectories", "grid")
+BEV_DEFAULT: Final[tuple[Layer, ...]] = ("bev", "points", "boxes", "grid")
+_OF_BOXES: Final = frozenset(("boxes", "ids", "velocities", "trajectories"))
+_BEYOND: Final = 5.0
+"""Metres past the edge of the picture at which a box may still reach into it."""
+_MARK: Final = np.array([[1.8, 0.0], [-1.2, 1.1], [-0.6, 0.0], [-1.2, -1.1]])
+"""An arrow head, metres of an agent's ego frame."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BevView:
+    """Which part of a moment is drawn from above, and from whose data.
+
+    Attributes:
+        view_range: metres shown to each side of the agent.
+        frame: of the axes: `ego`, `lidar` or `world`.
+        agents: whose points and boxes.
+        link: what happens to the partners' data.
+        sweeps: frames of points, the present included.
+        seconds: how far trajectories reach back and ahead.
+        center: of the picture, metres of `frame`; None for the agent.
+    """
+
+    view_range: float = 50.0
+    frame: str = "ego"
+    agents: Agents = "single"
+    link: Link | None = None
+    sweeps: int = 1
+    seconds: tuple[float, float] = (1.0, 3.0)
+    center: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        """Check the frame and the range; raises ChoiceError."""
+        check_view_range(self.view_range)
+        if self.frame not in get_args(Frame):
+            raise ChoiceError(f"frame: expected one of {', '.join(get_args(Frame))}, found {self.frame!r}")
+
+
+def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a notebook
+    dataset: Dataset,
+    sample: RowArgument,
+    *,
+    view_range: float = 50.0,
+    agents: Agents = "single",
+    frame: Frame = "ego",
+    layers: Iterable[Layer] | None = None,
+    link: Link | None = None,
+    sweeps: int = 1,
+    seconds: tuple[float, float] = (1.0, 3.0),
+    ax: Axes | None = None,
 ) -> Axes:
-    """Draw a sample's boxes and LiDAR points from above, in the agent's ego frame with forward to the right.
+    """Draw a moment from above: boxes, LiDAR points and more, in one frame, metres.
 
-    The colliding pair is red, the recording agent green, the others coloured by category.
+    The colliding pair is red, their companions green, the others coloured by category. The sample's own agent has a
+    dark mark, other agents one in their colour with their name; where several agents' points are drawn, they have
+    their agents' colours.
 
     Args:
         dataset: the release.
-        sample: token or record.
+        sample: token or record: its agent is in the middle, its frame the present.
         view_range: metres shown to each side of the agent.
-        points: whether to draw the LiDAR points, where their file is there.
+        agents: whose points and boxes: names of agents, a configuration or its name, or None for all that are there;
+            by default the sample's own agent alone. Several agents' boxes are drawn once an actor.
+        frame: of the axes: `ego` or `lidar` (forward to the right, left up), or `world`.
+        layers: of `bev` (what the agent's BEV camera saw, muted), `points`, `boxes`, `ids`, `velocities` (arrows of a
+            second), `trajectories` (past thin, future thick, fading) and `grid`; by default bev, points, boxes, grid.
+            Points and the BEV camera are left out where their files are not there.
+        link: what happens to the partners' data; None for nothing.
+        sweeps: how many frames of points, the present included.
+        seconds: how far trajectories reach back and ahead.
         ax: axes to draw on; new ones if None.
 
     Returns:
-        The axes drawn on, in metres of the ego frame.
+        The axes drawn on, in metres of `frame`.
 
     Raises:
         TokenError: no such sample.
+        ChoiceError: no such layer, frame, agent or configuration, `sweeps` is no whole number from 1, or `view_range`
+            is not above 0.
+        NotAvailableError: an agent is not in this (partial) release.
+        ConfigError: `link` is no Link, or its latency is longer than the scenario's past.
     """
-    ax = axes_or_new(ax)
-    record = dataset.get("sample", sample)
-    if points and dataset.get_sample_data_path(f"{record['token']}/lidar01").is_file():
-        cloud = dataset.load_point_cloud(record, frame="ego").xyz
-        near = (np.abs(cloud[:, :2]) < view_range).all(axis=1)
-        ax.scatter(cloud[near, 0], cloud[near, 1], s=0.6, c="#9a9a9a", linewidths=0, rasterized=True)
-    boxes = dataset.boxes(record, frame="ego")
-    draw_boxes_from_above(boxes, ax, box_colors(boxes, collider_ids(dataset, record)))
-    ax.set(xlim=(-view_range, view_range), ylim=(-view_range, view_range), aspect="equal")
-    ax.set(xlabel="x forward (m)", ylabel="y left (m)", title=f"{record['agent']}, t = {record['timestamp']:.1f} s")
-    ax.grid(color=GRID_COLOR, linewidth=0.4)
+    chosen = layers_of(layers, BEV_DEFAULT, BEV_LAYERS)
+    view = BevView(view_range=view_range, frame=frame, agents=agents, link=link, sweeps=sweeps, seconds=seconds)
+    names = cooperating_agents(dataset, sample, agents)
+    ax = axes_or_new(ax, (6, 6.6))
+    colors = draw_bev(dataset, sample, view, chosen, ax)
+    handles = box_handles(colors)
+    if "points" in chosen and len(names) > 1:
+        handles += agent_handles(names)
+    draw_legend(ax, handles, columns=5, loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=5)
     return ax
 
 
-def collider_ids(dataset: Dataset, sample: RowArgument) -> set[int]:
-    """The label ids, in this sample, of the pair that meta says collided: −100 where the agent is one of them."""
-    record = dataset.get("sample", sample)
-    collision = dataset.get("scenario", record["scenario_token"])["collision"]
-    if collision is None:
-        return set()
-    agent_id = dataset.get("agent", record["agent_token"])["actor_id"]
-    return {OWN_ACTOR_ID if actor_id == agent_id else actor_id for actor_id in collision["ids"]}
+def draw_bev(
+    dataset: Dataset, sample: RowArgument, view: BevView, layers: frozenset[Layer], ax: Axes
+) -> frozenset[str]:
+    """Draw a panel of `render_bev`, which says what and when it raises; returns the colours of the boxes drawn."""
+    record = dataset.sample[dataset.getind("sample", sample)]
+    names = cooperating_agents(dataset, record, view.agents)
+    target_from_world = dataset.world_from(record, view.frame).inverse()
+    target_from_ego = target_from_world @ dataset.world_from(record, "ego")
+    center = target_from_ego.translation[:2] if view.center is None else np.array(view.center)
+    ax.set(
+        xlim=(center[0] - view.view_range, center[0] + view.view_range),
+        ylim=(center[1] - view.view_range, center[1] + view.view_range),
+        aspect="equal",
+        anchor="N",
+    )
+    if "bev" in layers and dataset.get_sample_data_path(f"{record['token']}/{BEV_CAMERA}").is_file():
+        image = dataset.load_bev(record)
+        reach = view.view_range + float(np.abs(center - target_from_ego.translation[:2]).max())
+        draw_underlay(image, ax, target_from_ego=target_from_ego, view_range=reach)
+    if "points" in layers:
+        _draw_clouds(dataset, record, view, names, center, ax)
+    drawn: frozenset[str] = frozenset()
+    if not layers.isdisjoint(_OF_BOXES):
+        boxes = _boxes(dataset, record, view, names)
+        boxes = boxes.select((np.abs(boxes.center[:, :2] - center) < view.view_range + _BEYOND).all(axis=1))
+        colors = role_colors(dataset, record, boxes)
+        if "trajectories" in layers:
+            draw_trails(
+                dataset, record, boxes, colors, target_from_world=target_from_world, seconds=view.seconds, ax=ax
+            )
+        draw_actors_from_above(boxes, ax, colors, layers)
+        drawn = frozenset(colors)
+    _draw_marks(dataset, record, view.frame, names, ax)
+    _finish(record, view.frame, grid="grid" in layers, ax=ax)
+    return drawn
+
+
+def _boxes(dataset: Dataset, record: SampleRecord, view: BevView, names: Sequence[AgentName]) -> Boxes:
+    """The sample's own boxes with their label ids, or several agents' with CARLA's."""
+    if list(names) == [record["agent"]]:
+        return dataset.boxes(record, view.frame)
+    return cooperative_boxes(dataset, record, agents=names, frame=view.frame, link=view.link)
+
+
+def _draw_clouds(
+    dataset: Dataset,
+    record: SampleRecord,
+    view: BevView,
+    names: Sequence[AgentName],
+    center: FloatArray,
+    ax: Axes,
+) -> None:
+    """The points of each agent, in its colour where there are several."""
+    for agent in names:
+        there = at_once(record, agent)
+        if not dataset.get_sample_data_path(f"{there}/{LIDAR}").is_file():
+            continue
+        cloud = aggregate_point_cloud(
+            dataset, record, agents=[agent], sweeps=view.sweeps, frame=view.frame, link=view.link
+        )
+        color = AGENT_COLORS[agent] if len(names) > 1 else POINT_COLOR
+        draw_points_from_above(cloud.xyz, ax, center=center, view_range=view.view_range, color=color)
+
+
+def _draw_marks(dataset: Dataset, record: SampleRecord, frame: str, names: Sequence[AgentName], ax: Axes) -> None:
+    """An arrow head at the true pose of each agent; of several agents with their names."""
+    from matplotlib.collections import PolyCollection
+
+    heads, colors = [], []
+    for agent in names:
+        axes_from_ego = transform(dataset, record, at_once(record, agent), frame, "ego")
+        heads.append(axes_from_ego.apply(np.column_stack([_MARK, np.zeros(len(_MARK))]))[:, :2])
+        colors.append(OWN_COLOR if agent == record["agent"] else AGENT_COLORS[agent])
+        if len(names) > 1:
+            x, y = axes_from_ego.translation[:2].tolist()
+            write_beside(ax, short_name(agent), (x, y), colors[-1])
+    ax.add_collection(PolyCollection(heads, facecolors=colors, edgecolors="white", linewidths=0.6, zorder=5))
+
+
+def _finish(record: SampleRecord, frame: str, *, grid: bool, ax: Axes) -> None:
+    countdown = "" if record["time_to_impact"] is None else f", {record['time_to_impact']:.1f} s to the impact"
+    words = axis_words(frame)
+    ax.set(xlabel=words[0], ylabel=words[1])
+    ax.set_title(f"{record['agent']}, t = {record['timestamp']:.1f} s{countdown}", fontsize="medium")
+    ax.set_axisbelow(True)
+    if grid:
+        ax.grid(color=GRID_COLOR, linewidth=0.4)

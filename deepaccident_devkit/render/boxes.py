@@ -2,89 +2,171 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.arrays import BoolArray, FloatArray
 from deepaccident_devkit.geometry import Box, Boxes, PinholeCamera
-from deepaccident_devkit.render.colors import CATEGORY_COLORS, COLLIDER_COLOR, OWN_COLOR
-from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
+from deepaccident_devkit.render.colors import CATEGORY_COLORS
+from deepaccident_devkit.render.layers import Layer
+from deepaccident_devkit.taxonomy import OWN_ACTOR_ID, UNTRACKED_ID
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
-
     from matplotlib.axes import Axes
-    from matplotlib.collections import LineCollection, PolyCollection
 
 EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
 """The twelve edges of a box between its corners, in `Box.corners` order; the first four are its front."""
 NEAREST_DRAWN = 0.1
 """Metres before the camera at which edges are cut off."""
-
-
-def box_colors(boxes: Boxes, colliders: Collection[int] = ()) -> list[str]:
-    """A colour a box: the colliding pair, the agent itself, else by category."""
-    colors = []
-    for actor_id, name in zip(boxes.actor_id.tolist(), boxes.category_names, strict=True):
-        own = OWN_COLOR if actor_id == OWN_ACTOR_ID else CATEGORY_COLORS[name]
-        colors.append(COLLIDER_COLOR if actor_id in colliders else own)
-    return colors
+SMALLEST_TEXT: Final = 7
+"""Points: what is still read in a notebook."""
 
 
 def draw_box(box: Box, ax: Axes, color: str | None = None) -> Axes:
     """Draw one box from above, in its own frame's x and y, metres, with a line towards its front."""
-    corners = box.bottom_corners()
     chosen = color or CATEGORY_COLORS[box.category]
-    ax.add_collection(_outlines(corners.T[None, :, :2], [chosen]))
-    ax.add_collection(_headings(box.center[None, :2], corners.T[None, :, :2], [chosen]))
+    _draw_footprints(box.center[None, :2], box.bottom_corners().T[None, :, :2], ax, [chosen], 0.25, {})
     return ax
 
 
-def draw_boxes_from_above(boxes: Boxes, ax: Axes, colors: list[str]) -> None:
-    """Draw boxes in their frame's x and y, metres, each with a line towards its front."""
-    corners = boxes.bottom_corners()[..., :2]
-    ax.add_collection(_outlines(corners, colors))
-    ax.add_collection(_headings(boxes.center[:, :2], corners, colors))
+def draw_boxes_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str], *, fill: float = 0.25, **how: Any) -> None:
+    """Draw boxes in their frame's x and y, metres, each with a line towards its front.
+
+    Args:
+        boxes: in any frame that stands on the ground.
+        ax: axes to draw on.
+        colors: a colour a box.
+        fill: how opaque the inside is, from 0 to 1.
+        how: of the outlines, such as `linestyle` or `linewidths`.
+    """
+    _draw_footprints(boxes.center[:, :2], boxes.bottom_corners()[..., :2], ax, colors, fill, how)
 
 
-def draw_boxes_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: list[str]) -> None:
-    """Draw the edges of boxes given in the camera's optical frame, as far as they lie before the camera."""
+def draw_ids_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str]) -> None:
+    """Write the label ids of tracked boxes beside them; the recording agent is `own`."""
+    for center, actor_id, color in zip(boxes.center.tolist(), boxes.actor_id.tolist(), colors, strict=True):
+        _write_id(ax, (center[0], center[1]), actor_id, color)
+
+
+def draw_velocities_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str]) -> None:
+    """Draw an arrow to where each box with a known velocity would be in a second."""
+    moving = _moving(boxes)
+    if moving.any():
+        center, velocity = boxes.center[moving], boxes.velocity[moving]
+        chosen = [color for color, moves in zip(colors, moving.tolist(), strict=True) if moves]
+        start, step = center[:, :2].T, velocity[:, :2].T
+        ax.quiver(*start, *step, color=chosen, angles="xy", scale_units="xy", scale=1, width=0.004, zorder=4)
+
+
+def draw_actors_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str], layers: Collection[Layer]) -> None:
+    """Draw those of the layers `boxes`, `velocities` and `ids` that are asked for, as the functions above do."""
+    if "boxes" in layers:
+        draw_boxes_from_above(boxes, ax, colors)
+    if "velocities" in layers:
+        draw_velocities_from_above(boxes, ax, colors)
+    if "ids" in layers:
+        draw_ids_from_above(boxes, ax, colors)
+
+
+def draw_boxes_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Sequence[str]) -> None:
+    """Draw the edges of boxes given in the camera's optical frame, as far as they lie before the camera.
+
+    The front of a box is filled where all of it is before the camera.
+    """
+    from matplotlib.collections import LineCollection, PolyCollection
+    from matplotlib.colors import to_rgba_array
+
+    corners = boxes.corners()
+    pixels, drawn = segments_in_image(corners[:, EDGES].reshape(-1, 2, 3), camera)
+    edge_colors = to_rgba_array(list(colors)).repeat(len(EDGES), axis=0)[drawn]
+    ax.add_collection(LineCollection(list(pixels), colors=edge_colors, linewidths=1.2))
+    before = (corners[:, :4, 2] >= NEAREST_DRAWN).all(axis=1)
+    fronts = camera.project(corners[before, :4].reshape(-1, 3))[0].reshape(-1, 4, 2)
+    faces = to_rgba_array(list(colors))[before]
+    faces[:, 3] *= 0.25
+    ax.add_collection(PolyCollection(list(fronts), facecolors=faces, edgecolors="none"))
+
+
+def draw_ids_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Sequence[str]) -> None:
+    """Write the ids of tracked boxes of the camera's optical frame above them, where their top is in the image."""
+    top = boxes.corners()[:, (0, 1, 4, 5)].mean(axis=1)
+    pixels, depth = camera.project(top)
+    seen = camera.in_image(pixels, depth, min_depth=NEAREST_DRAWN)
+    for row in np.flatnonzero(seen).tolist():
+        _write_id(ax, (pixels[row, 0], pixels[row, 1]), int(boxes.actor_id[row]), colors[row])
+
+
+def draw_velocities_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Sequence[str]) -> None:
+    """Draw a line to where the centre of each moving box of the camera's optical frame would be in a second."""
     from matplotlib.collections import LineCollection
+    from matplotlib.colors import to_rgba_array
 
-    lines, line_colors = [], []
-    for corners, color in zip(boxes.corners(), colors, strict=True):
-        for edge in EDGES:
-            segment = _before_camera(corners[list(edge)])
-            if segment is not None:
-                pixels, _ = camera.project(segment)
-                lines.append(pixels)
-                line_colors.append(color)
-    ax.add_collection(LineCollection(lines, colors=line_colors, linewidths=1.2))
+    moving = _moving(boxes)
+    center = boxes.center[moving]
+    pixels, drawn = segments_in_image(np.stack([center, center + boxes.velocity[moving]], axis=1), camera)
+    chosen = to_rgba_array(list(colors))[moving][drawn]
+    ax.add_collection(LineCollection(list(pixels), colors=chosen, linewidths=2, linestyles=(0, (2, 1))))
 
 
-def _before_camera(segment: FloatArray) -> FloatArray | None:
-    """The part (2, 3) of a line segment with z ≥ NEAREST_DRAWN; None if there is none."""
-    depth = segment[:, 2]
-    if (depth < NEAREST_DRAWN).all():
-        return None
-    if (depth >= NEAREST_DRAWN).all():
-        return segment
-    share = (NEAREST_DRAWN - depth[0]) / (depth[1] - depth[0])
-    cut = segment[0] + share * (segment[1] - segment[0])
-    return np.array([cut, segment[1]] if depth[0] < NEAREST_DRAWN else [segment[0], cut])
+def segments_in_image(segments: FloatArray, camera: PinholeCamera) -> tuple[FloatArray, BoolArray]:
+    """Line segments (S, 2, 3) of the optical frame as pixels (V, 2, 2), and which (S,) of them are before the camera.
+
+    What is nearer than `NEAREST_DRAWN` is cut off.
+    """
+    depth = segments[..., 2]
+    drawn = np.asarray((depth >= NEAREST_DRAWN).any(axis=1))
+    ends, depth = segments[drawn].copy(), depth[drawn]
+    for near, far in ((0, 1), (1, 0)):
+        behind = depth[:, near] < NEAREST_DRAWN
+        share = (NEAREST_DRAWN - depth[behind, far]) / (depth[behind, near] - depth[behind, far])
+        start = ends[behind, far]
+        ends[behind, near] = start + share[:, None] * (ends[behind, near] - start)
+    pixels, _ = camera.project(ends.reshape(-1, 3))
+    return pixels.reshape(-1, 2, 2), drawn
 
 
-def _outlines(corners: FloatArray, colors: list[str]) -> PolyCollection:
-    from matplotlib.collections import PolyCollection
-    from matplotlib.colors import to_rgba
+def _draw_footprints(
+    centers: FloatArray, corners: FloatArray, ax: Axes, colors: Sequence[str], fill: float, how: Mapping[str, Any]
+) -> None:
+    """Outlines (N, 4, 2), the front corners first, and lines from the centres (N, 2) to the fronts."""
+    from matplotlib.collections import LineCollection, PolyCollection
+    from matplotlib.colors import to_rgba_array
 
-    faces = [to_rgba(color, 0.25) for color in colors]
-    return PolyCollection(list(corners), facecolors=faces, edgecolors=colors, linewidths=1.2, zorder=3)
+    faces = to_rgba_array(list(colors))
+    faces[:, 3] *= fill
+    style = {"linewidths": 1.2, "zorder": 3, **how}
+    ax.add_collection(PolyCollection(list(corners), facecolors=faces, edgecolors=list(colors), **style))
+    headings = np.stack([centers, corners[:, :2].mean(axis=1)], axis=1)
+    ax.add_collection(LineCollection(list(headings), colors=list(colors), **style))
 
 
-def _headings(centers: FloatArray, corners: FloatArray, colors: list[str]) -> LineCollection:
-    from matplotlib.collections import LineCollection
+def _moving(boxes: Boxes) -> BoolArray:
+    moving: BoolArray = np.linalg.norm(boxes.velocity, axis=1) > 0  # NaN, what is not known, is not
+    return moving
 
-    fronts = corners[:, :2].mean(axis=1)
-    return LineCollection(list(np.stack([centers, fronts], axis=1)), colors=colors, linewidths=1.2, zorder=3)
+
+def _write_id(ax: Axes, place: tuple[float, float], actor_id: int, color: str) -> None:
+    if actor_id == UNTRACKED_ID:
+        return
+    words = "own" if actor_id == OWN_ACTOR_ID else str(actor_id)
+    write_beside(ax, words, place, color)
+
+
+def write_beside(ax: Axes, words: str, place: tuple[float, float], color: str) -> None:
+    """Write a few words right above a place in data coordinates, legible on any ground; not outside the axes."""
+    from matplotlib.patheffects import withStroke
+
+    ax.annotate(
+        words,
+        place,
+        xytext=(2, 2),
+        textcoords="offset points",
+        color=color,
+        fontsize=SMALLEST_TEXT,
+        annotation_clip=True,
+        clip_on=True,
+        path_effects=[withStroke(linewidth=2, foreground="white")],
+        zorder=6,
+    )

@@ -13,12 +13,42 @@ CATEGORY_COLORS: Mapping[str, str] = {
     "pedestrian": "#c2379a",
 }
 AGENT_COLORS: Mapping[str, str] = dict(
-    zip(AGENTS, ("#d62728", "#ff9896", "#1f77b4", "#9ecae1", "#7f7f7f"), strict=True)
+    zip(AGENTS, ("#1f6fe0", "#1fb5d6", "#f07f09", "#c9a800", "#9b4de0"), strict=True)
 )
+"""Legible on white and in camera images; without red and green, which mark the accident's actors."""
 SPLIT_COLORS: Mapping[str, str] = dict(
     zip((*SPLITS, "unknown"), ("#2f6fde", "#e08a1e", "#1a9850", "#9a9a9a"), strict=True)
 )
 COLLIDER_COLOR = "#e60026"
-OWN_COLOR = "#1a9850"
-"""The recording agent itself."""
+COMPANION_COLOR = "#1a9850"
+"""The agents behind the colliding pair, as in the paper."""
+OWN_COLOR = "#111111"
+"""The recording agent itself: a mark beside the colour that its part in the accident gives it."""
+POINT_COLOR = "#9a9a9a"
+"""LiDAR points where nothing tells them apart."""
+DEPTH_COLORMAP = "turbo_r"
+"""LiDAR points in images, the nearest red."""
+HEIGHT_COLORMAP = "viridis"
+BEV_COLORS: Mapping[str, str] = {
+    "road": "#e9e9ec",
+    "road_line": "#ffffff",
+    "sidewalk": "#f6efe4",
+    "vehicle": "#cdd6e6",
+    "pedestrian": "#ecd2e4",
+}
+"""CARLA's tags in the BEV camera, muted: boxes are drawn upon it."""
 GRID_COLOR = "#d0d0d0"
+MUTED_COLOR = "#666666"
+"""Words of less weight."""
+TRUE_PLACE_COLOR = "#8a8a8a"
+"""Where something truly is that is drawn elsewhere, too."""
+OUTCOME_COLORS: Mapping[str, str] = {"right": "#1a9850", "false": "#e08a1e", "missed": "#9a9a9a"}
+"""What was predicted and is true, what is not true, and what was not predicted."""
+SERIES_COLORS = ("#08306b", "#2f6fde", "#7fb2e5", "#9a9a9a")
+"""Lines or bars of one kind that differ in one number, the strictest first."""
+ESTIMATE_COLOR = "#2f6fde"
+"""A number with an interval."""
+WARNING_COLOR = "#b00020"
+"""Words that nobody may overlook; dark enough for text on white."""
+BEYOND_COLOR = "#e4e4e4"
+"""Ground of a frame that is not recorded."""

@@ -2,29 +2,63 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.render.axes import figure_or_new
-from deepaccident_devkit.render.bev import render_bev
-from deepaccident_devkit.render.camera import render_sample_data
-from deepaccident_devkit.taxonomy import AGENTS
+from deepaccident_devkit.render.bev import BEV_DEFAULT, BEV_LAYERS, BevView, draw_bev
+from deepaccident_devkit.render.camera import CAMERA_DEFAULT, CAMERA_LAYERS, render_sample_data
+from deepaccident_devkit.render.colors import CATEGORY_COLORS
+from deepaccident_devkit.render.layers import LAYERS, Layer, layers_of
+from deepaccident_devkit.render.legends import agent_handles, box_handles, draw_legend
+from deepaccident_devkit.render.roles import at_once, in_drawing_order
+from deepaccident_devkit.taxonomy import CAMERAS
+from deepaccident_devkit.v2x import Agents, Link, cooperating_agents
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_CAMERA_GRID = (
+CAMERA_GRID: Final = (
     ("Camera_FrontLeft", "Camera_Front", "Camera_FrontRight"),
     ("Camera_BackLeft", "Camera_Back", "Camera_BackRight"),
 )
+"""Where the six cameras are in a picture of them all."""
+_TALL_GRID: Final = (
+    ("Camera_Front", "Camera_Back"),
+    ("Camera_FrontLeft", "Camera_FrontRight"),
+    ("Camera_BackLeft", "Camera_BackRight"),
+)
+"""The same in a figure of about 16 to 9."""
+_WIDE: Final = 2.1
+"""Width by height from which a figure has room for three cameras and a view from above beside each other."""
+_VIEW_RANGE: Final = 50.0
+"""Metres to each side of an agent among others; to its left and right more, where the figure is tall."""
+_TALLEST: Final = 2.0
+_BESIDE, _ABOUT = 0.9, 1.6
+"""Inches that words take beside panels, and above and below them."""
+MOMENT_LAYERS: Final = tuple(layer for layer in LAYERS if layer in {*CAMERA_LAYERS, *BEV_LAYERS})
 
 
-def render_sample(dataset: Dataset, sample: RowArgument, *, fig: Figure | None = None) -> Figure:
+def render_sample(
+    dataset: Dataset,
+    sample: RowArgument,
+    *,
+    agents: Agents = "single",
+    layers: Iterable[Layer] | None = None,
+    link: Link | None = None,
+    fig: Figure | None = None,
+) -> Figure:
     """Draw a sample: its six cameras as they look, and boxes and LiDAR from above.
 
     Args:
         dataset: the release.
         sample: token or record.
+        agents: whose points and boxes are drawn from above (`render_bev`); by default the sample's own agent's.
+        layers: each panel draws those of them that it has: cameras those of `render_sample_data`, the panel from above
+            those of `render_bev`; by default each its own default.
+        link: what happens to the partners' data; None for nothing.
         fig: an empty figure to draw on; a new one if None.
 
     Returns:
@@ -32,41 +66,108 @@ def render_sample(dataset: Dataset, sample: RowArgument, *, fig: Figure | None =
 
     Raises:
         TokenError: no such sample.
+        ChoiceError: no such layer, agent or configuration.
+        NotAvailableError: an agent is not in this (partial) release.
+        ConfigError: `link` is no Link, or its latency is longer than the scenario's past.
         MissingFileError: an image was not downloaded.
     """
+    in_cameras, from_above = panel_layers(layers)
     record = dataset.get("sample", sample)
-    fig = figure_or_new(fig, (16, 7))
-    axes = fig.subplot_mosaic([[*_CAMERA_GRID[0], "bev"], [*_CAMERA_GRID[1], "bev"]], width_ratios=(4, 4, 4, 4.5))
-    for channel in (*_CAMERA_GRID[0], *_CAMERA_GRID[1]):
-        render_sample_data(dataset, f"{record['token']}/{channel}", ax=axes[channel])
-    render_bev(dataset, record, ax=axes["bev"])
-    fig.suptitle(record["token"])
+    names = cooperating_agents(dataset, record, agents)
+    fig = figure_or_new(fig, (16, 5.6))
+    wide = fig.bbox.width > _WIDE * fig.bbox.height
+    grid, ratios = (CAMERA_GRID, (4, 4, 4, 4.5)) if wide else (_TALL_GRID, (4, 4, 8))
+    axes = fig.subplot_mosaic([[*row, "bev"] for row in grid], width_ratios=ratios)
+    for channel in CAMERAS:
+        render_sample_data(dataset, f"{record['token']}/{channel}", layers=in_cameras, ax=axes[channel])
+    drawn = draw_bev(dataset, record, BevView(agents=names, link=link), from_above, axes["bev"])
+    axes["bev"].set_title("")
+    handles = box_handles(drawn)
+    if "points" in from_above and len(names) > 1:
+        handles += agent_handles(names)
+    draw_legend(fig, handles, columns=len(handles), loc="outside lower center")
+    fig.suptitle(_heading(record["token"], record))
     return fig
 
 
-def render_frame(dataset: Dataset, frame: RowArgument, *, fig: Figure | None = None) -> Figure:
-    """Draw what the agents of a moment see to the front, and each one's boxes and LiDAR from above.
+def render_frame(
+    dataset: Dataset,
+    frame: RowArgument,
+    *,
+    agents: Agents = None,
+    layers: Iterable[Layer] | None = None,
+    fig: Figure | None = None,
+) -> Figure:
+    """Draw what the agents of a moment see to the front, and each one's boxes and LiDAR from above, side by side.
+
+    The colliding pair is red and their companions green, as in the paper.
 
     Args:
         dataset: the release.
         frame: token or record.
-        fig: an empty figure to draw on; a new one if None.
+        agents: which, or None for all that are there; a configuration is as seen from the first that is there. Their
+            order is always that of `taxonomy.AGENTS`.
+        layers: each panel draws those of them that it has: cameras those of `render_sample_data`, panels from above
+            those of `render_bev`; by default each its own default.
+        fig: an empty figure to draw on; a new one if None. In a tall one, panels from above reach farther to the left
+            and right of the agent than the 50 m before and behind it.
 
     Returns:
-        The figure drawn on, a column an agent that is there.
+        The figure drawn on, a column an agent.
 
     Raises:
         TokenError: no such frame.
+        ChoiceError: no such layer, agent or configuration.
+        NotAvailableError: an agent is not in this (partial) release.
         MissingFileError: an image was not downloaded.
     """
+    in_cameras, from_above = panel_layers(layers)
     record = dataset.get("frame", frame)
-    samples = dataset.samples_of(record)
-    fig = figure_or_new(fig, (4 * len(AGENTS), 6.5))
-    axes = fig.subplots(2, len(samples), squeeze=False, height_ratios=(9, 16))
-    for column, sample in enumerate(samples):
-        render_sample_data(dataset, f"{sample['token']}/Camera_Front", ax=axes[0, column]).set_title(sample["agent"])
-        render_bev(dataset, sample, ax=axes[1, column]).set_title("")
-    end = record["time_to_impact"]
-    countdown = "" if end is None else f", {end:.1f} s to the impact"
-    fig.suptitle(f"{record['token']}, t = {record['timestamp']:.1f} s{countdown}")
+    first = dataset.samples_of(record)[0]
+    names = in_drawing_order(cooperating_agents(dataset, first, agents))
+    fig = figure_or_new(fig, (3.6 * len(names), 6.9))
+    tall = _tallness(fig, len(names))
+    view = BevView(view_range=_VIEW_RANGE * tall)
+    axes = fig.subplots(2, len(names), squeeze=False, height_ratios=(9 / 16, tall))
+    drawn: set[str] = set()
+    for column, agent in enumerate(names):
+        sample = at_once(first, agent)
+        camera = render_sample_data(dataset, f"{sample}/Camera_Front", layers=in_cameras, ax=axes[0, column])
+        camera.set_title(agent)
+        above = axes[1, column]
+        drawn |= draw_bev(dataset, sample, view, from_above, above)
+        above.set_xlim(-_VIEW_RANGE, _VIEW_RANGE)
+        _plain(above, labelled=column == 0)
+    if fig.figure is fig:  # a part of a figure is laid out with it
+        fig.set_layout_engine("compressed")
+    draw_legend(fig, box_handles(drawn), columns=2 + len(CATEGORY_COLORS), loc="outside lower center")
+    fig.suptitle(_heading(f"{record['token']}, t = {record['timestamp']:.1f} s", record))
     return fig
+
+
+def panel_layers(layers: Iterable[Layer] | None) -> tuple[frozenset[Layer], frozenset[Layer]]:
+    """What cameras and what panels from above draw of the layers asked for; raises ChoiceError."""
+    if layers is None:
+        return frozenset(CAMERA_DEFAULT), frozenset(BEV_DEFAULT)
+    chosen = layers_of(layers, (), MOMENT_LAYERS)
+    return chosen.intersection(CAMERA_LAYERS), chosen.intersection(BEV_LAYERS)
+
+
+def _tallness(fig: Figure, columns: int) -> float:
+    """Height by width of panels from above that fill the figure below cameras of 16 to 9: a square's at least."""
+    width = (fig.bbox.width / fig.dpi - _BESIDE) / columns
+    height = fig.bbox.height / fig.dpi - _ABOUT
+    return min(max(height / width - 9 / 16, 1.0), _TALLEST)
+
+
+def _plain(ax: Axes, *, labelled: bool) -> None:
+    """A panel beside others that look alike: its title is above, its axes are those of the first."""
+    ax.set_title("")
+    if not labelled:
+        ax.set_ylabel("")
+        ax.tick_params(labelleft=False)
+
+
+def _heading(words: str, record: Mapping[str, Any]) -> str:
+    end = record["time_to_impact"]
+    return words if end is None else f"{words}, {end:.1f} s to the impact"

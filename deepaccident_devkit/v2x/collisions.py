@@ -65,6 +65,14 @@ class Contact(FrozenArrays):
         return not self.disagreements
 
 
+def first_accident(dataset: Dataset) -> str:
+    """The token of the first scenario that ends in an accident; raises NotAvailableError if meta names none."""
+    for record in dataset.scenario:
+        if record["collision"] is not None:
+            return record["token"]
+    raise NotAvailableError(f"{dataset.dataroot}: no scenario ends in an accident that a meta file names; name one")
+
+
 def collision(dataset: Dataset, scenario: RowArgument) -> Contact | None:
     """How a scenario's accident happened: the pair that meta names, where and how fast they met.
 

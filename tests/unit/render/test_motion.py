@@ -21,8 +21,8 @@ from deepaccident_devkit.motion import (
     labels_from_polygons,
 )
 from deepaccident_devkit.render import detached_figure, draw_motion_labels, draw_motion_map
-from deepaccident_devkit.render.bev import collider_ids
 from deepaccident_devkit.render.colors import COLLIDER_COLOR, OWN_COLOR
+from deepaccident_devkit.render.roles import collider_ids
 
 CONFIG = MotionLabelConfig(
     grid=BevGrid(x=(-20, 30, 0.5), y=(-15, 15, 0.5)), receptive_field=1, future_frames=2, protocol="clean"

@@ -1,0 +1,50 @@
+"""Pictures and videos of a synthetic scenario with five agents, at 1280×720."""
+
+import tempfile
+from functools import partial
+from pathlib import Path
+
+from benchmarks.measure import Figure, best_of, one_core
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.render.video.views import Scene, views_of
+from deepaccident_devkit.synth import SynthConfig, make_release
+
+FRAMES, SIZE = 40, (1280, 720)
+REPEATS = 3
+RELEASE = SynthConfig(scenarios=1, frames=FRAMES, image_size=(480, 270), seed=7)
+PICTURES = ("frame", "sample", "accident", "bev", "visibility")
+
+
+def measure() -> list[Figure]:
+    with tempfile.TemporaryDirectory() as folder:
+        dataset = DeepAccident(dataroot=make_release(Path(folder) / "release", RELEASE, workers=2), verbose=False)
+        return [*pictures_s(dataset), *video_s(dataset, Path(folder))]
+
+
+def pictures_s(dataset: DeepAccident) -> list[Figure]:
+    token = dataset.frame[FRAMES * 3 // 4]["token"]
+    figures = []
+    with one_core():
+        for name in PICTURES:
+            scene = Scene(dataset=dataset, views=views_of(name, None), agents=None, width=SIZE[0], height=SIZE[1])
+            seconds = best_of(REPEATS, partial(scene.picture, token))
+            bound = 1.0 if name == "frame" else None
+            figures.append(Figure(name=f"render_{name}_s", value=seconds, unit="s", bound=bound))
+    return figures
+
+
+def video_s(dataset: DeepAccident, folder: Path) -> list[Figure]:
+    scenario = dataset.scenario[0]
+    figures = []
+    for name, bound in (("frame", 60.0), ("accident", None)):
+        write = partial(
+            dataset.render_scenario_video,
+            scenario,
+            folder / f"{name}.mp4",
+            what=name,
+            size=SIZE,
+            workers=2,
+            progress=False,
+        )
+        figures.append(Figure(name=f"render_video_{name}_s", value=best_of(1, write), unit="s", bound=bound))
+    return figures

@@ -1,0 +1,290 @@
+"""`deepaccident render`: pictures and videos of a release, a verb a view."""
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast, get_args
+
+import click
+
+from deepaccident_devkit.cli.options import frame_range, names_or_configuration, pixel_size, release_parameters
+from deepaccident_devkit.cli.render_targets import picture_paths, rows_to_draw
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.deepaccident import DeepAccident
+from deepaccident_devkit.evaluation.results import read_results
+from deepaccident_devkit.render.accident import COUNTDOWN, render_accident
+from deepaccident_devkit.render.annotation import render_annotation
+from deepaccident_devkit.render.bev import render_bev
+from deepaccident_devkit.render.calibration import render_calibration
+from deepaccident_devkit.render.camera import render_sample_data
+from deepaccident_devkit.render.instance import render_instance
+from deepaccident_devkit.render.layers import LAYERS, Layer
+from deepaccident_devkit.render.link import render_link
+from deepaccident_devkit.render.moments import render_frame, render_sample
+from deepaccident_devkit.render.motion import MotionStyle, render_motion_labels
+from deepaccident_devkit.render.outcomes import render_evaluation
+from deepaccident_devkit.render.pictures import PICTURE_SUFFIXES, figure_of_pixels, save_picture
+from deepaccident_devkit.render.pointcloud import ColorBy, render_pointcloud_in_image
+from deepaccident_devkit.render.video import SUFFIXES, VIEWS, render_scenario_video
+from deepaccident_devkit.render.video.writers import check_target
+from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix
+from deepaccident_devkit.taxonomy import Frame
+from deepaccident_devkit.v2x import AGENT_CONFIGS, Link
+from deepaccident_devkit.v2x.collisions import first_accident
+
+_RELEASE = ("dataroot", "version", "index_dir", "workers", "on_error")
+_DPI = 100.0
+_OUT = f"A picture ({', '.join(PICTURE_SUFFIXES)}), or the folder of several."
+
+
+def _linked(draw: Callable[..., Any]) -> Callable[..., Any]:
+    """A function that takes `link`, as one that takes --latency, --pose-noise and --seed."""
+
+    def drawn(dataset: Dataset, token: str, *, latency: float, pose_noise: float, seed: int, **choices: Any) -> Any:
+        link = Link(latency=latency, pose_noise=pose_noise or None, seed=seed)  # noise of 0 m would still spread
+        return draw(dataset, token, link=link, **choices)
+
+    return drawn
+
+
+def _evaluated(dataset: Dataset, token: str, *, results: Path, **choices: Any) -> Any:
+    return render_evaluation(dataset, token, read_results(results).prediction(token), **choices)
+
+
+def _words(given: Sequence[str]) -> list[str] | None:
+    """The words of repeated texts with commas; None if there are none."""
+    return [word for text in given for word in text.split(",")] or None
+
+
+def _seconds(context: click.Context, parameter: click.Parameter, value: str) -> list[float]:
+    try:
+        return [float(word) for word in value.split(",")]
+    except ValueError:
+        raise click.BadParameter(f"expected seconds such as 2,1,0, found {value!r}", context, parameter) from None
+
+
+def _link_options(latency: float, pose_noise: float) -> tuple[Any, ...]:
+    return (
+        click.option("--latency", default=latency, show_default=True, help="Of the partners' data, seconds."),
+        click.option("--pose-noise", default=pose_noise, show_default=True, help="Of the partners' poses, metres."),
+        click.option("--seed", default=0, show_default=True, help="Of the noise."),
+    )
+
+
+_AGENTS = click.option(
+    "--agents",
+    multiple=True,
+    metavar="NAME[,NAME…]",
+    help=f"Agents, or one of {', '.join(AGENT_CONFIGS)}.  [default: the view's own]",
+)
+_VIEW_RANGE = click.option("--view-range", type=float, metavar="M", help="Metres shown to each side.")
+_COORDINATES = click.option("--frame", type=click.Choice(get_args(Frame)), help="Of the axes.  [default: ego]")
+_LAYERS = click.option(
+    "--layers",
+    multiple=True,
+    metavar="NAME[,NAME…]",
+    help=f"What is drawn, of those of {', '.join(LAYERS)} that the view has.",
+)
+_FRAMES = click.option("--frame-range", "frames", callback=frame_range, metavar="FIRST..LAST", help="Of a scenario.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Picture:
+    """A view that is drawn into a picture.
+
+    Attributes:
+        draw: the function of the render package, or one about it; its first line is the verb's help.
+        of: the table whose rows it draws.
+        canvas: `fig` if it draws on a figure, `ax` if on axes.
+        options: of this verb.
+        help: where `draw` does not say it.
+        default: what is drawn without a token.
+    """
+
+    draw: Callable[..., Any]
+    of: str
+    canvas: str = "fig"
+    options: tuple[Any, ...] = (_LAYERS,)
+    help: str | None = None
+    default: str = "the first accident"
+
+    def drawn(
+        self, dataset: Dataset, row: str, size: tuple[int, int] | None, dpi: float, choices: dict[str, Any]
+    ) -> Any:
+        """Draw a row on a figure of a size in pixels, or on one as large as the view wants."""
+        canvas = {}
+        if size is not None:
+            figure = figure_of_pixels(*size, dpi=dpi)
+            canvas[self.canvas] = figure if self.canvas == "fig" else figure.add_subplot()
+        return self.draw(dataset, row, **choices, **canvas)
+
+
+_PICTURES = {
+    "sample": _Picture(draw=render_sample, of="sample", options=(_AGENTS, _LAYERS)),
+    "sample-data": _Picture(draw=render_sample_data, of="sample_data", canvas="ax"),
+    "annotation": _Picture(draw=render_annotation, of="annotation"),
+    "instance": _Picture(draw=render_instance, of="instance", options=(_AGENTS, _LAYERS)),
+    "pointcloud": _Picture(
+        draw=render_pointcloud_in_image,
+        of="sample_data",
+        canvas="ax",
+        options=(click.option("--color-by", type=click.Choice(get_args(ColorBy)), help="[default: depth]"),),
+    ),
+    "frame": _Picture(draw=render_frame, of="frame", options=(_AGENTS, _LAYERS)),
+    "bev": _Picture(
+        draw=_linked(render_bev),
+        of="sample",
+        canvas="ax",
+        options=(
+            _AGENTS,
+            _VIEW_RANGE,
+            _COORDINATES,
+            click.option("--sweeps", type=click.IntRange(min=1), help="Frames of points.  [default: 1]"),
+            *_link_options(0.0, 0.0),
+            _LAYERS,
+        ),
+        help="Draw a moment from above: boxes, LiDAR points and more, of one agent or of several.",
+    ),
+    "labels": _Picture(
+        draw=render_motion_labels,
+        of="sample",
+        options=(click.option("--style", type=click.Choice(get_args(MotionStyle)), help="[default: maps]"), _LAYERS),
+    ),
+    "visibility": _Picture(
+        draw=render_visibility, of="frame", canvas="ax", options=(_AGENTS, _COORDINATES, _VIEW_RANGE, _LAYERS)
+    ),
+    "visibility-matrix": _Picture(draw=render_visibility_matrix, of="frame", canvas="ax", options=(_AGENTS,)),
+    "accident": _Picture(
+        draw=render_accident,
+        of="scenario",
+        options=(
+            _AGENTS,
+            click.option(
+                "--seconds",
+                callback=_seconds,
+                default=",".join(f"{second:g}" for second in COUNTDOWN),
+                show_default=True,
+                metavar="S[,S…]",
+                help="Moments before the impact.",
+            ),
+            _LAYERS,
+        ),
+    ),
+    "evaluation": _Picture(
+        draw=_evaluated,
+        of="sample",
+        options=(
+            click.option("--results", type=click.Path(path_type=Path), required=True, help="A model's results."),
+            click.option("--task", type=click.Choice(["motion", "accident"]), help="How motion is seen."),
+            click.option("--protocol", help="By name.  [default: released; of explicit accidents boxes]"),
+            _LAYERS,
+        ),
+        help="Draw a sample's truth and beside it what a model says, with the verdict in numbers.",
+        default="the first of the results",
+    ),
+    "link": _Picture(
+        draw=_linked(render_link),
+        of="sample",
+        options=(_AGENTS, _VIEW_RANGE, *_link_options(0.2, 0.3), _LAYERS),
+        help="Draw what latency and wrong poses do to what partners share with a sample's agent.",
+    ),
+    "calibration": _Picture(draw=render_calibration, of="frame", options=(_AGENTS, _LAYERS)),
+}
+
+
+@click.group()
+def render() -> None:
+    """Draw a release: each view is a verb, `video` puts them in motion."""
+    os.environ.setdefault("MPLBACKEND", "Agg")  # files alone: no window system is asked for anything
+
+
+def _verb(name: str, picture: _Picture) -> click.Command:
+    first_line = (picture.help or picture.draw.__doc__ or "").partition("\n")[0]
+    scenario = "" if picture.of == "scenario" else ", or a scenario for what it has a second before its end"
+    table = picture.of.replace("_", " ")
+    text = f"{first_line}\n\nTOKEN names a row of the table {table}{scenario}; without any, it is {picture.default}."
+
+    @click.command(name, help=text, short_help=first_line)
+    @release_parameters
+    @click.argument("tokens", nargs=-1, metavar="[TOKEN…]")
+    @click.option("--out", type=click.Path(path_type=Path), required=True, metavar="FILE|FOLDER", help=_OUT)
+    @click.option("--size", callback=pixel_size, metavar="WxH", help="Pixels.  [default: the view's own]")
+    @click.option(
+        "--dpi",
+        type=click.FloatRange(min=1),
+        default=_DPI,
+        show_default=True,
+        help="Pixels an inch: words grow with it.",
+    )
+    @_FRAMES
+    def verb(
+        tokens: tuple[str, ...],
+        out: Path,
+        size: tuple[int, int] | None,
+        dpi: float,
+        frames: range | None,
+        **options: Any,
+    ) -> None:
+        release = {option: options.pop(option) for option in _RELEASE}
+        options["agents"] = names_or_configuration(options.pop("agents", ()))
+        options["layers"] = _words(options.pop("layers", ()))
+        choices = {option: value for option, value in options.items() if value is not None}
+        if not tokens and "results" in choices:
+            tokens = read_results(choices["results"]).tokens[:1]
+        dataset = DeepAccident(**release)
+        rows = rows_to_draw(dataset, picture.of, tokens, frames)
+        for row, path in zip(rows, picture_paths(out, name, rows), strict=True):
+            save_picture(picture.drawn(dataset, row, size, dpi, choices), path, dpi=dpi)
+            click.echo(f"drawn: {row} in {path}")
+
+    for option in picture.options:  # of a command they are appended, of a function they would come in front
+        verb = option(verb)
+    return verb
+
+
+for _name, _picture in _PICTURES.items():
+    render.add_command(_verb(_name, _picture))
+
+
+@render.command(short_help="Write a scenario as a video: any of the views, side by side.")
+@release_parameters
+@click.argument("scenario", required=False)
+@click.option("--out", type=click.Path(path_type=Path), required=True, metavar="FILE", help=f"{', '.join(SUFFIXES)}.")
+@click.option(
+    "--what",
+    multiple=True,
+    metavar="VIEW[,VIEW…]",
+    help=f"Side by side, of {', '.join(VIEWS)}.  [default: frame]",
+)
+@_AGENTS
+@_LAYERS
+@_FRAMES
+@click.option("--size", callback=pixel_size, metavar="WxH", default="1280x720", show_default=True, help="Pixels.")
+@click.option("--fps", default=10.0, show_default=True, help="Frames a second; recorded are 10.")
+def video(
+    scenario: str | None,
+    out: Path,
+    what: tuple[str, ...],
+    agents: tuple[str, ...],
+    layers: tuple[str, ...],
+    **options: Any,
+) -> None:
+    """Write SCENARIO of the release under DATAROOT as a video; without one, the first accident.
+
+    MP4 plays in browsers if the extra is there: pip install 'deepaccident_devkit[video]'.
+    """
+    release = {option: options.pop(option) for option in _RELEASE}
+    check_target(out, size=options["size"], fps=options["fps"])  # before the release is indexed
+    dataset = DeepAccident(**release)
+    path = render_scenario_video(
+        dataset,
+        scenario or first_accident(dataset),
+        out,
+        what=_words(what) or "frame",
+        agents=names_or_configuration(agents),
+        layers=cast(list[Layer] | None, _words(layers)),
+        workers=release["workers"],
+        **options,
+    )
+    click.echo(f"written: {path}, {path.stat().st_size / 1e6:.1f} MB")

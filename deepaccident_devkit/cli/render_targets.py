@@ -1,0 +1,101 @@
+"""Which rows `deepaccident render` draws, and into which files."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+import numpy as np
+
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import ChoiceError, NotAvailableError
+from deepaccident_devkit.render.pictures import PICTURE_SUFFIXES
+from deepaccident_devkit.render.roles import collider_ids
+from deepaccident_devkit.tables.tokens import annotation_token, frame_token, instance_token, sample_token
+from deepaccident_devkit.taxonomy import FRAME_PERIOD, OWN_ACTOR_ID
+from deepaccident_devkit.v2x.collisions import first_accident
+from deepaccident_devkit.v2x.configurations import agents_of
+
+_SECONDS_BEFORE = 1.0
+_CAMERA = "Camera_Front"
+
+
+def rows_to_draw(dataset: Dataset, table: str, tokens: Sequence[str], frames: range | None) -> list[str]:
+    """The tokens of a table's rows that a verb draws.
+
+    Args:
+        dataset: the release.
+        table: what the verb draws.
+        tokens: of rows of this table, or of scenarios: their first agent at some of their frames, and there the actor
+            that it collides with. None at all stands for the first accident.
+        frames: numbers of scenarios' frames; None for one second before their end.
+
+    Raises:
+        TokenError: no such scenario.
+        ChoiceError: a scenario does not have such frames.
+        NotAvailableError: there is no accident, or the moment has no boxes.
+        click.UsageError: `frames` are given for what is no moment of a scenario.
+    """
+    if frames is not None and table in ("scenario", "instance"):
+        raise click.UsageError(f"--frame-range is for moments; a whole {table} is drawn, leave it out")
+    rows: list[str] = []
+    for token in tokens or [first_accident(dataset)]:
+        if token.count("/") == 1:
+            rows += _of_scenario(dataset, table, token, frames)
+        elif frames is not None:
+            raise click.UsageError(f"--frame-range is for scenarios; {token} is a {table}, name its scenario instead")
+        else:
+            rows.append(token)
+    return rows
+
+
+def _of_scenario(dataset: Dataset, table: str, token: str, frames: range | None) -> list[str]:
+    record = dataset.get("scenario", token)
+    if table == "scenario":
+        return [token]
+    if table == "instance":
+        return [_instance(dataset, token)]
+    if frames is not None and frames[-1] > record["num_frames"]:
+        raise ChoiceError(f"--frame-range: expected frames from 1 to {record['num_frames']}, found {frames[-1]}")
+    numbers = frames or [max(1, record["num_frames"] - round(_SECONDS_BEFORE / FRAME_PERIOD))]
+    if table == "frame":
+        return [frame_token(token, number) for number in numbers]
+    samples = [sample_token(token, agents_of(dataset, token)[0], number) for number in numbers]
+    if table == "sample_data":
+        return [f"{sample}/{_CAMERA}" for sample in samples]
+    return [_annotation(dataset, sample) for sample in samples] if table == "annotation" else samples
+
+
+def _instance(dataset: Dataset, scenario: str) -> str:
+    """The actor that the first agent collides with, else the first actor that there is."""
+    record = dataset.get("scenario", scenario)
+    if record["collision"] is None:
+        return dataset.field2token("instance", "scenario_token", scenario)[0]
+    first = dataset.agent.get(f"{scenario}/{agents_of(dataset, scenario)[0]}")["actor_id"]
+    other = next(actor for actor in record["collision"]["ids"] if actor != first)
+    return instance_token(scenario, other)
+
+
+def _annotation(dataset: Dataset, sample: str) -> str:
+    """Of the colliding pair the one that the sample's agent is not, else the box with the most LiDAR points."""
+    boxes = dataset.boxes(sample)
+    boxes = boxes.select(boxes.actor_id != OWN_ACTOR_ID)
+    if not len(boxes):
+        raise NotAvailableError(f"{sample}: has no boxes of others; name an annotation")
+    collides = np.isin(boxes.actor_id, list(collider_ids(dataset, sample)))
+    return annotation_token(sample, int(boxes.row[np.lexsort((boxes.num_lidar_pts, collides))[-1]]))
+
+
+def picture_paths(out: Path, view: str, rows: Sequence[str]) -> list[Path]:
+    """Where the pictures of rows go: the file `out` for a single one, else files in the folder `out`.
+
+    Raises:
+        click.UsageError: several pictures for one file.
+    """
+    if out.suffix.lower() not in PICTURE_SUFFIXES:
+        if out.suffix and not out.is_dir():
+            kinds = ", ".join(PICTURE_SUFFIXES)
+            raise click.UsageError(f"--out: expected a folder, or a file that ends in {kinds}; found {out}")
+        return [out / f"{view}_{row.replace('/', '_')}.png" for row in rows]
+    if len(rows) > 1:
+        raise click.UsageError(f"--out: {len(rows)} pictures need a folder, found the file {out}")
+    return [out]

@@ -1,0 +1,52 @@
+"""`deepaccident replay`: a scenario as one HTML file."""
+
+from typing import Any
+
+import click
+
+from deepaccident_devkit.cli.options import names_or_configuration, release_parameters
+from deepaccident_devkit.deepaccident import DeepAccident
+from deepaccident_devkit.evaluation.results import read_results
+from deepaccident_devkit.render.replay import render_replay
+from deepaccident_devkit.v2x import AGENT_CONFIGS
+
+
+@click.command()
+@release_parameters
+@click.argument("scenario", required=False)
+@click.option("--out", required=True, type=click.Path(), help="The file to write, such as replay.html.")
+@click.option("--results", type=click.Path(), help="A model's results of motion or accidents: shows their verdicts.")
+@click.option(
+    "--agents",
+    multiple=True,
+    metavar="NAME[,NAME…]",
+    help=f"Whose cameras, views and results: agents, or one of {', '.join(AGENT_CONFIGS)} as seen from the ego.  "
+    "[default: all that are there]",
+)
+@click.option("--image-width", type=int, metavar="N", help="Pixels.  [default: what keeps the file within 15 MB]")
+@click.option("--quality", type=int, metavar="Q", help="Of JPEG, 1 to 95.  [default: what keeps the file within 15 MB]")
+def replay(
+    scenario: str | None,
+    out: str,
+    results: str | None,
+    agents: tuple[str, ...],
+    image_width: int | None,
+    quality: int | None,
+    **release: Any,
+) -> None:
+    """Write SCENARIO of the release under DATAROOT as one HTML file that plays in any browser, without a network.
+
+    SCENARIO is a token, TYPE/NAME; without one it is the first that ends in an accident.
+    """
+    prediction = None if results is None else read_results(results)  # before the release is indexed
+    path = render_replay(
+        DeepAccident(**release),
+        scenario,
+        out,
+        prediction=prediction,
+        agents=names_or_configuration(agents),
+        image_width=image_width,
+        quality=quality,
+        progress=True,
+    )
+    click.echo(f"written: {path}, {path.stat().st_size / 1e6:.1f} MB; open it in a browser")

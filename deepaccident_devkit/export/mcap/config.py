@@ -1,0 +1,111 @@
+"""`McapConfig`: what of a scenario goes into an MCAP file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Final, Literal, get_args
+
+from deepaccident_devkit.arrays import checked_whole
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.evaluation.results import Prediction, Results
+from deepaccident_devkit.motion import MotionLabelConfig
+from deepaccident_devkit.motion.config import label_config
+from deepaccident_devkit.taxonomy import CAMERAS, LIDAR, OnError
+from deepaccident_devkit.text import possible_text
+from deepaccident_devkit.v2x import Agents
+
+EPOCH: Final = 1_704_067_200
+"""Unix seconds of every scenario's first frame: recordings have no date, and the viewers want one (2024-01-01 UTC)."""
+EXPORTED_CHANNELS: Final = (*CAMERAS, LIDAR)
+Predictions = Results | Mapping[str, Prediction]
+"""What is predicted, by sample token."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class McapConfig:
+    """What of a scenario goes into the file; checked when made.
+
+    Attributes:
+        agents: whose data: names of agents, a configuration as seen from the ego vehicle, or None for all that are
+            there (`v2x.Agents`).
+        channels: whose files: cameras and `lidar01`; None for all of these.
+        frames: their numbers, from 1; None for all.
+        points: `all`, or n for every n-th point of a cloud.
+        labels: whether the boxes go in.
+        motion_labels: what motion labels show, or the name of a preset (`motion.PRESETS`); None for none.
+        on_missing: of sensor files that are not there: `skip` leaves them out and logs how many, `raise`.
+    """
+
+    agents: Agents = None
+    channels: Iterable[str] | None = None
+    frames: Iterable[int] | None = None
+    points: Literal["all"] | int = "all"
+    labels: bool = True
+    motion_labels: MotionLabelConfig | str | None = None
+    on_missing: OnError = "skip"
+
+    def __post_init__(self) -> None:
+        """Check; raises ChoiceError."""
+        object.__setattr__(self, "channels", _channel_names(self.channels))
+        object.__setattr__(self, "frames", _frame_numbers(self.frames))
+        if self.on_missing not in get_args(OnError):
+            raise ChoiceError(f"on_missing: expected one of {', '.join(get_args(OnError))}, found {self.on_missing!r}")
+        if self.motion_labels is not None:
+            object.__setattr__(self, "motion_labels", label_config(self.motion_labels))
+        _ = self.point_step
+
+    @classmethod
+    def of(cls, **choices: Any) -> McapConfig:
+        """One with these fields; raises ChoiceError."""
+        names = [field.name for field in fields(cls)]
+        for name in choices:
+            if name not in names:
+                raise ChoiceError(f"export_mcap has no {name!r}; there are {possible_text(name, names)}")
+        return cls(**choices)
+
+    @property
+    def point_step(self) -> int:
+        """Every how many-th point is written."""
+        if self.points == "all":
+            return 1
+        step = checked_whole("points", self.points, "'all', or n for every n-th point", ChoiceError)
+        if step < 1:
+            raise ChoiceError(f"points: expected 'all', or a number from 1 for every n-th point, found {self.points!r}")
+        return step
+
+    def frame_numbers(self, last: int) -> tuple[int, ...]:
+        """The frames of a scenario of `last` frames, ascending; raises ChoiceError if it has not all of them."""
+        if self.frames is None:
+            return tuple(range(1, last + 1))
+        chosen = tuple(self.frames)
+        for number in chosen:
+            if not 1 <= number <= last:
+                raise ChoiceError(f"frames: expected numbers from 1 to {last}, found {number}")
+        return chosen
+
+
+def _channel_names(given: object) -> tuple[str, ...]:
+    """In the order of `EXPORTED_CHANNELS`; raises ChoiceError."""
+    if given is None:
+        return EXPORTED_CHANNELS
+    if isinstance(given, str) or not isinstance(given, Iterable):
+        raise ChoiceError(f"channels: expected names of channels, found {given!r}")
+    named = tuple(given)
+    for name in named:
+        if name not in EXPORTED_CHANNELS:
+            raise ChoiceError(f"channels: expected some of {', '.join(EXPORTED_CHANNELS)}, found {name!r}")
+    return tuple(name for name in EXPORTED_CHANNELS if name in named)
+
+
+def _frame_numbers(given: object) -> tuple[int, ...] | None:
+    """Each once, ascending; None for all; raises ChoiceError."""
+    if given is None:
+        return None
+    if isinstance(given, str) or not isinstance(given, Iterable):
+        raise ChoiceError(f"frames: expected frame numbers from 1, such as range(1, 11), found {given!r}")
+    meaning = "whole numbers from 1"
+    numbers = tuple(sorted({checked_whole("frames", number, meaning, ChoiceError) for number in given}))
+    if not numbers:
+        raise ChoiceError("frames: expected at least one frame number, found none")
+    return numbers

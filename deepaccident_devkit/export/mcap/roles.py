@@ -1,0 +1,23 @@
+"""Who is who in a scenario, by word; `render.roles` has the colours."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.render.roles import agent_actors
+
+
+class Roles:
+    """The colliding pair, the vehicles that record, and all others."""
+
+    def __init__(self, dataset: Dataset, scenario: str) -> None:
+        """Of a scenario, by its meta."""
+        collision = dataset.get("scenario", scenario)["collision"]
+        self.pair: frozenset[int] = frozenset() if collision is None else frozenset(collision["ids"])
+        self._agents: Mapping[int, str] = {actor: agent for agent, actor in agent_actors(dataset, scenario).items()}
+
+    def role(self, actor: int) -> str:
+        """What an actor is beside its category, such as `ego_vehicle, collides`; empty for most."""
+        words = [self._agents[actor]] if actor in self._agents else []
+        return ", ".join([*words, "collides"] if actor in self.pair else words)

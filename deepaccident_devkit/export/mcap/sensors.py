@@ -1,0 +1,119 @@
+"""What the agents' sensors recorded: images with their cameras, and point clouds."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from io import BytesIO
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import MissingFileError, SensorFileError
+from deepaccident_devkit.export.mcap.config import McapConfig
+from deepaccident_devkit.export.mcap.messages import cloud_message, frame_id
+from deepaccident_devkit.export.mcap.moment import Moment
+from deepaccident_devkit.export.mcap.recording import Recording, frame_timestamp
+from deepaccident_devkit.files import irregular_text
+from deepaccident_devkit.taxonomy import LIDAR
+from deepaccident_devkit.v2x.projection import camera_of
+
+LIDAR_POINT: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
+_logger = logging.getLogger(__name__)
+
+
+class Sensors:
+    """Writes the sensor files of moments, and counts those that are not there."""
+
+    def __init__(self, dataset: Dataset, config: McapConfig) -> None:
+        """Sensor files of a release."""
+        self._dataset = dataset
+        self._channels = tuple(config.channels or ())
+        self._step = config.point_step
+        self._skips = config.on_missing == "skip"
+        self._missing: Counter[str] = Counter()
+        self._asked: Counter[str] = Counter()
+
+    def write(self, moment: Moment, recording: Recording) -> None:
+        """Write the files of a moment, agent by agent; raises MissingFileError or SensorFileError."""
+        for agent, sample in moment.samples.items():
+            for channel in self._channels:
+                path = self._dataset.get_sample_data_path(f"{sample}/{channel}")
+                self._asked[channel] += 1
+                if self._skips and not path.is_file():
+                    self._missing[channel] += 1
+                elif channel == LIDAR:
+                    self._write_cloud(agent, sample, moment.index, recording)
+                else:
+                    self._write_image(agent, f"{sample}/{channel}", path, moment.index, recording)
+
+    def tell_missing(self) -> None:
+        """Log how many files were left out, if any."""
+        if self._missing:
+            counts = ", ".join(f"{self._missing[name]} of {self._asked[name]} of {name}" for name in self._missing)
+            _logger.warning("left out files that are not in %s: %s", self._dataset.dataroot, counts)
+
+    def _write_image(self, agent: str, token: str, path: Path, index: int, recording: Recording) -> None:
+        content, channel = _content(path), token.rsplit("/", 1)[1]
+        frame = frame_id(agent, channel)
+        image = CompressedImage(timestamp=frame_timestamp(index), frame_id=frame, data=content, format="jpeg")
+        calibration = _calibration(self._dataset, token, _image_size(path, content), frame, index)
+        recording.write(f"/{frame}/calibration", calibration, index)
+        recording.write(f"/{frame}/image", image, index)
+
+    def _write_cloud(self, agent: str, sample: str, index: int, recording: Recording) -> None:
+        cloud = self._dataset.load_point_cloud(sample, "lidar")
+        rows = slice(None, None, self._step)
+        points = np.zeros(len(cloud.xyz[rows]), dtype=LIDAR_POINT)
+        points["x"], points["y"], points["z"] = cloud.xyz[rows].T
+        points["intensity"] = cloud.intensity[rows]
+        frame = frame_id(agent, "lidar")
+        recording.write(f"/{frame}/points", cloud_message(points, frame, index), index)
+
+
+def _calibration(dataset: Dataset, token: str, size: tuple[int, int], frame: str, index: int) -> Any:
+    """A CameraCalibration for an image of `size`, width and height, which may be stored smaller than calib says."""
+    lens, (width, height) = camera_of(dataset, token), size
+    scaled = np.diag([width / lens.width, height / lens.height, 1.0]) @ lens.intrinsic
+    return CameraCalibration(
+        timestamp=frame_timestamp(index),
+        frame_id=frame,
+        width=width,
+        height=height,
+        distortion_model="plumb_bob",
+        D=[0.0] * 5,
+        K=scaled.ravel().tolist(),
+        R=np.eye(3).ravel().tolist(),
+        P=np.column_stack([scaled, np.zeros(3)]).ravel().tolist(),
+    )
+
+
+def _content(path: Path) -> bytes:
+    """An image file's bytes; raises MissingFileError or SensorFileError."""
+    try:
+        irregular = irregular_text(path.stat().st_mode)
+        if irregular:
+            raise SensorFileError(f"{path}: {irregular}; restore the file from its archive")
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise MissingFileError(
+            f"{path}: no such file; unpack the archive that holds this camera, or pass on_missing='skip'"
+        ) from None
+    except OSError as error:
+        raise SensorFileError(f"{path}: cannot be read ({error}); restore the file from its archive") from error
+
+
+def _image_size(path: Path, content: bytes) -> tuple[int, int]:
+    """Width and height by the image's header, without decoding it; raises SensorFileError."""
+    from PIL import Image
+
+    bombs = (Image.DecompressionBombError, Image.DecompressionBombWarning)
+    try:
+        with Image.open(BytesIO(content), formats=("JPEG",)) as image:
+            return image.size
+    except (OSError, SyntaxError, ValueError, *bombs) as error:
+        raise SensorFileError(f"{path}: not a readable image ({error}); restore the file from its archive") from error

@@ -1,0 +1,189 @@
+"""The countdown to an impact: what each agent sees of the colliding pair, and the pair from above."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import ChoiceError, NotAvailableError
+from deepaccident_devkit.geometry import SE3, Boxes
+from deepaccident_devkit.render.axes import axis_words, figure_or_new
+from deepaccident_devkit.render.best_view import best_camera
+from deepaccident_devkit.render.boxes import SMALLEST_TEXT, draw_actors_from_above, write_beside
+from deepaccident_devkit.render.camera import render_sample_data
+from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, GRID_COLOR
+from deepaccident_devkit.render.layers import Layer, layers_of
+from deepaccident_devkit.render.roles import in_drawing_order, role_colors, short_name
+from deepaccident_devkit.render.settling import settled
+from deepaccident_devkit.render.trails import draw_trails
+from deepaccident_devkit.tables.tokens import sample_token
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.v2x import Agents, Contact, collision, cooperating_agents
+from deepaccident_devkit.v2x.configurations import agents_of
+from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COUNTDOWN: Final = (2.0, 1.0, 0.5, 0.0)
+"""Seconds before the impact."""
+_IN_IMAGES: Final[tuple[Layer, ...]] = ("image", "points", "boxes", "ids", "velocities")
+COUNTDOWN_LAYERS: Final[tuple[Layer, ...]] = (*_IN_IMAGES, "trajectories", "grid")
+COUNTDOWN_DEFAULT: Final[tuple[Layer, ...]] = ("image", "boxes", "trajectories", "grid")
+_NEAR: Final = 18.0
+"""Metres around the place of contact that are shown."""
+_WIDTH: Final = 3.3
+"""Inches of a panel."""
+
+
+def render_accident(
+    dataset: Dataset,
+    scenario: RowArgument,
+    *,
+    seconds: Sequence[float] = COUNTDOWN,
+    agents: Agents = None,
+    layers: Iterable[Layer] | None = None,
+    fig: Figure | None = None,
+) -> Figure:
+    """Draw the countdown to an accident: a column a moment, a row an agent, and the pair from above at the bottom.
+
+    Each agent has the image of its camera that sees the colliding pair best (the front one where none does). From above
+    there is the place of contact (a cross), the pair's speeds, and where they came from and go to until they meet.
+
+    Args:
+        dataset: the release.
+        scenario: token or record of one with a collision.
+        seconds: before the impact, which is the recording's last frame; what was before its first is left out.
+        agents: whose images; None for all that are there, and an empty list for none.
+        layers: `image`, `boxes`, `trajectories` and `grid` are the default; also `points` (of the LiDAR, in images),
+            `ids` and `velocities`. Without `image` no image file is read.
+        fig: an empty figure to draw on; a new one if None.
+
+    Returns:
+        The figure drawn on; its title says who hits whom, how fast and at which angle.
+
+    Raises:
+        TokenError: no such scenario.
+        NotAvailableError: nobody collides in it (the nearest approach of a normal scenario is no accident), it has no
+            meta, or an agent is not in this release.
+        ChoiceError: no such agent, configuration or layer, or none of the moments was recorded.
+        MissingFileError: an image was not downloaded.
+    """
+    shown = layers_of(layers, COUNTDOWN_DEFAULT, COUNTDOWN_LAYERS)
+    contact = collision(dataset, scenario)
+    record = dataset.get("scenario", scenario)
+    if contact is None:
+        raise NotAvailableError(
+            f"{record['token']}: nobody collides in it, so there is nothing to count down to; choose a scenario with a "
+            "collision, or look at moments of this one with render_frame"
+        )
+    moments = _moments(seconds, record["num_frames"])
+    there = agents_of(dataset, scenario)
+    first = sample_token(record["token"], there[0], record["num_frames"])
+    names = in_drawing_order([] if agents == [] else cooperating_agents(dataset, first, agents))
+    rows = len(names) + 1
+    fig = figure_or_new(fig, (_WIDTH * len(moments) + 0.8, 1.95 * len(names) + _WIDTH + 1.1))
+    axes = fig.subplots(rows, len(moments), squeeze=False, height_ratios=(*[9 / 16] * len(names), 1))
+    tracks = scenario_tracks(dataset, record["token"])
+    for column, (left, index) in enumerate(moments):
+        for row, agent in enumerate(names):
+            sample = sample_token(record["token"], agent, index)
+            _draw_image(dataset, sample, pair_at(tracks, contact, index), shown, axes[row, column])
+        moment = sample_token(record["token"], there[0], index)
+        draw_contact(dataset, moment, contact, tracks, shown, axes[-1, column])
+        axes[0, column].set_title("the impact" if left == 0 else f"{left:g} s before")
+    for row, agent in enumerate(names):
+        _write_row(short_name(agent), AGENT_COLORS[agent], axes[row, 0])
+    for ax in axes[-1, 1:]:
+        ax.set_ylabel("")
+    fig.suptitle(accident_words(dataset, contact), fontsize=11)
+    return settled(fig)
+
+
+def accident_words(dataset: Dataset, contact: Contact) -> str:
+    """Who hits whom, with which sides, how fast and at which angle, in two lines."""
+    scenario = contact.frame.rsplit("/", 1)[0]
+    owners = {
+        dataset.agent.get(f"{scenario}/{agent}")["actor_id"]: short_name(agent)
+        for agent in agents_of(dataset, scenario)
+    }
+    names = []
+    for instance, actor in zip(contact.instances, contact.actor_ids, strict=True):
+        category = dataset.instance.get(instance)["category"]
+        names.append(f"{owners[actor]} ({category} {actor})" if actor in owners else f"{category} {actor}")
+    order = (1, 0) if contact.sides[1] == "front" and contact.sides[0] != "front" else (0, 1)
+    hitting, hit = (names[each] for each in order)
+    verb = "hits" if contact.sides[order[0]] == "front" else "touches"
+    sides = " to ".join(contact.sides[each] for each in order)
+    speeds = " and ".join(_number(contact.speeds[each], "m/s") for each in order)
+    return (
+        f"{hitting} {verb} {hit}, {sides}\n{speeds}, closing at {_number(contact.closing_speed, 'm/s')}, "
+        f"{np.degrees(contact.impact_angle):.0f}° between their headings"
+    )
+
+
+def _moments(seconds: Sequence[float], last: int) -> list[tuple[float, int]]:
+    """Seconds before the impact and frame numbers of those that were recorded."""
+    moments = [(left, last - round(left / FRAME_PERIOD)) for left in seconds]
+    recorded = [(left, index) for left, index in moments if 1 <= index <= last]
+    if not recorded:
+        raise ChoiceError(
+            f"seconds: expected some from 0 to {(last - 1) * FRAME_PERIOD:.1f}, which are recorded before the impact, "
+            f"found {list(seconds)}"
+        )
+    return recorded
+
+
+def pair_at(tracks: ScenarioTracks, contact: Contact, index: int) -> Boxes:
+    """The boxes, in world, of those who collide that are there in a frame (number from 1)."""
+    there = tracks.at(index)
+    return there.select(np.isin(there.actor_id, contact.actor_ids))
+
+
+def _draw_image(dataset: Dataset, sample: str, pair: Boxes, shown: frozenset[Layer], ax: Axes) -> None:
+    channel = best_camera(dataset, sample, pair)
+    render_sample_data(dataset, f"{sample}/{channel}", layers=[*shown.intersection(_IN_IMAGES)], ax=ax)
+    ax.set_title("")
+    write_beside(ax, channel, (ax.get_xlim()[0], ax.get_ylim()[0]), "black")
+
+
+def draw_contact(
+    dataset: Dataset, sample: str, contact: Contact, tracks: ScenarioTracks, shown: frozenset[Layer], ax: Axes
+) -> None:
+    """Draw the moment of a sample (a token) around the place of contact, in world: of the layers `shown` its own."""
+    record, index = dataset.get("sample", sample), int(sample.rsplit("/", 1)[1])
+    x, y = contact.point[:2].tolist()
+    ax.set(xlim=(x - _NEAR, x + _NEAR), ylim=(y - _NEAR, y + _NEAR), aspect="equal")
+    boxes = tracks.at(index)
+    colors = role_colors(dataset, record, boxes)
+    pair = np.isin(boxes.actor_id, contact.actor_ids)
+    if "trajectories" in shown:
+        seconds = (3.0, record["time_to_impact"] or 0.0)
+        both, red = boxes.select(pair), [COLLIDER_COLOR] * int(pair.sum())
+        draw_trails(dataset, record, both, red, target_from_world=SE3.identity(), seconds=seconds, ax=ax)
+    draw_actors_from_above(boxes, ax, colors, shown)
+    ax.plot(x, y, "x", color="black", markersize=9, markeredgewidth=1.8, zorder=5)
+    for row in np.flatnonzero(pair).tolist():
+        speed = float(np.linalg.norm(boxes.velocity[row]))
+        corner = boxes.center[row, :2] + (1.0, 1.0)
+        write_beside(ax, _number(speed, "m/s"), (float(corner[0]), float(corner[1])), COLLIDER_COLOR)
+    if "grid" in shown:
+        ax.grid(color=GRID_COLOR, linewidth=0.4)
+        ax.set_axisbelow(True)
+    words = axis_words("world")
+    ax.set(xlabel=words[0], ylabel=words[1])
+    ax.tick_params(labelsize=SMALLEST_TEXT)
+
+
+def _write_row(words: str, color: str, ax: Axes) -> None:
+    ax.text(
+        -0.02, 0.5, words, rotation=90, ha="right", va="center", color=color, fontweight="bold", transform=ax.transAxes
+    )
+
+
+def _number(value: float, unit: str) -> str:
+    return f"{value:.1f} {unit}" if np.isfinite(value) else f"unknown {unit}"

@@ -1,0 +1,115 @@
+"""Whether the transforms are right, to be seen at a glance."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import TokenError
+from deepaccident_devkit.geometry import Boxes, LidarPointCloud
+from deepaccident_devkit.render.axes import figure_or_new
+from deepaccident_devkit.render.camera import draw_camera_boxes, draw_image
+from deepaccident_devkit.render.colors import AGENT_COLORS
+from deepaccident_devkit.render.layers import Layer, layers_of
+from deepaccident_devkit.render.legends import agent_handles, draw_legend
+from deepaccident_devkit.render.moments import CAMERA_GRID
+from deepaccident_devkit.render.points import draw_points_in_image
+from deepaccident_devkit.render.roles import at_once, in_drawing_order
+from deepaccident_devkit.v2x import Agents, cooperating_agents, cooperative_boxes, project_to_image
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+CALIBRATION_LAYERS: Final[tuple[Layer, ...]] = ("image", "points", "boxes", "ids")
+_DEFAULT: Final[tuple[Layer, ...]] = ("image", "points", "boxes")
+_FARTHEST: Final = 60.0
+"""Metres from the camera up to which boxes are drawn: far ones are as small as the error that one looks for."""
+_COLUMNS: Final = 3
+
+
+def render_calibration(
+    dataset: Dataset,
+    frame_or_sample: RowArgument,
+    *,
+    agents: Agents = None,
+    layers: Iterable[Layer] | None = None,
+    fig: Figure | None = None,
+) -> Figure:
+    """Draw the LiDAR points of all agents and all agents' boxes in camera images, to prove the calibration.
+
+    Where the transforms are right, the points of each agent, which have its colour, lie on the same kerbs, walls and
+    cars as the image's; where an agent's pose or a sensor's place is wrong, its colour is off everywhere. Points and
+    boxes are drawn whatever may stand before them.
+
+    Args:
+        dataset: the release.
+        frame_or_sample: token or record: of a sample its six cameras, of a frame the front cameras of the agents.
+        agents: whose points and boxes (and, of a frame, whose cameras); None for all that are there.
+        layers: of `image`, `points`, `boxes` (up to 60 m) and `ids`; by default all but ids.
+        fig: an empty figure to draw on; a new one if None.
+
+    Returns:
+        The figure drawn on, three panels a row.
+
+    Raises:
+        TokenError: no such sample or frame.
+        ChoiceError: no such layer, agent or configuration.
+        NotAvailableError: an agent is not in this (partial) release.
+        MissingFileError: an image or a cloud was not downloaded.
+    """
+    chosen = layers_of(layers, _DEFAULT, CALIBRATION_LAYERS)
+    sample, is_frame = _present(dataset, frame_or_sample)
+    names = in_drawing_order(cooperating_agents(dataset, sample, agents))
+    record = dataset.get("sample", sample)
+    cameras = [f"{sample}/{channel}" for row in CAMERA_GRID for channel in row]
+    if is_frame:
+        cameras = [f"{at_once(record, agent)}/Camera_Front" for agent in names]
+    clouds = {agent: dataset.load_point_cloud(at_once(record, agent)) for agent in names if "points" in chosen}
+    boxes = cooperative_boxes(dataset, sample, agents=names)
+    rows = -(-len(cameras) // _COLUMNS)
+    fig = figure_or_new(fig, (15, 3.1 * rows + 0.8))
+    axes = fig.subplots(rows, min(_COLUMNS, len(cameras)), squeeze=False)
+    for ax in axes.flat[len(cameras) :]:
+        ax.set_axis_off()
+    for camera, ax in zip(cameras, axes.flat, strict=False):
+        _draw_panel(dataset, camera, clouds, boxes, chosen, ax)
+        if is_frame:
+            ax.set_title(f"{camera.rsplit('/', 3)[1]}, Camera_Front")
+    if clouds:
+        draw_legend(fig, agent_handles(names), columns=len(names), loc="outside lower center", fontsize=9)
+    whose = "each agent" if len(names) > 1 else names[0]
+    where = record["frame_token"] if is_frame else record["token"]
+    fig.suptitle(f"LiDAR of {whose} in the cameras of\n{where}", fontsize="medium")
+    return fig
+
+
+def _present(dataset: Dataset, row: RowArgument) -> tuple[str, bool]:
+    """The token of a sample of the moment, and whether the row is a frame; the frame's first sample then."""
+    try:
+        return dataset.get("sample", row)["token"], False
+    except TokenError:
+        return dataset.samples_of(row)[0]["token"], True
+
+
+def _draw_panel(
+    dataset: Dataset,
+    camera: str,
+    clouds: dict[str, LidarPointCloud],
+    boxes: Boxes,
+    layers: frozenset[Layer],
+    ax: Axes,
+) -> None:
+    record = dataset.get("sample_data", camera)
+    sample = dataset.get("sample", record["sample_token"])
+    draw_image(dataset, record, ax, image="image" in layers)
+    for agent, cloud in clouds.items():
+        points = project_to_image(dataset, cloud, sample, record, colors=False)
+        draw_points_in_image(points.pixels[points.mask], ax, size=1.2, color=AGENT_COLORS[agent])
+    own = dataset.get("agent", sample["agent_token"])["actor_id"]
+    optical = boxes.transform(dataset.world_from(sample, record["channel"]).inverse(), record["channel"])
+    near = np.linalg.norm(optical.center, axis=1) < _FARTHEST
+    draw_camera_boxes(dataset, record, optical.select(near & (optical.actor_id != own)), layers, ax)

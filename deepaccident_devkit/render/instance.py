@@ -1,0 +1,223 @@
+"""An actor over time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from deepaccident_devkit.arrays import IntArray
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.render.annotation import draw_view
+from deepaccident_devkit.render.axes import axis_words, figure_or_new, with_light_grid
+from deepaccident_devkit.render.best_view import best_view
+from deepaccident_devkit.render.boxes import draw_boxes_from_above, write_beside
+from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, GRID_COLOR
+from deepaccident_devkit.render.layers import Layer, layers_of
+from deepaccident_devkit.render.roles import agent_actors, in_drawing_order, role_colors, short_name
+from deepaccident_devkit.render.sights import Sightings, sightings
+from deepaccident_devkit.render.trails import draw_trail
+from deepaccident_devkit.render.underlay import draw_underlay
+from deepaccident_devkit.tables.tokens import instance_token, sample_token
+from deepaccident_devkit.taxonomy import BEV_CAMERA, FRAME_PERIOD, frame_timestamp
+from deepaccident_devkit.v2x import Agents, cooperating_agents
+from deepaccident_devkit.v2x.tracks import scenario_tracks
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_LAYERS: Final[tuple[Layer, ...]] = ("image", "bev", "boxes", "trajectories", "grid")
+_CROPS: Final = ("first", "second", "third", "fourth")
+_MOSAIC: Final[list[Any]] = [["path", "first", "second"], ["path", "third", "fourth"], ["speed", "points", "seen"]]
+_FRAMES_A_SECOND: Final = round(1 / FRAME_PERIOD)
+_AROUND: Final = 10.0
+"""Metres drawn beyond the path to each side, at least."""
+
+
+def render_instance(
+    dataset: Dataset,
+    instance: RowArgument,
+    *,
+    agents: Agents = None,
+    layers: Iterable[Layer] | None = None,
+    fig: Figure | None = None,
+) -> Figure:
+    """Draw an actor over time: its path, how it looks, how fast it is, and who sees it.
+
+    Args:
+        dataset: the release.
+        instance: token or record.
+        agents: whose views are shown, or None for all that are there; a configuration is as seen from the first agent.
+        layers: of the path `bev` (what a BEV camera saw, muted), `trajectories` (the path), `boxes` (each second) and
+            `grid`; of the camera pictures `image` and `boxes`. By default all.
+        fig: an empty figure to draw on; a new one if None.
+
+    Returns:
+        The figure drawn on: the path in world from above with its seconds and the impact; the largest views of it at
+        four moments; below them speed, LiDAR points in its box and who sees it (by the released rule; pale where an
+        agent annotated it only), over the time of the recording.
+
+    Raises:
+        TokenError: no such instance.
+        ChoiceError: no such layer, agent or configuration.
+        NotAvailableError: an agent is not in this (partial) release.
+    """
+    chosen = layers_of(layers, _LAYERS, _LAYERS)
+    actor = _actor(dataset, instance)
+    names = in_drawing_order(cooperating_agents(dataset, sample_token(actor.scenario, actor.recorder, 1), agents))
+    known = [sightings(dataset, actor.scenario, agent, actor.actor_id) for agent in names]
+    fig = figure_or_new(fig, (14, 8.5))
+    axes = fig.subplot_mosaic(_MOSAIC, height_ratios=(1, 1, 1.1))
+    _draw_path(dataset, actor, chosen, axes["path"])
+    _draw_crops(dataset, actor, known, chosen, [axes[name] for name in _CROPS])
+    _draw_speed(actor, axes["speed"])
+    _draw_points(known, axes["points"])
+    _draw_seen(actor, known, axes["seen"])
+    for name in ("speed", "points", "seen"):
+        _finish_time(actor, axes[name])
+    fig.suptitle(f"{instance_token(actor.scenario, actor.actor_id)}: {actor.boxes.category_names[0]}")
+    return fig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Actor:
+    """What the panels show of an actor.
+
+    Attributes:
+        scenario: token.
+        actor_id: CARLA id.
+        recorder: the first agent of the scenario.
+        own_agent: the agent that the actor itself is.
+        boxes: T boxes in world.
+        index: (T,) their frame numbers from 1.
+        duration: of the scenario, seconds.
+        impact: seconds from the first frame to the recorded impact.
+        color: of its part in the accident, or its category.
+    """
+
+    scenario: str
+    actor_id: int
+    recorder: str
+    own_agent: str | None
+    boxes: Boxes
+    index: IntArray
+    duration: float
+    impact: float | None
+    color: str
+
+
+def _actor(dataset: Dataset, instance: RowArgument) -> _Actor:
+    record = dataset.get("instance", instance)
+    scenario = dataset.scenario[dataset.getind("scenario", record["scenario_token"])]
+    tracks = scenario_tracks(dataset, scenario["token"])
+    rows = np.flatnonzero(tracks.actor_id == record["actor_id"])
+    boxes = tracks.boxes.select(rows)
+    first = dataset.samples_of(scenario["first_frame_token"])[0]
+    return _Actor(
+        scenario=scenario["token"],
+        actor_id=record["actor_id"],
+        recorder=first["agent"],
+        own_agent=next(
+            (name for name, actor in agent_actors(dataset, scenario["token"]).items() if actor == record["actor_id"]),
+            None,
+        ),
+        boxes=boxes,
+        index=tracks.index[rows],
+        duration=frame_timestamp(scenario["num_frames"]),
+        impact=first["time_to_impact"],
+        color=role_colors(dataset, first, boxes)[0],
+    )
+
+
+def _draw_path(dataset: Dataset, actor: _Actor, layers: frozenset[Layer], ax: Axes) -> None:
+    """The path from above, in world: the start pale, each second marked, and the impact of one that collides."""
+    path = actor.boxes.center[:, :2]
+    center = (path.min(axis=0) + path.max(axis=0)) / 2
+    reach = float(np.ptp(path, axis=0).max()) / 2 + _AROUND
+    ax.set(xlim=(center[0] - reach, center[0] + reach), ylim=(center[1] - reach, center[1] + reach), aspect="equal")
+    middle = sample_token(actor.scenario, actor.recorder, int(actor.index[len(actor.index) // 2]))
+    if "bev" in layers and dataset.get_sample_data_path(f"{middle}/{BEV_CAMERA}").is_file():
+        world_from_ego = dataset.world_from(middle, "ego")
+        away = float(np.abs(center - world_from_ego.translation[:2]).max())
+        draw_underlay(dataset.load_bev(middle), ax, target_from_ego=world_from_ego, view_range=reach + away)
+    if "trajectories" in layers:
+        draw_trail(path[::-1], ax, actor.color, linewidths=2.5)
+    seconds = np.flatnonzero((actor.index - 1) % _FRAMES_A_SECOND == 0)
+    if "boxes" in layers:
+        draw_boxes_from_above(actor.boxes.select(seconds), ax, [actor.color] * len(seconds), fill=0.1)
+    last = -np.inf
+    for row in seconds.tolist():
+        travelled = float(np.linalg.norm(path[row] - path[0]))
+        if travelled - last > reach / 8:
+            words = f"{frame_timestamp(int(actor.index[row])):.0f} s"
+            write_beside(ax, words, (float(path[row, 0]), float(path[row, 1])), "black")
+            last = travelled
+    if actor.impact is not None and actor.color == COLLIDER_COLOR:
+        ax.scatter(path[-1:, 0], path[-1:, 1], s=130, c=actor.color, marker="*", edgecolors="white", zorder=7)
+        write_beside(ax, "impact", (float(path[-1, 0]), float(path[-1, 1])), actor.color)
+    x_words, y_words = axis_words("world")
+    ax.set(xlabel=x_words, ylabel=y_words)
+    if "grid" in layers:
+        ax.grid(color=GRID_COLOR, linewidth=0.4)
+
+
+def _draw_crops(
+    dataset: Dataset, actor: _Actor, known: Sequence[Sightings], layers: frozenset[Layer], axes: Sequence[Axes]
+) -> None:
+    """The largest views at moments spread over those at which some camera sees the actor."""
+    moments = np.unique(np.concatenate([one.index[one.camera] for one in known]))
+    picked = moments[np.unique(np.linspace(0, len(moments) - 1, len(axes)).round().astype(int))] if len(moments) else []
+    for ax in axes[len(picked) :]:
+        ax.set_axis_off()
+    if not len(picked):
+        axes[0].text(0.5, 0.5, "no camera sees it", ha="center", va="center", transform=axes[0].transAxes)
+    for index, ax in zip(picked, axes, strict=False):
+        box = actor.boxes.select(actor.index == index)
+        there = [one.agent for one in known if index in one.index[one.camera]]
+        view = best_view(dataset, [sample_token(actor.scenario, agent, int(index)) for agent in there], box)
+        if view is None or not dataset.get_sample_data_path(view.camera).is_file():
+            ax.set_axis_off()
+            continue
+        colors = [actor.color] if "boxes" in layers else []
+        draw_view(dataset, view, box.select(np.arange(len(colors))), colors, ax, image="image" in layers)
+        agent, _, channel = view.camera.rsplit("/", 3)[1:]
+        ax.set_title(f"{frame_timestamp(int(index)):.1f} s, {short_name(agent)}, {channel}", fontsize="small")
+
+
+def _draw_speed(actor: _Actor, ax: Axes) -> None:
+    speed = np.linalg.norm(actor.boxes.velocity, axis=1)
+    ax.plot((actor.index - 1) * FRAME_PERIOD, speed, color=actor.color, linewidth=1.8)
+    ax.set_ylim(0, max(1.0, 1.1 * float(np.nan_to_num(speed).max(initial=0))))
+    ax.set_title("speed (m/s)", fontsize="medium")
+
+
+def _draw_points(known: Sequence[Sightings], ax: Axes) -> None:
+    for one in known:
+        ax.plot(one.timestamp, one.points, color=AGENT_COLORS[one.agent], linewidth=1.3, label=short_name(one.agent))
+    ax.set_yscale("symlog", linthresh=10)
+    ax.set_ylim(bottom=0)
+    ax.set_title("LiDAR points in its box", fontsize="medium")
+
+
+def _draw_seen(actor: _Actor, known: Sequence[Sightings], ax: Axes) -> None:
+    """A bar an agent, from the top: full where it sees the actor, pale where it annotated it only."""
+    for row, one in enumerate(known):
+        for which, opacity in ((one.seen, 1.0), (~one.seen, 0.25)):
+            spans = [(time - FRAME_PERIOD / 2, FRAME_PERIOD) for time in one.timestamp[which].tolist()]
+            ax.broken_barh(spans, (row - 0.35, 0.7), facecolors=AGENT_COLORS[one.agent], alpha=opacity, linewidth=0)
+        if one.agent == actor.own_agent:
+            ax.text(actor.duration / 2, row, "is the actor itself", ha="center", va="center", fontsize=8)
+    ax.set_yticks(range(len(known)), [short_name(one.agent) for one in known])
+    ax.set_ylim(len(known) - 0.5, -0.5)
+    ax.set_title("who sees it (pale: only annotated)", fontsize="medium")
+
+
+def _finish_time(actor: _Actor, ax: Axes) -> None:
+    with_light_grid(ax, "both")
+    ax.set(xlim=(-FRAME_PERIOD / 2, actor.duration + FRAME_PERIOD / 2), xlabel="time (s)")
+    if actor.impact is not None:
+        ax.axvline(actor.impact, color=COLLIDER_COLOR, linewidth=1, linestyle="--")

@@ -1,0 +1,38 @@
+"""What a picture shows: the layers that a caller can switch on and off."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from typing import Literal, cast, get_args
+
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.text import possible_text
+
+Layer = Literal["image", "bev", "points", "boxes", "ids", "velocities", "trajectories", "labels", "visibility", "grid"]
+"""`image` is the camera's picture, `bev` the simulator's camera from above, `labels` what the motion labels say."""
+LAYERS: tuple[Layer, ...] = get_args(Layer)
+
+
+def layers_of(
+    given: Iterable[Layer] | None, default: Iterable[Layer], possible: Collection[Layer] = LAYERS
+) -> frozenset[Layer]:
+    """The layers to draw.
+
+    Args:
+        given: what the caller asked for; one alone may stand without a list. None stands for the default, and nothing
+            at all for an empty picture.
+        default: the layers drawn when the caller does not choose.
+        possible: the layers that the picture has.
+
+    Returns:
+        The layers chosen.
+
+    Raises:
+        ChoiceError: a layer that the picture has not.
+    """
+    words = default if given is None else given
+    chosen = cast(tuple[Layer, ...], (words,) if isinstance(words, str) else tuple(words))
+    for layer in chosen:
+        if layer not in possible:
+            raise ChoiceError(f"layers: expected any of {possible_text(str(layer), possible)}, found {layer!r}")
+    return frozenset(chosen)

@@ -1,0 +1,42 @@
+"""What the colours of a picture mean."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import TYPE_CHECKING, Any
+
+from deepaccident_devkit.render.colors import AGENT_COLORS, CATEGORY_COLORS, COLLIDER_COLOR, COMPANION_COLOR
+from deepaccident_devkit.render.roles import in_drawing_order, short_name
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+
+
+def box_handles(colors: Collection[str]) -> list[Artist]:
+    """A patch for each meaning that a box's colour has, of those colours that are there."""
+    from matplotlib.colors import to_rgba
+    from matplotlib.patches import Patch
+
+    meanings = {"colliding pair": COLLIDER_COLOR, "companion": COMPANION_COLOR, **CATEGORY_COLORS}
+    return [
+        Patch(label=name, facecolor=to_rgba(color, 0.25), edgecolor=color)
+        for name, color in meanings.items()
+        if color in colors
+    ]
+
+
+def agent_handles(agents: Collection[str]) -> list[Artist]:
+    """A dot for each agent, in the order of all pictures."""
+    from matplotlib.lines import Line2D
+
+    return [
+        Line2D([], [], linestyle="none", marker="o", color=AGENT_COLORS[agent], label=short_name(agent))
+        for agent in in_drawing_order(agents)
+    ]
+
+
+def draw_legend(where: Any, handles: Sequence[Artist], *, columns: int, **how: Any) -> None:
+    """Draw a small legend below axes or a figure; nothing if it would be empty."""
+    if handles:
+        style = {"fontsize": 7.5, "frameon": False, "handlelength": 1.2, "columnspacing": 1.0, **how}
+        where.legend(handles=list(handles), ncols=columns, **style)

@@ -1,0 +1,186 @@
+"""What a link does to what partners share: where their boxes arrive, and the clouds with and without it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.render.axes import check_view_range, figure_or_new, with_light_grid
+from deepaccident_devkit.render.bev import BevView, draw_bev
+from deepaccident_devkit.render.boxes import draw_boxes_from_above, draw_ids_from_above
+from deepaccident_devkit.render.colors import AGENT_COLORS, OWN_COLOR, TRUE_PLACE_COLOR
+from deepaccident_devkit.render.layers import Layer, layers_of
+from deepaccident_devkit.render.legends import draw_legend
+from deepaccident_devkit.render.roles import short_name
+from deepaccident_devkit.render.settling import settled
+from deepaccident_devkit.taxonomy import UNTRACKED_ID
+from deepaccident_devkit.v2x import Agents, Link, cooperating_agents, cooperative_boxes
+from deepaccident_devkit.v2x.link import PoseNoise
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_LAYERS: Final[tuple[Layer, ...]] = ("points", "boxes", "ids", "grid")
+_SHOWN: Final[tuple[Layer, ...]] = ("points", "boxes", "grid")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SharedBoxes:
+    """What a partner shares of the actors that it annotated, in the ego frame of the receiver.
+
+    Attributes:
+        agent: the partner.
+        true: the boxes of its label at the present, at their true places.
+        received: those that arrive, where the receiver places them; none if the message is lost.
+    """
+
+    agent: str
+    true: Boxes
+    received: Boxes
+
+    @property
+    def shifts(self) -> tuple[FloatArray, FloatArray]:
+        """(M, 2) true and (M, 2) received centres, x and y, of the actors that are in both."""
+        _, first, second = np.intersect1d(self.true.actor_id, self.received.actor_id, return_indices=True)
+        return self.true.center[first, :2], self.received.center[second, :2]
+
+
+def render_link(
+    dataset: Dataset,
+    sample: RowArgument,
+    link: Link,
+    *,
+    agents: Agents = None,
+    view_range: float = 50.0,
+    layers: Iterable[Layer] | None = None,
+    fig: Figure | None = None,
+) -> Figure:
+    """Draw what latency, wrong poses and losses do to what partners share with a sample's agent.
+
+    The first panel has the partners' boxes: dashed where they truly are, in the partner's colour where they arrive,
+    with an arrow from one to the other and the metres in the legend. Beside it are the agents' clouds, without the link
+    and with it.
+
+    Args:
+        dataset: the release.
+        sample: token or record: its agent receives.
+        link: what happens to the partners' data.
+        agents: who cooperates: names, a configuration or its name as seen from the ego; None for all that are there.
+        view_range: metres shown to each side of the ego.
+        layers: `points`, `boxes` and `grid` are the default; also `ids`. Without `points` there are no clouds.
+        fig: an empty figure to draw on; a new one if None.
+
+    Returns:
+        The figure drawn on, in metres of the sample's ego frame.
+
+    Raises:
+        TokenError: no such sample.
+        ChoiceError: no such agent, configuration or layer, no partner among the agents, or `view_range` is not above 0.
+        NotAvailableError: an agent is not in this (partial) release.
+        ConfigError: `link` is no Link, or its latency is longer than the scenario's past.
+    """
+    shown = layers_of(layers, _SHOWN, _LAYERS)
+    check_view_range(view_range)
+    shared = shared_boxes(dataset, sample, link, agents)
+    clouds = {"without the link": None, "with the link": link} if "points" in shown else {}
+    fig = figure_or_new(fig, (5.4 * (1 + len(clouds)), 6.2))
+    first, *others = fig.subplots(1, 1 + len(clouds), squeeze=False)[0]
+    first.set(xlim=(-view_range, view_range), ylim=(-view_range, view_range), aspect="equal")
+    first.set(xlabel="x forward (m)", ylabel="y left (m)", title="the partners' boxes")
+    handles = _draw_shared(shared, shown, first)
+    for ax, (words, there) in zip(others, clouds.items(), strict=True):
+        view = BevView(view_range=view_range, agents=agents, link=there)
+        draw_bev(dataset, sample, view, shown - {"boxes", "ids"}, ax)
+        ax.set_title(f"clouds {words}")
+        ax.set_anchor("C")
+        if "boxes" in shown:
+            truth = cooperative_boxes(dataset, sample, agents=agents, frame="ego")
+            draw_boxes_from_above(truth, ax, [OWN_COLOR] * len(truth), fill=0.0, linewidths=0.7)
+    draw_legend(fig, handles, columns=min(3, 1 + len(clouds)), loc="outside lower center")
+    token = dataset.get("sample", sample)["token"]
+    fig.suptitle(f"{link_words(link)}\n{token}", fontsize=11)
+    return settled(fig)
+
+
+def shared_boxes(dataset: Dataset, sample: RowArgument, link: Link, agents: Agents = None) -> list[SharedBoxes]:
+    """What each partner's tracked boxes become on their way; arguments and errors as of `render_link`."""
+    record = dataset.get("sample", sample)
+    partners = [agent for agent in cooperating_agents(dataset, sample, agents) if agent != record["agent"]]
+    if not partners:
+        raise ChoiceError(f"agents: expected a partner of {record['agent']}, found none; a link has two ends")
+    return [
+        SharedBoxes(
+            agent=agent,
+            true=_tracked(cooperative_boxes(dataset, sample, agents=[agent], frame="ego")),
+            received=_tracked(cooperative_boxes(dataset, sample, agents=[agent], frame="ego", link=link)),
+        )
+        for agent in partners
+    ]
+
+
+def link_words(link: Link) -> str:
+    """A link in words: `latency 0.2 s, poses off by 0.3 m (σ 0.02 m), 10 % of messages lost`."""
+    words = [f"latency {link.latency:g} s"]
+    noise = link.pose_noise
+    if isinstance(noise, PoseNoise):
+        words.append(f"poses off by {noise.mean:g} m (σ {noise.std:g} m)")
+        if noise.heading_std:
+            words.append(f"headings by σ {np.degrees(noise.heading_std):.1f}°")
+    if link.packet_loss:
+        words.append(f"{100 * link.packet_loss:g} % of messages lost")
+    return ", ".join(words)
+
+
+def _tracked(boxes: Boxes) -> Boxes:
+    return boxes.select(boxes.actor_id != UNTRACKED_ID)
+
+
+def _draw_shared(shared: list[SharedBoxes], shown: frozenset[Layer], ax: Axes) -> list[Artist]:
+    """Draw the partners' boxes on axes; returns what the legend says."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    ax.plot(0, 0, "*", color=OWN_COLOR, markersize=10, zorder=5)
+    handles: list[Artist] = [
+        Line2D([], [], linestyle="none", marker="*", color=OWN_COLOR, markersize=8, label="receiver"),
+        Patch(facecolor="none", edgecolor=TRUE_PLACE_COLOR, linestyle="--", label="where they truly are"),
+    ]
+    for each in shared:
+        color = AGENT_COLORS[each.agent]
+        if "boxes" in shown:
+            dashed = (0, (2, 1))
+            draw_boxes_from_above(
+                each.true, ax, [TRUE_PLACE_COLOR] * len(each.true), fill=0, linestyle=dashed, linewidths=1
+            )
+            draw_boxes_from_above(each.received, ax, [color] * len(each.received), fill=0.15, linewidths=1.2)
+        if "ids" in shown:
+            draw_ids_from_above(each.received, ax, [color] * len(each.received))
+        start, end = each.shifts
+        if len(start):
+            ax.quiver(
+                *start.T, *(end - start).T, color=color, angles="xy", scale_units="xy", scale=1, width=0.004, zorder=4
+            )
+        handles.append(Patch(facecolor=(color, 0.15), edgecolor=color, label=_shift_words(each)))
+    if "grid" in shown:
+        with_light_grid(ax, "both")
+    return handles
+
+
+def _shift_words(shared: SharedBoxes) -> str:
+    name = short_name(shared.agent)
+    if not len(shared.received) and len(shared.true):
+        return f"{name}: nothing arrived"
+    start, end = shared.shifts
+    if not len(start):
+        return f"{name}: no box in common"
+    apart = np.linalg.norm(end - start, axis=1)
+    return f"{name}: {len(apart)} boxes off by {apart.mean():.2f} m, at most {apart.max():.2f} m"

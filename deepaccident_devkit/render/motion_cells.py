@@ -1,0 +1,168 @@
+"""How the cells of motion maps are drawn: one map of one frame, all frames as a trail, and what colours mean."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, FloatArray
+from deepaccident_devkit.render.axes import with_light_grid
+from deepaccident_devkit.render.colors import BEYOND_COLOR, COLLIDER_COLOR, OWN_COLOR
+from deepaccident_devkit.render.layers import Layer
+from deepaccident_devkit.render.motion_maps import DrawnMap, MotionMaps
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+PALEST: Final = 0.22
+"""How opaque the last frame of a trail is; the present is 1."""
+
+
+def draw_map_of(maps: MotionMaps, name: DrawnMap, frame: int, shown: frozenset[Layer], ax: Axes) -> Axes:
+    """Draw one map of one frame as `draw_motion_map` says; `shown` are its layers."""
+    ax.set(xlim=maps.grid.x[:2], ylim=maps.grid.y[:2], aspect="equal")
+    if not maps.valid[frame]:
+        ax.set_facecolor(BEYOND_COLOR)
+        ax.text(0.5, 0.5, "not recorded", ha="center", va="center", transform=ax.transAxes)
+        return ax
+    if "labels" in shown:
+        _draw_picture(maps, name, frame, ax)
+    if name == "flow" and "velocities" in shown:
+        _draw_arrows(maps, frame, ax)
+    return _with_ids_and_grid(maps, frame, shown, ax)
+
+
+def draw_trail_of(maps: MotionMaps, shown: frozenset[Layer], ax: Axes) -> Axes:
+    """Draw all frames as `draw_motion_trail` says; `shown` are its layers."""
+    ax.set(xlim=maps.grid.x[:2], ylim=maps.grid.y[:2], aspect="equal", xlabel="x forward (m)", ylabel="y left (m)")
+    if "labels" in shown:
+        _draw_cells(ax, trail_picture(maps), maps)
+        _edge_own(maps, 0, ax)
+    if "trajectories" in shown:
+        _draw_paths(maps, ax)
+    return _with_ids_and_grid(maps, 0, shown, ax)
+
+
+def trail_picture(maps: MotionMaps) -> FloatArray:
+    """(H, W, 3) the colours of all frames over each other, the earlier the stronger and on top."""
+    frames = np.flatnonzero(maps.valid).tolist()
+    opacity = np.linspace(1.0, PALEST, max(len(maps.valid), 2))
+    picture = np.ones((*maps.instance.shape[1:], 3))
+    for frame in reversed(frames):
+        here = maps.instance[frame] > 0
+        colors = maps.colors[maps.instance[frame][here]]
+        picture[here] = 1 - opacity[frame] * (1 - colors)
+    return picture
+
+
+def draw_key(maps: MotionMaps, name: DrawnMap, ax: Axes) -> None:
+    """What the colours of a map mean."""
+    ax.axis("off")
+    if name == "instance":
+        _draw_instance_key(maps, ax)
+    elif name == "centerness":
+        from matplotlib.cm import ScalarMappable
+        from matplotlib.colors import Normalize
+
+        ax.figure.colorbar(ScalarMappable(Normalize(0, 1), "magma"), cax=ax.inset_axes((0.1, 0.15, 0.15, 0.7)))
+    else:
+        side = np.linspace(-1, 1, 101)
+        along, left = np.meshgrid(side, side)
+        wheel = np.where((np.hypot(left, along) <= 1)[..., None], direction_colors(left, along, longest=1.0), 1.0)
+        ax.imshow(wheel, origin="lower", extent=(-1, 1, -1, 1))
+        ax.text(0, -1.2, f"rim: {maps.longest(name):.0f} cells", ha="center", va="top")
+        ax.text(0, 1.1, "left", ha="center", va="bottom")
+        ax.text(1.1, 0, "forward", ha="left", va="center", rotation=270)
+
+
+def direction_colors(left: AnyArray, along: AnyArray, *, longest: float) -> AnyArray:
+    """(H, W, 3) a colour for the direction of vectors (left, forward), paler for shorter ones."""
+    from matplotlib.colors import hsv_to_rgb
+
+    hue = (np.arctan2(left, along) / (2 * np.pi)) % 1
+    strength = np.minimum(np.hypot(left, along) / longest, 1)
+    return hsv_to_rgb(np.stack([hue, strength, np.full(hue.shape, 0.92)], axis=-1))
+
+
+def _draw_picture(maps: MotionMaps, name: DrawnMap, frame: int, ax: Axes) -> None:
+    if name == "instance":
+        _draw_cells(ax, maps.colors[maps.instance[frame]], maps)
+        _edge_own(maps, frame, ax)
+    elif name == "centerness":
+        if maps.centerness is not None:
+            _draw_cells(ax, maps.centerness[frame], maps, cmap="magma", vmin=0, vmax=1)
+    else:
+        vectors = maps.vectors(name)[frame]
+        colors = direction_colors(*np.nan_to_num(vectors), longest=maps.longest(name))
+        _draw_cells(ax, np.where(np.isnan(vectors[0])[..., None], 1.0, colors), maps)
+
+
+def _edge_own(maps: MotionMaps, frame: int, ax: Axes) -> None:
+    own = maps.instance[frame] == maps.own
+    if own.any():
+        ax.contour(*_cell_centers(maps), own, levels=(0.5,), colors=OWN_COLOR, linewidths=1.5)
+
+
+def _draw_arrows(maps: MotionMaps, frame: int, ax: Axes) -> None:
+    """An arrow an instance, from the mean of its cells, as long as the mean of their flow."""
+    flow, instance = maps.vectors("flow")[frame], maps.instance[frame]
+    known = ~np.isnan(flow[0])
+    if not known.any():
+        return
+    row, column = np.nonzero(known)
+    x, y = _cell_centers(maps)
+    _, member, count = np.unique(instance[known], return_inverse=True, return_counts=True)
+    left, along = flow[:, known]
+    start_x, start_y, step_y, step_x = (
+        np.bincount(member.ravel(), weights=values) / count for values in (x[column], y[row], left, along)
+    )
+    steps = step_x * maps.grid.x[2], step_y * maps.grid.y[2]
+    ax.quiver(start_x, start_y, *steps, angles="xy", scale_units="xy", scale=1, width=0.007, headlength=4, zorder=3)
+
+
+def _draw_paths(maps: MotionMaps, ax: Axes) -> None:
+    """A line an instance over the centres of its cells, with a dot at each frame after the present."""
+    from matplotlib.collections import LineCollection
+
+    paths = {identity: path for identity, path in maps.paths().items() if len(path) > 1}
+    colors = [maps.colors[identity] * 0.6 for identity in paths]  # darker than the cells that they lie on
+    ax.add_collection(LineCollection(list(paths.values()), colors=colors, linewidths=1.3, zorder=4))
+    if paths:
+        later = [path[1:] for path in paths.values()]
+        repeated = np.repeat(colors, [len(path) for path in later], axis=0)
+        x, y = np.concatenate(later).T
+        ax.scatter(x, y, s=6, c=repeated, zorder=4, linewidths=0)
+
+
+def _with_ids_and_grid(maps: MotionMaps, frame: int, shown: frozenset[Layer], ax: Axes) -> Axes:
+    if "ids" in shown:
+        x, y = _cell_centers(maps)
+        for identity in np.unique(maps.instance[frame][maps.instance[frame] > 0]).tolist():
+            row, column = np.nonzero(maps.instance[frame] == identity)
+            place = x[column].mean(), y[row].max()
+            ax.annotate(str(identity), place, (0, 2), textcoords="offset points", fontsize=7, ha="center", clip_on=True)
+    return with_light_grid(ax, "both") if "grid" in shown else ax
+
+
+def _draw_cells(ax: Axes, picture: AnyArray, maps: MotionMaps, **how: Any) -> None:
+    extent = (*maps.grid.x[:2], *maps.grid.y[:2])
+    ax.imshow(picture, origin="lower", extent=extent, interpolation="nearest", **how)
+
+
+def _draw_instance_key(maps: MotionMaps, ax: Axes) -> None:
+    from matplotlib.colors import to_rgb
+    from matplotlib.patches import Patch
+
+    red = np.isclose(maps.colors, to_rgb(COLLIDER_COLOR)).all(axis=1).any()
+    handles = [Patch(label="colliding pair", facecolor=COLLIDER_COLOR)] if red else []
+    if maps.own > 0:
+        handles.append(Patch(label="own box", facecolor="none", edgecolor=OWN_COLOR, linewidth=1.5))
+    if handles:
+        ax.legend(handles=handles, loc="center left", frameon=False, borderpad=0, handlelength=1)
+
+
+def _cell_centers(maps: MotionMaps) -> tuple[FloatArray, FloatArray]:
+    """Metres x of the columns' and y of the rows' middles."""
+    centers = maps.grid.centers()
+    return centers[0, :, 0], centers[:, 0, 1]

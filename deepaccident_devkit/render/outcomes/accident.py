@@ -1,0 +1,146 @@
+"""Accidents foreseen against the one that comes: where, when, and how far off."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.evaluation.accident import AccidentResult, BoxTruth, ComparedAccidents
+from deepaccident_devkit.evaluation.accident.result import AccidentsWithin
+from deepaccident_devkit.evaluation.accident.scoring import position_difference
+from deepaccident_devkit.evaluation.predictions import Accident
+from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.render.axes import axes_or_new
+from deepaccident_devkit.render.boxes import draw_boxes_from_above, draw_ids_from_above, write_beside
+from deepaccident_devkit.render.colors import OUTCOME_COLORS
+from deepaccident_devkit.render.layers import Layer, layers_of
+from deepaccident_devkit.render.legends import draw_legend
+from deepaccident_devkit.render.outcomes.panels import BESIDE, outcome_panel
+from deepaccident_devkit.render.trails import draw_trail
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+ACCIDENT_LAYERS: Final[tuple[Layer, ...]] = ("boxes", "trajectories", "ids", "grid")
+_SHOWN: Final[tuple[Layer, ...]] = ("boxes", "trajectories", "grid")
+_LEAST: Final = 20.0
+_MOST: Final = 60.0
+"""Metres around an accident that are shown, at least and at most."""
+_TRUE: Final = OUTCOME_COLORS["right"]
+_FORESEEN: Final = OUTCOME_COLORS["false"]
+
+
+def draw_accident_outcome(
+    compared: ComparedAccidents,
+    truth: BoxTruth | None = None,
+    *,
+    layers: Iterable[Layer] | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw where two collide in truth and where they are foreseen to, with the metres between the places.
+
+    Args:
+        compared: what a protocol compares, of `compared_accidents`.
+        truth: the actors around, as they are now, and where the pair goes; None draws the accidents alone.
+        layers: `boxes` (the actors now), `trajectories` (of the pair) and `grid` are the default; also `ids`.
+        ax: axes to draw on; new ones if None.
+
+    Returns:
+        The axes drawn on, in metres of the present ego frame.
+
+    Raises:
+        ChoiceError: no such layer.
+    """
+    shown = layers_of(layers, _SHOWN, ACCIDENT_LAYERS)
+    ax = axes_or_new(ax, (6, 6.4))
+    if truth is not None:
+        _draw_actors(truth, compared, shown, ax)
+    if compared.true is not None:
+        x, y = compared.true.positions.T
+        ax.plot(x, y, "o-", markersize=12, fillstyle="none", color=_TRUE, linewidth=1.6, zorder=5, label="to come")
+    for alarm in compared.predicted:
+        (line,) = ax.plot(*alarm.positions.T, "x--", color=_FORESEEN, markersize=9, markeredgewidth=2, zorder=6)
+        line.set_label("foreseen" if alarm is compared.predicted[0] else "")
+        place = alarm.positions.mean(axis=0)
+        write_beside(
+            ax, f"in {alarm.time:.1f} s, score {alarm.score:.2g}", (float(place[0]), float(place[1])), _FORESEEN
+        )
+        if compared.true is not None:
+            _draw_differences(alarm, compared.true, ax)
+    _look_at(compared, ax)
+    handles, _ = ax.get_legend_handles_labels()
+    draw_legend(ax, handles, columns=1, **BESIDE)
+    return outcome_panel(ax, difference_words(compared), shown)
+
+
+def difference_words(compared: ComparedAccidents) -> str:
+    """What comes, and how far off the surest alarm is, in places together and in time."""
+    true = compared.true
+    comes = "no accident comes" if true is None else f"an accident comes in {true.time:.1f} s"
+    if not compared.predicted:
+        return f"{comes}, none is foreseen"
+    alarm = compared.predicted[0]
+    if true is None:
+        return f"{comes}, one is foreseen in {alarm.time:.1f} s"
+    off = position_difference(alarm.positions, true.positions)
+    return f"{comes}; foreseen {off:.1f} m off in sum, {alarm.time - true.time:+.1f} s"
+
+
+def verdict_words(result: AccidentResult) -> str:
+    """What one sample counts as, by the distance allowed: `5 m: FP + FN, 10 m: TP`; `TN` where nothing is counted."""
+    return ", ".join(f"{distance:g} m: {count_words(within)}" for distance, within in result.within.items())
+
+
+def count_words(within: AccidentsWithin) -> str:
+    """What one sample counts as within a distance, such as `FP + FN`; `TN` where nothing is counted."""
+    counts = {"TP": within.tp, "FP": within.fp, "FN": within.fn}
+    said = [f"{count} {name}" if count > 1 else name for name, count in counts.items() if count]
+    return " + ".join(said) or "TN"
+
+
+def _draw_actors(truth: BoxTruth, compared: ComparedAccidents, shown: frozenset[Layer], ax: Axes) -> None:
+    present = truth.footprint[0]
+    here = np.isfinite(present[:, 0])
+    x, y, length, width, yaw = present[here].T
+    boxes = Boxes.from_arrays(
+        np.column_stack([x, y, np.zeros(len(x))]),
+        np.column_stack([length, width, np.ones(len(x))]),
+        yaw,
+        frame="ego",
+        actor_id=truth.actor_id[here],
+    )
+    colors = [OUTCOME_COLORS["missed"]] * len(boxes)
+    if "boxes" in shown:
+        draw_boxes_from_above(boxes, ax, colors, fill=0.15, linewidths=0.8)
+    if "ids" in shown:
+        draw_ids_from_above(boxes, ax, ["black"] * len(boxes))
+    ids = None if compared.true is None or truth.accident is None else truth.accident.ids
+    if "trajectories" in shown and ids is not None:
+        for column in np.flatnonzero(np.isin(truth.actor_id, ids)).tolist():
+            path = truth.footprint[:, column, :2]
+            draw_trail(path[np.isfinite(path[:, 0])], ax, _TRUE, linewidths=2.0)
+
+
+def _draw_differences(alarm: Accident, true: Accident, ax: Axes) -> None:
+    """Dotted lines from the two foreseen places to the two true ones, whichever way they fit better, with metres."""
+    for start, end in _pairs(alarm.positions, true.positions):
+        ax.plot(*np.stack([start, end]).T, ":", color="black", linewidth=1.2, zorder=4)
+        x, y = ((start + end) / 2).tolist()
+        write_beside(ax, f"{np.linalg.norm(start - end):.1f} m", (x, y), "black")
+
+
+def _pairs(places: FloatArray, others: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+    apart = np.linalg.norm(places[:, None] - others, axis=-1)
+    straight = apart[0, 0] + apart[1, 1] <= apart[0, 1] + apart[1, 0]
+    return list(zip(places, others if straight else others[::-1], strict=True))
+
+
+def _look_at(compared: ComparedAccidents, ax: Axes) -> None:
+    accidents = [*([] if compared.true is None else [compared.true]), *compared.predicted]
+    places = np.concatenate([each.positions for each in accidents]) if accidents else np.zeros((1, 2))
+    middle = accidents[0].positions.mean(axis=0) if accidents else places[0]
+    half = float(np.clip(np.abs(places - middle).max() + 10, _LEAST, _MOST))
+    ax.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half))

@@ -1,0 +1,108 @@
+"""Detections against the true boxes: matched, false and missed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from deepaccident_devkit.arrays import IntArray
+from deepaccident_devkit.evaluation.detection import (
+    DetectedBoxes,
+    DetectionMatches,
+    DetectionProtocol,
+    detection_matches,
+    detection_protocol,
+)
+from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.render.axes import axes_or_new
+from deepaccident_devkit.render.boxes import draw_boxes_from_above, draw_ids_from_above
+from deepaccident_devkit.render.colors import OUTCOME_COLORS
+from deepaccident_devkit.render.layers import Layer, layers_of
+from deepaccident_devkit.render.outcomes.panels import outcome_legend, outcome_panel
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+DETECTION_LAYERS: Final[tuple[Layer, ...]] = ("boxes", "ids", "grid")
+_SHOWN: Final[tuple[Layer, ...]] = ("boxes", "grid")
+WINDOW: Final = 50.0
+"""Metres around the agent that are shown."""
+_DASHED: Final = (0, (2, 1))
+
+
+def draw_detection_outcome(
+    prediction: DetectedBoxes,
+    truth: Boxes,
+    protocol: str | DetectionProtocol = "released",
+    *,
+    threshold: float | None = None,
+    layers: Iterable[Layer] | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw detections over true boxes: matched ones with a line to their true box, false ones, and who is missed.
+
+    Args:
+        prediction: in the protocol's frame.
+        truth: the true boxes in that frame, as `detection_truth` gives them.
+        protocol: name, or a protocol: its matching decides.
+        threshold: one of the protocol's; None for that of its errors, or else the middle one.
+        layers: `boxes` and `grid` are the default; also `ids`, those of the true boxes.
+        ax: axes to draw on; new ones if None.
+
+    Returns:
+        The axes drawn on, in metres of that frame; the title counts. What does not count, such as boxes beyond the
+        protocol's area, is not drawn.
+
+    Raises:
+        ChoiceError: no such protocol, threshold or layer.
+    """
+    shown = layers_of(layers, _SHOWN, DETECTION_LAYERS)
+    matches = detection_matches(prediction, truth, protocol, threshold)
+    ax = axes_or_new(ax, (6, 6.4))
+    if "boxes" in shown:
+        draw_true(truth, matches, ax)
+        _draw(prediction.boxes, matches.detection, OUTCOME_COLORS["right"], ax)
+        _draw(prediction.boxes, matches.false, OUTCOME_COLORS["false"], ax)
+        _draw_offsets(prediction.boxes, truth, matches, ax)
+    if "ids" in shown:
+        true = truth.select(np.concatenate([matches.truth, matches.missed]))
+        draw_ids_from_above(true, ax, ["black"] * len(true))
+    ax.set(xlim=(-WINDOW, WINDOW), ylim=(-WINDOW, WINDOW))
+    names = {"right": "detected", "false": "false", "missed": "missed"}
+    outcome_legend(ax, {words: OUTCOME_COLORS[kind] for kind, words in names.items()})
+    return outcome_panel(ax, detection_words(prediction, truth, matches, protocol), shown)
+
+
+def draw_true(truth: Boxes, matches: DetectionMatches, ax: Axes) -> None:
+    """Draw the true boxes that count, those that are missed dashed."""
+    found, missed = truth.select(matches.truth), truth.select(matches.missed)
+    draw_boxes_from_above(found, ax, ["black"] * len(found), fill=0, linewidths=0.7)
+    colors = [OUTCOME_COLORS["missed"]] * len(missed)
+    draw_boxes_from_above(missed, ax, colors, fill=0.3, linestyle=_DASHED, linewidths=1.6)
+
+
+def detection_words(
+    prediction: DetectedBoxes, truth: Boxes, matches: DetectionMatches, protocol: str | DetectionProtocol
+) -> str:
+    """How many are right, false and missed at which threshold, and how far off the right ones are."""
+    metres = detection_protocol(protocol).measure.startswith("distance")
+    limit = f"{matches.threshold:g} m" if metres else f"overlap {matches.threshold:g}"
+    counts = f"at {limit}: {len(matches.detection)} TP, {len(matches.false)} FP, {len(matches.missed)} FN"
+    if not len(matches.detection):
+        return counts
+    apart = prediction.boxes.center[matches.detection, :2] - truth.center[matches.truth, :2]
+    return f"{counts}; centres off by {np.linalg.norm(apart, axis=1).mean():.2f} m on average"
+
+
+def _draw(boxes: Boxes, rows: IntArray, color: str, ax: Axes) -> None:
+    chosen = boxes.select(rows)
+    draw_boxes_from_above(chosen, ax, [color] * len(chosen))
+
+
+def _draw_offsets(detected: Boxes, truth: Boxes, matches: DetectionMatches, ax: Axes) -> None:
+    from matplotlib.collections import LineCollection
+
+    ends = detected.center[matches.detection, :2], truth.center[matches.truth, :2]
+    ax.add_collection(LineCollection(list(np.stack(ends, axis=1)), colors="black", linewidths=1.0, zorder=4))

@@ -1,0 +1,62 @@
+"""A picture into a file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.files import replacing
+from deepaccident_devkit.render.axes import detached_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_UNDATED: Final[Mapping[str, dict[str, Any]]] = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
+PICTURE_SUFFIXES: Final = (".png", ".pdf", ".svg", ".jpg", ".webp")
+
+
+def check_picture_path(path: str | os.PathLike[str]) -> Path:
+    """The path, if it ends as a picture does; raises ChoiceError."""
+    path = Path(path).expanduser()
+    if path.suffix.lower() not in PICTURE_SUFFIXES:
+        raise ChoiceError(f"path: expected a file that ends in {', '.join(PICTURE_SUFFIXES)}, found {str(path)!r}")
+    return path
+
+
+def figure_of_pixels(width: int, height: int, *, dpi: float) -> Figure:
+    """A figure that pyplot does not know, whose picture has exactly this width and height."""
+    whole = 1e-3  # a canvas cuts off fractions of pixels, and inches are rounded
+    figure = detached_figure(((width + whole) / dpi, (height + whole) / dpi))
+    figure.set_dpi(dpi)
+    return figure
+
+
+def save_picture(drawn: Axes | Figure, path: str | os.PathLike[str], *, dpi: float = 100) -> Path:
+    """Write what a `render_…` function returned, atomically, over a file that is there; pyplot then forgets it.
+
+    Args:
+        drawn: axes, of whose whole figure the picture is, or a figure.
+        path: the file, by its suffix one of `PICTURE_SUFFIXES`.
+        dpi: pixels an inch.
+
+    Returns:
+        The path written.
+
+    Raises:
+        ChoiceError: no such kind of file.
+    """
+    from matplotlib import pyplot as plt
+
+    path = check_picture_path(path)
+    figure: Any = drawn.figure
+    kind = path.suffix[1:].lower()
+    try:
+        with replacing(path) as temporary:
+            figure.savefig(temporary, format=kind, dpi=dpi, metadata=_UNDATED.get(kind))
+    finally:
+        plt.close(figure)
+    return path

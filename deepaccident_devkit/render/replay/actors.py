@@ -1,0 +1,106 @@
+"""Where actors and agents are at each moment, and who sees whom."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, IntArray
+from deepaccident_devkit.geometry import quaternions
+from deepaccident_devkit.render.colors import AGENT_COLORS, CATEGORY_COLORS, COLLIDER_COLOR, COMPANION_COLOR
+from deepaccident_devkit.render.replay.recording import Recording
+from deepaccident_devkit.render.roles import short_name
+from deepaccident_devkit.v2x.cooperation import visible_actors
+from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
+
+
+def agent_entries(recording: Recording) -> list[dict[str, Any]]:
+    """The agents as the page has them: names, colour, actor id, and a pose a frame (cm, cm, mrad)."""
+    described = []
+    for agent in recording.agents:
+        poses = [recording.dataset.world_from(recording.sample(agent, frame), "ego") for frame in recording.frames]
+        yaw = quaternions.yaw_of(np.array([pose.quaternion.elements for pose in poses]))
+        places = recording.places([pose.translation[:2] for pose in poses])
+        described.append(
+            {
+                "name": agent,
+                "title": short_name(agent),
+                "short": "".join(word[0] for word in short_name(agent).split()).upper(),
+                "color": AGENT_COLORS[agent],
+                "actor": recording.actor_of(agent),
+                "poses": [[*place, _milliradians(turn)] for place, turn in zip(places, yaw.tolist(), strict=True)],
+            }
+        )
+    return described
+
+
+def actor_entries(recording: Recording) -> list[dict[str, Any]]:
+    """The actors as the page has them: the colliding pair, the agents, then the others by id.
+
+    Each has its name, role and colour, length and width (cm), a state a frame (cm, cm, mrad, dm/s or null; null where
+    nobody annotated it), and a bit mask a frame over the page's agents: who sees it by the released rule.
+    """
+    tracks = scenario_tracks(recording.dataset, recording.scenario)
+    recorders = recording.recorders
+    ids = np.unique(tracks.actor_id)
+    seen = _seen(recording, ids)
+    order = sorted(
+        range(len(ids)), key=lambda row: (ids[row] not in recording.pair, int(ids[row]) not in recorders, ids[row])
+    )
+    return [_actor(recording, tracks, int(ids[row]), recorders, seen[row]) for row in order]
+
+
+def _actor(
+    recording: Recording, tracks: ScenarioTracks, actor: int, recorders: Mapping[int, str], seen: AnyArray
+) -> dict[str, Any]:
+    rows = np.flatnonzero(tracks.actor_id == actor)
+    boxes, agent = tracks.boxes.select(rows), recorders.get(actor)
+    category = boxes.category_names[0]
+    length, width = np.rint(boxes.size[0, :2] * 100).astype(int).tolist()
+    role = _role(recording, actor, agent)
+    colors = {"pair": COLLIDER_COLOR, "companion": COMPANION_COLOR}
+    states: list[Any] = [None] * len(recording.frames)
+    moments = zip(
+        tracks.index[rows].tolist(),
+        recording.places(boxes.center[:, :2]),
+        boxes.yaw.tolist(),
+        np.linalg.norm(boxes.velocity[:, :2], axis=1).tolist(),
+        strict=True,
+    )
+    for frame, place, yaw, speed in moments:
+        states[frame - 1] = [*place, _milliradians(yaw), None if math.isnan(speed) else round(speed * 10)]
+    return {
+        "id": actor,
+        "title": f"{category} {actor}" + (f" ({short_name(agent)})" if agent else ""),
+        "category": category,
+        "role": role,
+        "color": colors.get(role, CATEGORY_COLORS[category]),
+        "length": length,
+        "width": width,
+        "states": states,
+        "seen": seen.tolist(),
+    }
+
+
+def _role(recording: Recording, actor: int, agent: str | None) -> str:
+    """`pair`, `companion` for an agent that does not collide, or `other`."""
+    if actor in recording.pair:
+        return "pair"
+    return "other" if agent is None else "companion"
+
+
+def _seen(recording: Recording, ids: IntArray) -> AnyArray:
+    """(actors, frames) uint8: bit masks over the recording's agents."""
+    seen = np.zeros((len(ids), len(recording.frames)), dtype=np.uint8)
+    for bit, agent in enumerate(recording.agents):
+        for column, frame in enumerate(recording.frames):
+            visible = visible_actors(recording.dataset, recording.sample(agent, frame), agents=[agent])
+            seen[np.isin(ids, visible), column] |= 1 << bit
+    return seen
+
+
+def _milliradians(angle: float) -> int:
+    return round(angle * 1000)

@@ -1,0 +1,184 @@
+// What stands beside the ground: cameras, who sees whom, what was foreseen. Text of the data is only set as text.
+
+const data = JSON.parse(document.getElementById("data").textContent);
+const last = data.countdown.length - 1;
+const state = {
+  frame: 0,
+  playing: false,
+  speed: 1,
+  follow: "",
+  sight: "",
+  layers: { trails: true, dots: true, ids: false, agents: true, points: false, prediction: true },
+  foreseen: [],
+};
+const byId = (name) => document.getElementById(name);
+const ground = new Ground(byId("ground"), data, state);
+
+function made(name, properties = {}, ...children) {
+  const element = Object.assign(document.createElement(name), properties);
+  element.append(...children);
+  return element;
+}
+
+function chip(color, kind = "") {
+  const element = made("span", { className: `chip ${kind}`, ariaHidden: "true" });
+  element.style.background = color;
+  return element;
+}
+
+const small = (text, kind = "") => made("p", { className: `small ${kind}`, textContent: text });
+
+// Fill a <select> with [value, text] and call back with what is chosen.
+function choice(element, options, chosen, changed) {
+  element.append(...options.map(([value, text]) => made("option", { value, textContent: text })));
+  element.value = chosen;
+  element.addEventListener("change", () => {
+    changed(element.value);
+    show();
+  });
+}
+
+// the cameras
+
+const cameras = data.agents.map((agent, number) => {
+  const available = data.cameras[number];
+  const title = made("span", {}, chip(agent.color, "round"), agent.title);
+  const caption = made("figcaption", {}, title);
+  const picture = made("img", { alt: "" });
+  const none = made("div", { className: "none" });
+  const sees = made("p");
+  const pictured = made("div", { className: "pictured" }, picture, none);
+  pictured.style.borderColor = agent.color;
+  const card = { agent, available, chosen: 0, picture, none, sees, shown: null };
+  if (available.length > 1) {
+    const select = made("select", { ariaLabel: `Camera of ${agent.title}` });
+    select.dataset.agent = agent.name;
+    choice(select, available.map((camera, index) => [String(index), camera.title]), "0", (value) => {
+      card.chosen = Number(value);
+    });
+    caption.append(select);
+  } else if (available.length) {
+    caption.append(made("span", { className: "small", textContent: available[0].title }));
+  }
+  const figure = made("figure", { className: "agent" }, caption, pictured, sees);
+  figure.dataset.agent = agent.name;
+  byId("agents").append(figure);
+  return card;
+});
+
+// The picture of a frame, or the one before where not every frame has one.
+function pictureAt(camera, frame) {
+  for (let at = frame; at >= 0; at -= 1) if (camera.pictures[at] !== null) return camera.pictures[at];
+  return null;
+}
+
+function showCameras() {
+  cameras.forEach((card, bit) => {
+    const camera = card.available[card.chosen];
+    const coded = camera ? pictureAt(camera, state.frame) : null;
+    if (coded !== card.shown) {
+      card.shown = coded;
+      if (coded !== null) card.picture.src = `data:image/jpeg;base64,${coded}`;
+    }
+    card.picture.hidden = coded === null;
+    card.none.hidden = coded !== null;
+    card.none.classList.toggle("absent", !camera);
+    card.none.textContent = camera ? "no picture of this moment" : "no pictures of this agent";
+    card.picture.alt = camera ? `${card.agent.title}, camera ${camera.title}, frame ${state.frame + 1}` : "";
+    const others = data.actors.filter((actor) => actor.states[state.frame] && actor.id !== card.agent.actor);
+    const seen = others.filter((actor) => actor.seen[state.frame] & (1 << bit));
+    const hidden = others.filter((actor) => actor.role === "pair" && !seen.includes(actor));
+    const without = hidden.length ? `; not ${hidden.map((actor) => actor.title).join(", ")}` : "";
+    card.sees.textContent = others.length ? `sees ${seen.length} of ${others.length}${without}` : "";
+  });
+}
+
+// who sees whom
+
+const table = byId("seen");
+const heads = data.agents.map((agent) =>
+  made("th", { scope: "col", title: agent.title }, chip(agent.color, "round"), agent.short),
+);
+table.append(made("thead", {}, made("tr", {}, made("th", { scope: "col", textContent: "actor" }), ...heads)));
+const rows = data.actors.map((actor) => {
+  const cells = data.agents.map(() => made("td"));
+  const row = made("tr", {}, made("th", { scope: "row" }, chip(actor.color), actor.title), ...cells);
+  return { actor, row, cells };
+});
+table.append(made("tbody", {}, ...rows.map((each) => each.row)));
+
+function showSeen() {
+  for (const { actor, row, cells } of rows) {
+    const there = actor.states[state.frame] !== null;
+    row.className = there ? "" : "absent";
+    cells.forEach((cell, bit) => {
+      const own = data.agents[bit].actor === actor.id;
+      const text = !there ? "" : own ? "self" : actor.seen[state.frame] & (1 << bit) ? "●" : "–";
+      if (cell.textContent !== text) cell.textContent = text;
+    });
+  }
+  const sentences = data.actors
+    .filter((actor) => actor.role === "pair" && actor.states[state.frame] !== null)
+    .map((actor) => {
+      const names = data.agents.filter((_, bit) => actor.seen[state.frame] & (1 << bit)).map((agent) => agent.title);
+      const speed = actor.states[state.frame][3];
+      const fast = speed === null ? "" : ` at ${(speed / 10).toFixed(1)} m/s`;
+      return `${actor.title}${fast}: seen by ${names.join(", ") || "nobody else"}.`;
+    });
+  byId("pair").textContent = sentences.join(" ");
+}
+
+// what was foreseen
+
+const verdictColors = {
+  TP: data.colors.right,
+  TN: data.colors.right,
+  FN: data.colors.warning,
+  "not judged": data.colors.missed,
+};
+const verdictColor = (verdict) => verdictColors[verdict] || data.colors.false;
+const badge = (verdict) => {
+  const element = made("span", { className: verdict === "FN" ? "badge dark" : "badge", textContent: verdict });
+  element.style.background = verdictColor(verdict);
+  return element;
+};
+const samplesAt = new Map();
+if (data.prediction) {
+  byId("verdict").hidden = false;
+  byId("rule").textContent = data.prediction.rule;
+  for (const sample of data.prediction.samples) {
+    samplesAt.set(sample.frame, [...(samplesAt.get(sample.frame) || []), sample]);
+  }
+  const head = data.agents.map((agent) => made("th", { scope: "col", textContent: agent.title }));
+  const body = [...samplesAt].map(([frame, samples]) => {
+    const number = String(frame + 1);
+    const jump = made("button", { type: "button", textContent: number, ariaLabel: `Go to frame ${number}` });
+    jump.addEventListener("click", () => go(frame));
+    const cells = data.agents.map((_, bit) => {
+      const sample = samples.find((each) => each.agent === bit);
+      return made("td", {}, sample ? badge(sample.verdict) : "");
+    });
+    const row = made("tr", {}, made("th", { scope: "row" }, jump), ...cells);
+    row.dataset.frame = String(frame);
+    return row;
+  });
+  const heading = made("tr", {}, made("th", { scope: "col", textContent: "frame" }), ...head);
+  byId("samples").append(made("table", {}, made("thead", {}, heading), made("tbody", {}, ...body)));
+}
+
+// Between the samples that were evaluated the one before stays.
+function showForeseen() {
+  if (!data.prediction) return;
+  const frames = [...samplesAt.keys()].filter((frame) => frame <= state.frame);
+  const frame = frames.length ? Math.max(...frames) : null;
+  state.foreseen = frame === null ? [] : samplesAt.get(frame);
+  const lines = state.foreseen.flatMap((sample) => [
+    made("p", {}, badge(sample.verdict), sample.text),
+    ...sample.alarms.map((alarm) => small(alarm.text, alarm.right ? "right" : "")),
+    ...(sample.more ? [small(`and ${sample.more} less sure`)] : []),
+  ]);
+  byId("foreseen").replaceChildren(...(lines.length ? lines : [small("Nothing was evaluated yet.")]));
+  for (const row of byId("samples").querySelectorAll("tbody tr")) {
+    row.className = row.dataset.frame === String(frame) ? "now" : "";
+  }
+}

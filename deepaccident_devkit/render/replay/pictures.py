@@ -1,0 +1,187 @@
+"""The cameras' pictures, made as small as it takes for the page to fit into a mail."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from deepaccident_devkit.arrays import ByteArray
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.parallel import run_batch
+from deepaccident_devkit.release import read_image
+from deepaccident_devkit.render.replay.recording import Recording
+from deepaccident_devkit.taxonomy import CAMERAS
+
+FRONT: Final = CAMERAS[0]
+_LADDER: Final = ((960, 80), (800, 75), (640, 75), (640, 65), (560, 60), (480, 60), (480, 50), (400, 50), (320, 45))
+"""Width in pixels and JPEG quality, the first that fits is taken."""
+_WIDTHS: Final = (960, 800, 640, 560, 480, 400, 320, 256)
+_QUALITIES: Final = (80, 70, 60, 50, 40, 30)
+"""Where the other one is given."""
+_PROBED: Final = 12
+"""Pictures from which the size of all is estimated."""
+_QUALITY_RANGE: Final = (1, 95)
+_LEAST_WIDTH: Final = 32
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PictureSettings:
+    """How pictures are written.
+
+    Attributes:
+        width: pixels; those of narrower files stay as they are.
+        quality: of JPEG.
+        every: of so many frames one has a picture.
+        front_only: whether the other cameras of the first agent are left out, too.
+    """
+
+    width: int
+    quality: int
+    every: int = 1
+    front_only: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraPictures:
+    """The pictures of a scenario.
+
+    Attributes:
+        jpegs: agent → camera → a picture a frame; None where there is none. Cameras without any are left out.
+        settings: how they are written; None if there is none.
+        found: files that are there, of those looked for.
+        wanted: files looked for.
+    """
+
+    jpegs: Mapping[str, Mapping[str, tuple[bytes | None, ...]]]
+    settings: PictureSettings | None
+    found: int
+    wanted: int
+
+
+def check_picture_settings(width: int | None, quality: int | None) -> None:
+    """Raise ConfigError if pictures cannot be of a width or quality; None is for what fits."""
+    if width is not None and width < _LEAST_WIDTH:
+        raise ConfigError(f"image_width: expected pixels from {_LEAST_WIDTH}, or None for what fits, found {width!r}")
+    least, most = _QUALITY_RANGE
+    if quality is not None and not least <= quality <= most:
+        raise ConfigError(
+            f"quality: expected a JPEG quality from {least} to {most}, or None for what fits, found {quality!r}"
+        )
+
+
+def camera_pictures(
+    recording: Recording, limit: float, *, width: int | None = None, quality: int | None = None, progress: bool = False
+) -> CameraPictures:
+    """The pictures of the agents' front cameras, and of the first agent's others.
+
+    Args:
+        recording: the scenario and the agents.
+        limit: bytes that all may have together: the largest pictures are taken that keep it, and at last fewer.
+        width: pixels; None for what fits.
+        quality: of JPEG; None for what fits.
+        progress: whether to show a bar.
+
+    Raises:
+        SensorFileError: a file cannot be read.
+    """
+    files: _Files = {
+        (agent, channel): [_file(recording, agent, frame, channel) for frame in recording.frames]
+        for number, agent in enumerate(recording.agents)
+        for channel in (CAMERAS if number == 0 else (FRONT,))
+    }
+    wanted = sum(len(paths) for paths in files.values())
+    found = sum(path is not None for paths in files.values() for path in paths)
+    settings, jpegs = _fitting(files, limit, _ladder(width, quality, len(recording.frames)), progress=progress)
+    return CameraPictures(jpegs=jpegs, settings=settings, found=found, wanted=wanted)
+
+
+_Files = dict[tuple[str, str], list[Path | None]]
+"""Agent and camera → a file a frame; None where there is none."""
+_Jpegs = dict[str, dict[str, tuple[bytes | None, ...]]]
+
+
+def _file(recording: Recording, agent: str, frame: int, channel: str) -> Path | None:
+    path = recording.dataset.get_sample_data_path(f"{recording.sample(agent, frame)}/{channel}")
+    return path if path.exists() else None
+
+
+def _ladder(width: int | None, quality: int | None, frames: int) -> Iterator[PictureSettings]:
+    """Ways to write pictures, each smaller than the one before."""
+    steps: Sequence[tuple[int, int]] = _LADDER
+    if width is not None:
+        steps = [(width, each) for each in (_QUALITIES if quality is None else [quality])]
+    elif quality is not None:
+        steps = [(each, quality) for each in _WIDTHS]
+    for pixels, each in steps:
+        yield PictureSettings(width=pixels, quality=each)
+    every = 1
+    while every < 2 * frames:
+        yield PictureSettings(width=steps[-1][0], quality=steps[-1][1], every=every, front_only=True)
+        every *= 2
+
+
+def _fitting(
+    files: _Files, limit: float, ladder: Iterator[PictureSettings], *, progress: bool
+) -> tuple[PictureSettings | None, _Jpegs]:
+    probes = _probes(files)
+    for settings in ladder if probes else ():
+        kept = _kept(files, settings)
+        paths = [path for each in kept.values() for path in each if path is not None]
+        if sum(len(_jpeg(image, settings)) for image in probes) / len(probes) * len(paths) > limit:
+            continue
+        encoded = _encoded(paths, settings, progress=progress)
+        if sum(map(len, encoded)) <= limit:
+            return settings, _by_agent(kept, encoded)
+    return None, {}
+
+
+def _probes(files: _Files) -> list[ByteArray]:
+    paths = [path for each in files.values() for path in each if path is not None]
+    return [read_image(path) for path in paths[:: max(1, len(paths) // _PROBED)]]
+
+
+def _kept(files: _Files, settings: PictureSettings) -> _Files:
+    return {
+        key: [path if frame % settings.every == 0 else None for frame, path in enumerate(paths)]
+        for key, paths in files.items()
+        if key[1] == FRONT or not settings.front_only
+    }
+
+
+def _encoded(paths: Sequence[Path], settings: PictureSettings, *, progress: bool) -> list[bytes]:
+    """In threads: most of the work is done by libraries that let others run meanwhile."""
+    work = partial(_jpeg_of, settings=settings)
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
+        return run_batch(work, paths, executor=threads, label="pictures", progress=progress)
+
+
+def _by_agent(kept: _Files, encoded: Sequence[bytes]) -> _Jpegs:
+    following = iter(encoded)
+    jpegs: _Jpegs = {}
+    for (agent, channel), paths in kept.items():
+        pictures = tuple(None if path is None else next(following) for path in paths)
+        if any(pictures):
+            jpegs.setdefault(agent, {})[channel] = pictures
+    return jpegs
+
+
+def _jpeg_of(path: Path, settings: PictureSettings) -> bytes:
+    return _jpeg(read_image(path), settings)
+
+
+def _jpeg(image: ByteArray, settings: PictureSettings) -> bytes:
+    from PIL import Image
+
+    height, width = image.shape[:2]
+    picture = Image.fromarray(image)
+    if width > settings.width:
+        picture = picture.resize((settings.width, max(1, round(height * settings.width / width))), reducing_gap=2.0)
+    written = io.BytesIO()
+    picture.save(written, "JPEG", quality=settings.quality, optimize=True)
+    return written.getvalue()

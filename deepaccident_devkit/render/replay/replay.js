@@ -1,0 +1,185 @@
+// Time and controls: `show` brings the whole page up to the frame of the state.
+
+const SPEEDS = [0.1, 0.25, 0.5, 1, 2];
+const LAYERS = {
+  trails: "trails",
+  dots: "who sees",
+  ids: "ids",
+  agents: "agents",
+  points: "LiDAR",
+  prediction: "prediction",
+};
+
+// time
+
+const scrubber = byId("scrubber");
+scrubber.max = String(last);
+
+function countdownText(left) {
+  if (left === null) return "no impact";
+  return left === 0 ? "0.0 s – impact" : `${left.toFixed(1)} s to impact`;
+}
+
+function showTime() {
+  const left = data.countdown[state.frame];
+  const seconds = (state.frame * data.period).toFixed(1);
+  scrubber.value = String(state.frame);
+  scrubber.setAttribute("aria-valuetext", `frame ${state.frame + 1}, ${seconds} seconds`);
+  byId("time").textContent = `${seconds} s, frame ${state.frame + 1} / ${last + 1}`;
+  byId("countdown").textContent = countdownText(left);
+  document.body.classList.toggle("impact", left === 0);
+  byId("announcement").textContent = left === 0 ? "Impact" : "";
+  byId("play").textContent = state.playing ? "Pause" : "Play";
+  byId("play").setAttribute("aria-pressed", String(state.playing));
+}
+
+function show() {
+  showForeseen();
+  showTime();
+  showCameras();
+  showSeen();
+  ground.draw();
+}
+
+function go(frame) {
+  state.frame = Math.min(last, Math.max(0, frame));
+  show();
+}
+
+let begun = null;
+function tick(now) {
+  if (!state.playing) return;
+  if (begun === null) begun = { now, frame: state.frame };
+  const frame = begun.frame + Math.floor(((now - begun.now) / 1000 / data.period) * state.speed + 1e-6);
+  if (frame >= last) state.playing = false;
+  if (frame !== state.frame || !state.playing) go(frame);
+  requestAnimationFrame(tick);
+}
+
+function play(playing) {
+  state.playing = playing;
+  begun = null;
+  if (playing && state.frame === last) state.frame = 0;
+  show();
+  if (playing) requestAnimationFrame(tick);
+}
+
+function step(frames) {
+  if (state.playing) play(false);
+  go(state.frame + frames);
+}
+
+// what one can touch
+
+byId("play").addEventListener("click", () => play(!state.playing));
+byId("back").addEventListener("click", () => step(-1));
+byId("on").addEventListener("click", () => step(1));
+scrubber.addEventListener("input", () => step(Number(scrubber.value) - state.frame));
+choice(byId("speed"), SPEEDS.map((speed) => [String(speed), `${speed} ×`]), "1", (value) => {
+  state.speed = Number(value);
+  begun = null;
+});
+const agentOptions = data.agents.map((agent, index) => [String(index), agent.title]);
+choice(byId("follow"), [["", "nobody"], ...agentOptions], "", (value) => {
+  state.follow = value;
+});
+choice(byId("sight"), [["", "none"], ["all", "all agents"], ...agentOptions], "", (value) => {
+  state.sight = value;
+});
+for (const [layer, title] of Object.entries(LAYERS)) {
+  if ((layer === "points" && !data.points) || (layer === "prediction" && !data.prediction)) continue;
+  const box = made("input", { type: "checkbox", checked: state.layers[layer], id: `layer-${layer}` });
+  box.addEventListener("change", () => {
+    state.layers[layer] = box.checked;
+    show();
+  });
+  byId("layers").append(made("label", {}, box, ` ${title}`));
+}
+
+function zoom(factor) {
+  ground.zoom(factor);
+  ground.draw();
+}
+byId("closer").addEventListener("click", () => zoom(ZOOM_STEP));
+byId("farther").addEventListener("click", () => zoom(1 / ZOOM_STEP));
+byId("whole").addEventListener("click", () => {
+  byId("follow").value = state.follow = "";
+  ground.showWhole();
+  ground.draw();
+});
+
+const fingers = new Map();
+const spread = () => {
+  const [one, other] = [...fingers.values()];
+  return Math.hypot(one.x - other.x, one.y - other.y);
+};
+ground.canvas.addEventListener("wheel", (event) => {
+  event.preventDefault();
+  zoom(event.deltaY < 0 ? ZOOM_STEP : 1 / ZOOM_STEP);
+});
+ground.canvas.addEventListener("pointerdown", (event) => {
+  ground.canvas.setPointerCapture(event.pointerId);
+  fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+});
+ground.canvas.addEventListener("pointermove", (event) => {
+  const before = fingers.get(event.pointerId);
+  if (!before) return;
+  const apart = fingers.size === 2 ? spread() : null;
+  fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+  if (apart !== null) ground.zoom(spread() / Math.max(apart, 1));
+  else {
+    byId("follow").value = state.follow = "";
+    ground.move(event.clientX - before.x, event.clientY - before.y);
+  }
+  ground.draw();
+});
+for (const kind of ["pointerup", "pointercancel"]) {
+  ground.canvas.addEventListener(kind, (event) => fingers.delete(event.pointerId));
+}
+
+const keys = {
+  " ": () => play(!state.playing),
+  ArrowLeft: () => step(-1),
+  ArrowRight: () => step(1),
+  Home: () => step(-last),
+  End: () => step(last),
+  "+": () => zoom(ZOOM_STEP),
+  "-": () => zoom(1 / ZOOM_STEP),
+};
+document.addEventListener("keydown", (event) => {
+  // a control that has the focus keeps the keys that it needs itself
+  const control = event.target.closest("button, select, input");
+  const own = control && (event.key === " " ? control !== scrubber : control.matches("select, input"));
+  if (own || event.ctrlKey || event.metaKey || event.altKey || !keys[event.key]) return;
+  event.preventDefault();
+  keys[event.key]();
+});
+new ResizeObserver(() => ground.draw()).observe(ground.canvas);
+
+// what stays
+
+document.documentElement.style.setProperty("--alarm", data.colors.pair);
+byId("scenario").textContent = data.scenario;
+for (const [name, value] of data.facts) {
+  byId("facts").append(made("dt", { textContent: name }), made("dd", { textContent: value }));
+}
+byId("notes").append(...data.notes.map((note) => made("li", { textContent: note })));
+const kinds = new Map();
+for (const actor of data.actors) {
+  const name = { pair: "colliding pair", companion: "companion" }[actor.role] || actor.category;
+  kinds.set(name, actor.color);
+}
+byId("legend").append(...[...kinds].map(([name, color]) => made("span", {}, chip(color), name)));
+for (const agent of data.agents) {
+  byId("legend").append(made("span", {}, chip(agent.color, "round"), `${agent.short} ${agent.title}`));
+}
+const impact = data.countdown.indexOf(0);
+const marks = [...samplesAt].map(([frame, samples]) => [frame, verdictColor(samples[0].verdict)]);
+if (impact >= 0) marks.push([impact, data.colors.pair]);
+for (const [frame, color] of marks) {
+  const mark = made("span");
+  mark.style.left = `${(100 * frame) / Math.max(last, 1)}%`;
+  mark.style.background = color;
+  byId("marks").append(mark);
+}
+show();

@@ -1,0 +1,131 @@
+"""`render_replay`: a scenario as one HTML file."""
+
+from __future__ import annotations
+
+import base64
+import math
+import os
+from pathlib import Path
+from typing import Any, Final
+
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.render.colors import COLLIDER_COLOR, GRID_COLOR, OUTCOME_COLORS, POINT_COLOR, WARNING_COLOR
+from deepaccident_devkit.render.replay.actors import actor_entries, agent_entries
+from deepaccident_devkit.render.replay.facts import facts
+from deepaccident_devkit.render.replay.notes import notes
+from deepaccident_devkit.render.replay.page import replay_page
+from deepaccident_devkit.render.replay.pictures import CameraPictures, camera_pictures, check_picture_settings
+from deepaccident_devkit.render.replay.points import lidar_points
+from deepaccident_devkit.render.replay.recording import Recording, recording_of
+from deepaccident_devkit.render.replay.verdicts import Foreseen, verdicts
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.v2x import Agents
+
+SIZE_LIMIT: Final = 15_000_000
+"""Bytes of a page, so that it can go by mail."""
+_BASE64: Final = 4 / 3
+_BESIDE: Final = 8
+"""Bytes of a picture in JSON beside its base64: quotes, a comma, filled up."""
+
+
+def render_replay(
+    dataset: Dataset,
+    scenario: RowArgument | None,
+    path: str | os.PathLike[str],
+    *,
+    prediction: Foreseen | None = None,
+    agents: Agents = None,
+    image_width: int | None = None,
+    quality: int | None = None,
+    progress: bool = False,
+) -> Path:
+    """Write a scenario as one HTML file that plays in any browser: no server, no network, small enough for a mail.
+
+    It shows the agents' front cameras and all six of the first agent, everybody from above with trails, who sees whom
+    by the released rule, the LiDAR of the first agent and the countdown to the impact. What the release lacks (images,
+    points, labels) is left out, and the page says so.
+
+    Args:
+        dataset: the release.
+        scenario: token or record; None for the first that ends in an accident.
+        path: the file to write.
+        prediction: a model's results of motion or accidents, or predictions by sample token: the page shows what they
+            foresee and whether it is right by the accident protocol `boxes`. None for none.
+        agents: whose cameras, views and predictions, as of `v2x.cooperating_agents`; None for all that are there.
+        image_width: of the pictures, in pixels; None for what keeps the page within `SIZE_LIMIT`.
+        quality: of the pictures' JPEG, 1 to 95; None likewise. If both are given, the page is as large as that takes.
+        progress: whether to show a bar.
+
+    Returns:
+        The path written; the same bytes for the same release and arguments.
+
+    Raises:
+        TokenError: no such scenario.
+        ChoiceError: no such agent, or `path` is a folder.
+        ConfigError: the width or quality is not possible.
+        NotAvailableError: the release has no accident, not one of the agents, or the prediction is of other samples.
+        EvaluationError: the prediction is neither of motion nor of accidents.
+        SensorFileError: an image or a point cloud cannot be read.
+    """
+    target = Path(path).expanduser()
+    if target.is_dir():
+        raise ChoiceError(f"{target}: is a folder; name a file in it, such as {target / 'replay.html'}")
+    check_picture_settings(image_width, quality)
+    recording = recording_of(dataset, scenario, agents)
+    data = _data(recording, prediction)
+    free = (SIZE_LIMIT - len(replay_page("", data).encode())) / _BASE64
+    free -= _BESIDE * len(recording.frames) * (len(recording.agents) + 5)
+    pictures = camera_pictures(
+        recording,
+        math.inf if image_width and quality else free,
+        width=image_width,
+        quality=quality,
+        progress=progress,
+    )
+    said = notes(recording, pictures, points=data["points"] is not None)
+    page = {**data, "notes": said, "cameras": _cameras(recording, pictures)}
+    title = f"Accident replay: {recording.scenario['name']}"
+    write_bytes(target, replay_page(title, page).encode())
+    return target
+
+
+def _data(recording: Recording, prediction: Foreseen | None) -> dict[str, Any]:
+    """All but the pictures."""
+    first, contact = recording.agents[0], recording.contact
+    moments = [
+        recording.dataset.get("frame", f"{recording.scenario['token']}/{frame:03d}") for frame in recording.frames
+    ]
+    return {
+        "scenario": recording.scenario["token"],
+        "facts": facts(recording),
+        "period": FRAME_PERIOD,
+        "countdown": [moment["time_to_impact"] for moment in moments],
+        "impact": None if contact is None else recording.places(contact.point[:2]),
+        "colors": {
+            "pair": COLLIDER_COLOR,
+            "points": POINT_COLOR,
+            "grid": GRID_COLOR,
+            "warning": WARNING_COLOR,
+            **OUTCOME_COLORS,
+        },
+        "agents": agent_entries(recording),
+        "actors": actor_entries(recording),
+        "points": lidar_points(recording, first),
+        "prediction": None if prediction is None else verdicts(recording, prediction),
+    }
+
+
+def _cameras(recording: Recording, pictures: CameraPictures) -> list[list[dict[str, Any]]]:
+    """Of each agent its cameras, with a picture a frame in base64; null where there is none."""
+    return [
+        [
+            {
+                "title": channel.removeprefix("Camera_"),
+                "pictures": [None if jpeg is None else base64.b64encode(jpeg).decode("ascii") for jpeg in jpegs],
+            }
+            for channel, jpegs in pictures.jpegs.get(agent, {}).items()
+        ]
+        for agent in recording.agents
+    ]

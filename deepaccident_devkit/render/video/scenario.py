@@ -1,0 +1,120 @@
+"""`render_scenario_video`: the frames of a scenario, drawn in parallel, into one file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Generator, Iterable, Sequence
+from contextlib import closing
+from pathlib import Path
+
+from deepaccident_devkit.arrays import ByteArray
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.parallel import run_unordered
+from deepaccident_devkit.render.layers import Layer
+from deepaccident_devkit.render.video.views import OwnView, Scene, names_at, views_of
+from deepaccident_devkit.render.video.writers import check_target, write_video
+from deepaccident_devkit.tables.tokens import frame_token
+from deepaccident_devkit.v2x import Agents
+
+
+def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on its own in a notebook
+    dataset: Dataset,
+    scenario: RowArgument,
+    path: str | os.PathLike[str],
+    *,
+    what: str | OwnView | Iterable[str | OwnView] = "frame",
+    agents: Agents = None,
+    layers: Iterable[Layer] | None = None,
+    frames: Collection[int] | slice | None = None,
+    size: tuple[int, int] = (1280, 720),
+    fps: float = 10.0,
+    workers: int | None = None,
+    progress: bool = True,
+) -> Path:
+    """Write a scenario as a video.
+
+    The views are those of the `render_…` functions: `frame` (the agents side by side), `sample` (six cameras), `bev`,
+    `visibility`, `visibility_matrix`, `calibration`, `labels` (motion labels as a trail), a camera by its channel, and
+    `accident`: the countdown to the impact in five cameras, from above and in speeds. `accident`, and two or three of
+    the others side by side, fill 16 to 9; `frame` alone fills (1280, 448).
+
+    Args:
+        dataset: the release.
+        scenario: token or record.
+        path: the file to write, by its suffix: `.mp4` (which browsers play if the extra `video` is installed), `.gif`
+            or `.webp`. One that is there is replaced, once the new one is whole.
+        what: a view by name, a function (dataset, frame record, figure) that draws one, or several side by side.
+        agents: who is shown, or None for all that are there. Views of one agent (`sample`, `bev`, cameras, …) show the
+            first one named, else the first one there; their boxes and points from above are of all of `agents`.
+        layers: each view draws those of them that it has; None for each one's default.
+        frames: numbers of frames, from 1, in the order given; or a slice of all of them, as of a list; None for all.
+        size: width and height, pixels; even numbers for MP4.
+        fps: frames a second; recorded are 10.
+        workers: processes that draw. None takes what the work is worth, and this one alone for functions of your own;
+            with more, these must be importable from a module.
+        progress: whether to show a bar.
+
+    Returns:
+        The path written.
+
+    Raises:
+        TokenError: no such scenario.
+        ChoiceError: no such view, layer, agent, frame or kind of file, or a size or rate that it cannot have.
+        NotAvailableError: an agent is not in this release, the sample has no label, or nobody collides and the view
+            is `accident`.
+        MissingFileError: an image was not downloaded.
+        MissingExtraError: nothing here can write MP4.
+    """
+    target, (width, height) = Path(path).expanduser(), size
+    check_target(target, size=(width, height), fps=fps)
+    views = views_of(what, layers)
+    record = dataset.get("scenario", scenario)
+    tokens = [frame_token(record["token"], number) for number in _numbers(frames, record["num_frames"])]
+    names_at(dataset, tokens[0], agents)  # before any worker starts
+    own = [view.own for view, _ in views if view.own is not None]
+    scene = Scene(dataset=dataset, views=views, agents=agents, width=width, height=height)
+    count = _workers(own, workers)
+    drawn = run_unordered(scene.picture, tokens, workers=count, label="frames", progress=progress)
+    with closing(drawn):
+        write_video(target, _in_order(drawn), fps=fps)
+    return target
+
+
+def _numbers(frames: Collection[int] | slice | None, last: int) -> list[int]:
+    """Frame numbers from 1; raises ChoiceError."""
+    recorded = range(1, last + 1)
+    if frames is None or isinstance(frames, slice):
+        numbers = list(recorded[frames] if frames else recorded)
+    else:
+        numbers = list(frames)
+    wrong = [number for number in numbers if number not in recorded]
+    if wrong or not numbers:
+        raise ChoiceError(f"frames: expected numbers from 1 to {last}, found {wrong[0] if wrong else 'none'}")
+    return numbers
+
+
+def _workers(own: Sequence[OwnView], workers: int | None) -> int | None:
+    """How many processes draw; raises ChoiceError if a function cannot be sent to them."""
+    if not own or workers == 1:
+        return workers
+    if workers is None:
+        return 1
+    for function in own:
+        name = getattr(function, "__qualname__", "<")
+        if function.__module__ == "__main__" or "<" in name:
+            raise ChoiceError(
+                f"workers: {name} cannot be sent to other processes; put it into a module of its own, or pass workers=1"
+            )
+    return workers
+
+
+def _in_order(results: Generator[tuple[int, ByteArray], None, None]) -> Generator[ByteArray, None, None]:
+    """Results by position, each as soon as those before it are there."""
+    waiting: dict[int, ByteArray] = {}
+    upcoming = 0
+    for position, result in results:
+        waiting[position] = result
+        while upcoming in waiting:
+            yield waiting.pop(upcoming)
+            upcoming += 1

@@ -1,0 +1,223 @@
+"""The views that a video can show, each drawn on a figure of its own, and a frame of them side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from deepaccident_devkit.arrays import ByteArray
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.render.accident import COUNTDOWN_LAYERS
+from deepaccident_devkit.render.bev import BEV_LAYERS, render_bev
+from deepaccident_devkit.render.calibration import CALIBRATION_LAYERS, render_calibration
+from deepaccident_devkit.render.camera import CAMERA_LAYERS, render_sample_data
+from deepaccident_devkit.render.layers import LAYERS, Layer, layers_of
+from deepaccident_devkit.render.moments import MOMENT_LAYERS, render_frame, render_sample
+from deepaccident_devkit.render.motion import TRAIL_LAYERS, render_motion_labels
+from deepaccident_devkit.render.pictures import figure_of_pixels
+from deepaccident_devkit.render.roles import short_name
+from deepaccident_devkit.render.video.countdown import draw_countdown
+from deepaccident_devkit.render.visibility import VISIBILITY_LAYERS, render_visibility, render_visibility_matrix
+from deepaccident_devkit.tables.tokens import sample_token
+from deepaccident_devkit.taxonomy import CAMERAS
+from deepaccident_devkit.v2x import Agents, cooperating_agents
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from deepaccident_devkit.tables.records import FrameRecord
+
+OwnView = Callable[[Dataset, "FrameRecord", "Figure"], object]
+"""Draws a moment, given by its record, on an empty figure; what it returns does not matter."""
+_DPI: Final = 100.0
+_DPI_AT: Final = 1280 * 720
+"""Pixels of the picture whose inch has `_DPI` pixels; that of larger ones has more, so that words stay as large."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Moment:
+    """What a view draws.
+
+    Attributes:
+        dataset: the release.
+        frame: token.
+        agents: as of `cooperating_agents`.
+        names: the agents meant, the one whose view it is first.
+        layers: None for the view's default.
+    """
+
+    dataset: Dataset
+    frame: str
+    agents: Agents
+    names: tuple[str, ...]
+    layers: tuple[Layer, ...] | None
+
+    @property
+    def sample(self) -> str:
+        """The token of the first agent's sample."""
+        scenario, number = self.frame.rsplit("/", 1)
+        return sample_token(scenario, self.names[0], int(number))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class View:
+    """One way to draw a moment.
+
+    Attributes:
+        draw: on an empty figure.
+        layers: that it has.
+        share: of a picture's width, beside others.
+        inches: width that it needs for its words; where there is less, they become smaller.
+        own: the function that `draw` calls, if it is a caller's.
+    """
+
+    draw: Callable[[Moment, Figure], object]
+    layers: tuple[Layer, ...] = LAYERS
+    share: int = 1
+    inches: float = 4.2
+    own: OwnView | None = None
+
+
+def _frame(moment: Moment, fig: Figure) -> object:
+    return render_frame(moment.dataset, moment.frame, agents=moment.agents, layers=moment.layers, fig=fig)
+
+
+def _sample(moment: Moment, fig: Figure) -> object:
+    return render_sample(moment.dataset, moment.sample, agents=moment.agents, layers=moment.layers, fig=fig)
+
+
+def _bev(moment: Moment, fig: Figure) -> object:
+    ax = fig.add_subplot()
+    return render_bev(moment.dataset, moment.sample, agents=moment.agents, layers=moment.layers, ax=ax)
+
+
+def _visibility(moment: Moment, fig: Figure) -> object:
+    ax = fig.add_subplot()
+    return render_visibility(moment.dataset, moment.sample, agents=moment.agents, layers=moment.layers, ax=ax)
+
+
+def _visibility_matrix(moment: Moment, fig: Figure) -> object:
+    return render_visibility_matrix(moment.dataset, moment.sample, agents=moment.agents, ax=fig.add_subplot())
+
+
+def _accident(moment: Moment, fig: Figure) -> None:
+    draw_countdown(moment.dataset, moment.frame, moment.names, moment.layers, fig)
+
+
+def _calibration(moment: Moment, fig: Figure) -> object:
+    return render_calibration(moment.dataset, moment.frame, agents=moment.agents, layers=moment.layers, fig=fig)
+
+
+def _labels(moment: Moment, fig: Figure) -> object:
+    render_motion_labels(moment.dataset, moment.sample, style="trail", layers=moment.layers, fig=fig)
+    return fig.suptitle(f"motion labels of {short_name(moment.names[0])}", fontsize="medium")  # the token is too long
+
+
+@dataclass(frozen=True, slots=True)
+class _Camera:
+    channel: str
+
+    def __call__(self, moment: Moment, fig: Figure) -> object:
+        camera = f"{moment.sample}/{self.channel}"
+        return render_sample_data(moment.dataset, camera, layers=moment.layers, ax=fig.add_subplot())
+
+
+@dataclass(frozen=True, slots=True)
+class _Own:
+    draw: OwnView
+
+    def __call__(self, moment: Moment, fig: Figure) -> object:
+        dataset = moment.dataset
+        return self.draw(dataset, dataset.frame[dataset.getind("frame", moment.frame)], fig)
+
+
+VIEWS: Final[Mapping[str, View]] = {
+    "frame": View(draw=_frame, layers=MOMENT_LAYERS, share=2, inches=12.8),
+    "sample": View(draw=_sample, layers=MOMENT_LAYERS, share=2, inches=12.8),
+    "accident": View(draw=_accident, layers=COUNTDOWN_LAYERS, share=2, inches=12.8),
+    "bev": View(draw=_bev, layers=BEV_LAYERS, inches=4.6),
+    "visibility": View(draw=_visibility, layers=VISIBILITY_LAYERS),
+    "visibility_matrix": View(draw=_visibility_matrix, layers=()),
+    "calibration": View(draw=_calibration, layers=CALIBRATION_LAYERS, share=2, inches=12.0),
+    "labels": View(draw=_labels, layers=TRAIL_LAYERS, inches=5.5),
+    **{channel: View(draw=_Camera(channel), layers=CAMERA_LAYERS) for channel in CAMERAS},
+}
+"""By name; those of cameras are the first agent's."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Scene:
+    """How every frame of a video is drawn.
+
+    Attributes:
+        dataset: the release.
+        views: side by side, each with the layers that it draws.
+        agents: as of `cooperating_agents`.
+        width: pixels.
+        height: pixels.
+    """
+
+    dataset: Dataset
+    views: tuple[tuple[View, tuple[Layer, ...] | None], ...]
+    agents: Agents
+    width: int
+    height: int
+
+    def picture(self, frame: str) -> ByteArray:
+        """Draw the moment of a frame's token; (height, width, 3) uint8, RGB."""
+        names = names_at(self.dataset, frame, self.agents)
+        total, left, parts = sum(view.share for view, _ in self.views), 0, []
+        for number, (view, layers) in enumerate(self.views):
+            shares = sum(each.share for each, _ in self.views[: number + 1])
+            right = round(self.width * shares / total)
+            moment = Moment(dataset=self.dataset, frame=frame, agents=self.agents, names=names, layers=layers)
+            parts.append(self._drawn(view, moment, right - left))
+            left = right
+        return np.hstack(parts)
+
+    def _drawn(self, view: View, moment: Moment, width: int) -> ByteArray:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+        dpi = min(_DPI * (self.width * self.height / _DPI_AT) ** 0.5, width / view.inches)
+        fig = figure_of_pixels(width, self.height, dpi=dpi)
+        view.draw(moment, fig)
+        canvas: Any = FigureCanvasAgg(fig)
+        canvas.draw()
+        drawn: ByteArray = np.asarray(canvas.buffer_rgba())[..., :3].copy()
+        return drawn
+
+
+def names_at(dataset: Dataset, frame: str, agents: Agents) -> tuple[str, ...]:
+    """The agents meant at a frame, the one whose view it is first: the first one named, else the first one there."""
+    first = dataset.samples_of(frame)[0]
+    names = cooperating_agents(dataset, first, agents)
+    if agents is None or isinstance(agents, str) or not isinstance(agents, Sequence):
+        return names
+    return tuple(sorted(names, key=lambda name: name != agents[0]))
+
+
+def views_of(
+    what: str | OwnView | Iterable[str | OwnView], layers: Iterable[Layer] | None
+) -> tuple[tuple[View, tuple[Layer, ...] | None], ...]:
+    """The views that are named, with those of the layers that each has; raises ChoiceError."""
+    given: list[Any] = [what] if isinstance(what, str) or callable(what) else list(what)
+    if not given:
+        raise ChoiceError(f"what: expected at least one of {', '.join(VIEWS)}, found none")
+    views = [_view(each) for each in given]
+    possible = [layer for layer in LAYERS if any(layer in view.layers for view in views)]
+    chosen = layers_of(layers, (), possible)
+    if layers is None:
+        return tuple((view, None) for view in views)
+    return tuple((view, tuple(layer for layer in view.layers if layer in chosen)) for view in views)
+
+
+def _view(given: object) -> View:
+    if isinstance(given, str) and given in VIEWS:
+        return VIEWS[given]
+    if callable(given):
+        return View(draw=_Own(given), layers=(), own=given)
+    raise ChoiceError(f"what: expected {', '.join(VIEWS)} or a function, found {given!r}")

@@ -1,0 +1,276 @@
+"""Who sees whom: the actors of a moment from above with the agents that see them, and as a table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Final, get_args
+
+import numpy as np
+
+from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.render.axes import axes_or_new, axis_words, check_view_range, with_light_grid
+from deepaccident_devkit.render.boxes import (
+    SMALLEST_TEXT,
+    draw_boxes_from_above,
+    draw_ids_from_above,
+    draw_velocities_from_above,
+    write_beside,
+)
+from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, COMPANION_COLOR, GRID_COLOR, MUTED_COLOR
+from deepaccident_devkit.render.layers import Layer, layers_of
+from deepaccident_devkit.render.legends import agent_handles, draw_legend
+from deepaccident_devkit.render.points import draw_points_from_above
+from deepaccident_devkit.render.roles import in_drawing_order, role_colors, short_name
+from deepaccident_devkit.render.sights import Sights, sights
+from deepaccident_devkit.taxonomy import Frame
+from deepaccident_devkit.v2x import Agents, aggregate_point_cloud
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+VISIBILITY_LAYERS: Final[tuple[Layer, ...]] = ("points", "boxes", "ids", "velocities", "visibility", "grid")
+_SHOWN: Final[tuple[Layer, ...]] = ("boxes", "visibility", "grid")
+_MARGIN: Final = 10.0
+"""Metres around the agents and the colliding pair."""
+_LEAST: Final = 25.0
+"""Metres to each side that are shown at least."""
+_SLOT: Final = 4.6
+"""Points from one agent's dot to the next."""
+_ABOVE: Final = 10.0
+"""Points from an actor's centre up to its dots."""
+_MOST_ROWS: Final = 24
+_BRIGHT: Final = 0.3
+"""Relative luminance (as of sRGB) from which black is read on a colour."""
+
+
+def render_visibility(
+    dataset: Dataset,
+    moment: RowArgument,
+    *,
+    agents: Agents = None,
+    frame: Frame = "ego",
+    view_range: float | None = None,
+    layers: Iterable[Layer] | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw who sees whom, from above: each actor has a dot for each agent that sees it by the released rule.
+
+    A dot has its agent's colour and its own place in the row, and lines lead from the agents to those of the colliding
+    pair that they see. The accident's actors that the sample's agent does not see are dashed, and the pair says so.
+
+    Args:
+        dataset: the release.
+        moment: token or record of a sample, or of a frame: then the first agent there is the ego.
+        agents: who looks: names, a configuration or its name as seen from the ego; None for all that are there.
+        frame: `ego`, `lidar` or `world`.
+        view_range: metres to each side of the ego; None shows all agents and the colliding pair.
+        layers: `boxes`, `visibility` (dots, lines, words) and `grid` are the default; also `points` (the LiDAR of those
+            who look), `ids` and `velocities`.
+        ax: axes to draw on; new ones if None.
+
+    Returns:
+        The axes drawn on, in metres of the frame.
+
+    Raises:
+        TokenError: no such sample or frame.
+        ChoiceError: no such agent, configuration, frame or layer, or `view_range` is not above 0.
+        NotAvailableError: an agent is not in this (partial) release.
+        MissingFileError: points are asked for, and a cloud was not downloaded.
+    """
+    shown = layers_of(layers, _SHOWN, VISIBILITY_LAYERS)
+    if frame not in get_args(Frame):
+        raise ChoiceError(f"frame: expected one of {', '.join(get_args(Frame))}, found {frame!r}")
+    if view_range is not None:
+        check_view_range(view_range)
+    known = sights(dataset, moment, agents, frame)
+    ax = axes_or_new(ax, (6, 6.9))
+    low, high = _view(known, view_range)
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", anchor="N")
+    words = axis_words(frame)
+    ax.set(xlabel=words[0], ylabel=words[1])
+    ax.set_title(_title(dataset, known), fontsize="medium")
+    if "points" in shown:
+        _draw_points(dataset, known, frame, ax)
+    colors = role_colors(dataset, known.sample, known.boxes)
+    hidden = known.hidden_from(known.ego)
+    if "boxes" in shown:
+        draw_boxes_from_above(known.boxes.select(~hidden), ax, _chosen(colors, ~hidden))
+        unseen = known.boxes.select(hidden)
+        draw_boxes_from_above(unseen, ax, _chosen(colors, hidden), fill=0.0, linestyle=(0, (2, 1)), linewidths=2.0)
+    if "velocities" in shown:
+        draw_velocities_from_above(known.boxes, ax, colors)
+    if "ids" in shown:
+        draw_ids_from_above(known.boxes, ax, colors)
+    if "visibility" in shown:
+        _draw_sight_lines(known, ax)
+        _draw_dots(known, ax)
+        _write_hidden(known, hidden, colors, ax)
+    _draw_agents(known, ax)
+    _draw_legend(known, hidden, ax)
+    return with_light_grid(ax, "both") if "grid" in shown else ax
+
+
+def render_visibility_matrix(
+    dataset: Dataset, moment: RowArgument, *, agents: Agents = None, ax: Axes | None = None
+) -> Axes:
+    """Draw who sees whom as a table: a row an actor, a column an agent; a full cell is seen, a hollow one is not.
+
+    The number in a cell is the agent's LiDAR points in the box; where its label lacks the actor there is no cell. The
+    colliding pair comes first, then the agents, then who is seen by more.
+
+    Args:
+        dataset: the release.
+        moment: token or record of a sample, or of a frame.
+        agents: who looks, as of `render_visibility`.
+        ax: axes to draw on; new ones if None.
+
+    Returns:
+        The axes drawn on, with rows counted from 0 downwards.
+
+    Raises:
+        TokenError: no such sample or frame.
+        ChoiceError: no such agent or configuration.
+        NotAvailableError: an agent is not in this (partial) release.
+    """
+    known = sights(dataset, moment, agents)
+    rows = np.lexsort((known.boxes.actor_id, -known.seen.sum(axis=1), ~known.records, ~known.collides))
+    shown = rows[:_MOST_ROWS]
+    columns = in_drawing_order(known.agents)
+    ax = axes_or_new(ax, (1.4 + 0.75 * len(columns), 1.2 + 0.27 * max(len(shown), 4)))
+    for column, agent in enumerate(columns):
+        _draw_column(known, shown, agent, column, ax)
+    names = known.boxes.category_names
+    words = [f"{names[row]} {known.boxes.actor_id[row]}" for row in shown.tolist()]
+    ax.set_yticks(range(len(shown)), words, fontsize=8)
+    for label, row in zip(ax.get_yticklabels(), shown.tolist(), strict=True):
+        label.set_color(_word_color(known, row))
+    ax.set_xticks(range(len(columns)), [short_name(agent).replace(" ", "\n") for agent in columns], fontsize=8)
+    ax.xaxis.tick_top()
+    ax.set(xlim=(-0.5, len(columns) - 0.5), ylim=(max(len(shown), 1) - 0.5, -0.5))
+    ax.tick_params(length=0)
+    ax.spines[:].set_visible(False)
+    more = len(rows) - len(shown)
+    below = f"numbers: LiDAR points{f'; {more} more actors' if more else ''}"
+    ax.set_xlabel(below, fontsize=8)
+    ax.set_title(_title(dataset, known), fontsize=9)
+    return ax
+
+
+def _title(dataset: Dataset, known: Sights) -> str:
+    record = dataset.get("sample", known.sample)
+    left = record["time_to_impact"]
+    countdown = "" if left is None else f", {left:.1f} s to the impact"
+    return f"who sees whom, t = {record['timestamp']:.1f} s{countdown}"
+
+
+def _view(known: Sights, view_range: float | None) -> tuple[FloatArray, FloatArray]:
+    """The lower left and the upper right corner (2,) of what is shown, a square."""
+    if view_range is not None:
+        column = known.agents.index(known.ego) if known.ego in known.agents else 0
+        middle, half = known.place[column], view_range
+    else:
+        places = np.concatenate([known.place, known.boxes.center[known.collides | known.records, :2]])
+        low, high = places.min(axis=0), places.max(axis=0)
+        middle, half = (low + high) / 2, max(_LEAST, float((high - low).max()) / 2 + _MARGIN)
+    return middle - half, middle + half
+
+
+def _draw_points(dataset: Dataset, known: Sights, frame: str, ax: Axes) -> None:
+    (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
+    middle, half = np.array([left + right, low + high]) / 2, (right - left) / 2
+    for agent in known.agents:
+        cloud = aggregate_point_cloud(dataset, known.sample, agents=[agent], frame=frame)
+        draw_points_from_above(cloud.xyz, ax, center=middle, view_range=half, color=AGENT_COLORS[agent])
+
+
+def _draw_sight_lines(known: Sights, ax: Axes) -> None:
+    from matplotlib.collections import LineCollection
+
+    row, column = np.nonzero(known.seen & known.collides[:, None])
+    lines = np.stack([known.place[column], known.boxes.center[row, :2]], axis=1)
+    colors = [AGENT_COLORS[known.agents[each]] for each in column.tolist()]
+    ax.add_collection(LineCollection(list(lines), colors=colors, linewidths=0.9, alpha=0.8, zorder=2))
+
+
+def _draw_dots(known: Sights, ax: Axes) -> None:
+    from matplotlib.transforms import ScaledTranslation
+
+    order = in_drawing_order(known.agents)
+    inches = ax.figure.dpi_scale_trans
+    for slot, agent in enumerate(order):
+        x, y, _ = known.boxes.center[known.seen[:, known.agents.index(agent)]].T
+        beside = ScaledTranslation((slot - (len(order) - 1) / 2) * _SLOT / 72, _ABOVE / 72, inches)
+        ax.scatter(
+            x,
+            y,
+            s=15,
+            c=AGENT_COLORS[agent],
+            edgecolors="white",
+            linewidths=0.4,
+            transform=ax.transData + beside,
+            zorder=5,
+            label=agent,
+        )
+
+
+def _write_hidden(known: Sights, hidden: BoolArray, colors: list[str], ax: Axes) -> None:
+    for row in np.flatnonzero(hidden & known.collides).tolist():
+        x, y = known.boxes.center[row, :2].tolist()
+        write_beside(ax, f"{short_name(known.ego)} cannot see", (x, y - known.boxes.size[row, 0] / 2 - 1), colors[row])
+
+
+def _draw_agents(known: Sights, ax: Axes) -> None:
+    for agent, place in zip(known.agents, known.place.tolist(), strict=True):
+        x, y = place
+        ax.plot(x, y, "*", color=AGENT_COLORS[agent], markeredgecolor="white", markersize=10, zorder=5)
+    if known.ego in known.agents:
+        x, y = known.place[known.agents.index(known.ego)].tolist()
+        ax.plot(x, y, "o", markersize=15, fillstyle="none", color=AGENT_COLORS[known.ego], zorder=5)
+
+
+def _draw_legend(known: Sights, hidden: BoolArray, ax: Axes) -> None:
+    from matplotlib.patches import Patch
+
+    handles = agent_handles(known.agents)
+    if known.pair:
+        handles.append(Patch(facecolor="none", edgecolor=COLLIDER_COLOR, label="colliding pair"))
+    if hidden.any():
+        words = f"{short_name(known.ego)} cannot see"
+        handles.append(Patch(facecolor="none", edgecolor="black", linestyle="--", label=words))
+    place = {"loc": "upper center", "bbox_to_anchor": (0.5, 0), "borderaxespad": 5}
+    draw_legend(ax, handles, columns=4, title="dots above an actor: who sees it", title_fontsize=8, **place)
+
+
+def _draw_column(known: Sights, rows: IntArray, agent: str, column: int, ax: Axes) -> None:
+    source = known.agents.index(agent)
+    for place, row in enumerate(rows.tolist()):
+        seen, own = bool(known.seen[row, source]), bool(known.own[row, source])
+        if own or not known.annotated[row, source]:
+            ax.text(column, place, "itself" if own else "–", ha="center", va="center", fontsize=8, color=MUTED_COLOR)
+            continue
+        face, edge = (AGENT_COLORS[agent],) * 2 if seen else ("none", GRID_COLOR)
+        ax.scatter(column, place, s=260, marker="s", facecolors=face, edgecolors=edge)
+        ink = _legible_on(AGENT_COLORS[agent]) if seen else MUTED_COLOR
+        ax.text(
+            column, place, f"{known.points[row, source]}", ha="center", va="center", fontsize=SMALLEST_TEXT, color=ink
+        )
+
+
+def _legible_on(color: str) -> str:
+    """Black or white, which of them is read on a colour."""
+    from matplotlib.colors import to_rgb
+
+    luminance = np.dot(np.power(to_rgb(color), 2.2), (0.2126, 0.7152, 0.0722))
+    return "black" if luminance > _BRIGHT else "white"
+
+
+def _word_color(known: Sights, row: int) -> str:
+    if known.collides[row]:
+        return COLLIDER_COLOR
+    return COMPANION_COLOR if known.pair and known.records[row] else "black"
+
+
+def _chosen(colors: list[str], which: BoolArray) -> list[str]:
+    return [color for color, take in zip(colors, which.tolist(), strict=True) if take]

@@ -1,0 +1,39 @@
+"""What tests of pictures measure: pixels rendered on an Agg canvas, at places given in data coordinates."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+
+from deepaccident_devkit.render import detached_figure
+
+
+def new_axes(size: tuple[float, float] = (5, 5)) -> Any:
+    """Axes of a figure that pyplot does not know."""
+    return detached_figure(size).add_subplot()
+
+
+def rendered(ax: Axes, dpi: float = 80) -> Any:
+    """The canvas (H, W, 3) in 0 to 255, row 0 at the top, after which `on_canvas` is right."""
+    figure: Any = ax.figure
+    figure.set_dpi(dpi)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].astype(float)
+
+
+def on_canvas(ax: Axes, places: Any) -> Any:
+    """Data coordinates (N, 2) as places (N, 2) of the canvas, u to the right and v down."""
+    u, v = ax.transData.transform(places).T
+    return np.column_stack([u, ax.figure.bbox.height - v])
+
+
+def has_color(picture: Any, place: Any, color: str, *, within: float = 2.0, tolerance: float = 60.0) -> bool:
+    """Whether a pixel whose centre is within some pixels of a place of the canvas has a colour, nearly."""
+    height, width = picture.shape[:2]
+    rows, columns = np.mgrid[:height, :width]
+    near = np.hypot(columns + 0.5 - place[0], rows + 0.5 - place[1]) <= within
+    distance = np.abs(picture[near] - np.array(to_rgb(color)) * 255).max(axis=1)
+    return bool((distance < tolerance).any())

@@ -1,0 +1,231 @@
+"""`deepaccident render`: a verb a view, and what it draws when nobody says what."""
+
+import re
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from matplotlib import pyplot as plt
+from PIL import Image
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.baselines import predict_results
+from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.cli.render import _PICTURES
+from deepaccident_devkit.cli.render_targets import rows_to_draw
+from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError, TokenError
+from deepaccident_devkit.render import detached_figure, render_bev, render_sample_data
+from deepaccident_devkit.render.pictures import figure_of_pixels, save_picture
+from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
+
+SIZE = (480, 480)
+
+
+def run(*arguments: object, status: int = 0) -> str:
+    result = CliRunner().invoke(deepaccident, ["render", *map(str, arguments)], catch_exceptions=False)
+    assert result.exit_code == status, result.output
+    return result.output
+
+
+def pixels(path: Path) -> Any:
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+@pytest.fixture(scope="module")
+def accident(da: DeepAccident) -> str:
+    return next(record["token"] for record in da.scenario if record["collision"])
+
+
+@pytest.mark.parametrize("verb", sorted(set(_PICTURES) - {"evaluation"}))
+def test_every_view_draws_the_first_accident_when_no_token_is_given(
+    da: DeepAccident, accident: str, tmp_path: Path, verb: str
+) -> None:
+    out = tmp_path / "picture.png"
+    in_short_recordings = ["--latency", 0] if verb == "link" else []
+    text = run(verb, da.dataroot, "--out", out, "--size", "{}x{}".format(*SIZE), "--dpi", 40, *in_short_recordings)
+    assert re.fullmatch(rf"drawn: {re.escape(accident)}\S* in {re.escape(str(out))}\n", text)
+    with Image.open(out) as image:
+        assert image.size == SIZE
+    assert len(np.unique(pixels(out).reshape(-1, 3), axis=0)) > 20
+    assert not plt.get_fignums()
+
+
+def test_a_view_has_its_own_size_if_none_is_given(da: DeepAccident, tmp_path: Path) -> None:
+    run("sample-data", da.dataroot, "--out", tmp_path / "a.png", "--dpi", 100)
+    with Image.open(tmp_path / "a.png") as image:
+        assert image.size == (800, 460)
+    assert not plt.get_fignums()
+
+
+def test_the_picture_is_what_the_function_draws(da: DeepAccident, accident: str, tmp_path: Path) -> None:
+    sample = f"{accident}/other_vehicle/003"
+    options = ["--agents", "+infrastructure", "--layers", "boxes,ids", "--layers", "grid", "--view-range", 30]
+    run("bev", da.dataroot, sample, *options, "--out", tmp_path / "a.png", "--size", "400x400", "--dpi", 80)
+    fig = figure_of_pixels(400, 400, dpi=80)
+    render_bev(
+        da, sample, agents="+infrastructure", layers=["boxes", "ids", "grid"], view_range=30, ax=fig.add_subplot()
+    )
+    fig.savefig(tmp_path / "b.png", dpi=80)
+    np.testing.assert_array_equal(pixels(tmp_path / "a.png"), pixels(tmp_path / "b.png"))
+
+
+def test_a_link_moves_what_partners_share(da: DeepAccident, accident: str, tmp_path: Path) -> None:
+    for name, link in {"ideal": [], "late": ["--latency", 0.2, "--pose-noise", 2.0, "--seed", 4]}.items():
+        arguments = ["--agents", "+other", "--out", tmp_path / f"{name}.png", "--size", "400x400", "--layers", "boxes"]
+        run("bev", da.dataroot, f"{accident}/ego_vehicle/005", *arguments, *link)
+    assert (pixels(tmp_path / "ideal.png") != pixels(tmp_path / "late.png")).any()
+
+
+def test_several_rows_go_into_a_folder(da: DeepAccident, accident: str, tmp_path: Path) -> None:
+    out = tmp_path / "drawn"
+    tokens = [f"{accident}/{agent}/002/Camera_Back" for agent in ("ego_vehicle", "infrastructure")]
+    run("sample-data", da.dataroot, *tokens, "--out", out, "--size", "160x90")
+    names = sorted(f"sample-data_{token.replace('/', '_')}.png" for token in tokens)
+    assert sorted(path.name for path in out.iterdir()) == names
+
+
+def test_a_range_of_frames_of_a_scenario(da: DeepAccident, accident: str, tmp_path: Path) -> None:
+    run("sample", da.dataroot, accident, "--frame-range", "2..3", "--out", tmp_path, "--size", "640x240", "--dpi", 40)
+    assert [path.name[-15:] for path in sorted(tmp_path.iterdir())] == ["vehicle_002.png", "vehicle_003.png"]
+
+
+def test_what_is_drawn_without_a_token(da_motion: DeepAccident) -> None:
+    scenario = next(record for record in da_motion.scenario if record["collision"])
+    token, pair = scenario["token"], scenario["collision"]["ids"]
+    assert scenario["num_frames"] == 35
+    assert rows_to_draw(da_motion, "frame", [], None) == [f"{token}/025"], "one second before the impact"
+    assert rows_to_draw(da_motion, "sample", [], None) == [f"{token}/ego_vehicle/025"]
+    assert rows_to_draw(da_motion, "sample_data", [], None) == [f"{token}/ego_vehicle/025/Camera_Front"]
+    assert rows_to_draw(da_motion, "scenario", [], None) == [token]
+    box = da_motion.get("annotation", rows_to_draw(da_motion, "annotation", [], None)[0])
+    assert box["is_collider"]
+    assert box["actor_id"] in pair
+    assert box["actor_id"] != OWN_ACTOR_ID
+    instance = da_motion.get("instance", rows_to_draw(da_motion, "instance", [], None)[0])
+    assert instance["actor_id"] == box["actor_id"]
+
+
+def test_a_scenario_without_a_collision_has_rows_too(da_motion: DeepAccident) -> None:
+    normal = next(record["token"] for record in da_motion.scenario if not record["collision"])
+    boxes = da_motion.boxes(f"{normal}/ego_vehicle/025")
+    others = boxes.select(boxes.actor_id != OWN_ACTOR_ID)
+    box = da_motion.get("annotation", rows_to_draw(da_motion, "annotation", [normal], None)[0])
+    assert box["num_lidar_pts"] == others.num_lidar_pts.max()
+    assert rows_to_draw(da_motion, "instance", [normal], None)[0].startswith(f"{normal}/actor/")
+
+
+def test_no_accident_at_all_is_said() -> None:
+    release: Any = SimpleNamespace(dataroot="data", scenario=[{"token": "type1/a", "collision": None}])
+    with pytest.raises(NotAvailableError, match=r"data: no scenario ends in an accident .* names; name one"):
+        rows_to_draw(release, "frame", [], None)
+
+
+def test_evaluation_draws_a_sample_of_the_results(da_motion: DeepAccident, tmp_path: Path) -> None:
+    tokens = da_motion.samples("train", "evaluate")[:2]
+    results = predict_results(da_motion, "accident", tokens, tmp_path / "results.json", workers=1)
+    text = run("evaluation", da_motion.dataroot, "--results", results, "--out", tmp_path / "a.png", "--size", "600x300")
+    assert tokens[0] in text
+    with pytest.raises(TokenError, match="has no prediction of 'no/such/ego_vehicle/001'"):
+        run("evaluation", da_motion.dataroot, "no/such/ego_vehicle/001", "--results", results, "--out", tmp_path)
+
+
+def test_video_writes_what_is_asked_for(da: DeepAccident, accident: str, tmp_path: Path) -> None:
+    out = tmp_path / "v.gif"
+    options = ["--what", "Camera_Front,bev", "--agents", "infrastructure", "--layers", "boxes", "--frame-range", "2..4"]
+    text = run("video", da.dataroot, accident, "--out", out, *options, "--size", "160x90", "--fps", 5, "--workers", 1)
+    assert f"written: {out}, 0." in text
+    with Image.open(out) as image:
+        assert (image.size, image.n_frames, image.info["duration"]) == ((160, 90), 3, 200)
+
+
+def test_video_takes_the_first_accident(da: DeepAccident, tmp_path: Path) -> None:
+    run(
+        "video",
+        da.dataroot,
+        "--out",
+        tmp_path / "v.webp",
+        "--what",
+        "accident",
+        "--frame-range",
+        "6",
+        "--size",
+        "160x90",
+    )
+    assert (tmp_path / "v.webp").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["frame", "--frame-range", "3..1"], "expected frame numbers such as 20..40, found '3..1'"),
+        (["frame", "--size", "big"], "expected width x height such as 480x270, found 'big'"),
+        (["accident", "--frame-range", "1..3"], "--frame-range is for moments; a whole scenario is drawn"),
+        (["frame", "a/b/003", "--frame-range", "1..3"], "--frame-range is for scenarios; a/b/003 is a frame"),
+        (["accident", "--seconds", "soon"], "expected seconds such as 2,1,0, found 'soon'"),
+        (["frame", "a/b/003", "a/b/004"], "2 pictures need a folder, found the file"),
+        (["frame", "--color-by", "depth"], "No such option"),
+        (["frame", "--dpi", "0"], "0.0 is not in the range x>=1"),
+    ],
+)
+def test_usage_errors(da: DeepAccident, tmp_path: Path, arguments: list[str], sentence: str) -> None:
+    verb, *others = arguments
+    text = run(verb, da.dataroot, *others, "--out", tmp_path / "a.png", status=2)
+    assert sentence in " ".join(text.split())
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "kind", "sentence"),
+    [
+        (["frame", "--layers", "label"], ChoiceError, "layers: expected any of .*found 'label'"),
+        (["frame", "--frame-range", "2..999"], ChoiceError, "--frame-range: expected frames from 1 to"),
+        (["bev", "--view-range", "-5"], ChoiceError, "view_range: expected metres above 0, found -5.0"),
+        (["frame", "--agents", "pole"], ChoiceError, "agent: expected one of .*'pole'"),
+        (["frame", "no/such"], TokenError, "no token 'no/such'"),
+        (["link", "--latency", "0.25"], ConfigError, "latency"),
+        (["accident", "--seconds", "9"], ChoiceError, r"seconds: expected some from 0 to 0\.5"),
+    ],
+)
+def test_errors_of_the_views(
+    da: DeepAccident, tmp_path: Path, arguments: list[str], kind: type[Exception], sentence: str
+) -> None:
+    verb, *others = arguments
+    with pytest.raises(kind, match=sentence):
+        run(verb, da.dataroot, *others, "--out", tmp_path / "a.png")
+    assert not list(tmp_path.iterdir())
+
+
+def test_other_kinds_of_files(da: DeepAccident, tmp_path: Path) -> None:
+    text = run("frame", da.dataroot, "--out", tmp_path / "a.bmp", status=2)
+    assert "expected a folder, or a file that ends in .png, .pdf, .svg, .jpg, .webp" in " ".join(text.split())
+    with pytest.raises(ChoiceError, match=r"path: expected a file that ends in \.mp4, \.gif, \.webp"):
+        run("video", da.dataroot, "--out", tmp_path / "a.png")
+
+
+@pytest.mark.parametrize(
+    ("suffix", "start"), [(".pdf", b"%PDF"), (".svg", b"<?xml"), (".jpg", b"\xff\xd8"), (".webp", b"RIFF")]
+)
+def test_pictures_of_all_kinds_have_the_same_bytes_each_time(
+    da: DeepAccident, accident: str, tmp_path: Path, suffix: str, start: bytes
+) -> None:
+    contents = []
+    for name in ("a", "b"):
+        fig = detached_figure((3, 2))
+        ax = render_sample_data(da, f"{accident}/ego_vehicle/001/Camera_Front", ax=fig.add_subplot())
+        contents.append(save_picture(ax, tmp_path / f"{name}{suffix}", dpi=50).read_bytes())
+    assert contents[0].startswith(start)
+    if suffix != ".svg":  # its ids are drawn by chance
+        assert contents[0] == contents[1]
+    with pytest.raises(ChoiceError, match=r"path: expected a file that ends in \.png"):
+        save_picture(ax, tmp_path / "a.bmp")
+
+
+@pytest.mark.parametrize("verb", [*_PICTURES, "video"])
+def test_the_verbs_have_the_grammar_of_all_others(verb: str) -> None:
+    text = run(verb, "--help")
+    for word in ("DATAROOT", "--version", "--index-dir", "--workers", "--on-error", "--out", "--size"):
+        assert word in text

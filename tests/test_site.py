@@ -1,0 +1,83 @@
+"""The documentation site: what it lists, and how docstrings get onto it. `.ci/run` builds it, warnings as errors."""
+
+import importlib.util
+import pkgutil
+import re
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+import deepaccident_devkit
+
+DOCS = Path(__file__).parents[1] / "docs"
+NOT_FOR_USERS = {"arrays", "cli", "dataset", "deepaccident", "files", "overview", "parallel", "tables", "text"}
+"""Command line, base of the facade, and what only the devkit itself calls."""
+
+
+def documented() -> set[str]:
+    pages = [path.read_text(encoding="utf-8") for path in (DOCS / "api").glob("*.md")]
+    assert pages
+    lines = re.compile(r"^\.\. automodule:: deepaccident_devkit\.(\S+)", re.MULTILINE)
+    return {name for page in pages for name in lines.findall(page)}
+
+
+def test_every_public_module_is_on_an_api_page() -> None:
+    names = {module.name for module in pkgutil.iter_modules(deepaccident_devkit.__path__)}
+    public = {name for name in names if not name.startswith("_")} - NOT_FOR_USERS
+    assert public - {name.partition(".")[0] for name in documented()} == set()
+
+
+def test_every_package_of_the_metrics_is_on_an_api_page() -> None:
+    evaluation = import_module("deepaccident_devkit.evaluation")
+    packages = {f"evaluation.{module.name}" for module in pkgutil.iter_modules(evaluation.__path__) if module.ispkg}
+    assert packages - documented() == set()
+
+
+@pytest.mark.parametrize("folder", [DOCS, DOCS / "api"], ids=lambda folder: folder.name)
+def test_every_page_is_listed(folder: Path) -> None:
+    """The build would tell, too, but takes half a minute."""
+    index = (folder / "index.md").read_text(encoding="utf-8")
+    listed = set(re.findall(r"^[\w/.]+$", index, re.MULTILINE))
+    assert {path.stem for path in folder.glob("*.md")} - listed == {"index"}
+
+
+def docstring_lines(text: str) -> str:
+    name = "markdown_docstrings"
+    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return "\n".join(module.restructured(text.split("\n")))
+
+
+def test_code_in_docstrings_becomes_literal() -> None:
+    assert docstring_lines("Reads `token`s of |x| metres.") == r"Reads \ ``token``\ s of \|x\| metres."
+
+
+def test_code_that_runs_over_a_line_stays_one() -> None:
+    assert docstring_lines("As `a\nb` is.") == "As \\ ``a\nb``\\  is."
+
+
+def test_doctests_stay() -> None:
+    text = "Counts.\n\n>>> len(`a`)\n0\n\nAnd `b`."
+    assert docstring_lines(text) == "Counts.\n\n>>> len(`a`)\n0\n\nAnd \\ ``b``\\ ."
+
+
+def test_a_fence_becomes_a_block() -> None:
+    assert docstring_lines("So:\n\n```python\nf(`x`)\n\ng()\n```\n\nEnd.") == (
+        "So:\n\n\n.. code-block:: python\n\n    f(`x`)\n    \n    g()\n\n\nEnd."
+    )
+
+
+def test_indented_code_becomes_a_block_but_not_what_a_section_holds() -> None:
+    assert docstring_lines("So:\n\n    f(*a)\n\nEnd.") == ("So:\n\n\n.. code-block:: python\n\n    f(*a)\n\n\nEnd.")
+    section = "Sums.\n\nArgs:\n    first: one.\n\n    second: two."
+    assert docstring_lines(section) == section
+
+
+def test_a_table_becomes_a_list_table() -> None:
+    assert docstring_lines("| field | values |\n|---|---|\n| `town` | any |") == (
+        "\n.. list-table::\n    :header-rows: 1\n\n    * - field\n      - values\n    * - ``town``\\ \n      - any\n"
+    )

@@ -1,0 +1,117 @@
+"""The countdown to an impact: which cameras, which moments, what is at which place, and the words."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_hex
+from numpy.testing import assert_allclose
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError, NotAvailableError
+from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.render import detached_figure
+from deepaccident_devkit.render.accident import accident_words, render_accident
+from deepaccident_devkit.render.best_view import best_camera, best_view
+from deepaccident_devkit.render.colors import COLLIDER_COLOR
+from deepaccident_devkit.taxonomy import CAMERAS
+from deepaccident_devkit.v2x.tracks import scenario_tracks
+
+
+def accident_of(da: DeepAccident) -> Any:
+    return next(scenario for scenario in da.scenario if scenario["collision"])
+
+
+def drawn(da: DeepAccident, scenario: Any, **how: Any) -> Any:
+    figure = detached_figure((8, 8))
+    assert render_accident(da, scenario, fig=figure, **how) is figure
+    return figure
+
+
+def test_a_column_a_moment_and_a_row_an_agent(da: DeepAccident) -> None:
+    scenario = accident_of(da)
+    figure = drawn(da, scenario, seconds=(2.0, 0.4, 0.0), agents=["infrastructure", "ego_vehicle"])
+    assert len(figure.axes) == 2 * 3  # 2 s before was not recorded
+    assert [ax.get_title() for ax in figure.axes[:2]] == ["0.4 s before", "the impact"]
+    assert [figure.axes[row * 2].texts[-1].get_text() for row in range(2)] == ["ego", "infrastructure"]
+    assert all(ax.images for ax in figure.axes[:4])
+    channels = {text.get_text() for ax in figure.axes[:4] for text in ax.texts} - {"ego", "infrastructure"}
+    assert channels <= {*CAMERAS}
+    assert figure.get_suptitle() == accident_words(da, da.collision(scenario))
+    plain = drawn(da, scenario, seconds=[0.0], layers=["boxes", "ids"])
+    assert not any(ax.images for ax in plain.axes)
+
+
+def test_the_pair_is_where_it_is_and_red(da_motion: DeepAccident) -> None:
+    scenario = accident_of(da_motion)
+    contact = da_motion.collision(scenario)
+    assert contact is not None
+    figure = drawn(da_motion, scenario, agents=[])
+    assert len(figure.axes) == 4
+    tracks = scenario_tracks(da_motion, scenario["token"])
+    for left, ax in zip((2.0, 1.0, 0.5, 0.0), figure.axes, strict=True):
+        boxes = tracks.at(scenario["num_frames"] - round(left * 10))
+        shapes = next(each for each in ax.collections if isinstance(each, PolyCollection))
+        for row, path in enumerate(shapes.get_paths()):
+            assert_allclose(path.vertices[:4], boxes.bottom_corners()[row, :, :2])
+        red = [to_hex(color) == COLLIDER_COLOR for color in shapes.get_edgecolor()]
+        assert red == np.isin(boxes.actor_id, contact.actor_ids).tolist()
+        crosses = [line for line in ax.lines if line.get_marker() == "x"]
+        assert_allclose(crosses[0].get_xydata(), [contact.point[:2]])
+        speeds = np.linalg.norm(boxes.velocity[np.array(red)], axis=1)
+        assert [text.get_text() for text in ax.texts] == [f"{speed:.1f} m/s" for speed in speeds]
+
+
+def test_trails_lead_from_where_the_pair_was_to_the_impact(da_motion: DeepAccident) -> None:
+    scenario = accident_of(da_motion)
+    with_trails = drawn(da_motion, scenario, agents=[], seconds=[1.0], layers=["trajectories"]).axes[0]
+    tracks = scenario_tracks(da_motion, scenario["token"])
+    ends = np.concatenate([segment for each in with_trails.collections for segment in each.get_segments()])
+    for actor in scenario["collision"]["ids"]:
+        last = tracks.boxes.center[tracks.actor_id == actor][-1, :2]
+        assert np.linalg.norm(ends - last, axis=1).min() < 1e-9
+    none = drawn(da_motion, scenario, agents=[], seconds=[1.0], layers=[]).axes[0]
+    assert len(none.collections) == 0
+
+
+def test_images_are_those_that_show_the_pair_best(da: DeepAccident) -> None:
+    scenario = accident_of(da)
+    figure = drawn(da, scenario, seconds=[0.0], agents=["ego_vehicle_behind"], layers=["boxes"])
+    sample = da.get_sample(scenario, "ego_vehicle_behind", scenario["num_frames"])["token"]
+    boxes = scenario_tracks(da, scenario["token"]).at(scenario["num_frames"])
+    view = best_view(da, [sample], boxes.select(np.isin(boxes.actor_id, scenario["collision"]["ids"])))
+    assert view is not None
+    assert figure.axes[0].texts[0].get_text() == view.camera.rsplit("/", 1)[1]
+    sizes = da.get("sample_data", view.camera)
+    assert (figure.axes[0].get_xlim(), figure.axes[0].get_ylim()) == ((0, sizes["width"]), (sizes["height"], 0))
+    assert to_hex(COLLIDER_COLOR) in {
+        to_hex(color) for each in figure.axes[0].collections for color in each.get_edgecolor()
+    }
+
+
+def test_the_words_say_who_hits_whom(da_motion: DeepAccident) -> None:
+    contact = da_motion.collision(accident_of(da_motion))
+    assert contact is not None
+    words = accident_words(da_motion, contact)
+    first, second = contact.sides
+    assert ("hits" in words) == ("front" in (first, second))
+    for actor in contact.actor_ids:
+        assert f" {actor})" in words
+    assert f"{contact.closing_speed:.1f} m/s" in words
+    assert f"{np.degrees(contact.impact_angle):.0f}°" in words
+
+
+def test_what_cannot_be_counted_down_to_is_named(da_motion: DeepAccident) -> None:
+    normal = next(scenario for scenario in da_motion.scenario if not scenario["collision"])
+    with pytest.raises(NotAvailableError, match="nobody collides in it, so there is nothing to count down to"):
+        drawn(da_motion, normal)
+    with pytest.raises(ChoiceError, match=r"seconds: expected some from 0 to 3\.4, which are recorded"):
+        drawn(da_motion, accident_of(da_motion), seconds=[7.0])
+    with pytest.raises(ChoiceError, match=r"layers: expected any of .*, found 'bev'"):
+        drawn(da_motion, accident_of(da_motion), layers=["bev"])
+
+
+def test_where_no_camera_sees_the_boxes_it_is_the_front_one(da: DeepAccident) -> None:
+    nobody = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [])
+    assert best_camera(da, da.sample[0]["token"], nobody) == "Camera_Front"

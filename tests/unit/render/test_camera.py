@@ -1,0 +1,175 @@
+"""Sensor files as pictures: images with boxes where the camera sees them, the others from above."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from drawing import has_color, new_axes, on_canvas, rendered
+from matplotlib import colormaps
+from matplotlib import pyplot as plt
+from matplotlib.collections import LineCollection, PathCollection, PolyCollection
+from numpy.testing import assert_allclose, assert_array_equal
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.render import render_pointcloud_in_image, render_sample_data
+from deepaccident_devkit.render.best_view import best_view, crop_about
+from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, DEPTH_COLORMAP, HEIGHT_COLORMAP
+from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, OWN_ACTOR_ID
+from deepaccident_devkit.v2x import map_pointcloud_to_image, project_to_image
+from deepaccident_devkit.v2x.projection import camera_of
+
+
+@pytest.fixture(scope="module")
+def behind(da: DeepAccident) -> str:
+    """The sample of the agent right behind a collider, at the impact."""
+    scenario = next(one for one in da.scenario if one["collision"] is not None)
+    return f"{scenario['token']}/ego_vehicle_behind/006"
+
+
+def test_the_box_of_a_collider_passes_within_two_pixels_of_its_corners(da: DeepAccident, behind: str) -> None:
+    ax = render_sample_data(da, f"{behind}/Camera_Front", layers=["boxes"], ax=new_axes((8, 4.5)))
+    picture = rendered(ax)
+    boxes = da.boxes(behind, "Camera_Front")
+    ego = da.get("agent", f"{behind.rsplit('/', 2)[0]}/ego_vehicle")["actor_id"]
+    camera = camera_of(da, f"{behind}/Camera_Front")
+    pixels, _ = camera.project(boxes.corners()[boxes.actor_id == ego][0])
+    seen = camera.in_image(pixels)
+    assert seen.sum() >= 4
+    for place in on_canvas(ax, pixels[seen]):
+        assert has_color(picture, place, COLLIDER_COLOR)
+
+
+def test_the_image_fills_the_pixels_of_its_calibration(da: DeepAccident, behind: str) -> None:
+    ax = render_sample_data(da, f"{behind}/Camera_Front", ax=new_axes())
+    (image,) = ax.images
+    assert_array_equal(image.get_array(), da.load_image(f"{behind}/Camera_Front"))
+    assert tuple(image.get_extent()) == (0, 64, 36, 0)
+    assert (ax.get_xlim(), ax.get_ylim()) == ((0, 64), (36, 0))
+    assert ax.get_title() == "Camera_Front"
+    assert plt.get_fignums() == []
+
+
+def test_boxes_are_those_a_camera_of_the_agent_sees_but_its_own(da: DeepAccident, behind: str) -> None:
+    ax = render_sample_data(da, f"{behind}/Camera_Back", layers="boxes", ax=new_axes())  # type: ignore[arg-type]
+    edges = next(one for one in ax.collections if type(one) is LineCollection)
+    boxes = da.boxes(behind, "Camera_Back", visible="camera")
+    corners = boxes.corners()[boxes.actor_id != OWN_ACTOR_ID]
+    whole = (corners[..., 2] >= 0.1).all(axis=1)
+    cut = (corners[..., 2] >= 0.1).any(axis=1) & ~whole
+    assert 12 * whole.sum() <= len(edges.get_segments()) <= 12 * (whole.sum() + cut.sum())
+    assert whole.any()
+
+
+def test_points_have_the_colour_of_their_depth(da: DeepAccident, behind: str) -> None:
+    ax = render_sample_data(da, f"{behind}/Camera_Front", layers=["points"], ax=new_axes())
+    rendered(ax)
+    (drawn,) = ax.collections
+    points = map_pointcloud_to_image(da, f"{behind}/Camera_Front", colors=False)
+    expected = {(*pixel, depth) for pixel, depth in zip(points.pixels.tolist(), points.depth.tolist(), strict=True)}
+    offsets, depths = np.asarray(drawn.get_offsets()), np.asarray(drawn.get_array())
+    assert len(depths) == points.mask.sum() > 50
+    assert {(*pixel, depth) for pixel, depth in zip(offsets.tolist(), depths.tolist(), strict=True)} <= expected
+    assert (np.diff(depths) <= 0).all()
+    assert_allclose(drawn.get_facecolor(), colormaps[DEPTH_COLORMAP](depths / 50))
+
+
+@pytest.mark.parametrize(("channel", "frame"), [("lidar01", "lidar"), ("BEV_instance_camera", "ego")])
+def test_the_other_sensors_are_drawn_from_above_in_their_frame(
+    da: DeepAccident, behind: str, channel: str, frame: str
+) -> None:
+    ax = render_sample_data(da, f"{behind}/{channel}", ax=new_axes())
+    footprints = next(one for one in ax.collections if type(one) is PolyCollection)
+    drawn = {tuple(np.round(path.vertices[:4].ravel(), 6)) for path in footprints.get_paths()}
+    boxes = da.boxes(behind, frame)
+    near = boxes.select(
+        (np.abs(boxes.center[:, :2] - np.mean([ax.get_xlim(), ax.get_ylim()], axis=1)) < 55).all(axis=1)
+    )
+    assert drawn == {tuple(np.round(one[:, :2].ravel(), 6)) for one in near.bottom_corners()}
+    clouds = [one for one in ax.collections if type(one) is PathCollection]
+    assert (len(clouds), len(ax.images)) == ((1, 0) if channel == "lidar01" else (0, 1))
+    assert ax.get_title().startswith(f"{channel}, ego_vehicle_behind")
+
+
+@pytest.mark.parametrize(("channel", "layer"), [("Camera_Front", "trajectories"), ("lidar01", "image")])
+def test_a_sensor_has_its_own_layers(da: DeepAccident, behind: str, channel: str, layer: Any) -> None:
+    with pytest.raises(ChoiceError, match=rf"layers: expected any of .*, found '{layer}'"):
+        render_sample_data(da, f"{behind}/{channel}", layers=[layer])
+
+
+def test_points_of_another_agent_lie_in_the_image_where_they_project(da: DeepAccident, behind: str) -> None:
+    camera, pole = f"{behind}/Camera_Front", behind.replace("ego_vehicle_behind", "infrastructure")
+    ax = render_pointcloud_in_image(da, camera, pole, color_by="height", ax=new_axes())
+    rendered(ax)
+    drawn = ax.collections[0]
+    cloud = da.load_point_cloud(pole, "world")
+    points = project_to_image(da, cloud, pole, camera, colors=False)
+    height = da.world_from(behind, "ego").inverse().apply(cloud.xyz)[:, 2]
+    order = np.flatnonzero(points.mask)[np.argsort(-points.depth[points.mask])]
+    assert len(order) > 20
+    assert_allclose(drawn.get_offsets(), points.pixels[order])
+    assert_allclose(drawn.get_array(), height[order])
+    assert drawn.get_cmap().name == HEIGHT_COLORMAP
+    assert pole in ax.get_title()
+
+
+def test_points_by_depth_are_the_camera_s_own_unless_told(da: DeepAccident, behind: str) -> None:
+    ax = render_pointcloud_in_image(da, f"{behind}/Camera_Back", ax=new_axes())
+    points = map_pointcloud_to_image(da, f"{behind}/Camera_Back", colors=False)
+    assert_allclose(np.sort(ax.collections[0].get_array()), np.sort(points.depth[points.mask]))
+    assert [one.get_ylabel() for one in ax.figure.axes[1:]] == ["depth (m)"]
+
+
+def test_by_agent_all_points_of_the_moment_have_their_agents_colours(da: DeepAccident, behind: str) -> None:
+    from matplotlib.colors import to_hex
+
+    ax = render_pointcloud_in_image(da, f"{behind}/Camera_Front", color_by="agent", ax=new_axes())
+    assert [to_hex(one.get_facecolor()[0]) for one in ax.collections] == list(AGENT_COLORS.values())
+    assert len(ax.get_legend().get_texts()) == len(AGENTS)
+    alone = render_pointcloud_in_image(da, f"{behind}/Camera_Front", behind, color_by="agent", ax=new_axes())
+    assert [to_hex(one.get_facecolor()[0]) for one in alone.collections] == [AGENT_COLORS["ego_vehicle_behind"]]
+
+
+def test_colours_that_points_cannot_have_and_sensors_without_image_are_refused(da: DeepAccident, behind: str) -> None:
+    with pytest.raises(ChoiceError, match="color_by: expected one of depth, height, agent, found 'time'"):
+        render_pointcloud_in_image(da, f"{behind}/Camera_Front", color_by="time")  # type: ignore[arg-type]
+    with pytest.raises(ChoiceError, match="camera: expected one of Camera_Front"):
+        render_pointcloud_in_image(da, f"{behind}/lidar01", ax=new_axes())
+
+
+def test_the_best_view_of_the_vehicle_ahead_is_the_front_camera(da: DeepAccident, behind: str) -> None:
+    boxes = da.boxes(behind, "world")
+    ego = da.get("agent", f"{behind.rsplit('/', 2)[0]}/ego_vehicle")["actor_id"]
+    view = best_view(da, [behind], boxes.select(boxes.actor_id == ego))
+    assert view is not None
+    assert view.camera == f"{behind}/Camera_Front"
+    pixels, _ = camera_of(da, view.camera).project(da.boxes(behind, "Camera_Front").corners()[boxes.actor_id == ego][0])
+    low, high = pixels.min(axis=0).clip(0, (64, 36)), pixels.max(axis=0).clip(0, (64, 36))
+    assert_allclose(view.bounds, [*low, *high])
+    assert view.area == pytest.approx(float(np.prod(high - low)))
+
+
+def test_what_no_camera_sees_has_no_best_view(da: DeepAccident, behind: str) -> None:
+    boxes = da.boxes(behind, "world")
+    assert best_view(da, [behind], boxes.select(boxes.actor_id == OWN_ACTOR_ID)) is None
+
+
+@pytest.mark.parametrize("bounds", [(10.0, 10, 14, 12), (0.0, 0, 5, 5), (0.0, 0, 64, 36), (60.0, 30, 64, 36)])
+def test_a_crop_has_the_image_s_shape_holds_the_bounds_and_stays_inside(bounds: Any) -> None:
+    left, top, right, bottom = crop_about(bounds, width=64, height=36)
+    assert (right - left) / (bottom - top) == pytest.approx(64 / 36)
+    assert min(left, top) >= 0
+    assert right <= 64
+    assert bottom <= 36
+    assert left <= bounds[0]
+    assert top <= bounds[1]
+    assert right >= bounds[2]
+    assert bottom >= bounds[3]
+
+
+def test_every_camera_can_be_drawn_with_all_its_layers(da: DeepAccident, behind: str) -> None:
+    for channel in CAMERAS:
+        layers: Any = ("image", "points", "boxes", "ids", "velocities")
+        ax = render_sample_data(da, f"{behind}/{channel}", layers=layers, ax=new_axes())
+        assert all(text.get_fontsize() >= 7 for text in ax.texts)
+        rendered(ax)

@@ -1,0 +1,165 @@
+"""Many panels of a moment: which, in which order, and of which size."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib import pyplot as plt
+from matplotlib.collections import PathCollection
+from matplotlib.colors import to_hex
+from numpy.testing import assert_array_equal
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.render import detached_figure, render_annotation, render_frame, render_sample
+from deepaccident_devkit.render.colors import COLLIDER_COLOR, COMPANION_COLOR
+from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
+
+
+@pytest.fixture(scope="module")
+def frame(da: DeepAccident) -> str:
+    """A moment of a scenario that ends in a collision."""
+    scenario = next(one for one in da.scenario if one["collision"] is not None)
+    return f"{scenario['token']}/004"
+
+
+def images(axes: Any) -> list[Any]:
+    return [np.asarray(ax.images[0].get_array()) for ax in axes]
+
+
+def colors_from_above(ax: Any) -> set[str]:
+    return {to_hex(color) for color in ax.collections[1].get_edgecolor()}
+
+
+def clouds(fig: Any) -> dict[str, int]:
+    """How many point clouds each panel has, by title."""
+    return {ax.get_title(): sum(type(one) is PathCollection for one in ax.collections) for ax in fig.axes}
+
+
+def test_a_frame_shows_its_agents_in_their_order(da: DeepAccident, frame: str) -> None:
+    fig = render_frame(da, frame, fig=detached_figure((16, 9)))
+    cameras, above = fig.axes[:5], fig.axes[5:]
+    assert [ax.get_title() for ax in cameras] == list(AGENTS)
+    scenario = frame.rsplit("/", 1)[0]
+    for agent, image in zip(AGENTS, images(cameras), strict=True):
+        assert_array_equal(image, da.load_image(f"{scenario}/{agent}/004/Camera_Front"))
+    for ax in above:
+        assert {COLLIDER_COLOR, COMPANION_COLOR} <= colors_from_above(ax)
+    assert "0.2 s to the impact" in fig._suptitle.get_text()
+    legend = [one.get_text() for one in fig.legends[0].get_texts()]
+    assert legend[:2] == ["colliding pair", "companion"]
+    assert tuple(fig.get_size_inches()) == (16, 9)
+    assert plt.get_fignums() == []
+
+
+def test_the_order_of_agents_is_fixed_and_who_is_left_out_leaves_no_hole(da: DeepAccident, frame: str) -> None:
+    fig = render_frame(da, frame, agents=("infrastructure", "ego_vehicle_behind"), fig=detached_figure((8, 6)))
+    assert [ax.get_title() for ax in fig.axes] == ["ego_vehicle_behind", "infrastructure", "", ""]
+    assert all(ax.has_data() for ax in fig.axes)
+
+
+def test_the_columns_stand_side_by_side_with_camera_above_view_from_above(da: DeepAccident, frame: str) -> None:
+    fig = render_frame(da, frame, fig=detached_figure((16, 9)))
+    fig.draw_without_rendering()
+    boxes = [ax.get_window_extent() for ax in fig.axes]
+    for camera, above, ax in zip(boxes[:5], boxes[5:], fig.axes[5:], strict=True):
+        assert above.y1 < camera.y0
+        assert abs(camera.x0 - above.x0) < 2
+        assert ax.get_xlim() == (-50, 50)
+        assert above.height / np.ptp(ax.get_ylim()) == pytest.approx(above.width / 100, rel=0.01)
+    assert (np.diff([box.x0 for box in boxes[:5]]) > boxes[0].width).all()
+
+
+@pytest.mark.parametrize("size", [(18, 6.9), (16, 9), (12.8, 7.2)])
+def test_panels_from_above_fill_a_tall_figure(da: DeepAccident, frame: str, size: tuple[float, float]) -> None:
+    fig = render_frame(da, frame, fig=detached_figure(size))
+    fig.draw_without_rendering()
+    low = min(ax.get_window_extent().y0 for ax in fig.axes)
+    high = max(ax.get_window_extent().y1 for ax in fig.axes)
+    assert (high - low) / fig.bbox.height > 0.7
+    half = fig.axes[-1].get_ylim()[1]
+    assert half == 50 if size[0] > 2.5 * size[1] else 50 < half <= 100
+
+
+def test_a_part_of_a_figure_is_drawn_on(da: DeepAccident, frame: str) -> None:
+    left, right = detached_figure((24, 7)).subfigures(1, 2)
+    assert render_frame(da, frame, fig=left) is left
+    assert render_sample(da, da.samples_of(frame)[0], fig=right) is right
+    left.figure.draw_without_rendering()
+    assert [len(part.axes) for part in (left, right)] == [10, 7]
+
+
+@pytest.mark.parametrize("size", [(16.0, 5.6), (12.8, 7.2)])
+def test_the_cameras_of_a_sample_fill_the_figure(da: DeepAccident, frame: str, size: tuple[float, float]) -> None:
+    """Three a row in a wide figure, two in one of 16 to 9: front and back on top."""
+    fig = render_sample(da, da.samples_of(frame)[0], fig=detached_figure(size))
+    fig.draw_without_rendering()
+    panels = {ax.get_title(): ax.get_window_extent() for ax in fig.axes}
+    rows = {round(panel.y1) for title, panel in panels.items() if title}
+    assert len(rows) == (2 if size[0] == 16 else 3)
+    assert min(panel.y0 for panel in panels.values()) < 0.2 * fig.bbox.height
+
+
+def test_a_sample_shows_six_cameras_as_they_look_and_the_view_from_above(da: DeepAccident, frame: str) -> None:
+    sample = da.samples_of(frame)[0]
+    fig = render_sample(da, sample, fig=detached_figure((16, 6)))
+    fig.draw_without_rendering()
+    panels = {ax.get_title(): ax.get_window_extent() for ax in fig.axes}
+    assert set(panels) == {*CAMERAS, ""}
+    for row in ("Front", "Back"):
+        left, middle, right = (panels[f"Camera_{row}{side}"] for side in ("Left", "", "Right"))
+        assert left.x1 <= middle.x0 < middle.x1 <= right.x0
+        assert right.x1 < panels[""].x0
+    assert panels["Camera_Back"].y1 < panels["Camera_Front"].y0
+    for ax in fig.axes:
+        if ax.get_title():
+            assert_array_equal(images([ax])[0], da.load_image(f"{sample['token']}/{ax.get_title()}"))
+
+
+def test_each_panel_draws_the_layers_that_it_has(da: DeepAccident, frame: str) -> None:
+    sample = da.samples_of(frame)[0]
+    fig = render_sample(da, sample, agents=None, layers=["points"], fig=detached_figure((16, 6)))
+    assert clouds(fig) == {**dict.fromkeys(CAMERAS, 1), "": 5}
+    assert not any(ax.images for ax in fig.axes)
+    plain = render_sample(da, sample, fig=detached_figure((16, 6)))
+    assert clouds(plain) == {**dict.fromkeys(CAMERAS, 0), "": 1}
+
+
+def test_layers_and_agents_that_are_not_there_are_refused(da: DeepAccident, frame: str) -> None:
+    with pytest.raises(ChoiceError, match=r"layers: expected any of image, .*, found 'labels'"):
+        render_frame(da, frame, layers=["labels"])
+    with pytest.raises(ChoiceError, match="agents: expected one of single"):
+        render_frame(da, frame, agents="pole")
+    assert plt.get_fignums() == []
+
+
+def test_an_annotation_is_shown_large_from_above_and_in_words(da: DeepAccident, frame: str) -> None:
+    sample = f"{frame.rsplit('/', 1)[0]}/ego_vehicle_behind/004"
+    ego = da.get("agent", f"{frame.rsplit('/', 1)[0]}/ego_vehicle")["actor_id"]
+    boxes = da.boxes(sample, "ego")
+    row = int(np.flatnonzero(boxes.actor_id == ego)[0])
+    fig = render_annotation(da, f"{sample}/{row}", margin=8, fig=detached_figure((10, 5)))
+    camera, above, words = fig.axes
+    assert camera.get_title() == "Camera_Front"
+    assert np.ptp(camera.get_xlim()) <= 64
+    center = np.mean([above.get_xlim(), above.get_ylim()], axis=1)
+    np.testing.assert_allclose(center, boxes.center[row, :2])
+    assert np.ptp(above.get_xlim()) == pytest.approx(16)
+    text = "\n".join(one.get_text() for one in words.texts)
+    length, width, height = boxes.size[row]
+    for fact in (
+        f"category: {boxes.category_names[row]}",
+        f"label id: {ego}",
+        f"size: {length:.2f} × {width:.2f} × {height:.2f} m",
+        f"speed: {np.linalg.norm(boxes.velocity[row]):.1f} m/s",
+        f"distance: {np.linalg.norm(boxes.center[row, :2]):.1f} m from the agent",
+        f"LiDAR points: {boxes.num_lidar_pts[row]}",
+        "impact: in 0.2 s, with this actor",
+        "annotated by: ego, ego behind",
+    ):
+        assert fact in text
+
+
+def test_an_agent_s_own_box_is_in_none_of_its_cameras(da: DeepAccident, frame: str) -> None:
+    fig = render_annotation(da, f"{frame.rsplit('/', 1)[0]}/ego_vehicle/004/0", fig=detached_figure((10, 5)))
+    assert [one.get_text() for one in fig.axes[0].texts] == ["in no camera of its agent"]

@@ -1,0 +1,146 @@
+"""Who sees whom: dots, lines and words are where the released rule and the labels put them."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex, to_rgba
+from numpy.testing import assert_allclose, assert_array_equal
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError, TokenError
+from deepaccident_devkit.render import detached_figure
+from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR
+from deepaccident_devkit.render.sights import sights
+from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix
+from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.taxonomy import AGENTS
+
+
+@pytest.fixture(scope="module")
+def hidden(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
+    """An accident whose ego and other are hidden from each other behind a house until late."""
+    root = tmp_path_factory.mktemp("synthetic") / "hidden"
+    make_release(root, SynthConfig(scenarios=1, frames=15, view="hidden", seed=2, sensors=False), workers=1)
+    return DeepAccident("v1", root, verbose=False)
+
+
+def panel(da: DeepAccident, moment: Any, size: tuple[float, float] = (5, 5.6), **how: Any) -> Any:
+    ax = detached_figure(size).add_subplot()
+    assert render_visibility(da, moment, ax=ax, **how) is ax
+    return ax
+
+
+def dots(ax: Any) -> dict[str, Any]:
+    """Agent → (n, 2) centres of the actors that have its dot."""
+    return {each.get_label(): each.get_offsets() for each in ax.collections if each.get_label() in AGENTS}
+
+
+def words(ax: Any) -> list[str]:
+    return [text.get_text() for text in ax.texts]
+
+
+def test_dots_are_at_who_is_visible_by_the_rule(hidden: DeepAccident) -> None:
+    scenario = hidden.scenario[0]["token"]
+    sample = hidden.get_sample(scenario, "other_vehicle", 10)
+    ax = panel(hidden, sample)
+    boxes = hidden.cooperative_boxes(sample, frame="ego")
+    for agent in AGENTS:
+        seen = hidden.visible_instances(f"{scenario}/{agent}/010", agents=[agent])
+        ids = [int(token.rsplit("/", 1)[1]) for token in seen]
+        expected = boxes.center[np.isin(boxes.actor_id, ids), :2]
+        assert_allclose(dots(ax)[agent], expected)
+    assert (
+        to_hex(next(each for each in ax.collections if each.get_label() == AGENTS[2]).get_facecolor()[0])
+        == (AGENT_COLORS[AGENTS[2]])
+    )
+
+
+def test_a_dot_is_drawn_right_above_its_actor(hidden: DeepAccident) -> None:
+    """On the canvas, a fixed number of points up and to its agent's own side."""
+    ax = panel(hidden, hidden.get_sample(hidden.scenario[0], "ego_vehicle", 10), agents=["ego_vehicle"])
+    ax.figure.canvas.draw()
+    (drawn,) = (each for each in ax.collections if each.get_label() == "ego_vehicle")
+    centers = ax.transData.transform(drawn.get_offsets())
+    moved = drawn.get_offset_transform().transform(drawn.get_offsets())
+    assert_allclose(moved - centers, np.tile([0, 10 / 72 * ax.figure.dpi], (len(centers), 1)), atol=0.01)
+
+
+def test_the_hidden_collider_stands_out(hidden: DeepAccident) -> None:
+    scenario = hidden.scenario[0]
+    known = sights(hidden, hidden.get_sample(scenario, "ego_vehicle", 2))
+    other = known.boxes.actor_id == hidden.get("agent", f"{scenario['token']}/other_vehicle")["actor_id"]
+    assert known.hidden_from("ego_vehicle")[other].all()
+    ax = panel(hidden, known.sample)
+    assert words(ax) == ["ego cannot see"]
+    dashed = [each for each in ax.collections if each.get_linestyle()[0][1] is not None and len(each.get_paths())]
+    corners = np.concatenate([path.vertices[:4] for path in dashed[0].get_paths()])
+    for corner in known.boxes.select(other).bottom_corners()[0, :, :2]:
+        assert np.linalg.norm(corners - corner, axis=1).min() < 1e-9
+    assert COLLIDER_COLOR in {to_hex(color) for color in dashed[0].get_edgecolor()}
+    lines = next(each for each in ax.collections if each.get_alpha() == 0.8)
+    assert_allclose(lines.get_colors()[:, :3], [to_rgba(AGENT_COLORS[name])[:3] for name in line_agents(known)])
+    later = panel(hidden, hidden.get_sample(scenario, "ego_vehicle", scenario["num_frames"]))
+    assert words(later) == []
+
+
+def line_agents(known: Any) -> list[str]:
+    _, column = np.nonzero(known.seen & known.collides[:, None])
+    return [known.agents[each] for each in column]
+
+
+def test_frames_agents_and_layers_are_the_callers(hidden: DeepAccident) -> None:
+    token = f"{hidden.scenario[0]['token']}/010"
+    ax = panel(hidden, hidden.get("frame", token), agents=["infrastructure", "ego_vehicle"], frame="world")
+    assert [*dots(ax)] == ["ego_vehicle", "infrastructure"]
+    assert sights(hidden, token).sample.endswith("ego_vehicle/010")  # the first agent there
+    bare = panel(hidden, token, layers=["ids"])
+    assert not dots(bare)
+    assert len(bare.texts) == len(sights(hidden, token).boxes)
+    wide = panel(hidden, token, view_range=12.0)
+    assert_allclose(np.diff([wide.get_xlim(), wide.get_ylim()]), 24.0)
+
+
+def test_the_matrix_has_a_cell_for_each_actor_and_agent(hidden: DeepAccident) -> None:
+    sample = hidden.get_sample(hidden.scenario[0], "ego_vehicle", 10)
+    known = sights(hidden, sample)
+    ax = detached_figure((5, 7)).add_subplot()
+    assert render_visibility_matrix(hidden, sample, ax=ax) is ax
+    rows = [label.get_text() for label in ax.get_yticklabels()]
+    assert [int(row.split()[1]) in known.pair for row in rows[:3]] == [True, True, False]
+    by_id = {int(row.split()[1]): number for number, row in enumerate(rows)}
+    full = np.zeros((len(rows), 5), dtype=bool)
+    for each in ax.collections:
+        column, row = each.get_offsets()[0].astype(int).tolist()
+        full[row, column] = each.get_facecolor().size > 0
+    for row, actor in enumerate(known.boxes.actor_id.tolist()):
+        if actor in by_id:
+            order = [known.agents.index(agent) for agent in AGENTS]
+            assert_array_equal(full[by_id[actor]], known.seen[row, order])
+    assert sum(text.get_text() == "itself" for text in ax.texts) == 4  # the pole has no body
+
+
+def test_a_normal_scenario_hides_nothing(da_motion: DeepAccident) -> None:
+    normal = next(scenario for scenario in da_motion.scenario if not scenario["collision"])
+    ax = panel(da_motion, da_motion.get_sample(normal, "ego_vehicle", 5))
+    assert words(ax) == []
+    assert not sights(da_motion, f"{normal['token']}/005").hidden_from("ego_vehicle").any()
+
+
+def test_what_is_not_there_is_named(da_motion: DeepAccident) -> None:
+    token = da_motion.sample[0]["token"]
+    with pytest.raises(TokenError, match="has no token 'nobody'"):
+        panel(da_motion, "nobody")
+    with pytest.raises(ChoiceError, match=r"layers: expected any of .*points.*, found 'image'"):
+        panel(da_motion, token, layers=["image"])
+    with pytest.raises(ChoiceError, match="agent: expected one of"):
+        panel(da_motion, token, agents=["me"])
+    with pytest.raises(ChoiceError, match="frame: expected one of world, ego, lidar, found 'Camera_Front'"):
+        panel(da_motion, token, frame="Camera_Front")
+
+
+def test_the_title_is_whole(da: DeepAccident) -> None:
+    ax = render_visibility(da, da.frame[0])
+    ax.figure.draw_without_rendering()
+    assert ax.title.get_window_extent().y1 <= ax.figure.bbox.y1
+    assert ax.get_legend().get_window_extent().y0 >= 0
