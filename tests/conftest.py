@@ -1,7 +1,9 @@
 """Fixtures that all tests share: one synthetic release a session, made and indexed once."""
 
+import importlib.util
 import shutil
 from pathlib import Path
+from types import ModuleType
 
 import matplotlib as mpl
 import pytest
@@ -66,6 +68,17 @@ def both_layouts(request: pytest.FixtureRequest) -> DeepAccident:
     """Each of the two releases in turn."""
     opened: DeepAccident = request.getfixturevalue("da" if request.param == "A" else "da_b")
     return opened
+
+
+@pytest.fixture(scope="session")
+def schema_generator() -> ModuleType:
+    """The script schema/generate.py, whose functions give the files as they should be."""
+    spec = importlib.util.spec_from_file_location("generate", Path(__file__).parents[1] / "schema" / "generate.py")
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture

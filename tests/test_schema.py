@@ -1,7 +1,6 @@
 """schema/ is what the code says, and records are what schema/ says."""
 
 import hashlib
-import importlib.util
 import json
 from pathlib import Path
 from types import ModuleType
@@ -17,24 +16,14 @@ from deepaccident_devkit.tables.specs import table_specs
 SCHEMA = Path(__file__).parents[1] / "schema"
 
 
-@pytest.fixture(scope="module")
-def generate() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("generate", SCHEMA / "generate.py")
-    assert spec
-    assert spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_the_files_are_not_stale(generate: ModuleType) -> None:
-    for name, content in generate.generated_files().items():
+def test_the_files_are_not_stale(schema_generator: ModuleType) -> None:
+    for name, content in schema_generator.generated_files().items():
         assert (SCHEMA / name).read_text(encoding="utf-8") == content, f"run python schema/generate.py: {name}"
 
 
-def test_no_file_is_left_over(generate: ModuleType) -> None:
+def test_no_file_is_left_over(schema_generator: ModuleType) -> None:
     by_hand = {"generate.py", "motion_labels.md"}  # tests/unit/motion/test_label_files.py runs what the page says
-    assert {path.name for path in SCHEMA.iterdir() if path.is_file()} == {*generate.generated_files(), *by_hand}
+    assert {path.name for path in SCHEMA.iterdir() if path.is_file()} == {*schema_generator.generated_files(), *by_hand}
 
 
 @pytest.mark.parametrize("table", list(table_specs()))

@@ -1,6 +1,5 @@
 """schema/results: the schemas are the code's, their examples are read, and the page's code writes valid files."""
 
-import importlib.util
 import json
 import re
 from collections.abc import Iterator
@@ -22,16 +21,6 @@ PAGE = SCHEMA / "results" / "README.md"
 TASKS = ("motion", "accident", "detection")
 STRANGE: tuple[Any, ...] = (None, True, "a", -1, 0.5, 10**30, [], {}, [[1, 2], [3, 4]], ...)
 """What stands in place of each value in turn; `...` takes it away."""
-
-
-@pytest.fixture(scope="module")
-def generate() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("generate", SCHEMA / "generate.py")
-    assert spec
-    assert spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def validator(task: str) -> Any:
@@ -72,8 +61,8 @@ def changed(told: dict[str, Any], place: tuple[Any, ...], value: Any) -> dict[st
     return copy
 
 
-def test_the_files_are_not_stale(generate: ModuleType) -> None:
-    files = generate.generated_results_files()
+def test_the_files_are_not_stale(schema_generator: ModuleType) -> None:
+    files = schema_generator.generated_results_files()
     for name, content in files.items():
         assert (SCHEMA / "results" / name).read_text(encoding="utf-8") == content, "run python schema/generate.py"
     assert {path.name for path in (SCHEMA / "results").iterdir()} == {*files, "README.md"}
