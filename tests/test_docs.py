@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from click import Context
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
@@ -157,7 +158,7 @@ def test_the_counterparts_are_found_on_the_page() -> None:
 @pytest.mark.parametrize("code", [code for code in COUNTERPARTS if code not in NO_CALLS])
 def test_every_counterpart_of_a_nuscenes_call_exists(code: str) -> None:
     if code.startswith("deepaccident "):
-        assert code.split()[1] in deepaccident.commands
+        assert code.split()[1] in deepaccident.list_commands(Context(deepaccident))
         return
     expression = ast.parse(code, mode="eval").body
     if not isinstance(expression, ast.Call):

@@ -9,33 +9,38 @@ import sys
 import click
 
 from deepaccident_devkit._version import __version__
-from deepaccident_devkit.cli.baseline import baseline
-from deepaccident_devkit.cli.demo import demo
-from deepaccident_devkit.cli.evaluate import evaluate
-from deepaccident_devkit.cli.export import export
-from deepaccident_devkit.cli.index import index
-from deepaccident_devkit.cli.info import info
-from deepaccident_devkit.cli.labels import labels
-from deepaccident_devkit.cli.render import render
-from deepaccident_devkit.cli.replay import replay
-from deepaccident_devkit.cli.split import split
-from deepaccident_devkit.cli.stats import stats
-from deepaccident_devkit.cli.synth import synth
-from deepaccident_devkit.cli.validate import validate
+from deepaccident_devkit.cli.groups import ModuleVerbs
 from deepaccident_devkit.errors import DeepAccidentError
 
 _ERROR_STATUS = 2
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+_VERBS = (
+    "demo",
+    "synth",
+    "index",
+    "info",
+    "labels",
+    "split",
+    "stats",
+    "validate",
+    "evaluate",
+    "baseline",
+    "render",
+    "replay",
+    "export",
+)
+
+
+@click.group(
+    cls=ModuleVerbs,
+    package=__name__,
+    verbs=_VERBS,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
 @click.version_option(__version__, prog_name="deepaccident")
 def deepaccident() -> None:
     """Tools for the DeepAccident V2X accident dataset."""
-
-
-_VERBS = (demo, synth, index, info, labels, split, stats, validate, evaluate, baseline, render, replay, export)
-for verb in _VERBS:
-    deepaccident.add_command(verb)
 
 
 def main() -> None:

@@ -1,8 +1,31 @@
-"""A verb that does its own work and has further verbs below it."""
+"""Groups of verbs: those that are imported when they are asked for, and a verb with further verbs below it."""
 
+from collections.abc import Sequence
+from importlib import import_module
 from typing import Any
 
 import click
+
+
+class ModuleVerbs(click.Group):
+    """Verbs that lie in modules of their names: each imports what it needs, and none waits for the others' imports."""
+
+    def __init__(self, *arguments: Any, package: str, verbs: Sequence[str], **options: Any) -> None:
+        """Take what `click.Group` takes, and the names of modules of a package that hold a verb of the same name."""
+        super().__init__(*arguments, **options)
+        self._package = package
+        self._verbs = tuple(verbs)
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
+        """The verbs by their alphabet, as click lists commands."""
+        return sorted(self._verbs)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002 - click's signature
+        """The verb of a name; None if there is none."""
+        if cmd_name not in self._verbs:
+            return None
+        verb: click.Command = getattr(import_module(f"{self._package}.{cmd_name}"), cmd_name)
+        return verb
 
 
 class VerbGroup(click.Group):
