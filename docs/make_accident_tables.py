@@ -16,7 +16,7 @@ from deepaccident_devkit.taxonomy import AGENTS
 
 HERE = Path(__file__).parent
 PAGE, TESTS = HERE / "protocols.md", HERE.parent / "tests"
-RELEASE = SynthConfig(scenarios=6, frames=40, seed=12, sensors=False)
+RELEASE = SynthConfig(scenarios=24, frames=40, seed=12, sensors=False)
 HORIZON = 2.0
 
 

@@ -1,5 +1,6 @@
 """Fixtures that all tests share: one synthetic release a session, made and indexed once."""
 
+import importlib
 import importlib.util
 import shutil
 from pathlib import Path
@@ -28,11 +29,20 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """A checkout that is on the path, but not installed, has no entry point for the test kit's plugin."""
+    if not config.pluginmanager.has_plugin("deepaccident"):
+        config.pluginmanager.register(importlib.import_module("deepaccident_devkit.testing.plugin"), "deepaccident")
+
+
 @pytest.fixture(scope="session")
 def release_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A synthetic release in layout A with all sensors; read-only by agreement. The path has a blank in it."""
+    """A synthetic release in layout A with all sensors; read-only by agreement. The path has a blank in it.
+
+    In its accidents ego and other collide, as designed.
+    """
     root = tmp_path_factory.mktemp("synthetic") / "deep accident"
-    config = SynthConfig(scenarios=4, frames=6, image_size=(64, 36), layout="A", seed=3)
+    config = SynthConfig(scenarios=4, frames=6, image_size=(64, 36), layout="A", seed=3, unplanned=0)
     return make_release(root, config, workers=2)
 
 
@@ -57,9 +67,9 @@ def da_b(release_root_b: Path) -> DeepAccident:
 
 @pytest.fixture(scope="session")
 def da_motion(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
-    """An accident and its normal twin of 3.5 s, labels only: long enough for pasts, futures and ends of recordings."""
+    """An accident of ego and other and its normal twin of 3.5 s, labels only: with pasts, futures and ends."""
     root = tmp_path_factory.mktemp("synthetic") / "motion"
-    make_release(root, SynthConfig(scenarios=2, frames=35, seed=5, sensors=False), workers=2)
+    make_release(root, SynthConfig(scenarios=2, frames=35, seed=5, sensors=False, unplanned=0), workers=2)
     return DeepAccident("v1", root, verbose=False)
 
 

@@ -1,96 +1,44 @@
-"""Hypothesis strategies for what the devkit reads, writes and turns: poses, points, boxes and the files' contents."""
+"""Hypothesis strategies of our own tests, beside those of the test kit."""
 
-import numpy as np
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 
-from deepaccident_devkit.geometry import SE3, BevGrid, Boxes, LidarPointCloud, PinholeCamera
-from deepaccident_devkit.release import Calib, Collision, Labels, Meta
-from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES, META_AGENTS, TIMES_OF_DAY
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.testing.strategies import (
+    ANGLES,
+    arrays,
+    boxes,
+    calibs,
+    cameras,
+    clouds,
+    labels,
+    matrices,
+    metas,
+    numbers,
+    points,
+    poses,
+    rotation_matrix,
+    upright_boxes,
+)
+from deepaccident_devkit.testing.strategies import damaged as mutations
 
-ANGLES = st.floats(-np.pi, np.pi, allow_nan=False)
-WEATHERS = ("Clear", "Cloudy", "HardRain", "MidRain", "SoftRain", "Wet", "WetCloudy")
-
-
-def numbers(reach: float) -> st.SearchStrategy[float]:
-    """Finite floats between ±reach."""
-    return st.floats(-reach, reach, allow_nan=False)
-
-
-def arrays(shape: tuple[int, ...], reach: float) -> st.SearchStrategy[np.ndarray]:
-    """Float64 arrays of numbers between ±reach."""
-    return hnp.arrays(np.float64, shape, elements=numbers(reach))
-
-
-def rotation_matrix(yaw: float, pitch: float, roll: float) -> np.ndarray:
-    """Rz(yaw) · Ry(pitch) · Rx(roll), right-handed: written out here, so that no test leans on the devkit's own."""
-    (cy, cp, cr), (sy, sp, sr) = np.cos([yaw, pitch, roll]), np.sin([yaw, pitch, roll])
-    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-    return about_z @ about_y @ about_x
-
-
-@st.composite
-def matrices(draw: st.DrawFn, reach: float = 1e3) -> np.ndarray:
-    """Rigid 4×4 matrices with any yaw, pitch and roll and a translation up to `reach`."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation_matrix(draw(ANGLES), draw(ANGLES), draw(ANGLES))
-    matrix[:3, 3] = draw(arrays((3,), reach))
-    return matrix
-
-
-def poses(reach: float = 1e3) -> st.SearchStrategy[SE3]:
-    """SE3 objects over `matrices`."""
-    return matrices(reach).map(SE3)
-
-
-def points(max_count: int = 8, reach: float = 100.0) -> st.SearchStrategy[np.ndarray]:
-    """Arrays (N, 3), N from 0."""
-    return st.integers(0, max_count).flatmap(lambda count: arrays((count, 3), reach))
-
-
-@st.composite
-def boxes(draw: st.DrawFn, max_count: int = 5, frame: str = "lidar") -> Boxes:
-    """Boxes with any rotation, unknown velocities among them."""
-    count = draw(st.integers(0, max_count))
-    rotation = [SE3(draw(matrices())).quaternion.elements for _ in range(count)]
-    velocity = draw(arrays((count, 3), 30.0))
-    velocity[draw(hnp.arrays(np.bool_, (count,)))] = np.nan
-    return Boxes(
-        frame=frame,
-        center=draw(arrays((count, 3), 100.0)),
-        size=np.abs(draw(arrays((count, 3), 10.0))) + 0.1,
-        rotation=np.array(rotation).reshape(count, 4),
-        velocity=velocity,
-        category=draw(hnp.arrays(np.int8, (count,), elements=st.integers(0, len(CATEGORIES) - 1))),
-        actor_id=draw(hnp.arrays(np.int64, (count,), elements=st.integers(-100, 30_000))),
-        num_lidar_pts=draw(hnp.arrays(np.int64, (count,), elements=st.integers(0, 5000))),
-        camera_visible=draw(hnp.arrays(np.bool_, (count,))),
-        row=np.arange(count),
-    )
-
-
-@st.composite
-def upright_boxes(draw: st.DrawFn, max_count: int = 4, reach: float = 10.0, frame: str = "lidar") -> Boxes:
-    """Boxes that stand on the ground, so near to one another that many overlap, axis-parallel ones among them."""
-    count = draw(st.integers(0, max_count))
-    yaws = ANGLES | st.sampled_from([0.0, np.pi / 2, -np.pi / 2, np.pi])
-    return Boxes.from_arrays(
-        draw(arrays((count, 3), reach)),
-        draw(hnp.arrays(np.float64, (count, 3), elements=st.floats(0.1, 10))),
-        draw(hnp.arrays(np.float64, (count,), elements=yaws)),
-        frame=frame,
-    )
-
-
-def cameras() -> st.SearchStrategy[PinholeCamera]:
-    """Pinhole cameras of all focal lengths and centres that a picture can have."""
-    focal, centre = st.floats(50, 5000), st.floats(0, 2000)
-    matrix = st.builds(
-        lambda fx, fy, cx, cy: np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), focal, focal, centre, centre
-    )
-    return st.builds(PinholeCamera, matrix, st.integers(1, 2000), st.integers(1, 2000))
+__all__ = [
+    "ANGLES",
+    "arrays",
+    "boxes",
+    "calibs",
+    "cameras",
+    "clouds",
+    "grids",
+    "labels",
+    "matrices",
+    "metas",
+    "mutations",
+    "numbers",
+    "points",
+    "poses",
+    "rotation_matrix",
+    "upright_boxes",
+]
 
 
 @st.composite
@@ -101,94 +49,3 @@ def grids(draw: st.DrawFn) -> BevGrid:
         start, size = draw(st.integers(-50, 50)), draw(st.sampled_from([0.1, 0.25, 0.5, 1.0, 3.0]))
         axes.append((start, start + draw(st.integers(1, 12)) * size, size))
     return BevGrid(axes[0], axes[1], draw(st.sampled_from(["devkit", "released", "fiery"])))
-
-
-@st.composite
-def labels(draw: st.DrawFn, max_count: int = 5) -> Labels:
-    """The content of one label file: any finite numbers, velocities unknown among them, either handedness."""
-    count = draw(st.integers(0, max_count))
-    anything = st.floats(allow_nan=False, allow_infinity=False)
-    velocity = draw(hnp.arrays(np.float64, (count, 2), elements=st.floats(allow_infinity=False)))
-    integers = st.integers(-(2**63), 2**63 - 1)
-    return Labels(
-        raw=draw(st.booleans()),
-        num_boxes=np.array([count]),
-        agent_velocity=draw(hnp.arrays(np.float64, (1, 2), elements=anything)),
-        category=draw(hnp.arrays(np.int8, (count,), elements=st.integers(0, len(CATEGORIES) - 1))),
-        center=draw(hnp.arrays(np.float64, (count, 3), elements=anything)),
-        size=draw(hnp.arrays(np.float64, (count, 3), elements=anything)),
-        yaw=draw(hnp.arrays(np.float64, (count,), elements=anything)),
-        velocity=velocity,
-        actor_id=draw(hnp.arrays(np.int64, (count,), elements=integers)),
-        num_lidar_pts=draw(hnp.arrays(np.int64, (count,), elements=integers)),
-        camera_visible=draw(hnp.arrays(np.bool_, (count,))),
-    )
-
-
-@st.composite
-def metas(draw: st.DrawFn) -> Meta:
-    """The content of a meta file, with and without a collision, whole and with lines missing."""
-    actors = st.integers(1, 30_000)
-    agents = st.sampled_from(list(META_AGENTS.values()))
-    collision = Collision(
-        ids=(draw(actors), draw(actors)),
-        classes=(draw(st.sampled_from(CATEGORIES)), draw(st.sampled_from(CATEGORIES))),
-        impact=draw(st.floats(allow_nan=False, allow_infinity=False)),
-        spawn_relation=draw(st.sampled_from(["same", "opposite", "left"])),
-        contact_side=draw(st.sampled_from(["front_side", "rear_side"])),
-        agents=draw(st.none() | st.tuples(agents, agents)),
-    )
-    directions = st.none() | st.sampled_from(["straight", "left", "right"])
-    return Meta(
-        weather=draw(st.sampled_from(WEATHERS)),
-        time_of_day=draw(st.none() | st.sampled_from(TIMES_OF_DAY)),
-        collision=draw(st.sampled_from([None, collision])),
-        simulated_frames=draw(st.integers(11, 110)),
-        agent_ids=draw(st.none() | st.tuples(actors, actors, actors, actors)),
-        road_type=draw(st.none() | st.sampled_from(["four-way junction", "three-way junction"])),
-        spawn_side=draw(st.none() | st.sampled_from(["left", "right", "opposite (straight)"])),
-        ego_direction=draw(directions),
-        other_direction=draw(directions),
-    )
-
-
-@st.composite
-def calibs(draw: st.DrawFn) -> Calib:
-    """The content of a calib file: arbitrary poses, cameras with focal lengths and centres of their own."""
-    focal = st.floats(100, 2000)
-    return Calib(
-        ego_from_lidar=draw(poses(5.0)),
-        world_from_ego=draw(poses()),
-        camera_from_lidar={camera: draw(poses(5.0)) for camera in CAMERAS},
-        intrinsic={
-            camera: np.array([[draw(focal), 0, draw(focal)], [0, draw(focal), draw(focal)], [0, 0, 1]])
-            for camera in CAMERAS
-        },
-    )
-
-
-@st.composite
-def clouds(draw: st.DrawFn) -> LidarPointCloud:
-    """Point clouds of single-precision numbers, which is what the files hold."""
-    values = draw(hnp.arrays(np.float32, (draw(st.integers(0, 20)), 4), elements=st.floats(-100, 100, width=32)))
-    return LidarPointCloud(values[:, :3].astype(np.float64), values[:, 3])
-
-
-def mutations(content: bytes) -> st.SearchStrategy[bytes]:
-    """Damaged copies of `content`: bytes changed, inserted, taken out, pieces repeated, the end cut off."""
-    places = st.integers(0, len(content) - 1)
-    few = st.integers(0, 12)
-
-    def damage(kind: str, at: int, length: int, new: bytes, other: int) -> bytes:
-        if kind == "change":
-            return content[:at] + new + content[at + len(new) :]
-        if kind == "insert":
-            return content[:at] + new + content[at:]
-        if kind == "remove":
-            return content[:at] + content[at + length + 1 :]
-        if kind == "repeat":
-            return content[:at] + content[other : other + length + 1] + content[at:]
-        return content[:at]
-
-    kinds = st.sampled_from(["change", "change", "insert", "remove", "repeat", "cut"])
-    return st.builds(damage, kinds, places, few, st.binary(min_size=1, max_size=4), places)

@@ -232,13 +232,14 @@ def test_listings_print(da: DeepAccident, capsys: pytest.CaptureFixture[str]) ->
     da.list_agents()
     da.list_categories()
     da.list_sample(da.sample[0]["token"])
+    own = da.get("agent", da.sample[0]["agent_token"])["category"]
     printed = capsys.readouterr().out
     for word in (
         da.scenario[0]["token"],
         "infrastructure  4 scenarios",
         "0  car  ",
         "Camera_Front",
-        "Box(car -100, lidar",
+        f"Box({own} -100, lidar",
     ):
         assert word in printed
 

@@ -6,11 +6,11 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray, IntArray
+from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.baselines.outlook import Outlook
 from deepaccident_devkit.evaluation import Accident
 from deepaccident_devkit.geometry.footprints import gaps_of_pairs
-from deepaccident_devkit.taxonomy import FRAME_PERIOD, OWN_ACTOR_ID
+from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD, OWN_ACTOR_ID
 
 DANGER_DISTANCE: Final = 0.25
 """Metres: who comes nearer collides. The evaluation's 1 m, which allows for cells, would be an alarm for every car that
@@ -19,15 +19,21 @@ _SITE: Final = 10.0
 """Metres within which two alarms are of one accident: the surer one is kept."""
 _MOVES: Final = 0.5
 """Metres that an actor covers if it does more than stand."""
+_SAME_WAY: Final = np.radians(20)
+"""Between the headings of two that drive one behind the other."""
+_SAME_LANE: Final = 1.0
+"""Metres to the side within which one is straight ahead of the other."""
+_PEDESTRIAN: Final = CATEGORIES.index("pedestrian")
 
 
 def accidents_ahead(outlook: Outlook, horizon: float, danger_distance: float = DANGER_DISTANCE) -> list[Accident]:
     """The accidents of an outlook, the surest first.
 
     A pair is named at the first moment, in steps of 0.1 s, at which the gap between its boxes is below the danger
-    distance. Who stands beside somebody who stands, or is as near already and comes no nearer, is in no danger. The
-    score is (1 − least gap / danger distance) / (1 + seconds to that moment): 1 for two that touch now. Whoever comes
-    later to the place of an accident finds other conditions, so of alarms within 10 m the surest is kept.
+    distance. Who stands beside somebody who stands, or is as near already and comes no nearer, is in no danger; nor are
+    two pedestrians, and who drives up to somebody straight ahead brakes: at constant velocity every queue would be an
+    accident. The score is (1 − least gap / danger distance) / (1 + seconds to that moment): 1 for two that touch now.
+    Whoever comes later to the place of an accident finds other conditions, so of alarms within 10 m the surest is kept.
 
     Args:
         outlook: who is known, and how they go on.
@@ -46,7 +52,8 @@ def accidents_ahead(outlook: Outlook, horizon: float, danger_distance: float = D
     near = gap < danger_distance
     moment = np.argmax(near, axis=0)
     least = gap.min(axis=0)
-    approaching = (moment > 0) | (least < gap[0]) | (gap[0] == 0)
+    approaching = (moment > 0) | (least < gap[0])
+    approaching = (approaching & ~_is_driving_up(poses[0], first, second)) | (gap[0] == 0)
     score = (1 - least / danger_distance) / (1 + times[moment])
     alarms = [
         _accident(outlook, poses, (int(first[row]), int(second[row])), int(moment[row]), float(score[row]))
@@ -56,14 +63,24 @@ def accidents_ahead(outlook: Outlook, horizon: float, danger_distance: float = D
 
 
 def _candidates(outlook: Outlook, poses: FloatArray, danger_distance: float) -> tuple[IntArray, IntArray]:
-    """Pairs (rows of the boxes) whose circles meet at some moment, not both standing."""
+    """Pairs (rows of the boxes) whose circles meet at some moment, not both standing nor both on foot."""
     place, size = poses[..., :2], outlook.seen.boxes.size
     reach = np.hypot(size[:, 0], size[:, 1]) / 2
     apart = np.linalg.norm(place[:, :, None] - place[:, None], axis=-1).min(axis=0, initial=np.inf)
     moves = np.linalg.norm(np.ptp(place, axis=0), axis=-1) >= _MOVES
-    near = (apart < reach[:, None] + reach + danger_distance) & (moves[:, None] | moves)
+    drives = outlook.seen.boxes.category != _PEDESTRIAN
+    near = (apart < reach[:, None] + reach + danger_distance) & (moves[:, None] | moves) & (drives[:, None] | drives)
     first, second = np.nonzero(np.triu(near, 1))
     return first, second
+
+
+def _is_driving_up(poses: FloatArray, first: IntArray, second: IntArray) -> BoolArray:
+    """(P,) pairs of which one is straight ahead of the other and heads the same way; `poses` (N, 3) of the present."""
+    way = poses[second] - poses[first]
+    turn, yaw = np.arctan2(np.sin(way[:, 2]), np.cos(way[:, 2])), poses[first, 2]
+    aside = np.cos(yaw) * way[:, 1] - np.sin(yaw) * way[:, 0]
+    is_ahead: BoolArray = (np.abs(turn) < _SAME_WAY) & (np.abs(aside) < _SAME_LANE)
+    return is_ahead
 
 
 def _gaps(outlook: Outlook, poses: FloatArray, first: IntArray, second: IntArray) -> FloatArray:

@@ -7,16 +7,39 @@ import click
 
 from deepaccident_devkit.cli.options import pixel_size
 from deepaccident_devkit.synth import SynthConfig, make_release
-from deepaccident_devkit.synth.config import View
+from deepaccident_devkit.synth.sensors.caster import has_embree
+from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, View, design_text, designs_text
 from deepaccident_devkit.taxonomy import Layout
 
 _DEFAULTS = SynthConfig()
+_EXAMPLES = """\b
+Examples:
+  deepaccident synth OUT --scenarios 24 --no-sensors     labels of all twelve designs
+  deepaccident synth --show-design 3 > mine.yaml         a scenario file: edit it, then
+  deepaccident synth OUT --spec mine.yaml                accidents by it"""
 
 
-@click.command()
+def _list_designs(context: click.Context, _parameter: click.Parameter, wanted: bool) -> None:
+    if wanted:
+        click.echo(designs_text())
+        context.exit()
+
+
+def _show_design(context: click.Context, _parameter: click.Parameter, number: int | None) -> None:
+    if number is not None:
+        click.echo(design_text(number), nl=False)
+        context.exit()
+
+
+@click.command(epilog=_EXAMPLES)
 @click.argument("out", type=click.Path(path_type=Path))
-@click.option("--scenarios", default=_DEFAULTS.scenarios, show_default=True, help="Accidents and their normal twins.")
-@click.option("--frames", default=_DEFAULTS.frames, show_default=True, help="Recorded frames a scenario, at 10 Hz.")
+@click.option(
+    "--scenarios",
+    default=_DEFAULTS.scenarios,
+    show_default=True,
+    help="How many: accidents and their normal twins in turn.",
+)
+@click.option("--frames", type=int, help="The last so many of each scenario, at 10 Hz.  [default: all, 40 to 100]")
 @click.option(
     "--image-size",
     callback=pixel_size,
@@ -34,19 +57,57 @@ _DEFAULTS = SynthConfig()
 )
 @click.option("--seed", default=_DEFAULTS.seed, show_default=True, help="The same seed gives the same bytes.")
 @click.option("--no-sensors", is_flag=True, help="Only labels, calib and meta: no images, point clouds, BEV arrays.")
+@click.option("--unlabelled-test", is_flag=True, help="Without labels in the test split, as in the real release.")
+@click.option(
+    "--design",
+    "designs",
+    type=click.IntRange(DESIGN_NUMBERS[0], DESIGN_NUMBERS[-1]),
+    multiple=True,
+    help="Only accidents of this design; of several --design in turn.  [default: all twelve in turn]",
+)
+@click.option(
+    "--spec",
+    type=click.Path(path_type=Path),
+    help="A scenario file of your own in place of the designs; docs/scenarios.md says what it can hold.",
+)
+@click.option(
+    "--unplanned",
+    default=_DEFAULTS.unplanned,
+    show_default=True,
+    help="Share of accidents, 0 to 1, that are none of the designs: with a pedestrian, a third vehicle.",
+)
 @click.option(
     "--view",
     type=click.Choice(get_args(View)),
-    default=_DEFAULTS.view,
-    show_default=True,
     help="hidden: a house on the street corner hides the two who will collide from each other.",
 )
 @click.option("--workers", type=click.IntRange(min=1), default=None, help="Processes to use.  [default: as it pays]")
+@click.option(
+    "--list-designs",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_list_designs,
+    help="List the twelve designs and stop.",
+)
+@click.option(
+    "--show-design",
+    type=click.IntRange(DESIGN_NUMBERS[0], DESIGN_NUMBERS[-1]),
+    is_eager=True,
+    expose_value=False,
+    callback=_show_design,
+    help="Print a design's scenario file, to begin one of your own with, and stop.",
+)
 def synth(out: Path, *, no_sensors: bool, workers: int | None, **options: Any) -> None:
-    """Make a complete synthetic release in the new folder OUT."""
+    """Make a complete synthetic release in the new folder OUT.
+
+    After a break the same command goes on where it was.
+    """
     config = SynthConfig(sensors=not no_sensors, **options)
+    if no_sensors and not has_embree():
+        click.echo("slow, without the package embreex: pip install 'deepaccident_devkit[synth]'", err=True)
     made = make_release(out, config, workers=workers, progress=True)
-    click.echo(
-        f"{made}: {config.scenarios} scenarios of {config.frames} frames and five agents, layout {config.layout}"
-    )
+    scenarios = f"{config.scenarios} scenario{'s' if config.scenarios > 1 else ''}"
+    frames = "" if config.frames is None else f" of {config.frames} frame{'s' if config.frames > 1 else ''}"
+    click.echo(f"{made}: {scenarios}{frames} with five agents, layout {config.layout}")
     click.echo(f"next: deepaccident info {made}")

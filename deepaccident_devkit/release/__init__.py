@@ -4,7 +4,7 @@ Readers convert CARLA's left-handed values to the devkit's right-handed ones unl
 """
 
 from deepaccident_devkit.release.bev_camera import BevImage, read_bev, write_bev
-from deepaccident_devkit.release.calib import Calib, Calibs, read_calib, read_calibs, write_calib
+from deepaccident_devkit.release.calib import Calib, Calibs, read_calib, read_calibs, write_calib, write_raw_calib
 from deepaccident_devkit.release.images import read_image, write_image
 from deepaccident_devkit.release.labels import Labels, read_label, read_labels, write_label
 from deepaccident_devkit.release.layout import ReleaseLayout, ScenarioFolder, find_release
@@ -37,5 +37,6 @@ __all__ = [
     "write_label",
     "write_lidar",
     "write_meta",
+    "write_raw_calib",
     "write_split_file",
 ]

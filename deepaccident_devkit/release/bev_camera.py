@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from deepaccident_devkit.arrays import ByteArray, readonly
 from deepaccident_devkit.errors import SensorFileError
-from deepaccident_devkit.release.npz import read_npz, write_npz
+from deepaccident_devkit.release.npz import FAST, read_npz, write_npz
 from deepaccident_devkit.taxonomy import BEV_RESOLUTION, BEV_SHAPE
 
 TAGS: dict[str, int] = {"pedestrian": 4, "road_line": 6, "road": 7, "sidewalk": 8, "vehicle": 10}
@@ -66,7 +66,7 @@ def read_bev(path: Path, *, raw: bool = False) -> BevImage | ByteArray:
     return BevImage(data[..., 2].copy(), instance)
 
 
-def write_bev(path: Path, semantic: ByteArray, instance: NDArray[np.uint16]) -> None:
-    """Write tags and object ids, both (1200, 1200), forward up."""
+def write_bev(path: Path, semantic: ByteArray, instance: NDArray[np.uint16], *, level: int = FAST) -> None:
+    """Write tags and object ids, both (1200, 1200), forward up; `level` is that of `npz.write_npz`."""
     high, low = instance >> 8, instance & 255
-    write_npz(path, np.stack([high, low, semantic], axis=-1).astype(np.uint8))
+    write_npz(path, np.stack([high, low, semantic], axis=-1).astype(np.uint8), level=level)

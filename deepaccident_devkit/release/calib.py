@@ -115,7 +115,7 @@ def read_calibs(paths: Sequence[Path], *, raw: bool = False) -> Calibs | list[di
 
 
 def write_calib(path: Path, calib: Calib) -> None:
-    """Write one calibration with CARLA's signs and axes, so that old numpy versions can read it too."""
+    """Write one calibration with CARLA's signs and axes; see `write_raw_calib`."""
     raw: dict[str, AnyArray] = {
         "lidar_to_ego": handedness.flip_pose(calib.ego_from_lidar.matrix),
         "ego_to_world": handedness.flip_pose(calib.world_from_ego.matrix),
@@ -123,10 +123,18 @@ def write_calib(path: Path, calib: Calib) -> None:
     for camera in CAMERAS:
         raw[f"lidar_to_{camera}"] = handedness.camera_from_lidar_to_raw(calib.camera_from_lidar[camera].matrix)
         raw[f"intrinsic_{camera}"] = handedness.intrinsic_to_raw(calib.intrinsic[camera])
-    raw = {key: np.ascontiguousarray(array) + 0.0 for key, array in raw.items()}  # + 0.0: no negative zeros
+    write_raw_calib(path, raw)
+
+
+def write_raw_calib(path: Path, raw: Mapping[str, AnyArray]) -> None:
+    """Write a file's own dict, as `read_calib(raw=True)` returns it; whether it is one that can be read is not checked.
+
+    Old numpy versions can read it too.
+    """
+    arrays = {key: np.ascontiguousarray(array) + 0.0 for key, array in raw.items()}  # + 0.0: no negative zeros
     # Protocol 3 names globals in plain text. numpy 2 writes its new private path, which numpy 1 (the reference needs
     # numpy < 1.20) does not have; numpy 2 still reads the old one.
-    content = pickle.dumps(raw, protocol=3)
+    content = pickle.dumps(arrays, protocol=3)
     write_bytes(path, content.replace(b"cnumpy._core.multiarray\n", b"cnumpy.core.multiarray\n"))
 
 

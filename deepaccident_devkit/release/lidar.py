@@ -12,6 +12,9 @@ from deepaccident_devkit.geometry import LidarPointCloud
 from deepaccident_devkit.geometry.handedness import flip_points
 from deepaccident_devkit.release.npz import read_npz, write_npz
 
+_LEVEL = 0
+"""Of compression: points are noise, of which zlib saves a tenth in 15 ms a file."""
+
 
 @overload
 def read_lidar(path: Path, *, raw: Literal[False] = False) -> LidarPointCloud: ...
@@ -43,4 +46,4 @@ def write_lidar(path: Path, xyz: ArrayLike, intensity: ArrayLike) -> None:
     """Write points (N, 3) of the right-handed LiDAR frame, metres, and their intensity (N,), as float32."""
     points = flip_points(checked("xyz", xyz, (None, 3)))
     values = checked("intensity", intensity, (len(points),))
-    write_npz(path, np.column_stack([points, values]).astype(np.float32))
+    write_npz(path, np.column_stack([points, values]).astype(np.float32), level=_LEVEL)

@@ -1,16 +1,19 @@
 """Road users: who they are and where they are at any time, in the ground frame."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import FloatArray, IntArray, readonly
+from deepaccident_devkit.arrays import AnyArray, FloatArray, FrozenArrays, IntArray, readonly
 from deepaccident_devkit.synth import solids
 from deepaccident_devkit.synth.solids import Solids
 from deepaccident_devkit.taxonomy import CATEGORIES, STATIC_ACTOR_ID
+
+_SLACK = 1e-9
+"""Seconds by which a time may miss a sample."""
 
 
 class Motion(Protocol):
@@ -50,51 +53,40 @@ class Uniform:
         return _directed(self.yaw, np.full(np.shape(times), self.speed))
 
 
-@dataclass(frozen=True, slots=True)
-class SetOff:
-    """Stand, accelerate evenly from `start_time` on, then keep the speed; straight on.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Sampled(FrozenArrays):
+    """As simulated, between samples straight lines; before the first sample and after the last it stands there.
 
     Attributes:
-        x: where it stands, metres.
-        y: where it stands, metres.
-        yaw: radians.
-        speed: that it reaches, m/s.
-        acceleration: m/s².
-        start_time: seconds.
+        start: time of the first sample, seconds.
+        period: seconds between samples.
+        samples: (S, 3) x, y (metres), yaw (radians, without jumps) of the box's centre; of M together, (S, M, 3).
+        sample_velocities: (S, 2) m/s; or (S, M, 2).
     """
 
-    x: float
-    y: float
-    yaw: float
-    speed: float
-    acceleration: float
-    start_time: float
+    start: float
+    period: float
+    samples: FloatArray
+    sample_velocities: FloatArray
 
     def poses(self, times: ArrayLike) -> FloatArray:
         """See `Motion`."""
-        since = self._since(times)
-        ramp = np.minimum(since, self._ramp_time)
-        distance = self.acceleration / 2 * ramp**2 + self.speed * (since - ramp)
-        return _along(self.x, self.y, self.yaw, distance)
+        return self._between(self.samples, np.asarray(times, dtype=np.float64))
 
     def velocities(self, times: ArrayLike) -> FloatArray:
         """See `Motion`."""
-        return _directed(self.yaw, self.acceleration * np.minimum(self._since(times), self._ramp_time))
+        wanted = np.asarray(times, dtype=np.float64)
+        end = self.start + self.period * (len(self.samples) - 1)
+        inside = (wanted >= self.start - _SLACK) & (wanted <= end + _SLACK)
+        values = self._between(self.sample_velocities, wanted)
+        return np.where(_over(inside, values), values, 0.0)
 
-    def delayed(self, seconds: float) -> "SetOff":
-        """The same motion, later."""
-        return replace(self, start_time=self.start_time + seconds)
-
-    def time_to(self, distance: float) -> float:
-        """Seconds from `start_time` until this far, metres; beyond the acceleration."""
-        return distance / self.speed + self._ramp_time / 2
-
-    @property
-    def _ramp_time(self) -> float:
-        return self.speed / self.acceleration
-
-    def _since(self, times: ArrayLike) -> FloatArray:
-        return np.maximum(np.asarray(times, dtype=np.float64) - self.start_time, 0.0)
+    def _between(self, values: FloatArray, times: FloatArray) -> FloatArray:
+        place = np.clip((times - self.start) / self.period, 0.0, len(values) - 1.0)
+        low = np.minimum(place.astype(np.int64), max(len(values) - 2, 0))
+        high = np.minimum(low + 1, len(values) - 1)
+        before, after = values[low], values[high]
+        return np.asarray(before + _over(place - low, before) * (after - before))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -138,6 +130,7 @@ class Actors:
         origin: (A, 2) float64, as in `Actor`.
         solids: of all actors, each in its own frame.
         solid_actor: (P,) int64, row of the actor that each solid belongs to.
+        motions: rows of actors, and their motion; of several whose samples are of the same times, one together.
     """
 
     all: tuple[Actor, ...]
@@ -148,6 +141,7 @@ class Actors:
     origin: FloatArray
     solids: Solids
     solid_actor: IntArray
+    motions: tuple[tuple[list[int], Motion], ...]
 
     @classmethod
     def of(cls, actors: Sequence[Actor]) -> "Actors":
@@ -163,6 +157,7 @@ class Actors:
             origin=readonly(np.array([actor.origin for actor in ordered], dtype=np.float64)),
             solids=solids.concatenate([actor.shape for actor in ordered]),
             solid_actor=readonly(np.repeat(np.arange(len(ordered)), counts)),
+            motions=_together([actor.motion for actor in ordered]),
         )
 
     def __len__(self) -> int:
@@ -175,8 +170,9 @@ class Actors:
 
     def at(self, time: float) -> "Snapshot":
         """Where all of them are at a time, seconds."""
-        poses = np.concatenate([actor.motion.poses([time]) for actor in self.all])
-        velocities = np.concatenate([actor.motion.velocities([time]) for actor in self.all])
+        poses, velocities = np.empty((len(self), 3)), np.empty((len(self), 2))
+        for rows, motion in self.motions:
+            poses[rows], velocities[rows] = motion.poses([time])[0], motion.velocities([time])[0]
         return Snapshot(readonly(poses), readonly(velocities))
 
 
@@ -193,14 +189,31 @@ class Snapshot:
     velocities: FloatArray
 
 
-def place(corners: FloatArray, poses: FloatArray) -> FloatArray:
-    """Points (P, K, 3) of P bodies' own frames, set at poses (P, 3) x, y, yaw."""
-    cos, sin = np.cos(poses[:, 2])[:, None], np.sin(poses[:, 2])[:, None]
-    result = np.empty_like(corners)
-    result[..., 0] = cos * corners[..., 0] - sin * corners[..., 1] + poses[:, None, 0]
-    result[..., 1] = sin * corners[..., 0] + cos * corners[..., 1] + poses[:, None, 1]
-    result[..., 2] = corners[..., 2]
-    return result
+def _together(motions: Sequence[Motion]) -> tuple[tuple[list[int], Motion], ...]:
+    """As `Actors.motions`."""
+    rows_of: dict[Hashable, list[int]] = {}
+    for row, motion in enumerate(motions):
+        times = (motion.start, motion.period, len(motion.samples)) if isinstance(motion, Sampled) else row
+        rows_of.setdefault(times, []).append(row)
+    return tuple((rows, _joined([motions[row] for row in rows])) for rows in rows_of.values())
+
+
+def _joined(motions: Sequence[Motion]) -> Motion:
+    """One motion of several of the same times, or the only one there is."""
+    sampled = [motion for motion in motions if isinstance(motion, Sampled)]
+    if not sampled:
+        return motions[0]
+    return Sampled(
+        start=sampled[0].start,
+        period=sampled[0].period,
+        samples=np.stack([motion.samples for motion in sampled], axis=1),
+        sample_velocities=np.stack([motion.sample_velocities for motion in sampled], axis=1),
+    )
+
+
+def _over(weights: AnyArray, values: FloatArray) -> AnyArray:
+    """Weights (T,) of the first axis of values (T, …), shaped to be multiplied with them."""
+    return weights.reshape(weights.shape + (1,) * (values.ndim - weights.ndim))
 
 
 def _along(x: float, y: float, yaw: float, distance: FloatArray) -> FloatArray:

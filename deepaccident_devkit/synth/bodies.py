@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deepaccident_devkit.synth.shapes import shape_of
+from deepaccident_devkit.synth.shapes import MODELS, shape_of
 from deepaccident_devkit.synth.solids import Color, Solids
 
 Size = tuple[float, float, float]
@@ -51,7 +51,8 @@ def random_body(rng: np.random.Generator, category: str) -> Body:
     factors = 1 + _SPREAD * rng.uniform(-1, 1, 3)
     size: Size = tuple((np.array(MEDIAN_SIZES[category]) * factors).round(3).tolist())
     color, accent = _colors(rng, category)
-    return Body(category, size, shape_of(category, size, color, accent), _random_origin(rng))
+    shape = shape_of(category, size, color, accent, model=int(rng.integers(len(MODELS[category]))))
+    return Body(category, size, shape, _random_origin(rng))
 
 
 def _colors(rng: np.random.Generator, category: str) -> tuple[Color, Color]:

@@ -1,15 +1,19 @@
 """What a synthetic release should be like."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from pathlib import Path
+from typing import Final, get_args
 
 from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, View
 from deepaccident_devkit.taxonomy import Layout
-
-View = Literal["open", "hidden"]
 
 MAX_FRAMES = 999
 MIN_IMAGE_SIZE = (16, 9)
+DESIGN_ROUND: Final = (1, 7, 2, 8, 3, 9, 4, 10, 5, 11, 6, 12)
+"""All designs in the order in which they take turns: with traffic lights and without, so that two pairs have both."""
+HIDDEN_DESIGN_ROUND: Final = (1, 7)
+"""Those in which a house on a street corner can hide the two who collide from each other till the end."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -18,36 +22,66 @@ class SynthConfig:
 
     Attributes:
         scenarios: how many; they alternate between an accident and its normal twin.
-        frames: recorded frames of each scenario, at 10 Hz.
+        frames: recorded frames of each scenario, at 10 Hz: the last ones before its end. None records it from when the
+            cars set off until it ends, 40 to 100 frames.
         image_size: width and height of the camera images, pixels (the real ones have 1600×900).
         layout: `A`, all splits in one folder, or `B`, a folder a split.
         seed: the same seed gives the same bytes (on the same machine with the same package versions).
         sensors: whether to write images, point clouds and BEV arrays besides labels, calib and meta.
         view: `hidden` puts a house on the kerb of the corner between ego and other, who drive a little faster than
-            where the view is `open`: they see each other about a second before they meet, the pole all the time.
+            where the view is `open`: they see each other about a second before they meet, the pole all the time. None
+            leaves it to the scenario files.
+        designs: which of the paper's twelve take turns, in this order; empty for all (for those that a house can hide
+            where the view is `hidden`).
+        unplanned: share of the accidents that are none of the design: a pedestrian, a third vehicle.
+            None are where `spec` or the view `hidden` asks for one certain accident.
+        spec: a scenario file (docs/scenarios.md) of which every pair is a draw, in place of the designs.
+        unlabelled_test: whether the test split lacks labels, BEV arrays and meta, as the real one does.
     """
 
     scenarios: int = 4
-    frames: int = 40
+    frames: int | None = 40
     image_size: tuple[int, int] = (480, 270)
     layout: Layout = "A"
     seed: int = 0
     sensors: bool = True
-    view: View = "open"
+    view: View | None = None
+    designs: tuple[int, ...] = ()
+    unplanned: float = 0.1
+    spec: Path | None = None
+    unlabelled_test: bool = False
 
     def __post_init__(self) -> None:
         """Check every field."""
         _check_range("scenarios", self.scenarios, 1, None)
-        _check_range("frames", self.frames, 1, MAX_FRAMES)
+        if self.frames is not None:
+            _check_range("frames", self.frames, 1, MAX_FRAMES)
         _check_range("seed", self.seed, 0, None)
-        if self.layout not in get_args(Layout):
-            raise ConfigError(f"layout: expected one of {', '.join(get_args(Layout))}, found {self.layout!r}")
-        if self.view not in get_args(View):
-            raise ConfigError(f"view: expected one of {', '.join(get_args(View))}, found {self.view!r}")
+        _check_word("layout", self.layout, get_args(Layout))
+        if self.view is not None:
+            _check_word("view", self.view, get_args(View))
         if len(self.image_size) != 2:
             raise ConfigError(f"image_size: expected (width, height), found {self.image_size!r}")
         for name, value, least in zip(("width", "height"), self.image_size, MIN_IMAGE_SIZE, strict=True):
             _check_range(f"image_size: {name}", value, least, 8192)
+        for design in self.designs:
+            _check_range("designs", design, DESIGN_NUMBERS[0], DESIGN_NUMBERS[-1])
+        if not 0 <= self.unplanned <= 1:
+            raise ConfigError(f"unplanned: {self.unplanned} is no share; choose a number from 0 to 1")
+        if self.spec is not None and self.designs:
+            raise ConfigError(
+                "spec, designs: a release is made of a scenario file or of designs; choose one of the two"
+            )
+
+    @property
+    def design_round(self) -> tuple[int, ...]:
+        """The designs that take turns."""
+        return self.designs or (HIDDEN_DESIGN_ROUND if self.view == "hidden" else DESIGN_ROUND)
+
+
+def _check_word(name: str, value: str, words: tuple[str, ...]) -> None:
+    if value not in words:
+        raise ConfigError(f"{name}: expected one of {', '.join(words)}, found {value!r}")
 
 
 def _check_range(name: str, value: int, least: int, most: int | None) -> None:

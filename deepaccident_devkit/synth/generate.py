@@ -1,18 +1,21 @@
 """Making a whole synthetic release."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.files import is_writable_folder, replacing_folder
-from deepaccident_devkit.parallel import run_batch
-from deepaccident_devkit.release import write_split_file
-from deepaccident_devkit.synth.caster import require_embree
+from deepaccident_devkit.files import is_writable_folder
+from deepaccident_devkit.parallel import run_unordered
 from deepaccident_devkit.synth.config import SynthConfig
-from deepaccident_devkit.synth.recording import RecordingJob, record_scenario
-from deepaccident_devkit.synth.scenario import ScenarioPlan, plan_scenarios
-from deepaccident_devkit.taxonomy import MINI_SPLITS, SPLITS
+from deepaccident_devkit.synth.plan import ScenarioPlan, plan_scenarios, plan_splits
+from deepaccident_devkit.synth.recording import RecordingJob, forget_scenario, parts_of, record_scenario
+from deepaccident_devkit.synth.sensors.caster import require_embree
+from deepaccident_devkit.synth.unfinished import Unfinished, unfinished_release
+
+_USUAL_FRAMES = 70
+"""Of a scenario of natural length."""
 
 
 def make_release(
@@ -20,17 +23,19 @@ def make_release(
 ) -> Path:
     """Write a complete synthetic release; returns its folder.
 
-    All splits are labelled, `test` too, which the real release leaves unlabelled. The release is made in a temporary
-    folder beside `out` and renamed when it is whole.
+    The release is made in a hidden folder beside `out`, `.NAME.unfinished`, and renamed when it is whole. After a break
+    (a full disk, a kill) the same call goes on with what is not made yet.
 
     Args:
         out: the folder to make; must not exist or be empty.
         config: what the release is like; `SynthConfig()` if None.
-        workers: processes, one a scenario; None chooses. The files do not depend on it.
+        workers: processes, of which several may record one scenario; None chooses. The files depend neither on it nor
+            on breaks.
         progress: whether to show a progress bar.
 
     Raises:
-        ConfigError: `out` is a file, holds something or cannot be made.
+        ConfigError: `out` is a file, holds something or cannot be made; an unfinished release of another
+            configuration is there; the scenario file cannot be read or carried out.
         MissingExtraError: sensors are wanted and the package embreex is not installed.
     """
     wanted = config or SynthConfig()
@@ -41,25 +46,46 @@ def make_release(
     if wanted.sensors:
         require_embree()
     plans = plan_scenarios(wanted)
-    with replacing_folder(out) as folder:
-        jobs = [RecordingJob(folder, wanted, plan) for plan in plans]
-        count = workers or _worker_count(wanted)
-        run_batch(record_scenario, jobs, workers=count, label="scenarios", progress=progress)
-        _write_splits(folder, plans)
+    with unfinished_release(out, wanted) as unfinished:
+        jobs = [_jobs(unfinished, wanted, plan) for plan in plans]
+        _record_all(unfinished, jobs, workers or _worker_count(wanted, len(plans)), progress=progress)
+        plan_splits(plans).save(unfinished.release, overwrite=True)
     return out
 
 
-def _worker_count(config: SynthConfig) -> int:
+def _jobs(unfinished: Unfinished, config: SynthConfig, plan: ScenarioPlan) -> dict[str, RecordingJob]:
+    """The parts of a scenario by their names."""
+    parts = parts_of(config)
+    names = {first: f"{plan.scenario_type}_{plan.name}_{first}of{parts}" for first in range(1, parts + 1)}
+    return {name: RecordingJob(unfinished.part(name), config, plan, first, parts) for first, name in names.items()}
+
+
+def _record_all(
+    unfinished: Unfinished, scenarios: Sequence[Mapping[str, RecordingJob]], workers: int, *, progress: bool
+) -> None:
+    """Record the parts that are not made yet, and bring each scenario into the release when all its parts are there."""
+    made = set(unfinished.made())
+    for parts in scenarios:
+        if made.issuperset(parts):
+            unfinished.gather(parts)
+    left = [(name, job, parts) for parts in scenarios for name, job in parts.items() if name not in made]
+    for name, _, _ in left:
+        unfinished.clear(name)
+    jobs = [job for _, job, _ in left]
+    recorded = run_unordered(record_scenario, jobs, workers=workers, label="recording", progress=progress)
+    try:
+        with closing(recorded):
+            for position, _ in recorded:
+                name, _, parts = left[position]
+                unfinished.note(name)
+                made.add(name)
+                if made.issuperset(parts):
+                    unfinished.gather(parts)
+    finally:
+        forget_scenario()
+
+
+def _worker_count(config: SynthConfig, scenarios: int) -> int:
     """As many as there are cores, where that pays for starting processes: a frame with sensors costs up to a second."""
-    frames = config.scenarios * config.frames
+    frames = scenarios * (config.frames or _USUAL_FRAMES)
     return (os.cpu_count() or 1) if frames >= (20 if config.sensors else 400) else 1
-
-
-def _write_splits(folder: Path, plans: Sequence[ScenarioPlan]) -> None:
-    """Every split file, empty where nothing falls into it; the mini splits hold the first pair of theirs."""
-    for split in SPLITS:
-        write_split_file(folder / f"{split}.txt", [plan.token for plan in plans if plan.split == split])
-    for mini in MINI_SPLITS:
-        of_split = [plan for plan in plans if plan.split == mini.removesuffix("_mini")]
-        tokens = [plan.token for plan in of_split if plan.pair == of_split[0].pair]
-        write_split_file(folder / f"{mini}.txt", tokens)

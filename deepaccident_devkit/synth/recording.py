@@ -1,9 +1,14 @@
-"""Recording a scenario: what all agents see, frame by frame, written as files of a release."""
+"""Recording a scenario: what all agents see, frame by frame, written as files of a release.
 
-from dataclasses import dataclass
+A scenario is recorded in parts, each of which takes every nth frame, so that several processes can work on one.
+"""
+
+import multiprocessing
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 
-from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.release import (
     ScenarioFolder,
     write_bev,
@@ -13,89 +18,135 @@ from deepaccident_devkit.release import (
     write_lidar,
     write_meta,
 )
-from deepaccident_devkit.synth.agents import Agent, make_agents
-from deepaccident_devkit.synth.annotate import annotate
-from deepaccident_devkit.synth.bev import bev_picture
-from deepaccident_devkit.synth.camera import Paint, paint, render
 from deepaccident_devkit.synth.config import SynthConfig
-from deepaccident_devkit.synth.lidar import Scan, scan
-from deepaccident_devkit.synth.look import Look, make_look
-from deepaccident_devkit.synth.scenario import RandomStreams, Scenario, ScenarioPlan, build_scenario
-from deepaccident_devkit.synth.scene import Scene, make_scene
+from deepaccident_devkit.synth.plan import ScenarioPlan
+from deepaccident_devkit.synth.roads import Arm
+from deepaccident_devkit.synth.scenario import Scenario, build_scenario
+from deepaccident_devkit.synth.sensors.agents import Agent
+from deepaccident_devkit.synth.sensors.images.shading import Surroundings
+from deepaccident_devkit.synth.sensors.rig import Rig, make_rig
+from deepaccident_devkit.synth.sensors.scene import Scene
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, LIDAR, frame_timestamp
+
+_PARTS = 8
+"""Of a scenario with sensors; a frame of one without takes less time than the scenario takes to be thought out."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingJob:
-    """One scenario to make and write below `root`."""
+    """A scenario to make, or a part of one.
+
+    Attributes:
+        root: the release that it is to be in.
+        config: what the release is like.
+        plan: which scenario it is.
+        first: the first frame, counted from 1.
+        step: from each frame to the next one.
+    """
 
     root: Path
     config: SynthConfig
     plan: ScenarioPlan
+    first: int = 1
+    step: int = 1
+
+    @property
+    def folder(self) -> ScenarioFolder:
+        """Where the scenario's files lie."""
+        folder = self.plan.split if self.config.layout == "B" else ""
+        return ScenarioFolder(self.root, folder, self.plan.scenario_type, self.plan.name, AGENTS)
 
 
-def record_scenario(job: RecordingJob) -> str:
-    """Make one scenario and write all its files; returns its token."""
-    config, plan = job.config, job.plan
-    scenario = build_scenario(config, plan)
-    folder = ScenarioFolder(job.root, plan.split if config.layout == "B" else "", plan.scenario_type, plan.name, AGENTS)
-    recorder = _Recorder(
-        folder=folder,
-        scenario=scenario,
-        agents=make_agents(scenario, config.image_size),
-        look=_look(config, scenario) if config.sensors else None,
-    )
-    write_meta(folder.meta_path, scenario.meta)
-    for frame in range(1, config.frames + 1):
+def parts_of(config: SynthConfig) -> int:
+    """In how many parts each scenario is recorded."""
+    return min(_PARTS, config.frames or _PARTS) if config.sensors else 1
+
+
+def record_scenario(job: RecordingJob) -> None:
+    """Make a scenario and write all its files, or those of a part of it."""
+    _share_cores()
+    scenario, rig = _made_ready(_Task(job.config, job.plan))
+    labelled = job.plan.split != "test" or not job.config.unlabelled_test
+    recorder = _Recorder(folder=job.folder, scenario=scenario, rig=rig, labelled=labelled)
+    if labelled and job.first == 1:
+        write_meta(job.folder.meta_path, scenario.meta)
+    for frame in range(job.first, scenario.frames + 1, job.step):
         recorder.record(frame)
-    return plan.token
+
+
+def forget_scenario() -> None:
+    """Let go of the scenario that is kept for its next part."""
+    _made_ready.cache_clear()
+
+
+def _share_cores() -> None:
+    """Where several scenarios are made at a time, each has one core; OpenCV would start threads for all of them."""
+    import cv2
+
+    if multiprocessing.parent_process() is not None:
+        cv2.setNumThreads(1)
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """Which scenario to make."""
+
+    config: SynthConfig
+    plan: ScenarioPlan = field(hash=False)
+
+
+@lru_cache(maxsize=1)
+def _made_ready(task: _Task) -> tuple[Scenario, Rig]:
+    """A scenario and its sensors; the last one is kept for the next part of it."""
+    config, plan = task.config, task.plan
+    scenario = build_scenario(config, plan)
+    rig = make_rig(
+        scenario.world,
+        scenario.actors,
+        scenario.agents,
+        sky=(scenario.weather, scenario.time_of_day),
+        image_size=config.image_size,
+        seed=(config.seed, plan.pair, int(plan.accident)),
+        images=config.sensors,
+    )
+    return scenario, rig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Recorder:
-    """Writes the files of one scenario; without a `look`, only what needs no sensor."""
+    """Writes the files of one scenario; from a rig without images, only what needs no sensor."""
 
     folder: ScenarioFolder
     scenario: Scenario
-    agents: tuple[Agent, ...]
-    look: Look | None
+    rig: Rig
+    labelled: bool
 
     def record(self, frame: int) -> None:
         """Write the files of all agents at one frame, counted from 1."""
-        scene = make_scene(self.scenario.world, self.scenario.actors, frame_timestamp(frame))
-        colors = paint(scene, self.scenario.world, self.look) if self.look else None
-        for agent in self.agents:
-            ground_from_ego = agent.ground_from_ego(scene.snapshot)
-            points = self._record_labels(frame, scene, agent, ground_from_ego)
-            if self.look and colors:
-                write_lidar(self.folder.channel_path(agent.name, LIDAR, frame), points.xyz, points.intensity)
-                self._record_bev(frame, scene, agent, ground_from_ego)
-                self._record_images(frame, scene, agent, ground_from_ego, self.look, colors)
+        time, rig = frame_timestamp(frame), self.rig
+        scene = rig.scene(time)
+        around = rig.surroundings(scene, self._signals(time))
+        for agent in rig.agents:
+            sighting = rig.sighting(scene, agent, frame)
+            write_calib(self.folder.calib_path(agent.name, frame), sighting.calib)
+            if self.labelled:
+                write_label(self.folder.label_path(agent.name, frame), sighting.labels)
+            if around:
+                intensity = rig.intensity(scene, agent, sighting.points)
+                write_lidar(self.folder.channel_path(agent.name, LIDAR, frame), sighting.points.xyz, intensity)
+                self._record_pictures(scene, around, agent, frame)
 
-    def _record_labels(self, frame: int, scene: Scene, agent: Agent, ground_from_ego: SE3) -> Scan:
-        """Write label and calib; returns the point cloud that the labels counted."""
-        world_from_ground = self.scenario.world.world_from_ground
-        ground_from_lidar = ground_from_ego @ agent.ego_from_lidar
-        points = scan(scene, ground_from_lidar)
-        labels = annotate(scene, agent, world_from_ground, ground_from_lidar, points)
-        write_label(self.folder.label_path(agent.name, frame), labels)
-        write_calib(self.folder.calib_path(agent.name, frame), agent.calib(world_from_ground @ ground_from_ego))
-        return points
+    def _record_pictures(self, scene: Scene, around: Surroundings, agent: Agent, frame: int) -> None:
+        """Write the images, and the view from above, whose instances are labels too."""
+        if self.labelled:
+            bev = self.rig.bev(scene, agent)
+            write_bev(self.folder.channel_path(agent.name, BEV_CAMERA, frame), bev.semantic, bev.instance)
+        for channel, image in self.rig.images(scene, around, agent, frame):
+            write_image(self.folder.channel_path(agent.name, channel, frame), image)
 
-    def _record_bev(self, frame: int, scene: Scene, agent: Agent, ground_from_ego: SE3) -> None:
-        picture = bev_picture(scene, self.scenario.world.top, ground_from_ego)
-        write_bev(self.folder.channel_path(agent.name, BEV_CAMERA, frame), picture.semantic, picture.instance)
-
-    def _record_images(
-        self, frame: int, scene: Scene, agent: Agent, ground_from_ego: SE3, look: Look, colors: Paint
-    ) -> None:
-        ground_from_lidar = ground_from_ego @ agent.ego_from_lidar
-        for camera in agent.cameras:
-            ground_from_camera = ground_from_lidar @ camera.camera_from_lidar.inverse()
-            image = render(scene, colors, look, camera, ground_from_camera)
-            write_image(self.folder.channel_path(agent.name, camera.channel, frame), image)
-
-
-def _look(config: SynthConfig, scenario: Scenario) -> Look:
-    rng = RandomStreams.of(config.seed, scenario.plan.pair).look
-    return make_look(scenario.world, scenario.weather, scenario.time_of_day, rng)
+    def _signals(self, time: float) -> Mapping[Arm, int]:
+        """Of each arm's traffic light, its state."""
+        signals = self.scenario.signals
+        if signals is None:
+            return {}
+        return {head.arm: int(signals.state(head.arm, time)) for head in self.scenario.world.signals}

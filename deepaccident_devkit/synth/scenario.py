@@ -1,195 +1,193 @@
-"""Scenarios: which there are in a release, and all that one of them holds."""
+"""All that one scenario holds, made so that what its plan says happens."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
+from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.release import Collision, Meta
-from deepaccident_devkit.synth.actors import Actor, Actors, Motion
+from deepaccident_devkit.synth.actors import Actor, Actors, Sampled, Uniform
 from deepaccident_devkit.synth.bodies import Body
 from deepaccident_devkit.synth.config import SynthConfig
-from deepaccident_devkit.synth.design import SPEEDS, Encounter, random_encounter
-from deepaccident_devkit.synth.traffic import BackgroundActor, random_traffic
-from deepaccident_devkit.synth.world import HidingPlace, World, random_world
-from deepaccident_devkit.taxonomy import (
-    STATIC_ACTOR_ID,
-    TIMES_OF_DAY,
-    TOWNS,
-    VEHICLE_AGENTS,
-    WARM_UP_FRAMES,
-    WEATHERS,
-    AgentName,
-    frame_timestamp,
+from deepaccident_devkit.synth.plan import ScenarioPlan
+from deepaccident_devkit.synth.roads import Junction
+from deepaccident_devkit.synth.spec import ScenarioSpec
+from deepaccident_devkit.synth.spec.model import Role
+from deepaccident_devkit.synth.stage import World, random_world
+from deepaccident_devkit.synth.traffic.drama import Performance, Stage, perform_accident, perform_twin, set_stage
+from deepaccident_devkit.synth.traffic.kinematics import PERIOD
+from deepaccident_devkit.synth.traffic.recorded import (
+    Recorded,
+    latest_end,
+    recorded_accident,
+    recorded_normal,
+    usual_duration,
 )
+from deepaccident_devkit.synth.traffic.signals import SignalPlan
+from deepaccident_devkit.synth.traffic.unplanned import unplanned
+from deepaccident_devkit.taxonomy import STATIC_ACTOR_ID, VEHICLE_AGENTS, WARM_UP_FRAMES, AgentName
 
-_FIRST_PAIRS = ("train", "val", "test")
-_HIDDEN_SPEEDS = (12.0, 14.0)
-"""m/s: with a house on the kerb between them, slower cars would see each other earlier."""
-_GOLDEN_RATIO = 0.6180339887498949
-"""Its multiples fill [0, 1) evenly, whatever their number."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ScenarioPlan:
-    """One scenario to make.
-
-    Attributes:
-        pair: number of its pair, from 0; an accident and its normal twin share scene, name and split.
-        accident: whether it is the accident.
-        subtype: 1, signalised, or 2.
-        name: such as `Town03_type001_subtype0001_scenario00024`.
-        split: `train`, `val` or `test`.
-    """
-
-    pair: int
-    accident: bool
-    subtype: int
-    name: str
-    split: str
-
-    @property
-    def scenario_type(self) -> str:
-        """Such as `type1_subtype1_accident`."""
-        return f"type1_subtype{self.subtype}_{'accident' if self.accident else 'normal'}"
-
-    @property
-    def token(self) -> str:
-        """The scenario's token."""
-        return f"{self.scenario_type}/{self.name}"
+AGENT_OF_ROLE: Mapping[Role, AgentName] = {
+    "ego": "ego_vehicle",
+    "ego_behind": "ego_vehicle_behind",
+    "other": "other_vehicle",
+    "other_behind": "other_vehicle_behind",
+}
+MAX_DRAWS = 100
+"""Draws of a scenario after which it is given up."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scenario:
-    """All that is there to be recorded.
+    """All that is there to be recorded; time 0 is that of the first recorded frame.
 
     Attributes:
         plan: which scenario it is.
+        spec: the draw that it plays.
         world: what stands still.
         actors: what moves, and parked vehicles.
         agents: actor ids of the four vehicle agents.
         weather: one of `WEATHERS`.
         time_of_day: one of `taxonomy.TIMES_OF_DAY`.
         meta: as its file says.
+        frames: how many are recorded.
+        signals: the traffic lights' phases; None if there are none.
+        draws: how many it took.
     """
 
     plan: ScenarioPlan
+    spec: ScenarioSpec
     world: World
     actors: Actors
     agents: dict[AgentName, int]
     weather: str
     time_of_day: str
     meta: Meta
+    frames: int
+    signals: SignalPlan | None
+    draws: int
 
 
 class RandomStreams(NamedTuple):
     """Independent random numbers for each part of a pair's scene, so that a change to one part leaves the others."""
 
     world: np.random.Generator
-    design: np.random.Generator
     traffic: np.random.Generator
     ids: np.random.Generator
-    weather: np.random.Generator
-    look: np.random.Generator
 
     @classmethod
     def of(cls, seed: int, pair: int) -> "RandomStreams":
         """The streams of a pair, from their start."""
-        return cls(*map(np.random.default_rng, _seed(seed, pair).spawn(len(cls._fields))))
-
-
-def plan_scenarios(config: SynthConfig) -> list[ScenarioPlan]:
-    """The scenarios of a release: accidents and their twins by turns."""
-    return [_plan(config.seed, number // 2, accident=number % 2 == 0) for number in range(config.scenarios)]
+        spawned = np.random.SeedSequence([seed, pair]).spawn(len(cls._fields))
+        return cls(*map(np.random.default_rng, spawned))
 
 
 def build_scenario(config: SynthConfig, plan: ScenarioPlan) -> Scenario:
-    """Make up a scenario; the same seed and pair give the same scene, for the accident and for its twin."""
+    """Make up a scenario; the same seed and pair give the same scene, for the accident and for its twin.
+
+    The scene is drawn until those who are timed to meet touch, if anybody is.
+
+    Raises:
+        ConfigError: they never do, in `MAX_DRAWS` draws.
+    """
     random = RandomStreams.of(config.seed, plan.pair)
-    hidden, end_time = config.view == "hidden", frame_timestamp(config.frames)
-    encounter = random_encounter(random.design, end_time, _HIDDEN_SPEEDS if hidden else SPEEDS)
-    hiding = _between(encounter) if hidden else None
-    world = random_world(random.world, signalized=plan.subtype == 1, hiding=hiding)
-    traffic = random_traffic(random.traffic, encounter, [hiding.block] if hiding else [])
-    actors, agents = _numbered(random.ids, encounter, traffic, accident=plan.accident)
-    weather, time_of_day = str(random.weather.choice(WEATHERS)), str(random.weather.choice(TIMES_OF_DAY))
-    meta = Meta(
-        weather=weather,
-        time_of_day=time_of_day,
-        collision=_collision(encounter, agents) if plan.accident else None,
-        simulated_frames=config.frames + WARM_UP_FRAMES,
-        agent_ids=(agents[VEHICLE_AGENTS[0]], agents[VEHICLE_AGENTS[1]], *_last_two(agents)),
-        road_type="four-way junction",
-        spawn_side=encounter.spawn_side,
-        ego_direction="straight",
-        other_direction="straight",
-    )
+    stage, accident, draws = _first_good_draw(random.traffic, config, plan)
+    if plan.accident and accident is not None:
+        recorded = recorded_accident(stage, accident, config.frames)
+    else:
+        recorded = _twin(stage, config, plan)
+    spec = stage.spec
+    ego, other = (spec.actor(role).from_arm or "west" for role in ("ego", "other"))
+    ids = _Ids.of(random.ids, stage)
     return Scenario(
         plan=plan,
-        world=world,
-        actors=Actors.of(actors),
-        agents=agents,
-        weather=weather,
-        time_of_day=time_of_day,
-        meta=meta,
+        spec=spec,
+        world=random_world(random.world, stage.junction, spec.view, between=(ego, other)),
+        actors=Actors.of(_actors(stage, recorded, ids)),
+        agents=ids.agents,
+        weather=spec.weather,
+        time_of_day=spec.time_of_day,
+        meta=_meta(plan, stage, recorded, ids),
+        frames=recorded.frames,
+        signals=None if stage.signals is None else stage.signals.shifted(-recorded.start),
+        draws=draws,
     )
 
 
-def _between(encounter: Encounter) -> HidingPlace:
-    """A house between the two who meet, ego coming along x from below 0; the pole looks along the other's lane."""
-    if encounter.spawn_side == "left":
-        return HidingPlace(house=(-1, 1), pole=(-1, -1))
-    return HidingPlace(house=(-1, -1), pole=(1, 1))
-
-
-def _seed(seed: int, pair: int) -> np.random.SeedSequence:
-    return np.random.SeedSequence([seed, pair])
-
-
-def _plan(seed: int, pair: int, *, accident: bool) -> ScenarioPlan:
-    town = TOWNS[_seed(seed, pair).generate_state(1)[0] % len(TOWNS)]
-    subtype = 1 + pair % 2
-    return ScenarioPlan(
-        pair=pair,
-        accident=accident,
-        subtype=subtype,
-        name=f"{town}_type001_subtype{subtype:04d}_scenario{pair + 1:05d}",
-        split=_split(pair),
+def _first_good_draw(
+    rng: np.random.Generator, config: SynthConfig, plan: ScenarioPlan
+) -> tuple[Stage, Performance | None, int]:
+    """The first draw in which the pair touches, what then happens, and how many draws it took."""
+    for draws in range(1, MAX_DRAWS + 1):
+        spec = plan.draw(rng)
+        junction = Junction(spec.road)
+        if plan.unplanned:
+            spec = unplanned(rng, spec, junction)
+        stage = set_stage(rng, spec, junction, usual_duration(rng, spec, config.frames))
+        if spec.meet is None:
+            return stage, None, draws
+        accident = perform_accident(stage)
+        if accident is not None:
+            return stage, accident, draws
+    raise ConfigError(
+        f"{plan.template.name}: those of meet.actors did not collide in {MAX_DRAWS} draws; choose paths that cross, or "
+        "a smaller meet.offset"
     )
 
 
-def _split(pair: int) -> str:
-    """Both of a pair go together: one pair to each split, then about 70, 15 and 15 %."""
-    if pair < len(_FIRST_PAIRS):
-        return _FIRST_PAIRS[pair]
-    share = pair * _GOLDEN_RATIO % 1
-    return "train" if share < 0.7 else "val" if share < 0.85 else "test"
+def _twin(stage: Stage, config: SynthConfig, plan: ScenarioPlan) -> Recorded:
+    normal = perform_twin(stage, latest_end(stage, config.frames))
+    if normal is None:
+        raise ConfigError(
+            f"{plan.template.name}: nothing keeps the road users of the normal twin apart; let them start farther from "
+            "each other"
+        )
+    return recorded_normal(stage, normal, config.frames)
 
 
-def _numbered(
-    rng: np.random.Generator, encounter: Encounter, traffic: Sequence[BackgroundActor], *, accident: bool
-) -> tuple[list[Actor], dict[AgentName, int]]:
-    """All actors with their ids: moving ones in the thousands, parked ones from 20000, in the order of their making."""
-    count = len(VEHICLE_AGENTS) + len(traffic)
-    moving = (rng.integers(1000, 2000) + rng.integers(1, 4, count).cumsum()).tolist()
-    objects = rng.choice(np.arange(1, 2**16), count, replace=False).tolist()
-    motions = encounter.accident if accident else encounter.normal
-    agents = dict(zip(VEHICLE_AGENTS, moving, strict=False))
-    actors = [
-        _actor(agents[agent], objects[row], encounter.bodies[agent], motions[agent])
-        for row, agent in enumerate(VEHICLE_AGENTS)
-    ]
-    for row, actor in enumerate(traffic, start=len(VEHICLE_AGENTS)):
-        actor_id = STATIC_ACTOR_ID + row if actor.parked else moving[row]
-        actors.append(_actor(actor_id, objects[row], actor.body, actor.motion))
-    return actors, agents
+class _Ids(NamedTuple):
+    """The numbers of all actors of a stage: those that move first, then the parked ones."""
+
+    actor: tuple[int, ...]
+    camera: tuple[int, ...]
+    agents: dict[AgentName, int]
+
+    @classmethod
+    def of(cls, rng: np.random.Generator, stage: Stage) -> "_Ids":
+        """Moving ones are numbered in the thousands, parked ones from 20000, in the order of their making."""
+        moving, count = len(stage.users), len(stage.users) + len(stage.parked)
+        actor = (rng.integers(1000, 2000) + rng.integers(1, 4, moving).cumsum()).tolist()
+        actor += [STATIC_ACTOR_ID + row for row in range(moving, count)]
+        camera = rng.choice(np.arange(1, 2**16), count, replace=False).tolist()
+        agents = {
+            AGENT_OF_ROLE[user.role]: actor[row] for row, user in enumerate(stage.users) if user.role in AGENT_OF_ROLE
+        }
+        return cls(tuple(actor), tuple(camera), {agent: agents[agent] for agent in VEHICLE_AGENTS})
 
 
-def _actor(actor_id: int, object_id: int, body: Body, motion: Motion) -> Actor:
+def _actors(stage: Stage, recorded: Recorded, ids: _Ids) -> list[Actor]:
+    simulation = recorded.performance.simulation
+    start = float(simulation.time[0]) - recorded.start
+    actors = []
+    for column, row in enumerate(recorded.performance.present):
+        motion = Sampled(
+            start=start,
+            period=PERIOD,
+            samples=simulation.poses[:, column],
+            sample_velocities=simulation.velocities[:, column],
+        )
+        actors.append(_actor(ids, row, stage.users[row].body, motion))
+    for row, vehicle in enumerate(stage.parked, start=len(stage.users)):
+        actors.append(_actor(ids, row, vehicle.body, Uniform(*vehicle.pose)))
+    return actors
+
+
+def _actor(ids: _Ids, row: int, body: Body, motion: Sampled | Uniform) -> Actor:
     return Actor(
-        actor_id=actor_id,
-        object_id=object_id,
+        actor_id=ids.actor[row],
+        object_id=ids.camera[row],
         category=body.category,
         size=body.size,
         shape=body.shape,
@@ -198,18 +196,32 @@ def _actor(actor_id: int, object_id: int, body: Body, motion: Motion) -> Actor:
     )
 
 
-def _collision(encounter: Encounter, agents: dict[AgentName, int]) -> Collision:
-    ego, _, other, _ = VEHICLE_AGENTS
-    return Collision(
-        ids=(agents[ego], agents[other]),
-        classes=(encounter.bodies[ego].category, encounter.bodies[other].category),
-        impact=encounter.impact,
-        spawn_relation="same",
-        contact_side="front_side",
-        agents=(ego, other),
+def _meta(plan: ScenarioPlan, stage: Stage, recorded: Recorded, ids: _Ids) -> Meta:
+    spec = stage.spec
+    ego, ego_behind, other, other_behind = (ids.agents[agent] for agent in VEHICLE_AGENTS)
+    return Meta(
+        weather=spec.weather,
+        time_of_day=spec.time_of_day,
+        collision=_collision(stage, recorded, ids),
+        simulated_frames=recorded.frames + WARM_UP_FRAMES,
+        agent_ids=(ego, ego_behind, other, other_behind),
+        road_type=plan.traits.road_type,
+        spawn_side=plan.traits.spawn_side,
+        ego_direction=spec.actor("ego").turn,
+        other_direction=spec.actor("other").turn,
     )
 
 
-def _last_two(agents: dict[AgentName, int]) -> tuple[int, int]:
-    _, _, other, other_behind = VEHICLE_AGENTS
-    return agents[other], agents[other_behind]
+def _collision(stage: Stage, recorded: Recorded, ids: _Ids) -> Collision | None:
+    impact, pair = recorded.impact, stage.cast.pair
+    if impact is None or pair is None:
+        return None
+    first, second = (stage.users[row] for row in pair)
+    return Collision(
+        ids=(ids.actor[pair[0]], ids.actor[pair[1]]),
+        classes=(first.body.category, second.body.category),
+        impact=impact.strength,
+        spawn_relation="same",
+        contact_side=f"{impact.side}_side",
+        agents=(AGENT_OF_ROLE.get(first.role), AGENT_OF_ROLE.get(second.role)),
+    )

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, ByteArray, FloatArray, checked, readonly
+from deepaccident_devkit.arrays import BoolArray, ByteArray, FloatArray, IntArray, checked, readonly
 from deepaccident_devkit.geometry.boxes import CORNER_SIGNS
 
 Color = tuple[int, int, int]
@@ -46,6 +46,10 @@ class Solids:
     def __len__(self) -> int:
         """Number of solids."""
         return len(self.corners)
+
+    def select(self, rows: IntArray) -> "Solids":
+        """The solids of some rows (K,), in that order."""
+        return Solids(*(getattr(self, name)[rows] for name in Solids.__slots__))
 
 
 @dataclass(frozen=True, slots=True)

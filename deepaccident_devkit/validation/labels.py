@@ -129,7 +129,7 @@ def _tracks(subject: Subject) -> Iterator[Finding]:
     step = np.diff(frame)
     three = same[1:] & same[:-1] & (step[1:] == 1) & (step[:-1] == 1)
     bend = np.linalg.norm(_second_difference(subject.centers[rows]), axis=1) / 2
-    free = ~(_in_collision(subject)[rows[1:-1]] & (frame[2:] > subject.num_frames - LAST_FRAMES))
+    free = ~(subject.in_collision[rows[1:-1]] & (frame[2:] > subject.num_frames - LAST_FRAMES))
     jumps = three & (bend > JUMP) & free
     yield from subject.label_findings(
         "track-jump", subject.mask(rows[1:-1][jumps]), f"over {JUMP} m off the middle of the frames around"
@@ -154,14 +154,6 @@ def _tracks(subject: Subject) -> Iterator[Finding]:
 def _is_car(subject: Subject) -> BoolArray:
     """(N,) boxes of what has four wheels."""
     return np.isin(subject.boxes.labels.category, _FOUR_WHEELS)
-
-
-def _in_collision(subject: Subject) -> BoolArray:
-    """(N,) boxes of meta's pair; all, where meta does not say."""
-    meta = subject.files.meta
-    if meta is None:
-        return np.ones(len(subject.boxes), dtype=bool)
-    return np.isin(subject.boxes.actor, meta.collision.ids if meta.collision else ())
 
 
 def _second_difference(values: FloatArray) -> FloatArray:

@@ -15,8 +15,8 @@ CAMERA_FIELD = {**dict.fromkeys(CAMERAS, 70.0), "Camera_Back": 110.0}
 """Horizontal field of view, degrees."""
 _YAW_TOLERANCE = 5.0
 _FIELD_TOLERANCE = 0.02
-_FURTHEST_CAMERA = 4.0
-"""Metres from the LiDAR."""
+_FURTHEST_CAMERA = 5.0
+"""Metres from the LiDAR; a truck's front is up to 4.8 m from its middle."""
 _TILT = np.sin(np.radians(10.0))
 _CAMERA_HEIGHTS = 0.4
 """Metres between a camera's height and that of the others."""

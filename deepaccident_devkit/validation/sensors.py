@@ -109,10 +109,18 @@ def _images(
     yield from _image_sizes(subject, agent, channel, sizes)
     telling += [frame for frame, picture in thumbnails.items() if np.ptp(picture, axis=(0, 1)).max() >= _BLANK]
     odd = out_of_sequence(thumbnails)
+    if subject.num_frames in odd and _collides(subject, agent):
+        odd.remove(subject.num_frames)  # at the impact another car may fill the view at once
     if odd:
         folder = subject.files.scenario.kind_folder(subject.agents[agent], channel)
         what = f"does not fit between its neighbours, {frames_text(odd)}"
         yield subject.finding("image-out-of-sequence", str(folder), what)
+
+
+def _collides(subject: Subject, agent: int) -> bool:
+    """Whether the agent is one of the pair that meta names."""
+    own = subject.own & (subject.boxes.agent == agent)
+    return bool(subject.in_collision[own].any())
 
 
 def _image_sizes(subject: Subject, agent: int, channel: str, sizes: Mapping[int, tuple[int, int]]) -> Iterator[Finding]:

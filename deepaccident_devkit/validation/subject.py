@@ -77,6 +77,14 @@ class Subject:
         return own
 
     @cached_property
+    def in_collision(self) -> BoolArray:
+        """(N,) boxes of meta's pair; all, where meta does not say."""
+        meta = self.files.meta
+        if meta is None:
+            return np.ones(len(self.boxes), dtype=bool)
+        return np.isin(self.boxes.actor, meta.collision.ids if meta.collision else ())
+
+    @cached_property
     def yaw(self) -> FloatArray:
         """(N,) heading of each box in world, radians."""
         return quaternions.yaw_of(box_rules.world_rotations(self.boxes))
@@ -85,16 +93,15 @@ class Subject:
     def reach(self) -> FloatArray:
         """(A,) metres around each agent within which its labels leave nobody out; 0 where nothing shows that.
 
-        Whose labels hold what neither its LiDAR nor its cameras saw leaves nobody out for being hidden; how far that
-        goes is told by the boxes that it has.
+        Labels that hold what neither its agent's LiDAR nor its cameras saw leave nobody out for being hidden, and all
+        labels of a scenario are written by one rule; how far that goes is told by the boxes that each agent has.
         """
         labels, agent = self.boxes.labels, self.boxes.agent
         distance = np.linalg.norm(labels.center[:, :2], axis=1)
         hidden = self.seen & (labels.num_lidar_pts == 0) & ~labels.camera_visible & (distance < _SURE_REACH)
         furthest = np.zeros(len(self.agents))
         np.maximum.at(furthest, agent, distance)
-        reach: FloatArray = np.minimum(_SURE_REACH, _SHARE_OF_FURTHEST * furthest)
-        reach[~np.isin(np.arange(len(reach)), agent[hidden])] = 0.0
+        reach: FloatArray = np.minimum(_SURE_REACH, _SHARE_OF_FURTHEST * furthest) * hidden.any()
         return reach
 
     def has_untracked(self, agent: int, frames: IntArray, places: FloatArray) -> BoolArray:

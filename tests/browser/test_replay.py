@@ -173,7 +173,9 @@ def test_the_impact_is_marked_where_the_pair_meets(opened: Browser, da_motion: D
     contact = da_motion.collision(scenario)
     assert contact is not None
     origin = recording_of(da_motion, scenario, None).origin
-    around = [contact.point[:2] + 1.5 * np.array([np.cos(turn), np.sin(turn)]) for turn in np.linspace(0, 6.2, 25)]
+    between_rays = (np.arange(8) + 0.5) * np.pi / 4
+    ring = np.column_stack([np.cos(between_rays), np.sin(between_rays)])
+    around = np.concatenate([contact.point[:2] + radius * ring for radius in (0.75, 1.25, 1.75, 2.5)])
 
     def red() -> int:
         wanted = mixed(COLLIDER_COLOR, 0.75)
@@ -182,16 +184,18 @@ def test_the_impact_is_marked_where_the_pair_meets(opened: Browser, da_motion: D
     def ray(pixels: float) -> int:
         """How many of the eight rays of the mark there are at a distance from its middle."""
         scale = float(opened.script("return document.getElementById('ground').dataset.view").split()[2])
-        turns = np.arange(8) * np.pi / 4
-        places = contact.point[:2] + pixels / scale * np.column_stack([np.cos(turns), np.sin(turns)])
+        turns, aside = np.meshgrid(np.arange(8) * np.pi / 4, [-1, 0, 1], indexing="ij")  # the line lies between pixels
+        along, across = np.array([np.cos(turns), np.sin(turns)]), np.array([-np.sin(turns), np.cos(turns)])
+        places = contact.point[:2] + (pixels * along + aside * across).reshape(2, -1).T / scale
         colors = np.array(pixels_at(opened, places, origin))[:, :3]
-        return int((np.abs(colors - mixed(COLLIDER_COLOR, 1)).max(axis=1) < 100).sum())
+        off = np.abs(colors - mixed(COLLIDER_COLOR, 1)).max(axis=1).reshape(turns.shape)
+        return int((off.min(axis=1) < 100).sum())
 
     assert red() == 0
     assert (ray(7), ray(23)) == (8, 0)
     assert opened.script("return document.body.classList.contains('impact')") is False
     scrub(opened, FRAMES - 1)
-    assert red() > 5
+    assert red() > 3
     assert ray(23) == 8
     assert opened.script("return document.body.classList.contains('impact')") is True
     assert opened.script("return getComputedStyle(document.getElementById('ground')).animationName") == "flash"

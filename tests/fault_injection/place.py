@@ -1,76 +1,42 @@
 """A scenario of a release that mutations may change, and that can be put back as it was."""
 
-import io
-import pickle
-import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.release import ScenarioFolder
-from deepaccident_devkit.release.layout import frame_numbers
-from deepaccident_devkit.taxonomy import CHANNEL_FORMAT, OWN_ACTOR_ID, VEHICLE_AGENTS
+from deepaccident_devkit.taxonomy import OWN_ACTOR_ID, VEHICLE_AGENTS
+from deepaccident_devkit.testing.editing import ENDINGS, FIELD, Rows, ScenarioEditor
 
-Rows = list[list[str]]
-"""The words of a label file's lines; the first line is the header."""
+Candidate = TypeVar("Candidate")
 Sightings = Mapping[str, Mapping[int, Mapping[int, np.ndarray]]]
 """Agent → actor id → frame → place in the world (x, y, z), metres, CARLA's signs."""
 
-ENDINGS = {"label": "txt", "calib": "pkl", **CHANNEL_FORMAT}
-"""Kind of file → its ending."""
-_FIELDS = ("class", "x", "y", "z", "l", "w", "h", "yaw", "vx", "vy", "id", "points", "visible")
-FIELD = {name: place for place, name in enumerate(_FIELDS)}
-"""Field of a label line → its place in the line."""
 NEAR = 35.0
 """Metres within which an agent does not lose sight of anybody."""
 LEAST_MOVE = 0.4
 """What counts as moving, metres a frame."""
 
 
-class Place:
-    """One scenario; every change goes through here, is noted, and undone by `restore`.
+class NoVictimError(LookupError):
+    """Nobody in a scenario is what a mutation needs."""
 
-    Files are always replaced, never written into, so a release of hard links is safe.
-    """
+
+class Place(ScenarioEditor):
+    """One scenario; every change is noted, and undone by `restore`."""
 
     def __init__(self, root: Path, scenario: ScenarioFolder) -> None:
-        self.root = root
-        self.scenario = scenario
-        self.token = scenario.token
-        self.agents = scenario.agents
-        self.frames = frame_numbers(scenario.kind_folder(scenario.agents[0], "calib"), "pkl")[0]
+        super().__init__(root, scenario)
         self.before: dict[Path, bytes | None] = {}
 
-    # ---- files
-
-    def read(self, path: Path) -> bytes:
-        return path.read_bytes()
-
-    def write(self, path: Path, content: bytes) -> None:
-        self._note(path)
-        write_bytes(path, content)
-
-    def remove(self, path: Path) -> None:
-        self._note(path)
-        path.unlink()
-
-    def remove_folder(self, folder: Path) -> None:
-        for path in _files_in(folder):
-            self._note(path)
-        shutil.rmtree(folder)
-
-    def rename(self, path: Path, name: str) -> None:
-        self.write(path.with_name(name), path.read_bytes())
-        self.remove(path)
-
-    def exchange(self, one: Path, other: Path) -> None:
-        content, other_content = one.read_bytes(), other.read_bytes()
-        self.write(one, other_content)
-        self.write(other, content)
+    def changing(self, path: Path) -> None:
+        """Note what a file held; nothing, if it is not there yet."""
+        if path not in self.before:
+            self.before[path] = path.read_bytes() if path.is_file() else None
 
     def restore(self) -> None:
         """Put every changed file back, and take away what was added."""
@@ -90,54 +56,6 @@ class Place:
             for path, content in now.items()
             if content != self.before[path]
         }
-
-    def _note(self, path: Path) -> None:
-        if path not in self.before:
-            self.before[path] = path.read_bytes() if path.is_file() else None
-
-    def file(self, agent: str, kind: str, frame: int) -> Path:
-        return self.scenario.file(agent, kind, frame, ENDINGS[kind])
-
-    def folder(self, agent: str, kind: str) -> Path:
-        return self.scenario.kind_folder(agent, kind)
-
-    # ---- contents
-
-    def rows(self, agent: str, frame: int) -> Rows:
-        return [line.split() for line in self.file(agent, "label", frame).read_text("ascii").splitlines()]
-
-    def write_rows(self, agent: str, frame: int, rows: Rows) -> None:
-        self.write(self.file(agent, "label", frame), "".join(" ".join(row) + "\n" for row in rows).encode("ascii"))
-
-    def edit_rows(self, agent: str, frames: list[int], edit: Callable[[list[str]], None], **where: Any) -> None:
-        """Apply `edit` to the box lines of the frames, or to those of one `actor` alone."""
-        for frame in frames:
-            rows = self.rows(agent, frame)
-            for row in rows[1:]:
-                if where.get("actor") in (None, int(row[FIELD["id"]])):
-                    edit(row)
-            self.write_rows(agent, frame, rows)
-
-    def calib(self, agent: str, frame: int) -> dict[str, np.ndarray]:
-        calib: dict[str, np.ndarray] = pickle.loads(self.file(agent, "calib", frame).read_bytes())
-        return calib
-
-    def write_calib(self, agent: str, frame: int, calib: Any) -> None:
-        self.write(self.file(agent, "calib", frame), pickle.dumps(calib, protocol=3))
-
-    def edit_calib(self, agent: str, frames: list[int], key: str, edit: Callable[[np.ndarray], np.ndarray]) -> None:
-        for frame in frames:
-            calib = self.calib(agent, frame)
-            self.write_calib(agent, frame, {**calib, key: edit(calib[key])})
-
-    def array(self, agent: str, channel: str, frame: int) -> np.ndarray:
-        array: np.ndarray = np.load(self.file(agent, channel, frame))["data"]
-        return array
-
-    def write_array(self, agent: str, channel: str, frame: int, array: np.ndarray) -> None:
-        content = io.BytesIO()
-        np.savez(content, data=array)
-        self.write(self.file(agent, channel, frame), content.getvalue())
 
     # ---- victims; call these before changing anything
 
@@ -160,7 +78,7 @@ class Place:
             start, end = self.position(agent, first), self.position(agent, last)
             return float(np.hypot(*(end - start)[:2])) > least
 
-        return str(rng.choice([agent for agent in self.agents if moves(agent)]))
+        return one_of([agent for agent in self.agents if moves(agent)], rng)
 
     def any_frame(self, rng: np.random.Generator) -> int:
         return int(rng.choice(self.frames))
@@ -213,24 +131,46 @@ class Place:
             if any(actor in steady[other] for other in self.agents if other != agent)
             and self._is_near(agent, actor, within)
         ]
-        return pairs[rng.integers(len(pairs))]
+        return one_of(pairs, rng)
+
+    def steady_ones(self, rng: np.random.Generator, count: int, *, moving: bool = False) -> tuple[str, list[int]]:
+        """An agent and so many of the actors that it sees in every frame."""
+        agents = [agent for agent in self.agents if len(self.steady(agent, moving=moving)) >= count]
+        agent = one_of(agents, rng)
+        return agent, rng.choice(sorted(self.steady(agent, moving=moving)), size=count, replace=False).tolist()
 
     def lone_actor(self, rng: np.random.Generator, *, vehicle: bool = False) -> tuple[str, int]:
-        """An agent, alone from now on (the others' files are gone), and a near moving actor that it sees always."""
-        agent = self.any_agent(rng)
-        classes = {int(row[FIELD["id"]]): row[0] for row in self.rows(agent, self.frames[0])[1:]}
-        actors = [
-            actor
+        """An agent, alone from now on (the others' files are gone), and a near moving actor that it sees always.
+
+        The agent's labels leave nobody out for being hidden: of others nobody can say whether an actor is missing.
+        """
+        classes = {
+            int(row[FIELD["id"]]): row[0] for agent in self.agents for row in self.rows(agent, self.frames[0])[1:]
+        }
+        pairs = [
+            (agent, actor)
+            for agent in self.agents
             for actor in sorted(self.steady(agent, moving=True))
-            if self._is_near(agent, actor, NEAR)
+            if self._annotates_the_hidden(agent)
+            and self._is_near(agent, actor, NEAR)
             and (not vehicle or classes[actor] in ("car", "truck", "van"))
             and actor not in self.agent_ids()
         ]
-        actor = actors[rng.integers(len(actors))]
+        agent, actor = one_of(pairs, rng)
         for other in self.agents:
             for kind in ENDINGS if other != agent else ():
                 self.remove_folder(self.folder(other, kind))
         return agent, actor
+
+    def _annotates_the_hidden(self, agent: str) -> bool:
+        return any(
+            int(row[FIELD["id"]]) > 0
+            and int(row[FIELD["num_lidar_pts"]]) == 0
+            and row[FIELD["camera_visible"]] == "False"
+            and np.hypot(float(row[FIELD["x"]]), float(row[FIELD["y"]])) < NEAR
+            for frame in self.frames
+            for row in self.rows(agent, frame)[1:]
+        )
 
     def _is_near(self, agent: str, actor: int, within: float) -> bool:
         places = self.sightings[agent][actor]
@@ -241,9 +181,6 @@ class Place:
         line = next(line for line in self.meta_lines() if "agents id:" in line)
         return [int(word) for word in line.split(":")[1].split()]
 
-    def meta_lines(self) -> list[str]:
-        return self.scenario.meta_path.read_text("ascii").splitlines()
-
     def row_of(self, rows: Rows, actor: int) -> list[str]:
         return next(row for row in rows[1:] if int(row[FIELD["id"]]) == actor)
 
@@ -253,13 +190,16 @@ class Place:
         return others[rng.integers(len(others))]
 
 
+def one_of(candidates: Sequence[Candidate], rng: np.random.Generator) -> Candidate:
+    """Any of the candidates. Raises NoVictimError if there is none."""
+    if not candidates:
+        raise NoVictimError("nobody in this scenario is what the mutation needs")
+    return candidates[rng.integers(len(candidates))]
+
+
 def way_length(way: np.ndarray) -> float:
     """Length over the ground, metres."""
     return float(np.hypot(way[0], way[1]))
-
-
-def _files_in(folder: Path) -> Iterator[Path]:
-    return (path for path in sorted(folder.rglob("*")) if path.is_file())
 
 
 def _remove_empty(folder: Path, root: Path) -> None:

@@ -13,9 +13,9 @@ from deepaccident_devkit.release import find_release
 from deepaccident_devkit.synth import SynthConfig, make_release
 from fault_injection.mutations import BEYOND, MUTATIONS, seeded
 from fault_injection.mutations.calib import marker
-from fault_injection.place import Place
+from fault_injection.place import NoVictimError, Place
 
-RELEASE = SynthConfig(scenarios=2, frames=7, image_size=(96, 54), seed=8)
+RELEASE = SynthConfig(scenarios=2, frames=7, image_size=(96, 54), seed=8, unplanned=0)
 NUM_MUTATIONS = 200
 SEEDS_BEYOND = 2
 WORKERS = 2
@@ -73,12 +73,17 @@ def places(root: Path) -> dict[str, Place]:
 
 
 def mutate(job: Job, of: dict[str, Place]) -> tuple[Place, str]:
-    """Apply a mutation to one of the scenarios, which its seed chooses."""
+    """Apply a mutation to the first scenario with a victim for it, in an order that its seed chooses."""
     mutation, rng = MUTATIONS[job.name], seeded(job.name, job.seed)
     fitting = sorted(token for token in of if mutation.only is None or token.split("/")[0].endswith(mutation.only))
-    place = of[str(rng.choice(fitting))]
-    assert set(place.sightings) == set(place.agents)  # looked at while all is well
-    return place, mutation.apply(place, rng)
+    for token in rng.permutation(fitting):
+        place = of[str(token)]
+        assert set(place.sightings) == set(place.agents)  # looked at while all is well
+        try:
+            return place, mutation.apply(place, rng)
+        except NoVictimError:
+            assert not place.changes()
+    raise NoVictimError(f"{job.name}: nobody in {', '.join(fitting)} is what it needs; try another seed of RELEASE")
 
 
 def run(root: Path, wanted: Sequence[Job]) -> list[Outcome]:

@@ -4,7 +4,7 @@ import numpy as np
 
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
 from fault_injection.kinds import Group
-from fault_injection.place import FIELD, NEAR, Place
+from fault_injection.place import FIELD, NEAR, Place, one_of
 
 GROUP = Group("label, lines and ids")
 _ID = FIELD["id"]
@@ -77,19 +77,17 @@ def boxes_removed(place: Place, rng: np.random.Generator) -> str:
 @GROUP.kind()
 def ids_exchanged(place: Place, rng: np.random.Generator) -> str:
     """Two moving actors' ids are exchanged in one agent, at all frames."""
-    agent = place.any_agent(rng)
-    return _exchange_ids(place, rng, agent, place.frames)
+    return _exchange_ids(place, rng, place.frames)
 
 
 @GROUP.kind()
 def ids_exchanged_in_a_frame(place: Place, rng: np.random.Generator) -> str:
     """Two moving actors' ids are exchanged in one agent, at one frame."""
-    agent = place.any_agent(rng)
-    return _exchange_ids(place, rng, agent, [place.any_frame(rng)])
+    return _exchange_ids(place, rng, [place.any_frame(rng)])
 
 
-def _exchange_ids(place: Place, rng: np.random.Generator, agent: str, frames: list[int]) -> str:
-    one, other = map(int, rng.choice(sorted(place.steady(agent, moving=True)), size=2, replace=False))
+def _exchange_ids(place: Place, rng: np.random.Generator, frames: list[int]) -> str:
+    agent, (one, other) = place.steady_ones(rng, 2, moving=True)
     new = {str(one): str(other), str(other): str(one)}
     place.edit_rows(agent, frames, lambda row: row.__setitem__(_ID, new.get(row[_ID], row[_ID])))
     return f"{agent} {frames[0]}..{frames[-1]}: {one} and {other}"
@@ -125,8 +123,7 @@ def id_changed_lone(place: Place, rng: np.random.Generator) -> str:
 @GROUP.kind()
 def id_twice(place: Place, rng: np.random.Generator) -> str:
     """Two boxes of one label file carry the same id."""
-    agent, frame = place.any_agent(rng), place.any_frame(rng)
-    one, other = map(int, rng.choice(sorted(place.steady(agent)), size=2, replace=False))
+    (agent, (one, other)), frame = place.steady_ones(rng, 2), place.any_frame(rng)
     place.edit_rows(agent, [frame], lambda row: _set_id(row, one), actor=other)
     return f"{agent} {frame}: {other} is {one} too"
 
@@ -207,7 +204,7 @@ def own_row_under_true_id(place: Place, rng: np.random.Generator) -> str:
 def own_row_on_the_pole(place: Place, rng: np.random.Generator) -> str:
     """The infrastructure's label has an own line (−100)."""
     agent, frame = "infrastructure", place.any_frame(rng)
-    actor = int(rng.choice(sorted(place.steady(agent))))
+    actor = one_of(sorted(place.steady(agent)), rng)
     place.edit_rows(agent, [frame], lambda row: _set_id(row, OWN_ACTOR_ID), actor=actor)
     return f"{agent} {frame}: {actor} is -100"
 
@@ -306,7 +303,7 @@ def points_changed(place: Place, rng: np.random.Generator) -> str:
     agent, frame = place.any_agent(rng), place.any_frame(rng)
     rows = place.rows(agent, frame)
     row = place.any_row(rng, rows)
-    old, place_of = int(row[FIELD["points"]]), FIELD["points"]
+    old, place_of = int(row[FIELD["num_lidar_pts"]]), FIELD["num_lidar_pts"]
     row[place_of] = str(old * 2 + 30)
     place.write_rows(agent, frame, rows)
     return f"{agent} {frame}: {row[_ID]}, {old} is {row[place_of]} points"
@@ -317,7 +314,7 @@ def points_negative(place: Place, rng: np.random.Generator) -> str:
     """A box's number of LiDAR points is negative."""
     agent, frame = place.any_agent(rng), place.any_frame(rng)
     rows = place.rows(agent, frame)
-    place.any_row(rng, rows)[FIELD["points"]] = "-3"
+    place.any_row(rng, rows)[FIELD["num_lidar_pts"]] = "-3"
     place.write_rows(agent, frame, rows)
     return f"{agent} {frame}"
 
@@ -328,6 +325,6 @@ def visible_flipped(place: Place, rng: np.random.Generator) -> str:
     agent, frame = place.any_agent(rng), place.any_frame(rng)
     rows = place.rows(agent, frame)
     row = place.any_row(rng, rows)
-    row[FIELD["visible"]] = "False" if row[FIELD["visible"]] == "True" else "True"
+    row[FIELD["camera_visible"]] = "False" if row[FIELD["camera_visible"]] == "True" else "True"
     place.write_rows(agent, frame, rows)
     return f"{agent} {frame}: {row[_ID]}"

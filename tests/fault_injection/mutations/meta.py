@@ -101,14 +101,16 @@ def meta_colliding_agents(place: Place, rng: np.random.Generator) -> str:
     """The colliding agents are other ones than the colliding ids."""
     line = next(line for line in place.meta_lines() if "colliding agents:" in line)
     pairs = ["ego other", "ego_behind other_behind", "ego other_behind", "ego_behind other"]
-    pairs.remove(line.split(":")[1].strip())
-    return _set_entry(place, "colliding agents", str(rng.choice(pairs)))
+    others = [pair for pair in pairs if set(pair.split()) != set(line.split(":")[1].split())]
+    return _set_entry(place, "colliding agents", str(rng.choice(others)))
 
 
 @GROUP.kind(only="accident")
 def meta_class_changed(place: Place, rng: np.random.Generator) -> str:
     """A colliding actor has another class than in the labels."""
-    return _set_word(place, int(rng.choice([2, 4])), str(rng.choice(["pedestrian", "motorcycle"])))
+    number = int(rng.choice([2, 4]))
+    others = {"pedestrian", "motorcycle"} - {place.meta_lines()[0].split()[number]}
+    return _set_word(place, number, str(rng.choice(sorted(others))))
 
 
 @GROUP.kind(only="accident")

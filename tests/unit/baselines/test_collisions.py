@@ -6,13 +6,15 @@ import pytest
 from deepaccident_devkit.baselines import Outlook, SeenActors
 from deepaccident_devkit.baselines.collisions import accidents_ahead
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
+from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID
 
 CAR = (4.0, 2.0, 1.5)
 
 
-def ahead(*actors: tuple[int, float, float, float, float, float], own: int | None = 50) -> Outlook:
-    """Cars by actor id, x, y, yaw, speed along x, speed along y."""
+def ahead(
+    *actors: tuple[int, float, float, float, float, float], own: int | None = 50, on_foot: Sequence[int] = ()
+) -> Outlook:
+    """Cars, or whom ids say to be on foot, by actor id, x, y, yaw, speed along x, speed along y."""
     rows: Sequence[tuple[float, ...]] = actors
     table = np.array(rows, dtype=np.float64).reshape(-1, 6)
     boxes = Boxes.from_arrays(
@@ -22,6 +24,7 @@ def ahead(*actors: tuple[int, float, float, float, float, float], own: int | Non
         frame="ego",
         actor_id=table[:, 0].astype(np.int64),
         velocity=np.column_stack([table[:, 4:6], np.zeros(len(table))]),
+        category=np.where(np.isin(table[:, 0], on_foot), CATEGORIES.index("pedestrian"), 0),
     )
     seen = SeenActors(boxes=boxes, seen_by=np.zeros(len(table), np.uint8), own_actor_id=own)
     return Outlook(seen=seen, turn_rate=np.zeros(len(table)))
@@ -55,6 +58,29 @@ def test_those_who_stand_or_come_no_nearer_are_in_no_danger() -> None:
     parked = [(1, 0, 20, 0, 0, 0), (2, 4.1, 20, 0, 0, 0)]
     side_by_side = [(3, 0, 40, 0, 5, 0), (4, 0, 42.1, 0, 5, 0)]
     assert accidents_ahead(ahead(*parked, *side_by_side), 2.0) == []
+
+
+@pytest.mark.parametrize("yaw", [0.0, 2.0])
+def test_who_drives_up_to_a_queue_brakes(yaw: float) -> None:
+    """At constant velocity the follower is through the one that stands within 2 s."""
+    along = np.array([np.cos(yaw), np.sin(yaw)])
+
+    def follower(aside: float, turned: float) -> tuple[int, float, float, float, float, float]:
+        place = -12 * along + aside * np.array([-along[1], along[0]])
+        return 2, *place, yaw + turned, *(8 * along)
+
+    stands = (1, 0, 0, yaw, 0, 0)
+    assert accidents_ahead(ahead(stands, follower(0.5, 0.0)), 2.0) == []
+    assert accidents_ahead(ahead(follower(0.5, 0.0), stands), 2.0) == []
+    assert len(accidents_ahead(ahead(stands, follower(1.5, 0.0)), 2.0)) == 1  # it comes from the next lane
+    assert len(accidents_ahead(ahead(stands, follower(0.5, 0.6)), 2.0)) == 1  # it slides
+
+
+def test_two_pedestrians_are_in_no_danger_of_each_other() -> None:
+    met = [(1, 0, 0, 0, 1.5, 0), (2, 6, 0.5, np.pi, -1.5, 0)]
+    assert len(accidents_ahead(ahead(*met), 3.0)) == 1
+    assert len(accidents_ahead(ahead(*met, on_foot=[2]), 3.0)) == 1
+    assert accidents_ahead(ahead(*met, on_foot=[1, 2]), 3.0) == []
 
 
 def test_two_that_overlap_now_are_the_surest_alarm() -> None:

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ from deepaccident_devkit.baselines.drawing import label_times, motion_of
 from deepaccident_devkit.baselines.oracle import SeenActors, seen_actors
 from deepaccident_devkit.evaluation import MotionEvaluator
 from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS
-from deepaccident_devkit.motion import MotionLabelConfig
+from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, MotionLabels
 from deepaccident_devkit.taxonomy import LIDAR, OWN_ACTOR_ID
 
 CLEAN = MOTION_PROTOCOLS["released"].__class__(labels="clean")
@@ -33,23 +35,31 @@ def what_comes(da: DeepAccident, token: str, config: MotionLabelConfig) -> tuple
     return seen, np.stack(result)
 
 
+def without_others(label: MotionLabels, known: set[int]) -> MotionLabels:
+    """The label without those whose whole future the labels do not tell: they leave the range, or come into sight."""
+    others = [number for actor, number in label.id_map.items() if actor not in {*known, OWN_BOX_ID}]
+    gone = np.isin(label.instance, others)
+    instance, segmentation = (np.where(gone, 0, each) for each in (label.instance, label.segmentation))
+    return replace(label, instance=instance, segmentation=segmentation)
+
+
 @pytest.mark.parametrize("agent", ["ego_vehicle", "other_vehicle_behind", "infrastructure"])
 @pytest.mark.parametrize("protocol", ["released", "clean"])
 def test_who_foresees_everything_scores_a_hundred(da_motion: DeepAccident, agent: str, protocol: str) -> None:
-    """Cell by cell; who leaves the label's range or comes into sight meanwhile is not drawn here."""
+    """Cell by cell."""
     config = MotionLabelConfig(protocol=protocol)
     token = f"{da_motion.scenario[0]['token']}/{agent}/012"
     seen, poses = what_comes(da_motion, token, config)
     output = motion_of(seen, poses, da_motion.ego_from(token, LIDAR), config)
     evaluator = MotionEvaluator("released" if protocol == "released" else CLEAN)
-    evaluator.update(token, output, da_motion.motion_labels(token, config))
+    label = da_motion.motion_labels(token, config)
+    evaluator.update(token, output, without_others(label, set(seen.boxes.actor_id.tolist())))
     result = evaluator.compute()
     assert len(seen.boxes) > 5
     for each in result.ranges.values():
         assert each.sq > 99.9
-        assert each.false_positive == 0
-        assert each.false_negative <= 0.1 * each.true_positive
-    assert result.ranges["100x100"].true_positive > 50
+        assert (each.false_positive, each.false_negative) == (0, 0)
+    assert result.ranges["100x100"].true_positive > 40
 
 
 def test_the_present_is_drawn_exactly_as_labels_are(da_motion: DeepAccident) -> None:

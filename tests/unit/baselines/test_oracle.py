@@ -64,9 +64,15 @@ def test_late_boxes_lag_behind_by_the_way_made_since(da_hidden: DeepAccident) ->
 
 
 def test_who_drives_straight_on_does_not_turn(da_hidden: DeepAccident) -> None:
+    scenario, present = da_hidden.scenario[0], seen_actors(da_hidden, sample(da_hidden), agents="all")
     rates = turn_rates(da_hidden, sample(da_hidden), agents="all")
-    assert rates.shape == seen_actors(da_hidden, sample(da_hidden), agents="all").boxes.actor_id.shape
-    np.testing.assert_allclose(rates, 0, atol=1e-2)  # poses in files are rounded
+    assert rates.shape == present.boxes.actor_id.shape
+    assert (scenario["ego_direction"], scenario["other_direction"]) == ("straight", "straight")
+    other = da_hidden.agent.get(f"{scenario['token']}/other_vehicle")["actor_id"]
+    assert other is not None
+    two = np.isin(present.boxes.actor_id, [OWN_ACTOR_ID, other])
+    assert two.sum() == 2
+    np.testing.assert_allclose(rates[two], 0, atol=1e-2)  # poses in files are rounded
 
 
 def test_turn_rates_are_those_since_the_earliest_sight(

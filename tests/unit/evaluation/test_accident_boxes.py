@@ -16,6 +16,8 @@ from deepaccident_devkit.evaluation.accident.protocol import AccidentContext
 from deepaccident_devkit.evaluation.accident.reading import AccidentReading
 from deepaccident_devkit.evaluation.accident.scoring import Scoring
 from deepaccident_devkit.evaluation.predictions import Accident
+from deepaccident_devkit.motion import OWN_BOX_ID
+from deepaccident_devkit.taxonomy import AGENTS
 
 BOXES = BoxAccidents()
 GIVEN = BoxAccidents(naming="given")
@@ -248,14 +250,20 @@ def test_normal_scenarios_have_no_accident(da_motion: DeepAccident) -> None:
 
 
 def test_label_maps_against_the_boxes_of_a_release(da_motion: DeepAccident) -> None:
-    """From where only the colliding pair comes near: nothing is lost in the rasters but half a cell of place."""
+    """Of the colliding pair alone, where both are seen: nothing is lost in the rasters but half a cell of place."""
     evaluator = AccidentEvaluator(protocol=BOXES, explain=True)
     scenario = next(each for each in da_motion.scenario if each["collision"])
-    for agent in ("other_vehicle", "infrastructure"):
+    for agent in AGENTS:
         token = f"{scenario['token']}/{agent}/{scenario['num_frames'] - 10:03d}"
         label = da_motion.motion_labels(token).to_present("bilinear")
-        evaluator.update(token, as_maps(label), label, accident_context(da_motion, token, horizon=2.0))
+        ids = dict(label.id_map)
+        own = da_motion.get("agent", f"{scenario['token']}/{agent}")["actor_id"]
+        pair = [ids.get(OWN_BOX_ID if actor == own else actor) for actor in scenario["collision"]["ids"]]
+        if None not in pair:
+            of_pair = replace(label, instance=np.where(np.isin(label.instance, pair), label.instance, 0))
+            evaluator.update(token, as_maps(of_pair), label, accident_context(da_motion, token, horizon=2.0))
     made = evaluator.compute()
+    assert len(evaluator.counts) > 1
     json.dumps([made.as_dict(), evaluator.settings, dict(evaluator.counts)])
     assert made.recall == 1
     assert made.id_error == 0

@@ -36,8 +36,17 @@ def still(label: MotionLabels) -> MotionOutput:
     return instances_of(label.instance[:1].repeat(5, axis=0), label.config.grid)
 
 
-def as_heads(label: MotionLabels) -> MotionOutput:
-    return MotionOutput(grid=label.config.grid, heads=(MotionHeads.from_labels(label),))
+def aside(label: MotionLabels) -> MotionOutput:
+    """Everybody 3 m to the side."""
+    return instances_of(np.roll(label.instance, 6, axis=-1), label.config.grid)
+
+
+def crowded(label: MotionLabels) -> MotionOutput:
+    """Heads with 25 peaks that are higher than those of the label's instances."""
+    heads = MotionHeads.from_labels(label)
+    centerness = heads.centerness / 2
+    centerness[..., 5:55:10, 5:55:10] = 1.0
+    return MotionOutput(grid=label.config.grid, heads=(replace(heads, centerness=centerness),))
 
 
 def motion(dataset: DeepAccident, tokens: list[str], predict: Callable[[MotionLabels], MotionOutput]) -> MemoryResults:
@@ -65,7 +74,7 @@ def value(explanation: Explanation, choice: str, headline: str) -> float | None:
 def test_protocols_and_choices_are_those_of_evaluations_of_their_own(
     da_motion: DeepAccident, tokens: list[str]
 ) -> None:
-    results, setup = motion(da_motion, tokens, still), EvaluationSetup(task="motion")
+    results, setup = motion(da_motion, tokens, aside), EvaluationSetup(task="motion")
     found = explain(da_motion, results, setup, tokens)
     assert found.samples == 2
     for name, values in found.protocols.items():
@@ -99,11 +108,11 @@ def test_of_heads_what_reads_them_is_a_choice_and_of_maps_it_changes_nothing(
     da_motion: DeepAccident, tokens: list[str]
 ) -> None:
     changed = {}
-    for predict in (still, as_heads):
+    for predict in (still, crowded):
         results = motion(da_motion, tokens[:1], predict)
         found = explain(da_motion, results, EvaluationSetup(task="motion"), tokens[:1])
         changed[predict] = {each.choice for each in found.numbers if each.changed}
-    assert "instances.max_centers=20" in changed[as_heads] - changed[still]
+    assert "instances.max_centers=20" in changed[crowded] - changed[still]
 
 
 def test_explicit_accidents_are_not_for_every_protocol(da_motion: DeepAccident, tokens: list[str]) -> None:

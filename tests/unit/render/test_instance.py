@@ -122,11 +122,11 @@ def test_views_are_of_cameras_that_see_it_at_moments_in_order(da: DeepAccident, 
 
 
 def test_agents_and_layers_can_be_chosen(da: DeepAccident, other: str) -> None:
-    _, panels = drawn(da, other, agents=["infrastructure"], layers=["trajectories"])
-    assert [one.get_text() for one in panels["seen"].get_yticklabels()] == ["infrastructure"]
+    _, panels = drawn(da, other, agents=["other_vehicle_behind"], layers=["trajectories"])
+    assert [one.get_text() for one in panels["seen"].get_yticklabels()] == ["other behind"]
     assert not panels["path"].images
     assert not any(type(one) is PolyCollection for one in panels["path"].collections)
-    assert all("infrastructure" in panels[name].get_title() for name in ("first", "fourth"))
+    assert all("other behind" in panels[name].get_title() for name in ("first", "fourth"))
     with pytest.raises(ChoiceError, match=r"layers: expected any of .*, found 'ids'"):
         render_instance(da, other, layers=["ids"])
 

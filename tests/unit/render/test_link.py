@@ -40,7 +40,7 @@ def test_arrows_are_as_long_as_the_poses_are_off(da_motion: DeepAccident) -> Non
     true = da_motion.cooperative_boxes(sample, agents=["other_vehicle"], frame="ego")
     for place in found.XY:
         assert np.linalg.norm(true.center[:, :2] - place, axis=1).min() < 1e-9
-    assert_allclose(np.hypot(found.U, found.V), 0.5, atol=1e-5)  # the agents stand a little tilted
+    assert_allclose(np.hypot(found.U, found.V), 0.5, atol=2.5e-3)  # the agents may stand on a slope, 10 % at most
     assert legend(figure)[-1].endswith("off by 0.50 m, at most 0.50 m")
     assert to_hex(found.get_facecolor()[0]) == AGENT_COLORS["other_vehicle"]
 

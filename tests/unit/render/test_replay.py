@@ -129,9 +129,12 @@ def test_the_countdown_ends_at_the_impact(da: DeepAccident, data: dict[str, Any]
     origin = recording_of(da, scenario, None).origin
     assert_allclose(np.array(data["impact"]) / 100 + origin, contact.point[:2], atol=0.00501)
     facts = dict(data["facts"])
-    first, second = da.get("scenario", scenario)["collision"]["ids"]
-    assert facts["Ends"] == f"car {first} (ego) and car {second} (other) collide"
-    assert facts["Speeds"].startswith(f"car {first} {contact.speeds[0]:.1f} m/s")
+    collision = da.get("scenario", scenario)["collision"]
+    first, second = collision["ids"]
+    first_role, second_role = (agent.removesuffix("_vehicle") for agent in collision["agents"])
+    kind, other_kind = collision["classes"]
+    assert facts["Ends"] == f"{kind} {first} ({first_role}) and {other_kind} {second} ({second_role}) collide"
+    assert facts["Speeds"].startswith(f"{kind} {first} {contact.speeds[0]:.1f} m/s")
     assert facts["Weather"].startswith(da.get("scenario", scenario)["weather"])
 
 
@@ -382,10 +385,10 @@ def test_each_sample_has_its_verdict(
     assert missed["text"] == "ego at frame 30: an accident comes in 0.5 s"
     assert (len(many["alarms"]), many["more"]) == (3, 1)
     assert "names nobody known" in many["alarms"][0]["text"]
-    # the true places are those of the pair at the end, in the page's own ground
+    # the true places are those of the pair at the end, in the page's own ground: centimetres; a slope takes a few
     pair = [actor["states"][-1][:2] for actor in data["actors"] if actor["role"] == "pair"]
-    assert_allclose(sorted(right["truth"]), sorted(pair), atol=2)
-    assert_allclose(sorted(right["alarms"][0]["places"]), sorted(pair), atol=2)
+    assert_allclose(sorted(right["truth"]), sorted(pair), atol=8)
+    assert_allclose(sorted(right["alarms"][0]["places"]), sorted(pair), atol=8)
     assert right["truth"] == right["alarms"][0]["places"]
 
 
@@ -419,7 +422,9 @@ def test_motion_is_read_for_accidents(da_motion: DeepAccident, tmp_path: Path) -
     """The pair as the labels draw it, and nobody else, as prediction: the true accident is foreseen."""
     config = MotionLabelConfig()
     ego = f"{accident(da_motion)}/ego_vehicle"
-    other = da_motion.get("scenario", accident(da_motion))["collision"]["ids"][1]
+    (other,) = set(da_motion.get("scenario", accident(da_motion))["collision"]["ids"]) - {
+        da_motion.get("agent", ego)["actor_id"]
+    }
     given = {}
     with ResultsWriter(tmp_path / "motion", "motion", grid=config.grid) as writer:
         for frame in (20, 30):

@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import pytest
 
 from deepaccident_devkit.errors import ConfigError
@@ -15,6 +17,9 @@ from deepaccident_devkit.synth import SynthConfig
         ("image_size", (16, 8), "height: 8"),
         ("image_size", (16,), r"expected \(width, height\)"),
         ("layout", "C", "layout: expected one of A, B, found 'C'"),
+        ("view", "close", "view: expected one of open, hidden, found 'close'"),
+        ("designs", (1, 13), "designs: 13 is not possible; choose a number from 1 to 12"),
+        ("unplanned", 1.5, "unplanned: 1.5 is no share; choose a number from 0 to 1"),
     ],
 )
 def test_what_cannot_be_made_is_refused(field, value, sentence):
@@ -25,3 +30,15 @@ def test_what_cannot_be_made_is_refused(field, value, sentence):
 def test_smallest_and_largest_are_accepted():
     SynthConfig(scenarios=1, frames=1, image_size=(16, 9))
     SynthConfig(frames=999)
+    SynthConfig(frames=None)
+
+
+def test_a_scenario_file_and_designs_exclude_each_other():
+    with pytest.raises(ConfigError, match="spec, designs: a release is made of a scenario file or of designs; choose"):
+        SynthConfig(spec=Path("own.yaml"), designs=(1,))
+
+
+def test_the_round_of_designs():
+    assert sorted(SynthConfig().design_round) == list(range(1, 13))
+    assert SynthConfig(designs=(5, 5, 2)).design_round == (5, 5, 2)
+    assert SynthConfig(view="hidden").design_round == (1, 7)

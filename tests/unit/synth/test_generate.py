@@ -1,10 +1,17 @@
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.release import find_release, read_label, read_meta, read_split_file
-from deepaccident_devkit.synth import SynthConfig, make_release
-from deepaccident_devkit.synth.scenario import build_scenario, plan_scenarios
+from deepaccident_devkit.synth import SynthConfig, generate, make_release
+from deepaccident_devkit.synth.plan import plan_scenarios
+from deepaccident_devkit.synth.recording import RecordingJob, _Recorder, parts_of, record_scenario
+from deepaccident_devkit.synth.scenario import build_scenario
+from deepaccident_devkit.synth.unfinished import Unfinished, unfinished_release
 from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, MINI_SPLITS, SPLITS
 
 TINY = {"scenarios": 2, "frames": 2, "image_size": (32, 18)}
@@ -27,23 +34,12 @@ def test_accident_and_twin_share_name_and_scene(scenarios):
     assert scenarios[0].name == scenarios[1].name
     accident, normal = (read_meta(s.meta_path) for s in scenarios)
     assert normal.collision is None
-    assert accident.collision.ids == (accident.agent_ids[0], accident.agent_ids[2])
-    assert accident.collision.agents == ("ego_vehicle", "other_vehicle")
+    assert set(accident.collision.ids) == {accident.agent_ids[0], accident.agent_ids[2]}
+    assert set(accident.collision.agents) == {"ego_vehicle", "other_vehicle"}
     assert accident.agent_ids == normal.agent_ids
     assert (accident.weather, accident.spawn_side) == (normal.weather, normal.spawn_side)
     assert accident.simulated_frames == 13
     assert accident.road_type == "four-way junction"
-
-
-def test_splits_go_by_pairs():
-    plans = plan_scenarios(SynthConfig(scenarios=400))
-    assert [plan.split for plan in plans[:6]] == ["train", "train", "val", "val", "test", "test"]
-    assert all(a.split == b.split and a.name == b.name for a, b in zip(plans[::2], plans[1::2], strict=True))
-    share = {split: sum(plan.split == split for plan in plans) / len(plans) for split in SPLITS}
-    assert share == pytest.approx({"train": 0.7, "val": 0.15, "test": 0.15}, abs=0.02)
-    assert len({plan.token for plan in plans}) == 400
-    assert {plan.subtype for plan in plans[::4]} == {1}
-    assert {plan.subtype for plan in plans[2::4]} == {2}
 
 
 def test_layout_b_has_a_folder_a_split(tmp_path):
@@ -60,10 +56,168 @@ def test_layout_b_has_a_folder_a_split(tmp_path):
 
 
 def test_same_seed_same_bytes_with_any_number_of_workers(tmp_path, digests):
-    config = SynthConfig(**TINY, seed=7)
-    one = digests(make_release(tmp_path / "one", config, workers=1))
-    two = digests(make_release(tmp_path / "two", config, workers=2))
-    assert one == two
+    """Two and three processes share one scenario."""
+    config = SynthConfig(scenarios=1, frames=4, image_size=(32, 18), seed=7)
+    one, two, three = (digests(make_release(tmp_path / str(count), config, workers=count)) for count in (1, 2, 3))
+    assert one == two == three
+
+
+def test_parts_of_any_number_make_the_same_scenario(tmp_path, digests):
+    config = SynthConfig(scenarios=1, frames=5, image_size=(32, 18), seed=7)
+    plan = plan_scenarios(config)[0]
+    for name, step in (("whole", 1), ("parts", 3)):
+        for first in range(1, step + 1):
+            record_scenario(RecordingJob(tmp_path / name, config, plan, first, step))
+    assert digests(tmp_path / "parts") == digests(tmp_path / "whole")
+
+
+def test_one_scenario_gives_work_to_several_processes():
+    assert parts_of(SynthConfig(frames=None)) == parts_of(SynthConfig(frames=60)) >= 4
+    assert parts_of(SynthConfig(frames=2)) == 2
+    assert parts_of(SynthConfig(frames=60, sensors=False)) == 1
+
+
+@pytest.fixture
+def break_off(monkeypatch):
+    """Makes a release until the disk is full, at the second frame of the second scenario."""
+
+    def make(out: Path, config: SynthConfig) -> None:
+        recorded = []
+        record = _Recorder.record
+
+        def record_until_full(recorder, frame):
+            recorded.append(frame)
+            if len(recorded) == config.frames + 2:
+                raise OSError("disk full")
+            record(recorder, frame)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(_Recorder, "record", record_until_full)
+            with pytest.raises(OSError, match="disk full"):
+                make_release(out, config, workers=1)
+
+    return make
+
+
+def test_a_broken_off_release_is_gone_on_with(tmp_path, break_off, digests, monkeypatch):
+    """The parts that are whole are not made again, and no byte tells."""
+    config = SynthConfig(scenarios=2, frames=3, image_size=(32, 18), seed=7)
+    whole = digests(make_release(tmp_path / "whole", config, workers=1))
+    out, recorded = tmp_path / "broken", []
+    break_off(out, config)
+    assert not out.exists()
+    unfinished = Unfinished(tmp_path / ".broken.unfinished")
+    (part,) = (tmp_path / ".broken.unfinished" / "parts").iterdir()
+    (half_made := part.with_name(part.name.replace("1of3", "2of3"))).mkdir()
+    (half_made / "half.tmp").write_text("left by the break")
+    assert [path.name for path in unfinished.release.iterdir()] == ["type1_subtype1_accident"]
+
+    def record(job):
+        recorded.append((job.plan.token, job.first))
+        return record_scenario(job)
+
+    monkeypatch.setattr(generate, "record_scenario", record)
+    assert make_release(out, config, workers=1) == out
+    assert recorded == [(plan_scenarios(config)[1].token, first) for first in (2, 3)]
+    assert digests(out) == whole
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["broken", "whole"]
+
+
+@pytest.fixture
+def unwritable(tmp_path):
+    """A folder where a scenario's frames from the third on cannot be written: a file lies where a folder must be."""
+    config = SynthConfig(scenarios=1, frames=4, image_size=(32, 18), seed=7)
+    unfinished = Unfinished(tmp_path / ".out.unfinished")
+    name = next(iter(generate._jobs(unfinished, config, plan_scenarios(config)[0])))
+    return tmp_path / "out", config, unfinished.part(name.replace("1of", "3of"))
+
+
+def test_a_worker_that_fails_leaves_no_half_written_scenario(unwritable, digests, monkeypatch, tmp_path):
+    """In another process; once the fault is gone, the release is finished, and no byte tells."""
+    out, config, place = unwritable
+    place.parent.mkdir(parents=True)
+    place.write_text("in the way")
+    with monkeypatch.context() as patch:
+        patch.setattr(Unfinished, "clear", lambda *_: None)
+        with pytest.raises(OSError, match=place.name):
+            make_release(out, config, workers=2)
+    assert not out.exists()
+    unfinished = Unfinished(place.parents[1])
+    assert not any(unfinished.release.rglob("*"))
+    place.unlink()
+    make_release(out, config, workers=2)
+    assert digests(out) == digests(make_release(tmp_path / "whole", config, workers=1))
+    assert not unfinished.folder.exists()
+
+
+def test_a_scenario_that_could_not_be_moved_in_is_not_made_again(tmp_path, digests, monkeypatch):
+    config = SynthConfig(scenarios=1, frames=1, sensors=False)
+    with monkeypatch.context() as patch:
+        patch.setattr(Unfinished, "gather", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            make_release(tmp_path / "out", config, workers=1)
+    with monkeypatch.context() as patch:
+        patch.setattr(generate, "record_scenario", lambda _: pytest.fail("made again"))
+        make_release(tmp_path / "out", config, workers=1)
+    assert digests(tmp_path / "out") == digests(make_release(tmp_path / "whole", config, workers=1))
+
+
+def test_gathering_goes_on_after_a_break(tmp_path):
+    """Some files are moved already; what is there is neither lost nor doubled."""
+    unfinished = Unfinished(tmp_path)
+    for part, name in (("one", "a/x"), ("one", "a/y"), ("two", "a/z"), ("two", "b/x")):
+        path = unfinished.part(part) / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(part)
+    (unfinished.release / "a").mkdir(parents=True)
+    (unfinished.part("one") / "a" / "x").rename(unfinished.release / "a" / "x")
+    for _ in range(2):
+        unfinished.gather(["one", "two"])
+        files = {p.relative_to(tmp_path / "release").as_posix() for p in unfinished.release.rglob("?") if p.is_file()}
+        assert files == {"a/x", "a/y", "a/z", "b/x"}
+    assert not any((tmp_path / "parts").iterdir())
+
+
+def test_another_configuration_does_not_go_on_with_it(tmp_path, break_off):
+    out, config = tmp_path / "out", SynthConfig(scenarios=2, frames=2, sensors=False)
+    break_off(out, config)
+    with pytest.raises(
+        ConfigError, match=r"another configuration \(seed: 0 there, 1 asked for\); ask for the same to finish it"
+    ):
+        make_release(out, replace(config, seed=1), workers=1)
+    assert not out.exists()
+
+
+def test_two_processes_do_not_make_the_same_release(tmp_path):
+    out, config = tmp_path / "out", SynthConfig(scenarios=1, frames=1, sensors=False)
+    with (
+        pytest.raises(ConfigError, match="another process is making it; wait for that one"),
+        unfinished_release(out, config),
+    ):
+        make_release(out, config, workers=1)
+    assert not out.exists()
+
+
+def test_a_line_that_a_break_cut_off_is_no_scenario(tmp_path):
+    unfinished = Unfinished(tmp_path)
+    assert unfinished.made() == frozenset()
+    unfinished.note("a/b")
+    with (tmp_path / "made.txt").open("a") as file:
+        file.write("a/c")
+    assert unfinished.made() == {"a/b"}
+
+
+def test_an_unlabelled_test_split_has_calib_images_and_points_alone(tmp_path):
+    """As the real one has; the other splits lack nothing."""
+    config = SynthConfig(scenarios=5, frames=1, image_size=(32, 18), layout="B", unlabelled_test=True)
+    root = make_release(tmp_path / "out", config, workers=1)
+    test = {path.parent.parent.name for path in (root / "test").rglob("*_001.*")}
+    assert test == {"calib", *CHANNELS} - {"BEV_instance_camera"}
+    assert not list((root / "test").rglob("meta"))
+    train = {path.parent.parent.name for path in (root / "train").rglob("*_001.*")}
+    assert train == {"calib", "label", *CHANNELS}
+    assert len(list((root / "train").rglob("meta/*.txt"))) == 2
+    assert len(DeepAccident("v1", root, verbose=False).split_scenarios("test")) == 1
 
 
 def test_another_seed_another_release(tmp_path, digests):

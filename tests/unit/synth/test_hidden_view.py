@@ -8,33 +8,30 @@ from click.testing import CliRunner
 
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.release import find_release, read_label
+from deepaccident_devkit.release import find_release, read_label, read_meta
 from deepaccident_devkit.synth import SynthConfig, make_release
-from deepaccident_devkit.synth.collision import gap, separation
-from deepaccident_devkit.synth.design import footprint, random_encounter
-from deepaccident_devkit.synth.scenario import build_scenario, plan_scenarios
+from deepaccident_devkit.synth.plan import plan_scenarios
+from deepaccident_devkit.synth.scenario import build_scenario
 from deepaccident_devkit.tables import visible_mask
 from deepaccident_devkit.taxonomy import INFRASTRUCTURE, VEHICLE_AGENTS
 
 EGO, EGO_BEHIND, OTHER, OTHER_BEHIND = VEHICLE_AGENTS
 HIDDEN = {
-    seed: SynthConfig(scenarios=2, frames=22, sensors=False, view="hidden", seed=seed) for seed in (0, 1)
-}  # from the left, from the right
-
-OPEN = [0.7337302350601433, -1.75, 0.0, -6.2, 6.2, 3.4905539257764655, -220.52161977844213]
-"""Of seed 3: the ego at the impact, the pole, and all actors' poses at 1 s summed up."""
-OPEN_COUNTS = 55, 106
+    side: SynthConfig(scenarios=2, frames=22, sensors=False, view="hidden", seed=seed)
+    for side, seed in (("left", 7), ("right", 0))
+}
+"""By where other comes from."""
 
 
 def build(config, number=0):
     return build_scenario(config, plan_scenarios(config)[number])
 
 
-@pytest.fixture(scope="module", params=HIDDEN, ids=["left", "right"])
+@pytest.fixture(scope="module", params=HIDDEN)
 def folder(request, tmp_path_factory):
     """The files of an accident, whose other comes from that side."""
     config = replace(HIDDEN[request.param], scenarios=1)
-    assert build(config).meta.spawn_side == ["left", "right"][request.param]
+    assert build(config).meta.spawn_side == request.param
     root = make_release(tmp_path_factory.mktemp("hidden") / "release", config, workers=1)
     return next(each for each in find_release(root).scenarios if each.scenario_type.endswith("accident"))
 
@@ -52,7 +49,7 @@ def sees(folder, agent, actor, frame):
 
 
 def test_ego_and_other_see_each_other_late_and_the_pole_sees_the_other(folder):
-    scenario = build(HIDDEN[0] if "left" in folder.meta_path.read_text() else HIDDEN[1])
+    scenario = build(HIDDEN[read_meta(folder.meta_path).spawn_side])
     ego, other = scenario.agents[EGO], scenario.agents[OTHER]
     frames = range(2, 18)  # 2 s to 0.5 s before the last, the 22nd
     ego_sees = [sees(folder, EGO, other, frame) for frame in frames]
@@ -64,39 +61,17 @@ def test_ego_and_other_see_each_other_late_and_the_pole_sees_the_other(folder):
     assert all(sees(folder, EGO_BEHIND, ego, frame) for frame in frames)
 
 
-def test_faster_cars_still_collide_at_the_last_frame_and_nobody_before():
-    for seed in range(30):
-        encounter = random_encounter(np.random.default_rng(seed), 3.9, (12.0, 14.0))
-        poses = {agent: motion.poses([encounter.end_time]) for agent, motion in encounter.accident.items()}
-        sizes = {agent: footprint(body) for agent, body in encounter.bodies.items()}
-        touching = separation(poses[EGO], sizes[EGO], poses[OTHER], sizes[OTHER])[0]
-        assert 0 <= touching < 1e-6
-        times = np.arange(-15, encounter.end_time - 1e-3, 0.05)
-        paths = {agent: motion.poses(times) for agent, motion in encounter.accident.items()}
-        assert gap(paths[EGO], sizes[EGO], paths[OTHER], sizes[OTHER]).min() > 0
-        assert gap(paths[EGO], sizes[EGO], paths[OTHER_BEHIND], sizes[OTHER_BEHIND]).min() > 0.5
-        assert gap(paths[EGO_BEHIND], sizes[EGO_BEHIND], paths[OTHER], sizes[OTHER]).min() > 0.5
-
-
-@pytest.mark.parametrize("seed", HIDDEN)
+@pytest.mark.parametrize("side", HIDDEN)
 @pytest.mark.parametrize("number", [0, 1])
-def test_nobody_walks_or_parks_in_the_house(seed, number):
+def test_nobody_walks_or_parks_in_the_house(side, number):
     """The house takes the sidewalk of its corner; its quadrant lies between ego and other."""
-    config = HIDDEN[seed]
+    config = HIDDEN[side]
     scenario = build(config, number)
     sign = 1 if scenario.meta.spawn_side == "left" else -1
     for time in np.linspace(0, 2.1, 22):
         x, y = scenario.actors.at(time).poses[:, :2].T
-        assert not ((x < -6.5) & (x > -27) & (sign * y > 6.5) & (sign * y < 27)).any()
-
-
-def test_the_wide_view_is_what_it_always_was():
-    """Numbers of the generator before it knew a hidden view (commit b11aae7); all releases of the tests have them."""
-    scenario = build(SynthConfig(scenarios=2, frames=40, seed=3))
-    ego = scenario.actors.all[scenario.actors.row_of(scenario.agents[EGO])]
-    numbers = [*ego.motion.poses([3.9])[0], *scenario.world.lidar_pole.translation, scenario.actors.at(1.0).poses.sum()]
-    np.testing.assert_allclose(numbers, OPEN, rtol=1e-9)
-    assert (len(scenario.actors), len(scenario.world.props)) == OPEN_COUNTS
+        edge = scenario.spec.road.road_edge + 0.5
+        assert not ((x < -edge) & (x > -27) & (sign * y > edge) & (sign * y < 27)).any()
 
 
 def test_all_else_of_the_town_stays_the_same():

@@ -12,15 +12,19 @@ import pytest
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.synth import SynthConfig
-from deepaccident_devkit.synth.agents import Agent, Camera, make_agents
-from deepaccident_devkit.synth.camera import _pixel_slopes, _ray_directions
+from deepaccident_devkit.synth.plan import plan_scenarios
 from deepaccident_devkit.synth.recording import RecordingJob, record_scenario
-from deepaccident_devkit.synth.scenario import Scenario, build_scenario, plan_scenarios
-from deepaccident_devkit.synth.scene import Scene, make_scene
+from deepaccident_devkit.synth.scenario import Scenario, build_scenario
+from deepaccident_devkit.synth.sensors.agents import Agent, Camera, make_agents
+from deepaccident_devkit.synth.sensors.images.buffers import ray_directions, slopes
+from deepaccident_devkit.synth.sensors.scene import Scene, make_scene
+from deepaccident_devkit.synth.sensors.setting import Setting
 from deepaccident_devkit.taxonomy import frame_timestamp
 
 CONFIG = SynthConfig(scenarios=1, frames=2, image_size=(320, 180), seed=11)
 FRAME = 2
+LARGE = 30
+"""Pixels."""
 
 
 @pytest.fixture(scope="module")
@@ -33,19 +37,26 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[DeepAccident, Sc
 
 def painted(scene: Scene, camera: Camera, ground_from_camera: SE3) -> np.ndarray:
     """The actor id of each pixel (H, W), or −1."""
-    directions = _ray_directions(ground_from_camera, *_pixel_slopes(camera))
-    _, face = scene.caster.cast(ground_from_camera.translation, directions.reshape(-1, 3))
-    owner = scene.owner_of(face)
+    right, down = slopes(camera, np.arange(camera.optics.width), np.arange(camera.optics.height))
+    directions = ray_directions(ground_from_camera, right[None, :], down[:, None])
+    _, face = scene.cast(ground_from_camera.translation, directions.reshape(-1, 3))
+    owner = scene.face_owner[face]
     ids = np.where(owner >= 0, scene.actors.actor_id[np.maximum(owner, 0)], -1)
     return ids.reshape(directions.shape[:2])
 
 
 def unoccluded(scene: Scene, ground_from_camera: SE3) -> set[int]:
     """The actors (true poses) towards whose middle the first surface is their own."""
-    middle = np.column_stack([scene.snapshot.poses[:, :2], scene.actors.size[:, 2] / 2])
+    middle = scene.frames[:, :3, 3] + scene.frames[:, :3, 2] * scene.actors.size[:, 2:] / 2
     rays = (middle - ground_from_camera.translation).astype(np.float32)
-    _, face = scene.caster.cast(ground_from_camera.translation, rays)
-    return set(scene.actors.actor_id[scene.owner_of(face) == np.arange(len(scene.actors))].tolist())
+    _, face = scene.cast(ground_from_camera.translation, rays)
+    return set(scene.actors.actor_id[scene.face_owner[face] == np.arange(len(scene.actors))].tolist())
+
+
+def drawn_large(picture: np.ndarray) -> set[int]:
+    """The actors of many pixels: the ray through a pixel of a small one may pass between a pedestrian's legs."""
+    actors, counts = np.unique(picture, return_counts=True)
+    return set(actors[counts >= LARGE].tolist())
 
 
 def hits_and_tries(da: DeepAccident, scene: Scene, agent: Agent, labeller: str) -> tuple[int, int]:
@@ -54,11 +65,10 @@ def hits_and_tries(da: DeepAccident, scene: Scene, agent: Agent, labeller: str) 
     source, sample = (f"{scenario}/{name}/{FRAME:03d}" for name in (labeller, agent.name))
     boxes, ids = da.boxes(source, "lidar"), da.actor_ids(source)
     for camera in agent.cameras:
-        ground_from_camera = agent.ground_from_ego(scene.snapshot) @ agent.ego_from_lidar
-        ground_from_camera = ground_from_camera @ camera.camera_from_lidar.inverse()
+        ground_from_camera = agent.ground_from_lidar(scene) @ camera.camera_from_lidar.inverse()
         picture, free = painted(scene, camera, ground_from_camera), unoccluded(scene, ground_from_camera)
         shown = da.project_to_image(boxes.center, source, f"{sample}/{camera.channel}", frame="lidar", colors=False)
-        wanted = shown.mask & np.isin(ids, list(free))
+        wanted = shown.mask & np.isin(ids, list(free & drawn_large(picture)))
         u, v = shown.pixels[wanted].astype(int).T
         hits += int((picture[v, u] == ids[wanted]).sum())
         tries += int(wanted.sum())
@@ -68,8 +78,8 @@ def hits_and_tries(da: DeepAccident, scene: Scene, agent: Agent, labeller: str) 
 @pytest.mark.parametrize("labeller", ["ego_vehicle", "other_vehicle_behind", "infrastructure"])
 def test_box_centres_fall_on_their_actors_pixels(recorded: tuple[DeepAccident, Scenario], labeller: str) -> None:
     da, scenario = recorded
-    scene = make_scene(scenario.world, scenario.actors, frame_timestamp(FRAME))
-    agents = make_agents(scenario, CONFIG.image_size)
+    scene = make_scene(Setting(scenario.world, scenario.actors), frame_timestamp(FRAME))
+    agents = make_agents(scenario.world, scenario.actors, scenario.agents, CONFIG.image_size)
     hits, tries = np.sum([hits_and_tries(da, scene, agent, labeller) for agent in agents], axis=0)
-    assert tries > 80
-    assert hits >= 0.99 * tries
+    assert tries > 50
+    assert hits == tries

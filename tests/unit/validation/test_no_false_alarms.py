@@ -63,6 +63,16 @@ def test_labels_of_a_small_radius(release: Path) -> None:
     assert told(release) == set()
 
 
+def test_hidden_actors_in_one_agents_labels_tell_of_those_missing_in_anothers(release: Path) -> None:
+    """All labels of a scenario are written by one rule."""
+    for path in labels(release):
+        first, rows = rows_of(path)
+        if "infrastructure" not in path.parts:
+            write(path, first, [row for row in rows if int(row[11]) or row[12] == "True" or row[10] == "-100"])
+    assert told(release) <= {"actor-missing", "track-gap"}
+    assert "actor-missing" in told(release)
+
+
 def test_tracking_that_comes_and_goes(release: Path) -> None:
     for number, path in enumerate(labels(release)):
         first, rows = rows_of(path)

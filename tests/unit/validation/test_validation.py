@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import tiny
 from click.testing import CliRunner
+from PIL import Image
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
@@ -187,6 +188,32 @@ def test_images_out_of_sequence() -> None:
         foreign = {**smooth, frame: rng.uniform(0, 255, (18, 32, 3))}
         assert out_of_sequence(foreign) == [frame]
     assert out_of_sequence({1: smooth[1], 2: foreign[8]}) == []  # two pictures have no sequence
+
+
+@pytest.mark.parametrize(("place", "is_told"), [(0, True), (-1, False)])
+def test_at_the_impact_another_car_may_fill_the_view(
+    da: DeepAccident, tmp_path: Path, place: int, *, is_told: bool
+) -> None:
+    of_type, name, agent = colliding_agent(da)
+    for folder in (*(f"{agent}/{kind}/{name}" for kind in ("calib", "label", "Camera_Front")), "meta"):
+        shutil.copytree(da.dataroot / of_type / folder, tmp_path / of_type / folder)
+    images = sorted(tmp_path.glob("*/*/Camera_Front/*/*.jpg"))
+    usual = images[0].read_bytes()
+    for path in images:
+        path.write_bytes(usual)
+    other = np.random.default_rng(0).integers(0, 256, (36, 64, 3), dtype=np.uint8)
+    Image.fromarray(other).save(images[place], quality=90)
+    report = validate_release(tmp_path, deep=True, scenarios=[f"{of_type}/{name}"])
+    assert ("image-out-of-sequence" in codes(report)) is is_told
+
+
+def colliding_agent(da: DeepAccident) -> tuple[str, str, str]:
+    """Type and name of a scenario, and a vehicle agent that collides there."""
+    for scenario in da.scenario:
+        for agent in (scenario["collision"] or {}).get("agents") or ():
+            if agent is not None:
+                return *scenario["token"].split("/"), agent
+    pytest.fail("no agent collides in this release")
 
 
 def test_json_has_everything_and_exit_status_tells(own_release: Path) -> None:

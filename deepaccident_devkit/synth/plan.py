@@ -1,0 +1,211 @@
+"""Which scenarios a release has: accidents of each design and their normal twins, their names and their splits."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final, cast
+
+import numpy as np
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.splits import Splits, split_records
+from deepaccident_devkit.synth.config import SynthConfig
+from deepaccident_devkit.synth.spec import DESIGNS, ScenarioSpec, SpecTemplate, View, draw, read_spec
+from deepaccident_devkit.tables.records import ScenarioRecord
+from deepaccident_devkit.taxonomy import ROAD_TYPES, SPLITS, TOWNS
+
+OFFICIAL_FROM_PAIRS: Final = 12
+"""Pairs from which the official procedure splits a release; of fewer it would leave val and test empty."""
+_GOLDEN_RATIO: Final = 0.6180339887498949
+"""Its multiples fill [0, 1) evenly, whatever their number."""
+_PLAN_STREAM: Final = 1
+"""Sets the plan's random numbers apart from those of the pair's scene."""
+_HIDDEN_SPEEDS: Final = (12.0, 14.0)
+"""m/s: with a house on the kerb between them, slower cars would see each other earlier."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScenarioPlan:
+    """One scenario to make.
+
+    Attributes:
+        pair: number of its pair, from 0; an accident and its normal twin share scene, name and split.
+        accident: whether it is the accident.
+        unplanned: whether the pair's accident is another one than the designed.
+        name: such as `Town03_type001_subtype0001_scenario00024`.
+        split: `train`, `val` or `test`.
+        traits: of all its draws.
+        template: of which its scene is a draw.
+        view: as the release asks for it; None for what the template says.
+    """
+
+    pair: int
+    accident: bool
+    unplanned: bool
+    name: str
+    split: str
+    traits: "Traits"
+    template: SpecTemplate
+    view: View | None
+
+    @property
+    def design(self) -> int | None:
+        """Which of the paper's twelve it is, if it is one."""
+        return self.template.design
+
+    @property
+    def subtype(self) -> int:
+        """1, signalised, or 2."""
+        return self.traits.subtype
+
+    @property
+    def scenario_type(self) -> str:
+        """Such as `type1_subtype1_accident`."""
+        return f"type1_subtype{self.subtype}_{'accident' if self.accident else 'normal'}"
+
+    @property
+    def token(self) -> str:
+        """The scenario's token."""
+        return f"{self.scenario_type}/{self.name}"
+
+    def draw(self, rng: np.random.Generator) -> ScenarioSpec:
+        """A draw of its template that has the plan's traits; the same numbers give the same one."""
+        spec = draw(self.template, rng)
+        while Traits.of(spec) != self.traits:
+            spec = draw(self.template, rng)
+        return spec if self.view is None else _seen(spec, self.view, rng)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Traits:
+    """What of a scenario decides its folder and its split.
+
+    Attributes:
+        signalized: whether its junction has traffic lights.
+        road_type: as meta names it.
+        spawn_side: where other comes from, as meta names it.
+    """
+
+    signalized: bool
+    road_type: str
+    spawn_side: str
+
+    @classmethod
+    def of(cls, spec: ScenarioSpec) -> "Traits":
+        """Those of a draw."""
+        four_way, three_way = ROAD_TYPES
+        return cls(
+            signalized=spec.road.signalized,
+            road_type=four_way if spec.road.kind == "four-way" else three_way,
+            spawn_side=spec.spawn_side,
+        )
+
+    @property
+    def subtype(self) -> int:
+        """1, signalised, or 2."""
+        return 1 if self.signalized else 2
+
+
+def plan_scenarios(config: SynthConfig) -> list[ScenarioPlan]:
+    """The scenarios of a release: accidents and their twins by turns, going round the designs.
+
+    A scenario file of one's own in which nobody is timed to meet gives normal scenarios alone.
+
+    Raises:
+        ConfigError: the scenario file cannot be read or carried out; the view is to be hidden where none can be.
+    """
+    own = None if config.spec is None else read_spec(config.spec)
+    twins = own is None or own.meets
+    plans = []
+    for number in range(config.scenarios):
+        pair, second = divmod(number, 2) if twins else (number, 1)
+        designs = config.design_round
+        template = own or DESIGNS[designs[pair % len(designs)]]
+        plans.append(_plan(config, pair, template, accident=second == 0))
+    split_of = {
+        token: name for name, tokens in plan_splits(plans).by_name().items() if name in SPLITS for token in tokens
+    }
+    return [replace(plan, split=split_of[plan.token]) for plan in plans]
+
+
+def plan_splits(plans: Sequence[ScenarioPlan]) -> Splits:
+    """The split files of a release.
+
+    The official procedure deals the scenarios out, as `deepaccident split` does. Of fewer than `OFFICIAL_FROM_PAIRS`
+    pairs, the first goes to train, the second to val, the third to test, and of those after them about 70, 15 and
+    15 %; each mini split is the first pair of its split.
+    """
+    if len({plan.pair for plan in plans}) >= OFFICIAL_FROM_PAIRS:
+        return split_records([_record(plan) for plan in plans])
+    by_split = {split: [plan for plan in plans if _small_split(plan.pair) == split] for split in SPLITS}
+    tokens = {split: tuple(sorted(plan.token for plan in of_split)) for split, of_split in by_split.items()}
+    return Splits(
+        train=tokens["train"],
+        val=tokens["val"],
+        test=tokens["test"],
+        train_mini=_first_pair(by_split["train"]),
+        val_mini=_first_pair(by_split["val"]),
+    )
+
+
+def _plan(config: SynthConfig, pair: int, template: SpecTemplate, *, accident: bool) -> ScenarioPlan:
+    rng = np.random.default_rng([config.seed, pair, _PLAN_STREAM])
+    town = TOWNS[int(rng.integers(len(TOWNS)))]
+    unplanned = bool(rng.random() < config.unplanned) and config.spec is None and config.view != "hidden"
+    traits = Traits.of(draw(template, rng))
+    if config.view == "hidden" and traits.spawn_side not in ("left", "right"):
+        raise ConfigError(
+            f"view: hidden needs an other vehicle from ego's left or right, and in '{template.name}' it comes from "
+            f"{traits.spawn_side}; choose other designs, or the view open"
+        )
+    return ScenarioPlan(
+        pair=pair,
+        accident=accident,
+        unplanned=unplanned,
+        name=f"{town}_type001_subtype{traits.subtype:04d}_scenario{pair + 1:05d}",
+        split=SPLITS[0],
+        traits=traits,
+        template=template,
+        view=config.view,
+    )
+
+
+def _seen(spec: ScenarioSpec, view: View, rng: np.random.Generator) -> ScenarioSpec:
+    """A scenario with another view; where a house hides them, the two who meet drive faster, on a narrow road."""
+    if view == "open":
+        return replace(spec, view=view)
+    actors = tuple(
+        replace(actor, lane=0, max_speed=float(rng.uniform(*_HIDDEN_SPEEDS)))
+        if actor.role in ("ego", "other")
+        else replace(actor, lane=0)
+        for actor in spec.actors
+    )
+    return replace(spec, view=view, actors=actors, road=replace(spec.road, lanes=1))
+
+
+def _small_split(pair: int) -> str:
+    """Both of a pair go together: one pair to each split, then about 70, 15 and 15 %."""
+    if pair < len(SPLITS):
+        return SPLITS[pair]
+    share = pair * _GOLDEN_RATIO % 1
+    return "train" if share < 0.7 else "val" if share < 0.85 else "test"
+
+
+def _first_pair(plans: Sequence[ScenarioPlan]) -> tuple[str, ...]:
+    return tuple(sorted(plan.token for plan in plans if plan.pair == plans[0].pair))
+
+
+def _record(plan: ScenarioPlan) -> ScenarioRecord:
+    """What the split procedure asks of a scenario's record, as it will be."""
+    designed = plan.accident and not plan.unplanned and plan.template.meeting_roles == {"ego", "other"}
+    agents = ("ego_vehicle", "other_vehicle") if designed else (None, None)
+    record = {
+        "token": plan.token,
+        "name": plan.name,
+        "scenario_type": plan.scenario_type,
+        "designed_accident": plan.accident,
+        "weather": "",
+        "collision": {"agents": agents} if plan.accident else None,
+        "road_type": plan.traits.road_type,
+        "spawn_side": plan.traits.spawn_side,
+    }
+    return cast("ScenarioRecord", record)

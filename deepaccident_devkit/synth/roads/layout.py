@@ -1,0 +1,114 @@
+"""What a junction is like: its arms, lanes and edges, in metres from its middle."""
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.synth.roads.terrain import ARMS, Arm, Hump
+
+RoadKind = Literal["four-way", "three-way"]
+
+LANE_WIDTH = 3.5
+PARKING_WIDTH = 2.4
+SIDEWALK_WIDTH = 3.0
+CROSSWALK_WIDTH = 3.0
+MAX_LANES = 2
+_GUTTER = 0.4
+_MOUTH = 2.0
+"""Metres by which the mouth of an arm lies before the end of the rounded kerb."""
+_STOP_LINE = 0.4
+_KERB_RADII = (3.0, 10.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RoadSpec:
+    """A junction of straight roads at right angles; checked when made, raises ConfigError.
+
+    Attributes:
+        kind: a three-way junction has no north arm.
+        signalized: whether it has traffic lights.
+        lanes: in each direction, 1 or 2.
+        crosswalks: whether zebra crossings lie across the arms.
+        parking: whether there are strips to park on beside the lanes.
+        hump: a rise on one arm, or None.
+        kerb_radius: of the rounded corners, metres.
+    """
+
+    kind: RoadKind = "four-way"
+    signalized: bool = True
+    lanes: int = 1
+    crosswalks: bool = True
+    parking: bool = True
+    hump: Hump | None = None
+    kerb_radius: float = 5.0
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        if self.kind not in get_args(RoadKind):
+            raise ConfigError(f"road.kind: expected one of {', '.join(get_args(RoadKind))}, found {self.kind!r}")
+        if not 1 <= self.lanes <= MAX_LANES:
+            raise ConfigError(f"road.lanes: expected 1 or {MAX_LANES} in each direction, found {self.lanes}")
+        low, high = _KERB_RADII
+        if not low <= self.kerb_radius <= high:
+            raise ConfigError(f"road.kerb_radius: expected {low:g} to {high:g} metres, found {self.kerb_radius:g}")
+        if self.hump is not None:
+            self._check_hump(self.hump)
+
+    @property
+    def arms(self) -> tuple[Arm, ...]:
+        """The arms that the junction has, counter-clockwise from the west."""
+        return ARMS if self.kind == "four-way" else ARMS[:3]
+
+    @property
+    def yielding_arms(self) -> tuple[Arm, ...]:
+        """The arms that have a yield line: at junctions without lights those of the road from south to north."""
+        if self.signalized:
+            return ()
+        return tuple(arm for arm in self.arms if arm in ("south", "north"))
+
+    @property
+    def lanes_edge(self) -> float:
+        """Metres from an arm's middle line to the outer edge of its lanes."""
+        return self.lanes * LANE_WIDTH
+
+    @property
+    def road_edge(self) -> float:
+        """Metres from an arm's middle line to the kerb."""
+        return self.lanes_edge + (PARKING_WIDTH if self.parking else _GUTTER)
+
+    @property
+    def sidewalk_edge(self) -> float:
+        """Metres from an arm's middle line to where the sidewalk ends."""
+        return self.road_edge + SIDEWALK_WIDTH
+
+    @property
+    def mouth(self) -> float:
+        """Metres from the junction's middle along an arm to where the arm begins, and its crosswalk."""
+        return self.road_edge + self.kerb_radius - _MOUTH
+
+    @property
+    def crosswalk(self) -> tuple[float, float]:
+        """From, to: metres along an arm."""
+        return self.mouth, self.mouth + CROSSWALK_WIDTH
+
+    @property
+    def stop_line(self) -> tuple[float, float]:
+        """From, to: metres along an arm."""
+        near = self.crosswalk[1] + 0.7 if self.crosswalks else self.road_edge + self.kerb_radius + 0.4
+        return near, near + _STOP_LINE
+
+    def lane_center(self, lane: int) -> float:
+        """Metres from the middle line to where a lane is driven; lane 0 is the rightmost."""
+        return (self.lanes - lane - 0.5) * LANE_WIDTH
+
+    def _check_hump(self, hump: Hump) -> None:
+        if hump.arm not in self.arms:
+            raise ConfigError(
+                f"road.hump.arm: a {self.kind} junction has no {hump.arm} arm; choose one of {', '.join(self.arms)}"
+            )
+        least = self.stop_line[1] + hump.length / 2
+        if hump.distance < least:
+            raise ConfigError(
+                f"road.hump.distance: {hump.distance:g} m put the foot of the hump into the junction; choose "
+                f"{least:.1f} m or more, or a shorter hump"
+            )

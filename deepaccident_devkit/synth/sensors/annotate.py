@@ -1,0 +1,68 @@
+"""Labels: what an agent's label file says of a scene."""
+
+import numpy as np
+
+from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.geometry import SE3, Boxes
+from deepaccident_devkit.release import Labels
+from deepaccident_devkit.synth.sensors.agents import Agent
+from deepaccident_devkit.synth.sensors.lidar import Scan
+from deepaccident_devkit.synth.sensors.scene import Scene
+from deepaccident_devkit.synth.sensors.visibility import camera_visible
+from deepaccident_devkit.synth.shapes import BOX_CLEARANCE
+from deepaccident_devkit.taxonomy import OWN_ACTOR_ID, UNTRACKED_ID
+
+LABEL_RANGE = 70.0
+"""Actors up to here are annotated, metres over the ground from the LiDAR to the box's centre."""
+TRACKING_RANGE = 60.0
+"""Actors beyond have no id."""
+
+
+def annotate(scene: Scene, agent: Agent, ground_from_lidar: SE3, world_from_ground: SE3, scan: Scan) -> Labels:
+    """The labels of one agent at one moment, in the order of the actors' ids.
+
+    `num_lidar_pts` counts the points of `scan`, as stored, in each box, whatever they lie on.
+    """
+    center, yaw, velocity = _kinematics(scene)
+    distance = np.hypot(*(center[:, :2] - ground_from_lidar.translation[:2]).T)
+    rows = np.flatnonzero(distance <= LABEL_RANGE)
+    actor_id = np.where(distance > TRACKING_RANGE, UNTRACKED_ID, scene.actors.actor_id)
+    lidar_from_ground = ground_from_lidar.inverse()
+    lidar_center, lidar_velocity = lidar_from_ground.apply(center), lidar_from_ground.rotate(velocity)[:, :2]
+    lidar_yaw = _turned(yaw, lidar_from_ground)
+    visible = camera_visible(scene, agent, ground_from_lidar, rows)
+    agent_velocity = np.zeros((1, 2))
+    if agent.row is not None:
+        actor_id[agent.row] = OWN_ACTOR_ID
+        agent_velocity[0] = world_from_ground.rotate(velocity[agent.row : agent.row + 1])[0, :2]
+        lidar_velocity[agent.row] = agent_velocity[0]
+    size = scene.actors.size[rows]
+    boxes = Boxes.from_arrays(lidar_center[rows], size, lidar_yaw[rows], frame="lidar")
+    return Labels(
+        raw=False,
+        num_boxes=np.array([len(rows)]),
+        agent_velocity=agent_velocity,
+        category=scene.actors.category[rows],
+        center=lidar_center[rows],
+        size=size,
+        yaw=lidar_yaw[rows],
+        velocity=lidar_velocity[rows],
+        actor_id=actor_id[rows],
+        num_lidar_pts=boxes.count_points(scan.xyz),
+        camera_visible=visible,
+    )
+
+
+def _kinematics(scene: Scene) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Centres (A, 3), forward unit vectors (A, 3) and velocities (A, 3) along the ground of all boxes, ground frame."""
+    forward, up = scene.frames[:, :3, 0], scene.frames[:, :3, 2]
+    center = scene.frames[:, :3, 3] + up * (BOX_CLEARANCE + scene.actors.size[:, 2:] / 2)
+    over_ground = scene.snapshot.velocities
+    climb = -(over_ground * up[:, :2]).sum(axis=1) / up[:, 2]
+    return center, forward, np.column_stack([over_ground, climb])
+
+
+def _turned(forward: FloatArray, lidar_from_ground: SE3) -> FloatArray:
+    """Yaw (A,) of forward vectors (A, 3) in the LiDAR frame, in (−π, π]."""
+    ahead = lidar_from_ground.rotate(forward)
+    return np.asarray(np.arctan2(ahead[:, 1], ahead[:, 0]))

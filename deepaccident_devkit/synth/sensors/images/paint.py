@@ -1,0 +1,144 @@
+"""Colours of surfaces in the light of a scenario."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepaccident_devkit.arrays import BoolArray, FloatArray
+from deepaccident_devkit.synth.sensors.caster import NOTHING
+from deepaccident_devkit.synth.sensors.images.light import Light
+from deepaccident_devkit.synth.sensors.scene import Scene
+from deepaccident_devkit.synth.sensors.setting import Setting, Surfaces
+from deepaccident_devkit.synth.shapes import LAMP, TAIL
+from deepaccident_devkit.synth.solids import FACES_A_SOLID, GLASS, Color
+from deepaccident_devkit.synth.stage import LANTERN_COLOR
+
+_MIRRORED = 0.5
+"""Share of the sky's light that glass mirrors."""
+_HEADLIGHT: Color = (255, 250, 226)
+_TAILLIGHT: Color = (255, 40, 30)
+_LANTERN_LIGHT: Color = (255, 232, 190)
+_LAMPS_ON = 0.2
+"""Of `Light.lamps`, from which on vehicles have their lamps on; in hard rain they have them on by day."""
+_ABOVE = 0.05
+_ALIKE, _DARKER = 32.0, 0.65
+"""Where a wall's colour is as near as this to that of its windows, these are so much darker."""
+FACADE, SHINES = 1, 2
+"""Kinds of faces: those with windows, and those with a light of their own."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Palette:
+    """Colours of faces (F, 3) float64, RGB 0 to 255, in the light and before haze.
+
+    Attributes:
+        wall: of the faces.
+        shaded: of the faces where something takes the sun from them.
+        window: of the windows on them.
+        shining: of their own light; 0 where they have none.
+        facade: (F,) whether they carry windows.
+    """
+
+    wall: FloatArray
+    shaded: FloatArray
+    window: FloatArray
+    shining: FloatArray
+    facade: BoolArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Colors:
+    """As `Palette`, of all faces of a moment and two more, `GROUND` and `NOTHING`, packed for looking up.
+
+    Attributes:
+        wall: (F + 2,) uint32: red, green, blue and kind (`FACADE`, `SHINES` or 0), one byte each.
+        shaded: (F + 2, 3) uint8.
+        window: (F + 2, 3) uint8.
+        shining: (F + 2, 3) uint8.
+    """
+
+    wall: NDArray[np.uint32]
+    shaded: NDArray[np.uint8]
+    window: NDArray[np.uint8]
+    shining: NDArray[np.uint8]
+
+
+def still_palette(setting: Setting, light: Light) -> Palette:
+    """The colours of what stands still: things, lanterns that shine at night, and parked vehicles without lights.
+
+    Walls of houses are in the sun here, wherever they are.
+    """
+    tops = setting.still.corners.mean(axis=1)
+    tops[:, 2] = setting.still.corners[:, :, 2].max(axis=1) + _ABOVE
+    shining = {LANTERN_COLOR: _LANTERN_LIGHT} if light.lamps > _LAMPS_ON else {}
+    in_sun = setting.still.solids.facade | _in_sun(setting, tops, light)
+    return _palette(setting.still, light, in_sun, shining)
+
+
+def moving_palette(scene: Scene, light: Light) -> Palette:
+    """The colours of those who move; one in the shadow of a thing is so all over."""
+    heads = scene.frames[:, :3, 3] + (0, 0, 1.0) * (scene.actors.size[:, 2:] + _ABOVE)
+    in_sun = _in_sun(scene.setting, heads, light)[scene.movers.owner]
+    lamps_on = light.lamps > _LAMPS_ON or light.rain > 0.5
+    return _palette(scene.movers, light, in_sun, {LAMP: _HEADLIGHT, TAIL: _TAILLIGHT} if lamps_on else {})
+
+
+def packed(still: Palette, moving: Palette, lamps: Mapping[int, Color]) -> Colors:
+    """All colours of a moment in one table each; `lamps` are rows of solids that stand still, and their light."""
+    wall, shaded, window, shining = (
+        np.concatenate([getattr(still, name), getattr(moving, name), np.zeros((2, 3))]).clip(0, 255).astype(np.uint8)
+        for name in ("wall", "shaded", "window", "shining")
+    )
+    for row, color in lamps.items():
+        shining[row * FACES_A_SOLID : (row + 1) * FACES_A_SOLID] = color
+    kind = np.concatenate([still.facade, moving.facade, [False, False]]).astype(np.uint8)
+    shines: BoolArray = np.asarray(shining.any(axis=1))
+    kind[shines] = SHINES
+    table = np.ascontiguousarray(np.column_stack([np.where(shines[:, None], shining, wall), kind]))
+    return Colors(table.view(np.uint32)[:, 0], shaded, window, shining)
+
+
+def is_facade(surfaces: Surfaces) -> BoolArray:
+    """Which faces (F,) carry windows."""
+    upright = np.abs(surfaces.planes[0][:, 2]) < 0.5
+    return np.asarray(np.repeat(surfaces.solids.facade, FACES_A_SOLID) & upright)
+
+
+def _in_sun(setting: Setting, points: FloatArray, light: Light) -> BoolArray:
+    """Which points (N, 3) nothing that stands still takes the sun from, (N,)."""
+    ray = light.to_sun[None]
+    return np.array([setting.caster.cast(point, ray)[1][0] == NOTHING for point in points], dtype=bool)
+
+
+def _palette(surfaces: Surfaces, light: Light, in_sun: BoolArray, shining: Mapping[Color, Color]) -> Palette:
+    normals, _ = surfaces.planes
+    colors = surfaces.colors
+    upward = normals[:, 2:]
+    sun = np.maximum(normals @ light.to_sun, 0.0) * np.repeat(in_sun, FACES_A_SOLID)
+    shaded = colors * (light.sky * (0.8 + 0.2 * upward))
+    lit = shaded + colors * light.sun * sun[:, None]
+    overhead = np.maximum(upward, 0.0)
+    mirrored = _MIRRORED * (light.horizon * (1 - overhead) + light.zenith * overhead)
+    glass = (colors == GLASS).all(axis=1)
+    pane = np.array(GLASS) * light.sky * 0.6
+    lit[glass] = (pane + mirrored)[glass]
+    window = pane + 0.8 * mirrored
+    alike = np.abs(window - lit).max(axis=1) < _ALIKE
+    window[alike] *= _DARKER
+    return Palette(
+        wall=lit,
+        shaded=shaded,
+        window=window,
+        shining=_shining(colors, shining),
+        facade=is_facade(surfaces),
+    )
+
+
+def _shining(colors: FloatArray, lights: Mapping[Color, Color]) -> FloatArray:
+    """The light of lamps among faces with colours (F, 3); `lights` are of lamps by the colours that they have."""
+    shining = np.zeros_like(colors)
+    for lamp, color in lights.items():
+        shining[(colors == lamp).all(axis=1)] = color
+    return shining

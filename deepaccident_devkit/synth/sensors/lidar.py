@@ -1,0 +1,207 @@
+"""The rotating LiDAR: 32 channels, 30° of height, 70 m, with noise, drop-outs and the weather in its way."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepaccident_devkit.arrays import AnyArray, IntArray, readonly
+from deepaccident_devkit.geometry import SE3
+from deepaccident_devkit.synth.sensors.agents import Agent
+from deepaccident_devkit.synth.sensors.caster import GROUND, NOTHING, make_caster
+from deepaccident_devkit.synth.sensors.reflection import ground_reflectivity
+from deepaccident_devkit.synth.sensors.scene import Scene
+from deepaccident_devkit.synth.sensors.setting import Setting
+from deepaccident_devkit.synth.sensors.turn import (
+    AZIMUTHS,
+    CHANNELS,
+    RANGE,
+    ray_directions,
+    rays_through,
+    rays_to_boxes,
+    turned_rays,
+)
+from deepaccident_devkit.synth.solids import FACES_A_SOLID
+
+RANGE_NOISE = 0.02
+"""Standard deviation along the ray, metres."""
+_ATTENUATION = 0.004
+"""Of the intensity, a metre of dry air: CARLA's default."""
+_LOST, _LOST_DARK, _DARK = 0.01, 0.3, 0.3
+"""Share of the returns that get lost; how much more of black ones; the reflectivity from which on none do."""
+_NUMBERS = 1 << 18
+_NEAREST_DROP, _FARTHEST_DROP = 1.5, 12.0
+"""Metres, between which raindrops send back a ray."""
+
+
+@dataclass(frozen=True, slots=True)
+class Air:
+    """What the weather does to a ray.
+
+    Attributes:
+        lost: share of the returns from `RANGE` metres that get lost, less from nearer in the square of the distance.
+        attenuation: of the intensity, a metre, in addition to dry air's.
+        drops: share of all rays that come back from a raindrop.
+    """
+
+    lost: float = 0.05
+    attenuation: float = 0.0
+    drops: float = 0.0
+
+
+AIR_OF_WEATHER = {
+    "Clear": Air(),
+    "Cloudy": Air(),
+    "Wet": Air(0.08, 0.001),
+    "WetCloudy": Air(0.08, 0.001),
+    "SoftRain": Air(0.2, 0.004, 0.0002),
+    "MidRain": Air(0.3, 0.008, 0.0005),
+    "HardRain": Air(0.45, 0.014, 0.0015),
+}
+"""By the weathers of `taxonomy.WEATHERS`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Lidar:
+    """The LiDAR of an agent, and what its rays meet of the agent itself, which is the same all the time.
+
+    Attributes:
+        row: of the agent's own actor, None for the pole.
+        body: (K,) rows of the rays that pass through the own box.
+        distance: (K,) float32, where they meet the own body, metres; infinite where they do not.
+        face: (K,) what they meet there, as in `Scene.cast`.
+    """
+
+    row: int | None
+    body: IntArray
+    distance: NDArray[np.float32]
+    face: IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """N points of one turn.
+
+    Attributes:
+        xyz: (N, 3) float32, metres, in the LiDAR frame: as they are stored.
+        ray: (N,) int64, row of each in `turn.ray_directions`.
+        face: (N,) what each lies on, as in `Scene.cast`; `caster.NOTHING` for a raindrop.
+    """
+
+    xyz: NDArray[np.float32]
+    ray: IntArray
+    face: AnyArray
+
+
+def make_lidar(setting: Setting, agent: Agent) -> Lidar:
+    """The LiDAR of an agent."""
+    if agent.row is None:
+        nothing = np.zeros(0, dtype=np.int64)
+        return Lidar(row=None, body=nothing, distance=np.zeros(0, dtype=np.float32), face=nothing)
+    place = (agent.box_from_ego @ agent.ego_from_lidar).translation
+    body = rays_through(setting.actors.all[agent.row].size, place)
+    solids = np.flatnonzero(setting.moving_owner == agent.row)
+    caster = make_caster(setting.moving_shapes.corners[solids])
+    distance, face = caster.cast(place, turned_rays(np.eye(3), body))
+    first = setting.faces + FACES_A_SOLID * int(solids[0])
+    return Lidar(row=agent.row, body=body, distance=distance, face=np.where(face >= 0, face + first, face))
+
+
+def scan(
+    scene: Scene, lidar: Lidar, ground_from_lidar: SE3, air: Air, rng: np.random.Generator, *, boxed: bool = False
+) -> Scan:
+    """What a LiDAR at this pose measures.
+
+    Args:
+        scene: the moment.
+        lidar: of which agent.
+        ground_from_lidar: its pose.
+        air: what is between.
+        rng: of the noise; used alike whatever the rays meet.
+        boxed: whether only rays are followed that may pass through a label box: of what lies in a box all points are
+            there, the same to the bit; of what lies beside them few.
+    """
+    cast = _cast_boxed if boxed else _cast_all
+    rows, distance, face = cast(scene, lidar, ground_from_lidar)
+    normal, even = _random_numbers()
+    noise, luck, wet = rng.integers(0, _NUMBERS - len(ray_directions()), 3)
+    returned = _returns(scene.setting, distance, face, even[luck + rows], air)
+    measured = np.maximum(distance + np.float32(RANGE_NOISE) * normal[noise + rows], np.float32(0.1))
+    if air.drops:
+        drop = np.flatnonzero(even[wet + rows] < air.drops)
+        place = _NEAREST_DROP + (_FARTHEST_DROP - _NEAREST_DROP) * even[luck + rows[drop]]
+        measured[drop] = np.minimum(place, measured[drop])
+        face[drop], returned[drop] = NOTHING, True
+    back = np.flatnonzero(returned & (measured <= RANGE))
+    ray = rows[back]
+    return Scan((ray_directions()[ray] * measured[back, None]).astype(np.float32), ray, face[back])
+
+
+def intensity(scene: Scene, ground_from_lidar: SE3, points: Scan, air: Air) -> NDArray[np.float32]:
+    """How bright the points (N,) came back, 0 to 1: by what they lie on, how steeply, how far and through which air."""
+    reach = np.linalg.norm(points.xyz, axis=1)
+    rays = ground_from_lidar.rotate(points.xyz.astype(np.float64)) / np.maximum(reach, 1e-6)[:, None]
+    hit, grounded = np.flatnonzero(points.face >= 0), np.flatnonzero(points.face == GROUND)
+    bright = np.full(len(reach), 0.05)
+    steep = -np.einsum("nk,nk->n", rays[hit], scene.normals[points.face[hit]])
+    bright[hit] = scene.setting.reflectivity[points.face[hit]] * (0.35 + 0.65 * np.clip(steep, 0, 1))
+    places = ground_from_lidar.apply(points.xyz[grounded].astype(np.float64))
+    angle = 0.35 + 0.65 * np.clip(-rays[grounded, 2], 0, 1)
+    bright[grounded] = ground_reflectivity(scene.setting.world.ground, places) * angle
+    return np.asarray(bright * np.exp(-(_ATTENUATION + air.attenuation) * reach), dtype=np.float32)
+
+
+def _cast_all(scene: Scene, lidar: Lidar, ground_from_lidar: SE3) -> tuple[IntArray, AnyArray, AnyArray]:
+    """All rows of rays; how far they go, right up to `RANGE`; and what they meet."""
+    setting, rays = scene.setting, turned_rays(ground_from_lidar.rotation)
+    pose = ground_from_lidar.matrix.tobytes()
+    origin, columns = ground_from_lidar.translation, rays.reshape(CHANNELS, AZIMUTHS, 3)
+    still = setting.kept(pose, lambda: setting.cast_columns(origin, columns, RANGE))
+    near = np.flatnonzero(rays_to_boxes(scene, ground_from_lidar, _others(setting.moving, lidar))[0])
+    distance, face = scene.with_movers(origin, rays, still, near)
+    met = np.isfinite(lidar.distance)
+    distance[lidar.body[met]], face[lidar.body[met]] = lidar.distance[met], lidar.face[met]
+    return np.arange(len(rays)), distance, face
+
+
+def _cast_boxed(scene: Scene, lidar: Lidar, ground_from_lidar: SE3) -> tuple[IntArray, AnyArray, AnyArray]:
+    """As `_cast_all`, of the rays that may pass through a box."""
+    setting = scene.setting
+    near, others = rays_to_boxes(scene, ground_from_lidar, _others(setting.moving, lidar), setting.parked)
+    wanted = near | others
+    met = np.isfinite(lidar.distance)
+    wanted[lidar.body[met]] = False
+    rows = np.flatnonzero(wanted)
+    rays = turned_rays(ground_from_lidar.rotation, rows)
+    distance, face = scene.cast(ground_from_lidar.translation, rays, near=np.flatnonzero(near[rows]))
+    own = np.flatnonzero(~wanted[lidar.body])
+    return (
+        np.concatenate([rows, lidar.body[own]]),
+        np.concatenate([distance, lidar.distance[own]]),
+        np.concatenate([face, lidar.face[own]]),
+    )
+
+
+@cache
+def _random_numbers() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Numbers of the standard normal distribution, and even ones from 0 to 1, (2 ** 18,) each.
+
+    Each turn takes them from places of its own: drawing them anew would take as long as casting the rays to the boxes.
+    """
+    rng = np.random.default_rng(0)
+    normal, even = rng.standard_normal(_NUMBERS, dtype=np.float32), rng.random(_NUMBERS, dtype=np.float32)
+    return readonly(normal), readonly(even)
+
+
+def _others(rows: IntArray, lidar: Lidar) -> IntArray:
+    return rows if lidar.row is None else rows[rows != lidar.row]
+
+
+def _returns(
+    setting: Setting, distance: AnyArray, face: AnyArray, luck: NDArray[np.float32], air: Air
+) -> NDArray[np.bool_]:
+    """Which rays (N,) that met something come back; from what reflects little, fewer."""
+    share = _LOST + air.lost * (np.minimum(distance, RANGE) / RANGE) ** 2
+    share += (_LOST_DARK * np.clip(1 - setting.reflectivity / _DARK, 0, 1))[face]
+    return np.asarray((distance <= RANGE) & (luck >= share))

@@ -1,0 +1,136 @@
+"""All sensors of a scenario's agents: what each records at one moment after another."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepaccident_devkit.arrays import ByteArray
+from deepaccident_devkit.release import Calib, Labels
+from deepaccident_devkit.synth.actors import Actors
+from deepaccident_devkit.synth.roads import Arm
+from deepaccident_devkit.synth.sensors.agents import Agent, make_agents
+from deepaccident_devkit.synth.sensors.annotate import annotate
+from deepaccident_devkit.synth.sensors.bev import BevPicture, bev_picture
+from deepaccident_devkit.synth.sensors.images.render import Studio, render
+from deepaccident_devkit.synth.sensors.images.shading import Surroundings
+from deepaccident_devkit.synth.sensors.lidar import AIR_OF_WEATHER, Air, Lidar, Scan, intensity, make_lidar, scan
+from deepaccident_devkit.synth.sensors.scene import Scene, make_scene
+from deepaccident_devkit.synth.sensors.setting import Setting
+from deepaccident_devkit.synth.stage import World
+from deepaccident_devkit.taxonomy import AGENTS, AgentName
+
+_LOOK, _LIDAR, _CAMERAS = range(3)
+"""What random numbers are for."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """What an agent knows at a moment without its cameras.
+
+    Attributes:
+        labels: its label file.
+        calib: its calib file.
+        points: its point cloud, as the labels count it; without images, only what may lie in a box, as in `lidar.scan`.
+    """
+
+    labels: Labels
+    calib: Calib
+    points: Scan
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rig:
+    """The sensors of a scenario.
+
+    Attributes:
+        setting: what stands still, and who moves.
+        agents: who records.
+        lidars: theirs.
+        air: what the weather does to the LiDARs' rays.
+        studio: for images; None where none are made.
+        seed: of all noise, so that a moment's does not depend on what was recorded before it.
+    """
+
+    setting: Setting
+    agents: tuple[Agent, ...]
+    lidars: Mapping[AgentName, Lidar]
+    air: Air
+    studio: Studio | None
+    seed: tuple[int, ...]
+
+    def scene(self, time: float) -> Scene:
+        """The scene at a time, seconds since the first recorded frame."""
+        return make_scene(self.setting, time)
+
+    def sighting(self, scene: Scene, agent: Agent, frame: int) -> Sighting:
+        """Labels, calib and points of an agent; `frame` seeds the noise."""
+        world_from_ground = self.setting.world.world_from_ground
+        ground_from_ego = agent.ground_from_ego(scene)
+        ground_from_lidar = ground_from_ego @ agent.ego_from_lidar
+        rng = self._random(_LIDAR, frame, agent)
+        points = scan(scene, self.lidars[agent.name], ground_from_lidar, self.air, rng, boxed=self.studio is None)
+        labels = annotate(scene, agent, ground_from_lidar, world_from_ground, points)
+        return Sighting(labels, agent.calib(world_from_ground @ ground_from_ego), points)
+
+    def intensity(self, scene: Scene, agent: Agent, points: Scan) -> NDArray[np.float32]:
+        """How bright each of an agent's points (N,) came back, 0 to 1."""
+        return intensity(scene, agent.ground_from_lidar(scene), points, self.air)
+
+    def bev(self, scene: Scene, agent: Agent) -> BevPicture:
+        """What lies around an agent, from above."""
+        return bev_picture(scene, self.setting.world.top, agent.ground_from_ego(scene))
+
+    def surroundings(self, scene: Scene, signals: Mapping[Arm, int]) -> Surroundings | None:
+        """What the images of all agents at a moment have in common; None where none are made.
+
+        `signals` are the traffic lights' states, as `images.signals.lit_lamps` takes them.
+        """
+        return self.studio.surroundings(scene, signals) if self.studio else None
+
+    def images(self, scene: Scene, around: Surroundings, agent: Agent, frame: int) -> Iterator[tuple[str, ByteArray]]:
+        """Channel and picture (H, W, 3) of each of an agent's cameras, one after the other."""
+        rng = self._random(_CAMERAS, frame, agent)
+        ground_from_lidar = agent.ground_from_lidar(scene)
+        for camera in agent.cameras:
+            ground_from_camera = ground_from_lidar @ camera.lidar_from_camera
+            yield camera.channel, render(scene, around, camera, ground_from_camera, rng)
+
+    def _random(self, purpose: int, frame: int, agent: Agent) -> np.random.Generator:
+        return np.random.default_rng([*self.seed, purpose, frame, AGENTS.index(agent.name)])
+
+
+def make_rig(
+    world: World,
+    actors: Actors,
+    ids: Mapping[AgentName, int],
+    *,
+    sky: tuple[str, str],
+    image_size: tuple[int, int],
+    seed: tuple[int, ...],
+    images: bool = True,
+) -> Rig:
+    """The sensors of a scenario.
+
+    Args:
+        world: what stands still.
+        actors: road users.
+        ids: actor ids of the four vehicle agents.
+        sky: weather and time of day, as in the taxonomy.
+        image_size: width and height of the images, pixels.
+        seed: of noise, clouds and the ground's grain.
+        images: whether images will be asked for; labels do not depend on it, points do as in `Sighting`.
+    """
+    weather, time_of_day = sky
+    setting = Setting(world, actors)
+    agents = make_agents(world, actors, ids, image_size)
+    rng = np.random.default_rng([*seed, _LOOK])
+    return Rig(
+        setting=setting,
+        agents=agents,
+        lidars={agent.name: make_lidar(setting, agent) for agent in agents},
+        air=AIR_OF_WEATHER[weather],
+        studio=Studio(setting, weather, time_of_day, rng) if images else None,
+        seed=seed,
+    )

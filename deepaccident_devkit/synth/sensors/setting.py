@@ -1,0 +1,189 @@
+"""What stands still over a scenario, made ready once: the ground, buildings, trees, poles and parked vehicles."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, FloatArray, IntArray
+from deepaccident_devkit.geometry.boxes import CORNER_SIGNS
+from deepaccident_devkit.synth.actors import Actors
+from deepaccident_devkit.synth.roads import Terrain
+from deepaccident_devkit.synth.sensors.caster import GROUND, NOTHING, Caster, make_caster, plane_distance
+from deepaccident_devkit.synth.sensors.placing import moved, placed_on
+from deepaccident_devkit.synth.sensors.reflection import color_reflectivity
+from deepaccident_devkit.synth.solids import FACES_A_SOLID, Solids, concatenate, face_corners, face_planes
+from deepaccident_devkit.synth.stage import World
+from deepaccident_devkit.taxonomy import CATEGORIES
+
+NOBODY = -1
+"""Owner of what is no road user."""
+_UPRIGHT = CATEGORIES.index("pedestrian")
+_ENDLESS = 1e3
+_LEVEL, _CAREFUL = 1e-6, 1e-3
+"""Up to which angle two lines count as one; by what share of a way a ray may end sooner than it seems."""
+_CASTS_KEPT = 8
+"""Of rays from sensors that have not moved since: five LiDARs, and room for some that come to a halt."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """Solids in the ground frame.
+
+    Attributes:
+        solids: in their owners' frames: their colours.
+        corners: (P, 8, 3) float64, metres, ground frame.
+        owner: (P,) int64, row of the actor that each solid belongs to, or `NOBODY`.
+    """
+
+    solids: Solids
+    corners: FloatArray
+    owner: IntArray
+
+    @cached_property
+    def quads(self) -> FloatArray:
+        """The corners of all faces, (F, 4, 3), metres."""
+        return face_corners(self.corners)
+
+    @cached_property
+    def planes(self) -> tuple[FloatArray, FloatArray]:
+        """Outward unit normals (F, 3) of the faces and their offsets (F,), normal · p on the face."""
+        return face_planes(self.quads)
+
+    @cached_property
+    def colors(self) -> FloatArray:
+        """RGB of the faces in white light, (F, 3) float64, 0 to 255."""
+        return self.solids.colors.reshape(-1, 3).astype(np.float64)
+
+    @cached_property
+    def face_owner(self) -> IntArray:
+        """Row of the actor that each face belongs to, (F,), or `NOBODY`."""
+        return np.repeat(self.owner, FACES_A_SOLID)
+
+
+class Setting:
+    """All that stands still, and who moves on it.
+
+    Attributes:
+        world: the place.
+        actors: all road users.
+        terrain: the shape of the ground.
+        still: surfaces of things and of parked vehicles.
+        moving: (M,) rows of the actors that are not parked.
+        parked: (A − M,) rows of those that are.
+        moving_shapes: their solids, each in its owner's frame.
+        moving_owner: (Q,) row of the actor that each of these belongs to.
+        props: (W,) rows of the world's solids among those of `still`.
+        caster: for rays against what stands still and the ground.
+    """
+
+    world: World
+    actors: Actors
+    terrain: Terrain
+    still: Surfaces
+    props: IntArray
+    moving: IntArray
+    parked: IntArray
+    moving_shapes: Solids
+    moving_owner: IntArray
+    caster: Caster
+
+    def __init__(self, world: World, actors: Actors) -> None:
+        self.world, self.actors, self.terrain = world, actors, world.terrain
+        parked = np.array([actor.parked for actor in actors.all], dtype=bool)
+        solid_parked = parked[actors.solid_actor]
+        frames = self.frames(actors.at(0.0).poses)
+        vehicles = np.flatnonzero(solid_parked)
+        placed = moved(actors.solids.corners[vehicles], frames[actors.solid_actor[vehicles]])
+        self.still = Surfaces(
+            concatenate([actors.solids.select(vehicles), world.props]),
+            np.concatenate([placed, world.props.corners]),
+            np.concatenate([actors.solid_actor[vehicles], np.full(len(world.props), NOBODY)]),
+        )
+        self.props = len(vehicles) + np.arange(len(world.props))
+        self.moving, self.parked = np.flatnonzero(~parked), np.flatnonzero(parked)
+        self.moving_shapes = actors.solids.select(np.flatnonzero(~solid_parked))
+        self.moving_owner = actors.solid_actor[~solid_parked]
+        self.caster = make_caster(self.still.corners, self.terrain)
+        self._fence: Caster = make_caster(_endless(self.still.corners))
+        self._kept: dict[bytes, tuple[AnyArray, AnyArray]] = {}
+
+    @property
+    def faces(self) -> int:
+        """How many faces stand still; those of what moves are numbered from here."""
+        return len(self.still.corners) * FACES_A_SOLID
+
+    @cached_property
+    def face_owner(self) -> IntArray:
+        """Row of the actor that each face belongs to, those of who moves included, (F + 2,), or `NOBODY`.
+
+        The last two are for `caster.GROUND` and `caster.NOTHING`, so that one can index with any face.
+        """
+        moving = np.repeat(self.moving_owner, FACES_A_SOLID)
+        return np.concatenate([self.still.face_owner, moving, [NOBODY, NOBODY]])
+
+    @cached_property
+    def reflectivity(self) -> FloatArray:
+        """Share of a LiDAR's light that each face reflects, (F + 2,), as in `face_owner`; 1 of the last two."""
+        colors = [solids.colors.reshape(-1, 3).astype(np.float64) for solids in (self.still.solids, self.moving_shapes)]
+        return np.concatenate([color_reflectivity(np.concatenate(colors)), [1.0, 1.0]])
+
+    def frames(self, poses: FloatArray) -> FloatArray:
+        """The actors' frames on the ground, (A, 4, 4), at poses (A, 3)."""
+        return placed_on(self.terrain, poses, self.actors.size, self.actors.category == _UPRIGHT)
+
+    def cast_columns(self, origin: FloatArray, rays: AnyArray, limit: float = np.inf) -> tuple[AnyArray, AnyArray]:
+        """As `caster.cast`, of rays that stand above each other: those that end before the first thing are not cast.
+
+        That can be told on flat ground, where all rays of a column go over the same line.
+
+        Args:
+            origin: (3,) metres.
+            rays: (R, C, 3) float32; if those of a column do not go over the same line, all are cast.
+            limit: how far what they meet has to be right, in lengths of the ray.
+
+        Returns:
+            (R · C,) distances and faces.
+        """
+        flat = rays.reshape(-1, 3)
+        if not self.terrain.is_flat or not _in_columns(rays):
+            return self.caster.cast(origin, flat)
+        distance = plane_distance(origin[2], flat[:, 2]).astype(np.float32)
+        face = np.where(np.isfinite(distance), np.int32(GROUND), np.int32(NOTHING))
+        clear = self._clear(origin, rays[0])
+        ends = np.minimum(distance, limit).reshape(rays.shape[:2]) * np.hypot(rays[..., 0], rays[..., 1])
+        open_ = np.flatnonzero((ends > clear * (1 - _CAREFUL)).ravel())
+        distance[open_], face[open_] = self.caster.cast(origin, flat[open_])
+        return distance, face
+
+    def _clear(self, origin: FloatArray, directions: AnyArray) -> AnyArray:
+        """Metres over the ground that rays (N, 3) go before they come above or below anything that stands still, (N,).
+
+        No ray over the same line meets a thing sooner. Infinite where there is nothing at all.
+        """
+        level = directions * np.array([1, 1, 0], dtype=np.float32)
+        reached, _ = self._fence.cast(np.array([*origin[:2], 0.0]), level)
+        return np.asarray(reached * np.linalg.norm(level, axis=1))
+
+    def kept(self, pose: bytes, cast: Callable[[], tuple[AnyArray, AnyArray]]) -> tuple[AnyArray, AnyArray]:
+        """What `cast` gives, from memory where it was called for the same pose before; not to be written."""
+        found = self._kept.pop(pose, None) or cast()
+        self._kept[pose] = found
+        if len(self._kept) > _CASTS_KEPT:
+            del self._kept[next(iter(self._kept))]
+        return found
+
+
+def _in_columns(rays: AnyArray) -> bool:
+    """Whether the rays (R, C, 3) of each column go over the same line on the ground."""
+    first, last = rays[0, :, :2], rays[-1, :, :2]
+    aside = first[:, 0] * last[:, 1] - first[:, 1] * last[:, 0]
+    return bool((np.abs(aside) <= _LEVEL * (np.abs(first) * np.abs(last)).sum(axis=1)).all())
+
+
+def _endless(corners: FloatArray) -> FloatArray:
+    """Upright boxes (P, 8, 3) around solids as seen from above, from deep below to high above."""
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    low[:, 2], high[:, 2] = -_ENDLESS, _ENDLESS
+    return np.asarray(np.where(CORNER_SIGNS > 0, high[:, None], low[:, None]))

@@ -1,0 +1,226 @@
+"""Whether a scenario file can be carried out, whatever is drawn."""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
+from typing import Final, TypeAlias, cast
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.synth.roads import ARMS, Arm, Junction, RoadSpec, Turn
+from deepaccident_devkit.synth.spec.choices import Items, Part
+from deepaccident_devkit.synth.spec.model import Role
+
+_Way: TypeAlias = tuple[Arm, Turn, int]
+"""Arm, turn and lane."""
+LEADERS: Final[Mapping[Role, Role]] = {"ego_behind": "ego", "other_behind": "other"}
+"""Those who follow → whom."""
+_LEADING: Final = tuple(LEADERS.values())
+_AGENTS: Final = (*_LEADING, *LEADERS)
+_AGENT_CATEGORIES: Final = ("car", "truck", "van", "motorcycle")
+_WALKING: Final = "pedestrian"
+_MOST_ACTORS: Final = 100
+_PARKED_CATEGORIES: Final = ("car", "truck", "van", "motorcycle")
+_FORBIDDEN: Final[Mapping[str, tuple[str, ...]]] = {
+    **dict.fromkeys(LEADERS, ("from_arm", "turn", "lane", "start_distance", "delay", "side", "lane_change")),
+    **dict.fromkeys((*_LEADING, "background"), ("gap", "side")),
+    _WALKING: ("turn", "lane", "gap", "ignores", "lane_change"),
+    "parked": ("turn", "lane", "gap", "ignores", "max_speed", "delay", "lane_change"),
+}
+"""Role → fields that mean nothing for it."""
+
+
+def check_scenario(root: Part) -> None:
+    """Check what the fields' types cannot say.
+
+    Raises:
+        ConfigError: there is something that cannot be, by at least one of its draws; the message names line and field.
+    """
+    actors = _actors(root)
+    _check_roles(root, actors)
+    _check_roads(root)
+    junctions = _junctions(root)
+    for actor in actors:
+        _check_fields(actor)
+        _check_category(actor)
+        _check_way(actor, junctions)
+        _check_lane(actor, junctions)
+    _check_view(root, actors)
+    _check_meeting(root, actors, junctions)
+
+
+def _actors(root: Part) -> Sequence[Part]:
+    actors = root.fields["actors"]
+    return actors.items if isinstance(actors, Items) else ()  # type: ignore[return-value]
+
+
+def _role(actor: Part) -> Role:
+    return cast("Role", actor.values("role")[0])
+
+
+def _check_roles(root: Part, actors: Sequence[Part]) -> None:
+    if len(actors) > _MOST_ACTORS:
+        raise _fault(root, "actors", f"there are {len(actors)}, for which no road has room", f"keep {_MOST_ACTORS}")
+    counts = Counter(_role(actor) for actor in actors)
+    for role in _LEADING:
+        if not counts[role]:
+            raise _fault(root, "actors", f"there is no actor with role {role}", "add one")
+    for actor in actors:
+        if _role(actor) in _AGENTS and counts[_role(actor)] > 1:
+            raise _fault(actor, "role", f"there are {counts[_role(actor)]} actors with role {_role(actor)}", "keep one")
+
+
+def _junctions(root: Part) -> tuple[Junction, ...]:
+    """One of each kind and number of lanes that can be drawn."""
+    pairs = {
+        pair
+        for road in root.values("road")
+        for pair in (product(road.values("kind"), road.values("lanes")) if isinstance(road, Part) else ())
+    }
+    return tuple(Junction(RoadSpec(kind=kind, lanes=lanes)) for kind, lanes in sorted(pairs)) or (Junction(),)
+
+
+def _check_fields(actor: Part) -> None:
+    role = _role(actor)
+    for name in actor.fields:
+        if name in _FORBIDDEN[role]:
+            raise _fault(actor, name, f"means nothing for the role {role}", "leave it out")
+    if role not in LEADERS and "from_arm" not in actor.fields:
+        raise _fault(actor, "from_arm", f"is missing; the role {role} needs it", f"add one of {', '.join(ARMS)}")
+
+
+def _check_category(actor: Part) -> None:
+    role = _role(actor)
+    possible = _possible_categories(role)
+    for category in actor.values("category") if "category" in actor.fields else ():
+        if category not in possible:
+            raise _fault(actor, "category", f"the role {role} cannot be a {category}", f"choose {', '.join(possible)}")
+
+
+def _possible_categories(role: Role) -> tuple[str, ...]:
+    if role == _WALKING:
+        return (_WALKING,)
+    if role in _AGENTS:
+        return _AGENT_CATEGORIES
+    return _PARKED_CATEGORIES if role == "parked" else (*_AGENT_CATEGORIES, "cyclist")
+
+
+def _check_way(actor: Part, junctions: Sequence[Junction]) -> None:
+    if _role(actor) in LEADERS:
+        return
+    for junction, arm, turn in product(junctions, actor.values("from_arm"), actor.values("turn")):
+        kind = junction.spec.kind
+        if arm not in junction.arms:
+            remedy = f"choose {' or '.join(junction.arms)}"
+            raise _fault(actor, "from_arm", f"a {kind} junction has no {arm} arm", remedy)
+        if _drives(actor) and turn not in junction.turns(arm):
+            remedy = f"choose {' or '.join(junction.turns(arm))}"
+            raise _fault(actor, "turn", f"a {kind} junction has no way {turn} from the {arm} arm", remedy)
+
+
+def _drives(actor: Part) -> bool:
+    return _role(actor) not in (_WALKING, "parked")
+
+
+def _check_lane(actor: Part, junctions: Sequence[Junction]) -> None:
+    fewest = min(junction.spec.lanes for junction in junctions)
+    if max(actor.values("lane")) >= fewest:
+        sentence = f"there is no lane {max(actor.values('lane'))} where the road has one lane in each direction"
+        raise _fault(actor, "lane", sentence, "choose 0, or give the road two lanes")
+    if any(value is not None for value in actor.values("lane_change")):
+        if fewest < 2:
+            sentence = "there is no other lane where the road has one lane in each direction"
+            raise _fault(actor, "lane_change", sentence, "leave it out, or give the road two lanes")
+        if set(actor.values("turn")) != {"straight"}:
+            raise _fault(actor, "lane_change", "goes with the turn straight alone", "leave it out, or go straight on")
+
+
+def _check_roads(root: Part) -> None:
+    """Make every road, which checks itself."""
+    for road in root.values("road"):
+        if isinstance(road, Part):
+            for hump in road.values("hump"):
+                if isinstance(hump, Part):
+                    _try(hump)
+            _try(road)
+
+
+def _try(part: Part) -> None:
+    try:
+        for _ in part.instances():
+            pass
+    except ConfigError as error:
+        place, _, sentence = str(error).partition(": ")
+        name = place.rpartition(".")[2]
+        line, path = (part.line(name), part.path_of(name)) if name in part.fields else (part.where, part.path)
+        raise ConfigError(f"{line}: {path}: {sentence}") from error
+
+
+def _check_view(root: Part, actors: Sequence[Part]) -> None:
+    if "hidden" not in root.values("view"):
+        return
+    ego, other = (next(actor for actor in actors if _role(actor) == role) for role in _LEADING)
+    for one, another in product(ego.values("from_arm"), other.values("from_arm")):
+        if abs(ARMS.index(one) - ARMS.index(another)) % 2 == 0:
+            sentence = f"no house can stand between ego from the {one} and other from the {another}"
+            raise _fault(root, "view", sentence, "choose open, or neighbouring arms")
+
+
+def _check_meeting(root: Part, actors: Sequence[Part], junctions: Sequence[Junction]) -> None:
+    by_role = {_role(actor): actor for actor in actors}
+    counts = Counter(_role(actor) for actor in actors)
+    for meeting in root.values("meet"):
+        if not isinstance(meeting, Part):
+            continue
+        first, second = meeting_roles(meeting)
+        for role in (first, second):
+            if role in LEADERS or role == "parked":
+                raise _fault(meeting, "actors", f"{role} cannot be timed", "choose two roles such as ego and other")
+            if counts[role] != 1:
+                sentence = f"there are {counts[role]} actors with role {role}"
+                raise _fault(meeting, "actors", sentence, "choose roles that one actor has")
+        if first == second:
+            raise _fault(meeting, "actors", f"{first} cannot meet itself", "name two roles")
+        if all(_drives(by_role[role]) and by_role[role].values("lane_change") == (None,) for role in (first, second)):
+            _check_crossing(meeting, by_role[first], by_role[second], junctions)
+
+
+def meeting_roles(meeting: Part) -> tuple[Role, Role]:
+    """Who is timed to meet."""
+    (pair,) = meeting.values("actors")
+    roles = tuple(next(item.alternatives()) for item in pair.items) if isinstance(pair, Items) else pair
+    return cast("tuple[Role, Role]", roles)
+
+
+def _check_crossing(meeting: Part, first: Part, second: Part, junctions: Sequence[Junction]) -> None:
+    for junction in junctions:
+        for ways in product(_ways(first, junction), _ways(second, junction)):
+            if junction.conflicts(*(junction.route(*way) for way in ways)) is None:
+                texts = [
+                    f"{_role(actor)} ({' '.join(map(str, way))})"
+                    for actor, way in zip((first, second), ways, strict=True)
+                ]
+                sentence = f"the ways of {' and '.join(texts)} do not meet"
+                raise _fault(meeting, "actors", sentence, _way_to_meet(*ways))
+
+
+def _way_to_meet(one: _Way, other: _Way) -> str:
+    """What to do about two ways that do not meet."""
+    if (one[0], one[2]) == (other[0], other[2]):
+        return "who comes by the same lane follows; let one of them come by the other lane, with a lane_change"
+    return "change an arm, a turn or a lane"
+
+
+def _ways(actor: Part, junction: Junction) -> Iterator[_Way]:
+    """Arm, turn and lane of a driver, all that can be drawn."""
+    for arm, turn in product(actor.values("from_arm"), actor.values("turn")):
+        lanes = actor.values("lane") if "lane" in actor.fields else usual_lanes(turn, junction.spec.lanes)
+        yield from ((arm, turn, lane) for lane in lanes)
+
+
+def usual_lanes(turn: Turn, lanes: int) -> range:
+    """From which of a road's lanes one does a turn."""
+    return {"left": range(lanes - 1, lanes), "right": range(1), "straight": range(lanes)}[turn]
+
+
+def _fault(part: Part, name: str, sentence: str, remedy: str) -> ConfigError:
+    return ConfigError(f"{part.line(name)}: {part.path_of(name)}: {sentence}; {remedy}")

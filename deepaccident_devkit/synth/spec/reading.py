@@ -1,0 +1,196 @@
+"""Values of a scenario file, checked against the types of the model's dataclasses."""
+
+import dataclasses
+import math
+import types
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.synth.spec.bounds import Bounds
+from deepaccident_devkit.synth.spec.choices import Choice, Fixed, Items, OneOf, Part, Range, key_of
+from deepaccident_devkit.synth.spec.yaml_nodes import Node
+from deepaccident_devkit.text import possible_text
+
+_SETTLED = {"name", "design", "exchange", "role"}
+"""Fields of which a file says one value: they decide what else it has to say."""
+_MOST = 1e9
+"""No number of a scenario is as large."""
+_SHOWN_LENGTH = 80
+"""Of what was found, in a message."""
+
+
+@dataclass(frozen=True, slots=True)
+class FieldType:
+    """What a field of the model can be.
+
+    Attributes:
+        base: `str`, `bool`, `int`, `float`, a dataclass, or `tuple` for a list.
+        optional: whether it can be null.
+        words: all that it can be, of a word that is not free.
+        bounds: of a number.
+        items: of a list: the type of each item, or of all of them if there is one.
+        length: of a list, if it is given.
+    """
+
+    base: type[Any]
+    optional: bool = False
+    words: tuple[str, ...] = ()
+    bounds: Bounds | None = None
+    items: "FieldType | None" = None
+    length: int | None = None
+
+
+def field_types(kind: type[Any]) -> dict[str, FieldType]:
+    """Field name → type, of a dataclass of the model."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {field.name: _field_type(hints[field.name]) for field in dataclasses.fields(kind)}
+
+
+def required_fields(kind: type[Any]) -> tuple[str, ...]:
+    """The fields of a dataclass that have no default."""
+    missing = dataclasses.MISSING
+    fields = dataclasses.fields(kind)
+    return tuple(field.name for field in fields if field.default is missing and field.default_factory is missing)
+
+
+def read_part(node: Node, kind: type[Any], path: str = "") -> Part:
+    """A part of a scenario, from a mapping.
+
+    Raises:
+        ConfigError: it is no mapping, has a key that the part has not, lacks one that it needs, or a value is not
+            what its field takes.
+    """
+    entries = node.value
+    if not isinstance(entries, Mapping):
+        raise _wrong(node, path or "the file", "keys and values", node)
+    types_of = field_types(kind)
+    names = {key_of(name): name for name in types_of}
+    prefix = f"{path}." if path else ""
+    for key, entry in entries.items():
+        if key not in names:
+            raise ConfigError(f"{entry.where}: {prefix}{key}: no such field; possible: {possible_text(key, names)}")
+    for name in required_fields(kind):
+        if key_of(name) not in entries:
+            raise ConfigError(f"{node.where}: {prefix}{key_of(name)}: is missing; add it")
+    present = [(key, name) for key, name in names.items() if key in entries]
+    fields = {
+        name: _read(entries[key], types_of[name], prefix + key, settled=name in _SETTLED) for key, name in present
+    }
+    return Part(kind, node.where, path, fields, {name: entries[key].where for key, name in present})
+
+
+def _field_type(hint: Any) -> FieldType:
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin in (Union, types.UnionType):
+        (inner,) = (argument for argument in arguments if argument is not type(None))
+        return dataclasses.replace(_field_type(inner), optional=True)
+    if origin is Annotated:
+        return dataclasses.replace(_field_type(arguments[0]), bounds=arguments[1])
+    if origin is Literal:
+        return FieldType(str, words=arguments)
+    if origin is tuple:
+        length = None if arguments[-1] is Ellipsis else len(arguments)
+        return FieldType(tuple, items=_field_type(arguments[0]), length=length)
+    return FieldType(hint)
+
+
+def _read(node: Node, wanted: FieldType, path: str, *, settled: bool = False) -> Choice:
+    if wanted.base is tuple:
+        return _read_list(node, wanted, path)
+    if not isinstance(node.value, tuple):
+        return _read_one(node, wanted, path)
+    if settled:
+        raise _wrong(node, path, f"{_described(wanted)}, and not several", node)
+    if wanted.base in (int, float):
+        return _read_range(node, wanted, path)
+    if not node.value:
+        raise _wrong(node, path, _described(wanted), node)
+    return OneOf(tuple(_read_one(item, wanted, f"{path}[{k}]") for k, item in enumerate(node.value)))
+
+
+def _read_list(node: Node, wanted: FieldType, path: str) -> Choice:
+    items = wanted.items
+    if items is None or not isinstance(node.value, tuple):
+        raise _wrong(node, path, _described(wanted), node)
+    if wanted.length is not None and len(node.value) != wanted.length:
+        raise _wrong(node, path, f"a list of {wanted.length}", node)
+    return Items(tuple(_read_one(item, items, f"{path}[{k}]") for k, item in enumerate(node.value)))
+
+
+def _read_range(node: Node, wanted: FieldType, path: str) -> Choice:
+    ends = node.value
+    if not isinstance(ends, tuple) or len(ends) != 2:
+        raise _wrong(node, path, f"{_described(wanted)}, or [low, high]", node)
+    low, high = (_number(end, wanted, f"{path}[{k}]") for k, end in enumerate(ends))
+    if low > high:
+        raise ConfigError(f"{node.where}: {path}: expected [low, high], found [{low:g}, {high:g}]; exchange the two")
+    return Range(low, high, wanted.base is int)
+
+
+def _read_one(node: Node, wanted: FieldType, path: str) -> Choice:
+    value = node.value
+    if value is None and wanted.optional:
+        return Fixed(None)
+    if dataclasses.is_dataclass(wanted.base):
+        return read_part(node, wanted.base, path)
+    if wanted.base in (int, float):
+        return Fixed(_number(node, wanted, path))
+    fits = value in wanted.words if wanted.words else isinstance(value, wanted.base)
+    if not fits:
+        raise _wrong(node, path, _described(wanted, value), node, _meant(wanted, value))
+    return Fixed(value)
+
+
+def _number(node: Node, wanted: FieldType, path: str) -> float:
+    value, bounds = node.value, wanted.bounds
+    possible = (int,) if wanted.base is int else (int, float)
+    if isinstance(value, bool) or not isinstance(value, possible) or not abs(value) < _MOST:
+        raise _wrong(node, path, _described(wanted), node, _meant(wanted, value))
+    if bounds is not None and not bounds.low <= value <= bounds.high:
+        raise _wrong(node, path, _described(wanted), node)
+    return wanted.base(value)  # type: ignore[no-any-return]
+
+
+def _wrong(node: Node, path: str, expected: str, found: Node, remedy: str = "") -> ConfigError:
+    shown = _shown(found)
+    clipped = shown if len(shown) <= _SHOWN_LENGTH else f"{shown[: _SHOWN_LENGTH - 1]}…"
+    return ConfigError(f"{node.where}: {path}: expected {expected}, found {clipped}{remedy}")
+
+
+def _meant(wanted: FieldType, value: object) -> str:
+    """The remedy where only quotes are wrong, or lacking."""
+    if wanted.base is str and not wanted.words and not isinstance(value, Mapping | tuple) and value is not None:
+        return "; put it in quotes"
+    if wanted.base in (int, float) and isinstance(value, str) and _is_number(value):
+        return f"; write {float(value):g}, without quotes"
+    return "; leave the quotes out" if wanted.base is bool and value in ("true", "false") else ""
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
+
+
+def _described(wanted: FieldType, found: object = None) -> str:
+    """A type in words; of a choice of words, those like the one found come first."""
+    if wanted.words:
+        return f"one of {possible_text(str(found), wanted.words)}"
+    if wanted.base is tuple and wanted.items is not None:
+        return f"a list, as [{', '.join(wanted.items.words[:2])}]" if wanted.items.words else "a list"
+    names = {str: "a text", bool: "true or false", int: "a whole number", float: "a number"}
+    text = names.get(wanted.base, "keys and values")
+    return f"{text}, {wanted.bounds}" if wanted.bounds else text
+
+
+def _shown(node: Node) -> str:
+    if isinstance(node.value, Mapping):
+        return f"the keys {', '.join(node.value)}" if node.value else "nothing"
+    if isinstance(node.value, tuple):
+        return f"[{', '.join(_shown(item) for item in node.value)}]"
+    if node.value is None:
+        return "nothing"
+    return repr(node.value) if isinstance(node.value, str) else str(node.value)

@@ -1,0 +1,108 @@
+"""A scenario whose ranges and choices are still open, and drawing from it."""
+
+from dataclasses import dataclass, replace
+from typing import cast
+
+import numpy as np
+
+from deepaccident_devkit.synth.roads import ARMS, Arm
+from deepaccident_devkit.synth.spec.checks import LEADERS, meeting_roles, usual_lanes
+from deepaccident_devkit.synth.spec.choices import Items, Part
+from deepaccident_devkit.synth.spec.model import ActorSpec, Role, ScenarioSpec
+
+_EXCHANGED: dict[Role, Role] = {
+    "ego": "other", "other": "ego", "ego_behind": "other_behind", "other_behind": "ego_behind",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class SpecTemplate:
+    """A scenario as a file says it.
+
+    Attributes:
+        root: what it says, checked.
+    """
+
+    root: Part
+
+    @property
+    def name(self) -> str:
+        """The scenario's, for people."""
+        return str(self.root.values("name")[0])
+
+    @property
+    def design(self) -> int | None:
+        """Which of the paper's twelve it is, if it is one."""
+        return cast("int | None", self.root.values("design")[0])
+
+    @property
+    def meeting_roles(self) -> frozenset[Role]:
+        """Who is timed to meet; empty if nobody is."""
+        meetings = [meeting for meeting in self.root.values("meet") if isinstance(meeting, Part)]
+        return frozenset(role for meeting in meetings for role in meeting_roles(meeting))
+
+    @property
+    def meets(self) -> bool:
+        """Whether two are timed to meet, so that there is an accident."""
+        return bool(self.meeting_roles)
+
+
+def draw(template: SpecTemplate, rng: np.random.Generator) -> ScenarioSpec:
+    """Make every choice of a scenario.
+
+    The four agents are there: followers that the file does not name are cars. Where the file asks for an exchange,
+    ego and other change places in half of the draws, and a four-way junction is then turned so that ego comes from the
+    arm from which it came before.
+
+    Args:
+        template: of `read_spec`, or one of `DESIGNS`.
+        rng: random numbers; the same give the same scenario.
+    """
+    spec = cast("ScenarioSpec", template.root.draw(rng))
+    named = cast("Items", template.root.fields["actors"]).items
+    actors = [_completed(actor, cast("Part", part), spec, rng) for actor, part in zip(spec.actors, named, strict=True)]
+    roles = {actor.role for actor in actors}
+    actors += [ActorSpec(role=role) for role in LEADERS if role not in roles]
+    spec = replace(spec, actors=tuple(actors))
+    exchanged = spec.exchange and bool(rng.random() < 0.5)
+    return _exchanged(spec) if exchanged else replace(spec, exchange=False)
+
+
+def _completed(actor: ActorSpec, part: Part, spec: ScenarioSpec, rng: np.random.Generator) -> ActorSpec:
+    """An actor with the values that follow from others."""
+    if actor.role == "pedestrian":
+        return replace(actor, category="pedestrian")
+    if "lane" in part.fields or spec.road.lanes == 1:
+        return actor
+    lane = int(rng.choice(usual_lanes(actor.turn, spec.road.lanes)))
+    return replace(actor, lane=lane)
+
+
+def _exchanged(spec: ScenarioSpec) -> ScenarioSpec:
+    """Ego in the place of other, and the reverse."""
+    came_from = spec.actor("ego").from_arm
+    actors = tuple(replace(actor, role=_EXCHANGED.get(actor.role, actor.role)) for actor in spec.actors)
+    meet = spec.meet
+    if meet is not None:
+        first, second = (_EXCHANGED.get(role, role) for role in meet.actors)
+        meet = replace(meet, actors=(first, second))
+    spec = replace(spec, actors=actors, meet=meet, exchange=True)
+    comes_from = spec.actor("ego").from_arm
+    if spec.road.kind == "three-way" or came_from is None or comes_from is None:
+        return spec
+    return _turned(spec, ARMS.index(came_from) - ARMS.index(comes_from))
+
+
+def _turned(spec: ScenarioSpec, quarters: int) -> ScenarioSpec:
+    """All arms so many quarter turns on, counter-clockwise."""
+
+    def turned(arm: Arm) -> Arm:
+        return ARMS[(ARMS.index(arm) + quarters) % len(ARMS)]
+
+    hump = spec.road.hump
+    if hump is not None:
+        hump = replace(hump, arm=turned(hump.arm))
+    actors = tuple(
+        actor if actor.from_arm is None else replace(actor, from_arm=turned(actor.from_arm)) for actor in spec.actors
+    )
+    return replace(spec, road=replace(spec.road, hump=hump), actors=actors)

@@ -1,0 +1,120 @@
+"""A YAML text as a tree that knows its lines."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+from deepaccident_devkit.errors import ConfigError
+
+if TYPE_CHECKING:
+    import yaml
+
+_PLAIN_TAGS: Final = tuple(
+    f"tag:yaml.org,2002:{name}" for name in ("map", "seq", "str", "int", "float", "bool", "null", "timestamp")
+)
+"""Those that values have without being told so."""
+_DECIMAL: Final = re.compile(r"[-+]?(\.inf|\.nan|(0|[1-9]\d*)(\.\d*)?([eE][-+]?\d+)?|\.\d+)", re.IGNORECASE)
+"""YAML 1.1 also reads 010 as eight, 1:30 as ninety and 1_0 as ten, which few expect."""
+Scalar: TypeAlias = object
+"""What a plain word of YAML is: a string, a number, a boolean, None; or something that no field takes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """A value and where it stands.
+
+    Attributes:
+        where: such as `mine.yaml:12`; of an entry the line of its key.
+        value: a scalar, the entries of a mapping, or the items of a list.
+    """
+
+    where: str
+    value: Scalar | Mapping[str, Node] | tuple[Node, ...]
+
+
+def parse_yaml(text: str, source: str) -> Node:
+    """The tree of a YAML text.
+
+    Args:
+        text: of one document, with no tags, anchors or aliases.
+        source: what messages call it, such as the file's path.
+
+    Raises:
+        ConfigError: it is empty or no YAML, has a key twice or that is no word, an alias, a tag, or a number that is
+            not decimal; line, path and remedy are in the message.
+    """
+    import yaml
+
+    try:
+        loader = yaml.SafeLoader(text)
+        root = loader.get_single_node()
+        if root is None:
+            raise ConfigError(f"{source}: is empty; write at least the actors ego and other (docs/scenarios.md)")
+        return _Tree(source, loader).node(root, root.start_mark.line)
+    except yaml.MarkedYAMLError as error:
+        raise ConfigError(f"{source}:{_fault(error)}") from error
+    except (yaml.YAMLError, RecursionError) as error:
+        raise ConfigError(f"{source}: no YAML: {str(error).splitlines()[0]}; write it anew as plain text") from error
+
+
+def _fault(error: yaml.MarkedYAMLError) -> str:
+    """What is wrong, from the line's number on; YAML often stumbles lines after the one where something began."""
+    marks = [mark for mark in (error.problem_mark, error.context_mark) if mark]
+    lines = list(dict.fromkeys(mark.line + 1 for mark in marks)) or [1]
+    began = f", or line {lines[-1]} where it begins" if len(lines) > 1 else ""
+    return f"{lines[0]}: no YAML: {error.problem}; mend that line{began}: its quotes, brackets or indent (no tabs)"
+
+
+class _Tree:
+    """Makes nodes of PyYAML's, each once: an alias would be a second time."""
+
+    def __init__(self, source: str, loader: yaml.SafeLoader) -> None:
+        self._source = source
+        self._loader = loader
+        self._seen: set[int] = set()
+
+    def node(self, raw: yaml.Node, line: int, path: str = "") -> Node:
+        """A node and all in it; `path` is where it stands, such as `actors[1]`."""
+        import yaml
+
+        where = f"{self._source}:{line + 1}"
+        if id(raw) in self._seen:
+            raise self._error(line, path, "aliases (*name) are not read here; write the value out")
+        self._seen.add(id(raw))
+        if not raw.tag.startswith(_PLAIN_TAGS):
+            raise self._error(line, path, f"tags ({raw.tag}) are not read here; leave the tag out")
+        if isinstance(raw, yaml.MappingNode):
+            return Node(where, self._entries(raw, path))
+        if isinstance(raw, yaml.SequenceNode):
+            items = enumerate(raw.value)
+            return Node(where, tuple(self.node(item, item.start_mark.line, f"{path}[{k}]") for k, item in items))
+        return Node(where, self._scalar(raw, line, path))
+
+    def _scalar(self, raw: yaml.Node, line: int, path: str) -> Scalar:
+        try:
+            value = self._loader.construct_object(raw)
+        except (ValueError, LookupError, AttributeError) as error:  # what PyYAML raises where a tag does not fit
+            sentence = f"no value: {raw.value[:40]!r} ({error}); put it in quotes if it is a word"
+            raise self._error(line, path, sentence) from error
+        if isinstance(value, int | float) and not isinstance(value, bool) and not _DECIMAL.fullmatch(raw.value):
+            sentence = f"{raw.value!r} is no plain decimal number; write it as one, or in quotes if it is a word"
+            raise self._error(line, path, sentence)
+        return value
+
+    def _entries(self, raw: yaml.MappingNode, path: str) -> dict[str, Node]:
+        entries: dict[str, Node] = {}
+        for raw_key, raw_value in raw.value:
+            key, line = raw_key.value, raw_key.start_mark.line
+            if not isinstance(key, str):
+                raise self._error(line, path, "expected a key that is a word, found a list or mapping; write a word")
+            inner = f"{path}.{key}" if path else key
+            if key in entries:
+                raise self._error(line, inner, "stands twice; keep one of them")
+            entries[key] = self.node(raw_value, line, inner)
+        return entries
+
+    def _error(self, line: int, path: str, sentence: str) -> ConfigError:
+        return ConfigError(": ".join(part for part in (f"{self._source}:{line + 1}", path, sentence) if part))

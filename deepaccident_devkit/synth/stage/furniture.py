@@ -1,0 +1,125 @@
+"""Street furniture: masts, traffic lights, signs, lanterns."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from deepaccident_devkit.synth.roads import POLE, Arm, RoadSpec
+from deepaccident_devkit.synth.roads.terrain import OUTWARD
+from deepaccident_devkit.synth.solids import Block, Color
+from deepaccident_devkit.synth.stage.props import Prop
+
+LAMP_COLORS: tuple[Color, Color, Color] = ((230, 46, 38), (240, 186, 50), (52, 210, 96))
+"""Of lit lamps: red, amber, green."""
+_DARK_LAMPS: tuple[Color, Color, Color] = ((72, 22, 20), (76, 58, 20), (18, 62, 32))
+_STEEL: Color = (92, 96, 100)
+_HOUSING: Color = (38, 40, 42)
+LANTERN_COLOR: Color = (226, 222, 200)
+"""Of a lantern's head, which shines at night."""
+_PLATE: Color = (230, 226, 220)
+_RIM: Color = (186, 34, 36)
+KERB_INSET = 0.3
+"""Metres from the kerb to the middle of a mast."""
+_BEHIND_LINE = 0.3
+"""Metres from the stop or yield line, towards the junction, to the light or sign."""
+_LAMP_HEIGHTS = (3.35, 3.05, 2.75)
+"""Metres above the ground: red, amber, green."""
+_LANTERN_SPACING = 28.0
+_LANTERN_HEIGHT = 6.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SignalHead:
+    """The lamps that those who come by one arm see.
+
+    Attributes:
+        arm: by which they come.
+        position: x, y, z of the middle lamp, metres, ground frame.
+        yaw: direction in which the lamps shine, radians.
+        rows: of the red, amber and green lamp in `World.props`.
+    """
+
+    arm: Arm
+    position: tuple[float, float, float]
+    yaw: float
+    rows: tuple[int, int, int]
+
+
+def mast(x: float, y: float, top: float) -> Prop:
+    """A mast of a height, metres."""
+    return Prop(POLE, (_column(x, y, (-0.1, top)),))
+
+
+def traffic_light(spec: RoadSpec, arm: Arm) -> Prop:
+    """A mast, a housing and three dark lamps (the last three blocks: red, amber, green) at the right of a stop line."""
+    out_x, out_y = OUTWARD[arm]
+    x, y = _right_of_line(spec, arm)
+    lamps = (
+        _box(x + 0.12 * out_x, y + 0.12 * out_y, 0.11, (z - 0.1, z + 0.1), color)
+        for z, color in zip(_LAMP_HEIGHTS, _DARK_LAMPS, strict=True)
+    )
+    housing = _box(x, y, 0.15, (_LAMP_HEIGHTS[2] - 0.2, _LAMP_HEIGHTS[0] + 0.2), _HOUSING)
+    return Prop(POLE, (_column(x, y, (-0.1, housing.z[0])), housing, *lamps))
+
+
+def yield_sign(spec: RoadSpec, arm: Arm) -> Prop:
+    """A post with a triangle that stands on its tip, red around white, at the right of a yield line."""
+    out_x, out_y = OUTWARD[arm]
+    x, y = _right_of_line(spec, arm)
+    rim = _triangle(x, y, arm, (2.05, 2.75), _RIM)
+    face = _triangle(x + 0.02 * out_x, y + 0.02 * out_y, arm, (2.2, 2.69), _PLATE)
+    return Prop(POLE, (_column(x, y, (-0.1, 2.3), half=0.025), rim, face))
+
+
+def signal_head(arm: Arm, light: Prop, first_row: int) -> SignalHead:
+    """Where the lamps of a light are.
+
+    Args:
+        arm: whose light it is.
+        light: from `traffic_light`, settled on its ground.
+        first_row: of the light's first block in the world's solids.
+    """
+    amber, red_row = light.blocks[-2], first_row + len(light.blocks) - len(LAMP_COLORS)
+    out_x, out_y = OUTWARD[arm]
+    return SignalHead(
+        arm=arm,
+        position=(float(np.mean(amber.x)), float(np.mean(amber.y)), float(np.mean(amber.z))),
+        yaw=float(np.arctan2(out_y, out_x)),
+        rows=(red_row, red_row + 1, red_row + 2),
+    )
+
+
+def lanterns(spec: RoadSpec) -> Iterator[Prop]:
+    """Street lanterns along both sidewalks of each arm, by turns."""
+    for arm in spec.arms:
+        out_x, out_y = OUTWARD[arm]
+        for number, along in enumerate(np.arange(spec.stop_line[1] + 9.0, 115.0, _LANTERN_SPACING)):
+            side = 1 if number % 2 else -1
+            beside = side * (spec.road_edge + KERB_INSET)
+            x, y = float(along * out_x - beside * out_y), float(along * out_y + beside * out_x)
+            head = _box(x, y, 0.24, (_LANTERN_HEIGHT, _LANTERN_HEIGHT + 0.25), LANTERN_COLOR)
+            yield Prop(POLE, (_column(x, y, (-0.1, _LANTERN_HEIGHT)), head))
+
+
+def _right_of_line(spec: RoadSpec, arm: Arm) -> tuple[float, float]:
+    """Where what concerns those who come by an arm stands: x and y, metres."""
+    along, beside = spec.stop_line[0] - _BEHIND_LINE, spec.road_edge + KERB_INSET
+    out_x, out_y = OUTWARD[arm]
+    return along * out_x - beside * out_y, along * out_y + beside * out_x
+
+
+def _triangle(x: float, y: float, arm: Arm, z: tuple[float, float], color: Color) -> Block:
+    """A plate across an arm, nearly a point below and as wide as it is high above."""
+    tip, wide, thin = 0.02, (z[1] - z[0]) * 0.5, 0.02
+    if OUTWARD[arm][0]:
+        return Block((x - thin, x + thin), (y - tip, y + tip), z, color, inset=(0.0, 0.0, tip - wide))
+    return Block((x - tip, x + tip), (y - thin, y + thin), z, color, inset=(tip - wide, tip - wide, 0.0))
+
+
+def _column(x: float, y: float, z: tuple[float, float], half: float = 0.09) -> Block:
+    return _box(x, y, half, z, _STEEL)
+
+
+def _box(x: float, y: float, half: float, z: tuple[float, float], color: Color) -> Block:
+    return Block((x - half, x + half), (y - half, y + half), z, color)

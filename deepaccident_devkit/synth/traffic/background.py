@@ -1,0 +1,193 @@
+"""Everyone else who moves: traffic on all arms, two-wheelers, people on the sidewalks and crosswalks."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from deepaccident_devkit.synth.bodies import random_body
+from deepaccident_devkit.synth.roads import Junction, Path, Route
+from deepaccident_devkit.synth.roads.terrain import OUTWARD
+from deepaccident_devkit.synth.spec import ScenarioSpec
+from deepaccident_devkit.synth.traffic.signals import RED, SignalPlan
+from deepaccident_devkit.synth.traffic.users import MANNERS, RoadUser
+from deepaccident_devkit.synth.traffic.ways import lane_span, lane_way, shifted
+
+_DRIVERS = ("car", "car", "car", "car", "van", "truck")
+_RIDERS = ("motorcycle", "cyclist")
+_REACH = 75.0
+"""Metres from the junction's middle within which background traffic starts."""
+_TRIES = 8
+_START_GAP = (3.0, 1.2)
+"""Metres, and seconds of driving, between two who start in one lane."""
+_QUEUE_BRAKING = 1.5
+"""m/s² at which those who start before a red light or a yield line are slowing down already."""
+_HOUSE_REACH = 32.0
+"""Metres from the junction's middle within which a house that hides the view stands."""
+_SIDEWALK_OFFSETS = (0.2, 0.4)
+"""Metres to the right of a sidewalk's middle; people pass each other on the left."""
+_CROSSWALK_OFFSETS = (0.3, 0.9)
+
+
+def background_users(
+    rng: np.random.Generator,
+    spec: ScenarioSpec,
+    junction: Junction,
+    named: Sequence[RoadUser],
+    signals: SignalPlan | None,
+    begin: float,
+) -> list[RoadUser]:
+    """The moving background, as at the beginning; who finds no room is left out.
+
+    Args:
+        rng: random numbers.
+        spec: how many there are.
+        junction: its roads.
+        named: those who are there already; the lanes before them are left free up to the junction.
+        signals: the traffic lights.
+        begin: seconds, when the simulation starts.
+    """
+    placed = _Lanes(named)
+    users: list[RoadUser] = []
+    sidewalks = [path for path in junction.sidewalk_paths() if not _built_over(spec, path)]
+    kinds: list[tuple[int, Callable[[], RoadUser | None]]] = [
+        (spec.background.vehicles, lambda: _driver(rng, junction, _DRIVERS, placed, signals, begin)),
+        (spec.background.two_wheelers, lambda: _driver(rng, junction, _RIDERS, placed, signals, begin)),
+        (spec.background.walking if sidewalks else 0, lambda: _walker(rng, sidewalks)),
+        (spec.background.crossing, lambda: _crosser(rng, junction, named, signals, begin)),
+    ]
+    for count, make in kinds:
+        users += [user for user in (make() for _ in range(count)) if user is not None]
+    return users
+
+
+class _Lanes:
+    """Who starts where, lane by lane."""
+
+    def __init__(self, named: Sequence[RoadUser]) -> None:
+        self._taken: list[tuple[Route, float, float]] = []
+        """Route, from, to: metres along it that are not free."""
+        for user in named:
+            if user.route is not None:
+                reach = user.body.size[0] / 2 + _START_GAP[0] + _START_GAP[1] * user.max_speed
+                self._taken.append((user.route, user.start - reach, user.route.exit_s + 15.0))
+
+    def is_free(self, route: Route, place: float) -> bool:
+        """Whether one can start at `place` metres along a route."""
+        return not any(low < place < high and _share_lane(route, other, place) for other, low, high in self._taken)
+
+    def take(self, user: RoadUser, route: Route) -> None:
+        """Keep others away from one who starts."""
+        reach = user.body.size[0] / 2 + _START_GAP[0] + _START_GAP[1] * user.start_speed
+        self._taken.append((route, user.start - reach - 3.0, user.start + reach + 3.0))
+
+
+def _share_lane(route: Route, other: Route, place: float) -> bool:
+    """Whether two routes are one lane at `place` metres along the first."""
+    if place < route.enter_s:
+        return route.from_arm == other.from_arm and route.lane == other.lane
+    return route.to_arm == other.to_arm and route.lane == other.lane
+
+
+def _driver(
+    rng: np.random.Generator,
+    junction: Junction,
+    categories: Sequence[str],
+    placed: _Lanes,
+    signals: SignalPlan | None,
+    begin: float,
+) -> RoadUser | None:
+    category = str(rng.choice(categories))
+    body, manner = random_body(rng, category), MANNERS[category]
+    max_speed = float(rng.uniform(*manner.max_speed))
+    for _ in range(_TRIES):
+        route = _random_route(rng, junction, category)
+        coming = rng.random() < 0.75
+        reach = route.enter_s - body.size[0] / 2 - 4.0
+        place = reach - rng.uniform(0, _REACH) if coming else route.exit_s + rng.uniform(8.0, 45.0)
+        if placed.is_free(route, float(place)):
+            break
+    else:
+        return None
+    speed = 0.9 * max_speed
+    red = signals is not None and signals.state(route.from_arm, begin) == RED
+    if coming and (red or route.from_arm in junction.spec.yielding_arms):
+        room = max(route.stop_s - place - body.size[0] / 2 - 0.5, 0.0)
+        speed = min(speed, float(np.sqrt(2 * _QUEUE_BRAKING * room)))
+    if coming and signals is None:
+        speed *= 0.7
+    user = RoadUser(
+        role="background",
+        body=body,
+        path=lane_way(junction, route, category),
+        start=float(place),
+        start_speed=float(speed),
+        max_speed=max_speed,
+        route=route,
+        span=lane_span(route),
+    )
+    placed.take(user, route)
+    return user
+
+
+def _random_route(rng: np.random.Generator, junction: Junction, category: str) -> Route:
+    arm = junction.arms[rng.integers(len(junction.arms))]
+    turns = [turn for turn in junction.turns(arm) if category != "cyclist" or turn != "left"]
+    weights = np.array([3.0 if turn == "straight" else 1.0 for turn in turns])
+    turn = turns[rng.choice(len(turns), p=weights / weights.sum())]
+    lane = int(rng.integers(junction.spec.lanes)) if turn == "straight" and category != "cyclist" else None
+    return junction.route(arm, turn, lane)
+
+
+def _built_over(spec: ScenarioSpec, sidewalk: Path) -> bool:
+    """Whether a house stands on a sidewalk: that between ego and other, where the view is hidden."""
+    if spec.view != "hidden":
+        return False
+    out = np.array([OUTWARD[spec.actor(role).from_arm or "west"] for role in ("ego", "other")], dtype=np.float64)
+    corner = out.sum(axis=0)
+    near = np.abs(sidewalk.xy).max(axis=1) < _HOUSE_REACH
+    return bool((near & (sidewalk.xy * corner > 0).all(axis=1)).any())
+
+
+def _walker(rng: np.random.Generator, sidewalks: Sequence[Path]) -> RoadUser:
+    """One on a sidewalk, either way."""
+    path = sidewalks[int(rng.integers(len(sidewalks)))]
+    path = shifted(path if rng.random() < 0.5 else path.reversed(), float(-rng.uniform(*_SIDEWALK_OFFSETS)))
+    body, manner = random_body(rng, "pedestrian"), MANNERS["pedestrian"]
+    speed = float(rng.uniform(*manner.max_speed))
+    start = float(path.length / 2 + rng.uniform(-55, 45))
+    return RoadUser(role="pedestrian", body=body, path=path, start=start, start_speed=speed, max_speed=speed)
+
+
+def _crosser(
+    rng: np.random.Generator,
+    junction: Junction,
+    named: Sequence[RoadUser],
+    signals: SignalPlan | None,
+    begin: float,
+) -> RoadUser | None:
+    """One over a crosswalk that no named road user drives over, while its arm has red."""
+    used = {arm for user in named if user.route for arm in (user.route.from_arm, user.route.to_arm)}
+    arms = [arm for arm in junction.arms if arm not in used]
+    if not arms or not junction.spec.crosswalks:
+        return None
+    arm = arms[rng.integers(len(arms))]
+    delay = float(rng.uniform(0.0, 8.0))
+    body, manner = random_body(rng, "pedestrian"), MANNERS["pedestrian"]
+    speed = float(rng.uniform(*manner.max_speed))
+    path = junction.crosswalk(arm)
+    path = shifted(path if rng.random() < 0.5 else path.reversed(), float(-rng.uniform(*_CROSSWALK_OFFSETS)))
+    needed = path.length / speed
+    if signals is not None and any(
+        signals.state(arm, begin + delay + share * needed) != RED for share in (0.0, 0.5, 1.0)
+    ):
+        return None
+    return RoadUser(
+        role="pedestrian",
+        body=body,
+        path=path,
+        start=0.0,
+        start_speed=0.0,
+        max_speed=speed,
+        delay=delay,
+        span=(0.0, path.length),
+    )

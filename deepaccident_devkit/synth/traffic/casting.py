@@ -1,0 +1,157 @@
+"""Who takes part: the road users of a scenario file, set so that those who are to meet do so."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from deepaccident_devkit.synth.bodies import random_body
+from deepaccident_devkit.synth.roads import LANE_WIDTH, Junction, Path, Route, crossing, lane_change
+from deepaccident_devkit.synth.spec import ActorSpec, ScenarioSpec
+from deepaccident_devkit.synth.spec.checks import LEADERS
+from deepaccident_devkit.synth.spec.model import Role
+from deepaccident_devkit.synth.traffic.approach import drive_alone
+from deepaccident_devkit.synth.traffic.users import MANNERS, RoadUser
+from deepaccident_devkit.synth.traffic.ways import lane_span, lane_way, middle_of, road_crossing
+
+WARM_UP = 1.0
+"""Seconds that are simulated before the first recorded frame."""
+_GAPS = (8.0, 16.0)
+"""Metres, bumper to bumper, where the file does not say."""
+_ALERTS = (-0.3, 0.3)
+"""Seconds before a contact at which one who is timed to meet another notices it; who would do so later, never does."""
+_STARTS = (35.0, 75.0)
+"""Metres before the junction's middle where one starts whose start is not given."""
+_LANE_CHANGE = 28.0
+"""Metres that a change of lanes takes."""
+_KEEPING_UP = 1.3
+"""Times its leader's, the speed that one behind would like: it closes up."""
+_FIRST_PLACE = 8.0
+"""Metres from the path's beginning to where the last one of a queue starts."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Cast:
+    """The named road users of a scenario at its beginning.
+
+    Attributes:
+        users: leaders come before those behind them.
+        begin: seconds, when the simulation starts; time 0 is when the first of the pair is where the paths cross.
+        pair: rows of the two who are timed to meet; None if nobody is.
+    """
+
+    users: tuple[RoadUser, ...]
+    begin: float
+    pair: tuple[int, int] | None
+
+    def row_of(self, role: Role) -> int:
+        """The first row of a role."""
+        return next(row for row, user in enumerate(self.users) if user.role == role)
+
+
+def cast_actors(rng: np.random.Generator, spec: ScenarioSpec, junction: Junction, duration: float) -> Cast:
+    """The moving road users that a file names.
+
+    Args:
+        rng: random numbers.
+        spec: what the file says, every choice made.
+        junction: its roads.
+        duration: seconds from the first recorded frame to when the pair meets.
+    """
+    begin = -(duration + WARM_UP)
+    named = [actor for actor in spec.actors if actor.role != "parked"]
+    leading = [actor for actor in named if actor.role not in LEADERS]
+    pair = _pair_rows(spec, leading)
+    users = [_drawn(rng, actor, junction, timed=row in (pair or ())) for row, actor in enumerate(leading)]
+    if pair is not None and spec.meet is not None:
+        meeting = crossing(users[pair[0]].path, users[pair[1]].path)
+        if meeting is None:
+            pair = None
+        else:
+            approaches = [drive_alone(users[row]) for row in pair]
+            for row, place, late, approach in zip(pair, meeting, (0.0, spec.meet.offset), approaches, strict=True):
+                users[row] = approach.at(approach.time_to(place) + begin - late)
+    for actor in named:
+        if actor.role in LEADERS:
+            leader = next(user for user in users if user.role == LEADERS[actor.role])
+            stays = spec.actor(leader.role).lane_change is not None  # or it would drive into who is beside it
+            path = leader.route.path if stays and leader.route else leader.path
+            users.append(_follower(rng, actor, leader, path))
+    return Cast(users=tuple(users), begin=begin, pair=pair)
+
+
+def _pair_rows(spec: ScenarioSpec, actors: Sequence[ActorSpec]) -> tuple[int, int] | None:
+    """Rows of those who are to meet; None if nobody is."""
+    if spec.meet is None:
+        return None
+    roles = [actor.role for actor in actors]
+    first, second = spec.meet.actors
+    return (roles.index(first), roles.index(second)) if first in roles and second in roles else None
+
+
+def _drawn(rng: np.random.Generator, actor: ActorSpec, junction: Junction, *, timed: bool) -> RoadUser:
+    """One who follows nobody; one who is timed starts from far away, standing, unless the file says where."""
+    body, manner = random_body(rng, actor.category), MANNERS[actor.category]
+    max_speed = actor.max_speed if actor.max_speed is not None else float(rng.uniform(*manner.max_speed))
+    arm = actor.from_arm or "west"
+    if actor.role == "pedestrian":
+        distance = actor.start_distance if actor.start_distance is not None else float(rng.uniform(22, 50))
+        path = road_crossing(junction.spec, arm, distance, actor.side)
+        return RoadUser(
+            role=actor.role,
+            body=body,
+            path=path,
+            start=0.0,
+            start_speed=0.0,
+            max_speed=max_speed,
+            delay=actor.delay,
+            span=(0.0, path.length),
+            ignores=actor.ignores,
+        )
+    route = junction.route(arm, actor.turn, actor.lane)
+    start, speed = _FIRST_PLACE + 2 * _GAPS[1] + body.size[0], 0.0
+    if actor.start_distance is not None:
+        start, speed = middle_of(route) - actor.start_distance, 0.0 if actor.delay else max_speed
+    elif not timed:
+        start, speed = middle_of(route) - float(rng.uniform(*_STARTS)), 0.8 * max_speed
+    return RoadUser(
+        role=actor.role,
+        body=body,
+        path=_way(junction, route, actor),
+        start=start,
+        start_speed=speed,
+        max_speed=max_speed,
+        delay=actor.delay,
+        route=route,
+        span=lane_span(route),
+        ignores=actor.ignores,
+        alert=max(float(rng.uniform(*_ALERTS)), 0.0) if timed else 0.0,
+    )
+
+
+def _way(junction: Junction, route: Route, actor: ActorSpec) -> Path:
+    """Its path, with the change of lanes if it makes one."""
+    path = lane_way(junction, route, actor.category)
+    if actor.lane_change is None:
+        return path
+    offset = LANE_WIDTH if actor.lane == 0 else -LANE_WIDTH
+    return lane_change(path, middle_of(route) - actor.lane_change, _LANE_CHANGE, offset)
+
+
+def _follower(rng: np.random.Generator, actor: ActorSpec, leader: RoadUser, path: Path) -> RoadUser:
+    """One behind its leader, as fast as it, on a path that begins as its leader's."""
+    body, manner = random_body(rng, actor.category), MANNERS[actor.category]
+    gap = actor.gap if actor.gap is not None else float(rng.uniform(*_GAPS))
+    own_speed = actor.max_speed if actor.max_speed is not None else float(rng.uniform(*manner.max_speed))
+    return RoadUser(
+        role=actor.role,
+        body=body,
+        path=path,
+        start=leader.start - (leader.body.size[0] + body.size[0]) / 2 - gap,
+        start_speed=leader.start_speed,
+        max_speed=max(own_speed, _KEEPING_UP * leader.max_speed),
+        delay=leader.delay,
+        route=leader.route,
+        span=leader.span,
+        ignores=leader.ignores,
+    )

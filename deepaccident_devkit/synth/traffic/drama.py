@@ -1,0 +1,196 @@
+"""A scenario on stage: all who take part at its beginning, and what happens with broken and with kept rules."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.synth.roads import Junction
+from deepaccident_devkit.synth.spec import ScenarioSpec
+from deepaccident_devkit.synth.spec.model import Role
+from deepaccident_devkit.synth.traffic.background import background_users
+from deepaccident_devkit.synth.traffic.casting import Cast, cast_actors
+from deepaccident_devkit.synth.traffic.parked import ParkedVehicle, parked_vehicles
+from deepaccident_devkit.synth.traffic.rights import find_rights
+from deepaccident_devkit.synth.traffic.signals import AXIS_OF_ARM, SignalPlan, plan_with_green
+from deepaccident_devkit.synth.traffic.simulate import Simulation, simulate
+from deepaccident_devkit.synth.traffic.touching import least_gap, touching_pairs
+from deepaccident_devkit.synth.traffic.users import RoadUser
+
+_GREEN_TIMES = (14.0, 20.0)
+_GREEN_SHARE = (0.35, 0.75)
+"""How much of the green is over when the pair meets."""
+_LATEST = 1.5
+"""Seconds after the time at which the pair should meet, when a simulation of their accident ends."""
+_ROUNDS = 5
+"""How often a simulation is made anew without those of the background who touch someone."""
+_LONGEST_DRIVE = 11.0
+"""Seconds before a meeting for which the background drives; in a longer scenario it stands until then."""
+_MARGIN = 0.1
+"""Metres: who comes nearer than this touches."""
+_CLEAR = 1.0
+"""Metres that the named ones keep from each other in a normal twin."""
+_DELAYS = (0.0, 1.5, 3.0, 5.0, 8.0, 1000.0)
+"""Seconds by which one of the pair comes later, one after the other, where keeping the rules is not enough."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Stage:
+    """All who take part, as at the beginning.
+
+    Attributes:
+        spec: what was asked for.
+        junction: its roads.
+        cast: the named road users.
+        background: the others that move.
+        parked: those that do not.
+        signals: the traffic lights, None if there are none.
+    """
+
+    spec: ScenarioSpec
+    junction: Junction
+    cast: Cast
+    background: tuple[RoadUser, ...]
+    parked: tuple[ParkedVehicle, ...]
+    signals: SignalPlan | None
+
+    @property
+    def users(self) -> tuple[RoadUser, ...]:
+        """All that move, the named ones first."""
+        return (*self.cast.users, *self.background)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Performance:
+    """What happened.
+
+    Attributes:
+        simulation: of those in `present`.
+        present: rows of the stage's users who took part: all but those of the background who would have touched
+            someone.
+    """
+
+    simulation: Simulation
+    present: tuple[int, ...]
+
+
+def set_stage(rng: np.random.Generator, spec: ScenarioSpec, junction: Junction, duration: float) -> Stage:
+    """Everyone's place at the beginning.
+
+    Args:
+        rng: random numbers.
+        spec: what is asked for.
+        junction: its roads.
+        duration: seconds from the first recorded frame to when the pair meets.
+    """
+    cast = cast_actors(rng, spec, junction, duration)
+    signals = _signal_plan(rng, cast) if spec.road.signalized else None
+    hold = max(duration - _LONGEST_DRIVE, 0.0)
+    background = background_users(rng, spec, junction, cast.users, signals, cast.begin + hold)
+    return Stage(
+        spec=spec,
+        junction=junction,
+        cast=cast,
+        background=tuple(_held(user, hold) for user in background),
+        parked=tuple(parked_vehicles(rng, spec, junction, [user for user in cast.users if user.walks])),
+        signals=signals,
+    )
+
+
+def _held(user: RoadUser, seconds: float) -> RoadUser:
+    """The same one, that stands so long first."""
+    return user if seconds == 0 else replace(user, start_speed=0.0, delay=user.delay + seconds)
+
+
+def perform_accident(stage: Stage) -> Performance | None:
+    """What happens where the pair breaks its rules, up to its contact; None if it has none, or others touch before."""
+    pair = stage.cast.pair
+    if pair is None:
+        return None
+    unruly = [replace(user, ignores=("signal", "priority")) for user in stage.cast.users]
+    users = [unruly[row] if row in pair else user for row, user in enumerate(stage.users)]
+    performance = _perform(stage, users, _LATEST, watched=pair)
+    return performance if performance is not None and performance.simulation.contact is not None else None
+
+
+def perform_twin(stage: Stage, end: float) -> Performance | None:
+    """What happens where everyone keeps the rules, up to `end`, seconds; None if named ones touch all the same.
+
+    Of all delays the first is taken with which the named ones keep `_CLEAR` of each other, or else nobody touches.
+    """
+    roles, narrow = _later_roles(stage.cast), None
+    for late in _DELAYS:
+        users = [_later(user.obeying(), late) if user.role in roles else user.obeying() for user in stage.users]
+        performance = _perform(stage, users, end)
+        if performance is not None and _keep_clear(stage, performance):
+            return performance
+        narrow = narrow or performance
+    return narrow
+
+
+def _later_roles(cast: Cast) -> tuple[Role, ...]:
+    """Who comes later where keeping the rules is not enough: a stranger of the pair, else other with its follower."""
+    strangers = [cast.users[row].role for row in cast.pair or () if cast.users[row].role not in ("ego", "other")]
+    return tuple(strangers) or ("other", "other_behind")
+
+
+def _later(user: RoadUser, seconds: float) -> RoadUser:
+    """The same one so much later."""
+    if seconds == 0:
+        return user
+    back = user.start - user.start_speed * seconds
+    if user.start_speed == 0 or back < user.body.size[0]:
+        return replace(user, start_speed=0.0, delay=user.delay + seconds)
+    return replace(user, start=back)
+
+
+def _keep_clear(stage: Stage, performance: Performance) -> bool:
+    rows = list(range(len(stage.cast.users)))
+    size = _sizes(stage.cast.users)
+    return least_gap(performance.simulation.poses, size, rows, _CLEAR) >= _CLEAR
+
+
+def _perform(
+    stage: Stage, users: Sequence[RoadUser], end: float, watched: tuple[int, int] | None = None
+) -> Performance | None:
+    """Simulate, again and again without those of the background who touch someone; None if named ones touch."""
+    present = list(range(len(users)))
+    named = len(stage.cast.users)
+    for _ in range(_ROUNDS):
+        there = [users[row] for row in present]
+        rights = find_rights(there, minor=stage.spec.road.yielding_arms, blind=watched)
+        simulation = simulate(
+            there, begin=stage.cast.begin, end=end, rights=rights, signals=stage.signals, watched=watched
+        )
+        pairs = set(_touching(stage, there, simulation)) - {tuple(sorted(watched or ()))}
+        if not pairs:
+            return Performance(simulation=simulation, present=tuple(present))
+        leaving = {max(i, j) if max(i, j) < len(there) else min(i, j) for i, j in pairs}
+        if min(leaving) < named:
+            return None
+        present = [row for place, row in enumerate(present) if place not in leaving]
+    return None
+
+
+def _touching(stage: Stage, users: Sequence[RoadUser], simulation: Simulation) -> list[tuple[int, int]]:
+    """Pairs of rows that touch; parked vehicles come after the users."""
+    standing = np.array([vehicle.pose for vehicle in stage.parked]).reshape(-1, 3)
+    poses = np.concatenate(
+        [simulation.poses, np.broadcast_to(standing, (len(simulation.time), *standing.shape))], axis=1
+    )
+    size = np.concatenate([_sizes(users), np.array([v.body.size[:2] for v in stage.parked]).reshape(-1, 2)])
+    return [(i, j) for i, j in touching_pairs(poses, size, _MARGIN) if i < len(users)]
+
+
+def _sizes(users: Sequence[RoadUser]) -> FloatArray:
+    return np.array([user.body.size[:2] for user in users])
+
+
+def _signal_plan(rng: np.random.Generator, cast: Cast) -> SignalPlan:
+    """Green for the one of the pair who keeps to the lights when they meet, for ego if nobody is to meet."""
+    rows = [*(cast.pair or ()), cast.row_of("ego")]
+    lawful = [cast.users[row] for row in rows if "signal" not in cast.users[row].ignores]
+    arms = [user.route.from_arm for user in lawful if user.route is not None]
+    axis = AXIS_OF_ARM[arms[0]] if arms else "west-east"
+    return plan_with_green(axis, 0.0, float(rng.uniform(*_GREEN_TIMES)), float(rng.uniform(*_GREEN_SHARE)))

@@ -1,0 +1,85 @@
+"""Who is in the way: the nearest road user in the stretch of road that each is about to drive over."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
+from deepaccident_devkit.synth.traffic.tracks import Tracks
+
+_SPACING = 2.0
+_POINTS = np.arange(0.0, 44.0, _SPACING)
+"""Metres ahead along one's own path."""
+_MARGIN = 0.25
+"""Metres at the sides that drivers want free."""
+_BEHIND = 2.0
+"""Metres: who is farther back than this is not ahead."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bodies:
+    """Where all road users are at one moment.
+
+    Attributes:
+        poses: (A, 3) x, y (metres), yaw (radians) of the boxes' centres.
+        speed: (A,) m/s.
+        length: (A,) metres.
+        width: (A,) metres.
+    """
+
+    poses: FloatArray
+    speed: FloatArray
+    length: FloatArray
+    width: FloatArray
+
+
+def leaders(bodies: Bodies, tracks: Tracks, centers: FloatArray, sees: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Gap (A,) in metres to the nearest one ahead on each one's path, infinite if there is none, and its speed (A,).
+
+    Args:
+        bodies: where they are.
+        tracks: their paths.
+        centers: (A,) how far along its path the centre of each is, metres.
+        sees: (A, A) bool, whether the row's minds the column's.
+    """
+    rows, others = _candidates(bodies, sees)
+    gaps, speeds = np.full(len(centers), np.inf), np.zeros(len(centers))
+    if not len(rows):
+        return gaps, speeds
+    ahead, lateral, turn = _in_path_frame(bodies, tracks, centers, rows, others)
+    cos, sin = np.abs(np.cos(turn)), np.abs(np.sin(turn))
+    half_along = (cos * bodies.length[others] + sin * bodies.width[others]) / 2
+    half_across = (sin * bodies.length[others] + cos * bodies.width[others]) / 2
+    blocking = (np.abs(lateral) < bodies.width[rows] / 2 + half_across + _MARGIN) & (ahead > 0)
+    rows, others = rows[blocking], others[blocking]
+    gap = (ahead - half_along)[blocking] - bodies.length[rows] / 2
+    order = np.argsort(-gap, kind="stable")  # the nearest is written last
+    gaps[rows[order]] = gap[order]
+    along_path = np.maximum(bodies.speed[others] * np.cos(turn[blocking]), 0.0)
+    speeds[rows[order]] = along_path[order]
+    return gaps, speeds
+
+
+def _candidates(bodies: Bodies, sees: BoolArray) -> tuple[IntArray, IntArray]:
+    """Pairs of rows: one that looks, and one that is near and not behind it."""
+    delta = bodies.poses[None, :, :2] - bodies.poses[:, None, :2]
+    heading = bodies.poses[:, 2]
+    forward = np.cos(heading)[:, None] * delta[..., 0] + np.sin(heading)[:, None] * delta[..., 1]
+    reach = (_POINTS[-1] + bodies.length)[:, None] / 2 + 2.0 * bodies.speed[:, None]
+    near = (delta[..., 0] ** 2 + delta[..., 1] ** 2 < reach**2) & (forward > -_BEHIND) & sees
+    rows, others = np.nonzero(near)
+    return rows, others
+
+
+def _in_path_frame(
+    bodies: Bodies, tracks: Tracks, centers: FloatArray, rows: IntArray, others: IntArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """How far ahead, how far to the left (metres) and how much turned (radians) others are, seen along rows' paths."""
+    points, along = tracks.near(rows, centers[rows, None] + _POINTS)
+    delta = bodies.poses[others, None, :2] - points[..., :2]
+    nearest = (delta**2).sum(axis=-1).argmin(axis=1)
+    pick = np.arange(len(rows))
+    offset, yaw = delta[pick, nearest], points[pick, nearest, 2]
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    ahead = along[pick, nearest] - centers[rows] + cos * offset[:, 0] + sin * offset[:, 1]
+    return ahead, cos * offset[:, 1] - sin * offset[:, 0], bodies.poses[others, 2] - yaw

@@ -1,0 +1,191 @@
+"""The simulation: all road users together, step by step, until a pair touches or time is over."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays
+from deepaccident_devkit.synth.collision import separation
+from deepaccident_devkit.synth.traffic.alarm import Alarm
+from deepaccident_devkit.synth.traffic.following import (
+    Temper,
+    can_stop,
+    free_acceleration,
+    hardest_braking,
+    interaction,
+    stopping,
+)
+from deepaccident_devkit.synth.traffic.kinematics import DECISION_STEPS, HARDEST_BRAKING, PERIOD, Wheels, step
+from deepaccident_devkit.synth.traffic.perception import Bodies, leaders
+from deepaccident_devkit.synth.traffic.rights import Rights
+from deepaccident_devkit.synth.traffic.signals import AMBER, GREEN, SignalPlan
+from deepaccident_devkit.synth.traffic.tracks import Tracks
+from deepaccident_devkit.synth.traffic.users import RoadUser, temper_of
+from deepaccident_devkit.synth.traffic.yielding import waiting_gap
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Simulation(FrozenArrays):
+    """Where everyone was; arrays are read-only.
+
+    Attributes:
+        time: (S,) seconds, `kinematics.PERIOD` apart.
+        states: (S, A, 5) x, y (metres), yaw (radians), speed (m/s) and steering angle (radians); x and y are of the
+            box's centre, speed and yaw of the rear axle, which does not slip.
+        velocities: (S, A, 2) of the box's centre, m/s.
+        contact: row of the first step at which the watched pair touches, None if it never does.
+    """
+
+    time: FloatArray
+    states: FloatArray
+    velocities: FloatArray
+    contact: int | None
+
+    @property
+    def poses(self) -> FloatArray:
+        """(S, A, 3) x, y (metres), yaw (radians) of the boxes' centres."""
+        return self.states[..., :3]
+
+
+def simulate(
+    users: Sequence[RoadUser],
+    *,
+    begin: float,
+    end: float,
+    rights: Rights | None = None,
+    signals: SignalPlan | None = None,
+    watched: tuple[int, int] | None = None,
+) -> Simulation:
+    """Let road users drive and walk.
+
+    Args:
+        users: who they are and how they start.
+        begin: time of the first step, seconds.
+        end: time of the last one, unless the watched pair touches before.
+        rights: what holds between them; None if nobody minds anybody.
+        signals: the traffic lights; None if there are none.
+        watched: rows of two whose contact ends the simulation, and who brake for each other at the last moment at most.
+    """
+    run = _Run(users, rights, signals, watched)
+    count = round((end - begin) / PERIOD) + 1
+    time = begin + PERIOD * np.arange(count, dtype=np.float64)
+    states, velocities = np.empty((count, len(users), 5)), np.empty((count, len(users), 2))
+    contact = None
+    for row in range(count):
+        run.write_state(states[row], velocities[row])
+        if row % DECISION_STEPS == 0:
+            run.decide(states[row], velocities[row], float(time[row]) - begin, float(time[row]))
+            if watched is not None:
+                contact = _first_contact(states, run.size, watched, max(row - DECISION_STEPS, 0), row + 1)
+                if contact is not None:
+                    count = contact + 1
+                    break
+        run.advance()
+    return Simulation(time=time[:count], states=states[:count], velocities=velocities[:count], contact=contact)
+
+
+class _Run:
+    """The state of a simulation between its steps."""
+
+    def __init__(
+        self,
+        users: Sequence[RoadUser],
+        rights: Rights | None,
+        signals: SignalPlan | None,
+        watched: tuple[int, int] | None,
+    ) -> None:
+        self.size = np.array([user.body.size[:2] for user in users])
+        wheelbase, self._walks = np.array([user.wheelbase for user in users]), np.array([user.walks for user in users])
+        self._ahead, self._wheelbase = wheelbase / 2, np.where(self._walks, np.inf, wheelbase)
+        self._walkers = np.flatnonzero(self._walks)
+        self._temper = temper_of(users)
+        lateral = np.array([user.manner.lateral for user in users])
+        self._tracks = Tracks([user.path for user in users], lateral, self._walks)
+        self._delay = np.array([user.delay for user in users])
+        self._rights = rights
+        self._lights = _Lights(users, signals)
+        self._alarm = None if watched is None else _alarm(users, watched, self.size)
+        along = np.array([user.start for user in users]) - self._ahead
+        self._on_path = self._tracks.at(along)
+        x, y, yaw, _ = self._on_path
+        speed = np.array([user.start_speed for user in users], dtype=np.float64)
+        self._wheels = Wheels(x, y, yaw, speed, np.zeros(len(users)), along)
+        self._acceleration = np.zeros(len(users))
+
+    def write_state(self, states: FloatArray, velocities: FloatArray) -> None:
+        """Fill in states (A, 5) and velocities (A, 2), as in `Simulation`."""
+        wheels = self._wheels
+        cos, sin = np.cos(wheels.yaw), np.sin(wheels.yaw)
+        across = wheels.speed * np.tan(wheels.steer) / 2
+        states[:, 0], states[:, 1] = wheels.x + self._ahead * cos, wheels.y + self._ahead * sin
+        states[:, 2], states[:, 3], states[:, 4] = wheels.yaw, wheels.speed, wheels.steer
+        velocities[:, 0], velocities[:, 1] = wheels.speed * cos - across * sin, wheels.speed * sin + across * cos
+
+    def decide(self, states: FloatArray, velocities: FloatArray, since: float, time: float) -> None:
+        """Choose everyone's acceleration, `since` seconds after the start."""
+        wheels, temper = self._wheels, self._temper
+        allowed = self._tracks.allowed_speed(wheels.along)
+        acceleration = free_acceleration(temper, wheels.speed, allowed)
+        if self._rights is not None:
+            acceleration = acceleration + self._for_others(self._rights, states, time)
+        hardest = -hardest_braking(wheels.speed)
+        acceleration[since < self._delay] = -HARDEST_BRAKING
+        if self._alarm is not None:
+            acceleration[self._alarm.rows(states[:, :3], velocities)] = -HARDEST_BRAKING
+        self._acceleration = np.maximum(acceleration, hardest)
+
+    def advance(self) -> None:
+        """One step."""
+        step(self._wheels, self._acceleration, self._on_path, self._wheelbase)
+        self._on_path = self._tracks.at(self._wheels.along)
+        wheels, walkers = self._wheels, self._walkers
+        wheels.x[walkers], wheels.y[walkers], wheels.yaw[walkers] = self._on_path[:3, walkers]
+
+    def _for_others(self, rights: Rights, states: FloatArray, time: float) -> FloatArray:
+        """(A,) m/s², at most 0, for who is ahead, for red lights and for who goes first."""
+        wheels, temper = self._wheels, self._temper
+        speed, centers = wheels.speed, wheels.along + self._ahead
+        front, rear = centers + self.size[:, 0] / 2, centers - self.size[:, 0] / 2
+        bodies = Bodies(states[:, :3], speed, self.size[:, 0], self.size[:, 1])
+        gap, leader_speed = leaders(bodies, self._tracks, centers, rights.sees)
+        red = self._lights.gap(time, front, speed, temper)
+        stop = np.minimum(red, waiting_gap(rights, front, rear, speed, temper.max_speed, red < np.inf))
+        following = np.where(self._walks, 0.0, interaction(temper, speed, gap, leader_speed))
+        result: FloatArray = np.minimum(following, stopping(temper, speed, stop))
+        return result
+
+
+class _Lights:
+    """The stop lines of all road users and what their lights show."""
+
+    def __init__(self, users: Sequence[RoadUser], signals: SignalPlan | None) -> None:
+        self._signals = signals
+        self._arms = [user.route.from_arm if user.route else None for user in users]
+        self._stop = np.array(
+            [user.route.stop_s if user.route and "signal" not in user.ignores else -np.inf for user in users]
+        )
+
+    def gap(self, time: float, front: FloatArray, speed: FloatArray, temper: Temper) -> FloatArray:
+        """(A,) metres to the stop line of each one that has to stop there, else infinite."""
+        if self._signals is None:
+            return np.full(len(front), np.inf)
+        colors = {arm: int(self._signals.state(arm, time)) for arm in set(self._arms) - {None} if arm}
+        color = np.array([colors[arm] if arm else GREEN for arm in self._arms])
+        gap = self._stop - front
+        stops = (color != GREEN) & (gap > -0.5)
+        stops &= (color != AMBER) | can_stop(temper, speed, gap)
+        return np.where(stops, np.maximum(gap, 0.0), np.inf)
+
+
+def _alarm(users: Sequence[RoadUser], pair: tuple[int, int], size: FloatArray) -> Alarm:
+    rows = np.array(pair)
+    return Alarm(rows, size[rows], np.array([users[row].alert for row in pair]))
+
+
+def _first_contact(states: FloatArray, size: FloatArray, pair: tuple[int, int], low: int, high: int) -> int | None:
+    """The first row from `low` up to before `high` at which the boxes of a pair touch."""
+    first, second = pair
+    apart = separation(states[low:high, first, :3], size[first], states[low:high, second, :3], size[second])
+    touching: BoolArray = apart <= 0
+    return low + int(touching.argmax()) if touching.any() else None

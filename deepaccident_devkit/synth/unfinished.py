@@ -1,0 +1,127 @@
+"""A release that is being made: a folder beside its place, with which a later call can go on after a break."""
+
+import json
+import shutil
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from deepaccident_devkit._version import __version__
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.synth.config import SynthConfig
+
+_CONFIG_FILE, _MADE_FILE, _LOCK_FILE = "config.json", "made.txt", ".lock"
+
+
+@dataclass(frozen=True, slots=True)
+class Unfinished:
+    """The folder of a release that is being made.
+
+    Attributes:
+        folder: hidden, beside the place that the release will have.
+    """
+
+    folder: Path
+
+    @property
+    def release(self) -> Path:
+        """The release, as far as it is made."""
+        return self.folder / "release"
+
+    def part(self, name: str) -> Path:
+        """Where a part of a scenario is recorded, as in a release of its own."""
+        return self.folder / "parts" / name
+
+    def clear(self, name: str) -> None:
+        """Remove what a break left of a part."""
+        shutil.rmtree(self.part(name), ignore_errors=True)
+
+    def made(self) -> frozenset[str]:
+        """Names of the parts that are whole; a line that a break cut off is none of them."""
+        path = self.folder / _MADE_FILE
+        return frozenset(path.read_text(encoding="utf-8").split("\n")[:-1] if path.is_file() else ())
+
+    def note(self, name: str) -> None:
+        """Remember that a part is whole."""
+        with (self.folder / _MADE_FILE).open("a", encoding="utf-8") as file:
+            file.write(f"{name}\n")
+
+    def gather(self, names: Iterable[str]) -> None:
+        """Move the files of a scenario's parts into the release, as far as they are not there yet."""
+        for name in names:
+            if self.part(name).is_dir():
+                _merge(self.part(name), self.release)
+
+
+@contextmanager
+def unfinished_release(out: Path, config: SynthConfig) -> Iterator[Unfinished]:
+    """The release that becomes `out` when the block succeeds; a block that fails leaves it to be gone on with.
+
+    Raises:
+        ConfigError: the one that is there is of another configuration or version, or another process is making it.
+    """
+    from filelock import FileLock, Timeout
+
+    place = out.absolute()
+    folder = place.with_name(f".{place.name}.unfinished")
+    folder.mkdir(exist_ok=True)
+    try:
+        with FileLock(folder / _LOCK_FILE, timeout=0):
+            unfinished = Unfinished(folder)
+            _agree(folder / _CONFIG_FILE, config)
+            unfinished.release.mkdir(exist_ok=True)
+            try:
+                yield unfinished
+                _move_into_place(unfinished.release, out)
+            finally:
+                if out.is_dir() or not unfinished.made():
+                    shutil.rmtree(folder, ignore_errors=True)
+    except Timeout as error:
+        raise ConfigError(
+            f"{out}: another process is making it; wait for that one, or choose another folder"
+        ) from error
+
+
+def _agree(path: Path, config: SynthConfig) -> None:
+    """Write the configuration beside the release, or compare it with the one that is there."""
+    wanted = _as_json(config)
+    if not path.is_file():
+        write_bytes(path, json.dumps(wanted, indent=1).encode())
+        return
+    there = json.loads(path.read_text(encoding="utf-8"))
+    for name, value in wanted.items():
+        found = there.get(name)
+        if found != value:
+            differs = "spec" if name == "spec" else f"{name}: {found!r} there, {value!r} asked for"
+            raise ConfigError(
+                f"{path.parent}: holds an unfinished release of another configuration ({differs}); ask for the same "
+                "to finish it, or remove the folder"
+            )
+
+
+def _as_json(config: SynthConfig) -> dict[str, Any]:
+    """All that the bytes of a release depend on, as it comes back from JSON; the scenario file with what it says."""
+    text = None if config.spec is None else config.spec.read_text(encoding="utf-8")
+    fields = {"version": __version__, **asdict(config), "spec": text}
+    as_read: dict[str, Any] = json.loads(json.dumps(fields))
+    return as_read
+
+
+def _move_into_place(release: Path, out: Path) -> None:
+    if out.is_dir():
+        out.rmdir()
+    release.replace(out)
+
+
+def _merge(source: Path, target: Path) -> None:
+    """Move a folder's contents into another one."""
+    for path in source.iterdir():
+        place = target / path.name
+        if path.is_dir() and place.is_dir():
+            _merge(path, place)
+        else:
+            path.replace(place)
+    source.rmdir()

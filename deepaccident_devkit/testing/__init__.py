@@ -1,0 +1,45 @@
+"""Test kit: releases of under 1 MB in both layouts, healthy or broken in a named way, for tests of loaders.
+
+A pytest plugin (`plugin`, loaded by pytest where the devkit is installed) has fixtures, and `strategies` draws contents
+with hypothesis; the functions here need neither. See docs/testing.md.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from deepaccident_devkit.testing.breakages import (
+        BREAKAGES,
+        Breakage,
+        BrokenRelease,
+        break_release,
+        broken_release,
+    )
+    from deepaccident_devkit.testing.releases import SmallRelease, write_small_release
+
+_HOMES = {
+    **dict.fromkeys(("BREAKAGES", "Breakage", "BrokenRelease", "break_release", "broken_release"), "breakages"),
+    **dict.fromkeys(("SmallRelease", "write_small_release"), "releases"),
+}
+"""Public name → its module."""
+
+__all__ = [
+    "BREAKAGES",
+    "Breakage",
+    "BrokenRelease",
+    "SmallRelease",
+    "break_release",
+    "broken_release",
+    "write_small_release",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name's module when it is asked for: pytest imports this package at every start."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

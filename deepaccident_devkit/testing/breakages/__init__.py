@@ -1,0 +1,130 @@
+"""`BREAKAGES`: every named way to break a release, and what the devkit says of each."""
+
+from collections.abc import Mapping
+from hashlib import sha256
+from pathlib import Path
+
+from deepaccident_devkit.errors import ChoiceError, ConfigError
+from deepaccident_devkit.release import ScenarioFolder, find_release
+from deepaccident_devkit.taxonomy import VEHICLE_AGENTS
+from deepaccident_devkit.testing.breakages import calibs, folders, labels, legal, metas, sensors
+from deepaccident_devkit.testing.breakages.kinds import Breakage, BrokenRelease, Victim
+from deepaccident_devkit.testing.editing import ScenarioEditor
+from deepaccident_devkit.testing.releases import SmallRelease, write_small_release
+
+_GROUPS = (
+    labels.FORM,
+    labels.MEANING,
+    calibs.FORM,
+    calibs.MEANING,
+    metas.FORM,
+    metas.MEANING,
+    sensors.FORM,
+    sensors.MISSING,
+    sensors.MEANING,
+    folders.BROKEN,
+    folders.ODD,
+    folders.SPLIT_FILES,
+    legal.GROUP,
+)
+BREAKAGES: Mapping[str, Breakage] = {breakage.name: breakage for group in _GROUPS for breakage in group.breakages}
+"""Name → breakage."""
+
+
+def break_release(root: Path, name: str, *, scenario: str | None = None) -> BrokenRelease:
+    """Break a release in place: one that this kit made, or any copy that may be lost. Hard links are safe.
+
+    Args:
+        root: the release's folder.
+        name: one of `BREAKAGES`.
+        scenario: token of the scenario to break; the first labelled one if None, an accident if there is any.
+
+    Raises:
+        ChoiceError: there is no such breakage.
+        ConfigError: the release has no such scenario, or not what this breaks.
+    """
+    breakage = checked_breakage(name)
+    editor = _Watched(root, _chosen(root, scenario))
+    agent = next((agent for agent in editor.agents if agent in VEHICLE_AGENTS), editor.agents[0])
+    frame = editor.frames[len(editor.frames) // 2]
+    victim = Victim(editor=editor, agent=agent, frame=frame, marker=root.with_name(f"{root.name} - code has run"))
+    try:
+        path = breakage.apply(victim)
+    except (FileNotFoundError, LookupError, ValueError) as error:
+        raise ConfigError(
+            f"{root}: breaking {name!r} in {editor.token} needs what is not there: {error}; choose a scenario that has "
+            "it whole, or a release as SmallRelease() is"
+        ) from error
+    if not editor.has_changed():
+        raise ConfigError(
+            f"{root}: breaking {name!r} in {editor.token} changes nothing there; choose a scenario that has what it "
+            "breaks, or a release as SmallRelease() is"
+        )
+    return BrokenRelease(
+        root=root,
+        breakage=breakage,
+        scenario=editor.token,
+        agent=agent,
+        frame=frame,
+        path=path,
+        marker=victim.marker,
+    )
+
+
+def broken_release(out: Path, name: str, config: SmallRelease | None = None) -> BrokenRelease:
+    """Write a small release and break its first accident.
+
+    Args:
+        out: the folder to make; must not exist or be empty.
+        name: one of `BREAKAGES`.
+        config: what the release is like; `SmallRelease()` if None.
+
+    Raises:
+        ChoiceError: there is no such breakage.
+        ConfigError: `out` is a file or holds something, or the release wanted has not what this breaks.
+    """
+    checked_breakage(name)
+    return break_release(write_small_release(out, config), name)
+
+
+def checked_breakage(name: str) -> Breakage:
+    """The breakage of a name. Raises ChoiceError if there is none."""
+    if name not in BREAKAGES:
+        raise ChoiceError(f"breakage: expected one of {', '.join(BREAKAGES)}, found {name!r}")
+    return BREAKAGES[name]
+
+
+class _Watched(ScenarioEditor):
+    """Knows whether anything is now another than it was."""
+
+    def __init__(self, root: Path, scenario: ScenarioFolder) -> None:
+        super().__init__(root, scenario)
+        self._before: dict[Path, bytes | None] = {}
+
+    def changing(self, path: Path) -> None:
+        """Note what a file holds, the first time."""
+        if path not in self._before:
+            self._before[path] = _digest(path)
+
+    def has_changed(self) -> bool:
+        """Whether a file holds something else, was made or is gone."""
+        return any(_digest(path) != before for path, before in self._before.items())
+
+
+def _digest(path: Path) -> bytes | None:
+    return sha256(path.read_bytes()).digest() if path.is_file() else None
+
+
+def _chosen(root: Path, token: str | None) -> ScenarioFolder:
+    scenarios = find_release(root).scenarios
+    labelled = [one for one in scenarios if one.kind_folder(one.agents[0], "label").is_dir()]
+    chosen = [one for one in scenarios if one.token == token] if token else labelled
+    if not chosen:
+        wanted, remedy = (
+            (f"scenario {token!r}", "choose one of its own") if token else ("labelled scenario", "name one")
+        )
+        raise ConfigError(f"{root}: has no {wanted} to break; {remedy}")
+    return chosen[0]
+
+
+__all__ = ["BREAKAGES", "Breakage", "BrokenRelease", "break_release", "broken_release", "checked_breakage"]

@@ -1,0 +1,56 @@
+"""Meta files that cannot be read, or tell another story."""
+
+from pathlib import Path
+
+from deepaccident_devkit.errors import BrokenReleaseError, MetaError
+from deepaccident_devkit.testing.breakages.kinds import Group, Victim
+
+FORM = Group("meta", opening=BrokenReleaseError, reading=MetaError)
+MEANING = Group("meta")
+
+
+def _edit_first_line(victim: Victim, word: int, new: str) -> Path:
+    first, *rest = victim.editor.meta_lines()
+    words = first.split()
+    words[word] = new
+    victim.editor.write_meta_lines([" ".join(words), *rest])
+    return victim.editor.scenario.meta_path
+
+
+@FORM.enter("meta-unreadable")
+def meta_empty(victim: Victim) -> Path:
+    """A meta file has no bytes."""
+    victim.editor.write_meta_lines([])
+    return victim.editor.scenario.meta_path
+
+
+@FORM.enter("meta-unreadable")
+def meta_cut(victim: Victim) -> Path:
+    """A meta file ends amid its first line."""
+    victim.editor.write_meta_lines([victim.editor.meta_lines()[0][:20]])
+    return victim.editor.scenario.meta_path
+
+
+@FORM.enter("meta-unreadable")
+def meta_id_no_number(victim: Victim) -> Path:
+    """A colliding actor's id is a word."""
+    return _edit_first_line(victim, 1, "ego")
+
+
+@MEANING.enter("meta-missing")
+def meta_missing(victim: Victim) -> Path:
+    """A labelled scenario has no meta file."""
+    victim.editor.remove(victim.editor.scenario.meta_path)
+    return victim.editor.scenario.meta_path
+
+
+@MEANING.enter("meta-frames")
+def meta_frames_wrong(victim: Victim) -> Path:
+    """Meta counts other frames than were recorded."""
+    return _edit_first_line(victim, 8, "99")
+
+
+@MEANING.enter("meta-pair", "pair-not-seen")
+def meta_pair_wrong(victim: Victim) -> Path:
+    """Meta names an actor as collider whom no label has."""
+    return _edit_first_line(victim, 1, "7777")

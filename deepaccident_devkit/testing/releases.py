@@ -1,0 +1,196 @@
+"""`write_small_release`: a whole release of a few hundred kilobytes, with everything that the format names."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.files import replacing_folder
+from deepaccident_devkit.release import Collision, Meta, ScenarioFolder, write_meta, write_split_file
+from deepaccident_devkit.taxonomy import (
+    AGENTS,
+    BEV_CAMERA,
+    CHANNELS,
+    MINI_SPLITS,
+    SPLITS,
+    TIMES_OF_DAY,
+    WARM_UP_FRAMES,
+    WEATHERS,
+    AgentName,
+    Layout,
+)
+from deepaccident_devkit.testing.recording import Recorder
+from deepaccident_devkit.testing.scene import AGENT_IDS, PAIR, SmallScene, small_scene
+
+_MOST_FRAMES = 100
+_LEAST_IMAGE, _MOST_IMAGE = (16, 9), (1600, 900)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SmallRelease:
+    """What a small release is like; checked when made, raises ConfigError.
+
+    Attributes:
+        layout: `A`, all splits in one folder, or `B`, a folder a split.
+        frames: recorded frames of each scenario, at 10 Hz; three to a whole release of less than 1 MB.
+        splits: which of `train` (an accident and its normal twin, signalised), `val` (an accident, unsignalised) and
+            `test` (a normal scenario without labels, BEV arrays and meta, as published) there are.
+        agents: who records.
+        channels: the sensors whose files there are; none for labels, calib and meta alone.
+        image_size: width and height of the pictures, pixels.
+        seed: draws places in town, speeds and weather; the same seed gives the same values.
+    """
+
+    layout: Layout = "A"
+    frames: int = 3
+    splits: tuple[str, ...] = SPLITS
+    agents: tuple[AgentName, ...] = AGENTS
+    channels: tuple[str, ...] = CHANNELS
+    image_size: tuple[int, int] = _LEAST_IMAGE
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check every field; lists become tuples, so that equal configurations are one key."""
+        for name in ("splits", "agents", "channels", "image_size"):
+            object.__setattr__(self, name, _as_tuple(name, getattr(self, name)))
+        for name, value, known in (
+            ("layout", (self.layout,), get_args(Layout)),
+            ("splits", self.splits, SPLITS),
+            ("agents", self.agents, AGENTS),
+            ("channels", self.channels, CHANNELS),
+        ):
+            unknown = [one for one in value if one not in known]
+            if unknown:
+                raise ConfigError(f"{name}: expected some of {', '.join(known)}, found {unknown[0]!r}")
+        for name, count in (("splits", len(self.splits)), ("agents", len(self.agents))):
+            if not count:
+                raise ConfigError(f"{name}: expected at least one, found none")
+        if not 1 <= self.frames <= _MOST_FRAMES:
+            raise ConfigError(f"frames: expected 1 to {_MOST_FRAMES}, found {self.frames}")
+        if self.seed < 0:
+            raise ConfigError(f"seed: expected a whole number from 0, found {self.seed}")
+        if len(self.image_size) != 2:
+            raise ConfigError(f"image_size: expected (width, height), found {self.image_size}")
+        (width, height), low, high = self.image_size, _LEAST_IMAGE, _MOST_IMAGE
+        if not (low[0] <= width <= high[0] and low[1] <= height <= high[1]):
+            raise ConfigError(f"image_size: expected width and height from {low} to {high}, found {self.image_size}")
+
+
+def _as_tuple(name: str, value: object) -> tuple[object, ...]:
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        raise ConfigError(f"{name}: expected a tuple or a list, found {value!r}")
+    return tuple(value)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Story:
+    """One scenario of the release; twins share their name and all that is drawn."""
+
+    split: str
+    scenario_type: str
+    name: str
+
+    @property
+    def token(self) -> str:
+        return f"{self.scenario_type}/{self.name}"
+
+    @property
+    def accident(self) -> bool:
+        return self.scenario_type.endswith("_accident")
+
+    @property
+    def published(self) -> bool:
+        """Whether labels, BEV arrays and meta are; those of the test split are not."""
+        return self.split != "test"
+
+    @property
+    def number(self) -> int:
+        """At the name's end."""
+        return int(re.sub(r".*scenario", "", self.name))
+
+
+_STORIES = (
+    _Story(split="train", scenario_type="type1_subtype1_accident", name="Town03_type001_subtype0001_scenario00001"),
+    _Story(split="train", scenario_type="type1_subtype1_normal", name="Town03_type001_subtype0001_scenario00001"),
+    _Story(split="val", scenario_type="type1_subtype2_accident", name="Town05_type001_subtype0002_scenario00002"),
+    _Story(split="test", scenario_type="type1_subtype2_normal", name="Town10HD_type001_subtype0002_scenario00003"),
+)
+
+
+def write_small_release(out: Path, config: SmallRelease | None = None) -> Path:
+    """Write a healthy release of less than 1 MB; returns its folder.
+
+    It needs neither a generator nor a GPU. `deepaccident validate --deep` has nothing to say against it. The default
+    takes a second or two, `SmallRelease(channels=())` a tenth of it.
+
+    Args:
+        out: the folder to make; must not exist or be empty.
+        config: what the release is like; `SmallRelease()` if None.
+
+    Raises:
+        ConfigError: `out` is a file or holds something.
+    """
+    wanted = config or SmallRelease()
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ConfigError(f"{out}: exists and is not an empty folder; choose another folder, or remove this one")
+    stories = [story for story in _STORIES if story.split in wanted.splits]
+    with replacing_folder(out) as root:
+        for story in stories:
+            _write_scenario(root, story, wanted)
+        _write_splits(root, stories)
+    return out
+
+
+def _write_scenario(root: Path, story: _Story, config: SmallRelease) -> None:
+    split_folder = story.split if config.layout == "B" else ""
+    folder = ScenarioFolder(root, split_folder, story.scenario_type, story.name, config.agents)
+    rng = np.random.default_rng([config.seed, story.number])
+    scene = small_scene(rng, frames=config.frames, accident=story.accident)
+    meta = _meta(rng, scene, accident=story.accident)
+    if story.published:
+        write_meta(folder.meta_path, meta)
+    channels = [channel for channel in config.channels if story.published or channel != BEV_CAMERA]
+    for agent in config.agents:
+        for frame in range(1, config.frames + 1):
+            recorder = Recorder(folder, scene, agent, frame, config.image_size)
+            recorder.write_calib()
+            if story.published:
+                recorder.write_label()
+            for channel in channels:
+                recorder.write_channel(channel)
+
+
+def _meta(rng: np.random.Generator, scene: SmallScene, *, accident: bool) -> Meta:
+    weather, time_of_day, impact = rng.choice(WEATHERS), rng.choice(TIMES_OF_DAY), rng.uniform(2000.0, 9000.0)
+    users = {user.actor_id: user for user in scene.users}
+    ids = (AGENT_IDS[AGENTS.index(PAIR[0])], AGENT_IDS[AGENTS.index(PAIR[1])])
+    collision = Collision(
+        ids=ids,
+        classes=(users[ids[0]].category, users[ids[1]].category),
+        impact=float(impact),
+        spawn_relation="same",
+        contact_side="front_side",
+        agents=PAIR,
+    )
+    return Meta(
+        weather=str(weather),
+        time_of_day=str(time_of_day),
+        collision=collision if accident else None,
+        simulated_frames=scene.frames + WARM_UP_FRAMES,
+        agent_ids=AGENT_IDS,
+        road_type="four-way junction",
+        spawn_side="right",
+        ego_direction="straight",
+        other_direction="straight",
+    )
+
+
+def _write_splits(root: Path, stories: Sequence[_Story]) -> None:
+    """Every split file, empty where nothing falls into it; the mini splits hold all of train and val."""
+    for split in (*SPLITS, *MINI_SPLITS):
+        of_split = [story.token for story in stories if story.split == split.removesuffix("_mini")]
+        write_split_file(root / f"{split}.txt", of_split)

@@ -1,0 +1,137 @@
+"""Write docs/scenarios.md from the fields of scenario files and the designs: `python docs/make_scenarios_page.py`."""
+
+from pathlib import Path
+
+from deepaccident_devkit.synth.spec import design_text, designs_text, field_tables
+
+PAGE = Path(__file__).parent / "scenarios.md"
+
+_HEAD = """# Scenario files: your own accidents
+
+`deepaccident synth` makes the paper's twelve accidents. Each is a small YAML file; you can write your own:
+
+```yaml
+# mine.yaml: a van turns left in front of ego, in the rain
+actors:
+  - {role: ego, from: west, max_speed: [8, 12]}
+  - {role: other, category: van, from: east, turn: left, ignores: [priority]}
+meet: {actors: [ego, other]}
+weather: [SoftRain, HardRain]
+```
+
+    deepaccident synth OUT --spec mine.yaml --scenarios 8     # four accidents and their normal twins
+
+Each pair is another draw of the file. In Python:
+
+```python
+import numpy as np
+from deepaccident_devkit.synth.spec import draw, read_spec
+
+template = read_spec("mine.yaml")
+scenario = draw(template, np.random.default_rng(0))
+print(scenario.weather, scenario.actor("ego").max_speed)
+```
+
+## What is drawn
+
+- A number can be a range: `max_speed: [8, 12]`. Every number between is as likely; both ends are possible.
+- A word, a `true` or `false`, or a group such as `hump` can be a list: `from: [north, south]`. One of them is drawn;
+  one that stands there twice is twice as likely. Only `name`, `design`, `exchange` and `role` have one value.
+- What a file does not name has its default. `actors` and `ignores` are lists all of which hold.
+- Ego and other are needed. Those behind them are in every scenario, named or not, since they record too.
+
+## What happens
+
+- The junction lies at the middle, its arms are `west`, `south`, `east` and, at a four-way junction, `north`. Traffic
+  keeps right. At lights the phases take turns. Without lights who comes from the right goes first, at a three-way
+  junction who stays on the road that goes on.
+- The actors of `meet` are timed so that both come to where their ways cross, the second `offset` seconds later. In the
+  accident they see each other too late and keep neither lights nor priority, and everyone else lets them go first. A
+  draw in which they miss each other is drawn again. Lights are green for that one of them who does not ignore `signal`.
+- All others keep the rules that they do not ignore: `signal` drives at red, `priority` gives way to nobody, `crosswalk`
+  does not wait for pedestrians.
+- The recording ends with the collision, or else when ego arrives or at `end.time`; `--frames N` keeps the last N.
+- The normal twin is the same scene with the same people in it, but all look out and nobody breaks a rule.
+- A file without `meet` gives normal scenarios alone.
+
+A mistake is told with file, line and field:
+
+    mine.yaml:4: actors[1].turn: expected one of left, straight, right, found 'lef'
+
+Files are read with PyYAML's safe loader, without tags and aliases. Numbers are decimal.
+
+## Three to begin with
+
+A pedestrian steps onto the road between parked cars, in front of ego:
+
+```yaml
+# pedestrian.yaml
+road: {signalized: false}
+actors:
+  - {role: ego, from: west, max_speed: [7, 10]}
+  - {role: other, category: van, from: east, max_speed: [6, 9]}
+  - {role: pedestrian, from: west, side: right, start_distance: [15, 25], max_speed: [1, 2]}
+  - {role: parked, from: west, start_distance: 28}
+  - {role: parked, category: van, from: west, start_distance: 34}
+meet: {actors: [ego, pedestrian], offset: [-0.2, 0.2]}
+background: {vehicles: [3, 6], walking: 8}
+weather: [Clear, SoftRain]
+time_of_day: [Noon, Sunset]
+```
+
+A rear-end. Who comes by the same lane follows, and who follows keeps its distance; so a slow van changes into ego's
+lane, and ego comes there 0.7 s later:
+
+```yaml
+# rear_end.yaml
+road: {lanes: 2}
+actors:
+  - {role: ego, from: west, lane: 1, max_speed: [12, 14]}
+  - {role: other, category: van, from: west, lane: 0, lane_change: 60, max_speed: [5, 6]}
+meet: {actors: [other, ego], offset: 0.7}
+```
+
+A normal scenario, in which nobody is to meet anybody:
+
+```yaml
+# quiet.yaml
+road: {kind: three-way, signalized: false}
+actors:
+  - {role: ego, from: south, turn: left}
+  - {role: other, from: east}
+background: {vehicles: 4, two_wheelers: 2}
+weather: Cloudy
+```
+
+## The twelve designs
+
+![The twelve designs, from above and 0.7 s before the impact](images/designs.jpg)
+
+    deepaccident synth --list-designs
+    deepaccident synth --show-design 3 > mine.yaml             # a file to begin with
+    deepaccident synth OUT --design 3 --design 9               # only these
+
+"""
+
+_FIELDS = """
+A full example is design 3:
+
+"""
+
+
+def page() -> str:
+    """The page's text."""
+    parts = [_HEAD, _indented(designs_text()), _FIELDS, f"```yaml\n{design_text(3)}```\n\n## All fields\n"]
+    for path, entries in field_tables().items():
+        parts.append(f"\n### {f'`{path}`' if path else 'The file'}\n\n")
+        parts.append("| field | can be | if not given | meaning |\n|---|---|---|---|\n")
+        parts += [f"| `{e.key}` | {e.values} | {e.default} | {e.meaning} |\n" for e in entries]
+    return "".join(parts)
+
+
+def _indented(text: str) -> str:
+    return "".join(f"    {line}\n" for line in text.splitlines())
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")

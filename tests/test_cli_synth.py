@@ -1,0 +1,114 @@
+"""`deepaccident synth`: from the words of the command line to a release."""
+
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from deepaccident_devkit.cli.synth import synth
+from deepaccident_devkit.release import find_release
+from deepaccident_devkit.synth import SynthConfig
+from deepaccident_devkit.synth.spec import design_text, parse_spec
+
+
+@pytest.fixture
+def made(monkeypatch) -> list[SynthConfig]:
+    """The configurations of the releases that were asked for; none is made."""
+    configs: list[SynthConfig] = []
+
+    def make_release(out: Path, config: SynthConfig, **_options: object) -> Path:
+        configs.append(config)
+        return out
+
+    monkeypatch.setattr(sys.modules[synth.callback.__module__], "make_release", make_release)
+    return configs
+
+
+def test_verb_writes_a_release_and_names_the_next_step(tmp_path):
+    out = tmp_path / "a b"
+    result = CliRunner().invoke(
+        synth, [str(out), "--scenarios", "1", "--frames", "1", "--layout", "B", "--seed", "3", "--no-sensors"]
+    )
+    assert result.exit_code == 0, result.output
+    assert f"deepaccident info {out}" in result.output
+    assert f"{out}: 1 scenario of 1 frame with five agents, layout B" in result.output
+    assert "slow" not in result.stderr
+    assert find_release(out).layout == "B"
+
+
+@pytest.mark.parametrize("size", ["480", "480x", "axb", "480x270x3"])
+def test_bad_image_size_is_a_usage_error(tmp_path, size):
+    result = CliRunner().invoke(synth, [str(tmp_path / "out"), "--image-size", size])
+    assert result.exit_code == 2
+    assert "expected width x height such as 480x270" in result.output
+
+
+def test_every_option_reaches_the_configuration(tmp_path, made):
+    words = (
+        "--scenarios 6 --frames 12 --image-size 64x36 --layout B --seed 7 --no-sensors --unlabelled-test --view open"
+    )
+    result = CliRunner().invoke(
+        synth, [str(tmp_path), *words.split(), "--unplanned", "0.5", "--design", "3", "--design", "9"]
+    )
+    assert result.exit_code == 0, result.output
+    assert made == [
+        SynthConfig(
+            scenarios=6,
+            frames=12,
+            image_size=(64, 36),
+            layout="B",
+            seed=7,
+            sensors=False,
+            unlabelled_test=True,
+            view="open",
+            unplanned=0.5,
+            designs=(3, 9),
+        )
+    ]
+
+
+def test_without_options_scenarios_have_their_natural_length(tmp_path, made):
+    result = CliRunner().invoke(synth, [str(tmp_path)])
+    assert made == [SynthConfig(frames=None)]
+    assert f"{tmp_path}: 4 scenarios with five agents, layout A" in result.output
+
+
+def test_labels_without_embree_are_said_to_take_long(tmp_path, made, monkeypatch):
+    monkeypatch.setattr(sys.modules[synth.callback.__module__], "has_embree", lambda: False)
+    result = CliRunner().invoke(synth, [str(tmp_path), "--no-sensors"])
+    assert "slow, without the package embreex: pip install 'deepaccident_devkit[synth]'" in result.stderr
+    assert made == [SynthConfig(frames=None, sensors=False)]
+
+
+def test_a_scenario_file_and_designs_exclude_each_other(tmp_path, made):
+    CliRunner().invoke(synth, [str(tmp_path), "--spec", "mine.yaml"])
+    assert made == [SynthConfig(frames=None, spec=Path("mine.yaml"))]
+    result = CliRunner().invoke(synth, [str(tmp_path), "--spec", "mine.yaml", "--design", "1"])
+    assert "a release is made of a scenario file or of designs" in str(result.exception)
+
+
+def test_a_design_that_is_not_there_is_a_usage_error(tmp_path):
+    result = CliRunner().invoke(synth, [str(tmp_path), "--design", "13"])
+    assert result.exit_code == 2
+    assert "13 is not in the range 1<=x<=12" in result.output
+
+
+def test_designs_are_listed_without_a_folder():
+    result = CliRunner().invoke(synth, ["--list-designs"])
+    assert result.exit_code == 0
+    assert "3  unprotected left turn" in result.output
+
+
+def test_a_design_is_shown_as_a_file_to_begin_with():
+    result = CliRunner().invoke(synth, ["--show-design", "9"])
+    assert result.exit_code == 0
+    assert result.output == design_text(9)
+    assert parse_spec(result.output).design == 9
+
+
+def test_help_names_every_option():
+    text = CliRunner().invoke(synth, ["--help"]).output
+    named = {option for parameter in synth.params for option in parameter.opts if option.startswith("--")}
+    assert len(named) == 14
+    assert all(option in text for option in named)

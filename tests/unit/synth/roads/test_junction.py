@@ -1,0 +1,167 @@
+"""Routes over junctions, against the painted ground."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.synth.roads import ROAD_CODES, SIDEWALK, Hump, Junction, RoadSpec
+from deepaccident_devkit.synth.roads.junction import REACH
+from deepaccident_devkit.synth.roads.terrain import OUTWARD
+
+HALF_TRUCK = 1.45
+
+
+def beside(path, left):
+    return path.xy + left * np.column_stack([-np.sin(path.yaw), np.cos(path.yaw)])
+
+
+def test_routes_begin_and_end_on_lane_centres(junction):
+    for route in junction.routes():
+        center = junction.spec.lane_center(route.lane)
+        for arm, point, yaw, sign in (
+            (route.from_arm, route.path.xy[0], route.path.yaw[0], -1),
+            (route.to_arm, route.path.xy[-1], route.path.yaw[-1], 1),
+        ):
+            out = np.array(OUTWARD[arm], dtype=float)
+            heading = sign * out
+            right = np.array([heading[1], -heading[0]])
+            np.testing.assert_allclose(point, REACH * out + center * right, atol=1e-6)
+            np.testing.assert_allclose([np.cos(yaw), np.sin(yaw)], heading, atol=1e-9)
+
+
+def test_even_a_truck_stays_on_the_road(junction):
+    ground = junction.ground_map()
+    for route in junction.routes():
+        for left in (-HALF_TRUCK, 0.0, HALF_TRUCK):
+            assert np.isin(ground.at(beside(route.path, left)), ROAD_CODES).all(), (route.from_arm, route.turn)
+
+
+def test_turns_are_as_wide_as_streets_have_them(junction):
+    for route in junction.routes():
+        curvature = np.abs(route.path.curvature).max()
+        if route.turn == "straight":
+            assert curvature == 0
+        else:
+            assert (6.0, 9.0)[route.turn == "left"] <= 1 / curvature <= (9.5, 14.0)[route.turn == "left"]
+        assert np.abs(np.diff(route.path.curvature)).max() < 0.005
+        turned = route.path.yaw[-1] - route.path.yaw[0]
+        np.testing.assert_allclose(turned, {"straight": 0, "left": 1, "right": -1}[route.turn] * np.pi / 2, atol=1e-9)
+
+
+def test_stop_line_then_junction_then_arm(junction):
+    spec = junction.spec
+    for route in junction.routes():
+        stop, enter, leave = (
+            np.array([x, y]) for x, y, *_ in (route.path.at(s) for s in (route.stop_s, route.enter_s, route.exit_s))
+        )
+        assert route.stop_s < route.enter_s < route.exit_s
+        assert stop @ OUTWARD[route.from_arm] == pytest.approx(spec.stop_line[1], abs=1e-3)
+        assert enter @ OUTWARD[route.from_arm] == pytest.approx(spec.mouth, abs=1e-3)
+        assert leave @ OUTWARD[route.to_arm] == pytest.approx(spec.mouth, abs=1e-3)
+        line = junction.stop_line(route.from_arm)
+        assert np.linalg.norm(line - stop, axis=1).max() < spec.lanes_edge
+
+
+def test_conflicts_are_symmetric_and_true(junction):
+    routes = junction.routes()[:6]
+    met = 0
+    for a, b in itertools.combinations(routes, 2):
+        meeting = junction.conflicts(a, b)
+        other = junction.conflicts(b, a)
+        assert (meeting is None) == (other is None)
+        if meeting is None:
+            continue
+        met += 1
+        np.testing.assert_allclose(other, meeting[::-1], atol=1e-9)
+        place_a, place_b = (np.array(r.path.at(s)[:2]) for r, s in ((a, meeting.s_a), (b, meeting.s_b)))
+        assert np.hypot(*(place_a - place_b)) < 0.8
+        assert a.stop_s < meeting.s_a < a.exit_s + 8
+    assert met >= 2
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "meet"),
+    [
+        (("west", "straight"), ("north", "straight"), True),
+        (("west", "straight"), ("east", "straight"), False),
+        (("west", "left"), ("east", "straight"), True),
+        (("west", "left"), ("east", "left"), False),
+        (("west", "left"), ("east", "right"), True),
+        (("west", "right"), ("east", "right"), False),
+        (("west", "straight"), ("south", "right"), True),
+        (("west", "right"), ("south", "straight"), False),
+        (("west", "straight"), ("west", "left"), False),
+    ],
+)
+def test_who_meets_whom(first, second, meet):
+    junction = Junction(RoadSpec())
+    meeting = junction.conflicts(junction.route(*first), junction.route(*second))
+    assert (meeting is not None) == meet
+
+
+def test_straight_roads_meet_at_the_crossing_of_their_lanes():
+    junction = Junction(RoadSpec())
+    ego, other = junction.route("west", "straight"), junction.route("north", "straight")
+    np.testing.assert_allclose(junction.conflicts(ego, other), (REACH - 1.75, REACH + 1.75), atol=1e-9)
+
+
+def test_crosswalks_go_from_sidewalk_to_sidewalk(junction):
+    ground = junction.ground_map()
+    for arm in junction.arms:
+        path = junction.crosswalk(arm)
+        codes = ground.at(path.xy)
+        assert codes[0] == codes[-1] == SIDEWALK
+        walked = np.flatnonzero(np.isin(codes, ROAD_CODES))
+        assert (np.diff(walked) == 1).all()
+        assert len(walked) * 0.1 > 2 * junction.spec.road_edge - 0.5
+        assert np.isin(codes, (SIDEWALK, *ROAD_CODES)).all()
+        out = np.array(OUTWARD[arm])
+        np.testing.assert_allclose(path.xy @ out, np.mean(junction.spec.crosswalk), atol=1e-9)
+
+
+def test_sidewalk_paths_stay_on_the_sidewalk(junction):
+    ground = junction.ground_map()
+    paths = junction.sidewalk_paths()
+    assert len(paths) == (4 if junction.spec.kind == "four-way" else 3)
+    for path in paths:
+        for left in (-0.3, 0.0, 0.3):
+            assert (ground.at(beside(path, left)) == SIDEWALK).all()
+
+
+def test_lefts_are_made_from_the_left_lane_unless_asked_otherwise():
+    junction = Junction(RoadSpec(lanes=2))
+    assert [junction.route("west", turn).lane for turn in ("straight", "left", "right")] == [0, 1, 0]
+    assert junction.route("west", "left", 0).lane == 0
+
+
+def test_a_three_way_junction_has_no_way_north():
+    junction = Junction(RoadSpec(kind="three-way"))
+    assert {arm: junction.turns(arm) for arm in junction.arms} == {
+        "west": ("straight", "right"),
+        "south": ("left", "right"),
+        "east": ("straight", "left"),
+    }
+    assert len(junction.routes()) == 6
+
+
+@pytest.mark.parametrize(
+    ("ask", "sentence"),
+    [
+        (lambda j: j.route("north", "left"), "arm: a three-way junction has no 'north' arm; choose one of west, south"),
+        (lambda j: j.route("west", "left"), "turn: nobody can go 'left' from the west arm of a three-way junction; ch"),
+        (lambda j: j.route("west", "right", 1), "lane: expected 0 to 0, found 1"),
+        (lambda j: j.crosswalk("north"), "arm: a three-way junction has no 'north' arm"),
+        (lambda j: j.stop_line("up"), "arm: a three-way junction has no 'up' arm"),
+    ],
+)
+def test_what_is_not_there_is_refused(ask, sentence):
+    with pytest.raises(ConfigError, match=sentence):
+        ask(Junction(RoadSpec(kind="three-way")))
+
+
+def test_the_ground_is_as_hilly_as_its_roads():
+    hump = Hump(arm="east", distance=60.0)
+    assert Junction(RoadSpec(hump=hump)).terrain.hump == hump
+    assert Junction(RoadSpec()).terrain.is_flat

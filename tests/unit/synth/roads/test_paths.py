@@ -1,0 +1,153 @@
+"""Paths: sampled densely, smooth, and true to their own numbers."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from deepaccident_devkit.errors import GeometryError
+from deepaccident_devkit.synth.roads.paths import (
+    SPACING,
+    Path,
+    bent,
+    crossing,
+    even_steps,
+    lane_change,
+    straight,
+    through,
+)
+
+CIRCLE = bent((3.0, -2.0), 0.4, [(40.0, 0.05, 0.05)])
+
+
+def assert_consistent(path, atol=1e-3):
+    """Steps are as long as they say, yaw is the direction of the steps, curvature how fast yaw turns."""
+    steps = np.diff(path.xy, axis=0)
+    assert np.diff(path.s).max() <= SPACING + 1e-9
+    np.testing.assert_allclose(np.hypot(*steps.T), np.diff(path.s), atol=atol * SPACING)
+    middle_yaw = (path.yaw[:-1] + path.yaw[1:]) / 2
+    np.testing.assert_allclose(np.arctan2(steps[:, 1], steps[:, 0]), np.angle(np.exp(1j * middle_yaw)), atol=atol)
+    np.testing.assert_allclose(np.diff(path.yaw) / np.diff(path.s), path.curvature[:-1], atol=0.01)
+
+
+def test_an_arc_lies_on_its_circle():
+    centre = np.array([3.0, -2.0]) + 20 * np.array([-np.sin(0.4), np.cos(0.4)])
+    np.testing.assert_allclose(np.hypot(*(CIRCLE.xy - centre).T), 20, atol=1e-9)
+    np.testing.assert_allclose(CIRCLE.yaw[-1], 0.4 + 40 * 0.05, atol=1e-12)
+    assert CIRCLE.length == 40
+    assert_consistent(CIRCLE)
+
+
+def test_clothoids_join_lines_and_arcs_without_jumps():
+    path = bent((0.0, 0.0), 1.0, [(5.0, 0.0, 0.0), (7.0, 0.0, -0.1), (4.0, -0.1, -0.1), (7.0, -0.1, 0.0)])
+    assert_consistent(path)
+    assert np.abs(np.diff(path.curvature)).max() < 0.1 / 7 * SPACING * 1.01
+    np.testing.assert_allclose(path.yaw[-1], 1.0 - 0.1 * (3.5 + 4 + 3.5), atol=1e-12)
+
+
+@given(st.floats(0.01, 500))
+def test_steps_are_even_and_end_exactly(length):
+    steps = even_steps(length)
+    assert steps[0] == 0
+    assert steps[-1] == length
+    assert 0 < np.diff(steps).max() <= SPACING + 1e-9
+    np.testing.assert_allclose(np.diff(steps), steps[1], rtol=1e-6)
+
+
+@given(st.floats(-10, 60), st.floats(-3, 3))
+def test_project_undoes_at(s, left):
+    x, y, yaw, _ = CIRCLE.at(s)
+    point = [x - left * np.sin(yaw), y + left * np.cos(yaw)]
+    along, beside = CIRCLE.project([point])
+    np.testing.assert_allclose([along[0], beside[0]], [s, left], atol=5e-4)
+
+
+def test_at_goes_straight_on_beyond_the_ends():
+    x, y, yaw, curvature = CIRCLE.at([-2.0, 42.0])
+    ends = CIRCLE.xy[[0, -1]]
+    ahead = np.column_stack([np.cos(CIRCLE.yaw[[0, -1]]), np.sin(CIRCLE.yaw[[0, -1]])]) * [[-2], [2]]
+    np.testing.assert_allclose(np.column_stack([x, y]), ends + ahead, atol=1e-12)
+    np.testing.assert_array_equal(yaw, CIRCLE.yaw[[0, -1]])
+    np.testing.assert_array_equal(curvature, 0)
+
+
+def test_at_keeps_the_shape_of_what_is_asked():
+    assert all(values.shape == (2, 3) for values in CIRCLE.at(np.ones((2, 3))))
+    assert CIRCLE.at(1.0)[0].shape == ()
+
+
+def test_reversed_is_the_same_way_back():
+    back = CIRCLE.reversed()
+    assert_consistent(back)
+    np.testing.assert_array_equal(back.xy, CIRCLE.xy[::-1])
+    np.testing.assert_allclose(back.reversed().yaw, CIRCLE.yaw + 2 * np.pi)
+    assert back.curvature[0] == -0.05
+
+
+@pytest.mark.parametrize("offset", [3.5, -3.5])
+def test_a_lane_change_shifts_the_rest_and_bends_gently(offset):
+    path = lane_change(straight((0.0, 0.0), 0.0, 100.0), 20.0, 35.0, offset)
+    assert_consistent(path)
+    before, after = path.xy[path.xy[:, 0] < 20, 1], path.xy[path.xy[:, 0] > 55, 1]
+    np.testing.assert_allclose(before, 0, atol=1e-9)
+    np.testing.assert_allclose(after, offset, atol=1e-9)
+    assert (np.sign(np.diff(path.xy[:, 1]).round(12)) * np.sign(offset) >= 0).all()
+    # of the quintic: 10/√3 · offset / length²
+    np.testing.assert_allclose(np.abs(path.curvature).max(), 10 / np.sqrt(3) * 3.5 / 35**2, rtol=0.05)
+
+
+def test_through_finds_yaw_and_curvature():
+    path = through(CIRCLE.xy[::3])  # chords of 0.3 m turn by 0.015 from one to the next
+    assert_consistent(path, atol=0.0075)
+    np.testing.assert_allclose(path.curvature[30:-30].mean(), 0.05, rtol=1e-3)
+
+
+def test_lines_meet_at_their_common_point():
+    east, north = straight((-10.0, 1.0), 0.0, 30.0), straight((2.0, -20.0), np.pi / 2, 50.0)
+    meeting = crossing(east, north)
+    np.testing.assert_allclose(meeting, (12.0, 21.0), atol=1e-9)
+    np.testing.assert_allclose(crossing(north, east), meeting[::-1], atol=1e-9)
+
+
+def test_paths_that_join_meet_where_they_have_come_near():
+    lane = straight((0.0, 0.0), 0.0, 120.0)
+    joining = lane_change(straight((0.0, 3.5), 0.0, 120.0), 30.0, 40.0, -3.5)
+    meeting = crossing(lane, joining, within=0.5)
+    x, y, _, _ = joining.at(meeting.s_b)
+    assert 30 < x < 70
+    assert 0.4 < y <= 0.5
+    assert abs(meeting.s_a - x) < 0.2
+
+
+def test_paths_beside_each_other_never_meet():
+    assert crossing(straight((0.0, 0.0), 0.0, 50.0), straight((0.0, 3.5), 0.0, 50.0)) is None
+    assert crossing(straight((0.0, 0.0), 0.0, 50.0), straight((60.0, -9.0), np.pi / 2, 20.0)) is None
+
+
+def test_the_first_of_two_crossings_counts():
+    snake = bent((0.0, -1.0), np.pi / 3, [(10.0, -0.25, -0.25)])
+    meeting = crossing(straight((-5.0, 0.0), 0.0, 40.0), snake)
+    x, y, _, _ = snake.at(meeting.s_b)
+    assert abs(y) < 1e-2
+    assert x < 1
+    assert abs(meeting.s_a - 5 - x) < 1e-2
+
+
+def test_a_point_is_no_path():
+    with pytest.raises(GeometryError, match=r"Path.xy: expected two samples or more, found 1; sample the path more"):
+        Path(xy=[[0.0, 0.0]], yaw=[0.0], curvature=[0.0], s=[0.0])
+
+
+def test_two_points_have_no_curvature():
+    with pytest.raises(GeometryError, match="points: expected three points or more, found 2; sample the way more den"):
+        through([[0.0, 0.0], [1.0, 0.0]])
+
+
+def test_samples_go_together():
+    with pytest.raises(GeometryError, match=r"Path.yaw: expected shape \(2\), found \(1,\)"):
+        Path(xy=np.zeros((2, 2)), yaw=[0.0], curvature=[0.0, 0.0], s=[0.0, 1.0])
+
+
+def test_arrays_are_read_only():
+    with pytest.raises(ValueError, match="read-only"):
+        CIRCLE.xy[0] = 0

@@ -1,0 +1,154 @@
+"""Light, weather and lamps show in the pictures."""
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit.synth.sensors.caster import GROUND, NOTHING
+from deepaccident_devkit.synth.sensors.images.buffers import look, ray_directions, slopes
+from deepaccident_devkit.synth.sensors.images.facades import facades_of, on_facades
+from deepaccident_devkit.synth.sensors.images.light import light_of
+from deepaccident_devkit.synth.sensors.images.wall_shadows import wall_shadows
+from deepaccident_devkit.synth.solids import FACES_A_SOLID, FRONT, REAR, Block
+from deepaccident_devkit.taxonomy import TIMES_OF_DAY, WEATHERS
+
+
+def picture(rig, signals=None, channel="Camera_Front", agent=0):
+    scene = rig.scene(0.0)
+    return dict(rig.images(scene, rig.surroundings(scene, signals or {}), rig.agents[agent], 1))[channel]
+
+
+@pytest.mark.parametrize("time_of_day", TIMES_OF_DAY)
+@pytest.mark.parametrize("weather", WEATHERS)
+def test_every_sky_has_a_light(weather, time_of_day):
+    light = light_of(weather, time_of_day)
+    assert 0 < light.ambient <= 1
+    assert 0 < light.in_shadow <= 1
+    assert np.linalg.norm(light.to_sun) == pytest.approx(1)
+    assert (light.rain > 0) == ("Rain" in weather)
+
+
+def test_noon_is_brighter_than_sunset_and_sunset_than_night(world, rig_of):
+    noon, sunset, night = (picture(rig_of(world, sky=("Cloudy", time))).mean() for time in ("Noon", "Sunset", "Night"))
+    assert noon > 1.15 * sunset > 1.15 * 2 * night
+
+
+def test_haze_hides_what_is_far(world, bare, rig_of):
+    """The contrast of two walls, one light and one dark, 100 m away, in hard rain and in clear air."""
+    walls = [
+        Block((70.0, 71.0), span, (-0.1, 30.0), color)
+        for span, color in (((-40, -1.75), (20,) * 3), ((-1.75, 40), (235,) * 3))
+    ]
+    contrast = {}
+    for weather in ("Clear", "HardRain"):
+        image = picture(rig_of(bare(world, walls), sky=(weather, "Noon"))).astype(int)
+        dark, light = image[70:80, 185:200].mean(), image[70:80, 120:135].mean()
+        contrast[weather] = light - dark
+    assert contrast["Clear"] > 60
+    assert 0 < contrast["HardRain"] < 0.4 * contrast["Clear"]
+
+
+def test_red_lights_are_red_and_green_ones_green(world, rig_of):
+    """The light for those who come from the west, seen from the ego that waits for it."""
+    rig = rig_of(world, image_size=(640, 360), places={"ego_vehicle": (-22.0, -1.75, 0.0)})
+    red, green, dark = (picture(rig, signals).astype(int) for signals in ({"west": 0}, {"west": 2}, {}))
+    changed = np.abs(red - green).max(axis=-1) > 60
+    assert 2 < changed.sum() < 900
+    gained = (red - dark).reshape(-1, 3)[(red - green).reshape(-1, 3)[:, 0] > 60]
+    assert gained[:, 0].mean() > 2 * np.abs(gained[:, 1]).mean()
+    gained = (green - dark).reshape(-1, 3)[(green - red).reshape(-1, 3)[:, 1] > 60]
+    assert gained[:, 1].mean() > 1.5 * gained[:, 0].mean()
+
+
+def test_headlamps_light_the_road_ahead_at_night_alone(world, bare, rig_of):
+    by_time = {}
+    for time in ("Noon", "Night"):
+        rows = picture(rig_of(bare(world), sky=("Clear", time))).astype(float)[125:160, 130:190].mean(axis=(1, 2))
+        by_time[time] = rows[15:].mean() / rows[:3].mean()
+    assert by_time["Night"] > 1.2 * by_time["Noon"]
+
+
+def test_cars_throw_shadows_in_the_sun(world, bare, actor, rig_of):
+    car = actor(9, "car", -16.0, -1.75)
+    with_car, without = (picture(rig_of(bare(world), others)).astype(int) for others in ([car], []))
+    scene_rig = rig_of(bare(world), [car])
+    scene, agent = scene_rig.scene(0.0), scene_rig.agents[0]
+    pose = agent.ground_from_lidar(scene) @ agent.cameras[0].camera_from_lidar.inverse()
+    ground = look(scene, agent.cameras[0], pose).all.face == GROUND
+    darker = ground & ((without - with_car).mean(axis=-1) > 25)
+    assert darker.sum() > 100
+
+
+HOUSE = Block((-15.0, -5.0), (-9.0, 4.0), (-0.2, 13.2), (206, 190, 160), facade=True)
+"""13 m wide towards the ego, which looks at it from the east."""
+OPPOSITE = {"ego_vehicle": (30.0, -1.75, np.pi)}
+
+
+def front_of_house(rig):
+    """Face of the house that the ego looks at, the picture (pixels, 3), and where which pixels are on the face."""
+    image, scene, agent = picture(rig), rig.scene(0.0), rig.agents[0]
+    pose = agent.ground_from_lidar(scene) @ agent.cameras[0].camera_from_lidar.inverse()
+    rays = look(scene, agent.cameras[0], pose).all
+    points = ray_directions(pose, rays.right, rays.down) * rays.depth[..., None] + pose.translation
+    front = int(rig.setting.props[0]) * FACES_A_SOLID + FRONT
+    places = on_facades(rays.face == front, rays.face, tuple(np.moveaxis(points, -1, 0)), facades_of(rig.setting.still))
+    return front, image.reshape(-1, 3).astype(int), places
+
+
+def test_a_facade_has_whole_windows_as_far_from_either_end(world, bare, rig_of):
+    rig = rig_of(bare(world, [HOUSE]), sky=("Cloudy", "Noon"), image_size=(640, 360), places=OPPOSITE)
+    _, image, places = front_of_house(rig)
+    assert places.across.min() < 0.2
+    assert places.across.max() > 12.8
+    row = np.flatnonzero((np.abs(places.up - 5.6) < 0.1) & (np.abs(places.across - 6.5) < 6.3))  # without the outline
+    row = row[np.argsort(places.across[row])]
+    across, color = places.across[row], image[places.pixel[row]]
+    glass = across[np.abs(color - color[0]).max(axis=1) > 12]
+    assert glass.min() == pytest.approx(13 - glass.max(), abs=0.25)
+    np.testing.assert_array_equal(np.unique(np.floor(glass / 2.6)), range(5))
+
+
+def test_things_throw_shadows_on_facades(world, bare, rig_of):
+    """A slab before the house, and the strip of the front that it takes the sun from."""
+    slab = Block((-1.0, -0.8), (-4.0, -1.0), (-0.2, 30.0), (90, 90, 90))
+    rig = rig_of(bare(world, [HOUSE, slab]), sky=("Clear", "Sunset"), image_size=(640, 360), places=OPPOSITE)
+    front, image, places = front_of_house(rig)
+    sun = rig.studio.light.to_sun
+    drift = 4.1 * sun[1] / sun[0]
+    y = places.across - 9.0
+    shaded = (y + drift > -3.7) & (y + drift < -1.3)
+    sunny = (y + drift < -4.5) | (y + drift > -0.5)
+    brightness = image[places.pixel].mean(axis=1)
+    assert np.median(brightness[shaded]) < 0.7 * np.median(brightness[sunny])
+    shadows = wall_shadows(rig.setting, facades_of(rig.setting.still), rig.studio.light)
+    behind = front - FRONT + REAR
+    assert shadows.density[front] == pytest.approx(1 / 0.4, rel=0.05)
+    assert (shadows.column[behind], shadows.density[behind]) == (0, 0)
+    assert (shadows.lit[:, 0] == 255).all()
+
+
+def test_depths_are_those_of_single_rays(world, actor, rig_of):
+    """Interpolated pixels against a ray through each of them."""
+    rig = rig_of(world, [actor(9, "truck", -10.0, 1.75, np.pi)], image_size=(240, 135))
+    scene, agent = rig.scene(0.0), rig.agents[1]
+    for camera in agent.cameras[:3]:
+        pose = agent.ground_from_lidar(scene) @ camera.camera_from_lidar.inverse()
+        buffers = look(scene, camera, pose)
+        right, down = slopes(camera, np.arange(240), np.arange(135))
+        rays = ray_directions(pose, right[None], down[:, None]).reshape(-1, 3)
+        depth, face = (each.reshape(135, 240) for each in scene.cast(pose.translation, rays))
+        same = buffers.all.face == face
+        assert same.mean() > 0.97
+        sure = same & (face != NOTHING)
+        sure.reshape(-1)[buffers.outline] = False
+        np.testing.assert_allclose(buffers.all.depth[sure], depth[sure], rtol=2e-3)
+
+
+def test_pictures_are_the_seeds_alone(world, rig_of):
+    first, again = (picture(rig_of(world, sky=("HardRain", "Night"))) for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+    assert (picture(rig_of(world, sky=("HardRain", "Night"), seed=(1,))) != first).any()
+
+
+def test_the_smallest_and_an_odd_size_work(world, rig_of):
+    for size in ((16, 9), (33, 19)):
+        assert picture(rig_of(world, image_size=size)).shape == (size[1], size[0], 3)

@@ -1,0 +1,181 @@
+import numpy as np
+import pytest
+
+from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.synth.sensors.caster import GROUND
+from deepaccident_devkit.synth.sensors.lidar import (
+    AIR_OF_WEATHER,
+    RANGE_NOISE,
+    Air,
+    _cast_all,
+    intensity,
+    scan,
+)
+from deepaccident_devkit.synth.sensors.turn import ray_directions, rays_through, rays_to_boxes
+from deepaccident_devkit.synth.solids import Block
+
+DRY, RAIN = AIR_OF_WEATHER["Clear"], AIR_OF_WEATHER["HardRain"]
+RED, BLACK = (200, 30, 30), (8, 8, 8)
+
+
+def scan_of(rig, agent=0, air=DRY, seed=0, *, boxed=False):
+    scene, agent = rig.scene(0.0), rig.agents[agent]
+    pose, rng = agent.ground_from_lidar(scene), np.random.default_rng(seed)
+    return scene, pose, scan(scene, rig.lidars[agent.name], pose, air, rng, boxed=boxed)
+
+
+def poses_of(scene, ground_from_lidar):
+    """Centres, sizes and yaws of all boxes in the LiDAR frame."""
+    lidar_from_ground = ground_from_lidar.inverse()
+    center = lidar_from_ground.apply(scene.box_corners.mean(axis=1))
+    ahead = lidar_from_ground.rotate(scene.frames[:, :3, 0])
+    return center, scene.actors.size, np.arctan2(ahead[:, 1], ahead[:, 0])
+
+
+def test_points_lie_on_surfaces_within_the_noise(world, bare, rig_of):
+    wall = Block((-20.0, -19.0), (-30.0, 30.0), (-0.1, 6.0), RED)
+    _, pose, points = scan_of(rig_of(bare(world, [wall]), images=False))
+    on_wall = pose.apply(points.xyz[points.face == 1].astype(np.float64))
+    assert len(on_wall) > 3000
+    reach = np.linalg.norm(on_wall - pose.translation, axis=1)
+    along = (on_wall[:, 0] + 20.0) * reach / (on_wall[:, 0] - pose.translation[0])
+    assert np.abs(along).max() < 6 * RANGE_NOISE
+    assert along.std() == pytest.approx(RANGE_NOISE, rel=0.05)
+    assert abs(along.mean()) < 0.002
+
+
+@pytest.mark.parametrize("kind", ["flat", "hilly"])
+def test_points_of_the_ground_lie_on_the_terrain(world, hilly_world, rig_of, kind):
+    place = world if kind == "flat" else hilly_world
+    rig = rig_of(place, images=False, places={"ego_vehicle": (-48.0, -1.75, 0.0)})
+    scene, pose, points = scan_of(rig)
+    ground = pose.apply(points.xyz[points.face == GROUND].astype(np.float64))
+    above = ground[:, 2] - scene.setting.terrain.height(ground[:, :2])
+    assert len(ground) > 5000
+    assert np.abs(above).max() < 0.06
+    assert (np.abs(ground[:, 2]).max() > 0.5) == (kind == "hilly")
+
+
+def test_a_car_on_a_slope_is_tilted_with_its_sensors(hilly_world, rig_of):
+    rig = rig_of(hilly_world, images=False, places={"ego_vehicle": (-70.0, -1.75, 0.0)})
+    scene = rig.scene(0.0)
+    up = rig.agents[0].ground_from_lidar(scene).rotation[:, 2]
+    normal = scene.setting.terrain.normal(np.array([[-70.0, -1.75]]))[0]
+    assert normal[2] < 0.998
+    np.testing.assert_allclose(up, normal, atol=0.02)
+    labels = rig.sighting(scene, rig.agents[0], 1).labels
+    own = int(np.flatnonzero(labels.actor_id == -100)[0])
+    assert labels.center[own, 2] - labels.size[own, 2] / 2 == pytest.approx(
+        0.02 - rig.agents[0].ego_from_lidar.translation[2], abs=0.01
+    )
+    assert labels.num_lidar_pts[own] > 300
+
+
+@pytest.fixture
+def crowd(actor):
+    trucks = [actor(10 + k, "truck", -60.0 + 17 * k, 1.75, np.pi) for k in range(8)]
+    pedestrians = [actor(30 + k, "pedestrian", -40.0 + 5 * k, -7.0) for k in range(8)]
+    return trucks + pedestrians + [actor(50 + k, "car", -70.0 + 20 * k, -4.8, parked=True) for k in range(3)]
+
+
+@pytest.mark.parametrize("place", ["world", "hilly_world"])
+def test_windows_hold_every_ray_that_meets_someone(request, crowd, rig_of, place):
+    rig = rig_of(request.getfixturevalue(place), crowd, images=False)
+    scene = rig.scene(0.0)
+    everybody = np.arange(len(scene.actors))
+    for agent in rig.agents:
+        pose = agent.ground_from_lidar(scene)
+        distance, face = scene.cast(pose.translation, pose.rotate(ray_directions()).astype(np.float32))
+        owner = np.where(distance <= 70, scene.face_owner[face], -1)
+        windows = rays_to_boxes(scene, pose, *(np.array([row]) for row in everybody if row != agent.row))
+        for row, window in zip(everybody[everybody != agent.row], windows, strict=True):
+            assert window[owner == row].all()
+        if agent.row is not None:
+            assert np.isin(np.flatnonzero(owner == agent.row), rig.lidars[agent.name].body).all()
+        assert windows.any(axis=0).mean() < 0.7
+
+
+def test_rays_through_a_box_are_those_with_a_point_in_it():
+    size, place = (4.0, 2.0, 1.5), np.array([0.2, 0.0, 1.94])
+    points = place + ray_directions()[:, None] * np.arange(0.01, 4, 0.01)[:, None]
+    inside = np.abs(points - (0, 0, 0.77)) <= np.array(size) / 2
+    through = np.flatnonzero(inside.all(axis=2).any(axis=1))
+    rows = rays_through(size, place)
+    assert np.isin(through, rows).all()
+    assert len(through) > 0.75 * len(rows) > 1000
+
+
+@pytest.mark.parametrize("place", ["world", "hilly_world"])
+@pytest.mark.parametrize("air", [DRY, RAIN, Air(drops=0.7)])
+def test_boxed_all_points_in_boxes_are_there(request, crowd, rig_of, place, air):
+    """Of what lies in a box, raindrops too; far fewer rays are followed."""
+    rig = rig_of(request.getfixturevalue(place), crowd, images=False)
+    for agent in range(5):
+        scene, pose, full = scan_of(rig, agent, air)
+        _, _, boxed = scan_of(rig, agent, air, boxed=True)
+        boxes = Boxes.from_arrays(*poses_of(scene, pose), frame="lidar")
+        found = []
+        for points in (full, boxed):
+            box, point = np.nonzero(boxes.contains(points.xyz))
+            order = np.lexsort([points.ray[point], box])
+            found.append((box[order], points.ray[point][order], points.xyz[point][order], points.face[point][order]))
+        assert len(found[0][0]) > 500
+        for one, other in zip(*found, strict=True):
+            np.testing.assert_array_equal(one, other)
+        assert len(boxed.xyz) < 0.7 * len(full.xyz)
+
+
+def test_the_own_body_is_met_where_it_is(world, rig_of):
+    """What is worked out once for all moments, against a cast at one."""
+    rig = rig_of(world, images=False)
+    scene, agent = rig.scene(0.0), rig.agents[0]
+    pose, lidar = agent.ground_from_lidar(scene), rig.lidars[agent.name]
+    distance, face = scene.cast(pose.translation, pose.rotate(ray_directions()[lidar.body]).astype(np.float32))
+    met = np.isfinite(lidar.distance)
+    assert 300 < met.sum() < len(lidar.body)
+    np.testing.assert_array_equal(scene.face_owner[face] == agent.row, met)
+    np.testing.assert_allclose(distance[met], lidar.distance[met], atol=1e-4)
+    assert (face[met] == lidar.face[met]).mean() > 0.99
+    rows, everywhere, _ = _cast_all(scene, lidar, pose)
+    np.testing.assert_array_equal(everywhere[lidar.body[met]], lidar.distance[met])
+    assert len(rows) == len(ray_directions())
+
+
+def test_more_gets_lost_far_away_in_rain_and_from_black(world, bare, rig_of):
+    far = Block((19.0, 20.0), (-60.0, 60.0), (-0.1, 12.0), RED)
+    rig = rig_of(bare(world, [far]), images=False)
+    clear, rain = (len(scan_of(rig, air=air)[2].xyz) for air in (DRY, RAIN))
+    assert rain < 0.95 * clear
+    sides = [
+        Block((-20.0, -19.0), span, (-0.1, 6.0), color)
+        for span, color in (((-12.0, -1.75), RED), ((-1.75, 8.5), BLACK))
+    ]
+    _, _, points = scan_of(rig_of(bare(world, sides), images=False))
+    assert (points.face == 7).sum() < 0.9 * (points.face == 1).sum()
+
+
+def test_rain_sends_rays_back(world, rig_of):
+    rig = rig_of(world, images=False)
+    assert (scan_of(rig)[2].face == -1).sum() == 0
+    assert (scan_of(rig, air=RAIN)[2].face == -1).sum() > 20
+
+
+def test_intensity_falls_with_distance_and_darkness(world, bare, rig_of):
+    sides = [
+        Block((-20.0, -19.0), span, (-0.1, 6.0), color)
+        for span, color in (((-12.0, -1.75), RED), ((-1.75, 8.5), BLACK))
+    ]
+    scene, pose, points = scan_of(rig_of(bare(world, sides), images=False))
+    bright = intensity(scene, pose, points, DRY)
+    assert bright.dtype == np.float32
+    assert 0 <= bright.min() < bright.max() <= 1
+    assert bright[points.face == 1].mean() > 1.5 * bright[points.face == 7].mean()
+    wet = intensity(scene, pose, points, RAIN)
+    assert (wet < bright).all()
+
+
+def test_noise_is_the_seeds_alone(world, rig_of):
+    rig = rig_of(world, images=False)
+    first, again, other = (scan_of(rig, seed=seed)[2].xyz for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert first.shape != other.shape or (first != other).any()

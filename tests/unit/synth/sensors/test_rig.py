@@ -1,0 +1,96 @@
+"""Labels, points and images of a moment agree, and do not depend on what else is made."""
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit.geometry import Boxes
+
+TRAFFIC = [("car", 5.0, 1.75, np.pi, 6.0), ("van", -5.0, 1.75, np.pi, 6.0), ("pedestrian", -12.0, 5.0, 0.0, 1.2)]
+
+
+@pytest.fixture(scope="module")
+def others(actor):
+    return [actor(10 + k, *each) for k, each in enumerate(TRAFFIC)] + [actor(20, "car", -18.0, -4.75, parked=True)]
+
+
+def sightings(rig, time=0.4, frame=5):
+    scene = rig.scene(time)
+    return [rig.sighting(scene, agent, frame) for agent in rig.agents]
+
+
+def same(first, second):
+    return all(
+        np.array_equal(getattr(first.labels, name), getattr(second.labels, name))
+        for name in ("center", "yaw", "velocity", "actor_id", "num_lidar_pts", "camera_visible")
+    )
+
+
+@pytest.mark.parametrize("place", ["world", "hilly_world"])
+def test_labels_do_not_depend_on_images(request, rig_of, others, place):
+    town = request.getfixturevalue(place)
+    without = sightings(rig_of(town, others, images=False))
+    large = sightings(rig_of(town, others, image_size=(800, 450)))
+    assert all(map(same, without, large))
+    assert not all(map(same, without, sightings(rig_of(town, others, images=False, seed=(1,)))))
+
+
+def test_a_moment_does_not_depend_on_what_was_recorded_before(world, rig_of, others):
+    rig = rig_of(world, others, images=False)
+    alone = sightings(rig_of(world, others, images=False), 0.9, 10)
+    sightings(rig, 0.0, 1)
+    assert all(map(same, alone, sightings(rig, 0.9, 10)))
+
+
+@pytest.mark.parametrize("place", ["world", "hilly_world"])
+def test_counts_are_the_points_in_the_boxes(request, rig_of, others, place):
+    for sighting in sightings(rig_of(request.getfixturevalue(place), others, images=False)):
+        labels = sighting.labels
+        boxes = Boxes.from_arrays(labels.center, labels.size, labels.yaw, frame="lidar")
+        np.testing.assert_array_equal(labels.num_lidar_pts, boxes.contains(sighting.points.xyz).sum(axis=1))
+        assert labels.num_lidar_pts.max() > 100
+
+
+def test_boxes_have_one_place_in_the_world(hilly_world, rig_of, others):
+    """Every agent's labels, brought into the world by its calib, show the same corners where the ground is flat."""
+    seen = {}
+    for sighting in sightings(rig_of(hilly_world, others, images=False)):
+        labels, calib = sighting.labels, sighting.calib
+        boxes = Boxes.from_arrays(labels.center, labels.size, labels.yaw, frame="lidar", actor_id=labels.actor_id)
+        world_boxes = boxes.transform(calib.world_from_ego @ calib.ego_from_lidar, "world")
+        for actor, center in zip(labels.actor_id.tolist(), world_boxes.center, strict=True):
+            if actor > 0:
+                seen.setdefault(actor, []).append(center)
+    assert max(map(len, seen.values())) == 5
+    for centers in seen.values():
+        np.testing.assert_allclose(centers, np.broadcast_to(centers[0], np.shape(centers)), atol=1e-6)
+
+
+@pytest.mark.parametrize("place", ["world", "hilly_world"])
+def test_images_show_road_users_where_their_boxes_project(request, rig_of, actor, place):
+    """A red car ahead: where the middle of its box projects, the picture is red or glass, not road."""
+    car = actor(9, "car", -16.0, -1.75)
+    rig = rig_of(request.getfixturevalue(place), [car], image_size=(640, 360))
+    scene, agent = rig.scene(0.0), rig.agents[0]
+    image = dict(rig.images(scene, rig.surroundings(scene, {}), agent, 1))["Camera_Front"]
+    camera = agent.cameras[0]
+    corners = scene.box_corners[scene.actors.row_of(1009)]
+    lidar_from_ground = agent.ground_from_lidar(scene).inverse()
+    local = (camera.camera_from_lidar @ lidar_from_ground).apply(corners)
+    pixels = local @ camera.optics.intrinsic.T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    (left, top), (right, bottom) = pixels.min(axis=0), pixels.max(axis=0)
+    row, column = int(0.6 * bottom + 0.4 * top), int((left + right) / 2)
+    red, green, blue = image[row, column].astype(int)
+    assert red > 1.8 * max(green, blue)
+    reddish = (image[..., 0].astype(int) > 1.8 * image[..., 1:].astype(int).max(axis=-1)) & (image[..., 0] > 60)
+    _, columns = np.nonzero(reddish[: int(bottom) + 8, max(int(left) - 15, 0) : int(right) + 15])
+    assert columns.min() + max(int(left) - 15, 0) == pytest.approx(left, abs=6)
+    assert columns.max() + max(int(left) - 15, 0) == pytest.approx(right, abs=6)
+
+
+def test_bev_shows_every_road_user_by_its_id(world, rig_of, others):
+    rig = rig_of(world, others, images=False)
+    scene = rig.scene(0.0)
+    picture = rig.bev(scene, rig.agents[0])
+    assert set(np.unique(picture.instance)) >= set(scene.actors.object_id.tolist())
+    assert {4, 6, 7, 8, 10} <= set(np.unique(picture.semantic))

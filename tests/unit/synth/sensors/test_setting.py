@@ -1,0 +1,81 @@
+"""Rays that need no casting, against all cast."""
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit.synth.sensors.images.buffers import ray_directions as camera_rays
+from deepaccident_devkit.synth.sensors.images.buffers import slopes
+from deepaccident_devkit.synth.sensors.turn import AZIMUTHS, CHANNELS, turned_rays
+
+KINDS = ("lidar", "camera")
+
+
+def rays_of(scene, agent, kind):
+    """Origin and rays (R, C, 3) of one turn, or of a picture."""
+    pose = agent.ground_from_lidar(scene)
+    if kind == "lidar":
+        return pose.translation, turned_rays(pose.rotation).reshape(CHANNELS, AZIMUTHS, 3)
+    camera = agent.cameras[0]
+    pose = pose @ camera.lidar_from_camera
+    right, down = slopes(camera, np.arange(camera.optics.width), np.arange(camera.optics.height))
+    return pose.translation, camera_rays(pose, right[None, :], down[:, None])
+
+
+@pytest.fixture
+def parked(actor):
+    return [actor(10 + k, "car", -60.0 + 12 * k, -4.8, parked=True) for k in range(9)]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("place", ["world", "hilly_world"])
+def test_rays_that_are_not_cast_would_have_met_the_same(request, rig_of, parked, place, kind):
+    rig = rig_of(request.getfixturevalue(place), parked, images=False)
+    scene = rig.scene(0.0)
+    for agent in rig.agents:
+        origin, rays = rays_of(scene, agent, kind)
+        distance, face = scene.setting.cast_columns(origin, rays)
+        slow_distance, slow_face = scene.setting.caster.cast(origin, rays.reshape(-1, 3))
+        np.testing.assert_array_equal(face, slow_face)
+        np.testing.assert_array_equal(distance, slow_distance)
+        assert 0.2 < (face >= 0).mean() < 0.9
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_over_flat_ground_many_are_not_cast(world, rig_of, parked, kind, monkeypatch):
+    rig = rig_of(world, parked, images=False)
+    scene = rig.scene(0.0)
+    origin, rays = rays_of(scene, rig.agents[0], kind)
+    cast, counts = scene.setting.caster.cast, []
+
+    def counting(origin, directions):
+        counts.append(len(directions))
+        return cast(origin, directions)
+
+    monkeypatch.setattr(scene.setting, "caster", type("", (), {"cast": staticmethod(counting)}))
+    scene.setting.cast_columns(origin, rays, 70.0)
+    assert counts[0] < 0.75 * rays.shape[0] * rays.shape[1]
+
+
+def test_up_to_a_limit_all_is_right(world, rig_of, parked):
+    rig = rig_of(world, parked, images=False)
+    scene = rig.scene(0.0)
+    origin, rays = rays_of(scene, rig.agents[0], "lidar")
+    near, far = (scene.setting.cast_columns(origin, rays, limit) for limit in (30.0, np.inf))
+    within = far[0] <= 30
+    np.testing.assert_array_equal(near[0][within], far[0][within])
+    np.testing.assert_array_equal(near[1][within], far[1][within])
+    assert (near[0][~within] > 30).all()
+
+
+def test_rays_of_a_leaning_sensor_are_all_cast(world, rig_of, parked):
+    """They do not stand above each other, so that none can be left out."""
+    rig = rig_of(world, parked, images=False)
+    scene = rig.scene(0.0)
+    origin, rays = rays_of(scene, rig.agents[0], "camera")
+    lean = np.deg2rad(20.0)
+    turn = np.array([[1, 0, 0], [0, np.cos(lean), -np.sin(lean)], [0, np.sin(lean), np.cos(lean)]], dtype=np.float32)
+    leaning = rays @ turn.T
+    distance, face = scene.setting.cast_columns(origin, leaning)
+    slow_distance, slow_face = scene.setting.caster.cast(origin, leaning.reshape(-1, 3))
+    np.testing.assert_array_equal(face, slow_face)
+    np.testing.assert_array_equal(distance, slow_distance)

@@ -1,0 +1,74 @@
+"""Who is seen: truths that one can work out by hand, and the pictures themselves."""
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit.synth.sensors.images.buffers import look
+from deepaccident_devkit.synth.sensors.visibility import Views, camera_visible
+from deepaccident_devkit.synth.solids import Block
+
+WALL = (120, 120, 120)
+
+
+def ego_sees(rig, actor_id, agent=0):
+    scene = rig.scene(0.0)
+    rows = np.array([scene.actors.row_of(actor_id)])
+    return bool(camera_visible(scene, rig.agents[agent], rig.agents[agent].ground_from_lidar(scene), rows)[0])
+
+
+@pytest.mark.parametrize(
+    ("upper_edge", "width", "seen"),
+    [(4.0, 6.0, False), (4.0, 1.9, True), (1.0, 6.0, True)],
+    ids=["a wall before all of it", "a wall before half of it", "a low wall"],
+)
+def test_a_wall_hides_what_is_behind_it(world, bare, actor, rig_of, upper_edge, width, seen):
+    """The wall ends `width` to the left of the car's right side, seen from the ego at (-30, -1.75)."""
+    wall = Block((-16.2, -16.0), (-5.0, -5.0 + width), (-0.1, upper_edge), WALL)
+    car = actor(9, "car", -8.0, -1.75)
+    rig = rig_of(bare(world, [wall]), [car])
+    assert ego_sees(rig, 1009) == seen
+    assert ego_sees(rig_of(bare(world), [car]), 1009)
+
+
+def test_a_truck_hides_the_car_before_it(world, bare, actor, rig_of):
+    car = actor(9, "car", 6.0, -1.75)
+    assert ego_sees(rig_of(bare(world), [car]), 1009)
+    assert not ego_sees(rig_of(bare(world), [car, actor(10, "truck", -8.0, -1.75)]), 1009)
+
+
+def test_a_rise_hides_a_pedestrian_behind_it(hilly_world, bare, actor, rig_of):
+    """The crest lies 55 m from the middle; the ego waits 30 m from it, the pedestrian stands far behind."""
+    pedestrian = actor(9, "pedestrian", -86.0, -1.75)
+    places = {"ego_vehicle": (-30.0, -1.75, np.pi), "ego_vehicle_behind": (20.0, -1.75, 0.0)}
+    rig = rig_of(bare(hilly_world), [pedestrian], places=places)
+    assert not ego_sees(rig, 1009)
+    flat = rig_of(
+        bare(hilly_world), [pedestrian], places={**places, "ego_vehicle": (-56.0, -1.75, np.pi)}
+    )  # from the crest
+    assert ego_sees(flat, 1009)
+
+
+def test_nobody_sees_itself_and_all_around_is_seen(world, bare, actor, rig_of):
+    around = [
+        actor(10 + k, "pedestrian", -30 + 9 * np.cos(turn), -1.75 + 9 * np.sin(turn))
+        for k, turn in enumerate(np.deg2rad([0, 50, -50, 95, -95, 140, -140, 180]))
+    ]
+    rig = rig_of(bare(world), around)
+    assert not ego_sees(rig, 1000)
+    assert all(ego_sees(rig, each.actor_id) for each in around)
+
+
+def test_pixels_are_about_those_of_the_picture(world, actor, rig_of):
+    """The counts of a 400 × 225 picture, against all pixels of a picture of that size; by everything in sight."""
+    others = [actor(10 + k, "car", 5.0 + 9 * k, 1.75, np.pi) for k in range(4)]
+    others += [actor(20 + k, "pedestrian", -14.0 + 4 * k, 5.0) for k in range(4)]
+    rig = rig_of(world, others, image_size=(400, 225))
+    scene, agent = rig.scene(0.0), rig.agents[1]
+    for camera in agent.cameras:
+        pose = agent.ground_from_lidar(scene) @ camera.camera_from_lidar.inverse()
+        face = look(scene, camera, pose).all.face
+        owner = scene.face_owner[face]
+        shown = np.bincount(owner[owner >= 0], minlength=len(scene.actors))
+        counted = Views(scene, [camera], [pose], np.arange(len(scene.actors))).pixels()[0]
+        np.testing.assert_allclose(counted, shown, rtol=0.35, atol=12)
+        assert not (counted[shown > 12] == 0).any()

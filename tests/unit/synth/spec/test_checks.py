@@ -1,0 +1,97 @@
+import pytest
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.synth.spec import parse_spec
+
+
+@pytest.mark.parametrize(
+    ("entries", "sentence"),
+    [
+        ("gap: 3", r"f.yaml:4: actors\[1\].gap: means nothing for the role other; leave it out"),
+        ("category: cyclist", "category: the role other cannot be a cyclist; choose car, truck, van, motorcycle"),
+        ("category: [car, pedestrian]", "the role other cannot be a pedestrian"),
+        ("lane: 1", "there is no lane 1 where the road has one lane in each direction; choose 0, or give the road two"),
+        ("lane: [0, 1]", "there is no lane 1"),
+        ("lane_change: 50", "there is no other lane where the road has one lane in each direction; leave it out, or"),
+    ],
+)
+def test_an_impossible_entry_is_refused(with_other, entries, sentence):
+    with pytest.raises(ConfigError, match=sentence):
+        parse_spec(with_other(entries), "f.yaml")
+
+
+@pytest.mark.parametrize(
+    ("more", "sentence"),
+    [
+        (
+            "road: {kind: three-way}",
+            r"f.yaml:4: actors\[1\].from: a three-way junction has no north arm; choose west or",
+        ),
+        ("road: {kind: [four-way, three-way]}", "a three-way junction has no north arm"),
+        ("road: {lanes: 3}", r"f.yaml:7: road.lanes: expected 1 or 2 in each direction, found 3"),
+        ("road:\n  hump: {distance: 20}", "f.yaml:8: road.hump"),
+        ("road:\n  hump: [null, {arm: west,\n    height: [1, 9]}]", "f.yaml:8: road.hump.*: .*grade"),
+        ("road:\n  kind: [four-way]\n  hump: {length: 300}", "f.yaml:9: road.hump: .*do not fit"),
+    ],
+)
+def test_an_impossible_road_is_refused(small, more, sentence):
+    with pytest.raises(ConfigError, match=sentence):
+        parse_spec(f"{small}\n{more}", "f.yaml")
+
+
+def scenario(*actors: str, more: str = "") -> str:
+    return "actors:\n" + "".join(f"  - {{{actor}}}\n" for actor in actors) + more
+
+
+EGO, OTHER = "role: ego, from: west", "role: other, from: south"
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (
+            scenario(EGO, OTHER, *["role: background, from: west"] * 99),
+            "f.yaml:1: actors: there are 101, for which no road has room; keep 100",
+        ),
+        (scenario(EGO), "f.yaml:1: actors: there is no actor with role other; add one"),
+        (
+            scenario(EGO, OTHER + ", turn: left, lane_change: [40, 50]", more="road: {lanes: 2}"),
+            "lane_change: goes with the turn straight alone; leave it out, or go straight on",
+        ),
+        (scenario(EGO, OTHER, EGO), r"f.yaml:2: actors\[0\].role: there are 2 actors with role ego; keep one"),
+        (scenario("role: ego", OTHER), r"actors\[0\].from: is missing; the role ego needs it; add one of west, "),
+        (scenario(EGO, OTHER, "role: ego_behind, from: west"), "from: means nothing for the role ego_behind"),
+        (scenario(EGO, OTHER, "role: pedestrian, category: car, from: east"), "the role pedestrian cannot be a car"),
+        (scenario(EGO, OTHER, "role: parked, from: east, turn: left"), "turn: means nothing for the role parked"),
+        (
+            scenario(EGO, OTHER, more="road: {kind: three-way}"),
+            r"f.yaml:3: actors\[1\].turn: a three-way junction has no way straight from the south arm; choose left or",
+        ),
+        (
+            scenario(EGO, "role: other, from: west", more="meet: {actors: [ego, other]}"),
+            "do not meet; who comes by the same lane follows; let one of them come by the other lane, with a",
+        ),
+        (scenario(EGO, OTHER, more="meet: {actors: [ego, ego]}"), "f.yaml:4: meet.actors: ego cannot meet itself"),
+        (scenario(EGO, OTHER, more="meet: {actors: [ego]}"), r"meet.actors: expected a list of 2, found \['ego'\]"),
+        (scenario(EGO, OTHER, more="meet: {actors: [ego, ego_behind]}"), "ego_behind cannot be timed"),
+        (scenario(EGO, OTHER, more="meet: {actors: [ego, pedestrian]}"), "there are 0 actors with role pedestrian"),
+        (
+            scenario(EGO, "role: other, from: [south, east]", more="meet: {}"),
+            r"meet.actors: the ways of ego \(west straight 0\) and other \(east straight 0\) do not meet",
+        ),
+        (
+            scenario(EGO, "role: other, from: [south, east]", more="view: hidden"),
+            "f.yaml:4: view: no house can stand between ego from the west and other from the east; choose open, or",
+        ),
+    ],
+)
+def test_an_impossible_scenario_is_refused(text, sentence):
+    with pytest.raises(ConfigError, match=sentence):
+        parse_spec(text, "f.yaml")
+
+
+def test_actors_that_record_nothing_may_be_several():
+    walkers = ["role: pedestrian, from: east", "role: pedestrian, from: west"]
+    parse_spec(scenario(EGO, OTHER, "role: parked, from: south", *walkers, "role: background, from: north"))
+    parse_spec(scenario(EGO, OTHER, walkers[0], more="meet: {actors: [ego, pedestrian]}"))
+    parse_spec(scenario(EGO, OTHER, more="view: [open, hidden]"))

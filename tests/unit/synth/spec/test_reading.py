@@ -1,0 +1,91 @@
+import pytest
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.synth.spec import parse_spec, read_spec
+
+FIELDS = "name, design, road, view, exchange, actors, meet, background, weather, time_of_day, end"
+
+
+@pytest.mark.parametrize(
+    ("entries", "sentence"),
+    [
+        ("turn: lef", r"f.yaml:4: actors\[1\].turn: expected one of left, straight, right, found 'lef'"),
+        ("trun: left", r"f.yaml:4: actors\[1\].trun: no such field; possible: turn, "),
+        ("max_speed: fast", r"actors\[1\].max_speed: expected a number, 0.5 to 20 m/s, found 'fast'"),
+        ("max_speed: true", "expected a number, 0.5 to 20 m/s, found True"),
+        ("max_speed: .nan", "expected a number, 0.5 to 20 m/s, found nan"),
+        ("max_speed: 20.1", "expected a number, 0.5 to 20 m/s, found 20.1"),
+        ("max_speed: [1, 2, 3]", r"expected a number, .*, or \[low, high\], found \[1, 2, 3\]"),
+        ("max_speed: [5, 40]", r"max_speed\[1\]: expected a number, 0.5 to 20 m/s, found 40"),
+        ("max_speed: [9, 3]", r"expected \[low, high\], found \[9, 3\]; exchange the two"),
+        ("max_speed: '8'", "expected a number, 0.5 to 20 m/s, found '8'; write 8, without quotes"),
+        ("max_speed: 1e1", "found '1e1'; write 10, without quotes"),
+        (f"max_speed: {'9' * 400}", "expected a number, 0.5 to 20 m/s, found 9{79}…$"),
+        (f"turn: {'x' * 5000}", "found 'x{78}…$"),
+        ("delay: null", r"delay: expected a number, 0 to 10 s, found nothing"),
+        ("lane: 0.5", "lane: expected a whole number, 0 to 1, found 0.5"),
+        ("ignores: signal", r"ignores: expected a list, as \[signal, priority\], found 'signal'"),
+        ("ignores: [signals]", r"ignores\[0\]: expected one of signal, priority, crosswalk, found 'signals'"),
+        ("turn: []", r"turn: expected one of straight, left, right, found \[\]"),
+        ("turn: [left, [right]]", r"turn\[1\]: expected one of .*, found \['right'\]"),
+        ("turn: {left: 1}", "turn: expected one of .*, found the keys left"),
+    ],
+)
+def test_a_wrong_value_is_refused_with_line_and_field(with_other, entries, sentence):
+    with pytest.raises(ConfigError, match=sentence):
+        parse_spec(with_other(entries), "f.yaml")
+
+
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [
+        ("actor: []", f"f.yaml:7: actor: no such field; possible: actors, {FIELDS.replace('actors, ', '')}"),
+        ("design: 13", "design: expected a whole number, 1 to 12, found 13"),
+        ("exchange: [true, false]", "exchange: expected true or false, and not several"),
+        ("background: none", "f.yaml:7: background: expected keys and values, found 'none'"),
+        (f"road: {{kerb_radius: {'9' * 400}}}", "road.kerb_radius: expected a number, found 9"),
+        ("exchange: 'true'", "exchange: expected true or false, found 'true'; leave the quotes out"),
+        ("view: 3", "view: expected one of open, hidden, found 3"),
+        ("road: {signalized: 1}", "road.signalized: expected true or false, found 1"),
+    ],
+)
+def test_a_wrong_line_is_refused(small, line, sentence):
+    with pytest.raises(ConfigError, match=sentence):
+        parse_spec(f"{small}\n{line}", "f.yaml")
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("[1, 2]", r"scenario:1: the file: expected keys and values, found \[1, 2\]"),
+        ("name: 3\nactors: []", "scenario:1: name: expected a text, found 3; put it in quotes"),
+        ("name: no\nactors: []", "name: expected a text, found False; put it in quotes"),
+        ("name: x", "scenario:1: actors: is missing; add it"),
+        ("actors: {}", "actors: expected a list, found nothing"),
+        ("actors: [{from: west}]", r"actors\[0\].role: is missing; add it"),
+    ],
+)
+def test_a_file_that_is_no_scenario_is_refused(text, sentence):
+    with pytest.raises(ConfigError, match=sentence):
+        parse_spec(text)
+
+
+def test_a_file_is_read_in_utf8_and_named_in_its_errors(tmp_path, small):
+    path = tmp_path / "mein.yaml"
+    path.write_text(small.replace("small", "Straße"), encoding="utf-8")
+    assert read_spec(path).name == "Straße"
+    path.write_text(small + "\nview: x", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"mein.yaml:7: view: expected one of open, hidden"):
+        read_spec(path)
+    path.write_bytes(b"\xff")
+    with pytest.raises(ConfigError, match=r"mein.yaml: cannot be read .*; give a YAML file in UTF-8"):
+        read_spec(path)
+    with pytest.raises(ConfigError, match=r"other.yaml: cannot be read"):
+        read_spec(tmp_path / "other.yaml")
+
+
+def test_what_is_too_large_for_a_scenario_is_not_parsed(tmp_path, small):
+    path = tmp_path / "big.yaml"
+    path.write_text(small + "# comment\n" * 20_000, encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"big.yaml: has more than 200000 characters; give a scenario file"):
+        read_spec(path)

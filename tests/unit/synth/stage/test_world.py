@@ -1,0 +1,160 @@
+"""Towns around junctions: nothing stands in the way, the pole sees the middle, lamps are where they should be."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.synth.roads import (
+    FIRST_BUILDING,
+    POLE,
+    ROAD_CODES,
+    SIDEWALK,
+    TREE,
+    Hump,
+    Junction,
+    RoadSpec,
+)
+from deepaccident_devkit.synth.stage import LAMP_COLORS, random_world
+
+SPECS = {
+    "four-way": RoadSpec(),
+    "three-way": RoadSpec(kind="three-way", parking=False),
+    "wide": RoadSpec(lanes=2, signalized=False),
+    "hilly": RoadSpec(parking=False, hump=Hump(arm="east", distance=60.0)),
+}
+CORNERS = [("west", "north"), ("south", "west"), ("east", "south"), ("north", "east")]
+
+
+def world_of(name, seed=0, view="open", between=("west", "south")):
+    return random_world(np.random.default_rng(seed), Junction(SPECS[name]), view, between=between)
+
+
+@pytest.fixture(params=itertools.product(SPECS, (0, 1)), ids=lambda param: f"{param[0]}-{param[1]}")
+def named(request):
+    name, seed = request.param
+    return Junction(SPECS[name]), world_of(name, seed)
+
+
+def clear_of_props(world, start, end):
+    """Whether the sight from one point to another passes above or beside every block, seen in steps of 5 cm."""
+    line = np.linspace(start, end, int(np.linalg.norm(np.subtract(end, start)) / 0.05))[1:-1]
+    low, high = world.props.corners.min(axis=1), world.props.corners.max(axis=1)
+    inside = ((line[:, None] > low) & (line[:, None] < high)).all(axis=2)
+    return not inside.any()
+
+
+def test_nothing_stands_on_the_road_and_no_house_on_the_sidewalk(named):
+    _, world = named
+    covered = world.top.codes != world.ground.codes
+    assert not np.isin(world.ground.codes[covered], ROAD_CODES).any()
+    on_sidewalk = world.top.codes[covered & (world.ground.codes == SIDEWALK)]
+    assert set(np.unique(on_sidewalk)) == {POLE}
+    seen = set(np.unique(world.top.codes))
+    assert {TREE, POLE, FIRST_BUILDING} <= seen
+
+
+def test_things_reach_into_the_ground_and_stand_above_it(named):
+    _, world = named
+    corners = world.props.corners
+    height = world.terrain.height(corners[..., :2])
+    grounded = (corners[..., 2] < height).any(axis=1)
+    houses = world.props.facade
+    assert (corners[houses][..., 2].min(axis=1) <= height[houses].min(axis=1) - 0.19).all()
+    assert (corners[houses][..., 2].max(axis=1) > height[houses].max(axis=1) + 3).all()
+    assert grounded.mean() > 0.3
+
+
+def test_the_pole_sees_the_middle(named):
+    _, world = named
+    place = world.lidar_pole.translation
+    assert 3 <= place[2] <= 5
+    ahead = world.lidar_pole.rotation[:, 0]
+    np.testing.assert_allclose(ahead[:2], -place[:2] / np.hypot(*place[:2]), atol=1e-9)
+    for target in ([0.0, 0.0, 0.5], [3.0, -3.0, 0.5], [-3.0, -3.0, 0.5], [2.0, 3.0, 0.5]):
+        assert clear_of_props(world, place, target)
+    assert world.ground.at(place[None, :2])[0] == SIDEWALK
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_pole_stands_where_the_two_come_from(seed):
+    for between, corners in {
+        ("west", "north"): {(-1, 1)},
+        ("south", "east"): {(1, -1)},
+        ("south", "south"): {(1, -1), (-1, -1)},
+        ("east", "west"): {(1, 1), (1, -1), (-1, 1), (-1, -1)},
+    }.items():
+        place = world_of("wide", seed, between=between).lidar_pole.translation
+        assert tuple(np.sign(place[:2]).astype(int).tolist()) in corners
+
+
+def test_each_arm_sees_its_lamps(named):
+    junction, world = named
+    assert [head.arm for head in world.signals] == (list(junction.arms) if junction.spec.signalized else [])
+    for head in world.signals:
+        lamps = world.props.corners[list(head.rows)].mean(axis=1)
+        assert (np.diff(lamps[:, 2]) < 0).all()
+        np.testing.assert_allclose(lamps[1], head.position, atol=1e-9)
+        line = junction.stop_line(head.arm)
+        out = line.mean(axis=0) - np.array([0.0, 0.0])
+        waiting = np.append(line.mean(axis=0) * (1 + 8 / np.hypot(*out)), 1.5)
+        shining = np.array([np.cos(head.yaw), np.sin(head.yaw)])
+        assert shining @ (waiting - lamps[1])[:2] > 5
+        assert clear_of_props(world, lamps[1] + 0.2 * np.append(shining, 0), waiting)
+        red, _, green = world.props.colors[list(head.rows), 0].astype(int)
+        assert red[0] == red.max() < LAMP_COLORS[0][0]
+        assert green[1] == green.max() < LAMP_COLORS[2][1]
+
+
+@pytest.mark.parametrize("between", CORNERS)
+@pytest.mark.parametrize("name", ["four-way", "hilly"])
+def test_a_house_on_the_kerb_hides_who_comes_until_late(name, between):
+    hidden = world_of(name, view="hidden", between=between)
+    junction = Junction(SPECS[name])
+    first, second = (junction.route(arm, "straight") for arm in between)
+    meeting = junction.conflicts(first, second)
+
+    def eyes(route, s):
+        x, y, _, _ = route.path.at(s)
+        return np.array([x, y, 1.5])
+
+    def sees(world, metres):
+        return clear_of_props(world, eyes(first, meeting.s_a - metres), eyes(second, meeting.s_b - metres))
+
+    assert not sees(hidden, 20.0)
+    assert not sees(hidden, 30.0)
+    assert sees(hidden, 6.0)
+    for route, s in ((first, meeting.s_a), (second, meeting.s_b)):
+        for metres in (0.0, 10.0, 20.0, 30.0):
+            assert clear_of_props(hidden, hidden.lidar_pole.translation, eyes(route, s - metres))
+    covered = hidden.top.codes != hidden.ground.codes
+    assert not np.isin(hidden.ground.codes[covered], ROAD_CODES).any()
+
+
+def test_all_else_of_the_town_stays_the_same():
+    wide, hidden = world_of("four-way"), world_of("four-way", view="hidden")
+    np.testing.assert_array_equal(wide.world_from_ground.matrix, hidden.world_from_ground.matrix)
+    assert wide.lidar_pole.translation[2] == hidden.lidar_pole.translation[2]
+    north_east = np.s_[1530:, 1530:]
+    np.testing.assert_array_equal(wide.top.codes[north_east] == TREE, hidden.top.codes[north_east] == TREE)
+
+
+def test_the_same_numbers_give_the_same_town():
+    first, again, other = world_of("three-way"), world_of("three-way"), world_of("three-way", seed=1)
+    np.testing.assert_array_equal(first.props.corners, again.props.corners)
+    assert first.props.corners.shape != other.props.corners.shape
+
+
+def test_a_junction_with_a_hump_lies_level():
+    assert world_of("hilly").world_from_ground.rotation[2, 2] == pytest.approx(1, abs=1e-15)
+    assert 0.9986 < world_of("four-way").world_from_ground.rotation[2, 2] < 1
+
+
+@pytest.mark.parametrize(
+    ("name", "between", "arms"),
+    [("four-way", ("west", "east"), "west, south, east, north"), ("three-way", ("west", "north"), "west, south, east")],
+)
+def test_arms_without_a_corner_are_refused(name, between, arms):
+    with pytest.raises(ConfigError, match=f"between: the arms .* no corner in common; choose two neighbours of {arms}"):
+        world_of(name, view="hidden", between=between)

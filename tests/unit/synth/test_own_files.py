@@ -1,0 +1,56 @@
+"""The scenario files that docs/scenarios.md begins with: what happens is what the page says."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.synth import SynthConfig, make_release
+
+PAGE = (Path(__file__).parents[3] / "docs" / "scenarios.md").read_text(encoding="utf-8")
+EXAMPLES = dict(re.findall(r"^```yaml\n# (\w+)\.yaml.*?\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE))
+
+
+@pytest.fixture
+def made(tmp_path):
+    """A function: name of an example → a release of an accident and its twin by it, two frames without sensors."""
+
+    def make(name: str) -> DeepAccident:
+        path = tmp_path / f"{name}.yaml"
+        path.write_text(EXAMPLES[name], encoding="utf-8")
+        config = SynthConfig(spec=path, scenarios=2, frames=2, sensors=False)
+        return DeepAccident("v1", make_release(tmp_path / name, config, workers=1), workers=1, verbose=False)
+
+    return make
+
+
+def test_the_page_has_four_files():
+    assert list(EXAMPLES) == ["mine", "pedestrian", "rear_end", "quiet"]
+
+
+def test_ego_hits_the_pedestrian(made):
+    da = made("pedestrian")
+    (accident,) = da.find(collision=True)
+    assert da.get("scenario", accident["token"])["collision"]["classes"] == ["car", "pedestrian"]
+
+
+def test_ego_runs_into_the_rear_of_the_one_who_changed_lanes(made):
+    """The first of meet.actors has the later row of the two, which once kept any draw from counting."""
+    da = made("rear_end")
+    (accident,) = da.find(collision=True)
+    collision = da.collision(accident)
+    assert collision.sides == ("rear", "front")
+    assert collision.speeds[0] < collision.speeds[1]
+    assert np.rad2deg(collision.impact_angle) < 20
+    ego, behind = (da.get_sample(accident, agent, 2) for agent in ("ego_vehicle", "other_vehicle_behind"))
+    ego_from_behind = da.transform(ego, behind)
+    assert ego_from_behind.translation[1] == pytest.approx(-3.5, abs=0.3)  # who is behind it stayed in the right lane
+    assert abs(ego_from_behind.yaw) < 0.02
+
+
+def test_nothing_happens_where_nobody_is_to_meet(made):
+    da = made("quiet")
+    assert [scenario["accident_type"] for scenario in da.scenario] == [None, None]
+    assert da.find(collision=True) == []

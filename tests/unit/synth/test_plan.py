@@ -1,0 +1,183 @@
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.splits import split_records
+from deepaccident_devkit.synth import SynthConfig
+from deepaccident_devkit.synth.plan import plan_scenarios, plan_splits
+from deepaccident_devkit.synth.scenario import build_scenario
+from deepaccident_devkit.taxonomy import TOWNS
+
+
+def plans_of(**fields):
+    return plan_scenarios(SynthConfig(**fields))
+
+
+def test_accidents_and_twins_by_turns_go_round_the_designs():
+    plans = plans_of(scenarios=26)
+    assert [plan.accident for plan in plans] == [True, False] * 13
+    assert [plan.design for plan in plans[::2]] == [1, 7, 2, 8, 3, 9, 4, 10, 5, 11, 6, 12, 1]
+    assert {plan.subtype for plan in plans[:4]} == {1, 2}
+    for accident, twin in zip(plans[::2], plans[1::2], strict=True):
+        assert (accident.name, accident.split, accident.traits) == (twin.name, twin.split, twin.traits)
+        assert accident.scenario_type == f"type1_subtype{accident.subtype}_accident"
+        assert twin.scenario_type == f"type1_subtype{twin.subtype}_normal"
+
+
+def test_names_are_the_release_s_and_unique():
+    plans = plans_of(scenarios=60)
+    assert len({plan.token for plan in plans}) == 60
+    assert len({plan.name for plan in plans}) == 30
+    towns = {plan.name.split("_")[0] for plan in plans}
+    assert towns <= set(TOWNS)
+    assert len(towns) > 4
+    number = 1 + plans[6].pair
+    assert plans[6].name.endswith(f"_type001_subtype{plans[6].subtype:04d}_scenario{number:05d}")
+
+
+def test_seeds_differ_and_repeat():
+    assert plans_of(seed=1) == plans_of(seed=1)
+    assert [plan.name for plan in plans_of(seed=1)] != [plan.name for plan in plans_of(seed=2)]
+
+
+def test_more_scenarios_leave_the_first_as_they_are_but_for_splits():
+    few, many = plans_of(scenarios=4), plans_of(scenarios=40)
+    assert [plan.token for plan in few] == [plan.token for plan in many[:4]]
+
+
+def test_designs_can_be_chosen():
+    assert [plan.design for plan in plans_of(scenarios=6, designs=(3, 9))[::2]] == [3, 9, 3]
+
+
+@pytest.mark.parametrize("design", range(1, 13))
+def test_a_draw_has_the_plan_s_traits(design):
+    for plan in plans_of(scenarios=20, designs=(design,)):
+        for seed in range(3):
+            spec = plan.draw(np.random.default_rng(seed))
+            assert spec.road.signalized == (plan.subtype == 1) == (design < 7)
+            assert f"{spec.road.kind} junction" == plan.traits.road_type
+            assert spec.spawn_side == plan.traits.spawn_side
+            assert spec.view == "open" or design in (1, 2, 6, 7, 8, 12)
+
+
+def test_a_view_that_is_asked_for_holds_for_every_draw():
+    for view, designs in (("open", range(1, 13)), ("hidden", (1, 7))):
+        for plan in plans_of(scenarios=24, view=view):
+            assert plan.design in designs
+            assert {plan.draw(np.random.default_rng(seed)).view for seed in range(3)} == {view}
+
+
+def test_a_house_hides_the_view_in_some_draws_where_none_is_asked_for():
+    views = Counter(plan.draw(np.random.default_rng(7)).view for plan in plans_of(scenarios=20, designs=(1, 2)))
+    assert views["open"] > 0
+    assert views["hidden"] > 0
+
+
+def test_the_first_three_pairs_of_a_small_release_fill_the_splits():
+    plans = plans_of(scenarios=6)
+    assert [plan.split for plan in plans] == ["train", "train", "val", "val", "test", "test"]
+    splits = plan_splits(plans)
+    assert splits.train == splits.train_mini == tuple(sorted(plan.token for plan in plans[:2]))
+    assert splits.val == splits.val_mini
+    assert plan_splits(plans[:2]).val_mini == ()
+
+
+def test_a_large_release_is_split_by_the_official_procedure():
+    plans = plans_of(scenarios=691)
+    assert Counter(plan.split for plan in plans) == {"train": 483, "val": 104, "test": 104}, "the real release's counts"
+    splits = plan_splits(plans)
+    assert set(splits.val) == {plan.token for plan in plans if plan.split == "val"}
+    assert set(splits.val_mini) < set(splits.val)
+    of_pair = {}
+    for plan in plans:
+        of_pair.setdefault(plan.pair, set()).add(plan.split)
+    assert all(len(names) == 1 for names in of_pair.values())
+
+
+@pytest.mark.parametrize("scenarios", [22, 24, 25, 40])
+def test_no_split_is_empty_from_six_scenarios_on(scenarios):
+    assert {plan.split for plan in plans_of(scenarios=scenarios)} == {"train", "val", "test"}
+
+
+def test_unplanned_accidents_come_at_their_rate():
+    share = np.mean([plan.unplanned for plan in plans_of(scenarios=800, unplanned=0.25)])
+    assert share == pytest.approx(0.25, abs=0.05)
+    assert not any(plan.unplanned for plan in plans_of(scenarios=40, unplanned=0.0))
+    assert not any(plan.unplanned for plan in plans_of(scenarios=40, unplanned=1.0, view="hidden"))
+
+
+def test_a_hidden_view_has_designs_that_a_house_can_hide_and_faster_cars():
+    plans = plans_of(scenarios=6, view="hidden")
+    assert [plan.design for plan in plans[::2]] == [1, 7, 1]
+    spec = plans[0].draw(np.random.default_rng(0))
+    assert spec.view == "hidden"
+    assert all(12 <= spec.actor(role).max_speed <= 14 for role in ("ego", "other"))
+    with pytest.raises(ConfigError, match=r"view: hidden needs .* in 'unprotected left turn' it comes from opposite"):
+        plans_of(view="hidden", designs=(3,))
+
+
+OWN = """\
+road: {signalized: [true, false], kind: [four-way, three-way]}
+view: hidden
+actors:
+  - {role: ego, from: west, turn: right}
+  - {role: other, from: south, turn: [left, right]}
+"""
+
+
+def test_an_own_file_takes_the_designs_place(tmp_path):
+    path = tmp_path / "own.yaml"
+    path.write_text(OWN + "meet: {actors: [ego, ego]}\n")
+    with pytest.raises(ConfigError, match="ego cannot meet itself"):
+        plans_of(spec=path)
+    path.write_text(OWN.replace("turn: right}", "turn: straight}", 1) + "meet: {}\n")
+    plans = plans_of(spec=path, scenarios=40, unplanned=1.0)
+    assert {plan.design for plan in plans} == {None}
+    assert {plan.subtype for plan in plans} == {1, 2}
+    assert not any(plan.unplanned for plan in plans)
+    for plan in plans:
+        spec = plan.draw(np.random.default_rng(plan.pair))
+        assert spec.road.signalized == (plan.subtype == 1)
+        assert spec.view == "hidden"
+
+
+def test_a_file_in_which_nobody_meets_gives_normal_scenarios(tmp_path):
+    path = tmp_path / "own.yaml"
+    path.write_text(OWN)
+    plans = plans_of(spec=path, scenarios=5)
+    assert [(plan.pair, plan.accident) for plan in plans] == [(k, False) for k in range(5)]
+    assert len({plan.token for plan in plans}) == 5
+
+
+def test_plans_survive_pickling():
+    import pickle
+
+    plan = plans_of()[0]
+    again = pickle.loads(pickle.dumps(plan))
+    assert again == plan
+    assert again.draw(np.random.default_rng(1)) == plan.draw(np.random.default_rng(1))
+
+
+def test_the_lists_are_what_the_official_procedure_makes_of_what_is_built():
+    config = SynthConfig(scenarios=24, frames=1, unplanned=0.3, seed=3)
+    plans = plan_scenarios(config)
+    assert {plan.unplanned for plan in plans} == {True, False}
+    records = []
+    for plan in plans:
+        meta = build_scenario(config, plan).meta if plan.accident else None
+        collision = None if meta is None or meta.collision is None else {"agents": meta.collision.agents}
+        records.append(
+            {
+                "token": plan.token,
+                "name": plan.name,
+                "scenario_type": plan.scenario_type,
+                "designed_accident": plan.accident,
+                "weather": "Clear",
+                "collision": collision,
+                "road_type": meta and meta.road_type,
+                "spawn_side": meta and meta.spawn_side,
+            }
+        )
+    assert split_records(records) == plan_splits(plans)

@@ -1,0 +1,124 @@
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.synth.collision import separation
+from deepaccident_devkit.synth.config import SynthConfig
+from deepaccident_devkit.synth.plan import plan_scenarios
+from deepaccident_devkit.synth.scenario import build_scenario
+from deepaccident_devkit.synth.spec import DESIGNS
+from deepaccident_devkit.tables.accidents import accident_type
+from deepaccident_devkit.taxonomy import VEHICLE_AGENTS
+
+CONFIG = SynthConfig(scenarios=24, frames=None, seed=2, unplanned=0.0)
+
+
+@pytest.fixture(scope="module")
+def built():
+    """All accidents of a round of the designs, and some twins."""
+    plans = plan_scenarios(CONFIG)
+    return [build_scenario(CONFIG, plan) for plan in plans if plan.accident or plan.pair < 3]
+
+
+def gaps(scenario, first, second, times):
+    """Separation of two actors, by id, at times."""
+    rows = [scenario.actors.row_of(actor) for actor in (first, second)]
+    poses = [scenario.actors.all[row].motion.poses(times) for row in rows]
+    size = scenario.actors.size[:, :2]
+    return separation(poses[0], size[rows[0]], poses[1], size[rows[1]])
+
+
+def test_each_design_is_told_by_its_meta(built):
+    types = [
+        accident_type(scenario.meta, signalized=scenario.plan.subtype == 1)
+        for scenario in built
+        if scenario.plan.accident
+    ]
+    assert sorted(types) == list(DESIGNS)
+    assert types == [scenario.plan.design for scenario in built if scenario.plan.accident]
+
+
+def test_the_last_frame_is_the_impact(built):
+    for scenario in built:
+        if scenario.plan.accident:
+            end = (scenario.frames - 1) / 10
+            apart = gaps(scenario, *scenario.meta.collision.ids, [*np.arange(0, end - 0.01, 0.02), end])
+            assert -0.3 < apart[-1] <= 1e-9
+            assert (apart[:-1] > 0).all()
+
+
+def test_recordings_are_of_natural_length(built):
+    assert all(40 <= scenario.frames <= 100 for scenario in built)
+    assert all(scenario.meta.simulated_frames == scenario.frames + 10 for scenario in built)
+    assert len({scenario.frames for scenario in built}) > 5
+
+
+def test_ids_are_unique_and_of_their_kind(built):
+    for scenario in built:
+        ids = scenario.actors.actor_id
+        assert len(set(ids.tolist())) == len(set(scenario.actors.object_id.tolist())) == len(ids)
+        assert list(scenario.agents) == list(VEHICLE_AGENTS)
+        speed = np.hypot(*scenario.actors.at(1.0).velocities.T)
+        np.testing.assert_array_equal(speed[ids >= 20000], 0)
+        assert ids[ids < 20000].max() < 3000
+
+
+def test_twins_have_the_same_scene(built):
+    for accident, normal in zip(built[:6:2], built[1:6:2], strict=True):
+        assert (accident.plan.accident, normal.plan.accident) == (True, False)
+        assert accident.plan.pair == normal.plan.pair
+        assert accident.spec == normal.spec
+        assert accident.agents == normal.agents
+        assert normal.meta.collision is None
+        assert normal.meta.agent_ids == accident.meta.agent_ids
+        np.testing.assert_array_equal(accident.world.top.codes, normal.world.top.codes)
+
+
+def test_every_category_moves_about_over_a_few_scenes(built):
+    moving = Counter(actor.category for scenario in built for actor in scenario.actors.all if not actor.parked)
+    assert set(moving) == {"car", "van", "truck", "motorcycle", "cyclist", "pedestrian"}
+
+
+@pytest.mark.parametrize("frames", [1, 4, 60, 130])
+def test_so_many_frames_are_recorded(frames):
+    config = replace(CONFIG, scenarios=2, frames=frames)
+    for plan in plan_scenarios(config):
+        scenario = build_scenario(config, plan)
+        assert scenario.frames == frames
+        first = min(actor.motion.start for actor in scenario.actors.all if not actor.parked)
+        assert first <= 0.0
+
+
+def test_the_same_numbers_make_the_same_scenario():
+    plan = plan_scenarios(CONFIG)[4]
+    one, again = (build_scenario(CONFIG, plan) for _ in range(2))
+    for first, second in zip(one.actors.all, again.actors.all, strict=True):
+        np.testing.assert_array_equal(first.motion.poses([0.0, 1.0, 3.9]), second.motion.poses([0.0, 1.0, 3.9]))
+    other = replace(CONFIG, seed=3)
+    assert build_scenario(other, plan_scenarios(other)[4]).spec != one.spec
+
+
+def test_unplanned_accidents_are_with_someone_who_records_nothing():
+    config = replace(CONFIG, scenarios=8, unplanned=1.0)
+    for plan in plan_scenarios(config)[::2]:
+        meta = build_scenario(config, plan).meta
+        assert accident_type(meta, signalized=plan.subtype == 1) is None
+        assert None in meta.collision.agents
+        assert not set(meta.collision.ids) <= set(meta.agent_ids)
+
+
+def test_a_scenario_in_which_nobody_meets_is_given_up(tmp_path, monkeypatch):
+    monkeypatch.setattr("deepaccident_devkit.synth.scenario.MAX_DRAWS", 2)
+    file = tmp_path / "late.yaml"
+    file.write_text(
+        "name: late\nroad: {signalized: false}\nactors:\n"
+        "  - {role: ego, from: west, max_speed: 9}\n  - {role: other, from: south, max_speed: 9}\n"
+        "meet: {actors: [ego, other], offset: 3}\n"
+        "background: {vehicles: 0, two_wheelers: 0, parked: 0, walking: 0, crossing: 0}\n"
+    )
+    config = SynthConfig(scenarios=1, spec=file)
+    with pytest.raises(ConfigError, match=r"late: those of meet.actors did not collide in 2 draws; choose paths that"):
+        build_scenario(config, plan_scenarios(config)[0])

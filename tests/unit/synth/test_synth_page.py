@@ -1,0 +1,67 @@
+"""docs/synth.md: its tables are what was measured, what was measured is still so, and its code runs."""
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+from deepaccident_devkit.synth.spec import DESIGNS
+
+DOCS = Path(__file__).parents[3] / "docs"
+
+
+@pytest.fixture(scope="module")
+def script():
+    """The module that writes the page."""
+    spec = importlib.util.spec_from_file_location("make_synth_page", DOCS / "make_synth_page.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_tables_are_made_of_what_was_measured(script):
+    page = script.PAGE.read_text(encoding="utf-8")
+    assert page == script.with_tables(page, script.measured()), "run: python docs/make_synth_page.py --tables"
+
+
+@pytest.mark.parametrize("number", [0, 4, 19, 34])
+def test_what_was_measured_is_still_so(script, number):
+    """Of a few pairs, what needs no sensors; numbers may differ a little between machines."""
+    stored, now = script.measured()[number], script.measure(number, views=False)
+    message = "the generator has changed; run: python docs/make_synth_page.py"
+    for key in ("design", "type", "draws", "frames", "twin_frames", "twin_touches"):
+        assert now[key] == stored[key], message
+    assert now["angle"] == pytest.approx(stored["angle"], abs=1.0), message
+    assert now["speeds"] == pytest.approx(stored["speeds"], abs=0.3), message
+    assert now["twin_gap"] == pytest.approx(stored["twin_gap"], abs=0.2), message
+
+
+def test_the_generator_keeps_its_promises(script):
+    pairs = script.measured()
+    for design in DESIGNS:
+        of_design = [pair for pair in pairs if pair["design"] == design]
+        assert len(of_design) == script.SEEDS
+        assert sum(pair["draws"] == 1 for pair in of_design) >= 0.7 * len(of_design)
+        assert all(pair["type"] == design for pair in of_design)
+    assert not any(pair["twin_touches"] or pair["twin_gap"] < 1.0 for pair in pairs)
+    letters = "".join(of_agent for pair in pairs for of_agent in pair["views"].values())
+    unseen = len(letters) - letters.count("v")
+    assert 0.05 < unseen / len(letters) < 0.3
+    assert letters.count("c") >= 0.95 * unseen
+
+
+def test_a_stale_page_is_told(script):
+    page = script.PAGE.read_text(encoding="utf-8")
+    pairs = script.measured()
+    pairs[0]["draws"] += 1
+    assert script.with_tables(page, pairs) != page
+
+
+def test_the_page_s_code_runs(tmp_path, monkeypatch, capsys):
+    (code,) = re.findall(r"^```python\n(.*?)^```", (DOCS / "synth.md").read_text("utf-8"), re.DOTALL | re.MULTILINE)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "synth.md", "exec"), {})  # noqa: S102
+    assert capsys.readouterr().out == "3\n"

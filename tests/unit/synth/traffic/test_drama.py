@@ -1,0 +1,112 @@
+"""The twelve designs as they are played; docs/synth.md has the numbers over more seeds."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit.synth.roads import Junction
+from deepaccident_devkit.synth.spec import DESIGNS, draw
+from deepaccident_devkit.synth.traffic.casting import WARM_UP
+from deepaccident_devkit.synth.traffic.drama import perform_accident, perform_twin, set_stage
+from deepaccident_devkit.synth.traffic.touching import least_gap, touching_pairs
+
+SEEDS = range(4)
+ANGLES = {
+    1: (80, 100), 2: (25, 130), 3: (95, 165), 4: (55, 110), 5: (55, 110), 6: (20, 70),
+    7: (80, 100), 8: (25, 130), 9: (95, 165), 10: (55, 110), 11: (55, 110), 12: (20, 70),
+}  # fmt: skip
+"""Degrees between the headings of the two when they touch, by design."""
+
+
+@lru_cache(maxsize=64)
+def played(design, seed):
+    """A stage, and its accident."""
+    rng = np.random.default_rng([seed, design])
+    spec = draw(DESIGNS[design], rng)
+    stage = set_stage(rng, spec, Junction(spec.road), float(rng.uniform(5.5, 9.5)))
+    return stage, perform_accident(stage)
+
+
+def sizes(stage, performance):
+    return np.array([stage.users[row].body.size[:2] for row in performance.present])
+
+
+@pytest.mark.parametrize("design", DESIGNS)
+def test_the_pair_meets_at_the_first_draw_at_the_design_s_angle(design):
+    met = [played(design, seed) for seed in SEEDS]
+    assert sum(accident is not None for _, accident in met) >= 3
+    low, high = ANGLES[design]
+    for stage, accident in met:
+        if accident is not None:
+            one, other = accident.simulation.poses[-1, list(stage.cast.pair), 2]
+            assert low < abs(np.degrees(np.angle(np.exp(1j * (one - other))))) < high
+
+
+@pytest.mark.parametrize("design", DESIGNS)
+def test_only_the_pair_touches_and_only_at_the_end(design):
+    for seed in SEEDS:
+        stage, accident = played(design, seed)
+        if accident is None:
+            continue
+        poses, size = accident.simulation.poses, sizes(stage, accident)
+        assert touching_pairs(poses, size, 0.0) == [tuple(sorted(stage.cast.pair))]
+        assert touching_pairs(poses[:-1], size, 0.0) == []
+
+
+@pytest.mark.parametrize("design", DESIGNS)
+def test_those_behind_are_behind_whom_they_follow(design):
+    stage, accident = played(design, 0)
+    poses = accident.simulation.poses
+    for leader, follower in (("ego", "ego_behind"), ("other", "other_behind")):
+        ahead, behind = (stage.cast.users[stage.cast.row_of(role)] for role in (leader, follower))
+        assert ahead.path is behind.path
+        first, second = (ahead.path.project(poses[:, stage.cast.row_of(role), :2])[0] for role in (leader, follower))
+        gap = first - second - (ahead.body.size[0] + behind.body.size[0]) / 2
+        assert gap.min() > 1.0
+        assert gap.max() < 35.0
+
+
+@pytest.mark.parametrize("design", DESIGNS)
+def test_nobody_slides_nor_drives_as_no_car_can(design):
+    stage, accident = played(design, 1)
+    run = accident.simulation
+    wheels = [column for column, row in enumerate(accident.present) if not stage.users[row].walks]
+    change = np.diff(run.velocities[:, wheels], axis=0) / 0.02
+    yaw = run.poses[:-1, wheels, 2]
+    along = np.cos(yaw) * change[..., 0] + np.sin(yaw) * change[..., 1]
+    across = np.cos(yaw) * change[..., 1] - np.sin(yaw) * change[..., 0]
+    assert np.abs(along).max() < 9.0
+    assert np.abs(across).max() < 7.0
+    sideways = np.arctan2(run.velocities[..., 1], run.velocities[..., 0]) - run.poses[..., 2]
+    fast = run.states[:, wheels, 3] > 1.0
+    assert np.abs(np.angle(np.exp(1j * sideways[:, wheels])))[fast].max() < np.deg2rad(15)
+
+
+@pytest.mark.parametrize("design", DESIGNS)
+def test_where_everyone_keeps_the_rules_all_keep_clear(design):
+    stage, _ = played(design, 2)
+    twin = perform_twin(stage, stage.cast.begin + WARM_UP + 10.0)
+    poses, size = twin.simulation.poses, sizes(stage, twin)
+    assert touching_pairs(poses, size, 0.0) == []
+    assert least_gap(poses, size, list(range(len(stage.cast.users))), 1.0) == 1.0
+    assert twin.simulation.time[-1] == pytest.approx(stage.cast.begin + WARM_UP + 10.0)
+
+
+def test_the_lawful_one_has_green_and_the_other_red():
+    for design in (1, 2, 6):
+        stage, _ = played(design, 3)
+        for row in stage.cast.pair:
+            user = stage.cast.users[row]
+            state = stage.signals.state(user.route.from_arm, -1.0)
+            assert state == (0 if "signal" in user.ignores else 2)
+
+
+def test_the_background_is_moved_by_the_same_numbers_in_both():
+    stage, accident = played(3, 0)
+    twin = perform_twin(stage, stage.cast.begin + WARM_UP + 10.0)
+    common = set(accident.present) & set(twin.present)
+    assert len(common) > 10
+    for row in common - set(range(len(stage.cast.users))):
+        columns = accident.present.index(row), twin.present.index(row)
+        np.testing.assert_array_equal(accident.simulation.poses[0, columns[0]], twin.simulation.poses[0, columns[1]])

@@ -1,0 +1,59 @@
+import numpy as np
+import pytest
+
+from deepaccident_devkit.synth.traffic.following import (
+    Temper,
+    can_stop,
+    free_acceleration,
+    hardest_braking,
+    interaction,
+    stopping,
+)
+from deepaccident_devkit.synth.traffic.rights import find_rights
+from deepaccident_devkit.synth.traffic.simulate import simulate
+
+ONE = np.ones(1)
+TEMPER = Temper(max_speed=10 * ONE, acceleration=2 * ONE, braking=2.5 * ONE, time_gap=ONE, min_gap=2 * ONE)
+FREE = np.array([np.inf])
+
+
+def test_a_free_driver_speeds_up_to_its_speed_and_keeps_it():
+    assert free_acceleration(TEMPER, 0 * ONE, FREE)[0] == pytest.approx(2.0)
+    assert free_acceleration(TEMPER, 10 * ONE, FREE)[0] == pytest.approx(0.0)
+    assert free_acceleration(TEMPER, 12 * ONE, FREE)[0] < 0
+
+
+def test_a_bend_ahead_slows_down_but_not_without_limit():
+    assert free_acceleration(TEMPER, 8 * ONE, 7.5 * ONE)[0] == pytest.approx(-1.25)
+    assert free_acceleration(TEMPER, 8 * ONE, 1 * ONE)[0] == pytest.approx(-4.0)
+
+
+def test_nobody_ahead_means_no_braking():
+    assert interaction(TEMPER, 8 * ONE, FREE, 0 * ONE)[0] == 0
+    assert stopping(TEMPER, 8 * ONE, FREE)[0] == 0
+
+
+def test_a_slower_leader_asks_for_more_braking_than_a_faster_one():
+    slow, fast = (interaction(TEMPER, 8 * ONE, 15 * ONE, speed * ONE)[0] for speed in (2, 10))
+    assert slow < fast < 0
+
+
+def test_nobody_brakes_hard_at_walking_pace():
+    hardest = hardest_braking(np.array([0.0, 1.0, 10.0]))
+    assert hardest[0] < hardest[1] < 5.0
+    assert hardest[2] == 8.0
+
+
+def test_whether_one_can_stop():
+    assert can_stop(TEMPER, 10 * ONE, 20 * ONE)[0]
+    assert not can_stop(TEMPER, 10 * ONE, 10 * ONE)[0]
+
+
+def test_a_follower_stands_behind_a_standing_one(driver):
+    users = [driver(before=5.0, speed=0.0, delay=100.0), driver(before=60.0)]
+    run = simulate(users, begin=0.0, end=15.0, rights=find_rights(users))
+    assert run.states[-1, 1, 3] < 0.05
+    gap = run.poses[-1, 0, 0] - run.poses[-1, 1, 0] - (users[0].body.size[0] + users[1].body.size[0]) / 2
+    assert 1.5 < gap < 3.0
+    acceleration = np.diff(run.states[:, 1, 3]) / 0.02
+    assert acceleration.min() > -4.0

@@ -1,0 +1,44 @@
+import numpy as np
+import pytest
+
+from deepaccident_devkit.synth.collision import separation
+from deepaccident_devkit.synth.traffic.impact import impact_of
+from deepaccident_devkit.synth.traffic.simulate import Simulation
+
+SIZE = np.array([[4.0, 2.0], [5.0, 2.0]])
+
+
+def last_step(first, second, velocities):
+    """A simulation of two steps that ends with poses, each reached at a velocity."""
+    last = np.array([first, second], dtype=np.float64)
+    velocity = np.array(velocities, dtype=np.float64)
+    before = last.copy()
+    before[:, :2] -= 0.02 * velocity
+    states = np.zeros((2, 2, 5))
+    states[0, :, :3], states[1, :, :3] = before, last
+    return Simulation(time=np.array([1.0, 1.02]), states=states, velocities=np.stack([velocity, velocity]), contact=1)
+
+
+@pytest.mark.parametrize(
+    ("second", "velocities", "side"),
+    [
+        ((4.4, 0.0, np.pi), ((8, 0), (-8, 0)), "front"),
+        ((-4.4, 0.0, 0.0), ((2, 0), (10, 0)), "back"),
+        ((0.0, 3.4, -np.pi / 2), ((0, 0), (0, -8)), "left"),
+        ((0.0, -3.4, np.pi / 2), ((0, 0), (0, 8)), "right"),
+    ],
+)
+def test_the_side_that_is_hit(second, velocities, side):
+    run = last_step((0, 0, 0), second, velocities)
+    assert impact_of(run, (0, 1), SIZE).side == side
+
+
+def test_the_boxes_just_touch_at_its_time():
+    run = last_step((0, 0, 0), (4.4, 0.0, np.pi), ((8, 0), (-8, 0)))
+    impact = impact_of(run, (0, 1), SIZE)
+    share = (impact.time - 1.0) / 0.02
+    poses = run.poses[0] + share * (run.poses[1] - run.poses[0])
+    assert separation(poses[0], SIZE[0], poses[1], SIZE[1]) == pytest.approx(0.0, abs=1e-6)
+    assert impact.time == pytest.approx(1.02 - 0.1 / 16)
+    assert impact.angle == pytest.approx(np.pi)
+    assert impact.strength == pytest.approx(60 * 8 * 16)

@@ -1,0 +1,170 @@
+"""What holds at every step of every scenario, whatever happens in it: physics, lanes, lights, people, flow."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit.synth.config import SynthConfig
+from deepaccident_devkit.synth.plan import plan_scenarios
+from deepaccident_devkit.synth.roads import ROAD_CODES, SIDEWALK, Junction
+from deepaccident_devkit.synth.spec import DESIGNS
+from deepaccident_devkit.synth.stage import random_world
+from deepaccident_devkit.synth.traffic.casting import WARM_UP
+from deepaccident_devkit.synth.traffic.drama import perform_accident, perform_twin, set_stage
+from deepaccident_devkit.synth.traffic.kinematics import HARDEST_BRAKING, MAX_STEER, PERIOD
+from deepaccident_devkit.synth.traffic.signals import GREEN, RED
+from deepaccident_devkit.synth.traffic.touching import touching_pairs
+from deepaccident_devkit.synth.traffic.unplanned import unplanned
+
+CORNERS = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) / 2
+MAPPED = 143.0
+"""Metres from the middle within which the ground is known under a whole truck."""
+SCENES = [
+    *((design, "designed") for design in DESIGNS),
+    (1, "hidden"),
+    (7, "hidden"),
+    (3, "unplanned"),
+    (7, "unplanned"),
+    (12, "unplanned"),
+]
+
+
+class Run:
+    """Part of a performance: all but the contact, and who took part."""
+
+    def __init__(self, stage, performance, *, accident):
+        simulation = performance.simulation
+        steps = slice(0, len(simulation.time) - 1 if accident else None)
+        self.stage, self.accident = stage, accident
+        self.users = [stage.users[row] for row in performance.present]
+        self.time, self.states = simulation.time[steps], simulation.states[steps]
+        self.velocities = simulation.velocities[steps]
+        self.size = np.array([user.body.size[:2] for user in self.users])
+        self.driving = np.flatnonzero([not user.walks for user in self.users])
+
+    @property
+    def poses(self):
+        return self.states[..., :3]
+
+    def corners(self, every=10):
+        """(S', A, 4, 2), metres."""
+        poses = self.poses[::every]
+        cos, sin = np.cos(poses[..., 2, None]), np.sin(poses[..., 2, None])
+        along, across = self.size[:, :1] * CORNERS[:, 0], self.size[:, 1:] * CORNERS[:, 1]
+        x = poses[..., 0, None] + cos * along - sin * across
+        return np.stack([x, poses[..., 1, None] + sin * along + cos * across], axis=-1)
+
+
+@lru_cache(maxsize=32)
+def runs(design, kind):
+    """An accident and its twin, as a release has them."""
+    view = "hidden" if kind == "hidden" else None
+    plan = plan_scenarios(SynthConfig(scenarios=1, designs=(design,), unplanned=0.0, seed=design, view=view))[0]
+    rng = np.random.default_rng([design, 4])
+    for _ in range(5):
+        spec = plan.draw(rng)
+        junction = Junction(spec.road)
+        spec = unplanned(rng, spec, junction) if kind == "unplanned" else spec
+        stage = set_stage(rng, spec, junction, 7.5)
+        accident = perform_accident(stage)
+        if accident is not None:
+            twin = perform_twin(stage, stage.cast.begin + WARM_UP + 10.0)
+            return Run(stage, accident, accident=True), Run(stage, twin, accident=False)
+    raise AssertionError("nobody met in five draws")
+
+
+def over_scenes(test):
+    return pytest.mark.parametrize(("design", "kind"), SCENES)(test)
+
+
+@over_scenes
+def test_nobody_touches_anybody(design, kind):
+    for run in runs(design, kind):
+        parked = np.array([vehicle.pose for vehicle in run.stage.parked]).reshape(-1, 3)
+        size = np.array([vehicle.body.size[:2] for vehicle in run.stage.parked]).reshape(-1, 2)
+        standing = np.broadcast_to(parked, (len(run.time), *parked.shape))
+        poses = np.concatenate([run.poses, standing], axis=1)
+        assert touching_pairs(poses, np.concatenate([run.size, size]), 0.0) == []
+
+
+@over_scenes
+def test_wheels_roll_and_do_not_slide(design, kind):
+    for run in runs(design, kind):
+        yaw, half = run.poses[:, run.driving, 2], [run.users[row].wheelbase / 2 for row in run.driving]
+        rear = run.poses[:, run.driving, :2] - np.stack([half * np.cos(yaw), half * np.sin(yaw)], axis=-1)
+        moved, middle = np.diff(rear, axis=0) / PERIOD, (yaw[1:] + yaw[:-1]) / 2
+        assert np.abs(np.cos(middle) * moved[..., 1] - np.sin(middle) * moved[..., 0]).max() < 1e-3
+        assert (np.cos(middle) * moved[..., 0] + np.sin(middle) * moved[..., 1]).min() > -1e-9
+        speed = np.maximum(run.states[1:, run.driving, 3], run.states[:-1, run.driving, 3])
+        turning = np.abs(np.diff(yaw, axis=0)) / PERIOD
+        assert (turning <= speed * np.tan(MAX_STEER) / (2 * np.array(half)) + 1e-6).all()
+        assert (turning * speed).max() < 5.0  # m/s² to the side
+
+
+@over_scenes
+def test_nobody_jumps(design, kind):
+    for run in runs(design, kind):
+        change = np.diff(run.states[..., 3], axis=0) / PERIOD
+        assert change.min() >= -HARDEST_BRAKING - 1e-6
+        assert change.max() < 3.5
+        between = (run.velocities[1:] + run.velocities[:-1]) / 2
+        driving = np.diff(run.poses[:, run.driving, :2], axis=0) / PERIOD - between[:, run.driving]
+        assert np.abs(driving).max() < 0.05
+
+
+@over_scenes
+def test_everyone_stays_where_it_belongs(design, kind):
+    for run in runs(design, kind):
+        spec = run.stage.spec
+        arms = tuple(spec.actor(role).from_arm or "west" for role in ("ego", "other"))
+        world = random_world(np.random.default_rng(design), run.stage.junction, spec.view, between=arms)
+        corners = run.corners()
+        codes = world.top.at(corners.reshape(-1, 2)).reshape(corners.shape[:3])
+        mapped = (np.abs(run.poses[::10, :, :2]).max(axis=-1) < MAPPED)[..., None]
+        for row, user in enumerate(run.users):
+            allowed = (*ROAD_CODES, SIDEWALK) if user.walks else ROAD_CODES
+            assert (np.isin(codes[:, row], allowed) | ~mapped[:, row]).all(), user.role
+
+
+@over_scenes
+def test_at_red_drives_only_who_breaks_that_rule_and_its_follower(design, kind):
+    for run in runs(design, kind):
+        if run.stage.signals is None:
+            continue
+        for row, user in enumerate(run.users):
+            if user.route is None:
+                continue
+            front = user.path.project(run.poses[::5, row, :2])[0] + user.body.size[0] / 2
+            passing = np.flatnonzero((front[:-1] < user.route.stop_s + 0.6) & (front[1:] >= user.route.stop_s + 0.6))
+            red = [run.stage.signals.state(user.route.from_arm, run.time[::5][step]) == RED for step in passing]
+            pair = run.stage.cast.pair if run.accident else ()
+            assert not any(red) or row in pair or (run.accident and "signal" in user.ignores)
+
+
+@over_scenes
+def test_traffic_flows_on(design, kind):
+    """Of those who have no red light, few stand during the last five seconds."""
+    for run in runs(design, kind):
+        since = max(len(run.time) - round(5.0 / PERIOD), 0)
+        standing = free = 0
+        for row in run.driving:
+            arm = run.users[row].route.from_arm
+            times = run.time[since::25]
+            if run.stage.signals is None or (run.stage.signals.state(arm, times) == GREEN).all():
+                free += 1
+                standing += int((run.states[since:, row, 3] < 0.3).all())
+        assert standing <= 2 + free / 4
+
+
+@over_scenes
+def test_those_who_follow_are_behind_at_a_sensible_gap(design, kind):
+    for run in runs(design, kind):
+        cast = run.stage.cast
+        for leader, follower in (("ego", "ego_behind"), ("other", "other_behind")):
+            first, second = (cast.row_of(role) for role in (leader, follower))
+            path = cast.users[first].path
+            ahead, behind = (path.project(run.poses[::10, row, :2])[0] for row in (first, second))
+            gap = ahead - behind - (run.size[first, 0] + run.size[second, 0]) / 2
+            assert gap.min() > 1.0
+            assert gap[0] == pytest.approx(12.0, abs=4.5)

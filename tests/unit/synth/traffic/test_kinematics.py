@@ -1,0 +1,56 @@
+import numpy as np
+import pytest
+
+from deepaccident_devkit.synth.traffic.kinematics import MAX_STEER, MAX_STEER_RATE, PERIOD
+from deepaccident_devkit.synth.traffic.simulate import simulate
+
+
+@pytest.fixture(scope="module", params=["car", "truck", "motorcycle", "cyclist"])
+def turning(request, driver):
+    """Left and right turns of a category."""
+    users = [
+        driver("west", "left", category=request.param, max_speed=6.0),
+        driver("east", "right", category=request.param, max_speed=6.0),
+    ]
+    return users, simulate(users, begin=0.0, end=12.0)
+
+
+def test_turns_are_driven_along_the_path_to_its_end(turning):
+    users, run = turning
+    for row, user in enumerate(users):
+        along, left = user.path.project(run.poses[:, row, :2])
+        assert along[-1] > user.route.exit_s
+        assert np.abs(left).max() < 0.85
+        assert abs(left[-1]) < 0.1
+
+
+def test_the_rear_axle_never_slips(turning):
+    users, run = turning
+    for row, user in enumerate(users):
+        pose = run.poses[:, row]
+        rear = pose[:, :2] - user.wheelbase / 2 * np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=1)
+        moved = np.diff(rear, axis=0)
+        yaw = (pose[1:, 2] + pose[:-1, 2]) / 2
+        np.testing.assert_allclose(-np.sin(yaw) * moved[:, 0] + np.cos(yaw) * moved[:, 1], 0.0, atol=1e-9)
+
+
+def test_velocities_are_the_poses_slopes(turning):
+    _, run = turning
+    slope = (run.poses[2:, :, :2] - run.poses[:-2, :, :2]) / (2 * PERIOD)
+    np.testing.assert_allclose(run.velocities[1:-1], slope, atol=0.08)
+
+
+def test_the_wheels_are_turned_no_farther_nor_faster_than_they_can_be(turning):
+    _, run = turning
+    steer = run.states[..., 4]
+    assert 0.05 < np.abs(steer).max() <= MAX_STEER + 1e-12
+    assert np.abs(np.diff(steer, axis=0)).max() <= MAX_STEER_RATE * PERIOD + 1e-12
+
+
+def test_one_on_foot_is_on_its_path_and_stops_at_its_end(walker):
+    user = walker()
+    run = simulate([user], begin=0.0, end=16.0)
+    along, left = user.path.project(run.poses[:, 0, :2])
+    np.testing.assert_allclose(left, 0.0, atol=1e-9)
+    assert (np.diff(along) >= 0).all()
+    assert along[-1] == pytest.approx(user.path.length, abs=0.5)

@@ -1,0 +1,92 @@
+import numpy as np
+import pytest
+
+from deepaccident_devkit.synth.traffic.conflicts import find_zones
+from deepaccident_devkit.synth.traffic.rights import find_rights
+from deepaccident_devkit.synth.traffic.simulate import simulate
+from deepaccident_devkit.synth.traffic.touching import touching_pairs
+
+
+def sizes(users):
+    return np.array([user.body.size[:2] for user in users])
+
+
+def test_zones_are_where_the_lanes_cross(driver):
+    users = [driver("west"), driver("south")]
+    zones = find_zones(
+        [user.path for user in users], [user.span for user in users], sizes(users)[:, 1], np.zeros((2, 2), dtype=bool)
+    )
+    for i, j in ((0, 1), (1, 0)):
+        middle = (zones.enter[i, j] + zones.leave[i, j]) / 2
+        x, y, _, _ = users[i].path.at(middle)
+        np.testing.assert_allclose([x, y], [1.75, -1.75], atol=0.5)
+        assert 3.0 < zones.leave[i, j] - zones.enter[i, j] < 6.0
+    assert np.isinf(zones.enter[0, 0])
+
+
+def test_oncoming_lanes_have_no_zone(driver):
+    users = [driver("west"), driver("east")]
+    assert np.isinf(find_rights(users).zones.enter).all()
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "minor", "waits"),
+    [
+        (("south", "straight"), ("west", "straight"), ("south", "north"), (True, False)),
+        (("west", "left"), ("east", "straight"), (), (True, False)),
+        (("west", "left"), ("east", "right"), (), (True, False)),
+        (("west", "left"), ("east", "left"), (), (False, False)),
+        (("west", "straight"), ("south", "straight"), (), (False, False)),
+    ],
+)
+def test_who_waits(driver, first, second, minor, waits):
+    rights = find_rights([driver(*first), driver(*second)], minor=minor)
+    assert (rights.waits[0, 1], rights.waits[1, 0]) == waits
+
+
+def test_drivers_wait_for_walkers_but_not_the_reverse(driver, walker):
+    rights = find_rights([driver(), walker()])
+    assert (rights.waits[0, 1], rights.waits[1, 0]) == (True, False)
+
+
+def test_a_rule_that_is_ignored_does_not_count(driver, walker):
+    users = [driver("south", ignores=("priority", "crosswalk")), driver("west"), walker()]
+    rights = find_rights(users, minor=("south", "north"))
+    assert not rights.waits[0].any()
+    assert not rights.sees[0, 2]
+    assert rights.sees[0, 1]
+
+
+def test_a_blind_pair_sees_nobody_but_who_is_on_its_arm(driver):
+    users = [driver("south"), driver("west"), driver("south", before=60.0), driver("east")]
+    rights = find_rights(users, blind=(0, 1))
+    assert rights.sees[0].tolist() == [False, False, True, False]
+    assert rights.sees[1].tolist() == [False] * 4
+    assert rights.waits[3].tolist() == [True, True, False, False]
+
+
+@pytest.mark.parametrize("other", [("east", "straight"), ("north", "straight"), ("west", "straight")])
+@pytest.mark.parametrize("before", [20.0, 30.0, 45.0])
+def test_one_who_has_to_wait_lets_the_other_pass(driver, other, before):
+    mine = ("east" if other[0] == "west" else "west", "left") if other[0] != "north" else ("west", "straight")
+    users = [driver(*mine, before=30.0), driver(*other, before=before)]
+    minor = ("west", "east") if other[0] == "north" else ()
+    run = simulate(users, begin=0.0, end=12.0, rights=find_rights(users, minor=minor))
+    assert not touching_pairs(run.poses, sizes(users), 0.1)
+    along = users[0].path.project(run.poses[-1:, 0, :2])[0][0]
+    assert along > users[0].route.exit_s - 5.0
+    assert run.states[:, 1, 3].min() > 6.0
+
+
+def test_one_on_foot_is_let_over_the_road(driver, walker):
+    users = [driver("west", before=35.0), walker()]
+    run = simulate(users, begin=0.0, end=20.0, rights=find_rights(users))
+    assert not touching_pairs(run.poses, sizes(users), 0.3)
+    assert run.states[:, 0, 3].min() < 5.0
+    assert users[0].path.project(run.poses[-1:, 0, :2])[0][0] > users[0].route.exit_s
+
+
+def test_one_on_foot_does_not_step_before_a_car_that_cannot_stop(driver, walker):
+    users = [driver("west", before=2.0, speed=10.0), walker(start=(-12.0, -4.3), delay=0.0)]
+    run = simulate(users, begin=0.0, end=4.0, rights=find_rights(users))
+    assert not touching_pairs(run.poses, sizes(users), 0.1)

@@ -1,0 +1,76 @@
+from collections import Counter
+
+import numpy as np
+
+from deepaccident_devkit.synth.roads import Junction
+from deepaccident_devkit.synth.spec import DESIGNS, draw
+from deepaccident_devkit.synth.traffic.drama import perform_accident, perform_twin, set_stage
+from deepaccident_devkit.synth.traffic.unplanned import unplanned
+
+
+def played(seed, design=1):
+    rng = np.random.default_rng([seed, 77])
+    spec = draw(DESIGNS[design], rng)
+    junction = Junction(spec.road)
+    spec = unplanned(rng, spec, junction)
+    stage = set_stage(rng, spec, junction, 6.0)
+    return spec, stage, perform_accident(stage)
+
+
+def test_a_stranger_meets_one_of_the_designed_pair_who_both_obey():
+    kinds, met = Counter(), 0
+    for seed in range(8):
+        spec, _, accident = played(seed)
+        victim, stranger = spec.meet.actors
+        kinds[stranger] += 1
+        assert victim in ("ego", "other")
+        assert spec.design is None
+        assert all(not actor.ignores for actor in spec.actors if actor.role != stranger)
+        met += accident is not None
+    assert set(kinds) == {"pedestrian", "background"}
+    assert met >= 6
+
+
+def test_the_twin_has_no_accident():
+    _, stage, _ = played(0)
+    twin = perform_twin(stage, stage.cast.begin + 11.0)
+    assert twin is not None
+    assert set(range(len(stage.cast.users))) <= set(twin.present)
+
+
+def test_a_pedestrian_steps_out_behind_the_crest_of_a_hump():
+    found = 0
+    for seed in range(40):
+        rng = np.random.default_rng([seed, 78])
+        spec = draw(DESIGNS[1], rng)
+        hump = spec.road.hump
+        changed = unplanned(rng, spec, Junction(spec.road))
+        stranger = changed.actors[-1]
+        if hump is not None and stranger.role == "pedestrian" and stranger.from_arm == hump.arm:
+            found += 1
+            assert 15.0 <= hump.distance - stranger.start_distance <= 22.0
+    assert found > 0
+
+
+def test_where_there_are_two_lanes_some_change_into_the_victim_s(monkeypatch):
+    monkeypatch.setattr("deepaccident_devkit.synth.traffic.unplanned._PEDESTRIANS", 0.0)
+    met = found = 0
+    for seed in range(60):
+        rng = np.random.default_rng([seed, 79])
+        spec = draw(DESIGNS[7], rng)
+        junction = Junction(spec.road)
+        changed = unplanned(rng, spec, junction)
+        stranger = changed.actors[-1]
+        if stranger.lane_change is None or found == 5:
+            continue
+        found += 1
+        victim = changed.actor(changed.meet.actors[0])
+        assert (stranger.from_arm, stranger.lane) == (victim.from_arm, 1 - victim.lane)
+        stage = set_stage(rng, changed, junction, 6.0)
+        accident = perform_accident(stage)
+        if accident is not None:
+            met += 1
+            one, other = accident.simulation.poses[-1, list(stage.cast.pair), 2]
+            assert abs(np.degrees(np.angle(np.exp(1j * (one - other))))) < 25
+    assert found >= 4
+    assert met >= 3

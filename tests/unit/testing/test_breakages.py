@@ -1,0 +1,163 @@
+"""Every breakage: what `validate` says of it, what opening and reading raise, and that nothing else is touched."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError
+from deepaccident_devkit.release import (
+    find_release,
+    read_bev,
+    read_calib,
+    read_image,
+    read_label,
+    read_lidar,
+    read_meta,
+    read_split_file,
+)
+from deepaccident_devkit.taxonomy import BEV_CAMERA, LIDAR
+from deepaccident_devkit.testing import BREAKAGES, SmallRelease, break_release, broken_release
+from deepaccident_devkit.validation import CODES, validate_release
+
+CAMERA = "Camera_Front"
+BARE = SmallRelease(splits=("train",), channels=())
+READERS: dict[str, Callable[[Path], Any]] = {
+    "label": read_label,
+    "calib": read_calib,
+    CAMERA: read_image,
+    LIDAR: read_lidar,
+    BEV_CAMERA: read_bev,
+}
+
+
+def read(path: Path) -> object:
+    """The content of a release's file, by where it lies."""
+    if path.parent.name == "meta":
+        return read_meta(path)
+    reader = READERS.get(path.parent.parent.name)
+    return reader(path) if reader else read_split_file(path)
+
+
+def copied(release: Path, root: Path) -> Path:
+    return shutil.copytree(release, root, ignore=shutil.ignore_patterns(".deepaccident"))
+
+
+@pytest.mark.parametrize("name", BREAKAGES)
+def test_what_the_devkit_says(make_deepaccident_release, tmp_path: Path, name: str) -> None:
+    breakage = BREAKAGES[name]
+    options = SmallRelease(splits=("train",), channels=(breakage.channel or CAMERA,))
+    broken = break_release(copied(make_deepaccident_release(options), tmp_path / "release"), name)
+    report = validate_release(broken.root, deep=breakage.deep, workers=1)
+    assert tuple(sorted({finding.code for finding in report.findings})) == breakage.codes
+    assert {finding.scenario for finding in report.findings} <= {broken.scenario, None}
+    assert raised_by(lambda: DeepAccident("v1", broken.root, workers=1, verbose=False)) == breakage.opening
+    if breakage.reading or broken.path.is_file():
+        assert raised_by(lambda: read(broken.path)) == breakage.reading
+    assert not broken.marker.exists()
+
+
+def raised_by(call: Callable[[], object]) -> type[DeepAccidentError] | None:
+    """The kind of our error that a call raises; another's error fails the test."""
+    try:
+        call()
+    except DeepAccidentError as error:
+        return type(error)
+    return None
+
+
+@pytest.mark.parametrize("name", ["frame-lost", "scenario-twice", "split-line-twice", "infrastructure-absent"])
+def test_folders_in_the_other_layout(make_deepaccident_release, tmp_path: Path, name: str) -> None:
+    options = SmallRelease(layout="B", splits=("train",), channels=(CAMERA,))
+    broken = break_release(copied(make_deepaccident_release(options), tmp_path / "release"), name)
+    report = validate_release(broken.root, workers=1)
+    assert tuple(sorted({finding.code for finding in report.findings})) == BREAKAGES[name].codes
+
+
+def test_a_program_in_a_calib_file_runs_where_it_is_unpickled(make_deepaccident_release, tmp_path: Path) -> None:
+    """So that `marker` can tell."""
+    import pickle
+
+    broken = break_release(copied(make_deepaccident_release(BARE), tmp_path / "release"), "calib-code")
+    pickle.loads(broken.path.read_bytes())
+    assert broken.marker.is_dir()
+
+
+def test_the_other_scenarios_stay_as_they_were(make_deepaccident_release, tmp_path: Path) -> None:
+    release = make_deepaccident_release(BARE)
+    broken = break_release(copied(release, tmp_path / "release"), "agents-swapped")
+    changed = {
+        path.relative_to(release).parts[0]
+        for path in release.rglob("*.???")
+        if path.is_file() and path.read_bytes() != (broken.root / path.relative_to(release)).read_bytes()
+    }
+    assert changed == {broken.scenario.split("/")[0]}
+
+
+def test_a_scenario_can_be_chosen(make_deepaccident_release, tmp_path: Path) -> None:
+    root = copied(make_deepaccident_release(BARE), tmp_path / "release")
+    token = find_release(root).scenarios[1].token
+    broken = break_release(root, "label-empty", scenario=token)
+    assert (broken.scenario, broken.agent, broken.frame) == (token, "ego_vehicle", 2)
+    assert broken.path.read_bytes() == b""
+    with pytest.raises(ConfigError, match="has no scenario 'a/b' to break"):
+        break_release(root, "label-empty", scenario="a/b")
+
+
+def test_what_cannot_be_broken(make_deepaccident_release, tmp_path: Path) -> None:
+    with pytest.raises(ChoiceError, match=r"breakage: expected one of label-empty, .*found 'label-purple'"):
+        broken_release(tmp_path / "release", "label-purple")
+    assert not (tmp_path / "release").exists()
+    with pytest.raises(ConfigError, match=r"breaking 'lidar-cut' in .* needs what is not there: .*npz"):
+        broken_release(tmp_path / "release", "lidar-cut", BARE)
+    with pytest.raises(ConfigError, match="needs what is not there: a second vehicle that records; choose a scenario"):
+        broken_release(tmp_path / "one", "agents-swapped", SmallRelease(agents=("ego_vehicle",), channels=()))
+    with pytest.raises(ConfigError, match="has no labelled scenario to break"):
+        broken_release(tmp_path / "test", "lidar-cut", SmallRelease(splits=("test",), frames=1, channels=()))
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("frames-swapped", {"frames": 1}),
+        ("label-own-row-missing", {"agents": ("infrastructure",)}),
+        ("infrastructure-absent", {"agents": ("ego_vehicle",)}),
+        ("sensors-absent", {}),
+    ],
+)
+def test_a_release_that_would_stay_whole_is_not_called_broken(tmp_path: Path, name: str, options) -> None:
+    config = SmallRelease(splits=("val",), channels=(), **options)
+    with pytest.raises(ConfigError, match=f"breaking '{name}' in .*_accident/.* changes nothing there; choose"):
+        broken_release(tmp_path / "release", name, config)
+
+
+@pytest.mark.parametrize(
+    ("first", "then"),
+    [("label-garbage", "label-nan"), ("meta-empty", "meta-pair-wrong"), ("calib-key-missing", "calib-key-missing")],
+)
+def test_what_is_broken_already_may_be_too_broken_for_more(tmp_path: Path, first: str, then: str) -> None:
+    root = broken_release(tmp_path / "release", first, BARE).root
+    with pytest.raises(ConfigError, match=f"breaking '{then}' in .* needs what is not there"):
+        break_release(root, then)
+
+
+def test_a_split_that_has_lines_is_the_one_that_repeats_them(tmp_path: Path) -> None:
+    config = SmallRelease(splits=("val",), channels=())
+    broken = broken_release(tmp_path / "release", "split-line-twice", config)
+    assert broken.path.name == "val.txt"
+
+
+def test_breakages_are_described() -> None:
+    """Each has a sentence of its own, and codes that there are."""
+    assert len({breakage.description for breakage in BREAKAGES.values()}) == len(BREAKAGES) > 50
+    assert all(code in CODES for breakage in BREAKAGES.values() for code in breakage.codes)
+
+
+def test_faults_and_what_is_legal_are_told_apart() -> None:
+    """A warning or an error for each fault; at most notes for what a loader must take."""
+    for breakage in BREAKAGES.values():
+        severities = {CODES[code].severity for code in breakage.codes}
+        assert bool(severities & {"error", "warning"}) == (breakage.group != "legal"), breakage.name

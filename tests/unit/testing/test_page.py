@@ -1,0 +1,60 @@
+"""docs/testing.md: its code runs as it stands, its table is that of the breakages."""
+
+import importlib.util
+import re
+from pathlib import Path
+
+DOCS = Path(__file__).parents[3] / "docs"
+PAGE = (DOCS / "testing.md").read_text(encoding="utf-8")
+TESTS, CONFTEST, ALONE, STRATEGIES = re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
+MINE = """
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit import DeepAccidentError as MyError
+from deepaccident_devkit.errors import MissingFileError
+
+def my_loader(root):
+    da = DeepAccident("v1", root, workers=1, verbose=False)
+    for sample in da.sample:
+        try:
+            yield da.load_point_cloud(sample)
+        except MissingFileError:
+            yield None
+
+def my_parser(text):
+    return [row for row in map(str.split, text.splitlines()[1:]) if len(row) > 1]
+"""
+
+
+def test_the_tests_on_the_page_pass_in_a_project_of_somebody_else(foreign) -> None:
+    (foreign.folder / "mine.py").write_text(MINE)
+    (foreign.folder / "test_mine.py").write_text(TESTS)
+    (foreign.folder / "test_property.py").write_text(STRATEGIES)
+    ran = foreign.pytest("-k", "every_label or (layout_A and not (label or meta or split or files))")
+    assert " passed" in ran.stdout, ran.stdout + ran.stderr
+    assert "failed" not in ran.stdout, ran.stdout
+
+
+def test_the_conftest_on_the_page_says_what_the_releases_are_like(foreign) -> None:
+    (foreign.folder / "conftest.py").write_text(CONFTEST.replace("frames=20", "frames=2"))
+    (foreign.folder / "test_mine.py").write_text(
+        "def test_release(deepaccident_release):\n"
+        "    assert len(list(deepaccident_release.glob('train/*/*/label/*/*.txt'))) == 2 * 5 * 2\n"
+        "    assert not list(deepaccident_release.rglob('*.jpg'))\n"
+    )
+    ran = foreign.pytest()
+    assert "1 passed" in ran.stdout, ran.stdout + ran.stderr
+
+
+def test_the_code_without_pytest_runs(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    exec(compile(ALONE, "testing.md", "exec"), {})  # noqa: S102
+    assert "_002.txt A position is NaN." in capsys.readouterr().out
+
+
+def test_the_table_is_that_of_the_breakages() -> None:
+    spec = importlib.util.spec_from_file_location("make_testing_page", DOCS / "make_testing_page.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    assert module.with_table(PAGE) == PAGE, "run: python docs/make_testing_page.py"

@@ -1,0 +1,67 @@
+"""The plugin in a pytest of somebody else: found by its entry point, slow at nothing, and to be turned off."""
+
+FOREIGN = """
+import pytest
+
+seen = []
+
+def test_release(deepaccident_release, deepaccident_layout, tmp_path):
+    seen.append(deepaccident_layout)
+    labels = list(deepaccident_release.rglob("label/*/*.txt"))
+    assert len(labels) == 3 * 5 * 3
+    assert (deepaccident_release / "val").exists() == (deepaccident_layout == "B")
+
+def test_copy(deepaccident_release, deepaccident_release_copy):
+    path = next(deepaccident_release_copy.rglob("*.txt"))
+    path.write_text("mine")
+    assert (deepaccident_release / path.relative_to(deepaccident_release_copy)).read_text() != "mine"
+
+def test_broken(deepaccident_broken, deepaccident_release):
+    broken, again = deepaccident_broken("label-missing"), deepaccident_broken("meta-missing")
+    assert not broken.path.exists() and not again.path.exists()
+    assert (deepaccident_release / broken.path.relative_to(broken.root)).exists()
+    with pytest.raises(ValueError, match="expected one of"):
+        deepaccident_broken("label-purple")
+
+def test_factory(make_deepaccident_release):
+    small = make_deepaccident_release(frames=1, splits=("val",), channels=())
+    assert small == make_deepaccident_release(frames=1, splits=("val",), channels=())
+    assert small != make_deepaccident_release(frames=1, splits=("test",), channels=())
+
+def test_factory_with_a_configuration_of_which_one_option_is_another(make_deepaccident_release, deepaccident_config):
+    one = make_deepaccident_release(deepaccident_config, frames=1, channels=[])
+    assert len(list(one.rglob("label/*/*.txt"))) == 3 * 5
+    assert (one / "val").exists() == (deepaccident_config.layout == "B")
+
+def test_the_folder_of_the_test_is_its_own(deepaccident_release_copy, deepaccident_broken, tmp_path):
+    deepaccident_broken("meta-missing")
+    assert not list(tmp_path.iterdir())
+
+def test_both_layouts_were_there():
+    assert seen == ["A", "B"]
+"""
+LIGHT = """
+import sys
+
+def test_nothing_else_was_imported():
+    assert "deepaccident_devkit.testing.plugin" in sys.modules
+    assert not {"numpy", "deepaccident_devkit.release", "hypothesis"} & set(sys.modules)
+"""
+
+
+def test_a_foreign_project_has_the_fixtures_in_both_layouts(foreign) -> None:
+    (foreign.folder / "test_mine.py").write_text(FOREIGN)
+    ran = foreign.pytest()
+    assert "12 passed" in ran.stdout, ran.stdout + ran.stderr
+
+
+def test_it_imports_nothing_until_a_fixture_is_asked_for(foreign) -> None:
+    (foreign.folder / "test_mine.py").write_text(LIGHT)
+    ran = foreign.pytest()
+    assert "1 passed" in ran.stdout, ran.stdout + ran.stderr
+
+
+def test_it_can_be_turned_off(foreign) -> None:
+    (foreign.folder / "test_mine.py").write_text("def test_release(deepaccident_release): pass\n")
+    ran = foreign.pytest("-p", "no:deepaccident")
+    assert "fixture 'deepaccident_release' not found" in ran.stdout, ran.stdout + ran.stderr

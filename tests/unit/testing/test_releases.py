@@ -1,0 +1,208 @@
+"""Small releases: nothing is wrong with them, they are small, and their files tell one story."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.geometry import Boxes, PinholeCamera
+from deepaccident_devkit.release import find_release, read_calib, read_image, read_label, read_meta
+from deepaccident_devkit.release.bev_camera import TAGS
+from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CAMERAS, CATEGORIES, CHANNELS
+from deepaccident_devkit.testing import SmallRelease, write_small_release
+from deepaccident_devkit.testing.sensors import picture_of
+from deepaccident_devkit.validation import validate_release
+
+MEGABYTE = 1_000_000
+BARE = SmallRelease(channels=())
+"""Labels, calib and meta alone."""
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    files = (path for path in sorted(root.rglob("*")) if path.is_file() and ".deepaccident" not in path.parts)
+    return {path.relative_to(root).as_posix(): path.read_bytes() for path in files}
+
+
+@pytest.fixture(scope="session")
+def opened(deepaccident_release: Path) -> DeepAccident:
+    return DeepAccident("v1", deepaccident_release, verbose=False)
+
+
+def test_nothing_is_wrong_with_it(deepaccident_release: Path) -> None:
+    report = validate_release(deepaccident_release, deep=True, workers=1)
+    assert {(finding.severity, finding.code) for finding in report.findings} == {("note", "unlabelled")}
+
+
+@pytest.mark.parametrize("frames", [1, 12])
+@pytest.mark.parametrize("seed", [1, 7])
+def test_nothing_is_wrong_with_others(tmp_path: Path, frames: int, seed: int) -> None:
+    options = SmallRelease(frames=frames, seed=seed, splits=("val",), image_size=(32, 18), channels=CHANNELS[:-1])
+    report = validate_release(write_small_release(tmp_path / "release", options), deep=True, workers=1)
+    assert not report.findings
+
+
+def test_it_is_less_than_a_megabyte_with_files_of_every_kind(deepaccident_release: Path) -> None:
+    files = contents(deepaccident_release)
+    assert sum(map(len, files.values())) < MEGABYTE
+    kinds = {kind for kind in (*CHANNELS, "label", "calib", "meta") if any(f"/{kind}/" in name for name in files)}
+    assert kinds == {*CHANNELS, "label", "calib", "meta"}
+
+
+def test_it_lies_in_the_layout_asked_for(deepaccident_release: Path, deepaccident_layout: str) -> None:
+    layout = find_release(deepaccident_release)
+    assert layout.layout == deepaccident_layout
+    assert {scenario.folder for scenario in layout.scenarios} == (
+        {""} if deepaccident_layout == "A" else {"train", "val", "test"}
+    )
+
+
+def test_the_splits_are_an_accident_and_its_twin_an_accident_and_an_unlabelled_one(opened: DeepAccident) -> None:
+    splits = {split: sorted(opened.split_scenarios(split)) for split in ("train", "val", "test", "train_mini")}
+    accident, twin = splits["train"]
+    assert (accident.split("/")[1], splits["train_mini"]) == (twin.split("/")[1], splits["train"])
+    types = [opened.get("scenario", token)["accident_type"] for token in (accident, twin, *splits["val"])]
+    assert types == [1, None, 7]
+    first_frame = opened.get("scenario", splits["test"][0])["first_frame_token"]
+    assert [sample["labelled"] for sample in opened.samples_of(first_frame)] == [False] * 5
+
+
+def test_the_pair_meets_in_the_last_frame_and_no_sooner_and_not_at_all_in_the_twin(opened: DeepAccident) -> None:
+    accident, twin = sorted(opened.split_scenarios("train"))
+    pair = opened.get("scenario", accident)["collision"]["ids"]
+
+    def gap(scenario: str, frame: int) -> float:
+        boxes = opened.boxes(f"{scenario}/infrastructure/{frame:03d}", frame="world")
+        first, second = (boxes.select(boxes.actor_id == actor) for actor in pair)
+        return float(first.distance_bev(second)[0, 0])
+
+    assert gap(accident, 1) > gap(accident, 2) > gap(accident, 3) == 0
+    assert min(gap(twin, frame) for frame in (1, 2, 3)) > 5
+
+
+def test_every_class_and_every_kind_of_id_occurs(opened: DeepAccident) -> None:
+    boxes = opened.boxes(f"{min(opened.split_scenarios('train'))}/ego_vehicle/002")
+    assert set(boxes.category.tolist()) == set(range(len(CATEGORIES)))
+    assert {-100, -1, 1212, 20001} <= set(boxes.actor_id.tolist())
+
+
+def test_the_pictures_show_the_boxes(make_deepaccident_release) -> None:
+    """The colour in the middle of a near box is another one than that of the background."""
+    options = SmallRelease(frames=1, splits=("train",), image_size=(160, 90), channels=CAMERAS)
+    da = DeepAccident("v1", make_deepaccident_release(options), verbose=False)
+    sample = da.get_sample(min(da.split_scenarios("train")), "ego_vehicle_behind", 1)
+    _, boxes, intrinsic = da.get_sample_data(f"{sample['token']}/Camera_Front")
+    image = da.load_image(f"{sample['token']}/Camera_Front").astype(int)
+    (ego,) = [box for box in boxes if box.actor_id == 1223]
+    u, v = (intrinsic @ ego.center)[:2] / ego.center[2]
+    road, ahead = image[-3, 5], image[round(v), round(u)]
+    assert np.ptp(road) < 30
+    assert ahead[0] - ahead[2] > 100  # a car is red
+
+
+def test_the_nearer_box_covers_the_farther_one_and_each_class_has_its_colour() -> None:
+    camera = PinholeCamera.from_field_of_view(64, 36, np.radians(70))
+    centers, sizes = [(0.0, 0.0, 10.0), (0.0, 0.0, 20.0)], [(2.0, 2.0, 1.0), (12.0, 2.0, 1.0)]
+    for order in ([0, 1], [1, 0]):
+        boxes = Boxes.from_arrays(
+            np.array(centers)[order], np.array(sizes)[order], [0, 0], frame=CAMERAS[0], category=np.array([1, 0])[order]
+        )
+        picture = picture_of(boxes, camera, sky=(0, 0, 0), road=(0, 0, 0))
+        near, far = picture[18, 32].astype(int), picture[18, 42].astype(int)
+        assert near[2] - near[0] > 100  # a truck is blue
+        assert far[0] - far[2] > 100
+
+
+def test_the_top_view_shows_the_boxes_and_their_own_ids(opened: DeepAccident) -> None:
+    sample = f"{min(opened.split_scenarios('train'))}/other_vehicle/003"
+    boxes, view = opened.boxes(sample, frame="ego"), opened.load_bev(sample)
+    (ego,) = boxes.select(boxes.actor_id == 1223).center
+    row, column = np.rint(599.5 - ego[:2] / view.resolution).astype(int)
+    assert view.semantic[row, column] == TAGS["vehicle"]
+    assert view.instance[row, column] != view.instance[600, 600] != 0
+
+
+def test_the_points_are_counted(opened: DeepAccident) -> None:
+    sample = f"{min(opened.split_scenarios('train'))}/infrastructure/001"
+    boxes = opened.boxes(sample, frame="lidar")
+    cloud = opened.load_point_cloud(sample, frame="lidar")
+    assert boxes.num_lidar_pts.max() > 5
+    np.testing.assert_array_equal(boxes.count_points(cloud.xyz), boxes.num_lidar_pts)
+
+
+def test_the_same_options_give_the_same_values_and_another_seed_others(tmp_path: Path) -> None:
+    options = {"frames": 1, "splits": ("val",), "channels": ("lidar01", BEV_CAMERA)}
+    first, again, other = (
+        contents(write_small_release(tmp_path / str(number), SmallRelease(seed=seed, **options)))
+        for number, seed in enumerate((4, 4, 5))
+    )
+    assert first == again
+    assert first.keys() == other.keys()
+    assert all(first[name] != other[name] for name in first if "/calib/" in name or "/meta/" in name)
+
+
+def test_options_choose_what_is_written(tmp_path: Path) -> None:
+    options = SmallRelease(layout="B", frames=2, splits=("val",), agents=("ego_vehicle", "infrastructure"), channels=())
+    root = write_small_release(tmp_path / "release", options)
+    (scenario,) = find_release(root).scenarios
+    assert scenario.agents == ("ego_vehicle", "infrastructure")
+    assert (root / "train.txt").read_bytes() == b""
+    assert {name.split("/")[3] for name in contents(root) if name.count("/") > 3} == {"label", "calib"}
+    assert read_meta(scenario.meta_path).simulated_frames == 12
+    calib = read_calib(scenario.calib_path("infrastructure", 2))
+    assert calib.ego_from_lidar.matrix.tolist() == np.eye(4).tolist()
+    assert len(read_label(scenario.label_path("infrastructure", 2))) == len(
+        read_label(scenario.label_path("ego_vehicle", 2))
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"layout": "C"}, "layout: expected some of A, B, found 'C'"),
+        ({"splits": ("train", "train_mini")}, "splits: expected some of train, val, test, found 'train_mini'"),
+        ({"splits": ()}, "splits: expected at least one, found none"),
+        ({"agents": ()}, "agents: expected at least one, found none"),
+        ({"agents": ("ego",)}, f"agents: expected some of {AGENTS[0]}.*found 'ego'"),
+        ({"channels": ("Camera_Side",)}, "channels: expected some of .*found 'Camera_Side'"),
+        ({"frames": 0}, "frames: expected 1 to 100, found 0"),
+        ({"seed": -1}, "seed: expected a whole number from 0, found -1"),
+        ({"channels": "lidar01"}, "channels: expected a tuple or a list, found 'lidar01'"),
+        ({"image_size": 32}, "image_size: expected a tuple or a list, found 32"),
+        ({"image_size": (32,)}, r"image_size: expected \(width, height\), found \(32,\)"),
+        ({"image_size": (8, 9)}, r"image_size: expected width and height from \(16, 9\) to \(1600, 900\)"),
+    ],
+)
+def test_options_that_cannot_be_carried_out(options, sentence) -> None:
+    with pytest.raises(ConfigError, match=sentence):
+        SmallRelease(**options)
+
+
+def test_lists_of_names_do_as_well_as_tuples() -> None:
+    lists = SmallRelease(splits=["val"], channels=["lidar01"], agents=list(AGENTS), image_size=[32, 18])
+    assert lists == SmallRelease(splits=("val",), channels=("lidar01",), image_size=(32, 18))
+    assert len({lists, SmallRelease(splits=("val",), channels=("lidar01",), image_size=(32, 18))}) == 1
+
+
+def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(ConfigError, match="exists and is not an empty folder; choose another folder"):
+        write_small_release(tmp_path, BARE)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_it_needs_neither_the_generator_nor_what_tests_need(tmp_path: Path) -> None:
+    """As where only the core is installed: no embreex, hypothesis, pytest."""
+    absent = ["embreex", "hypothesis", "pytest", "deepaccident_devkit.synth"]
+    code = (
+        f"import sys; sys.modules.update(dict.fromkeys({absent}));"
+        "from pathlib import Path; from deepaccident_devkit.testing import SmallRelease, broken_release;"
+        f"broken_release(Path({str(tmp_path / 'release')!r}), 'image-cut', SmallRelease(frames=1, splits=('val',)))"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+    (path,) = (tmp_path / "release").glob("*/ego_vehicle/Camera_Front/*/*.jpg")
+    with pytest.raises(ValueError, match="not a readable image"):
+        read_image(path)
