@@ -23,7 +23,7 @@ class SynthConfig:
     Attributes:
         scenarios: how many; they alternate between an accident and its normal twin.
         frames: recorded frames of each scenario, at 10 Hz: the last ones before its end. None records it from when the
-            cars set off until it ends, 40 to 100 frames.
+            cars set off until it ends, 40 to 100 frames; a normal one up to 200, if `end.time` of its file says so.
         image_size: width and height of the camera images, pixels (the real ones have 1600×900).
         layout: `A`, all splits in one folder, or `B`, a folder a split.
         seed: the same seed gives the same bytes (on the same machine with the same package versions).

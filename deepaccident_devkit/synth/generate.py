@@ -41,11 +41,11 @@ def make_release(
     wanted = config or SynthConfig()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f"{out}: exists and is not an empty folder; choose another folder, or remove this one")
-    if not is_writable_folder(out.parent):
-        raise ConfigError(f"{out.parent}: cannot be written; choose another folder")
     if wanted.sensors:
         require_embree()
     plans = plan_scenarios(wanted)
+    if not is_writable_folder(out.parent):
+        raise ConfigError(f"{out.parent}: cannot be written; choose another folder")
     with unfinished_release(out, wanted) as unfinished:
         jobs = [_jobs(unfinished, wanted, plan) for plan in plans]
         _record_all(unfinished, jobs, workers or _worker_count(wanted, len(plans)), progress=progress)

@@ -11,7 +11,7 @@ from deepaccident_devkit.synth.traffic.impact import Impact, impact_of
 from deepaccident_devkit.synth.traffic.ways import middle_of
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
-MIN_FRAMES, MAX_FRAMES = 40, 100
+_LEAST_FRAMES, _MOST_FRAMES = 40, 100
 """Of a recording of natural length, as in the release."""
 _EARLIEST = 5.5
 """Seconds from the beginning until the pair meets, at least."""
@@ -57,7 +57,7 @@ def recorded_accident(stage: Stage, performance: Performance, frames: int | None
     pair = stage.cast.pair or (0, 0)
     size = np.array([stage.users[row].body.size[:2] for row in pair])
     impact = impact_of(performance.simulation, pair, size)
-    count = frames or _natural_frames(stage, impact.time, MAX_FRAMES)
+    count = frames or _natural_frames(stage, impact.time, _MOST_FRAMES)
     return Recorded(
         performance=performance, start=impact.time - FRAME_PERIOD * (count - 1), frames=count, impact=impact
     )
@@ -68,7 +68,7 @@ def recorded_normal(stage: Stage, performance: Performance, frames: int | None) 
     begin = stage.cast.begin + WARM_UP
     longest = round(stage.spec.end.time / FRAME_PERIOD)
     arrival = _arrival_time(stage, performance)
-    natural = _natural_frames(stage, min(arrival, begin + stage.spec.end.time), max(longest, MIN_FRAMES))
+    natural = _natural_frames(stage, min(arrival, begin + stage.spec.end.time), max(longest, _LEAST_FRAMES))
     if frames is None:
         return Recorded(performance=performance, start=begin, frames=natural, impact=None)
     end = max(begin + FRAME_PERIOD * (natural - 1), begin + FRAME_PERIOD * (frames - 1))
@@ -77,7 +77,7 @@ def recorded_normal(stage: Stage, performance: Performance, frames: int | None) 
 
 def _natural_frames(stage: Stage, end: float, most: int) -> int:
     since = end - (stage.cast.begin + WARM_UP)
-    return int(np.clip(int(since / FRAME_PERIOD + 1e-6) + 1, MIN_FRAMES, most))
+    return int(np.clip(int(since / FRAME_PERIOD + 1e-6) + 1, _LEAST_FRAMES, most))
 
 
 def _arrival_time(stage: Stage, performance: Performance) -> float:

@@ -1,3 +1,4 @@
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import pytest
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.release import find_release, read_label, read_meta, read_split_file
-from deepaccident_devkit.synth import SynthConfig, generate, make_release
+from deepaccident_devkit.synth import SynthConfig, generate, make_release, recording
 from deepaccident_devkit.synth.plan import plan_scenarios
 from deepaccident_devkit.synth.recording import RecordingJob, _Recorder, parts_of, record_scenario
 from deepaccident_devkit.synth.scenario import build_scenario
@@ -156,6 +157,7 @@ def test_a_scenario_that_could_not_be_moved_in_is_not_made_again(tmp_path, diges
         patch.setattr(Unfinished, "gather", lambda *_: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             make_release(tmp_path / "out", config, workers=1)
+    assert recording._made_ready.cache_info().currsize == 0
     with monkeypatch.context() as patch:
         patch.setattr(generate, "record_scenario", lambda _: pytest.fail("made again"))
         make_release(tmp_path / "out", config, workers=1)
@@ -176,6 +178,18 @@ def test_gathering_goes_on_after_a_break(tmp_path):
         files = {p.relative_to(tmp_path / "release").as_posix() for p in unfinished.release.rglob("?") if p.is_file()}
         assert files == {"a/x", "a/y", "a/z", "b/x"}
     assert not any((tmp_path / "parts").iterdir())
+
+
+def test_one_of_a_configuration_with_other_fields_does_not_go_on_either(tmp_path, break_off):
+    """As left by a state of the package in which a field was not there yet."""
+    out, config = tmp_path / "out", SynthConfig(scenarios=2, frames=2, sensors=False)
+    break_off(out, config)
+    path = tmp_path / ".out.unfinished" / "config.json"
+    there = json.loads(path.read_text())
+    del there["unplanned"]
+    path.write_text(json.dumps(there))
+    with pytest.raises(ConfigError, match=r"another configuration \(unplanned: None there, 0.1 asked for\)"):
+        make_release(out, config)
 
 
 def test_another_configuration_does_not_go_on_with_it(tmp_path, break_off):

@@ -135,7 +135,7 @@ def _below_level_ground(eye: FloatArray, rays: F32Array) -> tuple[FloatArray, F3
     """Level ground mirrors what the camera's mirror image sees from below it.
 
     Returns:
-        where the mirrored rays begin (3,), where they go (R, C, 3), and how much the rays fall towards the ground (R, C).
+        where mirrored rays begin (3,), where they go (R, C, 3), and how much the rays fall towards the ground (R, C).
     """
     mirror = np.array([1, 1, -1], dtype=np.float32)
     return eye * mirror, rays * mirror, -rays[..., 2]
@@ -144,7 +144,7 @@ def _below_level_ground(eye: FloatArray, rays: F32Array) -> tuple[FloatArray, F3
 def _off_slopes(
     eye: FloatArray, rays: F32Array, depth: F32Array, terrain: Terrain
 ) -> tuple[FloatArray, F32Array, AnyArray]:
-    """Each ray is mirrored where it ends, at `depth` (R, C); as `_below_level_ground`, but one begin a ray, (R · C, 3)."""
+    """As `_below_level_ground`, but each ray is mirrored where it ends, at `depth` (R, C): (R · C, 3) begin."""
     met = eye + rays * depth[..., None]
     normal = terrain.normal(met[..., :2])
     falling = -(rays * normal).sum(axis=-1)

@@ -143,12 +143,39 @@ def test_depths_are_those_of_single_rays(world, actor, rig_of):
         np.testing.assert_allclose(buffers.all.depth[sure], depth[sure], rtol=2e-3)
 
 
+@pytest.mark.parametrize("ground", ["world", "hilly_world"])
+def test_wet_ground_mirrors_what_stands_on_it(ground, request, bare, rig_of):
+    """The road before a red wall is redder than before a green one, with a hump elsewhere as well as without."""
+    roads, before = request.getfixturevalue(ground), {}
+    for color in ((220, 20, 20), (20, 220, 20)):
+        wall = Block((0.0, 1.0), (-20.0, 20.0), (-0.1, 12.0), color)
+        image = picture(rig_of(bare(roads, [wall]), sky=("Wet", "Noon"), places={"ego_vehicle": (-25.0, -1.75, 0.0)}))
+        before[color[0]] = image[112:125, 140:180].astype(int).mean(axis=(0, 1))
+    assert (before[220] - before[20])[0] > 10
+    assert (before[20] - before[220])[1] > 10
+
+
+def test_a_wet_slope_mirrors_the_sky_without_a_seam(hilly_world, bare, rig_of):
+    """Up the hump from its foot the road's colour goes on as it is, above the horizon of level ground as below."""
+    toward = {"ego_vehicle": (-8.0, 1.75, np.pi)}
+    column = {}
+    for weather in ("Wet", "Clear"):
+        rig = rig_of(bare(hilly_world), sky=(weather, "Noon"), image_size=(1280, 720), places=toward)
+        scene, agent = rig.scene(0.0), rig.agents[0]
+        pose = agent.ground_from_lidar(scene) @ agent.cameras[0].camera_from_lidar.inverse()
+        rows = np.flatnonzero(look(scene, agent.cameras[0], pose).all.face[:, 640] == GROUND)
+        assert rows.min() < 350
+        column[weather] = picture(rig)[352:368, 620:660].astype(int).mean(axis=(1, 2))
+    assert np.abs(np.diff(column["Wet"] - column["Clear"])).max() < 8
+
+
 def test_pictures_are_the_seeds_alone(world, rig_of):
     first, again = (picture(rig_of(world, sky=("HardRain", "Night"))) for _ in range(2))
     np.testing.assert_array_equal(first, again)
     assert (picture(rig_of(world, sky=("HardRain", "Night"), seed=(1,))) != first).any()
 
 
-def test_the_smallest_and_an_odd_size_work(world, rig_of):
+def test_the_smallest_and_an_odd_size_work(world, hilly_world, rig_of):
     for size in ((16, 9), (33, 19)):
-        assert picture(rig_of(world, image_size=size)).shape == (size[1], size[0], 3)
+        for roads in (world, hilly_world):
+            assert picture(rig_of(roads, sky=("Wet", "Noon"), image_size=size)).shape == (size[1], size[0], 3)
