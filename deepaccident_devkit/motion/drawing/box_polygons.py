@@ -12,14 +12,13 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, checked, readonly
+from deepaccident_devkit.arrays import AnyArray, BoolArray, Float32Array, FloatArray, IntArray, checked, readonly
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry.handedness import flip_pose
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.labels import OWN_BOX_ID
 from deepaccident_devkit.motion.warps import single_precision
-from deepaccident_devkit.motion.warps.single_precision import Float32Array
 from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID, UNTRACKED_ID
 
 _DEFAULT_SIZE: Final = (3.99, 1.85, 1.62)

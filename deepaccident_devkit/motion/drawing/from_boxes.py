@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, IntArray, checked, checked_whole
+from deepaccident_devkit.arrays import AnyArray, Float32Array, IntArray, checked, checked_whole
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import Axis
@@ -24,7 +24,6 @@ from deepaccident_devkit.motion.orientations import axes_of
 from deepaccident_devkit.motion.protocols import LabelProtocol
 from deepaccident_devkit.motion.settings import count
 from deepaccident_devkit.motion.warps.chains import frames_from_next
-from deepaccident_devkit.motion.warps.single_precision import Float32Array
 from deepaccident_devkit.motion.warps.warping import nearest_indices, sampling_matrix
 from deepaccident_devkit.taxonomy import UNTRACKED_ID
 

@@ -13,10 +13,9 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, IntArray
+from deepaccident_devkit.arrays import AnyArray, BoolArray, Float32Array, IntArray
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.orientations import cells_in, vectors_in
-from deepaccident_devkit.motion.warps.single_precision import Float32Array
 
 _VANISHED: Final = 104.0
 """exp(−x) is 0 in float32 from here on."""

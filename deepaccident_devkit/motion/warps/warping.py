@@ -26,14 +26,13 @@ from typing import Final, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from deepaccident_devkit.arrays import AnyArray, FloatArray, checked
+from deepaccident_devkit.arrays import AnyArray, Float32Array, FloatArray, checked
 from deepaccident_devkit.errors import ChoiceError, GeometryError
 from deepaccident_devkit.geometry import BevGrid, six_vectors
 from deepaccident_devkit.geometry.bev_grid import Axis, Orientation
 from deepaccident_devkit.motion.orientations import axes_of
 from deepaccident_devkit.motion.protocols import LabelProtocol
 from deepaccident_devkit.motion.warps import single_precision
-from deepaccident_devkit.motion.warps.single_precision import Float32Array
 
 WarpMode = Literal["nearest", "bilinear"]
 CellIndices = NDArray[np.intp]

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.arrays import Float32Array, FloatArray
 from deepaccident_devkit.errors import ConfigError
 
 Arm = Literal["west", "south", "east", "north"]
@@ -107,7 +107,7 @@ class Terrain:
         normals[..., :2] = -(profile_slope * fade)[..., None] * outward - (profile * fade_slope)[..., None] * sideways
         return np.asarray(normals / np.linalg.norm(normals, axis=-1, keepdims=True))
 
-    def triangles(self) -> NDArray[np.float32]:
+    def triangles(self) -> Float32Array:
         """The surface over ±`EXTENT` as triangles (M, 3, 3), metres, their normals upwards; fine along a hump."""
         along, beside = np.array([-EXTENT, EXTENT]), np.array([-EXTENT, EXTENT])
         arm: Arm = "east"

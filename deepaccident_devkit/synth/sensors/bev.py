@@ -1,12 +1,11 @@
 """The top-down instance camera: semantic tags and object ids, seen from above the agent."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from deepaccident_devkit.arrays import ByteArray, FloatArray
 from deepaccident_devkit.geometry import SE3
+from deepaccident_devkit.release import BevImage
 from deepaccident_devkit.release.bev_camera import TAGS
 from deepaccident_devkit.synth.roads import MAP_EXTENT, MAP_RESOLUTION, TERRAIN, GroundMap, tag_of_code
 from deepaccident_devkit.synth.sensors.scene import Scene
@@ -19,15 +18,7 @@ _TAG_OF_CATEGORY = np.array(
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BevPicture:
-    """As `release.BevImage`: semantic (1200, 1200) uint8, instance (1200, 1200) uint16; forward up, left left."""
-
-    semantic: ByteArray
-    instance: NDArray[np.uint16]
-
-
-def bev_picture(scene: Scene, top: GroundMap, ground_from_ego: SE3) -> BevPicture:
+def bev_picture(scene: Scene, top: GroundMap, ground_from_ego: SE3) -> BevImage:
     """What lies around an agent; higher road users cover lower ones."""
     x, y = ground_from_ego.translation[:2].tolist()
     semantic = tag_of_code()[_map_around(top, x, y, ground_from_ego.yaw)]
@@ -40,7 +31,7 @@ def bev_picture(scene: Scene, top: GroundMap, ground_from_ego: SE3) -> BevPictur
         window, inside = _footprint(poses[row], actors.size[row])
         semantic[window][inside] = _TAG_OF_CATEGORY[actors.category[row]]
         instance[window][inside] = actors.object_id[row]
-    return BevPicture(semantic, instance)
+    return BevImage(semantic, instance)
 
 
 def _map_around(top: GroundMap, x: float, y: float, yaw: float) -> ByteArray:

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from deepaccident_devkit.arrays import AnyArray, IntArray, readonly
+from deepaccident_devkit.arrays import AnyArray, Float32Array, IntArray, readonly
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.synth.sensors.agents import Agent
 from deepaccident_devkit.synth.sensors.caster import GROUND, NOTHING, make_caster
@@ -75,7 +75,7 @@ class Lidar:
 
     row: int | None
     body: IntArray
-    distance: NDArray[np.float32]
+    distance: Float32Array
     face: IntArray
 
 
@@ -89,7 +89,7 @@ class Scan:
         face: (N,) what each lies on, as in `Scene.cast`; `caster.NOTHING` for a raindrop.
     """
 
-    xyz: NDArray[np.float32]
+    xyz: Float32Array
     ray: IntArray
     face: AnyArray
 
@@ -138,7 +138,7 @@ def scan(
     return Scan((ray_directions()[ray] * measured[back, None]).astype(np.float32), ray, face[back])
 
 
-def intensity(scene: Scene, ground_from_lidar: SE3, points: Scan, air: Air) -> NDArray[np.float32]:
+def intensity(scene: Scene, ground_from_lidar: SE3, points: Scan, air: Air) -> Float32Array:
     """How bright the points (N,) came back, 0 to 1: by what they lie on, how steeply, how far and through which air."""
     reach = np.linalg.norm(points.xyz, axis=1)
     rays = ground_from_lidar.rotate(points.xyz.astype(np.float64)) / np.maximum(reach, 1e-6)[:, None]
@@ -184,7 +184,7 @@ def _cast_boxed(scene: Scene, lidar: Lidar, ground_from_lidar: SE3) -> tuple[Int
 
 
 @cache
-def _random_numbers() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _random_numbers() -> tuple[Float32Array, Float32Array]:
     """Numbers of the standard normal distribution, and even ones from 0 to 1, (2 ** 18,) each.
 
     Each turn takes them from places of its own: drawing them anew would take as long as casting the rays to the boxes.
@@ -198,9 +198,7 @@ def _others(rows: IntArray, lidar: Lidar) -> IntArray:
     return rows if lidar.row is None else rows[rows != lidar.row]
 
 
-def _returns(
-    setting: Setting, distance: AnyArray, face: AnyArray, luck: NDArray[np.float32], air: Air
-) -> NDArray[np.bool_]:
+def _returns(setting: Setting, distance: AnyArray, face: AnyArray, luck: Float32Array, air: Air) -> NDArray[np.bool_]:
     """Which rays (N,) that met something come back; from what reflects little, fewer."""
     share = _LOST + air.lost * (np.minimum(distance, RANGE) / RANGE) ** 2
     share += (_LOST_DARK * np.clip(1 - setting.reflectivity / _DARK, 0, 1))[face]

@@ -4,15 +4,14 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from deepaccident_devkit.arrays import ByteArray
-from deepaccident_devkit.release import Calib, Labels
+from deepaccident_devkit.arrays import ByteArray, Float32Array
+from deepaccident_devkit.release import BevImage, Calib, Labels
 from deepaccident_devkit.synth.actors import Actors
 from deepaccident_devkit.synth.roads import Arm
 from deepaccident_devkit.synth.sensors.agents import Agent, make_agents
 from deepaccident_devkit.synth.sensors.annotate import annotate
-from deepaccident_devkit.synth.sensors.bev import BevPicture, bev_picture
+from deepaccident_devkit.synth.sensors.bev import bev_picture
 from deepaccident_devkit.synth.sensors.images.render import Studio, render
 from deepaccident_devkit.synth.sensors.images.shading import Surroundings
 from deepaccident_devkit.synth.sensors.lidar import AIR_OF_WEATHER, Air, Lidar, Scan, intensity, make_lidar, scan
@@ -74,11 +73,11 @@ class Rig:
         labels = annotate(scene, agent, ground_from_lidar, world_from_ground, points)
         return Sighting(labels, agent.calib(world_from_ground @ ground_from_ego), points)
 
-    def intensity(self, scene: Scene, agent: Agent, points: Scan) -> NDArray[np.float32]:
+    def intensity(self, scene: Scene, agent: Agent, points: Scan) -> Float32Array:
         """How bright each of an agent's points (N,) came back, 0 to 1."""
         return intensity(scene, agent.ground_from_lidar(scene), points, self.air)
 
-    def bev(self, scene: Scene, agent: Agent) -> BevPicture:
+    def bev(self, scene: Scene, agent: Agent) -> BevImage:
         """What lies around an agent, from above."""
         return bev_picture(scene, self.setting.world.top, agent.ground_from_ego(scene))
 

@@ -3,9 +3,8 @@
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray, readonly
+from deepaccident_devkit.arrays import BoolArray, Float32Array, FloatArray, IntArray, readonly
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.synth.sensors.scene import Scene
 from deepaccident_devkit.synth.shapes import BOX_CLEARANCE
@@ -34,7 +33,7 @@ def ray_directions() -> FloatArray:
     return readonly(np.stack(directions, axis=-1).reshape(-1, 3))
 
 
-def turned_rays(rotation: FloatArray, rows: IntArray | slice = slice(None)) -> NDArray[np.float32]:
+def turned_rays(rotation: FloatArray, rows: IntArray | slice = slice(None)) -> Float32Array:
     """Directions (K, 3) of some rays, or of all, turned by a rotation (3, 3); each is the same whatever others are."""
     x, y, z = _direction_columns()[:, rows]
     turn = rotation.astype(np.float32)
@@ -100,6 +99,6 @@ def _azimuths(corners: FloatArray, *, around: BoolArray) -> tuple[IntArray, IntA
 
 
 @cache
-def _direction_columns() -> NDArray[np.float32]:
+def _direction_columns() -> Float32Array:
     """As `ray_directions`, (3, 32 · 1300)."""
     return readonly(np.ascontiguousarray(ray_directions().T.astype(np.float32)))

@@ -3,9 +3,8 @@
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray
+from deepaccident_devkit.arrays import BoolArray, Float32Array, FloatArray
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.geometry.boxes import CORNER_SIGNS
 from deepaccident_devkit.synth.sensors.agents import Camera
@@ -60,7 +59,7 @@ def _cut_edges(corners: FloatArray) -> tuple[FloatArray, BoolArray]:
     return cut, crosses
 
 
-def nearest_movers(scene: Scene, camera: Camera, ground_from_camera: SE3) -> NDArray[np.float32]:
+def nearest_movers(scene: Scene, camera: Camera, ground_from_camera: SE3) -> Float32Array:
     """How near, metres ahead, pixels may show someone who moves; infinite where nobody is.
 
     Returns:

@@ -9,13 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from deepaccident_devkit.arrays import AnyArray, IntArray
+from deepaccident_devkit.arrays import AnyArray, Float32Array, IntArray
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.synth.sensors.agents import Camera
 from deepaccident_devkit.synth.sensors.scene import Scene
 from deepaccident_devkit.synth.sensors.windows import nearest_movers
 
-F32Array = NDArray[np.float32]
 _SUBPIXELS = ((-0.25, -0.25), (0.25, 0.25))
 """Offsets of the rays of a pixel on an outline, pixels."""
 _COLUMNS = 256
@@ -32,10 +31,10 @@ class Rays:
         depth: (R, C) float32, metres along the camera's axis; infinite for the sky.
     """
 
-    right: F32Array
-    down: F32Array
+    right: Float32Array
+    down: Float32Array
     face: IntArray
-    depth: F32Array
+    depth: Float32Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,14 +75,14 @@ def look(scene: Scene, camera: Camera, ground_from_camera: SE3) -> Buffers:
     return Buffers(Rays(all_right[None, :], all_down[:, None], full_face, full_depth), outline, fine)
 
 
-def slopes(camera: Camera, column: AnyArray, row: AnyArray) -> tuple[F32Array, F32Array]:
+def slopes(camera: Camera, column: AnyArray, row: AnyArray) -> tuple[Float32Array, Float32Array]:
     """How far the rays through pixels' middles go right and down, a metre ahead, for columns and for rows."""
     (focal, _, cx), (_, _, cy) = camera.optics.intrinsic[0], camera.optics.intrinsic[1]
     right, down = (column + 0.5 - cx) / focal, (row + 0.5 - cy) / focal
     return right.astype(np.float32), down.astype(np.float32)
 
 
-def ray_directions(ground_from_camera: SE3, right: F32Array, down: F32Array) -> F32Array:
+def ray_directions(ground_from_camera: SE3, right: Float32Array, down: Float32Array) -> Float32Array:
     """Directions (…, 3) float32 in the ground frame, a metre ahead; distances along them are depths."""
     axes = ground_from_camera.rotation.astype(np.float32)
     rays = np.empty((*np.broadcast_shapes(right.shape, down.shape), 3), dtype=np.float32)
@@ -101,7 +100,7 @@ def _spread(coarse: IntArray, height: int, width: int) -> tuple[IntArray, NDArra
     return np.ascontiguousarray(full), np.ascontiguousarray(mixed)
 
 
-def _interpolated(depth: F32Array, height: int, width: int) -> F32Array:
+def _interpolated(depth: Float32Array, height: int, width: int) -> Float32Array:
     """Depths of all pixels (H, W) from those of every second: the inverse of a plane's depth is linear."""
     inverse = 1 / depth
     full = np.empty((2 * (len(inverse) - 1), 2 * (inverse.shape[1] - 1)), dtype=np.float32)
@@ -114,7 +113,7 @@ def _interpolated(depth: F32Array, height: int, width: int) -> F32Array:
         return np.ascontiguousarray(1 / full[:height, :width])
 
 
-def _fine(scene: Scene, camera: Camera, ground_from_camera: SE3, outline: IntArray, movers: F32Array) -> Rays:
+def _fine(scene: Scene, camera: Camera, ground_from_camera: SE3, outline: IntArray, movers: Float32Array) -> Rays:
     """Two rays to each pixel of `outline`; `movers` as `nearest_movers` gives them."""
     row, column = np.divmod(outline, camera.optics.width)
     offsets = np.array(_SUBPIXELS)

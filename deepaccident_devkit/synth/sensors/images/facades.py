@@ -5,8 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, ByteArray, FloatArray, IntArray
-from deepaccident_devkit.synth.sensors.images.buffers import F32Array
+from deepaccident_devkit.arrays import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from deepaccident_devkit.synth.sensors.images.paint import Colors, is_facade
 from deepaccident_devkit.synth.sensors.setting import Surfaces
 from deepaccident_devkit.synth.stage import STOREY
@@ -31,9 +30,9 @@ class Facades:
         foot: (F,) float32, height of the lower edge above the ground frame's origin, metres.
     """
 
-    start: F32Array
-    length: F32Array
-    foot: F32Array
+    start: Float32Array
+    length: Float32Array
+    foot: Float32Array
 
 
 class OnFacades(NamedTuple):
@@ -48,8 +47,8 @@ class OnFacades(NamedTuple):
 
     pixel: IntArray
     face: IntArray
-    across: F32Array
-    up: F32Array
+    across: Float32Array
+    up: Float32Array
 
 
 def facades_of(surfaces: Surfaces) -> Facades:
@@ -62,7 +61,7 @@ def facades_of(surfaces: Surfaces) -> Facades:
 
 
 def on_facades(
-    shown: BoolArray, face: IntArray, xyz: tuple[F32Array, F32Array, F32Array], facades: Facades
+    shown: BoolArray, face: IntArray, xyz: tuple[Float32Array, Float32Array, Float32Array], facades: Facades
 ) -> OnFacades:
     """Where on which façade pixels are.
 

@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from deepaccident_devkit.arrays import ByteArray, FloatArray
+from deepaccident_devkit.arrays import ByteArray, Float32Array, FloatArray
 from deepaccident_devkit.synth import roads
 from deepaccident_devkit.synth.roads import MAP_CELLS, MAP_EXTENT, GroundMap
 from deepaccident_devkit.synth.sensors.images.light import Light
@@ -39,7 +38,7 @@ class Ground:
 
     levels: tuple[ByteArray, ...]
 
-    def at(self, x: NDArray[np.float32], y: NDArray[np.float32], level: int) -> ByteArray:
+    def at(self, x: Float32Array, y: Float32Array, level: int) -> ByteArray:
         """Colours (R, C, 3) at points (R, C) each, metres; beyond the map as at its corner."""
         import cv2
 

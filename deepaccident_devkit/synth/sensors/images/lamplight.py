@@ -1,15 +1,13 @@
 """Light of headlamps on the ground and on what is low above it, at dusk and at night."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from deepaccident_devkit.arrays import AnyArray
+from deepaccident_devkit.arrays import AnyArray, Float32Array
 from deepaccident_devkit.synth.roads import MAP_EXTENT
 from deepaccident_devkit.synth.sensors.scene import Scene
 from deepaccident_devkit.synth.stage import LANTERN_COLOR
 from deepaccident_devkit.taxonomy import CATEGORIES
 
-F32Array = NDArray[np.float32]
 _CELLS = 600
 _CELL = 2 * MAP_EXTENT / _CELLS
 _BEAM, _SPREAD = 32.0, 0.3
@@ -18,7 +16,7 @@ _BEAM_LIGHT, _LANTERN_LIGHT, _LANTERN_REACH = 0.55, 0.22, 16.0
 _WITH_LAMPS = tuple(CATEGORIES.index(name) for name in ("car", "van", "truck", "motorcycle"))
 
 
-def lamplight(scene: Scene) -> F32Array:
+def lamplight(scene: Scene) -> Float32Array:
     """Light on the ground, (600, 600), cells of 0.5 m, row = y, column = x; 1 is as bright as noon.
 
     All moving vehicles have a wide beam ahead and a little light behind them; lanterns stand in a pool of light.
@@ -35,7 +33,7 @@ def lamplight(scene: Scene) -> F32Array:
     return np.asarray(cv2.GaussianBlur(lit, (5, 5), 0))
 
 
-def light_at(lit: F32Array, x: F32Array, y: F32Array) -> F32Array:
+def light_at(lit: Float32Array, x: Float32Array, y: Float32Array) -> Float32Array:
     """The light (R, C) at points (R, C) each, metres; none beyond the map."""
     import cv2
 
@@ -43,7 +41,7 @@ def light_at(lit: F32Array, x: F32Array, y: F32Array) -> F32Array:
     return np.asarray(cv2.remap(lit, x * scale + shift, y * scale + shift, cv2.INTER_LINEAR))
 
 
-def _add_beam(lit: F32Array, x: float, y: float, yaw: float, half: float) -> None:
+def _add_beam(lit: Float32Array, x: float, y: float, yaw: float, half: float) -> None:
     rows, columns, east, north = _around(x, y, _BEAM + half)
     if not east.size:
         return
@@ -55,7 +53,7 @@ def _add_beam(lit: F32Array, x: float, y: float, yaw: float, half: float) -> Non
     lit[rows, columns] += (_BEAM_LIGHT * beam + behind).astype(np.float32)
 
 
-def _add_pool(lit: F32Array, x: float, y: float) -> None:
+def _add_pool(lit: Float32Array, x: float, y: float) -> None:
     rows, columns, east, north = _around(x, y, _LANTERN_REACH)
     lit[rows, columns] += (_LANTERN_LIGHT * np.clip(1 - np.hypot(east, north) / _LANTERN_REACH, 0, 1)).astype(
         np.float32

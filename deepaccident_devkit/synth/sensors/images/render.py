@@ -4,12 +4,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, ByteArray, FloatArray
+from deepaccident_devkit.arrays import AnyArray, ByteArray, Float32Array, FloatArray
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.synth.roads import Arm, Terrain
 from deepaccident_devkit.synth.sensors.agents import Camera
 from deepaccident_devkit.synth.sensors.caster import GROUND
-from deepaccident_devkit.synth.sensors.images.buffers import Buffers, F32Array, look, ray_directions, slopes
+from deepaccident_devkit.synth.sensors.images.buffers import Buffers, look, ray_directions, slopes
 from deepaccident_devkit.synth.sensors.images.facades import facades_of
 from deepaccident_devkit.synth.sensors.images.ground import ground_of, still_ground
 from deepaccident_devkit.synth.sensors.images.lamplight import lamplight
@@ -131,7 +131,7 @@ def _with_reflections(
     return picture
 
 
-def _below_level_ground(eye: FloatArray, rays: F32Array) -> tuple[FloatArray, F32Array, AnyArray]:
+def _below_level_ground(eye: FloatArray, rays: Float32Array) -> tuple[FloatArray, Float32Array, AnyArray]:
     """Level ground mirrors what the camera's mirror image sees from below it.
 
     Returns:
@@ -142,8 +142,8 @@ def _below_level_ground(eye: FloatArray, rays: F32Array) -> tuple[FloatArray, F3
 
 
 def _off_slopes(
-    eye: FloatArray, rays: F32Array, depth: F32Array, terrain: Terrain
-) -> tuple[FloatArray, F32Array, AnyArray]:
+    eye: FloatArray, rays: Float32Array, depth: Float32Array, terrain: Terrain
+) -> tuple[FloatArray, Float32Array, AnyArray]:
     """As `_below_level_ground`, but each ray is mirrored where it ends, at `depth` (R, C): (R · C, 3) begin."""
     met = eye + rays * depth[..., None]
     normal = terrain.normal(met[..., :2])

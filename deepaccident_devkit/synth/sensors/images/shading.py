@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, ByteArray
+from deepaccident_devkit.arrays import BoolArray, ByteArray, Float32Array
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.synth.sensors.caster import GROUND, NOTHING
-from deepaccident_devkit.synth.sensors.images.buffers import F32Array, Rays
+from deepaccident_devkit.synth.sensors.images.buffers import Rays
 from deepaccident_devkit.synth.sensors.images.facades import Facades, on_facades, windows_on
 from deepaccident_devkit.synth.sensors.images.ground import Ground
 from deepaccident_devkit.synth.sensors.images.lamplight import light_at
@@ -46,19 +46,19 @@ class Surroundings:
     facades: Facades
     shadows: WallShadows
     colors: Colors
-    lamplight: F32Array | None
+    lamplight: Float32Array | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Points:
     """Where rays (R, C) meet something, and where they go, ground frame, metres."""
 
-    x: F32Array
-    y: F32Array
-    z: F32Array
-    east: F32Array
-    north: F32Array
-    up: F32Array
+    x: Float32Array
+    y: Float32Array
+    z: Float32Array
+    east: Float32Array
+    north: Float32Array
+    up: Float32Array
 
 
 def shade(rays: Rays, around: Surroundings, ground_from_camera: SE3) -> ByteArray:
@@ -120,7 +120,7 @@ def _rows_of(mask: BoolArray) -> list[tuple[slice, ByteArray]]:
     return [(span, mask[span].view(np.uint8))]
 
 
-def _lamplit(picture: ByteArray, share: F32Array, points: Points, around: Surroundings) -> ByteArray:
+def _lamplit(picture: ByteArray, share: Float32Array, points: Points, around: Surroundings) -> ByteArray:
     """The picture with the light of lamps added to what they reach, by the `share` (R, C) of it that shows."""
     import cv2
 

@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from deepaccident_devkit.arrays import ByteArray, FloatArray
+from deepaccident_devkit.arrays import ByteArray, Float32Array, FloatArray
 from deepaccident_devkit.synth.sensors.images.light import Light
 
 _COLUMNS, _ROWS = 1024, 192
@@ -21,7 +20,7 @@ class Sky:
 
     picture: ByteArray
 
-    def toward(self, x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32]) -> ByteArray:
+    def toward(self, x: Float32Array, y: Float32Array, z: Float32Array) -> ByteArray:
         """Colours (R, C, 3) of the sky in directions (R, C) each, of any length; below the horizon, the horizon's."""
         import cv2
 
@@ -61,7 +60,7 @@ def _clouds(azimuth: FloatArray, rise: FloatArray, cover: float, rng: np.random.
     return np.asarray(0.85 * np.clip((layer - level) / (0.6 * float(noise.std())), 0, 1))
 
 
-def _seamless_noise(side: int, rng: np.random.Generator) -> NDArray[np.float32]:
+def _seamless_noise(side: int, rng: np.random.Generator) -> Float32Array:
     """Noise (side, side) that goes on over the edges, rough and fine alike."""
     frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(side), np.fft.fftfreq(side)))
     spectrum = np.fft.fft2(rng.standard_normal((side, side))) / np.maximum(frequency, 1 / side) ** 1.6

@@ -4,9 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deepaccident_devkit.arrays import ByteArray, IntArray
+from deepaccident_devkit.arrays import ByteArray, Float32Array, IntArray
 from deepaccident_devkit.synth.sensors.caster import NOTHING
-from deepaccident_devkit.synth.sensors.images.buffers import F32Array
 from deepaccident_devkit.synth.sensors.images.facades import Facades, OnFacades
 from deepaccident_devkit.synth.sensors.images.light import Light
 from deepaccident_devkit.synth.sensors.images.paint import Colors
@@ -34,8 +33,8 @@ class WallShadows:
     """
 
     lit: ByteArray
-    column: F32Array
-    density: F32Array
+    column: Float32Array
+    density: Float32Array
 
 
 def wall_shadows(setting: Setting, facades: Facades, light: Light) -> WallShadows:
