@@ -11,6 +11,7 @@ from deepaccident_devkit.release.layout import ReleaseLayout, ScenarioFolder, fi
 from deepaccident_devkit.release.lidar import read_lidar, write_lidar
 from deepaccident_devkit.release.meta import Collision, Meta, read_meta, write_meta
 from deepaccident_devkit.release.split_files import read_split_file, write_split_file
+from deepaccident_devkit.release.velocities import label_from_world_velocity, world_from_label_velocity
 
 __all__ = [
     "BevImage",
@@ -22,6 +23,7 @@ __all__ = [
     "ReleaseLayout",
     "ScenarioFolder",
     "find_release",
+    "label_from_world_velocity",
     "read_bev",
     "read_calib",
     "read_calibs",
@@ -31,6 +33,7 @@ __all__ = [
     "read_lidar",
     "read_meta",
     "read_split_file",
+    "world_from_label_velocity",
     "write_bev",
     "write_calib",
     "write_image",
