@@ -13,9 +13,17 @@ from deepaccident_devkit.arrays import AnyArray, BoolArray, ByteArray, FloatArra
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
 from deepaccident_devkit.geometry import SE3, Box, Boxes, LidarPointCloud
 from deepaccident_devkit.geometry.boxes import trusted_boxes
-from deepaccident_devkit.geometry.se3 import LAST_ROW, trusted_se3
+from deepaccident_devkit.geometry.se3 import stored_transforms, trusted_se3
 from deepaccident_devkit.release import BevImage, read_bev, read_image, read_lidar, read_split_file
-from deepaccident_devkit.tables import Problem, Table, Tables, table_names, visible_ids, visible_mask
+from deepaccident_devkit.tables import (
+    Problem,
+    Table,
+    Tables,
+    displacement_velocities,
+    table_names,
+    visible_ids,
+    visible_mask,
+)
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     BEV_CAMERA,
@@ -37,7 +45,7 @@ if TYPE_CHECKING:
 RowArgument = str | Mapping[str, Any]
 """How a row is named wherever the API takes one: by its token, or by its record."""
 Visible = Literal["camera", "released"]
-VelocitySource = Literal["derived", "label"]
+VelocitySource = Literal["decoded", "derived", "label"]
 _FRAMES = frozenset((*get_args(Frame), *CHANNELS))
 
 
@@ -257,14 +265,15 @@ class Dataset:
         return self._world_from(self._sample_row(sample), self.frame_name(frame))
 
     def ego_from(self, sample: RowArgument, channel: str) -> SE3:
-        """The transform to a sample's ego frame from a sensor's, with the numbers that calib has for the LiDAR.
+        """The transform to a sample's ego frame from a sensor's, with the very numbers of the sample's calib file.
+
+        The one row of `calibrated_sensor` is what was meant; the files of a scenario differ from it by rounding.
 
         Raises:
             TokenError: no such sample or sensor.
         """
         row = self.getind("sample_data", f"{_token(sample)}/{channel}")
-        calibrated = self.columns("sample_data")["calibrated_sensor_row"].item(row)
-        return trusted_se3(_pose(self.columns("calibrated_sensor")["matrix"][calibrated]))
+        return trusted_se3(stored_transforms(self.columns("sample_data")["matrix"][row]))
 
     def frame_name(self, frame: str) -> str:
         """The one name of a frame of samples, which results carry: `lidar` for the channel `lidar01`, else its own.
@@ -286,7 +295,7 @@ class Dataset:
         sample: RowArgument,
         frame: str = "world",
         visible: Visible | None = None,
-        velocity: VelocitySource = "derived",
+        velocity: VelocitySource = "decoded",
     ) -> Boxes:
         """The annotated boxes of a sample as arrays; 0 rows if it has no label.
 
@@ -295,8 +304,9 @@ class Dataset:
             frame: frame of the result: `world`, `ego`, `lidar` or a camera channel (then optical axes).
             visible: None for all; `camera` for those that a camera of this agent sees; `released` for those that any
                 agent at this moment sees by the released rule (evaluation.md f; the agent itself is not among them).
-            velocity: `derived` from world positions at 10 Hz, or the `label`'s own (taken as being in the LiDAR
-                frame, the agent's own in world; format.md says why it is doubtful).
+            velocity: the label's, `decoded` (the column `velocity`; see docs/conventions.md); `derived` from this
+                agent's world positions of the actor at 10 Hz, NaN where there are none; or the raw pair of the
+                `label`, as if it were in the LiDAR frame (the agent's own in world).
 
         Raises:
             TokenError: no such sample.
@@ -318,7 +328,7 @@ class Dataset:
         sample: RowArgument,
         frame: str = "world",
         visible: Visible | None = None,
-        velocity: VelocitySource = "derived",
+        velocity: VelocitySource = "decoded",
     ) -> list[Box]:
         """The annotated boxes of a sample, one object each, with their tokens; arguments as of `boxes`."""
         row = self._sample_row(sample)
@@ -449,9 +459,25 @@ class Dataset:
         }
         if velocity == "label":
             columns["velocity"] = self._label_velocity(sample_row, columns["actor_id"], view["velocity_label"][rows])
-        elif velocity != "derived":
-            raise ChoiceError(f"velocity: expected 'derived' or 'label', found {velocity!r}")
+        elif velocity == "derived":
+            columns["velocity"] = self._derived_velocity(sample_row)
+        elif velocity != "decoded":
+            raise ChoiceError(f"velocity: expected one of {', '.join(get_args(VelocitySource))}, found {velocity!r}")
         return trusted_boxes("lidar", columns)
+
+    def _derived_velocity(self, sample_row: int) -> FloatArray:
+        """(N, 3) in the sample's LiDAR frame, by the samples around it."""
+        samples, boxes = self._tables.views["sample"], self._tables.views["annotation"]
+        around = (samples["prev_row"].item(sample_row), sample_row, samples["next_row"].item(sample_row))
+        parts = [(row, self._annotation_slice(row), self._world_from(row, "lidar")) for row in around if row >= 0]
+        frame = np.concatenate([np.full(rows.stop - rows.start, row) for row, rows, _ in parts])
+        velocity = displacement_velocities(
+            np.concatenate([world.apply(boxes["translation"][rows]) for _, rows, world in parts]),
+            np.zeros(len(frame), dtype=np.int64),
+            np.concatenate([boxes["actor_id"][rows] for _, rows, _ in parts]),
+            frame,
+        )
+        return self._world_from(sample_row, "lidar").inverse().rotate(velocity[frame == sample_row])
 
     def _label_velocity(self, sample_row: int, actor_id: IntArray, velocity_label: FloatArray) -> FloatArray:
         velocity = np.column_stack([velocity_label, np.zeros(len(velocity_label))])
@@ -466,7 +492,7 @@ class Dataset:
             raise ChoiceError(f"visible: expected None, 'camera' or 'released', found {visible!r}")
         masks, ids = [], []
         for other in self._samples_at_once(sample_row):
-            seen = self._lidar_boxes(other, "derived")
+            seen = self._lidar_boxes(other, "decoded")
             pole = AGENTS[self._tables.views["sample"]["agent"].item(other)] == INFRASTRUCTURE
             masks.append(
                 visible_mask(
@@ -487,20 +513,12 @@ class Dataset:
         if frame == "world":
             return SE3.identity()
         views = self._tables.views
-        pose = _pose(views["ego_pose"]["matrix"][sample_row])
+        pose = stored_transforms(views["ego_pose"]["matrix"][sample_row])
         if frame == "ego":
             return trusted_se3(pose)
         channel = LIDAR if frame == "lidar" else frame
         sample_data_row = sample_row * len(CHANNELS) + CHANNELS.index(channel)
-        calibrated = views["sample_data"]["calibrated_sensor_row"].item(sample_data_row)
-        return trusted_se3(pose @ _pose(views["calibrated_sensor"]["matrix"][calibrated]))
-
-
-def _pose(numbers: FloatArray) -> FloatArray:
-    """A stored transform (16,) as a new array (4, 4); the file's numbers, but for a last row that is a little off."""
-    pose = numbers.reshape(4, 4).copy()
-    pose[3] = LAST_ROW
-    return pose
+        return trusted_se3(pose @ stored_transforms(views["sample_data"]["matrix"][sample_data_row]))
 
 
 def _reopened(kind: type[Dataset], arguments: dict[str, Any]) -> Dataset:

@@ -61,6 +61,16 @@ UNTRACKED_ID: Final = -1
 STATIC_ACTOR_ID: Final = 20000
 """Ids from here on are parked vehicles."""
 
+VELOCITY_FRAMES: Final[dict[str, str]] = {
+    "released": "the release's own: the world's, turned once more by the box's yaw in the LiDAR frame",
+    "lidar": "the recording agent's LiDAR frame",
+    "world": "the world frame",
+    "turned-wrong": "the world frame turned by the agent's yaw with the wrong sign",
+    "box": "the box's own frame, x along its length",
+}
+"""What the labels' velocities can be in: the release's own way first, then what foreign releases may have."""
+RELEASED_VELOCITY_FRAME: Final = "released"
+
 FRAME_PERIOD: Final = 0.1
 """Seconds between two recorded frames."""
 WARM_UP_FRAMES: Final = 10

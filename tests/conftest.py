@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.util
+import os
 import shutil
 from pathlib import Path
 from types import ModuleType
@@ -26,6 +27,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         type=Path,
         default=DATA / "golden",
         help="folder with inputs and outputs of the released code, for tests/parity",
+    )
+    parser.addoption(
+        "--real",
+        type=Path,
+        default=os.environ.get("DEEPACCIDENT_REAL") or None,
+        help="folder with a real scenario, for tests/real, which are skipped without [DEEPACCIDENT_REAL]",
     )
 
 

@@ -51,15 +51,16 @@ def ego_to_world(agent: str, frame: int) -> np.ndarray:
 
 
 def label_lines(agent: str, frame: int) -> list[str]:
-    """One car that drives at 2 m/s along world x, standing in the LiDAR frame's coordinates of each agent."""
+    """A van that drives at 2 m/s along world x; its velocity is turned once more by its yaw, as the release does."""
     lidar_to_world = ego_to_world(agent, frame) @ pose(z=lidar_height(agent))
     world = np.array([20.0 + 0.2 * frame, 3.0, 1.3, 1.0])
     x, y, z, _ = np.linalg.inv(lidar_to_world) @ world
     yaw = -np.arctan2(lidar_to_world[1, 0], lidar_to_world[0, 0])
     lines = ["0.0 10.0" if agent == "ego_vehicle" else "0.0 0.0"]
     if agent != "infrastructure":
-        lines.append("car 0.1 0.0 -1.2 4.5 1.9 1.5 0.0 0.0 10.0 -100 900 False")
-    lines.append(f"van {float(x)!r} {float(y)!r} {float(z)!r} 5.0 2.0 2.2 {float(yaw)!r} 2.0 0.0 1300 12 True")
+        lines.append(f"car 0.1 0.0 -1.2 4.5 1.9 1.5 0.0 {lines[0]} -100 900 False")
+    place = f"{float(x)!r} {float(y)!r} {float(z)!r} 5.0 2.0 2.2 {float(yaw)!r}"
+    lines.append(f"van {place} {2 * float(np.cos(yaw))!r} {2 * float(np.sin(yaw))!r} 1300 12 True")
     lines.append("pedestrian 30.0 -1.5 -0.9 0.375 0.375 1.86 2.19 0.0 0.0 -1 0 True")
     return lines
 

@@ -212,6 +212,14 @@ class SE3(FrozenArrays):
         return f"SE3(translation=[{x:.3f}, {y:.3f}, {z:.3f}], yaw={self.yaw:.4f})"
 
 
+def stored_transforms(numbers: FloatArray) -> FloatArray:
+    """Transforms stored as 12 or 16 numbers, (…, 12 or 16), as a new array (…, 4, 4) with the exact last row."""
+    transforms = np.empty((*numbers.shape[:-1], 4, 4))
+    transforms[..., :3, :] = numbers[..., :12].reshape(*numbers.shape[:-1], 3, 4)
+    transforms[..., 3, :] = LAST_ROW
+    return transforms
+
+
 def trusted_se3(matrix: FloatArray) -> SE3:
     """An SE3 over a fresh matrix that is rigid by construction, or was checked when it was read."""
     result = object.__new__(SE3)

@@ -235,8 +235,7 @@ def _scenario_arrays(dataset: Dataset, scenario: str) -> Iterator[AnyArray]:
     first, last = samples["scenario_row"].searchsorted((row, row + 1))
     yield dataset.columns("ego_pose")["matrix"][first:last]
     lidars = slice(first * len(CHANNELS) + CHANNELS.index(LIDAR), last * len(CHANNELS), len(CHANNELS))
-    used = dataset.columns("sample_data")["calibrated_sensor_row"][lidars]
-    yield dataset.columns("calibrated_sensor")["matrix"][used]
+    yield dataset.columns("sample_data")["matrix"][lidars]
     yield samples["agent"][first:last]
     counts = samples["num_annotations"][first:last]
     yield counts

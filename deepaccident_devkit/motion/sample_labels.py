@@ -13,7 +13,7 @@ import numpy as np
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.geometry.se3 import LAST_ROW
+from deepaccident_devkit.geometry.se3 import stored_transforms
 from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
 from deepaccident_devkit.motion.drawing.from_boxes import FrameBoxes, motion_labels_from_boxes
 from deepaccident_devkit.motion.labels import MotionLabels
@@ -79,7 +79,7 @@ def motion_labels(
 def _world_from_ego(dataset: Dataset, rows: IntArray, there: BoolArray) -> FloatArray:
     """(len(rows), 4, 4) poses of samples; the identity for rows that are not `there`."""
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[there] = _transforms(dataset.columns("ego_pose")["matrix"][rows[there]])
+    poses[there] = stored_transforms(dataset.columns("ego_pose")["matrix"][rows[there]])
     return poses
 
 
@@ -94,8 +94,8 @@ def _frames(
     if config.filter_invisible:
         mask = np.isin(_pairs(actors), _seen(dataset, sample, index, config))
         visible = np.split(mask, np.cumsum([len(actor) for actor in actors])[:-1])
-    lidars = dataset.columns("sample_data")["calibrated_sensor_row"][rows * len(CHANNELS) + CHANNELS.index(LIDAR)]
-    ego_from_lidar = _transforms(dataset.columns("calibrated_sensor")["matrix"][lidars])
+    lidars = rows * len(CHANNELS) + CHANNELS.index(LIDAR)
+    ego_from_lidar = stored_transforms(dataset.columns("sample_data")["matrix"][lidars])
     return [
         FrameBoxes(
             center=boxes["translation"][one],
@@ -141,10 +141,3 @@ def _pairs(actors: list[AnyArray]) -> IntArray:
     number = np.repeat(np.arange(len(actors)), [len(actor) for actor in actors])
     pairs: IntArray = np.concatenate(actors) * len(actors) + number
     return pairs
-
-
-def _transforms(numbers: FloatArray) -> FloatArray:
-    """Stored transforms (N, 16) as a new array (N, 4, 4), as `Dataset.world_from` gives them."""
-    transforms = numbers.reshape(-1, 4, 4).copy()
-    transforms[:, 3] = LAST_ROW
-    return transforms

@@ -6,6 +6,7 @@ from deepaccident_devkit.tables.index import Index, open_index
 from deepaccident_devkit.tables.manifest import Problem
 from deepaccident_devkit.tables.report import IndexInfo, IndexReport, index_report
 from deepaccident_devkit.tables.tables import Table, Tables, table_names
+from deepaccident_devkit.tables.velocities import displacement_velocities
 from deepaccident_devkit.tables.visibility import visible_ids, visible_mask
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "Table",
     "Tables",
     "clear_index",
+    "displacement_velocities",
     "index_report",
     "open_index",
     "table_names",

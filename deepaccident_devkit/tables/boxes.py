@@ -1,4 +1,4 @@
-"""What labels alone do not say: world poses, velocities from them, chains, instances, tracks.
+"""What labels alone do not say: world poses, chains, instances, tracks.
 
 All of it is arrays over the N boxes of one scenario, in the order agent, frame, row.
 """
@@ -12,7 +12,7 @@ from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.release import Labels
 from deepaccident_devkit.tables.columns import NULL_INTEGER
-from deepaccident_devkit.taxonomy import FRAME_PERIOD, OWN_ACTOR_ID, UNTRACKED_ID
+from deepaccident_devkit.taxonomy import OWN_ACTOR_ID, UNTRACKED_ID
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -56,28 +56,6 @@ def world_rotations(boxes: ScenarioBoxes) -> FloatArray:
     """(N, 4) quaternions of the boxes in world: an agent's pitch and roll included."""
     poses = quaternions.left_multiplier(quaternions.from_matrix(boxes.world_from_lidar[:, :3, :3]))
     return as_floats(np.einsum("nij,nj->ni", poses[boxes.sample], box_rotation(boxes)))
-
-
-def world_velocities(boxes: ScenarioBoxes, centers: FloatArray) -> FloatArray:
-    """(N, 3) m/s from differences of world positions at 10 Hz, NaN where unknown (format.md, label).
-
-    A track is one agent's rows of one label id (−100 is its own track): central differences where the frames before
-    and after are there, one-sided where one is, NaN where none is and for untracked rows.
-    """
-    label_id = boxes.labels.actor_id
-    keys = np.column_stack([boxes.agent, label_id, boxes.frame])
-    steps, first, step_of = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    position = centers[first]
-    follows = (steps[1:, :2] == steps[:-1, :2]).all(axis=1) & (steps[1:, 2] == steps[:-1, 2] + 1)
-    before = np.concatenate([[False], follows])[: len(steps)]
-    after = np.concatenate([follows, [False]])[: len(steps)]
-    index = np.arange(len(steps))
-    span = (before.astype(np.float64) + after) * FRAME_PERIOD
-    moved = position[index + after] - position[index - before]
-    known = (before | after) & (steps[:, 1] != UNTRACKED_ID)
-    velocity = np.full((len(steps), 3), np.nan)
-    velocity[known] = moved[known] / span[known, None]
-    return velocity[step_of.reshape(-1)]
 
 
 def to_lidar(boxes: ScenarioBoxes, world_vectors: FloatArray) -> FloatArray:

@@ -17,6 +17,7 @@ from deepaccident_devkit.tables.columns import NULL_INTEGER
 from deepaccident_devkit.tables.findings import Finding, finding_of
 from deepaccident_devkit.tables.scan import ScenarioScan
 from deepaccident_devkit.tables.sensor_rows import Rows, neighbour_rows, sensor_tables, timestamps
+from deepaccident_devkit.tables.velocities import decoded_velocities, displacement_velocities, fit_velocities
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     INFRASTRUCTURE,
@@ -24,6 +25,7 @@ from deepaccident_devkit.taxonomy import (
     TIMES_OF_DAY,
     UNTRACKED_ID,
     VEHICLE_AGENTS,
+    VELOCITY_FRAMES,
 )
 
 
@@ -93,10 +95,12 @@ def scenario_rows(files: ScenarioFiles) -> dict[str, Rows]:
     boxes = scenario_boxes(files)
     instance_rows, instance_of_box = box_rules.instances(boxes)
     centers = box_rules.world_centers(boxes)
-    velocities = box_rules.world_velocities(boxes, centers)
+    displacement = displacement_velocities(centers, boxes.agent, boxes.labels.actor_id, boxes.frame)
+    velocity_frame = fit_velocities(boxes, displacement).best
+    velocities = decoded_velocities(boxes, displacement, velocity_frame)
     annotations = _annotation_rows(files, boxes, instance_of_box, velocities)
     return {
-        "scenario": _scenario_row(files),
+        "scenario": _scenario_row(files, velocity_frame),
         "agent": _agent_rows(files, boxes),
         "frame": _frame_rows(files),
         "sample": _sample_rows(files),
@@ -125,7 +129,7 @@ def scenario_boxes(files: ScenarioFiles) -> ScenarioBoxes:
     )
 
 
-def _scenario_row(files: ScenarioFiles) -> Rows:
+def _scenario_row(files: ScenarioFiles, velocity_frame: str | None) -> Rows:
     scenario, meta = files.scenario, files.meta
     signalized = "_subtype1_" in f"{scenario.scenario_type}_"
     collision = asdict(meta.collision) if meta and meta.collision else None
@@ -148,6 +152,7 @@ def _scenario_row(files: ScenarioFiles) -> Rows:
         "time_of_day": [_time_of_day_code(meta)],
         "collision": [collision],
         "accident_type": [NULL_INTEGER if design is None else design],
+        "velocity_frame": [NULL_INTEGER if velocity_frame is None else [*VELOCITY_FRAMES].index(velocity_frame)],
         "num_frames": [files.scan.num_frames],
         "first_frame_row": [0],
         "last_frame_row": [files.scan.num_frames - 1],

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from deepaccident_devkit.files import write_bytes
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 """Counts up whenever the stored columns or their meaning change."""
 MANIFEST_FILE = "manifest.json"
 

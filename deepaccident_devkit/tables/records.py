@@ -6,7 +6,16 @@
 from typing import Annotated, TypedDict
 
 from deepaccident_devkit.tables.columns import Choice, Derived, Items, Key, Number, Struct, Subset, Vector, Word
-from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, CHANNELS, FILE_FORMATS, MODALITIES, SPLITS, TIMES_OF_DAY
+from deepaccident_devkit.taxonomy import (
+    AGENTS,
+    CATEGORIES,
+    CHANNELS,
+    FILE_FORMATS,
+    MODALITIES,
+    SPLITS,
+    TIMES_OF_DAY,
+    VELOCITY_FRAMES,
+)
 
 
 class CollisionRecord(TypedDict):
@@ -56,6 +65,15 @@ class ScenarioRecord(TypedDict):
     accident_type: Annotated[
         int | None,
         Number(dtype="int8", doc="The paper's design 1 to 12 that the accident realises; null for any other end."),
+    ]
+    velocity_frame: Annotated[
+        str | None,
+        Choice(
+            values=tuple(VELOCITY_FRAMES),
+            doc="What the labels' velocities turned out to be in, by the displacements of moving boxes (see "
+            "docs/conventions.md); null where too few boxes move or nothing fits. They are decoded by it; by "
+            "`released` where it is null.",
+        ),
     ]
     num_frames: Annotated[int, Number(dtype="int32", doc="Recorded frames, numbered from 1, at 10 Hz.")]
     first_frame_token: Annotated[str, Key(table="frame", doc="The first moment.")]
@@ -136,6 +154,14 @@ class SampleDataRecord(TypedDict):
     fileformat: Annotated[str, Choice(values=FILE_FORMATS, doc="Ending of the file.")]
     width: Annotated[int | None, Number(dtype="int32", doc="Image width by calib (2·cx); null for lidar.", unit="px")]
     height: Annotated[int | None, Number(dtype="int32", doc="Image height by calib (2·cy); null for lidar.", unit="px")]
+    matrix: Annotated[
+        list[list[float]],
+        Vector(
+            shape=(3, 4),
+            doc="Upper three rows of `ego_from_sensor` as this sample's calib file gives it; `calibrated_sensor` holds "
+            "the same but for rounding.",
+        ),
+    ]
     prev: Annotated[str | None, Key(table="sample_data", doc="The same sensor's file before.")]
     next: Annotated[str | None, Key(table="sample_data", doc="The same sensor's file after.")]
 
@@ -149,12 +175,16 @@ class SensorRecord(TypedDict):
 
 
 class CalibratedSensorRecord(TypedDict):
-    """A sensor on an agent: `ego_from_sensor`; one row a distinct value."""
+    """A sensor on an agent: `ego_from_sensor`; one row, and a further one where it moved on its agent.
+
+    The release computes its matrices in single precision at every frame, so that they jitter: what differs by at most
+    1 mm in the translation and 1e-5 in the rotation is one row, with the numbers of its first frame.
+    """
 
     token: Annotated[str, Derived(doc="`<scenario>/<agent>/<channel>`, then `/2`, `/3`, … for further values.")]
     sensor_token: Annotated[str, Key(table="sensor", doc="Its sensor.")]
     agent_token: Annotated[str, Key(table="agent", doc="Its agent.")]
-    number: Annotated[int, Number(dtype="int32", doc="Counts the distinct values of this sensor from 1.")]
+    number: Annotated[int, Number(dtype="int32", doc="Counts the rows of this sensor from 1.")]
     translation: Annotated[
         list[float],
         Vector(shape=(3,), doc="Of the sensor in the agent's ego frame; 0 for the BEV camera.", unit="m"),
@@ -168,7 +198,7 @@ class CalibratedSensorRecord(TypedDict):
     ]
     matrix: Annotated[
         list[list[float]],
-        Vector(shape=(4, 4), doc="`ego_from_sensor` as the calib files give it, before any rounding to quaternions."),
+        Vector(shape=(4, 4), doc="`ego_from_sensor` as the first of its calib files gives it."),
     ]
 
 
@@ -217,8 +247,8 @@ class AnnotationRecord(TypedDict):
         list[float],
         Vector(
             shape=(3,),
-            doc="Over the ground, in the LiDAR frame's axes: differences of this agent's world positions of the "
-            "actor at 10 Hz; NaN where there is no neighbour frame or no id.",
+            doc="Over the ground, in the LiDAR frame's axes: the label's own, decoded. Where that is no number: "
+            "differences of this agent's world positions of the actor at 10 Hz, NaN without a neighbour frame or id.",
             unit="m/s",
         ),
     ]
@@ -232,8 +262,8 @@ class AnnotationRecord(TypedDict):
         list[float],
         Vector(
             shape=(2,),
-            doc="The label's own velocity as (vx, −vy). Its frame is doubtful: LiDAR by the author's word (world for "
-            "the own row); NaN where the label has no number.",
+            doc="The label's own numbers as (vx, −vy): the world's velocity, turned once more by the box's yaw; NaN "
+            "where the label has no number.",
             unit="m/s",
         ),
     ]

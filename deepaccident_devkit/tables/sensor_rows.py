@@ -1,7 +1,7 @@
 """Rows of the tables that say where sensors are: `sample_data`, `calibrated_sensor`, `ego_pose`, `sensor`."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -22,15 +22,26 @@ from deepaccident_devkit.taxonomy import (
     frame_timestamp,
 )
 
+TRANSLATION_TOLERANCE: Final = 1e-3
+"""Metres by which a sensor's place on its agent jitters, since the release computes it in single precision; measured:
+2e-4 a few hundred metres from the world's origin."""
+ROTATION_TOLERANCE: Final = 1e-5
+"""The same for the entries of its rotation; measured: 4e-7."""
+_INTRINSIC_TOLERANCE = 1e-6
+
 Rows = Mapping[str, Any]
 """Stored column name → array (or list, for words) of one table."""
 
 
 def sensor_tables(calibs: Calibs, *, agents: int, frames: int) -> dict[str, Rows]:
     """The rows of one scenario's sensor tables; `calibs` holds its samples agent by agent."""
-    calibrated_sensors, calibrated_sensor_of = _calibrated_sensor_rows(calibs, agents, frames)
+    values = _sensor_values(calibs)
+    calibrated_sensors, calibrated_sensor_of = _calibrated_sensor_rows(values, agents, frames)
     return {
-        "sample_data": _sample_data_rows(calibs, calibrated_sensor_of, agents, frames),
+        "sample_data": {
+            **_sample_data_rows(calibs, calibrated_sensor_of, agents, frames),
+            "matrix": values[..., :12].reshape(-1, 12),
+        },
         "calibrated_sensor": calibrated_sensors,
         "ego_pose": _ego_pose_rows(calibs, agents, frames),
     }
@@ -78,13 +89,17 @@ def _sample_data_rows(calibs: Calibs, calibrated_sensor_of: IntArray, agents: in
     }
 
 
-def _calibrated_sensor_rows(calibs: Calibs, agents: int, frames: int) -> tuple[Rows, IntArray]:
-    """The distinct values of every agent's sensors, by agent, channel, first occurrence; and each file's row.
+def _calibrated_sensor_rows(values: FloatArray, agents: int, frames: int) -> tuple[Rows, IntArray]:
+    """What every agent's sensors were meant to be, by agent, channel, first occurrence; and each file's row.
+
+    Args:
+        values: as of `_sensor_values`.
+        agents: how many.
+        frames: of each.
 
     Returns:
         The columns; (samples, channels) rows of them.
     """
-    values = _sensor_values(calibs)
     row_of = np.zeros(values.shape[:2], dtype=np.int64)
     chosen: list[FloatArray] = []
     keys: list[tuple[int, int, int]] = []
@@ -112,7 +127,7 @@ def _sensor_values(calibs: Calibs) -> FloatArray:
     """(samples, channels, 25): `ego_from_sensor` and K (NaN where there is none) of every file."""
     samples, channels = len(calibs), len(CHANNELS)
     matrix = np.tile(np.eye(4), (samples, channels, 1, 1))
-    matrix[:, : len(CAMERAS)] = calibs.ego_from_lidar[:, None] @ _inverse(calibs.camera_from_lidar)
+    matrix[:, : len(CAMERAS)] = calibs.ego_from_lidar[:, None] @ np.linalg.inv(calibs.camera_from_lidar)
     matrix[:, CHANNELS.index(LIDAR)] = calibs.ego_from_lidar
     intrinsic = np.full((samples, channels, 3, 3), np.nan)
     intrinsic[:, : len(CAMERAS)] = calibs.intrinsic
@@ -130,21 +145,18 @@ def _ego_pose_rows(calibs: Calibs, agents: int, frames: int) -> Rows:
 
 
 def _distinct(rows: FloatArray) -> tuple[FloatArray, IntArray]:
-    """The distinct rows (by their bytes, so that NaN equals itself) in order of occurrence, and which each row is."""
-    seen: dict[bytes, int] = {}
-    which = np.array([seen.setdefault(row.tobytes(), len(seen)) for row in rows], dtype=np.int64)
-    distinct = np.array([np.frombuffer(content) for content in seen])
-    return distinct, which
-
-
-def _inverse(poses: FloatArray) -> FloatArray:
-    """Inverses of rigid transforms (…, 4, 4)."""
-    result = np.zeros_like(poses)
-    turn = np.swapaxes(poses[..., :3, :3], -1, -2)
-    result[..., :3, :3] = turn
-    result[..., :3, 3] = -(turn @ poses[..., :3, 3:])[..., 0]
-    result[..., 3, 3] = 1
-    return result
+    """The rows (F, 25) that differ by more than rounding, in order of occurrence, and which of them each row is."""
+    tolerance = np.full(25, _INTRINSIC_TOLERANCE)
+    tolerance[:16] = ROTATION_TOLERANCE
+    tolerance[[3, 7, 11]] = TRANSLATION_TOLERANCE
+    which = np.full(len(rows), NULL_INTEGER)
+    first: list[int] = []
+    while (left := np.flatnonzero(which < 0)).size:
+        change = np.abs(rows[left] - rows[left[0]])
+        alike = (~(change > tolerance)).all(axis=1)  # NaN, where there is no K, is alike
+        which[left[alike]] = len(first)
+        first.append(int(left[0]))
+    return rows[first], which
 
 
 def _channel_modalities() -> AnyArray:

@@ -9,6 +9,7 @@ from deepaccident_devkit.geometry import BoxVisibility
 from deepaccident_devkit.release import (
     Labels,
     ScenarioFolder,
+    label_from_world_velocity,
     write_bev,
     write_calib,
     write_image,
@@ -55,7 +56,7 @@ class Recorder:
         if agent in VEHICLE_AGENTS:
             own = VEHICLE_AGENTS.index(agent)
             world = world.select([own, *(row for row in range(len(world)) if row != own)])
-        self._own_velocity = world.velocity[self._own, :2]
+        self._world_velocity = world.velocity[:, :2]
         lidar_from_world = (self._calib.world_from_ego @ self._calib.ego_from_lidar).inverse()
         self._boxes = world.transform(lidar_from_world, "lidar")
         height = self._calib.ego_from_lidar.translation[2] if self._own.any() else POLE_HEIGHT
@@ -91,17 +92,15 @@ class Recorder:
     def _labels(self) -> Labels:
         """What the label says, without the numbers of points."""
         boxes = self._boxes
-        velocity = boxes.velocity[:, :2].copy()
-        velocity[self._own] = self._own_velocity
         return Labels(
             raw=False,
             num_boxes=np.array([len(boxes)]),
-            agent_velocity=self._own_velocity if self._own.any() else np.zeros((1, 2)),
+            agent_velocity=self._world_velocity[self._own] if self._own.any() else np.zeros((1, 2)),
             category=boxes.category,
             center=boxes.center,
             size=boxes.size,
             yaw=boxes.yaw,
-            velocity=velocity,
+            velocity=label_from_world_velocity(self._world_velocity, boxes.yaw),
             actor_id=np.select(
                 [self._own, boxes.actor_id == FAR_ACTOR_ID], [OWN_ACTOR_ID, UNTRACKED_ID], boxes.actor_id
             ),

@@ -1,9 +1,9 @@
 """What is wrong, odd or missing in a release, checked across agents and files."""
 
 from deepaccident_devkit.tables import Finding
+from deepaccident_devkit.tables.velocities import VelocityFit
 from deepaccident_devkit.validation.codes import CODES
 from deepaccident_devkit.validation.report import Coverage, ValidationReport
 from deepaccident_devkit.validation.validate import findings, validate_release
-from deepaccident_devkit.validation.velocities import VelocityFit
 
 __all__ = ["CODES", "Coverage", "Finding", "ValidationReport", "VelocityFit", "findings", "validate_release"]

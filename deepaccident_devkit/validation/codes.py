@@ -135,20 +135,16 @@ CODES: dict[str, Code] = {
     "velocity-off": Code(
         "warning",
         "Actors' velocities do not fit their displacement, though those of others do.",
-        "use velocity='derived', the default",
-        known="the frame of vx vy is doubtful in the real release",
+        "pass velocity='derived' where their velocities count",
     ),
     "velocity-frame": Code(
-        "note",
-        "The labels' velocities fit another frame than the LiDAR's.",
-        "use velocity='derived', the default",
-        known="the frame of vx vy is doubtful in the real release",
+        "warning",
+        "The labels' velocities are not written as the release writes them, but in another known frame.",
+        "nothing to do for the column velocity, which is decoded by what was found; the released protocols use the raw "
+        "pair",
     ),
     "velocity-unexplained": Code(
-        "warning",
-        "The labels' velocities fit no frame.",
-        "use velocity='derived', the default",
-        known="the frame of vx vy is doubtful in the real release",
+        "warning", "The labels' velocities fit no known frame.", "pass velocity='derived' where velocities count"
     ),
     # meta
     "name-and-folder": Code("warning", "A scenario lies in another type's folder than its name says.", "move it"),

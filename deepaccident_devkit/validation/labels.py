@@ -33,6 +33,8 @@ OWN_VELOCITY = 0.05
 SAME_PLACE = 0.05
 """Metres within which two boxes of a class stand in the same place."""
 SIZE_CHANGE = 0.02
+WALKER_SIZE_CHANGE = 1.0
+"""Metres by which a pedestrian's box may change from frame to frame: real ones stretch by 0.62."""
 JUMP = 0.6
 """Metres that an actor may be off the middle of its neighbours in time: 120 m/s²."""
 TURN = np.radians(40.0)
@@ -68,7 +70,9 @@ def _sizes_and_points(subject: Subject) -> Iterator[Finding]:
     size = subject.boxes.labels.size
     shortest, longest = np.array([LENGTHS[name] for name in CATEGORIES])[subject.boxes.labels.category].T
     odd: BoolArray = np.any(size <= 0, axis=1) | np.any(size[:, 1:] > LARGEST_SIZE, axis=1)
-    odd |= (size[:, 0] < shortest) | (size[:, 0] > longest) | (_is_car(subject) & (size[:, 0] < size[:, 1]))
+    unlike = (size[:, 0] < shortest) | (size[:, 0] > longest) | (_is_car(subject) & (size[:, 0] < size[:, 1]))
+    odd |= unlike & (subject.label_id != UNTRACKED_ID)  # real untracked rows have sizes of another class
+    odd |= size[:, 0] > max(most for _, most in LENGTHS.values())
     yield from subject.label_findings("odd-size", odd, "sizes that their classes do not have")
     yield from subject.label_findings("odd-points", subject.boxes.labels.num_lidar_pts < 0, "less than 0 LiDAR points")
     far: BoolArray = np.any(np.abs(subject.boxes.labels.center) > FURTHEST, axis=1)
@@ -123,7 +127,10 @@ def _tracks(subject: Subject) -> Iterator[Finding]:
     )
     for code, changed in (
         ("class-changes", boxes.labels.category[rows][1:] != boxes.labels.category[rows][:-1]),
-        ("size-changes", (np.abs(np.diff(boxes.labels.size[rows], axis=0)) > SIZE_CHANGE).any(axis=1)),
+        (
+            "size-changes",
+            np.abs(np.diff(boxes.labels.size[rows], axis=0)).max(axis=1) > _size_change(subject)[rows[1:]],
+        ),
     ):
         yield from subject.label_findings(code, subject.mask(rows[1:][same & changed]), "changes along the track")
     step = np.diff(frame)
@@ -149,6 +156,12 @@ def _tracks(subject: Subject) -> Iterator[Finding]:
         yield from subject.label_findings(
             "track-gap", subject.mask(after[of_agent]), "near, and missing in the frames before"
         )
+
+
+def _size_change(subject: Subject) -> FloatArray:
+    """(N,) metres by which each box's size may change from frame to frame."""
+    walks = subject.boxes.labels.category == CATEGORIES.index("pedestrian")
+    return np.where(walks, WALKER_SIZE_CHANGE, SIZE_CHANGE)
 
 
 def _is_car(subject: Subject) -> BoolArray:

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 from deepaccident_devkit.tables import SEVERITIES, Finding
-from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CHANNELS
-from deepaccident_devkit.validation.velocities import HYPOTHESES, VelocityFit
+from deepaccident_devkit.tables.velocities import VelocityFit
+from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CHANNELS, VELOCITY_FRAMES
 
 KINDS = ("calib", "label", *CHANNELS)
 """The kinds of files that an agent has."""
@@ -71,7 +71,8 @@ class ValidationReport:
         samples: agents times frames of those.
         findings: worst scenario first, within it worst first.
         coverage: what is here of a whole release.
-        velocity: which hypothesis on the labels' velocities fits.
+        velocity: in which frame the labels' velocities fit the displacements.
+        velocity_frames: scenario → what its labels' velocities are in; None where it cannot be told.
     """
 
     dataroot: str
@@ -82,6 +83,7 @@ class ValidationReport:
     findings: Sequence[Finding]
     coverage: Coverage
     velocity: VelocityFit
+    velocity_frames: Mapping[str, str | None]
 
     @property
     def counts(self) -> dict[str, int]:
@@ -141,8 +143,13 @@ class ValidationReport:
             shares = ", ".join(
                 f"{name} {count / self.velocity.boxes:.0%}" for name, count in self.velocity.fits.items()
             )
-            best = HYPOTHESES[self.velocity.best] if self.velocity.best else "none of the known frames"
-            yield f"label velocities: {best} ({shares} of {self.velocity.boxes:,} moving boxes)"
+            best = VELOCITY_FRAMES[self.velocity.best] if self.velocity.best else "in none of the known frames"
+            found = Counter(self.velocity_frames.values())
+            scenarios = ", ".join(f"{name or 'unknown'} in {count}" for name, count in found.most_common())
+            yield (
+                f"label velocities: {best}\n"
+                f"  scenarios: {scenarios}; of {self.velocity.boxes:,} moving boxes fit: {shares}"
+            )
         missing = list(self.coverage.to_download())
         if missing:
             shown = missing[:_LINES_A_SCENARIO]

@@ -11,7 +11,7 @@ import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.geometry import Boxes, quaternions
-from deepaccident_devkit.tables import Finding
+from deepaccident_devkit.tables import Finding, displacement_velocities
 from deepaccident_devkit.tables import boxes as box_rules
 from deepaccident_devkit.tables.boxes import ScenarioBoxes
 from deepaccident_devkit.tables.build import ScenarioFiles, scenario_boxes
@@ -123,7 +123,7 @@ class Subject:
     @cached_property
     def velocity(self) -> FloatArray:
         """(N, 3) m/s from displacements, NaN where unknown."""
-        return box_rules.world_velocities(self.boxes, self.centers)
+        return displacement_velocities(self.centers, self.boxes.agent, self.label_id, self.boxes.frame)
 
     @cached_property
     def positions(self) -> FloatArray:

@@ -16,6 +16,7 @@ from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.build import read_scenario
 from deepaccident_devkit.tables.scan import scan_scenario
 from deepaccident_devkit.tables.split_assignment import SplitAssignment
+from deepaccident_devkit.tables.velocities import VelocityFit, fit_velocities, total_fit
 from deepaccident_devkit.taxonomy import EXPECTED_MINI_SCENARIOS, EXPECTED_SCENARIOS
 from deepaccident_devkit.validation.agreement import check_agreement
 from deepaccident_devkit.validation.inventory import Recording, absences, take_inventory
@@ -27,7 +28,7 @@ from deepaccident_devkit.validation.split_files import check_splits
 from deepaccident_devkit.validation.story import check_story
 from deepaccident_devkit.validation.subject import make_finding, subject_of
 from deepaccident_devkit.validation.untracked import check_untracked
-from deepaccident_devkit.validation.velocities import VelocityFit, check_velocities, fit_velocities, total_fit
+from deepaccident_devkit.validation.velocities import check_velocities
 
 _UNKNOWN_SPLIT = "unknown"
 _NO_FIT = total_fit([])
@@ -97,6 +98,7 @@ def validate_release(
         findings=worst_first([*of_release, *(finding for check in checks for finding in check.findings)]),
         coverage=_coverage(version, checks if scenarios is None else [], splits),
         velocity=total_fit([check.velocity for check in checks]),
+        velocity_frames={check.token: check.velocity.best for check in checks},
     )
 
 
@@ -135,7 +137,7 @@ def check_scenario(scenario: ScenarioFolder, *, deep: bool = False) -> ScenarioC
     if files is not None:
         with np.errstate(all="ignore"):  # absurd numbers are what is looked for
             subject = subject_of(files)
-            velocity = fit_velocities(subject)
+            velocity = fit_velocities(subject.boxes, subject.velocity)
             found += [
                 *check_poses(subject),
                 *check_labels(subject),

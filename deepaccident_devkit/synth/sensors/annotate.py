@@ -4,7 +4,7 @@ import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.geometry import SE3, Boxes
-from deepaccident_devkit.release import Labels
+from deepaccident_devkit.release import Labels, label_from_world_velocity
 from deepaccident_devkit.synth.sensors.agents import Agent
 from deepaccident_devkit.synth.sensors.lidar import Scan
 from deepaccident_devkit.synth.sensors.scene import Scene
@@ -28,14 +28,14 @@ def annotate(scene: Scene, agent: Agent, ground_from_lidar: SE3, world_from_grou
     rows = np.flatnonzero(distance <= LABEL_RANGE)
     actor_id = np.where(distance > TRACKING_RANGE, UNTRACKED_ID, scene.actors.actor_id)
     lidar_from_ground = ground_from_lidar.inverse()
-    lidar_center, lidar_velocity = lidar_from_ground.apply(center), lidar_from_ground.rotate(velocity)[:, :2]
-    lidar_yaw = _turned(yaw, lidar_from_ground)
+    lidar_center, lidar_yaw = lidar_from_ground.apply(center), _turned(yaw, lidar_from_ground)
+    world_velocity = world_from_ground.rotate(velocity)[:, :2]
     visible = camera_visible(scene, agent, ground_from_lidar, rows)
     agent_velocity = np.zeros((1, 2))
     if agent.row is not None:
         actor_id[agent.row] = OWN_ACTOR_ID
-        agent_velocity[0] = world_from_ground.rotate(velocity[agent.row : agent.row + 1])[0, :2]
-        lidar_velocity[agent.row] = agent_velocity[0]
+        lidar_yaw[agent.row] = 0.0
+        agent_velocity[0] = world_velocity[agent.row]
     size = scene.actors.size[rows]
     boxes = Boxes.from_arrays(lidar_center[rows], size, lidar_yaw[rows], frame="lidar")
     return Labels(
@@ -46,7 +46,7 @@ def annotate(scene: Scene, agent: Agent, ground_from_lidar: SE3, world_from_grou
         center=lidar_center[rows],
         size=size,
         yaw=lidar_yaw[rows],
-        velocity=lidar_velocity[rows],
+        velocity=label_from_world_velocity(world_velocity[rows], lidar_yaw[rows]),
         actor_id=actor_id[rows],
         num_lidar_pts=boxes.count_points(scan.xyz),
         camera_visible=visible,

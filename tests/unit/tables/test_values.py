@@ -64,24 +64,51 @@ def test_world_boxes_are_where_the_car_is_for_every_agent(hand_made: DeepAcciden
 
 
 @pytest.mark.parametrize("frame", [1, 2, 4])
-def test_velocity_comes_from_world_positions(hand_made: DeepAccident, frame: int) -> None:
-    """Central in the middle, one-sided at the ends; in the LiDAR frame's axes, yawed by −90° in world."""
+def test_velocity_is_the_labels_decoded(hand_made: DeepAccident, frame: int) -> None:
+    """In the LiDAR frame's axes, yawed by −90° in world."""
     van = hand_made.get("annotation", f"{tiny.TOKEN}/ego_vehicle/{frame:03d}/1")
     np.testing.assert_allclose(van["velocity"], [0.0, 2.0, 0.0], atol=1e-9)
     own = hand_made.boxes(f"{tiny.TOKEN}/ego_vehicle/{frame:03d}").velocity[0]
     np.testing.assert_allclose(own, [0.0, -10.0, 0.0], atol=1e-9)
 
 
-def test_untracked_boxes_have_no_velocity_no_instance_and_no_chain(hand_made: DeepAccident) -> None:
+@pytest.mark.parametrize("frame", [1, 2, 4])
+def test_velocity_can_come_from_world_positions(hand_made: DeepAccident, frame: int) -> None:
+    """Central in the middle, one-sided at the ends; untracked boxes have none."""
+    boxes = hand_made.boxes(f"{tiny.TOKEN}/ego_vehicle/{frame:03d}", velocity="derived")
+    np.testing.assert_allclose(boxes.velocity, [[0, -10, 0], [2, 0, 0], [np.nan] * 3], atol=1e-9)
+
+
+def test_velocity_is_exact_where_positions_tell_less(tmp_path: Path) -> None:
+    """A van whose label says 3 m/s at the end of its track, an untracked walker, and a van without a number."""
+
+    def lines(agent: str, frame: int) -> list[str]:
+        own, walker = (
+            tiny.label_lines(agent, frame)[:-2],
+            "pedestrian 30.0 -1.5 -0.9 0.375 0.375 1.86 {} {} {} -1 0 True",
+        )
+        place = tiny.label_lines(agent, frame)[-2].rsplit(" ", 5)[0]
+        yaw = float(place.rsplit(" ", 1)[1])
+        said = f"{3 * float(np.cos(yaw))!r} {3 * float(np.sin(yaw))!r}" if frame == 4 else "nan nan"
+        return [*own, f"{place} {said} 1300 12 True", walker.format(0.5, float(np.cos(0.5)), float(np.sin(0.5)))]
+
+    da = DeepAccident("v1", tiny.write_tiny_release(tmp_path, lines_of=lines), verbose=False)
+    for agent in ("ego_vehicle", "other_vehicle"):
+        at_end = da.boxes(f"{tiny.TOKEN}/{agent}/004").velocity
+        np.testing.assert_allclose(at_end[1:], [[3, 0, 0], [1, 0, 0]], atol=1e-9)
+        np.testing.assert_allclose(da.boxes(f"{tiny.TOKEN}/{agent}/002").velocity[1], [2, 0, 0], atol=1e-9)
+
+
+def test_untracked_boxes_have_no_instance_and_no_chain(hand_made: DeepAccident) -> None:
     untracked = hand_made.get("annotation", f"{FRAME_2}/2")
-    assert np.isnan(untracked["velocity"]).all()
+    assert untracked["velocity"] == [0.0, 0.0, 0.0]
     assert (untracked["instance_token"], untracked["prev"], untracked["next"]) == (None, None, None)
 
 
 def test_the_labels_own_velocity_can_be_asked_for(hand_made: DeepAccident) -> None:
-    """(vx, −vy) of the label in the LiDAR frame; the agent's own row is in world already."""
+    """(vx, −vy) of the label as if in the LiDAR frame; the agent's own row is in world already."""
     boxes = hand_made.boxes(FRAME_2, "lidar", velocity="label")
-    np.testing.assert_allclose(boxes.velocity[1], [2.0, 0.0, 0.0])
+    np.testing.assert_allclose(boxes.velocity[1], [0.0, 2.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(hand_made.boxes(FRAME_2, "world", velocity="label").velocity[0], [0, -10, 0], atol=1e-9)
 
 

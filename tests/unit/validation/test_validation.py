@@ -43,7 +43,8 @@ def test_healthy_releases_are_clean(release_root: Path, release_root_b: Path) ->
         report = validate_release(root, deep=deep)
         assert report.findings == []
         assert report.is_good
-        assert report.velocity.best == "lidar"
+        assert report.velocity.best == "released"
+        assert set(report.velocity_frames) == {f"{path.parts[-3]}/{path.stem}" for path in root.glob("**/meta/*.txt")}
 
 
 def test_the_whole_release_is_what_coverage_counts_against(release_root_b: Path) -> None:
@@ -70,28 +71,55 @@ def test_partial_downloads_are_notes(own_release: Path) -> None:
     assert not any(line.startswith("test: ") and "label" in line for line in missing)
 
 
-def test_labels_in_another_frame_are_told(own_release: Path) -> None:
-    root = own_release
+def write_velocities(root: Path, angle: Callable[[float, float], float]) -> dict[str, np.ndarray]:
+    """Write each box's world velocity turned by `angle` of its yaw and its agent's, and return the truth by token."""
     release = DeepAccident(dataroot=root, verbose=False)
+    truth = {}
     for sample in release.sample:
-        pose = release.world_from(sample["token"], "lidar").rotation
-        turn = pose[:2, :2]
+        boxes = release.boxes(sample)
+        truth[sample["token"]] = boxes.velocity
+        rotation = release.world_from(sample["token"], "lidar").rotation
+        agent_yaw = float(np.arctan2(rotation[1, 0], rotation[0, 0]))
         scenario = release.get("scenario", sample["scenario_token"])
-        frame = release.get("frame", sample["frame_token"])["index"]
-        name = scenario["name"]
+        frame, name = release.get("frame", sample["frame_token"])["index"], scenario["name"]
         folder = root / scenario["folder"] / scenario["scenario_type"] / sample["agent"] / "label" / name
+        velocities = iter(boxes.velocity[:, :2])
 
-        def in_world(words: list[str], turn: np.ndarray = turn) -> list[str]:
+        def turned(words: list[str], rows=velocities, agent_yaw=agent_yaw) -> list[str]:
+            (x, y), turn = next(rows), angle(-float(words[7]), agent_yaw)
             if words[10] != "-100":
-                right_handed = turn @ np.array([float(words[8]), -float(words[9])])
-                words[8:10] = [repr(float(right_handed[0])), repr(float(-right_handed[1]))]
+                words[8] = repr(float(np.cos(turn) * x - np.sin(turn) * y))
+                words[9] = repr(float(-np.sin(turn) * x - np.cos(turn) * y))
             return words
 
-        rewrite_boxes(folder / f"{name}_{frame:03d}.txt", in_world)
-    report = validate_release(root)
-    assert report.velocity.best == "world"
-    assert codes(report) == {"velocity-frame"}
-    assert all(finding.known and finding.severity == "note" for finding in report.findings)
+        rewrite_boxes(folder / f"{name}_{frame:03d}.txt", turned)
+    return truth
+
+
+@pytest.mark.parametrize(
+    ("name", "angle"),
+    [
+        ("world", lambda _yaw, _agent: 0.0),
+        ("lidar", lambda _yaw, agent: -agent),
+        ("turned-wrong", lambda _yaw, agent: agent),
+        ("box", lambda yaw, agent: -(yaw + agent)),
+        ("released", lambda yaw, _agent: yaw),
+    ],
+)
+def test_velocities_in_another_frame_are_told_and_decoded(
+    own_release: Path, name: str, angle: Callable[[float, float], float]
+) -> None:
+    truth = write_velocities(own_release, angle)
+    report = validate_release(own_release)
+    assert report.velocity.best == name
+    assert codes(report) == ({"velocity-frame"} if name != "released" else set())
+    assert all(not finding.known and finding.severity == "warning" for finding in report.findings)
+    shutil.rmtree(own_release / ".deepaccident")
+    release = DeepAccident(dataroot=own_release, verbose=False)
+    assert {scenario["velocity_frame"] for scenario in release.scenario} == {name}
+    assert {scenario["token"]: scenario["velocity_frame"] for scenario in release.scenario} == report.velocity_frames
+    for token, velocity in truth.items():
+        np.testing.assert_allclose(release.boxes(token).velocity[:, :2], velocity[:, :2], atol=5e-3)
 
 
 def test_velocities_of_no_frame_are_told(own_release: Path) -> None:
@@ -222,7 +250,7 @@ def test_json_has_everything_and_exit_status_tells(own_release: Path) -> None:
     assert clean.exit_code == 0
     content = json.loads(clean.stdout)
     assert content["counts"] == {"error": 0, "warning": 0, "note": 0}
-    assert content["velocity"]["best"] == "lidar"
+    assert content["velocity"]["best"] == "released"
     first = labels_of(own_release, "ego_vehicle")[0]
     first.write_text(first.read_text()[:-20])
     broken = runner.invoke(deepaccident, ["validate", str(own_release), "--json"])
