@@ -1,7 +1,7 @@
 """What a set of agents knows of a moment, by the labels: the actors that they see, where these are and how they move.
 
 An oracle, since no detector is asked: every actor that the released rule calls seen (evaluation.md f) is known exactly,
-but for what the link between the agents does. Velocities are the devkit's, from positions 0.1 s before and after.
+but for what the link between the agents does. Velocities are the labels', decoded.
 """
 
 from __future__ import annotations

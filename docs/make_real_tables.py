@@ -1,0 +1,95 @@
+"""Measure the tables of docs/conventions.md on a real scenario: `python docs/make_real_tables.py DATAROOT`."""
+
+import re
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.geometry import quaternions
+from deepaccident_devkit.release.velocities import turned
+from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES, CHANNELS, LIDAR, VELOCITY_FRAMES
+
+PAGE = Path(__file__).parent / "conventions.md"
+LEAST_SPEED = 1.0
+
+
+def main() -> None:
+    """Write all tables into the page."""
+    with tempfile.TemporaryDirectory() as folder:
+        dataset = DeepAccident("v1", sys.argv[1], index_dir=folder, verbose=False)
+        put("velocity-real", velocity_table(dataset))
+        put("calibration-real", calibration_table(dataset))
+
+
+def velocity_table(dataset: DeepAccident) -> str:
+    """How far the labels' velocities, read in each frame, are from the displacements of the boxes that move."""
+    rows = [_errors(dataset, sample["token"]) for sample in dataset.sample]
+    category = np.concatenate([classes for classes, _ in rows])
+    lines = ["| read as | boxes | median error | within 10 % | " + " | ".join(CATEGORIES) + " |"]
+    lines.append("| --- " * (4 + len(CATEGORIES)) + "|")
+    for name, meaning in VELOCITY_FRAMES.items():
+        error = np.concatenate([errors[name] for _, errors in rows])
+        shares = [error[category == code] < 0.1 for code in range(len(CATEGORIES))]
+        by_class = " | ".join(f"{np.mean(share):.0%}" if len(share) else "–" for share in shares)
+        lines.append(
+            f"| {meaning} | {len(error):,} | {np.median(error):.1%} | {(error < 0.1).mean():.0%} | {by_class} |"
+        )
+    return "\n".join(lines)
+
+
+def _errors(dataset: DeepAccident, sample: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """The classes of a sample's moving, tracked boxes of others; their errors as shares of the speed, by frame."""
+    world, lidar = dataset.boxes(sample, velocity="derived"), dataset.boxes(sample, "lidar", velocity="label")
+    moved, said = world.velocity[:, :2], lidar.velocity[:, :2]
+    speed = np.linalg.norm(moved, axis=1)
+    telling = (speed > LEAST_SPEED) & (world.actor_id > 0)
+    heading = np.full(len(said), quaternions.yaw_of(dataset.world_from(sample, LIDAR).quaternion.elements[None])[0])
+    angles = {
+        "released": -lidar.yaw,
+        "lidar": heading,
+        "world": np.zeros(len(said)),
+        "turned-wrong": -heading,
+        "box": world.yaw,
+    }
+    off = {name: np.linalg.norm(turned(said, angle) - moved, axis=1) for name, angle in angles.items()}
+    return world.category[telling], {name: error[telling] / speed[telling] for name, error in off.items()}
+
+
+def calibration_table(dataset: DeepAccident) -> str:
+    """How far each agent's sensors jitter over the scenario."""
+    lines = [
+        "| agent | places of a sensor | entries of its rotation | not rigid by | distinct matrices | rows |",
+        "| --- " * 6 + "|",
+    ]
+    matrices = dataset.columns("sample_data")["matrix"].reshape(-1, len(CHANNELS), 3, 4)
+    frames = len(dataset.frame)
+    for number, agent in enumerate(dataset.agent):
+        own = matrices[number * frames : (number + 1) * frames, : len(CAMERAS) + 1]
+        turn = own[..., :3]
+        rigid = np.abs(turn @ np.swapaxes(turn, -1, -2) - np.eye(3)).max()
+        distinct = sum(len(np.unique(own[:, k].reshape(frames, -1), axis=0)) for k in range(own.shape[1]))
+        rows = sum(row["agent_token"] == agent["token"] for row in dataset.calibrated_sensor)
+        moved, turned_by = np.ptp(own[..., 3], axis=0).max(), np.ptp(turn, axis=0).max()
+        lines.append(
+            f"| {agent['name']} | {1000 * moved:.2f} mm | {turned_by:.1g} | {rigid:.1g} | {distinct} | {rows} |"
+        )
+    return "\n".join(lines)
+
+
+def put(name: str, table: str) -> None:
+    """Replace what stands between a table's two marks."""
+    page = PAGE.read_text(encoding="utf-8")
+    marks = f"<!-- {name} -->\n", f"<!-- /{name} -->"
+    changed, count = re.subn(
+        f"{re.escape(marks[0])}.*?{re.escape(marks[1])}", f"{marks[0]}{table}\n{marks[1]}", page, flags=re.DOTALL
+    )
+    if count != 1:
+        raise SystemExit(f"{PAGE}: expected the marks of {name} once, found {count}")
+    PAGE.write_text(changed, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
