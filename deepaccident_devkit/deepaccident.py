@@ -15,9 +15,6 @@ from deepaccident_devkit.release import find_release
 from deepaccident_devkit.tables import open_index
 from deepaccident_devkit.taxonomy import OnError
 
-if TYPE_CHECKING:
-    from deepaccident_devkit import motion, render, validation
-
 
 class _Later:
     """A function of a package that takes its time to import: fetched when somebody asks for it, and then in its place.
@@ -25,16 +22,39 @@ class _Later:
     `DeepAccident` binds functions of all layers, and who only reads tables should not wait for those that draw.
     """
 
-    def __init__(self, package: str) -> None:
-        self._package = f"{__package__}.{package}"
+    def __init__(self, package: str, function: str) -> None:
+        self._package = package
+        self._function = function
 
     def __set_name__(self, owner: type, name: str) -> None:
+        self._owner = owner
         self._name = name
 
     def __get__(self, instance: object, owner: type) -> Any:
-        function = getattr(import_module(self._package), self._name)
-        setattr(owner, self._name, function)
+        function = getattr(import_module(self._package), self._function)
+        setattr(self._owner, self._name, function)
         return function.__get__(instance, owner)
+
+
+class _Package:
+    """Stands for such a package at run time, so that each function is named once: whatever it is asked for comes later.
+
+    Type checkers see the package itself, and with it every signature.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = f"{__package__}.{name}"
+
+    def __getattr__(self, name: str) -> _Later:
+        if name.startswith("_"):  # what tools look for on any object
+            raise AttributeError(name)
+        return _Later(self._name, name)
+
+
+if TYPE_CHECKING:
+    from deepaccident_devkit import motion, render, validation
+else:
+    motion, render, validation = map(_Package, ("motion", "render", "validation"))
 
 
 class DeepAccident(Dataset):
@@ -109,51 +129,27 @@ class DeepAccident(Dataset):
     trajectory = v2x.trajectory
     collision = v2x.collision
     message_sizes = v2x.message_sizes
-
-    if TYPE_CHECKING:
-        motion_labels = motion.motion_labels
-        bev_segmentation = motion.bev_segmentation
-        samples = motion.samples
-        evaluation_samples = motion.evaluation_samples
-        findings = validation.findings
-        render_sample = render.render_sample
-        render_frame = render.render_frame
-        render_sample_data = render.render_sample_data
-        render_annotation = render.render_annotation
-        render_instance = render.render_instance
-        render_pointcloud_in_image = render.render_pointcloud_in_image
-        render_bev = render.render_bev
-        render_calibration = render.render_calibration
-        render_motion_labels = render.render_motion_labels
-        render_visibility = render.render_visibility
-        render_visibility_matrix = render.render_visibility_matrix
-        render_accident = render.render_accident
-        render_link = render.render_link
-        render_evaluation = render.render_evaluation
-        render_scenario_video = render.render_scenario_video
-        render_replay = render.render_replay
-    else:
-        motion_labels = _Later("motion")
-        bev_segmentation = _Later("motion")
-        samples = _Later("motion")
-        evaluation_samples = _Later("motion")
-        findings = _Later("validation")
-        render_sample = _Later("render")
-        render_frame = _Later("render")
-        render_sample_data = _Later("render")
-        render_annotation = _Later("render")
-        render_instance = _Later("render")
-        render_pointcloud_in_image = _Later("render")
-        render_bev = _Later("render")
-        render_calibration = _Later("render")
-        render_motion_labels = _Later("render")
-        render_visibility = _Later("render")
-        render_visibility_matrix = _Later("render")
-        render_accident = _Later("render")
-        render_link = _Later("render")
-        render_evaluation = _Later("render")
-        render_scenario_video = _Later("render")
-        render_replay = _Later("render")
+    motion_labels = motion.motion_labels
+    bev_segmentation = motion.bev_segmentation
+    samples = motion.samples
+    evaluation_samples = motion.evaluation_samples
+    findings = validation.findings
+    render_sample = render.render_sample
+    render_frame = render.render_frame
+    render_sample_data = render.render_sample_data
+    render_annotation = render.render_annotation
+    render_instance = render.render_instance
+    render_pointcloud_in_image = render.render_pointcloud_in_image
+    render_bev = render.render_bev
+    render_calibration = render.render_calibration
+    render_motion_labels = render.render_motion_labels
+    render_visibility = render.render_visibility
+    render_visibility_matrix = render.render_visibility_matrix
+    render_accident = render.render_accident
+    render_link = render.render_link
+    render_evaluation = render.render_evaluation
+    render_scenario_video = render.render_scenario_video
+    render_replay = render.render_replay
 
     def list_scenarios(self) -> None:
         """Print a line for each scenario."""
