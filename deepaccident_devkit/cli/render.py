@@ -17,7 +17,7 @@ from deepaccident_devkit.render.accident import COUNTDOWN, render_accident
 from deepaccident_devkit.render.annotation import render_annotation
 from deepaccident_devkit.render.bev import render_bev
 from deepaccident_devkit.render.calibration import render_calibration
-from deepaccident_devkit.render.camera import render_sample_data
+from deepaccident_devkit.render.camera import ColorBy, render_pointcloud_in_image, render_sample_data
 from deepaccident_devkit.render.instance import render_instance
 from deepaccident_devkit.render.layers import LAYERS, Layer
 from deepaccident_devkit.render.link import render_link
@@ -25,7 +25,6 @@ from deepaccident_devkit.render.moments import render_frame, render_sample
 from deepaccident_devkit.render.motion import MotionStyle, render_motion_labels
 from deepaccident_devkit.render.outcomes import render_evaluation
 from deepaccident_devkit.render.pictures import PICTURE_SUFFIXES, figure_of_pixels, save_picture
-from deepaccident_devkit.render.pointcloud import ColorBy, render_pointcloud_in_image
 from deepaccident_devkit.render.video import SUFFIXES, VIEWS, render_scenario_video
 from deepaccident_devkit.render.video.writers import check_target
 from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix

@@ -6,7 +6,7 @@ from deepaccident_devkit.render.axes import detached_figure
 from deepaccident_devkit.render.bev import render_bev
 from deepaccident_devkit.render.boxes import draw_box
 from deepaccident_devkit.render.calibration import render_calibration
-from deepaccident_devkit.render.camera import render_sample_data
+from deepaccident_devkit.render.camera import render_pointcloud_in_image, render_sample_data
 from deepaccident_devkit.render.instance import render_instance
 from deepaccident_devkit.render.layers import LAYERS, Layer
 from deepaccident_devkit.render.link import render_link
@@ -19,7 +19,6 @@ from deepaccident_devkit.render.motion import (
     render_motion_labels,
 )
 from deepaccident_devkit.render.outcomes import draw_accident_outcome, draw_detection_outcome, render_evaluation
-from deepaccident_devkit.render.pointcloud import render_pointcloud_in_image
 from deepaccident_devkit.render.replay import render_replay
 from deepaccident_devkit.render.video import render_scenario_video
 from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix

@@ -1,26 +1,25 @@
-"""The countdown to an impact: what each agent sees of the colliding pair, and the pair from above."""
+"""The countdown to an impact, as a figure of several moments and as a video's picture of one."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Final
+from collections.abc import Collection, Iterable, Sequence
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
 from deepaccident_devkit.geometry import SE3, Boxes
-from deepaccident_devkit.render.axes import axis_words, figure_or_new
+from deepaccident_devkit.render.axes import axis_words, figure_or_new, settled, with_light_grid
 from deepaccident_devkit.render.best_view import best_camera
 from deepaccident_devkit.render.boxes import SMALLEST_TEXT, draw_actors_from_above, write_beside
-from deepaccident_devkit.render.camera import render_sample_data
+from deepaccident_devkit.render.camera import CAMERA_LAYERS, render_sample_data
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, GRID_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.roles import in_drawing_order, role_colors, short_name
-from deepaccident_devkit.render.settling import settled
 from deepaccident_devkit.render.trails import draw_trails
 from deepaccident_devkit.tables.tokens import sample_token
-from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD
 from deepaccident_devkit.v2x import Agents, Contact, collision, cooperating_agents
 from deepaccident_devkit.v2x.configurations import agents_of
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
@@ -31,13 +30,18 @@ if TYPE_CHECKING:
 
 COUNTDOWN: Final = (2.0, 1.0, 0.5, 0.0)
 """Seconds before the impact."""
-_IN_IMAGES: Final[tuple[Layer, ...]] = ("image", "points", "boxes", "ids", "velocities")
-COUNTDOWN_LAYERS: Final[tuple[Layer, ...]] = (*_IN_IMAGES, "trajectories", "grid")
-COUNTDOWN_DEFAULT: Final[tuple[Layer, ...]] = ("image", "boxes", "trajectories", "grid")
+COUNTDOWN_LAYERS: Final[tuple[Layer, ...]] = (*CAMERA_LAYERS, "trajectories", "grid")
+_SHOWN: Final[tuple[Layer, ...]] = ("image", "boxes", "trajectories", "grid")
 _NEAR: Final = 18.0
+_NEAR_IN_VIDEO: Final = 28.0
 """Metres around the place of contact that are shown."""
 _WIDTH: Final = 3.3
 """Inches of a panel."""
+_MOSAIC: Final[list[Any]] = [[*AGENTS[:3]], ["above", *AGENTS[3:]], ["above", "speeds", "speeds"]]
+"""Of a video's picture."""
+_SHOWS_BEST: Final = 0.5
+"""Seconds before the impact at which the cameras are chosen: at the impact the pair may be beside each other."""
+_DASHES: Final = ("-", "--")
 
 
 def render_accident(
@@ -73,14 +77,9 @@ def render_accident(
         ChoiceError: no such agent, configuration or layer, or none of the moments was recorded.
         MissingFileError: an image was not downloaded.
     """
-    shown = layers_of(layers, COUNTDOWN_DEFAULT, COUNTDOWN_LAYERS)
-    contact = collision(dataset, scenario)
+    shown = layers_of(layers, _SHOWN, COUNTDOWN_LAYERS)
+    contact = _contact(dataset, scenario, "look at moments of this one with render_frame")
     record = dataset.get("scenario", scenario)
-    if contact is None:
-        raise NotAvailableError(
-            f"{record['token']}: nobody collides in it, so there is nothing to count down to; choose a scenario with a "
-            "collision, or look at moments of this one with render_frame"
-        )
     moments = _moments(seconds, record["num_frames"])
     there = agents_of(dataset, scenario)
     first = sample_token(record["token"], there[0], record["num_frames"])
@@ -92,9 +91,9 @@ def render_accident(
     for column, (left, index) in enumerate(moments):
         for row, agent in enumerate(names):
             sample = sample_token(record["token"], agent, index)
-            _draw_image(dataset, sample, pair_at(tracks, contact, index), shown, axes[row, column])
+            _draw_image(dataset, sample, _pair_at(tracks, contact, index), shown, axes[row, column])
         moment = sample_token(record["token"], there[0], index)
-        draw_contact(dataset, moment, contact, tracks, shown, axes[-1, column])
+        _draw_contact(dataset, moment, contact, tracks, shown, axes[-1, column])
         axes[0, column].set_title("the impact" if left == 0 else f"{left:g} s before")
     for row, agent in enumerate(names):
         _write_row(short_name(agent), AGENT_COLORS[agent], axes[row, 0])
@@ -102,6 +101,51 @@ def render_accident(
         ax.set_ylabel("")
     fig.suptitle(accident_words(dataset, contact), fontsize=11)
     return settled(fig)
+
+
+def draw_countdown(
+    dataset: Dataset, frame: str, agents: Sequence[str], layers: Collection[Layer] | None, fig: Figure
+) -> None:
+    """Draw a moment of an accident: five cameras, the place of contact from above, the speeds of the pair.
+
+    Each agent's camera is the one that shows the pair best shortly before the impact, in all moments.
+
+    Args:
+        dataset: the release.
+        frame: token.
+        agents: whose cameras are shown.
+        layers: of `render_accident`; None for its default.
+        fig: an empty figure to draw on, about 16 to 9.
+
+    Raises:
+        NotAvailableError: nobody collides in the scenario, or it has no meta.
+        ChoiceError: no such layer.
+        MissingFileError: an image was not downloaded.
+    """
+    shown = layers_of(layers, _SHOWN, COUNTDOWN_LAYERS)
+    record = dataset.get("frame", frame)
+    scenario, index = record["scenario_token"], record["index"]
+    contact = _contact(dataset, scenario, "the view 'frame'")
+    tracks = scenario_tracks(dataset, scenario)
+    impact = int(tracks.index.max())
+    chosen_at = max(1, impact - round(_SHOWS_BEST / FRAME_PERIOD))
+    axes = fig.subplot_mosaic(_MOSAIC, height_ratios=(1, 1, 0.8))
+    for agent in AGENTS:
+        if agent not in agents:
+            axes[agent].set_axis_off()
+            continue
+        pair = _pair_at(tracks, contact, chosen_at)
+        channel = best_camera(dataset, sample_token(scenario, agent, chosen_at), pair)
+        _draw_camera(dataset, f"{sample_token(scenario, agent, index)}/{channel}", shown, axes[agent])
+    moment = sample_token(scenario, agents[0], index)
+    _draw_contact(dataset, moment, contact, tracks, shown, axes["above"], near=_NEAR_IN_VIDEO)
+    axes["above"].set(xlabel="", ylabel="")
+    axes["above"].set_title("from above, world (m)", fontsize="medium")
+    _draw_speeds(dataset, contact, tracks, index, axes["speeds"])
+    axes["speeds"].set_title(accident_words(dataset, contact).replace("\n", "; "), fontsize=9)
+    left = (impact - index) * FRAME_PERIOD
+    words = f"{left:.1f} s to the impact" if index < impact else "the impact"
+    fig.suptitle(words, fontsize=15, fontweight="bold", color=COLLIDER_COLOR)
 
 
 def accident_words(dataset: Dataset, contact: Contact) -> str:
@@ -126,6 +170,17 @@ def accident_words(dataset: Dataset, contact: Contact) -> str:
     )
 
 
+def _contact(dataset: Dataset, scenario: RowArgument, instead: str) -> Contact:
+    """How the accident of a scenario happened; raises NotAvailableError, with what to do instead, if there is none."""
+    contact = collision(dataset, scenario)
+    if contact is None:
+        raise NotAvailableError(
+            f"{dataset.get('scenario', scenario)['token']}: nobody collides in it, so there is nothing to count down "
+            f"to; choose a scenario with a collision, or {instead}"
+        )
+    return contact
+
+
 def _moments(seconds: Sequence[float], last: int) -> list[tuple[float, int]]:
     """Seconds before the impact and frame numbers of those that were recorded."""
     moments = [(left, last - round(left / FRAME_PERIOD)) for left in seconds]
@@ -138,7 +193,7 @@ def _moments(seconds: Sequence[float], last: int) -> list[tuple[float, int]]:
     return recorded
 
 
-def pair_at(tracks: ScenarioTracks, contact: Contact, index: int) -> Boxes:
+def _pair_at(tracks: ScenarioTracks, contact: Contact, index: int) -> Boxes:
     """The boxes, in world, of those who collide that are there in a frame (number from 1)."""
     there = tracks.at(index)
     return there.select(np.isin(there.actor_id, contact.actor_ids))
@@ -146,18 +201,25 @@ def pair_at(tracks: ScenarioTracks, contact: Contact, index: int) -> Boxes:
 
 def _draw_image(dataset: Dataset, sample: str, pair: Boxes, shown: frozenset[Layer], ax: Axes) -> None:
     channel = best_camera(dataset, sample, pair)
-    render_sample_data(dataset, f"{sample}/{channel}", layers=[*shown.intersection(_IN_IMAGES)], ax=ax)
+    render_sample_data(dataset, f"{sample}/{channel}", layers=[*shown.intersection(CAMERA_LAYERS)], ax=ax)
     ax.set_title("")
     write_beside(ax, channel, (ax.get_xlim()[0], ax.get_ylim()[0]), "black")
 
 
-def draw_contact(
-    dataset: Dataset, sample: str, contact: Contact, tracks: ScenarioTracks, shown: frozenset[Layer], ax: Axes
+def _draw_contact(
+    dataset: Dataset,
+    sample: str,
+    contact: Contact,
+    tracks: ScenarioTracks,
+    shown: frozenset[Layer],
+    ax: Axes,
+    *,
+    near: float = _NEAR,
 ) -> None:
     """Draw the moment of a sample (a token) around the place of contact, in world: of the layers `shown` its own."""
     record, index = dataset.get("sample", sample), int(sample.rsplit("/", 1)[1])
     x, y = contact.point[:2].tolist()
-    ax.set(xlim=(x - _NEAR, x + _NEAR), ylim=(y - _NEAR, y + _NEAR), aspect="equal")
+    ax.set(xlim=(x - near, x + near), ylim=(y - near, y + near), aspect="equal")
     boxes = tracks.at(index)
     colors = role_colors(dataset, record, boxes)
     pair = np.isin(boxes.actor_id, contact.actor_ids)
@@ -187,3 +249,31 @@ def _write_row(words: str, color: str, ax: Axes) -> None:
 
 def _number(value: float, unit: str) -> str:
     return f"{value:.1f} {unit}" if np.isfinite(value) else f"unknown {unit}"
+
+
+def _draw_camera(dataset: Dataset, camera: str, shown: Collection[Layer], ax: Axes) -> None:
+    in_camera: list[Layer] = [layer for layer in CAMERA_LAYERS if layer in shown]
+    render_sample_data(dataset, camera, layers=in_camera, ax=ax)
+    agent, _, channel = camera.rsplit("/", 3)[1:]
+    ax.set_title(f"{short_name(agent)}: {channel}", fontsize="medium", color=AGENT_COLORS[agent])
+
+
+def _draw_speeds(dataset: Dataset, contact: Contact, tracks: ScenarioTracks, index: int, ax: Axes) -> None:
+    """Draw how fast the pair is over the seconds before the impact, up to the present full, then pale."""
+    impact, fastest = int(tracks.index.max()), 1.0
+    for actor, instance, dashes in zip(contact.actor_ids, contact.instances, _DASHES, strict=True):
+        rows = np.flatnonzero(tracks.actor_id == actor)
+        before = (tracks.index[rows] - impact) * FRAME_PERIOD
+        speed = np.linalg.norm(tracks.boxes.velocity[rows], axis=1)
+        fastest = max(fastest, float(np.nan_to_num(speed).max()))
+        past = tracks.index[rows] <= index
+        words = f"{dataset.instance.get(instance)['category']} {actor}"
+        ax.plot(before, speed, color=COLLIDER_COLOR, linestyle=dashes, linewidth=1.2, alpha=0.25)
+        ax.plot(before[past], speed[past], color=COLLIDER_COLOR, linestyle=dashes, linewidth=2.0, label=words)
+    ax.axvline((index - impact) * FRAME_PERIOD, color="black", linewidth=1.2)
+    ax.axvline(0, color=COLLIDER_COLOR, linewidth=1.2, linestyle=":")
+    ax.set(
+        xlabel="time to the impact (s)", ylabel="speed (m/s)", xlim=(-(impact - 1) * FRAME_PERIOD, 0.1), ylim=(0, None)
+    )
+    ax.legend(loc="lower left", fontsize=8, ncols=2, framealpha=0.7)
+    with_light_grid(ax, "both")

@@ -42,6 +42,13 @@ def check_view_range(metres: float) -> None:
         raise ChoiceError(f"view_range: expected metres above 0, found {metres!r}")
 
 
+def titled_from_above(ax: Axes, title: str, *, grid: bool) -> Axes:
+    """The axes as a view from above in metres, with a small title."""
+    ax.set(aspect="equal", xlabel="x forward (m)", ylabel="y left (m)")
+    ax.set_title(title, fontsize=9)
+    return with_light_grid(ax, "both") if grid else ax
+
+
 def detached_figure(size: tuple[float, float]) -> Figure:
     """A figure that pyplot does not know, for files: loops pile none up, and no display is needed."""
     from matplotlib.figure import Figure
@@ -55,3 +62,15 @@ def with_light_grid(ax: Axes, grid: Literal["x", "y", "both"]) -> Axes:
     ax.set_axisbelow(True)
     ax.spines[["top", "right"]].set_visible(False)
     return ax
+
+
+def settled(fig: Figure) -> Figure:
+    """The figure, laid out once.
+
+    matplotlib measures the room for titles and legends on panels as they are before it makes their scales equal, so
+    that it takes too little of it; laid out again at drawing, it starts from panels that are nearly right.
+    """
+    engine = fig.get_layout_engine() if fig.figure is fig else None  # a part of a figure is laid out with it
+    if engine is not None:
+        engine.execute(fig)
+    return fig

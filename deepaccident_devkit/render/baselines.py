@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from deepaccident_devkit.files import replacing
 from deepaccident_devkit.render.axes import axes_or_new, detached_figure, figure_or_new, with_light_grid
+from deepaccident_devkit.render.pictures import write_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -99,9 +99,7 @@ def render_panels(panels: Sequence[Sequence[Panel]], title: str, *, fig: Figure 
 
 def save_panels(panels: Sequence[Sequence[Panel]], title: str, path: Path) -> None:
     """Draw `render_panels` into a PNG file, over the one that is there. Raises OSError."""
-    figure = render_panels(panels, title, fig=detached_figure(_size(panels)))
-    with replacing(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=_DPI)
+    write_figure(render_panels(panels, title, fig=detached_figure(_size(panels))), path, dpi=_DPI)
 
 
 def _size(panels: Sequence[Sequence[Panel]]) -> tuple[float, float]:

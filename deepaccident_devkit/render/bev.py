@@ -1,4 +1,4 @@
-"""A moment from above."""
+"""A moment from above: boxes, points, and what the BEV camera saw as the ground."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from typing import TYPE_CHECKING, Final, get_args
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.arrays import ByteArray, FloatArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.geometry import SE3, Boxes
+from deepaccident_devkit.release import BevImage
+from deepaccident_devkit.release.bev_camera import TAGS
 from deepaccident_devkit.render.axes import axes_or_new, axis_words, check_view_range
 from deepaccident_devkit.render.boxes import draw_actors_from_above, write_beside
-from deepaccident_devkit.render.colors import AGENT_COLORS, GRID_COLOR, OWN_COLOR, POINT_COLOR
+from deepaccident_devkit.render.colors import AGENT_COLORS, BEV_COLORS, GRID_COLOR, OWN_COLOR, POINT_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import agent_handles, box_handles, draw_legend
-from deepaccident_devkit.render.points import draw_points_from_above
 from deepaccident_devkit.render.roles import at_once, role_colors, short_name
 from deepaccident_devkit.render.trails import draw_trails
-from deepaccident_devkit.render.underlay import draw_underlay
 from deepaccident_devkit.taxonomy import BEV_CAMERA, LIDAR, AgentName, Frame
 from deepaccident_devkit.v2x import (
     Agents,
@@ -43,6 +43,8 @@ _BEYOND: Final = 5.0
 """Metres past the edge of the picture at which a box may still reach into it."""
 _MARK: Final = np.array([[1.8, 0.0], [-1.2, 1.1], [-0.6, 0.0], [-1.2, -1.1]])
 """An arrow head, metres of an agent's ego frame."""
+_MOST_PIXELS: Final = 400
+"""Along a side, in round numbers: panels of a video have less, and more takes time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -217,3 +219,52 @@ def _finish(record: SampleRecord, frame: str, *, grid: bool, ax: Axes) -> None:
     ax.set_axisbelow(True)
     if grid:
         ax.grid(color=GRID_COLOR, linewidth=0.4)
+
+
+def draw_points_from_above(
+    xyz: FloatArray, ax: Axes, *, center: FloatArray, view_range: float, color: str = POINT_COLOR
+) -> None:
+    """Draw the points (P, 3) within a square of ±`view_range` metres about `center` (2,), all in one colour."""
+    near = (np.abs(xyz[:, :2] - center) < view_range).all(axis=1)
+    ax.scatter(xyz[near, 0], xyz[near, 1], s=0.6, c=color, linewidths=0, rasterized=True, zorder=1)
+
+
+def draw_underlay(image: BevImage, ax: Axes, *, target_from_ego: SE3, view_range: float) -> None:
+    """Draw a BEV camera's tags at their places in the frame of the axes, metres, up to `view_range` to each side.
+
+    Args:
+        image: of an agent.
+        ax: axes to draw on; its limits stay as they are.
+        target_from_ego: from the agent's ego frame into the frame of the axes; its tilt is left out.
+        view_range: metres about the agent; a turned picture is cut to a square that the corners reach.
+    """
+    from matplotlib.transforms import Affine2D
+
+    yaw = float(np.arctan2(target_from_ego.rotation[1, 0], target_from_ego.rotation[0, 0]))
+    place = Affine2D().rotate(yaw).translate(*target_from_ego.translation[:2])
+    size = len(image.semantic)
+    half = min(size // 2, int(np.ceil(view_range * (abs(np.cos(yaw)) + abs(np.sin(yaw))) / image.resolution)))
+    shown = slice(size // 2 - half, size // 2 + half)
+    tags = image.semantic[::-1, ::-1].T[shown, shown]
+    step = max(1, len(tags) // _MOST_PIXELS)
+    reach = half * image.resolution
+    limits = ax.get_xlim(), ax.get_ylim()
+    ax.imshow(
+        _colored(tags[step // 2 :: step, step // 2 :: step]),
+        origin="lower",
+        extent=(-reach, reach, -reach, reach),
+        transform=place + ax.transData,
+        interpolation="nearest",
+        zorder=0,
+    )
+    ax.set(xlim=limits[0], ylim=limits[1])
+
+
+def _colored(tags: ByteArray) -> ByteArray:
+    """CARLA's tags (H, W) as RGB (H, W, 3), white where a tag has no colour."""
+    from matplotlib.colors import to_rgb
+
+    table = np.full((256, 3), 255, dtype=np.uint8)
+    for name, color in BEV_COLORS.items():
+        table[TAGS[name]] = np.rint(np.array(to_rgb(color)) * 255)
+    return table[tags]

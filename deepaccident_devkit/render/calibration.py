@@ -11,12 +11,11 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import TokenError
 from deepaccident_devkit.geometry import Boxes, LidarPointCloud
 from deepaccident_devkit.render.axes import figure_or_new
-from deepaccident_devkit.render.camera import draw_camera_boxes, draw_image
+from deepaccident_devkit.render.camera import draw_camera_boxes, draw_image, draw_points_in_image
 from deepaccident_devkit.render.colors import AGENT_COLORS
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import agent_handles, draw_legend
 from deepaccident_devkit.render.moments import CAMERA_GRID
-from deepaccident_devkit.render.points import draw_points_in_image
 from deepaccident_devkit.render.roles import at_once, in_drawing_order
 from deepaccident_devkit.v2x import Agents, cooperating_agents, cooperative_boxes, project_to_image
 

@@ -1,27 +1,40 @@
-"""A camera's image with what it may see; of the other sensors, the matching view from above."""
+"""A camera's image with what it may see and any LiDAR points; of other sensors, the matching view from above."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
+import numpy as np
+
+from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.render.axes import axes_or_new
 from deepaccident_devkit.render.bev import BEV_LAYERS, BevView, draw_bev
 from deepaccident_devkit.render.boxes import draw_boxes_in_image, draw_ids_in_image, draw_velocities_in_image
+from deepaccident_devkit.render.colors import AGENT_COLORS, DEPTH_COLORMAP, HEIGHT_COLORMAP
 from deepaccident_devkit.render.layers import Layer, layers_of
-from deepaccident_devkit.render.points import draw_depths
+from deepaccident_devkit.render.legends import agent_handles, draw_legend
 from deepaccident_devkit.render.roles import role_colors
 from deepaccident_devkit.taxonomy import LIDAR, OWN_ACTOR_ID
-from deepaccident_devkit.v2x import map_pointcloud_to_image
-from deepaccident_devkit.v2x.projection import camera_of
+from deepaccident_devkit.v2x import map_pointcloud_to_image, project_to_image
+from deepaccident_devkit.v2x.projection import ImagePoints, camera_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.collections import PathCollection
+
+    from deepaccident_devkit.tables.records import SampleRecord
 
 CAMERA_LAYERS: Final[tuple[Layer, ...]] = ("image", "points", "boxes", "ids", "velocities")
 CAMERA_DEFAULT: Final[tuple[Layer, ...]] = ("image", "boxes")
+ColorBy = Literal["depth", "height", "agent"]
+_DEPTHS: Final = (0.0, 50.0)
+"""Metres from the camera between which the colours of depth go."""
+_HEIGHTS: Final = (-1.0, 6.0)
+"""Metres above the origin of the camera's agent between which the colours of height go."""
 
 
 def render_sample_data(
@@ -62,7 +75,7 @@ def render_sample_data(
     draw_image(dataset, record, ax, image="image" in chosen)
     if "points" in chosen:
         points = map_pointcloud_to_image(dataset, record, colors=False)
-        draw_depths(points.pixels[points.mask], points.depth[points.mask], ax)
+        _draw_numbers(points, points.depth, _DEPTHS, DEPTH_COLORMAP, ax)
     boxes = dataset.boxes(record["sample_token"], frame=record["channel"], visible="camera")
     draw_camera_boxes(dataset, record, boxes.select(boxes.actor_id != OWN_ACTOR_ID), chosen, ax)
     return ax
@@ -88,6 +101,21 @@ def draw_image(dataset: Dataset, camera: Any, ax: Axes, *, image: bool = True) -
     ax.spines[:].set_visible(False)
 
 
+def draw_points_in_image(pixels: FloatArray, ax: Axes, *, size: float = 2.0, **colors: Any) -> PathCollection:
+    """Draw points at pixels (P, 2) of an image.
+
+    Args:
+        pixels: as (u, v), those in the image alone.
+        ax: axes to draw on, in pixels.
+        size: of a point, in points².
+        colors: `color`, one for all; or `c`, a number a point, with `cmap`, `vmin` and `vmax`.
+
+    Returns:
+        What was drawn, for a colour bar.
+    """
+    return ax.scatter(pixels[:, 0], pixels[:, 1], s=size, linewidths=0, rasterized=True, **colors)
+
+
 def draw_camera_boxes(dataset: Dataset, camera: Any, boxes: Boxes, layers: Collection[Layer], ax: Axes) -> None:
     """Draw the layers of boxes, given in the optical frame of a camera (a record), in its image."""
     lens = camera_of(dataset, camera)
@@ -98,3 +126,81 @@ def draw_camera_boxes(dataset: Dataset, camera: Any, boxes: Boxes, layers: Colle
         draw_velocities_in_image(boxes, lens, ax, colors)
     if "ids" in layers:
         draw_ids_in_image(boxes, lens, ax, colors)
+
+
+def render_pointcloud_in_image(
+    dataset: Dataset,
+    camera: RowArgument,
+    sample: RowArgument | None = None,
+    *,
+    color_by: ColorBy = "depth",
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw a camera's image and LiDAR points upon it, whatever may stand before them.
+
+    Args:
+        dataset: the release.
+        camera: token or record of the image (sample data).
+        sample: token or record: whose points, of any agent and moment of the scenario; by default the camera's own
+            sample's, and of `color_by="agent"` those of all agents at its moment.
+        color_by: `depth` along the camera's axis, up to 50 m; `height` above the ground that the camera's agent is on;
+            or `agent`, a colour for each.
+        ax: axes to draw on; new ones if None.
+
+    Returns:
+        The axes drawn on, in pixels.
+
+    Raises:
+        TokenError: no such sample or sensor file.
+        ChoiceError: the sensor is no camera, the two are of two scenarios, or there is no such way to colour.
+        MissingFileError: the image or a cloud was not downloaded.
+    """
+    if color_by not in get_args(ColorBy):
+        raise ChoiceError(f"color_by: expected one of {', '.join(get_args(ColorBy))}, found {color_by!r}")
+    record = dataset.get("sample_data", camera)
+    own = dataset.sample.get(record["sample_token"])
+    sources = [own if sample is None else dataset.sample[dataset.getind("sample", sample)]]
+    if color_by == "agent" and sample is None:
+        sources = dataset.samples_of(own["frame_token"])
+    ax = axes_or_new(ax, (8, 5))
+    draw_image(dataset, record, ax)
+    if color_by == "agent":
+        for source in sources:
+            _draw_agent(dataset, source, record, ax)
+        handles = agent_handles([source["agent"] for source in sources])
+        draw_legend(ax, handles, columns=len(handles), loc="upper center", bbox_to_anchor=(0.5, 0))
+    else:
+        _draw_metres(dataset, sources[0], record, color_by, ax)
+    whose = sources[0]["token"] if len(sources) == 1 else "all agents"
+    ax.set_title(f"{own['agent']}, {record['channel']}\nLiDAR of {whose}", fontsize="medium")
+    return ax
+
+
+def _draw_agent(dataset: Dataset, source: SampleRecord, camera: RowArgument, ax: Axes) -> None:
+    cloud = dataset.load_point_cloud(source, "lidar")
+    points = project_to_image(dataset, cloud, source, camera, colors=False)
+    draw_points_in_image(points.pixels[points.mask], ax, color=AGENT_COLORS[source["agent"]])
+
+
+def _draw_metres(
+    dataset: Dataset, source: SampleRecord, camera: RowArgument, color_by: Literal["depth", "height"], ax: Axes
+) -> None:
+    """Points coloured by depth or height, and what the colours mean."""
+    cloud = dataset.load_point_cloud(source, "world")
+    points = project_to_image(dataset, cloud, source, camera, colors=False)
+    values, limits, colormap = points.depth, _DEPTHS, DEPTH_COLORMAP
+    if color_by == "height":
+        ego_from_world = dataset.world_from(dataset.get("sample_data", camera)["sample_token"], "ego").inverse()
+        values, limits, colormap = ego_from_world.apply(cloud.xyz)[:, 2], _HEIGHTS, HEIGHT_COLORMAP
+    drawn = _draw_numbers(points, values, limits, colormap, ax)
+    ax.figure.colorbar(drawn, ax=ax, label=f"{color_by} (m)", fraction=0.03, pad=0.01)
+
+
+def _draw_numbers(
+    points: ImagePoints, values: FloatArray, limits: tuple[float, float], colormap: str, ax: Axes
+) -> PathCollection:
+    """Points coloured by a number (P,) each, the far ones first."""
+    shown = np.flatnonzero(points.mask)
+    shown = shown[np.argsort(-points.depth[shown])]
+    low, high = limits
+    return draw_points_in_image(points.pixels[shown], ax, c=values[shown], cmap=colormap, vmin=low, vmax=high)

@@ -14,13 +14,13 @@ from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.render.annotation import draw_view
 from deepaccident_devkit.render.axes import axis_words, figure_or_new, with_light_grid
 from deepaccident_devkit.render.best_view import best_view
+from deepaccident_devkit.render.bev import draw_underlay
 from deepaccident_devkit.render.boxes import draw_boxes_from_above, write_beside
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, GRID_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.roles import agent_actors, in_drawing_order, role_colors, short_name
 from deepaccident_devkit.render.sights import Sightings, sightings
 from deepaccident_devkit.render.trails import draw_trail
-from deepaccident_devkit.render.underlay import draw_underlay
 from deepaccident_devkit.tables.tokens import instance_token, sample_token
 from deepaccident_devkit.taxonomy import BEV_CAMERA, FRAME_PERIOD, frame_timestamp
 from deepaccident_devkit.v2x import Agents, cooperating_agents

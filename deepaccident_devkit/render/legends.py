@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.render.colors import AGENT_COLORS, CATEGORY_COLORS, COLLIDER_COLOR, COMPANION_COLOR
 from deepaccident_devkit.render.roles import in_drawing_order, short_name
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+
+BESIDE: Final[Mapping[str, Any]] = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0), "borderaxespad": 0.0}
+"""Where a legend covers nothing."""
 
 
 def box_handles(colors: Collection[str]) -> list[Artist]:
@@ -40,3 +44,11 @@ def draw_legend(where: Any, handles: Sequence[Artist], *, columns: int, **how: A
     if handles:
         style = {"fontsize": 7.5, "frameon": False, "handlelength": 1.2, "columnspacing": 1.0, **how}
         where.legend(handles=list(handles), ncols=columns, **style)
+
+
+def draw_legend_of_fills(ax: Axes, colors: Mapping[str, str]) -> None:
+    """Say beside the axes what the colours of filled shapes mean."""
+    from matplotlib.patches import Patch
+
+    handles = [Patch(label=name, facecolor=(color, 0.4), edgecolor=color) for name, color in colors.items()]
+    draw_legend(ax, handles, columns=1, **BESIDE)

@@ -12,14 +12,13 @@ from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.render.axes import check_view_range, figure_or_new, with_light_grid
+from deepaccident_devkit.render.axes import check_view_range, figure_or_new, settled, with_light_grid
 from deepaccident_devkit.render.bev import BevView, draw_bev
 from deepaccident_devkit.render.boxes import draw_boxes_from_above, draw_ids_from_above
 from deepaccident_devkit.render.colors import AGENT_COLORS, OWN_COLOR, TRUE_PLACE_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import draw_legend
 from deepaccident_devkit.render.roles import short_name
-from deepaccident_devkit.render.settling import settled
 from deepaccident_devkit.taxonomy import UNTRACKED_ID
 from deepaccident_devkit.v2x import Agents, Link, cooperating_agents, cooperative_boxes
 from deepaccident_devkit.v2x.link import PoseNoise

@@ -1,4 +1,4 @@
-"""A picture into a file."""
+"""Pictures into files."""
 
 from __future__ import annotations
 
@@ -53,10 +53,25 @@ def save_picture(drawn: Axes | Figure, path: str | os.PathLike[str], *, dpi: flo
 
     path = check_picture_path(path)
     figure: Any = drawn.figure
-    kind = path.suffix[1:].lower()
     try:
-        with replacing(path) as temporary:
-            figure.savefig(temporary, format=kind, dpi=dpi, metadata=_UNDATED.get(kind))
+        return write_figure(figure, path, dpi=dpi)
     finally:
         plt.close(figure)
+
+
+def write_figure(figure: Figure, path: Path, *, dpi: float, words: dict[str, Any] | None = None) -> Path:
+    """Write a figure as the path's suffix says, atomically and without a date: the same picture makes the same bytes.
+
+    Args:
+        figure: as `detached_figure` makes it; pyplot does not forget others.
+        path: a file that is there is replaced.
+        dpi: pixels an inch.
+        words: what a PNG file says of itself.
+
+    Returns:
+        The path.
+    """
+    kind = path.suffix[1:].lower()
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format=kind, dpi=dpi, metadata=_UNDATED.get(kind, words))
     return path

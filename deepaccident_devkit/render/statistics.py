@@ -1,214 +1,32 @@
-"""Figures of a release's statistics: a panel a table, a figure a group of them."""
+"""Figures of a release's statistics: one a group of panels, and the files that they become."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from itertools import pairwise
-from math import radians
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, get_args
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError
-from deepaccident_devkit.files import replacing
-from deepaccident_devkit.render.axes import axes_or_new, detached_figure, figure_or_new, with_light_grid
-from deepaccident_devkit.render.colors import CATEGORY_COLORS, COLLIDER_COLOR, GRID_COLOR, SPLIT_COLORS
-from deepaccident_devkit.statistics import (
-    GROUPS,
-    PROBABILITIES,
-    CollisionPair,
-    CountTable,
-    DatasetStatistics,
-    Histogram,
-    QuantileRow,
-    QuantileTable,
+from deepaccident_devkit.render.axes import detached_figure, figure_or_new
+from deepaccident_devkit.render.colors import SPLIT_COLORS
+from deepaccident_devkit.render.pictures import write_figure
+from deepaccident_devkit.render.statistics_panels import (
+    draw_quantile_boxes,
+    render_angles,
+    render_counts,
+    render_histogram,
+    render_quantiles,
+    render_relative_positions,
 )
-from deepaccident_devkit.taxonomy import CATEGORIES
+from deepaccident_devkit.statistics import GROUPS, DatasetStatistics
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 PictureFormat = Literal["png", "pdf"]
 
 _DPI = 120
-_PANEL = (7.0, 4.5)
-
-
-def render_counts(table: CountTable, *, ax: Axes | None = None) -> Axes:
-    """Draw a table of counts as horizontal bars, the splits one after the other, each with its sum and share.
-
-    Args:
-        table: of `DatasetStatistics.counts`.
-        ax: axes to draw on; new ones if None.
-
-    Returns:
-        The axes drawn on.
-    """
-    ax = axes_or_new(ax, _PANEL)
-    values, whole = list(table.counts), table.total()
-    starts = [0] * len(values)
-    for group in GROUPS[1:]:
-        widths = [table.counts[value][group] for value in values]
-        if any(widths):
-            colors = SPLIT_COLORS[group]
-            ax.barh(range(len(values)), widths, left=starts, color=colors, label=group, height=0.72)
-        starts = [start + width for start, width in zip(starts, widths, strict=True)]
-    for position, total in enumerate(starts):
-        share = f" ({100 * total / whole:.0f} %)" if whole else ""
-        ax.annotate(f"{total:,}{share}", (total, position), (4, 0), textcoords="offset points", va="center", fontsize=8)
-    ax.set_yticks(range(len(values)), values)
-    ax.invert_yaxis()
-    ax.set(xlabel=table.counted, title=table.title, xlim=(0, 1.3 * max([1, *starts])))
-    _counting(ax.xaxis)
-    return with_light_grid(ax, "x")
-
-
-def render_histogram(histogram: Histogram, *, ax: Axes | None = None) -> Axes:
-    """Draw a histogram as bars, the splits on top of each other.
-
-    Args:
-        histogram: of `DatasetStatistics.histograms`.
-        ax: axes to draw on; new ones if None.
-
-    Returns:
-        The axes drawn on; its title says how many values lie outside of the bins.
-    """
-    ax = axes_or_new(ax, _PANEL)
-    for group, base in _stacked(histogram):
-        ax.bar(
-            histogram.edges[:-1],
-            histogram.counts[group],
-            bottom=base,
-            width=[high - low for low, high in pairwise(histogram.edges)],
-            align="edge",
-            color=SPLIT_COLORS[group],
-            edgecolor="white",
-            linewidth=0.5,
-            label=group,
-        )
-    unit = "" if histogram.unit == histogram.field else f" ({histogram.unit})"
-    ax.set(xlabel=f"{histogram.field}{unit}", ylabel=histogram.counted, title=_title(histogram))
-    ax.set_xlim(histogram.edges[0], histogram.edges[-1])
-    ax.set_xticks(histogram.edges[:: -(-len(histogram.edges) // 12)])
-    _counting(ax.yaxis)
-    return with_light_grid(ax, "y")
-
-
-def render_quantiles(table: QuantileTable, field: str, *, ax: Axes | None = None) -> Axes:
-    """Draw a number's quantiles by category: box from 25 to 75 %, line at the median, whiskers at 5 and 95 %.
-
-    Args:
-        table: of `DatasetStatistics.quantiles`.
-        field: which of its numbers.
-        ax: axes to draw on; new ones if None.
-
-    Returns:
-        The axes drawn on.
-    """
-    ax = axes_or_new(ax, _PANEL)
-    rows = [row for row in table.quantiles if row.field == field and row.group == GROUPS[0] and row.values]
-    _draw_boxes({row.category: row for row in rows}, ax)
-    ax.set(ylabel=f"{field} ({table.unit})", title=f"{field.capitalize()} by category", ylim=(0, None))
-    ax.tick_params(axis="x", labelrotation=20)
-    return ax
-
-
-def render_angles(histogram: Histogram, *, ax: Axes | None = None) -> Axes:
-    """Draw a histogram of angles around a circle: 0° up, counter-clockwise.
-
-    Args:
-        histogram: in degrees.
-        ax: polar axes to draw on; new ones if None.
-
-    Returns:
-        The axes drawn on.
-
-    Raises:
-        ChoiceError: the axes are not polar.
-    """
-    from matplotlib.projections.polar import PolarAxes
-
-    if ax is None:
-        ax = figure_or_new(None, (5, 5)).add_subplot(projection="polar")
-    if not isinstance(ax, PolarAxes):
-        raise ChoiceError(f"ax: expected polar axes (projection='polar'), found {type(ax).__name__}")
-    ax.set_theta_zero_location("N")
-    edges = histogram.edges
-    middles = [radians((low + high) / 2) for low, high in pairwise(edges)]
-    for group, base in _stacked(histogram):
-        width = radians(edges[1] - edges[0])
-        ax.bar(
-            middles,
-            histogram.counts[group],
-            bottom=base,
-            width=width,
-            color=SPLIT_COLORS[group],
-            edgecolor="white",
-            linewidth=0.5,
-            label=group,
-        )
-    ax.set_xticks([radians(angle) for angle in range(0, 360, 30)])
-    ax.set_rlabel_position(15)
-    ax.tick_params(labelsize=8)
-    highest = max(1, *histogram.counts[GROUPS[0]])
-    ax.set_ylim(0, highest)
-    ax.set_yticks(sorted({-(-highest * part // 3) for part in (1, 2, 3)}))
-    ax.set_title(_title(histogram), fontsize=10)
-    ax.grid(color=GRID_COLOR, linewidth=0.6)
-    ax.set_axisbelow("line")
-    return ax
-
-
-def render_relative_positions(pairs: Sequence[CollisionPair], *, ax: Axes | None = None) -> Axes:
-    """Draw where the other of each colliding pair was at the last frame, seen by the first, forward up.
-
-    Args:
-        pairs: `DatasetStatistics.collisions`.
-        ax: axes to draw on; new ones if None.
-
-    Returns:
-        The axes drawn on, in metres from the centre of the first: its forward up, its left to the left.
-    """
-    from matplotlib.patches import Rectangle
-
-    ax = axes_or_new(ax, (5.5, 5.5))
-    for category in CATEGORIES:
-        others = [pair for pair in pairs if pair.other_category == category]
-        if others:
-            positions = ([pair.y for pair in others], [pair.x for pair in others])
-            color = CATEGORY_COLORS[category]
-            ax.scatter(*positions, s=16, color=color, alpha=0.75, linewidths=0, label=category, zorder=3)
-    ax.add_patch(Rectangle((-0.97, -2.3), 1.94, 4.6, fill=False, edgecolor=COLLIDER_COLOR, linewidth=1.2))
-    ax.annotate("", (0, 2.3), (0, 0.4), arrowprops={"arrowstyle": "->", "color": COLLIDER_COLOR})
-    reach = max([6.0, *(1.1 * max(abs(pair.x), abs(pair.y)) for pair in pairs)])
-    ax.set(xlim=(reach, -reach), ylim=(-reach, reach), aspect="equal")
-    ax.set(xlabel="to the left of the first (m)", ylabel="forward of the first (m)")
-    ax.set_title("Centre of the other (red: the first, as a median car)", fontsize=10)
-    if pairs:
-        ax.legend(fontsize=8, loc="upper right", title="the other", title_fontsize=8)
-    return with_light_grid(ax, "both")
-
-
-def _draw_boxes(rows: Mapping[str, QuantileRow], ax: Axes) -> None:
-    """A box for each labelled row of quantiles, with its median in figures."""
-    boxes = [
-        {"label": label, "whislo": q[1], "q1": q[2], "med": q[3], "q3": q[4], "whishi": q[5]}
-        for label, row in rows.items()
-        if (q := row.values)
-    ]
-    if boxes:
-        parts = ax.bxp(boxes, showfliers=False, patch_artist=True, widths=0.6, medianprops={"color": "black"})
-        for patch, row in zip(parts["boxes"], rows.values(), strict=True):
-            patch.set(facecolor=CATEGORY_COLORS.get(row.category, SPLIT_COLORS["unknown"]), alpha=0.75)
-        medians = [row.values[PROBABILITIES.index(0.5)] for row in rows.values() if row.values]
-        for position, median in enumerate(medians, 1):
-            text = f"{median:.{1 if median >= 10 else 2}f}"
-            ax.annotate(text, (position + 0.33, median), va="center", fontsize=8)
-        ax.set_xlim(0.4, len(boxes) + 0.9)
-    ax.set_xlabel("line: median; box: 25–75 %; whiskers: 5–95 %", fontsize=8)
-    with_light_grid(ax, "y")
 
 
 def _scenarios(statistics: DatasetStatistics, fig: Figure) -> None:
@@ -236,7 +54,7 @@ def _ego(statistics: DatasetStatistics, fig: Figure) -> None:
     render_histogram(statistics.histograms["ego_speeds"], ax=axes[0])
     sizes = statistics.quantiles["ego_sizes"]
     rows = [row for row in sizes.quantiles if row.group == GROUPS[0] and row.values]
-    _draw_boxes({row.field: row for row in rows}, axes[1])
+    draw_quantile_boxes({row.field: row for row in rows}, axes[1])
     axes[1].set(ylabel=f"size ({sizes.unit})", title=sizes.title, ylim=(0, None))
 
 
@@ -349,34 +167,5 @@ def save_statistics(
     for group, (size, _) in _FIGURES.items():
         figure = render_statistics(statistics, group, fig=detached_figure(size))
         for name in [name for name in get_args(PictureFormat) if name in formats]:  # one order: the same bytes
-            paths.append(folder / f"{group}.{name}")
-            with replacing(paths[-1]) as temporary:
-                undated = {"CreationDate": None} if name == "pdf" else None
-                figure.savefig(temporary, format=name, dpi=_DPI, metadata=undated)
+            paths += [write_figure(figure, folder / f"{group}.{name}", dpi=_DPI)]
     return paths
-
-
-def _stacked(histogram: Histogram) -> list[tuple[str, list[int]]]:
-    """The groups that have something, each with the heights that its bars stand on."""
-    base, groups = [0] * (len(histogram.edges) - 1), []
-    for group in GROUPS[1:]:
-        if any(histogram.counts[group]):
-            groups.append((group, base))
-            base = [below + count for below, count in zip(base, histogram.counts[group], strict=True)]
-    return groups
-
-
-def _title(histogram: Histogram) -> str:
-    outside = histogram.outside[GROUPS[0]]
-    if not outside:
-        return histogram.title
-    share = 100 * outside / histogram.total()
-    return f"{histogram.title}\n({share:.2g} % outside of {histogram.edges[0]:g}–{histogram.edges[-1]:g})"
-
-
-def _counting(axis: Axis) -> None:
-    """Whole numbers with a comma at thousands, in at most six steps."""
-    from matplotlib.ticker import MaxNLocator, StrMethodFormatter
-
-    axis.set_major_locator(MaxNLocator(nbins=6, integer=True))
-    axis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))

@@ -11,6 +11,7 @@ from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render.axes import axes_or_new, axis_words, check_view_range, with_light_grid
+from deepaccident_devkit.render.bev import draw_points_from_above
 from deepaccident_devkit.render.boxes import (
     SMALLEST_TEXT,
     draw_boxes_from_above,
@@ -21,7 +22,6 @@ from deepaccident_devkit.render.boxes import (
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, COMPANION_COLOR, GRID_COLOR, MUTED_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import agent_handles, draw_legend
-from deepaccident_devkit.render.points import draw_points_from_above
 from deepaccident_devkit.render.roles import in_drawing_order, role_colors, short_name
 from deepaccident_devkit.render.sights import Sights, sights
 from deepaccident_devkit.taxonomy import Frame

@@ -9,12 +9,14 @@ from deepaccident_devkit.evaluation.breakdowns import Breakdown, Group
 from deepaccident_devkit.evaluation.headlines import Headline, headlines
 from deepaccident_devkit.render.axes import axes_or_new
 from deepaccident_devkit.render.colors import AGENT_COLORS, ESTIMATE_COLOR
-from deepaccident_devkit.render.evaluation.panels import LIMITS, PANEL, Bar, draw_bars, with_unit
+from deepaccident_devkit.render.evaluation.panels import PANEL, Bar, draw_bars
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 UNKNOWN: Final = "not known"
+_LIMITS: Final = {"%": 100.0, "share": 1.0, "1 - overlap": 1.0}
+"""Unit → the most that a number of it can be; others have no limit."""
 
 
 def render_breakdown(task: str, broken: Breakdown[Any], number: str, *, ax: Axes | None = None) -> Axes:
@@ -34,9 +36,9 @@ def render_breakdown(task: str, broken: Breakdown[Any], number: str, *, ax: Axes
         headline = next((each for each in headlines(task, group.result) if each.path == number), None)
         shown = headline or shown
         bars.append(_bar(group, headline, AGENT_COLORS.get(group.value or "", ESTIMATE_COLOR)))
-    draw_bars(bars, ax, None if shown is None else LIMITS.get(shown.unit))
+    draw_bars(bars, ax, None if shown is None else _LIMITS.get(shown.unit))
     ax.set_title(f"{number if shown is None else shown.name} by {broken.by.replace('_', ' ')}", fontsize=10)
-    ax.set_xlabel("" if shown is None else with_unit(shown))
+    ax.set_xlabel("" if shown is None else _with_unit(shown))
     return ax
 
 
@@ -51,3 +53,8 @@ def _bar(group: Group[Any], headline: Headline | None, color: str) -> Bar:
         text="" if headline is None else headline.text(),
         color=color,
     )
+
+
+def _with_unit(headline: Headline) -> str:
+    """What an axis says of a headline number: `position_error (m)`."""
+    return headline.name if headline.unit == "share" else f"{headline.name} ({headline.unit})"

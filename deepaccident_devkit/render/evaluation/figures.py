@@ -1,17 +1,31 @@
-"""A figure of a run, and the file that it becomes."""
+"""The figures of a run: which there are, and the files that they become."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+import numpy as np
 
 from deepaccident_devkit._version import __version__
+from deepaccident_devkit.evaluation.accident import AccidentEvaluator
+from deepaccident_devkit.evaluation.attributes import EVERYTHING
+from deepaccident_devkit.evaluation.breakdowns import Breakdown
+from deepaccident_devkit.evaluation.detection import DetectionEvaluator
+from deepaccident_devkit.evaluation.headlines import Headline, headlines
+from deepaccident_devkit.evaluation.motion import MotionEvaluator
 from deepaccident_devkit.evaluation.runs import EvaluationRun
-from deepaccident_devkit.files import replacing
+from deepaccident_devkit.evaluation.warning import WarningResult
 from deepaccident_devkit.render.axes import detached_figure
 from deepaccident_devkit.render.colors import WARNING_COLOR
+from deepaccident_devkit.render.evaluation import accident, detection, motion, warning
+from deepaccident_devkit.render.evaluation.breakdowns import UNKNOWN, render_breakdown
 from deepaccident_devkit.render.evaluation.panels import PANEL
+from deepaccident_devkit.render.pictures import write_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,6 +41,9 @@ MAIN_NUMBERS: Final = {
 }
 """Task → paths of the headline numbers that figures show by attribute: the first by all attributes, and samples are
 ranked by it; the others by time to impact alone."""
+_BY_TIME: Final = "time_to_impact"
+_WITHIN_RECORDINGS: Final = (_BY_TIME, "impact_step", "time_to_end", "accident_visibility")
+"""Attributes that cut recordings apart: of no use to a task that is about whole ones."""
 
 
 class Draw(Protocol):
@@ -77,7 +94,164 @@ def save_figure(run: EvaluationRun, drawn: RunFigure, folder: Path) -> Path:
     mark = "" if run.partial is None else run.partial.text()
     if mark:
         figure.suptitle(mark, color=WARNING_COLOR, fontsize=10, fontweight="bold")
-    with replacing(path) as temporary:
-        said = {"Title": drawn.name, "Description": f"{mark} {made_of}".strip()}
-        figure.savefig(temporary, format="png", dpi=_DPI, metadata=said)
-    return path
+    said = {"Title": drawn.name, "Description": f"{mark} {made_of}".strip()}
+    return write_figure(figure, path, dpi=_DPI, words=said)
+
+
+def run_figures(run: EvaluationRun) -> tuple[RunFigure, ...]:
+    """All figures of a run, those of its task first, then the breakdowns that have more than one group."""
+    own = _FIGURES[run.setup.task](run)
+    left_out = (EVERYTHING, *(_WITHIN_RECORDINGS if run.setup.task == "warning" else ()))
+    broken = {each.by: each for each in run.breakdowns if each.by not in left_out and len(each.groups) > 1}
+    numbers = [path for path in MAIN_NUMBERS[run.setup.task] if _headline(run.setup.task, run.result, path) is not None]
+    pairs = [(path, each) for path in numbers[:1] for each in broken.values()]
+    pairs[1:1] = [(path, broken[_BY_TIME]) for path in numbers[1:] if _BY_TIME in broken]
+    return (*own, *(_by(run.setup.task, each, path) for path, each in pairs))
+
+
+def _accident(run: EvaluationRun) -> Iterator[RunFigure]:
+    evaluator, result = run.evaluator, run.result
+    if not isinstance(evaluator, AccidentEvaluator):
+        return
+    curve = "" if accident.has_alarms(evaluator) else " The released protocol counts at these three distances alone."
+    yield RunFigure(
+        name="accuracy",
+        caption=f"Accident prediction accuracy over the distance allowed; APA is the mean of the three points.{curve}",
+        alt=f"Accuracy {_listed((f'within {d:g} m', x.accuracy) for d, x in result.within.items())}.",
+        draw=partial(accident.render_accuracy, evaluator),
+    )
+    yield RunFigure(
+        name="outcomes",
+        caption="Accidents foreseen, false and missed, by the distance allowed.",
+        alt="; ".join(f"within {d:g} m {x.tp} foreseen, {x.fp} false, {x.fn} missed" for d, x in result.within.items()),
+        draw=partial(accident.render_outcomes, result),
+    )
+    if not accident.has_alarms(evaluator):
+        return
+    yield RunFigure(
+        name="position_errors",
+        caption="How far off the predicted positions are, the sum over the two agents, where an accident is to come.",
+        alt="Histogram of position errors in metres.",
+        draw=partial(accident.render_errors, evaluator, "position"),
+    )
+    yield RunFigure(
+        name="time_errors",
+        caption="How late the predicted moments are, where an accident is to come.",
+        alt="Histogram of time errors in seconds.",
+        draw=partial(accident.render_errors, evaluator, "time"),
+    )
+    if hasattr(result, "average_precision"):
+        yield RunFigure(
+            name="alarms",
+            caption="Precision over recall of the alarms, from the surest on.",
+            alt=f"Precision over recall of alarms; {_listed([('average precision', result.average_precision)])}.",
+            draw=partial(accident.render_alarms, evaluator),
+        )
+
+
+def _detection(run: EvaluationRun) -> Iterator[RunFigure]:
+    result = run.result
+    if not isinstance(run.evaluator, DetectionEvaluator):
+        return
+    yield RunFigure(
+        name="average_precision",
+        caption="Average precision by class, the mean over the thresholds (and ranges, where there are several).",
+        alt=f"Average precision in percent: {_listed(result.class_average_precision.items())}.",
+        draw=partial(detection.render_average_precisions, result),
+    )
+    unit = "metres" if run.setup.rules.measure.startswith("distance") else "share of overlap"
+    several = len(result.ranges) > 1
+    for row, ring in np.argwhere(result.truths).tolist():
+        name, (low, high) = result.classes[row], result.ranges[ring].tolist()
+        where = f" from {low:g} to {high:g} m" if several else ""
+        limits = zip(result.thresholds[row].tolist(), result.average_precision[row, ring].tolist(), strict=True)
+        yield RunFigure(
+            name=f"precision_recall_{name}" + f"_{low:g}_{high:g}m" * several,
+            caption=f"Precision over recall: {name}{where}, a line a threshold ({unit}).",
+            alt=f"{name}{where}, average precision in percent: {_listed((f'{t:g}', x) for t, x in limits)}.",
+            draw=partial(detection.render_precision_recall, result, name, ring=ring),
+        )
+
+
+def _motion(run: EvaluationRun) -> Iterator[RunFigure]:
+    result = run.result
+    if not isinstance(run.evaluator, MotionEvaluator):
+        return
+    form = run.results.form or {}
+    yield RunFigure(
+        name="ranges",
+        caption="Intersection over union, panoptic quality, and its two factors, within each range around the ego.",
+        alt="; ".join(
+            f"{name}: {_listed([('IoU', x.iou), ('PQ', x.pq), ('SQ', x.sq), ('RQ', x.rq)])} percent"
+            for name, x in result.ranges.items()
+        ),
+        draw=partial(motion.render_ranges, result),
+    )
+    yield RunFigure(
+        name="quality_by_time",
+        caption="Panoptic quality frame by frame, from the present to the horizon.",
+        alt="Panoptic quality in percent over seconds from the present.",
+        draw=partial(motion.render_quality_by_time, run.evaluator, form.get("step", 0.5)),
+    )
+
+
+def _warning(run: EvaluationRun) -> Iterator[RunFigure]:
+    result = run.result
+    if not isinstance(result, WarningResult):
+        return
+    rates = _listed((f"{seconds:g} s before", rate) for seconds, rate in result.detection_rate.items())
+    yield RunFigure(
+        name="warning_times",
+        caption="Seconds of warning: from the first right alarm of a recording to the impact.",
+        alt=f"Histogram of seconds of warning; {_listed([('mean', result.mean_warning)])} s.",
+        draw=partial(warning.render_warning_times, result),
+    )
+    yield RunFigure(
+        name="detection_rates",
+        caption="Share of the accidents of which a right alarm warns so long before the impact, or earlier.",
+        alt=f"Share of accidents with a right alarm: {rates}.",
+        draw=partial(warning.render_detection_rates, result),
+    )
+    yield RunFigure(
+        name="false_alarms",
+        caption="False alarms a minute, by kind of recording; twins are normal scenarios made like an accident.",
+        alt=f"False alarms a minute: {_listed(result.false_alarms_per_minute.items())}.",
+        draw=partial(warning.render_false_alarms, result),
+    )
+    yield RunFigure(
+        name="warning_curve",
+        caption="Detection rate over false alarms a minute, a point a score from which alarms are raised.",
+        alt="Detection rate over false alarms a minute.",
+        draw=partial(warning.render_warning_curve, result),
+    )
+
+
+_FIGURES: Final[dict[str, Callable[[EvaluationRun], Iterator[RunFigure]]]] = {
+    "accident": _accident,
+    "detection": _detection,
+    "motion": _motion,
+    "warning": _warning,
+}
+
+
+def _by(task: str, broken: Breakdown[Any], path: str) -> RunFigure:
+    values = [(group.value or UNKNOWN, _headline(task, group.result, path)) for group in broken.groups]
+    name = next(headline.name for _, headline in values if headline is not None)
+    words = ", ".join(f"{value} {'–' if headline is None else headline.text()}" for value, headline in values)
+    by, percent = broken.by.replace("_", " "), 100 * broken.bootstrap.confidence
+    return RunFigure(
+        name=f"{path.rsplit('/', 1)[-1]}_by_{broken.by}",
+        caption=f"{name} by {by}; whiskers: {percent:g} % intervals over scenarios, where there are several.",
+        alt=f"{name} by {by}: {words}.",
+        draw=partial(render_breakdown, task, broken, path),
+        rows=len(broken.groups),
+    )
+
+
+def _headline(task: str, result: object, path: str) -> Headline | None:
+    return next((each for each in headlines(task, result) if each.path == path), None)
+
+
+def _listed(values: Iterable[tuple[str, float | None]]) -> str:
+    known = [(name, None if value is None or math.isnan(value) else value) for name, value in values]
+    return ", ".join(f"{name} {'–' if value is None else f'{value:.3g}'}" for name, value in known)

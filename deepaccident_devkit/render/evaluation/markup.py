@@ -7,6 +7,8 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
+from deepaccident_devkit.render.colors import GRID_COLOR, WARNING_COLOR
+
 _VOID: Final = ("img", "meta")
 _MOST_DIGITS: Final = 6
 _LONG: Final = 40
@@ -93,3 +95,81 @@ def _list(values: Sequence[Any]) -> Markup:
         return tag("ul", *(tag("li", tree(each)) for each in values))
     rows = [", ".join(map(scalar, each)) if isinstance(each, list | tuple) else scalar(each) for each in values]
     return joined(["; ".join(rows) if any(isinstance(each, list | tuple) for each in values) else ", ".join(rows)])
+
+
+_POLICY: Final = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+"""Whatever a name in it should try, a browser loads nothing and runs nothing."""
+_STYLE: Final = f"""
+:root {{ color-scheme: light; }}
+* {{ box-sizing: border-box; }}
+body {{ margin: 0 auto; padding: 1rem 1.25rem 3rem; max-width: 76rem; background: #fff; color: #1c1c1c;
+  font: 16px/1.5 system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; overflow-wrap: anywhere; }}
+h1 {{ font-size: 1.7rem; line-height: 1.2; margin: .6rem 0 .4rem; }}
+h2 {{ font-size: 1.25rem; margin: 2.2rem 0 .6rem; padding-bottom: .2rem; border-bottom: 2px solid {GRID_COLOR}; }}
+h3 {{ font-size: 1rem; margin: 1.4rem 0 .4rem; }}
+p {{ margin: .4rem 0; max-width: 46rem; }}
+nav a {{ display: inline-block; margin: 0 .9rem .3rem 0; }}
+a {{ color: #14489c; }}
+dl {{ display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 21rem), 1fr)); gap: 0 2rem;
+  margin: .6rem 0; }}
+dl div {{ display: flex; gap: .8rem; padding: .2rem 0; border-bottom: 1px solid #ececec; min-width: 0; }}
+dt {{ flex: 0 0 8.5rem; color: #555; }}
+dd {{ margin: 0; min-width: 0; }}
+.wide {{ overflow-x: auto; max-width: 100%; }}
+table {{ border-collapse: collapse; font-size: .92rem; font-variant-numeric: tabular-nums; }}
+caption {{ text-align: left; color: #555; padding: .2rem 0; }}
+th, td {{ padding: .28rem .9rem .28rem 0; text-align: right; vertical-align: top; border-bottom: 1px solid #ececec;
+  overflow-wrap: normal; }}
+thead th {{ border-bottom: 2px solid {GRID_COLOR}; font-weight: 600; }}
+th:first-child {{ text-align: left; font-weight: 500; }}
+@media (min-width: 700px) {{ .wide th:first-child {{ position: sticky; left: 0; background: #fff; }} }}
+.text td, .text th, .tree td, .tree th {{ text-align: left; overflow-wrap: break-word; }}
+.wide th, .wide td {{ white-space: nowrap; }}
+.wide.text th, .wide.text td {{ white-space: normal; }}
+.wide td.long {{ white-space: normal; text-align: left; min-width: 18rem; }}
+.big td {{ font-size: 1.02rem; font-weight: 600; }}
+.big td ~ td {{ font-weight: 400; color: #444; font-size: .92rem; }}
+.interval {{ color: #666; font-size: .82rem; font-weight: 400; }}
+.figures {{ display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 28rem), 1fr)); gap: 1.4rem; }}
+figure {{ margin: 0; }}
+figure img {{ width: 100%; height: auto; border: 1px solid #ececec; }}
+figcaption {{ font-size: .9rem; color: #333; }}
+.partial {{ color: #fff; background: {WARNING_COLOR}; font-weight: 600; padding: .35rem .7rem; max-width: none; }}
+.warning {{ border-left: .3rem solid {WARNING_COLOR}; padding-left: .7rem; }}
+summary {{ cursor: pointer; padding: .3rem 0; }}
+code {{ font: .9em/1.4 ui-monospace, "DejaVu Sans Mono", Menlo, Consolas, monospace; background: #f3f3f3;
+  padding: .1em .3em; }}
+footer {{ margin-top: 3rem; color: #555; font-size: .88rem; }}
+@page {{ size: A4 landscape; margin: 12mm; }}
+@media print {{
+  body {{ max-width: none; padding: 0; font-size: 10.5pt; }}
+  nav {{ display: none; }}
+  .wide {{ overflow: visible; }}
+  .wide th, .wide td {{ white-space: normal; }}
+  table {{ font-size: 7.5pt; }}
+  th, td {{ padding-right: .5rem; }}
+  figure, tr, .partial {{ break-inside: avoid; }}
+  h2, h3 {{ break-after: avoid; }}
+  .partial {{ print-color-adjust: exact; -webkit-print-color-adjust: exact; }}
+  .figures {{ grid-template-columns: 1fr 1fr 1fr; gap: .8rem; }}
+  .big td, .big td ~ td {{ font-size: inherit; }}
+}}
+"""
+
+
+def document(title: str, *content: Markup) -> str:
+    """A whole page in HTML.
+
+    Args:
+        title: of the window.
+        *content: of the body.
+    """
+    head = tag(
+        "head",
+        tag("meta", charset="utf-8"),
+        tag("meta", http_equiv="Content-Security-Policy", content=_POLICY),
+        tag("meta", name_="viewport", content="width=device-width, initial-scale=1"),
+        tag("title", title),
+        tag("style", Markup(_STYLE)),
+    )
+    return f"<!DOCTYPE html>\n{tag('html', head, tag('body', *content), lang='en')}\n"

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from deepaccident_devkit.evaluation.headlines import Headline
 from deepaccident_devkit.render.axes import with_light_grid
 from deepaccident_devkit.render.colors import ESTIMATE_COLOR
 
@@ -16,8 +15,6 @@ if TYPE_CHECKING:
 
 PANEL: Final = (6.4, 4.2)
 """Inches of one panel."""
-LIMITS: Final = {"%": 100.0, "share": 1.0, "1 - overlap": 1.0}
-"""Unit → the most that a number of it can be; others have no limit."""
 _BESIDE: Final = 1.22
 """Of the longest bar: where the axis ends, so that the words beside the bars have room."""
 
@@ -89,8 +86,3 @@ def draw_nothing(ax: Axes, why: str = "nothing to count") -> Axes:
     ax.text(0.5, 0.5, why, ha="center", va="center", transform=ax.transAxes, color="#555555")
     ax.set(xticks=[], yticks=[])
     return ax
-
-
-def with_unit(headline: Headline) -> str:
-    """What an axis says of a headline number: `position_error (m)`."""
-    return headline.name if headline.unit == "share" else f"{headline.name} ({headline.unit})"

@@ -13,11 +13,9 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.files import write_bytes
-from deepaccident_devkit.render.evaluation import doubts, sections
-from deepaccident_devkit.render.evaluation.figures import RunFigure, save_figure
-from deepaccident_devkit.render.evaluation.listing import run_figures
-from deepaccident_devkit.render.evaluation.markup import Markup, joined, tag
-from deepaccident_devkit.render.evaluation.page import document
+from deepaccident_devkit.render.evaluation import sections
+from deepaccident_devkit.render.evaluation.figures import RunFigure, run_figures, save_figure
+from deepaccident_devkit.render.evaluation.markup import Markup, document, joined, tag
 from deepaccident_devkit.render.evaluation.samples import sample_figures
 
 REPORT_FILE: Final = "report.html"
@@ -72,8 +70,8 @@ def report_html(run: EvaluationRun, figures: Sequence[tuple[RunFigure, Path]]) -
         "Counts": sections.counts(run),
         "Figures": tag("div", *(_figure(*each) for each in figures), class_="figures"),
         "Breakdowns": joined(sections.breakdowns(run)),
-        **({"Sanity": doubts.sanity(run.sanity)} if run.sanity is not None else {}),
-        **({"What each choice changes": doubts.explanation(run.explanation)} if run.explanation is not None else {}),
+        **({"Sanity": sections.sanity(run.sanity)} if run.sanity is not None else {}),
+        **({"What each choice changes": sections.explanation(run.explanation)} if run.explanation is not None else {}),
         "Choices": sections.choices(run),
         "Check these numbers": sections.checking(),
     }

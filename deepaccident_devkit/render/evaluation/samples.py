@@ -18,12 +18,12 @@ from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.evaluation.setups import SampleLoader
 from deepaccident_devkit.motion import MotionLabels
-from deepaccident_devkit.render.axes import axes_or_new
+from deepaccident_devkit.render.axes import axes_or_new, titled_from_above
 from deepaccident_devkit.render.colors import OUTCOME_COLORS
 from deepaccident_devkit.render.evaluation.figures import MAIN_NUMBERS, RunFigure
 from deepaccident_devkit.render.evaluation.panels import PANEL
+from deepaccident_devkit.render.legends import draw_legend_of_fills
 from deepaccident_devkit.render.outcomes import draw_accident_outcome, draw_detection_outcome
-from deepaccident_devkit.render.outcomes.panels import outcome_legend, outcome_panel
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 if TYPE_CHECKING:
@@ -86,9 +86,9 @@ def draw_motion_outcome(prediction: MotionOutput, label: MotionLabels, *, ax: Ax
     for kind, cells in (("right", there & true), ("false", there & ~true), ("missed", true & ~there)):
         picture[cells] = to_rgb(OUTCOME_COLORS[kind])
     ax.imshow(picture, origin="lower", extent=(*grid.x[:2], *grid.y[:2]), interpolation="nearest")
-    outcome_legend(ax, OUTCOME_COLORS)
+    draw_legend_of_fills(ax, OUTCOME_COLORS)
     seconds = frame * label.config.step * FRAME_PERIOD
-    return outcome_panel(ax, f"actors {seconds:g} s ahead", frozenset({"grid"}))
+    return titled_from_above(ax, f"actors {seconds:g} s ahead", grid=True)
 
 
 def _draw(load: SampleLoader, token: str, text: str, *, ax: Axes) -> Axes:

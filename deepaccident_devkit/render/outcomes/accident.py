@@ -13,12 +13,11 @@ from deepaccident_devkit.evaluation.accident.result import AccidentsWithin
 from deepaccident_devkit.evaluation.accident.scoring import position_difference
 from deepaccident_devkit.evaluation.predictions import Accident
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.render.axes import axes_or_new
+from deepaccident_devkit.render.axes import axes_or_new, titled_from_above
 from deepaccident_devkit.render.boxes import draw_boxes_from_above, draw_ids_from_above, write_beside
 from deepaccident_devkit.render.colors import OUTCOME_COLORS
 from deepaccident_devkit.render.layers import Layer, layers_of
-from deepaccident_devkit.render.legends import draw_legend
-from deepaccident_devkit.render.outcomes.panels import BESIDE, outcome_panel
+from deepaccident_devkit.render.legends import BESIDE, draw_legend
 from deepaccident_devkit.render.trails import draw_trail
 
 if TYPE_CHECKING:
@@ -73,7 +72,7 @@ def draw_accident_outcome(
     _look_at(compared, ax)
     handles, _ = ax.get_legend_handles_labels()
     draw_legend(ax, handles, columns=1, **BESIDE)
-    return outcome_panel(ax, difference_words(compared), shown)
+    return titled_from_above(ax, difference_words(compared), grid="grid" in shown)
 
 
 def difference_words(compared: ComparedAccidents) -> str:

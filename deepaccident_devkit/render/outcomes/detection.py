@@ -16,11 +16,11 @@ from deepaccident_devkit.evaluation.detection import (
     detection_protocol,
 )
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.render.axes import axes_or_new
+from deepaccident_devkit.render.axes import axes_or_new, titled_from_above
 from deepaccident_devkit.render.boxes import draw_boxes_from_above, draw_ids_from_above
 from deepaccident_devkit.render.colors import OUTCOME_COLORS
 from deepaccident_devkit.render.layers import Layer, layers_of
-from deepaccident_devkit.render.outcomes.panels import outcome_legend, outcome_panel
+from deepaccident_devkit.render.legends import draw_legend_of_fills
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -71,8 +71,8 @@ def draw_detection_outcome(
         draw_ids_from_above(true, ax, ["black"] * len(true))
     ax.set(xlim=(-WINDOW, WINDOW), ylim=(-WINDOW, WINDOW))
     names = {"right": "detected", "false": "false", "missed": "missed"}
-    outcome_legend(ax, {words: OUTCOME_COLORS[kind] for kind, words in names.items()})
-    return outcome_panel(ax, detection_words(prediction, truth, matches, protocol), shown)
+    draw_legend_of_fills(ax, {words: OUTCOME_COLORS[kind] for kind, words in names.items()})
+    return titled_from_above(ax, detection_words(prediction, truth, matches, protocol), grid="grid" in shown)
 
 
 def draw_true(truth: Boxes, matches: DetectionMatches, ax: Axes) -> None:

@@ -25,7 +25,7 @@ from deepaccident_devkit.evaluation.detection import (
 from deepaccident_devkit.evaluation.motion import MotionEvaluator
 from deepaccident_devkit.evaluation.predictions import MotionOutput
 from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels, motion_labels
-from deepaccident_devkit.render.axes import figure_or_new
+from deepaccident_devkit.render.axes import figure_or_new, settled, titled_from_above
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.outcomes.accident import ACCIDENT_LAYERS, draw_accident_outcome, verdict_words
 from deepaccident_devkit.render.outcomes.detection import (
@@ -35,8 +35,6 @@ from deepaccident_devkit.render.outcomes.detection import (
     draw_true,
 )
 from deepaccident_devkit.render.outcomes.motion import MOTION_LAYERS, draw_motion_side, motion_outcome
-from deepaccident_devkit.render.outcomes.panels import outcome_panel
-from deepaccident_devkit.render.settling import settled
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 if TYPE_CHECKING:
@@ -181,7 +179,9 @@ def _draw_detection(
     if "boxes" in shown:
         draw_true(truth, matches, left)
     left.set(xlim=(-WINDOW, WINDOW), ylim=(-WINDOW, WINDOW))
-    outcome_panel(left, f"true boxes: {len(matches.truth)} found, {len(matches.missed)} missed (dashed)", shown)
+    titled_from_above(
+        left, f"true boxes: {len(matches.truth)} found, {len(matches.missed)} missed (dashed)", grid="grid" in shown
+    )
     return fig, f"detection: mean average precision of this sample {judge.compute().mean_average_precision:.1f} %"
 
 

@@ -16,12 +16,12 @@ from deepaccident_devkit.evaluation.panoptic import vpq_matches
 from deepaccident_devkit.evaluation.predictions import MotionOutput
 from deepaccident_devkit.evaluation.ranges import cells_within
 from deepaccident_devkit.motion import MotionLabels
-from deepaccident_devkit.render.axes import axes_or_new
+from deepaccident_devkit.render.axes import axes_or_new, titled_from_above
 from deepaccident_devkit.render.colors import BEYOND_COLOR, OUTCOME_COLORS
 from deepaccident_devkit.render.layers import Layer, layers_of
+from deepaccident_devkit.render.legends import draw_legend_of_fills
 from deepaccident_devkit.render.motion_cells import draw_trail_of
 from deepaccident_devkit.render.motion_maps import MotionMaps, maps_of_labels, maps_of_output
-from deepaccident_devkit.render.outcomes.panels import outcome_legend, outcome_panel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -112,10 +112,10 @@ def draw_motion_side(
     draw_trail_of(_recolored(maps, maps.instance, []), shown - {"labels", "grid"}, ax)
     half = outcome.extent / 2
     ax.plot(np.array([-1, 1, 1, -1, -1]) * half, np.array([-1, -1, 1, 1, -1]) * half, ":", color="black", linewidth=0.8)
-    outcome_legend(ax, colors)
+    draw_legend_of_fills(ax, colors)
     total = sum(np.unique(frame[frame > 0]).size for frame in _counted(maps, outcome.extent))
     found = len(outcome.matches)
-    return outcome_panel(ax, f"{side} instances: {found} {right}, {total - found} {wrong}", shown)
+    return titled_from_above(ax, f"{side} instances: {found} {right}, {total - found} {wrong}", grid="grid" in shown)
 
 
 def _counted(maps: MotionMaps, extent: float) -> AnyArray:

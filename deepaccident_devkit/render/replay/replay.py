@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import base64
+import hashlib
+import html
+import json
 import math
 import os
+from collections.abc import Mapping
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,12 +18,14 @@ from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.render.colors import COLLIDER_COLOR, GRID_COLOR, OUTCOME_COLORS, POINT_COLOR, WARNING_COLOR
 from deepaccident_devkit.render.replay.actors import actor_entries, agent_entries
-from deepaccident_devkit.render.replay.facts import facts
-from deepaccident_devkit.render.replay.notes import notes
-from deepaccident_devkit.render.replay.page import replay_page
-from deepaccident_devkit.render.replay.pictures import CameraPictures, camera_pictures, check_picture_settings
-from deepaccident_devkit.render.replay.points import lidar_points
+from deepaccident_devkit.render.replay.facts import facts, notes
 from deepaccident_devkit.render.replay.recording import Recording, recording_of
+from deepaccident_devkit.render.replay.sensors import (
+    CameraPictures,
+    camera_pictures,
+    check_picture_settings,
+    lidar_points,
+)
 from deepaccident_devkit.render.replay.verdicts import Foreseen, verdicts
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x import Agents
@@ -28,6 +35,8 @@ SIZE_LIMIT: Final = 15_000_000
 _BASE64: Final = 4 / 3
 _BESIDE: Final = 8
 """Bytes of a picture in JSON beside its base64: quotes, a comma, filled up."""
+_SCRIPTS: Final = ("ground.js", "panels.js", "replay.js")
+"""In the order in which they build on each other."""
 
 
 def render_replay(
@@ -129,3 +138,48 @@ def _cameras(recording: Recording, pictures: CameraPictures) -> list[list[dict[s
         ]
         for agent in recording.agents
     ]
+
+
+def replay_page(title: str, data: Mapping[str, Any]) -> str:
+    """A whole page in HTML.
+
+    Its policy lets a browser run this script and use this style alone, and load nothing. All text of the data is shown
+    as text by the script, never as HTML.
+
+    Args:
+        title: of the window.
+        data: what the scripts play, as JSON holds it.
+    """
+    style, script = _part("replay.css"), "".join(map(_part, _SCRIPTS))
+    policy = (
+        f"default-src 'none'; img-src data:; style-src '{_hash(style)}'; script-src '{_hash(script)}'; "
+        "base-uri 'none'; form-action 'none'"
+    )
+    parts = {
+        "policy": html.escape(policy, quote=False),
+        "title": html.escape(title),
+        "style": style,
+        "script": script,
+        "data": _json(data),
+    }
+    page = _part("replay.html")
+    for name, part in parts.items():  # the data come last, so that nothing in them is taken for a mark
+        page = page.replace(f"<!--{name}-->", part)
+    return page
+
+
+def _json(data: Mapping[str, Any]) -> str:
+    """JSON that cannot end the element in which it stands."""
+    text = json.dumps(data, allow_nan=False, separators=(",", ":"))
+    for character in "<>&":
+        text = text.replace(character, f"\\u{ord(character):04x}")
+    return text
+
+
+def _part(name: str) -> str:
+    return (files(__package__) / name).read_text(encoding="utf-8")
+
+
+def _hash(text: str) -> str:
+    """A source of a content security policy that is this text alone."""
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")

@@ -11,7 +11,7 @@ import numpy as np
 from deepaccident_devkit.arrays import ByteArray
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.render.accident import COUNTDOWN_LAYERS
+from deepaccident_devkit.render.accident import COUNTDOWN_LAYERS, draw_countdown
 from deepaccident_devkit.render.bev import BEV_LAYERS, render_bev
 from deepaccident_devkit.render.calibration import CALIBRATION_LAYERS, render_calibration
 from deepaccident_devkit.render.camera import CAMERA_LAYERS, render_sample_data
@@ -20,7 +20,6 @@ from deepaccident_devkit.render.moments import MOMENT_LAYERS, render_frame, rend
 from deepaccident_devkit.render.motion import TRAIL_LAYERS, render_motion_labels
 from deepaccident_devkit.render.pictures import figure_of_pixels
 from deepaccident_devkit.render.roles import short_name
-from deepaccident_devkit.render.video.countdown import draw_countdown
 from deepaccident_devkit.render.visibility import VISIBILITY_LAYERS, render_visibility, render_visibility_matrix
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import CAMERAS

@@ -16,7 +16,7 @@ from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.release import BevImage
 from deepaccident_devkit.release.bev_camera import TAGS
-from deepaccident_devkit.render.bev import BevView, draw_bev, render_bev
+from deepaccident_devkit.render.bev import BevView, draw_bev, draw_underlay, render_bev
 from deepaccident_devkit.render.colors import (
     AGENT_COLORS,
     BEV_COLORS,
@@ -27,7 +27,6 @@ from deepaccident_devkit.render.colors import (
     POINT_COLOR,
 )
 from deepaccident_devkit.render.roles import collider_ids, companion_ids, role_colors, short_name
-from deepaccident_devkit.render.underlay import draw_underlay
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID
 from deepaccident_devkit.v2x import Link, PoseNoise, cooperative_boxes
 

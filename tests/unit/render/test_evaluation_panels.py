@@ -32,7 +32,7 @@ from deepaccident_devkit.render.evaluation import (
     render_warning_curve,
     render_warning_times,
 )
-from deepaccident_devkit.render.evaluation.alarms import accuracy_by_distance, alarm_precision_recall
+from deepaccident_devkit.render.evaluation.accident import accuracy_by_distance, alarm_precision_recall
 
 
 def new_axes() -> Any:

@@ -23,7 +23,7 @@ from deepaccident_devkit.motion import MotionLabelConfig, samples
 from deepaccident_devkit.render import detached_figure
 from deepaccident_devkit.render.colors import OUTCOME_COLORS
 from deepaccident_devkit.render.evaluation import draw_motion_outcome, save_report
-from deepaccident_devkit.render.evaluation.listing import run_figures
+from deepaccident_devkit.render.evaluation.figures import run_figures
 from deepaccident_devkit.render.evaluation.markup import Markup, tag, tree
 from deepaccident_devkit.render.evaluation.samples import sample_figures
 

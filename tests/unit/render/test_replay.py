@@ -27,11 +27,10 @@ from deepaccident_devkit.evaluation.results import ResultsWriter, read_results
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, motion_labels
 from deepaccident_devkit.render.colors import CATEGORY_COLORS, COLLIDER_COLOR, COMPANION_COLOR
-from deepaccident_devkit.render.replay import pictures, render_replay
-from deepaccident_devkit.render.replay.page import replay_page
-from deepaccident_devkit.render.replay.pictures import camera_pictures
+from deepaccident_devkit.render.replay import render_replay, sensors
 from deepaccident_devkit.render.replay.recording import recording_of
-from deepaccident_devkit.render.replay.replay import SIZE_LIMIT
+from deepaccident_devkit.render.replay.replay import SIZE_LIMIT, replay_page
+from deepaccident_devkit.render.replay.sensors import camera_pictures
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 from deepaccident_devkit.v2x.tracks import scenario_tracks
@@ -213,7 +212,7 @@ def test_pictures_keep_the_limit_and_at_last_become_fewer(da: DeepAccident, how:
 
 def test_a_wrong_estimate_does_not_break_the_limit(da: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:
     """The size of all is estimated from a black picture, which is smaller than any other."""
-    monkeypatch.setattr(pictures, "_probes", lambda _: [np.zeros((36, 64, 3), dtype=np.uint8)])
+    monkeypatch.setattr(sensors, "_probes", lambda _: [np.zeros((36, 64, 3), dtype=np.uint8)])
     taken = camera_pictures(recording_of(da, accident(da), None), 50_000)
     sizes = [len(each) for cameras in taken.jpegs.values() for all_ in cameras.values() for each in all_ if each]
     assert len(sizes) == 60

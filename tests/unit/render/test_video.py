@@ -18,10 +18,10 @@ from video_views import STEP, colors, grey
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
 from deepaccident_devkit.render import detached_figure
+from deepaccident_devkit.render.accident import draw_countdown
 from deepaccident_devkit.render.camera import render_sample_data
 from deepaccident_devkit.render.colors import COLLIDER_COLOR, COMPANION_COLOR
 from deepaccident_devkit.render.video import VIEWS, render_scenario_video
-from deepaccident_devkit.render.video.countdown import draw_countdown
 from deepaccident_devkit.render.video.views import Scene, names_at, views_of
 from deepaccident_devkit.render.video.writers import write_video
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS

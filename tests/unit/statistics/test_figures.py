@@ -7,15 +7,13 @@ import pytest
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.render import detached_figure
-from deepaccident_devkit.render.statistics import (
-    STATISTICS_FIGURES,
+from deepaccident_devkit.render.statistics import STATISTICS_FIGURES, render_statistics, save_statistics
+from deepaccident_devkit.render.statistics_panels import (
     render_angles,
     render_counts,
     render_histogram,
     render_quantiles,
     render_relative_positions,
-    render_statistics,
-    save_statistics,
 )
 from deepaccident_devkit.statistics import DatasetStatistics, dataset_statistics
 

@@ -1,7 +1,8 @@
-"""The cameras' pictures, made as small as it takes for the page to fit into a mail."""
+"""What the sensors recorded, made small enough for the page: the cameras' pictures, and one agent's LiDAR points."""
 
 from __future__ import annotations
 
+import base64
 import io
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -9,10 +10,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
+
+import numpy as np
 
 from deepaccident_devkit.arrays import ByteArray
-from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.errors import ConfigError, MissingFileError
 from deepaccident_devkit.parallel import run_batch
 from deepaccident_devkit.release import read_image
 from deepaccident_devkit.render.replay.recording import Recording
@@ -28,6 +31,13 @@ _PROBED: Final = 12
 """Pictures from which the size of all is estimated."""
 _QUALITY_RANGE: Final = (1, 95)
 _LEAST_WIDTH: Final = 32
+_CELL: Final = 0.4
+"""Metres: of the points in such a square one is kept."""
+_MOST: Final = 1500
+_LEAST_HEIGHT: Final = 0.3
+"""Metres above the ground: the road itself says nothing from above."""
+_GROUND: Final = 5.0
+"""Percentile of the points' heights that is the ground: the ego frame of the pole is not on it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -185,3 +195,36 @@ def _jpeg(image: ByteArray, settings: PictureSettings) -> bytes:
     written = io.BytesIO()
     picture.save(written, "JPEG", quality=settings.quality, optimize=True)
     return written.getvalue()
+
+
+def lidar_points(recording: Recording, agent: str) -> list[str | None] | None:
+    """A cloud a frame: int16 x and y in turn, little-endian, in decimetres from the origin, as base64.
+
+    Returns:
+        None where files are missing; None as a whole if all are.
+
+    Raises:
+        SensorFileError: a file cannot be read.
+    """
+    clouds = [_cloud(recording, recording.sample(agent, frame)) for frame in recording.frames]
+    return clouds if any(cloud is not None for cloud in clouds) else None
+
+
+def _cloud(recording: Recording, sample: str) -> str | None:
+    dataset = recording.dataset
+    try:
+        cloud = dataset.load_point_cloud(sample, "ego")
+    except MissingFileError:
+        return None
+    height = cloud.xyz[:, 2]
+    ground = np.percentile(height, _GROUND) if len(height) else 0.0
+    raised = cloud.xyz[height > ground + _LEAST_HEIGHT]
+    world = dataset.world_from(sample, "ego").apply(raised)[:, :2] - recording.origin
+    cells = np.floor(world / _CELL).astype(np.int64)
+    _, first = np.unique(cells, axis=0, return_index=True)
+    kept = world[first[:: max(1, -(-len(first) // _MOST))]]
+    return _coded(np.clip(np.rint(kept * 10), -(2**15), 2**15 - 1))
+
+
+def _coded(decimetres: Any) -> str:
+    return base64.b64encode(decimetres.astype("<i2").tobytes()).decode("ascii")
