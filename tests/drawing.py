@@ -37,3 +37,13 @@ def has_color(picture: Any, place: Any, color: str, *, within: float = 2.0, tole
     near = np.hypot(columns + 0.5 - place[0], rows + 0.5 - place[1]) <= within
     distance = np.abs(picture[near] - np.array(to_rgb(color)) * 255).max(axis=1)
     return bool((distance < tolerance).any())
+
+
+def words(ax: Axes) -> str:
+    """The title and the texts on the axes, a line each."""
+    return "\n".join([ax.get_title(), *(text.get_text() for text in ax.texts)])
+
+
+def picture(ax: Axes) -> Any:
+    """The first image on the axes, as it was given."""
+    return np.asarray(ax.images[0].get_array())

@@ -28,12 +28,7 @@ from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels, motion_l
 from deepaccident_devkit.render.axes import figure_or_new, settled, titled_from_above
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.outcomes.accident import ACCIDENT_LAYERS, draw_accident_outcome, verdict_words
-from deepaccident_devkit.render.outcomes.detection import (
-    DETECTION_LAYERS,
-    WINDOW,
-    draw_detection_outcome,
-    draw_true,
-)
+from deepaccident_devkit.render.outcomes.detection import DETECTION_LAYERS, WINDOW, draw_detection_outcome, draw_true
 from deepaccident_devkit.render.outcomes.motion import MOTION_LAYERS, draw_motion_side, motion_outcome
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 

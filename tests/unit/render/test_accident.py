@@ -1,21 +1,23 @@
 """The countdown to an impact: which cameras, which moments, what is at which place, and the words."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from matplotlib.collections import PolyCollection
-from matplotlib.colors import to_hex
+from matplotlib.colors import to_hex, to_rgba
 from numpy.testing import assert_allclose
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
-from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.render import detached_figure
-from deepaccident_devkit.render.accident import accident_words, render_accident
-from deepaccident_devkit.render.best_view import best_camera, best_view
+from deepaccident_devkit.render.accident import accident_words, draw_countdown, render_accident
+from deepaccident_devkit.render.best_view import best_view
 from deepaccident_devkit.render.colors import COLLIDER_COLOR
-from deepaccident_devkit.taxonomy import CAMERAS
+from deepaccident_devkit.render.video import render_scenario_video
+from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
+from deepaccident_devkit.v2x import collision
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 
@@ -27,6 +29,12 @@ def drawn(da: DeepAccident, scenario: Any, **how: Any) -> Any:
     figure = detached_figure((8, 8))
     assert render_accident(da, scenario, fig=figure, **how) is figure
     return figure
+
+
+@pytest.fixture(scope="module")
+def accident(da: DeepAccident) -> str:
+    token: str = accident_of(da)["token"]
+    return token
 
 
 def test_a_column_a_moment_and_a_row_an_agent(da: DeepAccident) -> None:
@@ -112,6 +120,33 @@ def test_what_cannot_be_counted_down_to_is_named(da_motion: DeepAccident) -> Non
         drawn(da_motion, accident_of(da_motion), layers=["bev"])
 
 
-def test_where_no_camera_sees_the_boxes_it_is_the_front_one(da: DeepAccident) -> None:
-    nobody = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [])
-    assert best_camera(da, da.sample[0]["token"], nobody) == "Camera_Front"
+def test_the_countdown_has_five_cameras_and_the_pair_at_its_place(da: DeepAccident, accident: str) -> None:
+    fig = detached_figure((12.8, 7.2))
+    draw_countdown(da, f"{accident}/004", AGENTS, None, fig)
+    agents = [ax.get_title().split(":")[0] for ax in fig.axes if "Camera_" in ax.get_title()]
+    assert agents == ["ego", "ego behind", "other", "other behind", "infrastructure"]
+    assert fig.get_suptitle() == "0.2 s to the impact"
+    above = next(ax for ax in fig.axes if ax.get_title().startswith("from above"))
+    contact = collision(da, accident)
+    assert contact is not None
+    tracks = [da.track.get(f"{accident}/004/actor/{actor}") for actor in contact.actor_ids]
+    (boxes,) = [each for each in above.collections if isinstance(each, PolyCollection)][-1:]
+    red = [np.allclose(color[:3], to_rgba(COLLIDER_COLOR)[:3]) for color in boxes.get_edgecolor()]
+    places = [path.vertices[:4].mean(axis=0) for path, is_red in zip(boxes.get_paths(), red, strict=True) if is_red]
+    wanted = sorted(tuple(track["translation"][:2]) for track in tracks)
+    np.testing.assert_allclose(sorted(map(tuple, places)), wanted, atol=0.05)
+
+
+def test_an_agent_that_is_not_asked_for_has_an_empty_place(da: DeepAccident, accident: str) -> None:
+    fig = detached_figure((12.8, 7.2))
+    draw_countdown(da, f"{accident}/006", ["infrastructure"], ["boxes"], fig)
+    assert sum(ax.axison for ax in fig.axes) == 3  # a camera, from above, speeds
+    assert not any(ax.images for ax in fig.axes)
+    assert fig.get_suptitle() == "the impact"
+
+
+def test_nothing_to_count_down_to_is_said(da: DeepAccident, tmp_path: Path) -> None:
+    normal = next(record["token"] for record in da.scenario if not record["collision"])
+    with pytest.raises(NotAvailableError, match=r"nobody collides in it.*the view 'frame'"):
+        render_scenario_video(da, normal, tmp_path / "v.gif", what="accident", workers=1, progress=False)
+    assert not list(tmp_path.iterdir())

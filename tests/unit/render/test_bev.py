@@ -20,22 +20,14 @@ from deepaccident_devkit.render.bev import BevView, draw_bev, draw_underlay, ren
 from deepaccident_devkit.render.colors import (
     AGENT_COLORS,
     BEV_COLORS,
-    CATEGORY_COLORS,
     COLLIDER_COLOR,
     COMPANION_COLOR,
     OWN_COLOR,
     POINT_COLOR,
 )
-from deepaccident_devkit.render.roles import collider_ids, companion_ids, role_colors, short_name
+from deepaccident_devkit.render.roles import collider_ids, short_name
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID
 from deepaccident_devkit.v2x import Link, PoseNoise, cooperative_boxes
-
-
-@pytest.fixture(scope="module")
-def accident(da: DeepAccident) -> str:
-    """The ego's third sample in a scenario that ends in a collision."""
-    scenario = next(one for one in da.scenario if one["collision"] is not None)
-    return f"{scenario['token']}/ego_vehicle/003"
 
 
 def of_kind(ax: Any, kind: type) -> list[Any]:
@@ -49,10 +41,10 @@ def outlines(ax: Any) -> dict[tuple[float, ...], str]:
     return dict(zip(corners, map(to_hex, boxes.get_edgecolor()), strict=True))
 
 
-def test_boxes_and_points_are_where_the_sample_has_them(da: DeepAccident, accident: str) -> None:
+def test_boxes_and_points_are_where_the_sample_has_them(da: DeepAccident, approach: str) -> None:
     ax = new_axes()
-    assert render_bev(da, accident, view_range=30, ax=ax) is ax
-    boxes, cloud = da.boxes(accident, "ego"), da.load_point_cloud(accident, "ego").xyz
+    assert render_bev(da, approach, view_range=30, ax=ax) is ax
+    boxes, cloud = da.boxes(approach, "ego"), da.load_point_cloud(approach, "ego").xyz
     near = boxes.select((np.abs(boxes.center[:, :2]) < 35).all(axis=1))
     expected = {tuple(np.round(corners[:, :2].ravel(), 6)) for corners in near.bottom_corners()}
     assert set(outlines(ax)) == expected
@@ -63,42 +55,13 @@ def test_boxes_and_points_are_where_the_sample_has_them(da: DeepAccident, accide
     assert plt.get_fignums() == []
 
 
-def test_the_outline_of_a_collider_is_red_within_two_pixels_of_its_corners(da: DeepAccident, accident: str) -> None:
-    ax = render_bev(da, accident, layers=("boxes",), ax=new_axes())
+def test_the_outline_of_a_collider_is_red_within_two_pixels_of_its_corners(da: DeepAccident, approach: str) -> None:
+    ax = render_bev(da, approach, layers=("boxes",), ax=new_axes())
     picture = rendered(ax)
-    boxes = da.boxes(accident, "ego")
-    other = boxes.select(boxes.actor_id == next(iter(collider_ids(da, accident) - {OWN_ACTOR_ID})))
+    boxes = da.boxes(approach, "ego")
+    other = boxes.select(boxes.actor_id == next(iter(collider_ids(da, approach) - {OWN_ACTOR_ID})))
     for place in on_canvas(ax, other.bottom_corners()[0, :, :2]):
         assert has_color(picture, place, COLLIDER_COLOR)
-
-
-def test_the_pair_is_red_their_companions_green_and_the_rest_by_category(da: DeepAccident, accident: str) -> None:
-    boxes = da.boxes(accident, "ego")
-    colors = dict(zip(boxes.actor_id.tolist(), role_colors(da, accident, boxes), strict=True))
-    scenario = da.get("scenario", accident.rsplit("/", 2)[0])
-    agents = {name: da.get("agent", f"{scenario['token']}/{name}")["actor_id"] for name in AGENTS[:4]}
-    assert colors[OWN_ACTOR_ID] == COLLIDER_COLOR
-    assert {actor for actor, color in colors.items() if color == COLLIDER_COLOR} == {
-        OWN_ACTOR_ID,
-        agents["other_vehicle"],
-    }
-    behind = {agents["ego_vehicle_behind"], agents["other_vehicle_behind"]}
-    assert companion_ids(da, accident) == behind
-    assert {actor for actor, color in colors.items() if color == COMPANION_COLOR} == behind & set(colors)
-    for actor, category, color in zip(
-        boxes.actor_id.tolist(), boxes.category_names, role_colors(da, accident, boxes), strict=True
-    ):
-        if actor not in {OWN_ACTOR_ID, *agents.values()}:
-            assert color == CATEGORY_COLORS[category]
-
-
-def test_an_agent_has_its_part_s_colour_in_its_own_label_and_in_the_union(da: DeepAccident, accident: str) -> None:
-    sample = accident.replace("ego_vehicle/", "ego_vehicle_behind/")
-    assert OWN_ACTOR_ID in companion_ids(da, sample)
-    union = cooperative_boxes(da, accident, frame="ego")
-    colors = dict(zip(union.actor_id.tolist(), role_colors(da, accident, union), strict=True))
-    pair = set(da.get("scenario", accident.rsplit("/", 2)[0])["collision"]["ids"])
-    assert {actor for actor, color in colors.items() if color == COLLIDER_COLOR} == pair
 
 
 def test_without_a_collision_nobody_is_red(da: DeepAccident) -> None:
@@ -109,9 +72,9 @@ def test_without_a_collision_nobody_is_red(da: DeepAccident) -> None:
     assert COMPANION_COLOR in outlines(ax).values()
 
 
-def test_of_several_agents_each_has_its_colour_its_name_and_its_place(da: DeepAccident, accident: str) -> None:
-    ax = render_bev(da, accident, agents=None, frame="world", view_range=80, ax=new_axes())
-    scenario, _, number = accident.rsplit("/", 2)
+def test_of_several_agents_each_has_its_colour_its_name_and_its_place(da: DeepAccident, approach: str) -> None:
+    ax = render_bev(da, approach, agents=None, frame="world", view_range=80, ax=new_axes())
+    scenario, _, number = approach.rsplit("/", 2)
     clouds = of_kind(ax, PathCollection)
     assert [to_hex(one.get_facecolor()[0]) for one in clouds] == list(AGENT_COLORS.values())
     marks = of_kind(ax, PolyCollection)[-1]
@@ -125,20 +88,20 @@ def test_of_several_agents_each_has_its_colour_its_name_and_its_place(da: DeepAc
     assert entries[:2] == ["colliding pair", "companion"]
     assert entries[-5:] == ["ego", "ego behind", "other", "other behind", "infrastructure"]
     center = np.mean([ax.get_xlim(), ax.get_ylim()], axis=1)
-    assert_allclose(center, da.world_from(accident, "ego").translation[:2])
+    assert_allclose(center, da.world_from(approach, "ego").translation[:2])
 
 
-def test_several_agents_boxes_are_drawn_once_an_actor(da: DeepAccident, accident: str) -> None:
-    ax = render_bev(da, accident, agents=("ego_vehicle", "infrastructure"), layers=["boxes"], ax=new_axes())
-    union = cooperative_boxes(da, accident, agents=("ego_vehicle", "infrastructure"), frame="ego")
+def test_several_agents_boxes_are_drawn_once_an_actor(da: DeepAccident, approach: str) -> None:
+    ax = render_bev(da, approach, agents=("ego_vehicle", "infrastructure"), layers=["boxes"], ax=new_axes())
+    union = cooperative_boxes(da, approach, agents=("ego_vehicle", "infrastructure"), frame="ego")
     near = union.select((np.abs(union.center[:, :2]) < 55).all(axis=1))
     assert set(outlines(ax)) == {tuple(np.round(one[:, :2].ravel(), 6)) for one in near.bottom_corners()}
 
 
-def test_a_link_moves_what_a_partner_sends_and_not_the_partner_s_mark(da: DeepAccident, accident: str) -> None:
+def test_a_link_moves_what_a_partner_sends_and_not_the_partner_s_mark(da: DeepAccident, approach: str) -> None:
     both = ("ego_vehicle", "infrastructure")
     link = Link(pose_noise=PoseNoise(mean=3.0, std=0.0))
-    true, wrong = (render_bev(da, accident, agents=both, link=one, ax=new_axes()) for one in (None, link))
+    true, wrong = (render_bev(da, approach, agents=both, link=one, ax=new_axes()) for one in (None, link))
     before, after = (np.asarray(of_kind(ax, PathCollection)[0].get_offsets()) for ax in (true, wrong))
     assert_allclose(before, after)
     first, second = (np.asarray(of_kind(ax, PathCollection)[1].get_offsets()) for ax in (true, wrong))
@@ -147,18 +110,18 @@ def test_a_link_moves_what_a_partner_sends_and_not_the_partner_s_mark(da: DeepAc
     assert_allclose(marks[0], marks[1])
 
 
-def test_sweeps_add_the_points_of_the_frames_before(da: DeepAccident, accident: str) -> None:
+def test_sweeps_add_the_points_of_the_frames_before(da: DeepAccident, approach: str) -> None:
     counts = [
-        len(of_kind(render_bev(da, accident, sweeps=sweeps, ax=new_axes()), PathCollection)[0].get_offsets())
+        len(of_kind(render_bev(da, approach, sweeps=sweeps, ax=new_axes()), PathCollection)[0].get_offsets())
         for sweeps in (1, 3)
     ]
     assert 2.5 * counts[0] < counts[1] < 3.5 * counts[0]
 
 
-def test_each_layer_draws_its_own_and_nothing_else(da: DeepAccident, accident: str) -> None:
+def test_each_layer_draws_its_own_and_nothing_else(da: DeepAccident, approach: str) -> None:
     kinds = {}
     for layer in ("bev", "points", "boxes", "ids", "velocities", "trajectories"):
-        ax = render_bev(da, accident, layers=[layer], ax=new_axes())
+        ax = render_bev(da, approach, layers=[layer], ax=new_axes())
         drawn = {type(one).__name__ for one in ax.collections[:-1]} | {type(one).__name__ for one in ax.images}
         kinds[layer] = drawn | {"text" for _ in ax.texts}
     assert kinds == {
@@ -172,14 +135,14 @@ def test_each_layer_draws_its_own_and_nothing_else(da: DeepAccident, accident: s
 
 
 def test_trajectories_fade_from_the_present_to_where_the_actors_were_and_will_be(
-    da: DeepAccident, accident: str
+    da: DeepAccident, approach: str
 ) -> None:
     ax = new_axes()
-    render_bev(da, accident, layers=["trajectories"], seconds=(0.2, 0.3), view_range=25, ax=ax)
+    render_bev(da, approach, layers=["trajectories"], seconds=(0.2, 0.3), view_range=25, ax=ax)
     past, future = of_kind(ax, LineCollection)
-    scenario, _, number = accident.rsplit("/", 2)
+    scenario, _, number = approach.rsplit("/", 2)
     own = da.get("agent", f"{scenario}/ego_vehicle")["actor_id"]
-    path = da.trajectory(f"{scenario}/actor/{own}", accident, "ego")
+    path = da.trajectory(f"{scenario}/actor/{own}", approach, "ego")
     there = {int(index): center[:2] for index, center in zip(path.index, path.center, strict=True)}
     present = int(number)
     ahead = [[there[one], there[one + 1]] for one in range(present, present + 3)]
@@ -214,9 +177,9 @@ def test_the_bev_camera_lies_under_the_picture_the_right_way_round(x: float, y: 
         assert not has_color(picture, place, BEV_COLORS["vehicle"], within=1.0, tolerance=3)
 
 
-def test_a_picture_can_be_centred_elsewhere(da: DeepAccident, accident: str) -> None:
+def test_a_picture_can_be_centred_elsewhere(da: DeepAccident, approach: str) -> None:
     ax = new_axes()
-    colors = draw_bev(da, accident, BevView(view_range=8, center=(20.0, 5.0)), frozenset(("bev", "boxes")), ax)
+    colors = draw_bev(da, approach, BevView(view_range=8, center=(20.0, 5.0)), frozenset(("bev", "boxes")), ax)
     assert (ax.get_xlim(), ax.get_ylim()) == ((12, 28), (-3, 13))
     assert colors == set(outlines(ax).values())
 
@@ -227,21 +190,21 @@ def test_a_release_without_sensor_files_is_drawn_from_its_labels(da_b: DeepAccid
     assert len(outlines(ax)) > 5
 
 
-def test_words_say_when_and_whose(da: DeepAccident, accident: str) -> None:
-    ax = render_bev(da, accident, ax=new_axes())
+def test_words_say_when_and_whose(da: DeepAccident, approach: str) -> None:
+    ax = render_bev(da, approach, ax=new_axes())
     assert ax.get_title() == "ego_vehicle, t = 0.2 s, 0.3 s to the impact"
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("x forward (m)", "y left (m)")
     sizes = [*ax.get_legend().get_texts(), *ax.get_xticklabels(), ax.title]
     assert min(one.get_fontsize() for one in sizes) >= 7
 
 
-def test_what_cannot_be_drawn_is_refused(da: DeepAccident, accident: str) -> None:
+def test_what_cannot_be_drawn_is_refused(da: DeepAccident, approach: str) -> None:
     with pytest.raises(ChoiceError, match=r"layers: expected any of .*, found 'image'"):
-        render_bev(da, accident, layers=["image"])
+        render_bev(da, approach, layers=["image"])
     with pytest.raises(ChoiceError, match="frame: expected one of world, ego, lidar, found 'Camera_Front'"):
-        render_bev(da, accident, frame="Camera_Front")  # type: ignore[arg-type]
+        render_bev(da, approach, frame="Camera_Front")  # type: ignore[arg-type]
     with pytest.raises(ChoiceError, match="agents: expected one of single"):
-        render_bev(da, accident, agents="ego_vehicle")
+        render_bev(da, approach, agents="ego_vehicle")
     assert plt.get_fignums() == []
 
 

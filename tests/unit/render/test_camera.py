@@ -13,18 +13,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render import render_pointcloud_in_image, render_sample_data
-from deepaccident_devkit.render.best_view import best_view, crop_about
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, DEPTH_COLORMAP, HEIGHT_COLORMAP
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, OWN_ACTOR_ID
 from deepaccident_devkit.v2x import map_pointcloud_to_image, project_to_image
 from deepaccident_devkit.v2x.projection import camera_of
-
-
-@pytest.fixture(scope="module")
-def behind(da: DeepAccident) -> str:
-    """The sample of the agent right behind a collider, at the impact."""
-    scenario = next(one for one in da.scenario if one["collision"] is not None)
-    return f"{scenario['token']}/ego_vehicle_behind/006"
 
 
 def test_the_box_of_a_collider_passes_within_two_pixels_of_its_corners(da: DeepAccident, behind: str) -> None:
@@ -135,36 +127,6 @@ def test_colours_that_points_cannot_have_and_sensors_without_image_are_refused(d
         render_pointcloud_in_image(da, f"{behind}/Camera_Front", color_by="time")  # type: ignore[arg-type]
     with pytest.raises(ChoiceError, match="camera: expected one of Camera_Front"):
         render_pointcloud_in_image(da, f"{behind}/lidar01", ax=new_axes())
-
-
-def test_the_best_view_of_the_vehicle_ahead_is_the_front_camera(da: DeepAccident, behind: str) -> None:
-    boxes = da.boxes(behind, "world")
-    ego = da.get("agent", f"{behind.rsplit('/', 2)[0]}/ego_vehicle")["actor_id"]
-    view = best_view(da, [behind], boxes.select(boxes.actor_id == ego))
-    assert view is not None
-    assert view.camera == f"{behind}/Camera_Front"
-    pixels, _ = camera_of(da, view.camera).project(da.boxes(behind, "Camera_Front").corners()[boxes.actor_id == ego][0])
-    low, high = pixels.min(axis=0).clip(0, (64, 36)), pixels.max(axis=0).clip(0, (64, 36))
-    assert_allclose(view.bounds, [*low, *high])
-    assert view.area == pytest.approx(float(np.prod(high - low)))
-
-
-def test_what_no_camera_sees_has_no_best_view(da: DeepAccident, behind: str) -> None:
-    boxes = da.boxes(behind, "world")
-    assert best_view(da, [behind], boxes.select(boxes.actor_id == OWN_ACTOR_ID)) is None
-
-
-@pytest.mark.parametrize("bounds", [(10.0, 10, 14, 12), (0.0, 0, 5, 5), (0.0, 0, 64, 36), (60.0, 30, 64, 36)])
-def test_a_crop_has_the_image_s_shape_holds_the_bounds_and_stays_inside(bounds: Any) -> None:
-    left, top, right, bottom = crop_about(bounds, width=64, height=36)
-    assert (right - left) / (bottom - top) == pytest.approx(64 / 36)
-    assert min(left, top) >= 0
-    assert right <= 64
-    assert bottom <= 36
-    assert left <= bounds[0]
-    assert top <= bounds[1]
-    assert right >= bounds[2]
-    assert bottom >= bounds[3]
 
 
 def test_every_camera_can_be_drawn_with_all_its_layers(da: DeepAccident, behind: str) -> None:

@@ -15,15 +15,6 @@ from deepaccident_devkit.render import detached_figure, render_instance
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.render.sights import sightings
 from deepaccident_devkit.taxonomy import AGENTS
-from deepaccident_devkit.v2x import visible_instances
-
-
-@pytest.fixture(scope="module")
-def other(da: DeepAccident) -> str:
-    """The other vehicle, which the ego collides with."""
-    scenario = next(one for one in da.scenario if one["collision"] is not None)
-    actor = da.get("agent", f"{scenario['token']}/other_vehicle")["actor_id"]
-    return f"{scenario['token']}/actor/{actor}"
 
 
 def drawn(da: DeepAccident, instance: str, **how: Any) -> tuple[Any, dict[str, Any]]:
@@ -63,24 +54,6 @@ def test_speed_and_points_are_drawn_over_time(da: DeepAccident, other: str) -> N
     assert_array_equal(lines["ego"].get_ydata(), known.points)
     assert to_hex(lines["ego"].get_color()) == AGENT_COLORS["ego_vehicle"]
     assert panels["speed"].lines[-1].get_xdata() == [0.5, 0.5]
-
-
-@pytest.mark.parametrize("agent", AGENTS)
-def test_sightings_are_the_agent_s_annotations_and_the_released_rule(da: DeepAccident, other: str, agent: str) -> None:
-    scenario, actor = other.split("/actor/")
-    known = sightings(da, scenario, agent, int(actor))
-    points, camera, seen = {}, {}, []
-    for index in range(1, 7):
-        sample = f"{scenario}/{agent}/{index:03d}"
-        for annotation in da.annotation:
-            if annotation["sample_token"] == sample and annotation["actor_id"] == int(actor):
-                points[index], camera[index] = annotation["num_lidar_pts"], annotation["camera_visible"]
-                seen.append(other in visible_instances(da, sample, agents=[agent]))
-    assert known.index.tolist() == list(points)
-    assert known.points.tolist() == list(points.values())
-    assert known.camera.tolist() == list(camera.values())
-    assert known.seen.tolist() == seen
-    assert (agent == "other_vehicle") == (len(points) == 0)
 
 
 def test_a_bar_an_agent_says_when_it_sees_the_actor(da: DeepAccident, other: str) -> None:

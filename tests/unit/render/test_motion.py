@@ -1,27 +1,38 @@
-"""Pictures of motion labels: what is drawn where, in which colour, and what is not."""
+"""Pictures of motion labels and predictions: what is drawn where, in which colour, and what is not."""
 
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from drawing import new_axes, picture
+from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
 from matplotlib.quiver import Quiver
 from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.evaluation import MotionOutput, instances_of
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
 from deepaccident_devkit.motion import (
     OWN_BOX_ID,
     FramePolygons,
+    MotionHeads,
     MotionLabelConfig,
     MotionLabels,
     labels_from_polygons,
 )
-from deepaccident_devkit.render import detached_figure, draw_motion_labels, draw_motion_map
+from deepaccident_devkit.render import (
+    detached_figure,
+    draw_motion_labels,
+    draw_motion_map,
+    draw_motion_output,
+    draw_motion_trail,
+)
 from deepaccident_devkit.render.colors import COLLIDER_COLOR, OWN_COLOR
+from deepaccident_devkit.render.motion_cells import PALEST
 from deepaccident_devkit.render.roles import collider_ids
 
 CONFIG = MotionLabelConfig(
@@ -50,14 +61,6 @@ def panel(labels: MotionLabels, name: Any, frame: int = 0, **how: Any) -> Any:
     return ax
 
 
-def picture(ax: Any) -> Any:
-    return np.asarray(ax.images[0].get_array())
-
-
-def arrows(ax: Any) -> list[Quiver]:
-    return [one for one in ax.collections if isinstance(one, Quiver)]
-
-
 def color_at(ax: Any, x: float, y: float) -> Any:
     """The colour of the cell that a point in metres lies in."""
     left, right, low, high = ax.images[0].get_extent()
@@ -65,6 +68,10 @@ def color_at(ax: Any, x: float, y: float) -> Any:
     assert ax.images[0].origin == "lower"
     row, column = (y - low) / (high - low) * colors.shape[0], (x - left) / (right - left) * colors.shape[1]
     return colors[int(row), int(column)]
+
+
+def arrows(ax: Any) -> list[Quiver]:
+    return [one for one in ax.collections if isinstance(one, Quiver)]
 
 
 def test_instances_are_where_they_are_and_have_their_colours() -> None:
@@ -147,3 +154,57 @@ def test_what_is_not_there_is_named() -> None:
     for frame in (-1, 3):
         with pytest.raises(ChoiceError, match=f"frame: expected 0 to 2, found {frame}"):
             panel(two_cars(), "flow", frame)
+
+
+def test_a_trail_is_opaque_at_the_present_and_paler_after(labels: MotionLabels) -> None:
+    grid, instance = labels.config.grid, np.zeros((3, *labels.config.grid.shape), dtype=np.int32)
+    for frame, column in enumerate((50, 56, 62)):
+        instance[frame, 100:104, column : column + 8] = 1
+    ax = draw_motion_trail(instances_of(instance, grid), marked={1}, ax=new_axes())
+    red, cells = np.array(to_rgb(COLLIDER_COLOR)), picture(ax)
+    assert_allclose(cells[101, 51], red)
+    assert_allclose(cells[101, 57], red)  # the present is on top
+    assert_allclose(cells[101, 60], 1 - (1 + PALEST) / 2 * (1 - red))
+    assert_allclose(cells[101, 69], 1 - PALEST * (1 - red))
+    assert_allclose(cells[90, 51], 1)
+    (path,) = next(each for each in ax.collections if isinstance(each, LineCollection)).get_segments()
+    assert_allclose(path, [(-50 + 0.5 * (column + 4), 1.0) for column in (50, 56, 62)])
+    none = draw_motion_trail(instances_of(instance, grid), layers=["ids"], ax=new_axes())
+    assert not none.images
+    assert [text.get_text() for text in none.texts] == ["1"]
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+def test_outputs_are_drawn_as_they_lie(labels: MotionLabels, orientation: Any) -> None:
+    heads = MotionHeads.from_labels(labels).in_orientation(orientation)
+    output = MotionOutput(grid=labels.config.grid.with_orientation(orientation), heads=(heads,))
+    ax = draw_motion_map(output, "instance", 0, ax=new_axes())
+    assert_array_equal((picture(ax) != 1).any(axis=-1), labels.segmentation[0] == 1)
+    for name in ("offset", "flow"):
+        mine = picture(draw_motion_map(output, name, 0, ax=new_axes()))
+        assert_allclose(mine, picture(draw_motion_map(labels, name, 0, ax=new_axes())), atol=1e-6)
+
+
+def test_outputs_have_the_rows_that_they_have(labels: MotionLabels) -> None:
+    output = MotionOutput(grid=labels.config.grid, heads=(MotionHeads.from_labels(labels),))
+    figure = draw_motion_output(output, fig=detached_figure((10, 8)))
+    assert len(figure.axes) == 4 * (5 + 1)
+    alone = instances_of(labels.instance, labels.config.grid)
+    assert len(draw_motion_output(alone, fig=detached_figure((10, 3))).axes) == 5 + 1
+    assert len(draw_motion_output(alone, style="trail", fig=detached_figure((6, 5))).axes) == 2
+    with pytest.raises(ChoiceError, match="map: this prediction has instance alone, not flow; give heads for it"):
+        draw_motion_map(alone, "flow", 0, ax=new_axes())
+    with pytest.raises(ChoiceError, match="prediction: expected a number from 0 to 0, or from the end, found 1"):
+        draw_motion_output(alone, number=1)
+    with pytest.raises(ChoiceError, match="style: expected one of maps, trail, found 'film'"):
+        draw_motion_output(alone, style="film")  # type: ignore[arg-type]
+
+
+def test_labels_as_a_trail(da_motion: DeepAccident, sample: str) -> None:
+    figure = da_motion.render_motion_labels(sample, style="trail", fig=detached_figure((6, 6)))
+    assert len(figure.axes) == 2
+    assert figure.get_suptitle() == sample
+    with pytest.raises(ChoiceError, match="trail: each frame is in its own ego frame; warp the labels"):
+        da_motion.render_motion_labels(sample, style="trail", at_present=False)
+    with pytest.raises(ChoiceError, match=r"layers: expected any of .*, found 'velocities'"):
+        da_motion.render_motion_labels(sample, style="trail", layers=["velocities"])

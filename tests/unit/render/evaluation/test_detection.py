@@ -1,0 +1,31 @@
+"""Panels of detection results: what they draw is what the result says."""
+
+import pytest
+from drawing import new_axes, words
+from numpy.testing import assert_array_equal
+
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.evaluation.detection import DetectionEvaluator, DetectionResult
+from deepaccident_devkit.render.evaluation import render_average_precisions, render_precision_recall
+
+
+def test_precision_is_drawn_up_to_the_recall_that_is_reached(detected: DetectionResult) -> None:
+    ax = render_precision_recall(detected, "car", ax=new_axes())
+    assert_array_equal(ax.lines[0].get_xydata(), [(0.25, 1), (0.5, 0.5), (0.75, 0.5)])
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["0.5: AP 50.0 %", "2: AP 75.0 %"]
+    assert words(ax) == "car: 8 true, 9 detected"
+    ax = render_precision_recall(detected, "truck", ax=new_axes())
+    assert not ax.lines
+    assert "none in the truth" in words(ax)
+    with pytest.raises(ChoiceError, match="name: expected one of car, van, truck, found 'bus'"):
+        render_precision_recall(detected, "bus")
+    with pytest.raises(ChoiceError, match="ring: expected 0 to 0, found 1"):
+        render_precision_recall(detected, "car", ring=1)
+
+
+def test_bars_are_average_precisions(detected: DetectionResult) -> None:
+    ax = render_average_precisions(detected, ax=new_axes())
+    assert [bar.get_width() for bar in ax.patches] == [62.5, 25.0]
+    assert [text.get_text() for text in ax.texts] == ["62.5 %", "25.0 %", "–"]
+    assert [label.get_text() for label in ax.get_yticklabels()] == ["car\n8 true", "van\n4 true", "truck\n0 true"]
+    render_average_precisions(DetectionEvaluator("paper").compute(), ax=new_axes()).figure.draw_without_rendering()

@@ -1,0 +1,116 @@
+"""Reports of runs: all in one file, nothing from outside, partial ones marked everywhere, names harmless."""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from evaluation_runs import PARTIAL, evaluation_run
+from PIL import Image
+from report_page import page_of
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.evaluation.headlines import headlines
+from deepaccident_devkit.evaluation.setups import EvaluationSetup
+from deepaccident_devkit.render.evaluation import save_report
+from deepaccident_devkit.render.evaluation.figures import run_figures
+
+SETUPS = (
+    EvaluationSetup(task="motion"),
+    EvaluationSetup(task="accident", protocol="boxes"),
+    EvaluationSetup(task="accident", protocol="paper"),
+    EvaluationSetup(task="detection"),
+    EvaluationSetup(task="warning", protocol="boxes"),
+)
+
+
+def red_pixels(path: Path) -> int:
+    with Image.open(path) as picture:
+        return int((np.abs(np.asarray(picture.convert("RGB")) - (176, 0, 32)).max(axis=-1) < 8).sum())
+
+
+EVIL = '</script><script>alert("x")</script><img src=http://x.example/y.png onerror=alert(1)>&'
+
+
+@pytest.mark.parametrize("setup", SETUPS, ids=lambda setup: f"{setup.task} {setup.protocol}")
+def test_a_report_holds_all_and_asks_for_nothing(
+    setup: EvaluationSetup, da_motion: DeepAccident, tokens: list[str], tmp_path: Path
+) -> None:
+    run = evaluation_run(da_motion, setup, tokens)
+    page = page_of(save_report(run, tmp_path))
+    figures = sorted((tmp_path / "figures").iterdir())
+    assert [path.stem for path in figures] == sorted(each.name for each in run_figures(run))
+    assert len(page.all("img")) == len(figures) >= 4
+    for image in page.all("img"):
+        assert str(image["src"]).startswith("data:image/png;base64,")
+        assert len(str(image["alt"])) > 10
+    assert not [name for name, _ in page.found if name in ("script", "link", "iframe", "object", "form")]
+    assert {str(link["href"])[0] for link in page.all("a")} == {"#"}
+    assert {str(link["href"])[1:] for link in page.all("a")} == {str(each["id"]) for each in page.all("section")}
+    assert "PARTIAL" not in page.text
+    assert not any(map(red_pixels, figures))
+    for headline in headlines(setup.task, run.result):
+        assert headline.name in page.text
+        assert headline.text() in page.text
+    for told in (run.release.fingerprint, run.results.fingerprint, setup.protocol, "deepaccident evaluate verify"):
+        assert told in page.text
+    for switch in re.findall(r"'(\w+)':", str(run.setup.as_dict()["settings"])):
+        assert switch in page.text
+
+
+def test_the_same_run_makes_the_same_bytes(da_motion: DeepAccident, tokens: list[str], tmp_path: Path) -> None:
+    runs = [evaluation_run(da_motion, SETUPS[2], tokens[::2]) for _ in range(2)]
+    path = save_report(runs[0], tmp_path)
+    before = {each: each.read_bytes() for each in (path, *(tmp_path / "figures").iterdir())}
+    save_report(runs[1], tmp_path)
+    assert before == {each: each.read_bytes() for each in (path, *(tmp_path / "figures").iterdir())}
+    with pytest.raises(ConfigError, match="is a file; give a folder"):
+        save_report(runs[0], path)
+
+
+def test_a_partial_run_says_so_everywhere(da_motion: DeepAccident, tokens: list[str], tmp_path: Path) -> None:
+    page = page_of(save_report(evaluation_run(da_motion, SETUPS[1], tokens, partial=PARTIAL), tmp_path))
+    marks = page.text.count("PARTIAL: 120 of 180 samples, 2 predictions left out")
+    assert marks == 1 + len(page.all("section"))
+    for path in (tmp_path / "figures").iterdir():
+        assert red_pixels(path) > 50, path
+        with Image.open(path) as picture:
+            assert str(picture.info["Description"]).startswith("PARTIAL: 120 of 180 samples")
+            assert "protocol boxes, devkit" in str(picture.info["Description"])
+
+
+def test_names_from_elsewhere_are_harmless(da_motion: DeepAccident, tokens: list[str], tmp_path: Path) -> None:
+    meta: Mapping[str, Any] = {"method": EVIL, EVIL: [{EVIL: EVIL}]}
+    sanity = {
+        "samples": 20,
+        "perfect": {"apa": 1.0},
+        "empty": {"apa": 0.0},
+        "given": {"apa": None},
+        "units": {"apa": "share"},
+        "candidates": [{"name": EVIL, "description": EVIL, "score": 0.5, "given": None, "suspected": True}],
+        "warnings": [EVIL],
+    }
+    explanation = {
+        "samples": 6,
+        "protocol": EVIL,
+        "units": {"apa": "share"},
+        "chosen": {"apa": 0.5},
+        "protocols": {EVIL: {"apa": 0.5}, "paper": {}},
+        "numbers": [
+            {"choice": EVIL, "headline": "apa", "value": 0.75, "change": 0.25, "changed": True},
+            {"choice": "idle=no", "headline": "apa", "value": 0.5, "change": 0.0, "changed": False},
+        ],
+        "refused": {EVIL: EVIL},
+    }
+    run = evaluation_run(da_motion, SETUPS[1], tokens, meta=meta, sanity=sanity, explanation=explanation)
+    path = save_report(run, tmp_path)
+    page = page_of(path)
+    assert not page.all("script")
+    assert all(str(image["src"]).startswith("data:") for image in page.all("img"))
+    assert page.text.count(EVIL) >= 11
+    assert "+0.250" in page.text
+    assert "No number changes with: idle=no." in page.text
+    assert "http" not in re.sub(r"http-equiv", "", path.read_text().replace("http://x.example/y.png", ""))

@@ -1,0 +1,67 @@
+"""Predictions beside labels, with the verdict of a protocol."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError, EvaluationError
+from deepaccident_devkit.evaluation import Accident, AccidentEvaluator, accident_context, box_truth, instances_of
+from deepaccident_devkit.evaluation.accident import PROTOCOLS, compared_accidents
+from deepaccident_devkit.motion import MotionLabels
+from deepaccident_devkit.render import detached_figure
+from deepaccident_devkit.render.outcomes.accident import verdict_words
+from deepaccident_devkit.render.outcomes.evaluation import render_evaluation
+
+
+def test_accidents_have_their_metres_and_verdict(da_motion: DeepAccident, sample: str) -> None:
+    true = box_truth(da_motion, sample).accident
+    assert true is not None
+    near = Accident(positions=true.positions + np.array([3.0, 0.0]), time=true.time + 0.5, score=0.9)
+    figure = render_evaluation(da_motion, sample, [near], fig=detached_figure((10, 6)))
+    left, right = figure.axes
+    assert figure.get_suptitle().endswith("accident: 5 m: FP + FN, 10 m: TP, 15 m: TP")
+    assert right.get_title() == f"an accident comes in {true.time:.1f} s; foreseen 6.0 m off in sum, +0.5 s"
+    assert [text.get_text() for text in right.texts] == [f"in {near.time:.1f} s, score 0.9", "3.0 m", "3.0 m"]
+    assert_allclose(left.lines[0].get_xydata(), true.positions)
+    assert_allclose(right.lines[1].get_xydata(), near.positions)
+    assert left.get_xlim() == right.get_xlim()
+    assert not left.texts
+    silent = render_evaluation(da_motion, sample, [], fig=detached_figure((10, 6)))
+    assert silent.get_suptitle().endswith("5 m: FN, 10 m: FN, 15 m: FN")
+    assert silent.axes[1].get_title().endswith("none is foreseen")
+
+
+@pytest.mark.parametrize("protocol", ["released", "paper", "boxes"])
+def test_motion_is_seen_as_accidents_by_every_protocol(
+    da_motion: DeepAccident, sample: str, labels: MotionLabels, protocol: str
+) -> None:
+    instance = np.zeros_like(labels.instance)
+    for frame, step in enumerate((0, 4, 8, 8, 8)):  # two that drive into each other
+        instance[frame, 100:104, 110 + step : 118 + step] = 1
+        instance[frame, 102:106, 139 - 2 * step : 147 - 2 * step] = 2
+    output = instances_of(instance, labels.config.grid)
+    figure = render_evaluation(
+        da_motion, sample, output, task="accident", protocol=protocol, fig=detached_figure((9, 5))
+    )
+    context = accident_context(da_motion, sample, 2.0)
+    rules = PROTOCOLS[protocol]
+    evaluator = AccidentEvaluator(rules)
+    evaluator.update(sample, output, labels, context)
+    assert figure.get_suptitle().endswith(verdict_words(evaluator.compute()))
+    compared = compared_accidents(output, labels, context, rules)
+    assert len(compared.predicted) == 1
+    true, predicted = (2 * [compared.true.positions] if compared.true else []), compared.predicted[0].positions
+    drawn = [line.get_xydata() for ax in figure.axes for line in ax.lines if line.get_marker() == "o"]
+    assert_allclose(drawn, true)
+    crosses = [line.get_xydata() for line in figure.axes[1].lines if line.get_marker() == "x"]
+    assert_allclose(crosses, [predicted])
+
+
+def test_what_cannot_be_evaluated_is_named(da_motion: DeepAccident, sample: str) -> None:
+    with pytest.raises(ChoiceError, match="task: expected accident of this prediction, found 'motion'"):
+        render_evaluation(da_motion, sample, [], task="motion")
+    with pytest.raises(EvaluationError, match="the released protocol compares motion"):
+        render_evaluation(da_motion, sample, [], protocol="released")
+    with pytest.raises(ChoiceError, match=r"layers: expected any of .*, found 'labels'"):
+        render_evaluation(da_motion, sample, [], layers=["labels"])

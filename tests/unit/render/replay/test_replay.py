@@ -1,0 +1,105 @@
+"""Replays: one page that asks for nothing else, and the command that writes it."""
+
+import base64
+import hashlib
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+from numpy.testing import assert_array_equal
+from replay_page import accident, data_of
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.cli.replay import replay
+from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError, TokenError
+from deepaccident_devkit.evaluation import Accident
+from deepaccident_devkit.evaluation.results import ResultsWriter
+from deepaccident_devkit.render.replay import render_replay
+from deepaccident_devkit.render.replay.replay import replay_page
+
+
+def test_the_same_call_gives_the_same_bytes(da: DeepAccident, page: Path, tmp_path: Path) -> None:
+    again = render_replay(da, da.get("scenario", accident(da)), str(tmp_path / "again.html"), progress=True)
+    assert again.read_bytes() == page.read_bytes()
+
+
+def test_the_policy_allows_this_script_and_style_alone(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    (policy,) = re.findall(r'Content-Security-Policy" content="([^"]*)"', text)
+    rules = dict(rule.split(" ", 1) for rule in policy.split("; "))
+    assert rules.pop("default-src") == "'none'"
+    assert rules.pop("img-src") == "data:"
+    for name, tag in (("style-src", "style"), ("script-src", "script")):
+        (content,) = re.findall(rf"<{tag}>(.*?)</{tag}>", text, re.DOTALL)
+        digest = base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()
+        assert rules.pop(name) == f"'sha256-{digest}'"
+    assert rules == {"base-uri": "'none'", "form-action": "'none'"}
+    assert not re.search(r"(?:https?:)?//\w|\bsrc=|\bhref=|@import|url\(|\bon\w+=", re.sub(r"//.*\n", "", text))
+
+
+def test_text_stays_text() -> None:
+    wild = "</script><script>alert(1)</script> & <!--title--> \u2028 é"
+    text = replay_page(wild, {"scenario": wild})
+    assert data_of(text) == {"scenario": wild}
+    assert "alert(1)</script>" not in text
+    assert "<title>&lt;/script&gt;&lt;script&gt;alert(1)" in text
+    assert text.isascii() is False  # the script itself has signs that are not
+    assert text.count("<script") == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "match"),
+    [
+        ({"scenario": "type1_subtype1_accident/nowhere"}, TokenError, "nowhere"),
+        ({"agents": ["pedestrian"]}, ChoiceError, "agent: expected one of ego_vehicle"),
+        ({"image_width": 4}, ConfigError, "image_width: expected pixels from 32, or None for what fits, found 4"),
+        ({"quality": 0}, ConfigError, "quality: expected a JPEG quality from 1 to 95, or None for what fits, found 0"),
+        ({"path": "."}, ChoiceError, "is a folder; name a file in it, such as replay.html"),
+    ],
+)
+def test_what_cannot_be_is_refused(
+    arguments: dict[str, Any], error: type[Exception], match: str, da: DeepAccident, tmp_path: Path
+) -> None:
+    with pytest.raises(error, match=match):
+        render_replay(da, **{"scenario": None, "path": tmp_path / "no.html", **arguments})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_release_without_an_accident_needs_a_name(own_release: Path, tmp_path: Path) -> None:
+    for folder in sorted(own_release.rglob("*_accident")):
+        shutil.rmtree(folder)
+    dataset = DeepAccident("v1", own_release, verbose=False)
+    with pytest.raises(NotAvailableError, match="no scenario ends in an accident that a meta file names; name one"):
+        render_replay(dataset, None, tmp_path / "no.html")
+
+
+def test_the_command_writes_the_page(
+    da_motion: DeepAccident, predictions: dict[str, list[Accident]], tmp_path: Path
+) -> None:
+    with ResultsWriter(tmp_path / "results.json", "accident") as writer:
+        for token, alarms in predictions.items():
+            writer.add(token, alarms)
+    out = tmp_path / "replay.html"
+    arguments = [str(da_motion.dataroot), accident(da_motion), "--out", str(out), "--results"]
+    ran = CliRunner().invoke(
+        replay, [*arguments, str(tmp_path / "results.json"), "--agents", "ego_vehicle,infrastructure"]
+    )
+    assert ran.exit_code == 0, ran.output
+    assert f"written: {out}, " in ran.output
+    data = data_of(out)
+    assert [agent["name"] for agent in data["agents"]] == ["ego_vehicle", "infrastructure"]
+    assert [each["verdict"] for each in data["prediction"]["samples"]] == ["TP", "FP + FN", "FN", "4 FP + FN"]
+    assert_array_equal([each["agent"] for each in data["prediction"]["samples"]], [0, 0, 0, 1])
+
+
+def test_the_command_takes_the_first_accident_and_a_configuration(da_motion: DeepAccident, tmp_path: Path) -> None:
+    out = tmp_path / "replay.html"
+    ran = CliRunner().invoke(replay, [str(da_motion.dataroot), "--out", str(out), "--agents", "+other"])
+    assert ran.exit_code == 0, ran.output
+    data = data_of(out)
+    assert data["scenario"] == accident(da_motion)
+    assert [agent["name"] for agent in data["agents"]] == ["ego_vehicle", "other_vehicle"]
+    assert data["prediction"] is None

@@ -1,0 +1,127 @@
+"""The pictures and points of a replay, which keep its size."""
+
+import base64
+import math
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from replay_page import accident, data_of, picture
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.render.replay import render_replay, sensors
+from deepaccident_devkit.render.replay.recording import recording_of
+from deepaccident_devkit.render.replay.replay import SIZE_LIMIT
+from deepaccident_devkit.render.replay.sensors import camera_pictures
+from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
+
+
+def test_points_lie_on_those_of_the_lidar(da: DeepAccident, data: dict[str, Any]) -> None:
+    scenario = accident(da)
+    origin = recording_of(da, scenario, None).origin
+    for frame, coded in enumerate(data["points"], 1):
+        shown = np.frombuffer(base64.b64decode(coded), dtype="<i2").reshape(-1, 2) / 10 + origin
+        sample = f"{scenario}/ego_vehicle/{frame:03d}"
+        height = da.load_point_cloud(sample, "ego").xyz[:, 2]
+        raised = da.load_point_cloud(sample, "world").xyz[height > np.percentile(height, 5) + 0.3]
+        assert 100 < len(shown) <= 1500
+        apart = np.linalg.norm(shown[::10, None] - raised[None, :, :2], axis=-1).min(axis=1)
+        assert apart.max() < 0.0708  # half a decimetre along both axes
+
+
+def test_the_first_agent_has_six_cameras_and_the_others_one(da: DeepAccident, data: dict[str, Any]) -> None:
+    titles = [[camera["title"] for camera in cameras] for cameras in data["cameras"]]
+    assert titles == [[channel.removeprefix("Camera_") for channel in CAMERAS], *[["Front"]] * 4]
+    shown, true = {}, {}
+    for agent, cameras in zip(AGENTS, data["cameras"], strict=True):
+        for camera in cameras:
+            for frame in (1, 6):
+                token = f"{accident(da)}/{agent}/{frame:03d}/Camera_{camera['title']}"
+                shown[token] = np.asarray(picture(camera["pictures"][frame - 1]), dtype=float)
+                true[token] = da.load_image(token)
+    assert len(shown) == 20
+    for token, pixels in shown.items():
+        assert min(true, key=lambda other: np.abs(true[other] - pixels).mean()) == token
+    assert any("all but the front camera of ego behind, other" in note for note in data["notes"])
+
+
+def test_width_and_quality_are_as_asked(da: DeepAccident, tmp_path: Path) -> None:
+    path = render_replay(da, accident(da), tmp_path / "a.html", agents=["infrastructure"], image_width=40, quality=30)
+    data = data_of(path)
+    assert [agent["name"] for agent in data["agents"]] == ["infrastructure"]
+    assert [camera["title"] for camera in data["cameras"][0]] == [each.removeprefix("Camera_") for each in CAMERAS]
+    assert picture(data["cameras"][0][0]["pictures"][0]).size == (40, 22)
+    assert "Pictures are up to 40 pixels wide, of JPEG quality 30." in data["notes"]
+    assert "Agents not shown: ego, ego behind, other, other behind." in data["notes"]
+
+
+@pytest.mark.parametrize("how", [{}, {"width": 48}, {"quality": 60}])
+def test_pictures_keep_the_limit_and_at_last_become_fewer(da: DeepAccident, how: dict[str, int]) -> None:
+    recording = recording_of(da, accident(da), None)
+    sizes = []
+    for limit in (math.inf, 45_000, 20_000, 8_000, 5_000):
+        taken = camera_pictures(recording, limit, **how)
+        weight = sum(
+            len(each) for cameras in taken.jpegs.values() for all_ in cameras.values() for each in all_ if each
+        )
+        assert weight <= limit
+        assert taken.settings is not None
+        sizes.append(weight)
+        assert set(taken.jpegs) == set(AGENTS)
+        others = len(taken.jpegs["ego_vehicle"]) == len(CAMERAS)
+        assert others != taken.settings.front_only
+        given = [each is not None for each in taken.jpegs["infrastructure"][CAMERAS[0]]]
+        assert given == [frame % taken.settings.every == 0 for frame in range(6)]
+    assert sizes == sorted(sizes, reverse=True)
+    assert taken.settings.every > 1
+    assert camera_pictures(recording, 10, **how).jpegs == {}
+
+
+def test_a_wrong_estimate_does_not_break_the_limit(da: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The size of all is estimated from a black picture, which is smaller than any other."""
+    monkeypatch.setattr(sensors, "_probes", lambda _: [np.zeros((36, 64, 3), dtype=np.uint8)])
+    taken = camera_pictures(recording_of(da, accident(da), None), 50_000)
+    sizes = [len(each) for cameras in taken.jpegs.values() for all_ in cameras.values() for each in all_ if each]
+    assert len(sizes) == 60
+    assert 25_000 < sum(sizes) <= 50_000
+
+
+def test_forty_frames_of_real_size_go_by_mail(tmp_path: Path) -> None:
+    """Pictures of 1600×900 with noise, which hardly compresses, at all cameras of all frames."""
+    root = make_release(tmp_path / "release", SynthConfig(scenarios=1, frames=40, sensors=False, seed=1), workers=1)
+    dataset = DeepAccident("v1", root, verbose=False)
+    scenario = accident(dataset)
+    noise = np.random.default_rng(0).integers(0, 256, (56, 100, 3), dtype=np.uint8)
+    source = tmp_path / "noise.jpg"
+    Image.fromarray(noise).resize((1600, 900), Image.Resampling.BICUBIC).save(source, quality=90)
+    for number, agent in enumerate(AGENTS):
+        for channel in CAMERAS if number == 0 else CAMERAS[:1]:
+            for frame in range(1, 41):
+                path = dataset.get_sample_data_path(f"{scenario}/{agent}/{frame:03d}/{channel}")
+                path.parent.mkdir(parents=True, exist_ok=True)
+                os.link(source, path)
+    page = render_replay(dataset, None, tmp_path / "replay.html")
+    assert 0.5 * SIZE_LIMIT < page.stat().st_size <= SIZE_LIMIT == 15_000_000
+    data = data_of(page)
+    assert [len(cameras) for cameras in data["cameras"]] == [6, 1, 1, 1, 1]
+    assert all(coded is not None for cameras in data["cameras"] for each in cameras for coded in each["pictures"])
+    assert picture(data["cameras"][0][0]["pictures"][0]).width >= 320
+
+
+def test_a_missing_picture_leaves_a_hole(da: DeepAccident, tmp_path: Path) -> None:
+    root = tmp_path / "release"
+    shutil.copytree(da.dataroot, root, copy_function=os.link, ignore=shutil.ignore_patterns(".deepaccident"))
+    part = DeepAccident("v1", root, verbose=False)
+    gone = part.get_sample_data_path(f"{accident(part)}/other_vehicle/003/Camera_Front")
+    gone.unlink()
+    part.get_sample_data_path(f"{accident(part)}/ego_vehicle/002/lidar01").unlink()
+    data = data_of(render_replay(part, None, tmp_path / "replay.html"))
+    there = [coded is not None for coded in data["cameras"][2][0]["pictures"]]
+    assert there == [True, True, False, True, True, True]
+    assert [cloud is not None for cloud in data["points"]] == [True, False, True, True, True, True]
+    assert "1 of 60 camera files are missing in the release; unpack the cameras' archives." in data["notes"]

@@ -1,0 +1,28 @@
+"""Panels of statistics: what they draw is what was counted."""
+
+from deepaccident_devkit.render import detached_figure
+from deepaccident_devkit.render.statistics_panels import (
+    render_angles,
+    render_counts,
+    render_histogram,
+    render_quantiles,
+    render_relative_positions,
+)
+from deepaccident_devkit.statistics import DatasetStatistics
+
+
+def test_bars_add_up_to_the_counts(statistics: DatasetStatistics) -> None:
+    table = statistics.counts["weathers"]
+    ax = detached_figure((4, 3)).add_subplot()
+    assert render_counts(table, ax=ax) is ax
+    assert sum(bar.get_width() for bar in ax.patches) == table.total() == statistics.scenarios["total"]
+    assert [label.get_text() for label in ax.get_yticklabels()] == list(table.counts)
+    histogram = statistics.histograms["distances"]
+    ax = render_histogram(histogram)
+    assert sum(bar.get_height() for bar in ax.patches) == sum(histogram.counts["total"])
+    assert ax.get_xlabel() == "distance (m)"
+    ax = render_angles(statistics.histograms["collision_angles"])
+    assert sum(bar.get_height() for bar in ax.patches) == len(statistics.collisions)
+    ax = render_relative_positions(statistics.collisions)
+    assert sum(len(points.get_offsets()) for points in ax.collections) == len(statistics.collisions)
+    assert render_quantiles(statistics.quantiles["box_sizes"], "width").get_ylabel() == "width (m)"
