@@ -1,11 +1,12 @@
 """Measure the tables of docs/synth.md: `python docs/make_synth_page.py`, from a checkout; takes minutes.
 
-What was measured of each pair is kept in docs/synth_statistics.json; `--tables` makes the tables from that again.
+What was measured is kept in docs/synth_statistics.json; `--tables` makes the tables from that again. `--real DIR`
+measures the real scenario under DIR as well; without it, its numbers stay as they are.
 """
 
+import argparse
 import json
 import re
-import sys
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -13,6 +14,7 @@ from statistics import median
 from typing import TypedDict
 
 import numpy as np
+import synth_beside
 
 from deepaccident_devkit.release import Labels
 from deepaccident_devkit.selection import accident_visible_mask, pair_in_view
@@ -56,6 +58,14 @@ class Pair(TypedDict):
     twin_touches: bool
     sees_both: dict[str, bool]
     views: dict[str, str]
+
+
+class Measured(TypedDict):
+    """All that was measured: of a real scenario, of generated ones like it, and of pairs of all designs."""
+
+    real: synth_beside.Numbers
+    generated: synth_beside.Numbers
+    pairs: list[Pair]
 
 
 _WATCHING = (VEHICLE_AGENTS[1], VEHICLE_AGENTS[3], INFRASTRUCTURE)
@@ -197,14 +207,20 @@ def lengths_table(pairs: Sequence[Pair]) -> str:
     return "\n".join(lines + [f"| {name} | {' | '.join(map(str, cells))} |" for name, cells in rows.items()])
 
 
-def tables(pairs: Sequence[Pair]) -> dict[str, str]:
+def tables(measured: Measured) -> dict[str, str]:
     """What stands between the page's markers."""
-    return {"designs": designs_table(pairs), "views": views_table(pairs), "lengths": lengths_table(pairs)}
+    pairs = measured["pairs"]
+    return {
+        "designs": designs_table(pairs),
+        "views": views_table(pairs),
+        "lengths": lengths_table(pairs),
+        "beside": synth_beside.table(measured["real"], measured["generated"]),
+    }
 
 
-def with_tables(page: str, pairs: Sequence[Pair]) -> str:
+def with_tables(page: str, measured: Measured) -> str:
     """The page with the tables between its markers."""
-    for marker, text in tables(pairs).items():
+    for marker, text in tables(measured).items():
         begin, end = f"<!-- {marker} -->", f"<!-- end of {marker} -->"
         pattern = re.compile(f"{re.escape(begin)}.*?{re.escape(end)}", re.DOTALL)
         if not pattern.search(page):
@@ -213,10 +229,17 @@ def with_tables(page: str, pairs: Sequence[Pair]) -> str:
     return page
 
 
-def measured() -> list[Pair]:
+def measured() -> Measured:
     """What was measured last."""
-    pairs: list[Pair] = json.loads(MEASURED.read_text(encoding="utf-8"))
-    return pairs
+    content: Measured = json.loads(MEASURED.read_text(encoding="utf-8"))
+    return content
+
+
+def save(content: Measured) -> None:
+    """Keep what was measured, a pair a line."""
+    beside = [f'"{key}": {json.dumps(content[key], indent=1)}' for key in ("real", "generated")]
+    pairs = ",\n".join(json.dumps(pair) for pair in content["pairs"])
+    MEASURED.write_text("{\n" + ",\n".join([*beside, f'"pairs": [\n{pairs}\n]']) + "\n}\n", encoding="utf-8")
 
 
 def _share(holds: Iterable[bool]) -> str:
@@ -233,12 +256,21 @@ def _ends(values: Sequence[float]) -> str:
 
 def main() -> None:
     """Measure, unless the tables alone are wanted, and write them into the page."""
-    if "--tables" not in sys.argv[1:]:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--tables", action="store_true", help="only make the tables again")
+    parser.add_argument("--beside", action="store_true", help="measure only what stands beside the real scenario")
+    parser.add_argument("--real", type=Path, metavar="DIR", help="a release with one real scenario, measured too")
+    options = parser.parse_args()
+    content = measured()
+    if options.real:
+        content["real"] = synth_beside.measure_real(options.real)
+    if not options.tables:
+        content["generated"] = synth_beside.measure_generated()
+    if not options.tables and not options.beside:
         with ProcessPoolExecutor(WORKERS) as executor:
-            pairs = list(executor.map(measure, range(SEEDS * len(DESIGNS)), chunksize=4))
-        text = ",\n".join(json.dumps(pair) for pair in pairs)
-        MEASURED.write_text(f"[\n{text}\n]\n", encoding="utf-8")
-    PAGE.write_text(with_tables(PAGE.read_text(encoding="utf-8"), measured()), encoding="utf-8")
+            content["pairs"] = list(executor.map(measure, range(SEEDS * len(DESIGNS)), chunksize=4))
+    save(content)
+    PAGE.write_text(with_tables(PAGE.read_text(encoding="utf-8"), content), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -58,6 +58,7 @@ def _show_design(context: click.Context, _parameter: click.Parameter, number: in
 @click.option("--seed", default=_DEFAULTS.seed, show_default=True, help="The same seed gives the same bytes.")
 @click.option("--no-sensors", is_flag=True, help="Only labels, calib and meta: no images, point clouds, BEV arrays.")
 @click.option("--unlabelled-test", is_flag=True, help="Without labels in the test split, as in the real release.")
+@click.option("--exact", is_flag=True, help="Calib and numbers of points without the small errors of the real release.")
 @click.option(
     "--design",
     "designs",

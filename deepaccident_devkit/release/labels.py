@@ -131,7 +131,7 @@ def read_labels(paths: Sequence[Path], *, raw: bool = False) -> Labels:
 
 
 def write_label(path: Path, labels: Labels) -> None:
-    """Write one file's boxes with CARLA's signs; reading it back gives equal values.
+    """Write one file's boxes with CARLA's signs; reading it back gives equal values. The last line has no end.
 
     Raises:
         LabelError: `labels` are not those of one file.
@@ -152,7 +152,7 @@ def write_label(path: Path, labels: Labels) -> None:
         strict=True,
     )
     lines += [f"{CATEGORIES[code]} {_words(row)} {actor} {points} {seen}" for code, row, actor, points, seen in rows]
-    write_bytes(path, ("\n".join(lines) + "\n").encode("ascii"))
+    write_bytes(path, "\n".join(lines).encode("ascii"))
 
 
 def _words(numbers: Iterable[float]) -> str:

@@ -51,6 +51,8 @@ class Meta:
         spawn_side: where the other vehicle comes from: `left`, `right` or `opposite…`.
         ego_direction: `straight`, `left` or `right`.
         other_direction: likewise.
+        planned_agents: of a scenario that ended without a collision, the pair that `colliding agents:` names all the
+            same: those who were to collide. None if it names nobody, or if there was a collision.
     """
 
     weather: str
@@ -62,6 +64,7 @@ class Meta:
     spawn_side: str | None = None
     ego_direction: str | None = None
     other_direction: str | None = None
+    planned_agents: tuple[AgentName | None, AgentName | None] | None = None
 
 
 @overload
@@ -91,7 +94,7 @@ def read_meta(path: Path, *, raw: bool = False) -> Meta | tuple[str, ...]:
 
 
 def write_meta(path: Path, meta: Meta) -> None:
-    """Write a meta file as the release's generator does; lines 2 on begin with a blank."""
+    """Write a meta file as the release's generator does: lines 2 on begin with a blank, the last one has no end."""
     collision = meta.collision
     words: list[object] = [meta.weather + (meta.time_of_day or "")]
     if collision is None:
@@ -100,7 +103,7 @@ def write_meta(path: Path, meta: Meta) -> None:
         (id1, id2), (class1, class2) = collision.ids, collision.classes
         words += [id1, class1, id2, class2, collision.impact, collision.spawn_relation, collision.contact_side]
     lines = [" ".join(map(str, [*words, meta.simulated_frames]))]
-    agents = collision.agents if collision else (None, None)
+    agents = collision.agents if collision else meta.planned_agents or (None, None)
     entries = {
         "colliding agents": agents and " ".join(_SHORT_NAMES[agent] for agent in agents),
         "agents id": meta.agent_ids and " ".join(map(str, meta.agent_ids)),
@@ -110,7 +113,7 @@ def write_meta(path: Path, meta: Meta) -> None:
         "other_vehicle_direction": meta.other_direction,
     }
     lines += [f" {key}: {value}" for key, value in entries.items() if value is not None]
-    write_bytes(path, ("\n".join(lines) + "\n").encode())
+    write_bytes(path, "\n".join(lines).encode())
 
 
 def _entries(path: Path, lines: Sequence[tuple[int, str]]) -> dict[str, tuple[int, str]]:
@@ -131,16 +134,19 @@ def _parse(path: Path, first: tuple[int, str], entries: dict[str, tuple[int, str
         raise MetaError(f"{path}:{number}: expected 9 words '{_FIRST_LINE}', found {len(words)}: '{line}'; {_REMEDY}")
     where = f"{path}:{number}"
     weather, time_of_day = _weather_and_time(words[0])
+    agents = _colliding_agents(path, entries)
+    collision = _collision(where, words, agents)
     return Meta(
         weather=weather,
         time_of_day=time_of_day,
-        collision=_collision(where, words, _colliding_agents(path, entries)),
+        collision=collision,
         simulated_frames=_integer(where, "simulated frames", words[8]),
         agent_ids=_agent_ids(path, entries),
         road_type=_text(entries, "road_type"),
         spawn_side=_text(entries, "another_vehicle_spawn_side"),
         ego_direction=_text(entries, "ego_vehicle_direction"),
         other_direction=_text(entries, "other_vehicle_direction"),
+        planned_agents=None if collision or agents == (None, None) else agents,
     )
 
 

@@ -18,7 +18,9 @@ MEDIAN_SIZES: dict[str, Size] = {
     "pedestrian": (0.38, 0.38, 1.86),
 }
 """Of the real release: length, width, height, metres (format.md, label)."""
-_SPREAD = 0.05
+_SPREAD = (0.05, 0.05, 0.04)
+"""Of length, width and height."""
+_FARTHEST_ORIGIN = 0.3
 _PAINTS: tuple[Color, ...] = (
     (196, 30, 36), (28, 74, 160), (226, 228, 230), (150, 155, 160), (46, 50, 56), (236, 196, 56), (40, 120, 72),
     (120, 40, 44), (88, 142, 196), (214, 120, 44),
@@ -48,8 +50,8 @@ class Body:
 
 def random_body(rng: np.random.Generator, category: str) -> Body:
     """A road user of this category, near the median size of the real release."""
-    factors = 1 + _SPREAD * rng.uniform(-1, 1, 3)
-    size: Size = tuple((np.array(MEDIAN_SIZES[category]) * factors).round(3).tolist())
+    factors = 1 + np.array(_SPREAD) * rng.uniform(-1, 1, 3)
+    size: Size = tuple((np.array(MEDIAN_SIZES[category]) * factors).astype(np.float32).tolist())
     color, accent = _colors(rng, category)
     shape = shape_of(category, size, color, accent, model=int(rng.integers(len(MODELS[category]))))
     return Body(category, size, shape, _random_origin(rng))
@@ -62,7 +64,5 @@ def _colors(rng: np.random.Generator, category: str) -> tuple[Color, Color]:
 
 
 def _random_origin(rng: np.random.Generator) -> tuple[float, float]:
-    """Where an ego origin lies: 0.1 to 0.3 m off the box's centre, mostly along the vehicle, as in the real data."""
-    distance = rng.uniform(0.1, 0.3) * rng.choice([-1, 1])
-    angle = rng.uniform(-0.2, 0.2)
-    return round(float(distance * np.cos(angle)), 4), round(float(distance * np.sin(angle)), 4)
+    """Where an ego origin lies: ahead of the box's centre, by some centimetres, of a few by up to 0.3 m."""
+    return round(float(_FARTHEST_ORIGIN * rng.random() ** 3), 4), 0.0

@@ -37,6 +37,8 @@ class SynthConfig:
             None are where `spec` or the view `hidden` asks for one certain accident.
         spec: a scenario file (docs/scenarios.md) of which every pair is a draw, in place of the designs.
         unlabelled_test: whether the test split lacks labels, BEV arrays and meta, as the real one does.
+        exact: whether calib files are the same at each frame, and `num_lidar_pts` what a recount gives. Else both are
+            a little off, as in the real release.
     """
 
     scenarios: int = 4
@@ -50,6 +52,7 @@ class SynthConfig:
     unplanned: float = 0.1
     spec: Path | None = None
     unlabelled_test: bool = False
+    exact: bool = False
 
     def __post_init__(self) -> None:
         """Check every field."""

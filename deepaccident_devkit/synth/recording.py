@@ -108,6 +108,7 @@ def _made_ready(task: _Task) -> tuple[Scenario, Rig]:
         image_size=config.image_size,
         seed=(config.seed, plan.pair, int(plan.accident)),
         images=config.sensors,
+        exact=config.exact,
     )
     return scenario, rig
 
@@ -132,7 +133,7 @@ class _Recorder:
             if self.labelled:
                 write_label(self.folder.label_path(agent.name, frame), sighting.labels)
             if around:
-                intensity = rig.intensity(scene, agent, sighting.points)
+                intensity = rig.intensity(sighting.points)
                 write_lidar(self.folder.channel_path(agent.name, LIDAR, frame), sighting.points.xyz, intensity)
                 self._record_pictures(scene, around, agent, frame)
 

@@ -197,18 +197,19 @@ def _actor(ids: _Ids, row: int, body: Body, motion: Sampled | Uniform) -> Actor:
 
 
 def _meta(plan: ScenarioPlan, stage: Stage, recorded: Recorded, ids: _Ids) -> Meta:
-    spec = stage.spec
+    spec, collision, planned = stage.spec, _collision(stage, recorded, ids), _pair_agents(stage)
     ego, ego_behind, other, other_behind = (ids.agents[agent] for agent in VEHICLE_AGENTS)
     return Meta(
         weather=spec.weather,
         time_of_day=spec.time_of_day,
-        collision=_collision(stage, recorded, ids),
+        collision=collision,
         simulated_frames=recorded.frames + WARM_UP_FRAMES,
         agent_ids=(ego, ego_behind, other, other_behind),
         road_type=plan.traits.road_type,
         spawn_side=plan.traits.spawn_side,
         ego_direction=spec.actor("ego").turn,
         other_direction=spec.actor("other").turn,
+        planned_agents=None if collision or planned == (None, None) else planned,
     )
 
 
@@ -223,5 +224,11 @@ def _collision(stage: Stage, recorded: Recorded, ids: _Ids) -> Collision | None:
         impact=impact.strength,
         spawn_relation="same",
         contact_side=f"{impact.side}_side",
-        agents=(AGENT_OF_ROLE.get(first.role), AGENT_OF_ROLE.get(second.role)),
+        agents=_pair_agents(stage),
     )
+
+
+def _pair_agents(stage: Stage) -> tuple[AgentName | None, AgentName | None]:
+    """Which agents the two are who are timed to meet; None for a road user that records nothing, or if nobody is."""
+    first, second = (stage.users[row] for row in stage.cast.pair) if stage.cast.pair else (None, None)
+    return AGENT_OF_ROLE.get(first.role) if first else None, AGENT_OF_ROLE.get(second.role) if second else None

@@ -56,7 +56,7 @@ class Recorder:
         if agent in VEHICLE_AGENTS:
             own = VEHICLE_AGENTS.index(agent)
             world = world.select([own, *(row for row in range(len(world)) if row != own)])
-        self._world_velocity = world.velocity[:, :2]
+        self._velocity = world.velocity[:, :2]
         lidar_from_world = (self._calib.world_from_ego @ self._calib.ego_from_lidar).inverse()
         self._boxes = world.transform(lidar_from_world, "lidar")
         height = self._calib.ego_from_lidar.translation[2] if self._own.any() else POLE_HEIGHT
@@ -92,15 +92,16 @@ class Recorder:
     def _labels(self) -> Labels:
         """What the label says, without the numbers of points."""
         boxes = self._boxes
+        yaw = np.where(self._own, 0.0, boxes.yaw)
         return Labels(
             raw=False,
             num_boxes=np.array([len(boxes)]),
-            agent_velocity=self._world_velocity[self._own] if self._own.any() else np.zeros((1, 2)),
+            agent_velocity=self._velocity[self._own] if self._own.any() else np.zeros((1, 2)),
             category=boxes.category,
             center=boxes.center,
             size=boxes.size,
-            yaw=boxes.yaw,
-            velocity=label_from_world_velocity(self._world_velocity, boxes.yaw),
+            yaw=yaw,
+            velocity=label_from_world_velocity(self._velocity, yaw),
             actor_id=np.select(
                 [self._own, boxes.actor_id == FAR_ACTOR_ID], [OWN_ACTOR_ID, UNTRACKED_ID], boxes.actor_id
             ),

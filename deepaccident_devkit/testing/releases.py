@@ -186,6 +186,7 @@ def _meta(rng: np.random.Generator, scene: SmallScene, *, accident: bool) -> Met
         spawn_side="right",
         ego_direction="straight",
         other_direction="straight",
+        planned_agents=None if accident else PAIR,
     )
 
 

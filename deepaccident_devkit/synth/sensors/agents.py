@@ -13,17 +13,18 @@ from deepaccident_devkit.synth.sensors.scene import Scene
 from deepaccident_devkit.synth.stage import World
 from deepaccident_devkit.taxonomy import CAMERAS, INFRASTRUCTURE, VEHICLE_AGENTS, AgentName
 
-LIDAR_HEIGHT = 1.94
-"""Of a vehicle's LiDAR above its ego origin on the road, metres; more on a vehicle too tall for it."""
-_LEAST_ABOVE_ROOF, _ABOVE_ROOF = 0.25, 0.45
-"""Metres: a LiDAR that would be lower than the first above the roof is put as high above it as the second."""
-_BELOW_LIDAR = 0.3
+ABOVE_ROOF = 0.5
+"""Of a vehicle's LiDAR, metres above the height of its label box, from the ego origin on the road."""
+BELOW_LIDAR = 0.3
+"""Of a vehicle's cameras, metres; the pole's are as high as its LiDAR."""
+POLE_LENGTH, POLE_WIDTH = 4.9373, 8.9666
+"""Metres: the pole's cameras stand where those of a vehicle so long and wide would, its x axis being their y axis."""
 _CAMERA_YAW = dict(zip(CAMERAS, np.deg2rad([0.0, 55.0, -55.0, 180.0, 110.0, -110.0]).tolist(), strict=True))
+_SIDES = dict(zip(CAMERAS, ((1, 0), (1, 1), (1, -1), (-1, 0), (-1, 1), (-1, -1)), strict=True))
+"""Of the box's faces at which a camera is: 1 front or left, −1 back or right, 0 neither."""
 _FIELD_OF_VIEW = {camera: float(np.deg2rad(110.0 if camera == "Camera_Back" else 70.0)) for camera in CAMERAS}
-_FRONT, _BACK = 2.337, 2.096
-"""Where the real release has its front and back cameras, metres ahead of and behind the LiDAR."""
-_CLEAR_OF_HULL = 0.06
-_POLE_RADIUS = 0.3
+_CLEAR_OF_HULL = 0.001
+"""Metres by which a camera is off the face of the box, so that its rays do not begin in the hull."""
 _OPTICAL_FROM_FORWARD = SE3(handedness.camera_from_lidar(np.eye(4)))
 """A frame with x forward, y left, z up → the optical one."""
 
@@ -102,7 +103,7 @@ def make_agents(
         row=None,
         box_from_ego=world.lidar_pole,
         ego_from_lidar=SE3.identity(),
-        cameras=_cameras(_pole_places(), image_size),
+        cameras=_cameras(_pole_places(), 0.0, image_size),
     )
     return (*vehicles, pole)
 
@@ -113,45 +114,30 @@ def _vehicle(name: AgentName, row: int, actor: Actor, image_size: tuple[int, int
         name=name,
         row=row,
         box_from_ego=SE3.from_rotation(np.eye(3), (x, y, 0.0)),
-        ego_from_lidar=SE3.from_rotation(np.eye(3), (0.0, 0.0, _lidar_height(actor))),
-        cameras=_cameras(_vehicle_places(actor), image_size),
+        ego_from_lidar=SE3.from_rotation(np.eye(3), (0.0, 0.0, actor.size[2] + ABOVE_ROOF)),
+        cameras=_cameras(_vehicle_places(actor), -BELOW_LIDAR, image_size),
     )
-
-
-def _lidar_height(actor: Actor) -> float:
-    roof = actor.size[2]
-    return LIDAR_HEIGHT if roof + _LEAST_ABOVE_ROOF <= LIDAR_HEIGHT else roof + _ABOVE_ROOF
 
 
 def _vehicle_places(actor: Actor) -> dict[str, tuple[float, float]]:
-    """x, y of each camera in the LiDAR frame, metres: outside the hull, so that it is in no picture."""
+    """x, y of each camera in the LiDAR frame, metres: in the middle of the box's front and back, and at its corners."""
     length, width, _ = actor.size
     x, y = actor.origin
-    front, back = length / 2 - x + _CLEAR_OF_HULL, -length / 2 - x - _CLEAR_OF_HULL
-    left, right = width / 2 - y + _CLEAR_OF_HULL, -width / 2 - y - _CLEAR_OF_HULL
-    places = (
-        (max(front, _FRONT), 0.0),
-        (0.8, left),
-        (0.8, right),
-        (min(back, -_BACK), 0.0),
-        (-0.6, left),
-        (-0.6, right),
-    )
-    return dict(zip(CAMERAS, places, strict=True))
+    ahead, aside = length / 2 + _CLEAR_OF_HULL, width / 2 + _CLEAR_OF_HULL
+    return {camera: (along * ahead - x, across * aside - y) for camera, (along, across) in _SIDES.items()}
 
 
 def _pole_places() -> dict[str, tuple[float, float]]:
-    return {
-        camera: (_POLE_RADIUS * float(np.cos(yaw)), _POLE_RADIUS * float(np.sin(yaw)))
-        for camera, yaw in _CAMERA_YAW.items()
-    }
+    """x, y of each camera in the LiDAR frame, metres."""
+    return {camera: (-across * POLE_WIDTH / 2, along * POLE_LENGTH / 2) for camera, (along, across) in _SIDES.items()}
 
 
-def _cameras(places: dict[str, tuple[float, float]], image_size: tuple[int, int]) -> tuple[Camera, ...]:
+def _cameras(places: dict[str, tuple[float, float]], height: float, image_size: tuple[int, int]) -> tuple[Camera, ...]:
+    """All cameras at x, y in the LiDAR frame and at a height above the LiDAR, metres."""
     return tuple(
         Camera(
             channel,
-            _OPTICAL_FROM_FORWARD @ SE3.from_yaw(_CAMERA_YAW[channel], (x, y, -_BELOW_LIDAR)).inverse(),
+            _OPTICAL_FROM_FORWARD @ SE3.from_yaw(_CAMERA_YAW[channel], (x, y, height)).inverse(),
             PinholeCamera.from_field_of_view(*image_size, _FIELD_OF_VIEW[channel]),
         )
         for channel, (x, y) in places.items()

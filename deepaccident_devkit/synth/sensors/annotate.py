@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.geometry import SE3, Boxes
 from deepaccident_devkit.release import Labels, label_from_world_velocity
 from deepaccident_devkit.synth.sensors.agents import Agent
@@ -10,34 +10,44 @@ from deepaccident_devkit.synth.sensors.lidar import Scan
 from deepaccident_devkit.synth.sensors.scene import Scene
 from deepaccident_devkit.synth.sensors.visibility import camera_visible
 from deepaccident_devkit.synth.shapes import BOX_CLEARANCE
-from deepaccident_devkit.taxonomy import OWN_ACTOR_ID, UNTRACKED_ID
+from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID, UNTRACKED_ID
 
-LABEL_RANGE = 70.0
+LABEL_RANGE = 120.0
 """Actors up to here are annotated, metres over the ground from the LiDAR to the box's centre."""
-TRACKING_RANGE = 60.0
+TRACKING_RANGE = 115.0
 """Actors beyond have no id."""
+COUNTED_LATER = 0.004
+"""Seconds from the point cloud to the boxes that its points are counted in: others who move have gone on by then."""
+_PEDESTRIAN = CATEGORIES.index("pedestrian")
 
 
-def annotate(scene: Scene, agent: Agent, ground_from_lidar: SE3, world_from_ground: SE3, scan: Scan) -> Labels:
-    """The labels of one agent at one moment, in the order of the actors' ids.
+def annotate(scene: Scene, agent: Agent, world_from_ground: SE3, scan: Scan, *, exact: bool) -> Labels:
+    """The labels of one agent at one moment: parked vehicles, other vehicles, pedestrians.
 
-    `num_lidar_pts` counts the points of `scan`, as stored, in each box, whatever they lie on.
+    Args:
+        scene: the moment.
+        agent: whose labels.
+        world_from_ground: of its town.
+        scan: whose points, as stored, `num_lidar_pts` counts in each box, whatever they lie on.
+        exact: whether they are counted in the boxes as annotated, and not in those of `COUNTED_LATER`.
     """
+    ground_from_lidar = agent.ground_from_lidar(scene)
     center, yaw, velocity = _kinematics(scene)
     distance = np.hypot(*(center[:, :2] - ground_from_lidar.translation[:2]).T)
-    rows = np.flatnonzero(distance <= LABEL_RANGE)
+    rows = _in_order(scene, distance <= LABEL_RANGE)
     actor_id = np.where(distance > TRACKING_RANGE, UNTRACKED_ID, scene.actors.actor_id)
     lidar_from_ground = ground_from_lidar.inverse()
-    lidar_center, lidar_yaw = lidar_from_ground.apply(center), _turned(yaw, lidar_from_ground)
+    lidar_center, lidar_velocity = lidar_from_ground.apply(center), lidar_from_ground.rotate(velocity)
+    lidar_yaw = _turned(yaw, lidar_from_ground)
     world_velocity = world_from_ground.rotate(velocity)[:, :2]
-    visible = camera_visible(scene, agent, ground_from_lidar, rows)
     agent_velocity = np.zeros((1, 2))
     if agent.row is not None:
         actor_id[agent.row] = OWN_ACTOR_ID
-        lidar_yaw[agent.row] = 0.0
         agent_velocity[0] = world_velocity[agent.row]
+        lidar_yaw[agent.row], lidar_velocity[agent.row] = 0.0, 0.0
+    later = 0.0 if exact else COUNTED_LATER
     size = scene.actors.size[rows]
-    boxes = Boxes.from_arrays(lidar_center[rows], size, lidar_yaw[rows], frame="lidar")
+    counted = Boxes.from_arrays(lidar_center[rows] + later * lidar_velocity[rows], size, lidar_yaw[rows], frame="lidar")
     return Labels(
         raw=False,
         num_boxes=np.array([len(rows)]),
@@ -46,11 +56,19 @@ def annotate(scene: Scene, agent: Agent, ground_from_lidar: SE3, world_from_grou
         center=lidar_center[rows],
         size=size,
         yaw=lidar_yaw[rows],
-        velocity=label_from_world_velocity(world_velocity[rows], lidar_yaw[rows]),
+        velocity=label_from_world_velocity(world_velocity, lidar_yaw)[rows],
         actor_id=actor_id[rows],
-        num_lidar_pts=boxes.count_points(scan.xyz),
-        camera_visible=visible,
+        num_lidar_pts=counted.count_points(scan.xyz),
+        camera_visible=camera_visible(scene, agent, ground_from_lidar, rows),
     )
+
+
+def _in_order(scene: Scene, wanted: BoolArray) -> IntArray:
+    """Rows of those who are wanted (A,) as labels list them: all agents' and frames' in the same order, not by ids."""
+    actors = scene.actors
+    parked = np.isin(np.arange(len(actors)), scene.setting.parked)
+    order = np.lexsort([actors.object_id, actors.category == _PEDESTRIAN, ~parked])
+    return np.asarray(order[wanted[order]])
 
 
 def _kinematics(scene: Scene) -> tuple[FloatArray, FloatArray, FloatArray]:

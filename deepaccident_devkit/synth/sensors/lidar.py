@@ -1,4 +1,4 @@
-"""The rotating LiDAR: 32 channels, 30° of height, 70 m, with noise, drop-outs and the weather in its way."""
+"""The rotating LiDAR: 32 channels, 40° of height, 70 m, with noise, drop-outs and the weather in its way."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from deepaccident_devkit.arrays import AnyArray, Float32Array, IntArray, readonly
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.synth.sensors.agents import Agent
-from deepaccident_devkit.synth.sensors.caster import GROUND, NOTHING, make_caster
-from deepaccident_devkit.synth.sensors.reflection import ground_reflectivity
+from deepaccident_devkit.synth.sensors.caster import NOTHING, make_caster
 from deepaccident_devkit.synth.sensors.scene import Scene
 from deepaccident_devkit.synth.sensors.setting import Setting
 from deepaccident_devkit.synth.sensors.turn import (
@@ -24,12 +23,12 @@ from deepaccident_devkit.synth.sensors.turn import (
 )
 from deepaccident_devkit.synth.solids import FACES_A_SOLID
 
-RANGE_NOISE = 0.02
-"""Standard deviation along the ray, metres."""
-_ATTENUATION = 0.004
-"""Of the intensity, a metre of dry air: CARLA's default."""
-_LOST, _LOST_DARK, _DARK = 0.01, 0.3, 0.3
-"""Share of the returns that get lost; how much more of black ones; the reflectivity from which on none do."""
+RANGE_NOISE = 0.05
+"""Standard deviation along the ray, metres: the release's."""
+_ATTENUATION = 0.03
+"""Of the intensity, a metre of dry air: the release's."""
+_SURE, _LOST_DARK = 0.8, 0.4
+"""The intensity from which on no return gets lost, and the share that does where it is 0: CARLA's defaults."""
 _NUMBERS = 1 << 18
 _NEAREST_DROP, _FARTHEST_DROP = 1.5, 12.0
 """Metres, between which raindrops send back a ray."""
@@ -40,12 +39,13 @@ class Air:
     """What the weather does to a ray.
 
     Attributes:
-        lost: share of the returns from `RANGE` metres that get lost, less from nearer in the square of the distance.
+        lost: share of the returns from `RANGE` metres that get lost besides the weak ones, less from nearer in the
+            square of the distance.
         attenuation: of the intensity, a metre, in addition to dry air's.
         drops: share of all rays that come back from a raindrop.
     """
 
-    lost: float = 0.05
+    lost: float = 0.0
     attenuation: float = 0.0
     drops: float = 0.0
 
@@ -53,11 +53,11 @@ class Air:
 AIR_OF_WEATHER = {
     "Clear": Air(),
     "Cloudy": Air(),
-    "Wet": Air(0.08, 0.001),
-    "WetCloudy": Air(0.08, 0.001),
-    "SoftRain": Air(0.2, 0.004, 0.0002),
-    "MidRain": Air(0.3, 0.008, 0.0005),
-    "HardRain": Air(0.45, 0.014, 0.0015),
+    "Wet": Air(0.03, 0.001),
+    "WetCloudy": Air(0.03, 0.001),
+    "SoftRain": Air(0.15, 0.004, 0.0002),
+    "MidRain": Air(0.25, 0.008, 0.0005),
+    "HardRain": Air(0.4, 0.014, 0.0015),
 }
 """By the weathers of `taxonomy.WEATHERS`."""
 
@@ -87,11 +87,13 @@ class Scan:
         xyz: (N, 3) float32, metres, in the LiDAR frame: as they are stored.
         ray: (N,) int64, row of each in `turn.ray_directions`.
         face: (N,) what each lies on, as in `Scene.cast`; `caster.NOTHING` for a raindrop.
+        reach: (N,) float32, metres to it, without the noise.
     """
 
     xyz: Float32Array
     ray: IntArray
     face: AnyArray
+    reach: Float32Array
 
 
 def make_lidar(setting: Setting, agent: Agent) -> Lidar:
@@ -126,30 +128,26 @@ def scan(
     rows, distance, face = cast(scene, lidar, ground_from_lidar)
     normal, even = _random_numbers()
     noise, luck, wet = rng.integers(0, _NUMBERS - len(ray_directions()), 3)
-    returned = _returns(scene.setting, distance, face, even[luck + rows], air)
-    measured = np.maximum(distance + np.float32(RANGE_NOISE) * normal[noise + rows], np.float32(0.1))
+    reach = distance.astype(np.float32)
+    returned = _returns(reach, even[luck + rows], air)
     if air.drops:
         drop = np.flatnonzero(even[wet + rows] < air.drops)
         place = _NEAREST_DROP + (_FARTHEST_DROP - _NEAREST_DROP) * even[luck + rows[drop]]
-        measured[drop] = np.minimum(place, measured[drop])
+        reach[drop] = np.minimum(place, reach[drop])
         face[drop], returned[drop] = NOTHING, True
-    back = np.flatnonzero(returned & (measured <= RANGE))
-    ray = rows[back]
-    return Scan((ray_directions()[ray] * measured[back, None]).astype(np.float32), ray, face[back])
+    back = np.flatnonzero(returned)
+    ray, reach = rows[back], reach[back]
+    measured = np.maximum(reach + np.float32(RANGE_NOISE) * normal[noise + ray], np.float32(0.1))
+    return Scan((ray_directions()[ray] * measured[:, None]).astype(np.float32), ray, face[back], reach)
 
 
-def intensity(scene: Scene, ground_from_lidar: SE3, points: Scan, air: Air) -> Float32Array:
-    """How bright the points (N,) came back, 0 to 1: by what they lie on, how steeply, how far and through which air."""
-    reach = np.linalg.norm(points.xyz, axis=1)
-    rays = ground_from_lidar.rotate(points.xyz.astype(np.float64)) / np.maximum(reach, 1e-6)[:, None]
-    hit, grounded = np.flatnonzero(points.face >= 0), np.flatnonzero(points.face == GROUND)
-    bright = np.full(len(reach), 0.05)
-    steep = -np.einsum("nk,nk->n", rays[hit], scene.normals[points.face[hit]])
-    bright[hit] = scene.setting.reflectivity[points.face[hit]] * (0.35 + 0.65 * np.clip(steep, 0, 1))
-    places = ground_from_lidar.apply(points.xyz[grounded].astype(np.float64))
-    angle = 0.35 + 0.65 * np.clip(-rays[grounded, 2], 0, 1)
-    bright[grounded] = ground_reflectivity(scene.setting.world.ground, places) * angle
-    return np.asarray(bright * np.exp(-(_ATTENUATION + air.attenuation) * reach), dtype=np.float32)
+def intensity(points: Scan, air: Air) -> Float32Array:
+    """How bright the points (N,) came back, 0 to 1: by the air on the way alone, as in the release."""
+    return _brightness(points.reach, air)
+
+
+def _brightness(reach: AnyArray, air: Air) -> Float32Array:
+    return np.asarray(np.exp(-(_ATTENUATION + air.attenuation) * reach), dtype=np.float32)
 
 
 def _cast_all(scene: Scene, lidar: Lidar, ground_from_lidar: SE3) -> tuple[IntArray, AnyArray, AnyArray]:
@@ -198,8 +196,8 @@ def _others(rows: IntArray, lidar: Lidar) -> IntArray:
     return rows if lidar.row is None else rows[rows != lidar.row]
 
 
-def _returns(setting: Setting, distance: AnyArray, face: AnyArray, luck: Float32Array, air: Air) -> NDArray[np.bool_]:
-    """Which rays (N,) that met something come back; from what reflects little, fewer."""
-    share = _LOST + air.lost * (np.minimum(distance, RANGE) / RANGE) ** 2
-    share += (_LOST_DARK * np.clip(1 - setting.reflectivity / _DARK, 0, 1))[face]
-    return np.asarray((distance <= RANGE) & (luck >= share))
+def _returns(reach: Float32Array, luck: Float32Array, air: Air) -> NDArray[np.bool_]:
+    """Which rays (N,) come back from where they met something, metres: of weak ones fewer."""
+    near = np.minimum(reach, RANGE)
+    lost = _LOST_DARK * np.maximum(1 - _brightness(near, air) / _SURE, 0) + air.lost * (near / RANGE) ** 2
+    return np.asarray((reach <= RANGE) & (luck >= lost))

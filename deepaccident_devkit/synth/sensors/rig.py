@@ -17,6 +17,7 @@ from deepaccident_devkit.synth.sensors.images.shading import Surroundings
 from deepaccident_devkit.synth.sensors.lidar import AIR_OF_WEATHER, Air, Lidar, Scan, intensity, make_lidar, scan
 from deepaccident_devkit.synth.sensors.scene import Scene, make_scene
 from deepaccident_devkit.synth.sensors.setting import Setting
+from deepaccident_devkit.synth.sensors.single_precision import with_single_precision
 from deepaccident_devkit.synth.stage import World
 from deepaccident_devkit.taxonomy import AGENTS, AgentName
 
@@ -50,6 +51,7 @@ class Rig:
         air: what the weather does to the LiDARs' rays.
         studio: for images; None where none are made.
         seed: of all noise, so that a moment's does not depend on what was recorded before it.
+        exact: whether calib files are ideal, and counts those of a recount.
     """
 
     setting: Setting
@@ -58,6 +60,7 @@ class Rig:
     air: Air
     studio: Studio | None
     seed: tuple[int, ...]
+    exact: bool
 
     def scene(self, time: float) -> Scene:
         """The scene at a time, seconds since the first recorded frame."""
@@ -70,12 +73,13 @@ class Rig:
         ground_from_lidar = ground_from_ego @ agent.ego_from_lidar
         rng = self._random(_LIDAR, frame, agent)
         points = scan(scene, self.lidars[agent.name], ground_from_lidar, self.air, rng, boxed=self.studio is None)
-        labels = annotate(scene, agent, ground_from_lidar, world_from_ground, points)
-        return Sighting(labels, agent.calib(world_from_ground @ ground_from_ego), points)
+        labels = annotate(scene, agent, world_from_ground, points, exact=self.exact)
+        calib = agent.calib(world_from_ground @ ground_from_ego)
+        return Sighting(labels, calib if self.exact else with_single_precision(calib), points)
 
-    def intensity(self, scene: Scene, agent: Agent, points: Scan) -> Float32Array:
-        """How bright each of an agent's points (N,) came back, 0 to 1."""
-        return intensity(scene, agent.ground_from_lidar(scene), points, self.air)
+    def intensity(self, points: Scan) -> Float32Array:
+        """How bright each of the points (N,) came back, 0 to 1."""
+        return intensity(points, self.air)
 
     def bev(self, scene: Scene, agent: Agent) -> BevImage:
         """What lies around an agent, from above."""
@@ -109,6 +113,7 @@ def make_rig(
     image_size: tuple[int, int],
     seed: tuple[int, ...],
     images: bool = True,
+    exact: bool = False,
 ) -> Rig:
     """The sensors of a scenario.
 
@@ -120,6 +125,7 @@ def make_rig(
         image_size: width and height of the images, pixels.
         seed: of noise, clouds and the ground's grain.
         images: whether images will be asked for; labels do not depend on it, points do as in `Sighting`.
+        exact: as in `Rig`.
     """
     weather, time_of_day = sky
     setting = Setting(world, actors)
@@ -132,4 +138,5 @@ def make_rig(
         air=AIR_OF_WEATHER[weather],
         studio=Studio(setting, weather, time_of_day, rng) if images else None,
         seed=seed,
+        exact=exact,
     )

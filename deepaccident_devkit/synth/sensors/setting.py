@@ -12,7 +12,6 @@ from deepaccident_devkit.synth.actors import Actors
 from deepaccident_devkit.synth.roads import Terrain
 from deepaccident_devkit.synth.sensors.caster import GROUND, NOTHING, Caster, make_caster, plane_distance
 from deepaccident_devkit.synth.sensors.placing import moved, placed_on
-from deepaccident_devkit.synth.sensors.reflection import color_reflectivity
 from deepaccident_devkit.synth.solids import FACES_A_SOLID, Solids, concatenate, face_corners, face_planes
 from deepaccident_devkit.synth.stage import World
 from deepaccident_devkit.taxonomy import CATEGORIES
@@ -122,12 +121,6 @@ class Setting:
         """
         moving = np.repeat(self.moving_owner, FACES_A_SOLID)
         return np.concatenate([self.still.face_owner, moving, [NOBODY, NOBODY]])
-
-    @cached_property
-    def reflectivity(self) -> FloatArray:
-        """Share of a LiDAR's light that each face reflects, (F + 2,), as in `face_owner`; 1 of the last two."""
-        colors = [solids.colors.reshape(-1, 3).astype(np.float64) for solids in (self.still.solids, self.moving_shapes)]
-        return np.concatenate([color_reflectivity(np.concatenate(colors)), [1.0, 1.0]])
 
     def frames(self, poses: FloatArray) -> FloatArray:
         """The actors' frames on the ground, (A, 4, 4), at poses (A, 3)."""

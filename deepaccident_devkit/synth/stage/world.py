@@ -26,9 +26,9 @@ Corner = tuple[int, int]
 """By its signs of x and y."""
 
 _MAX_SLOPE = np.deg2rad(3.0)
-_POLE_HEIGHTS = (3.0, 4.0)
-"""Metres between which the infrastructure's sensors are above the ground: from higher up its LiDAR, which looks 20°
-down, passes over cars in the lane beside it."""
+_POLE_HEIGHTS = (4.1, 4.6)
+"""Metres between which the infrastructure's sensors are above the ground: its cameras, some of which are above the
+road, are higher than any truck."""
 _POLE_INSET = 0.15
 """Metres from the sidewalk's outer edges to the middle of the pole: as far from the lanes as one can see along them."""
 _POLE_UNDER_SENSOR = 0.4

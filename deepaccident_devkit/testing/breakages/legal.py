@@ -111,8 +111,8 @@ def lidar_other_key(victim: Victim) -> Path:
 
 
 @GROUP.enter(channel=LIDAR)
-def lidar_double(victim: Victim) -> Path:
-    """A point cloud is of double precision."""
+def lidar_single(victim: Victim) -> Path:
+    """A point cloud is of single precision."""
     points = victim.editor.array(victim.agent, LIDAR, victim.frame)
-    victim.editor.write_array(victim.agent, LIDAR, victim.frame, points.astype(np.float64))
+    victim.editor.write_array(victim.agent, LIDAR, victim.frame, points.astype(np.float32))
     return victim.file(LIDAR)

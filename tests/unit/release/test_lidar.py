@@ -58,10 +58,10 @@ def test_a_missing_file(path: Path) -> None:
         read_lidar(path)
 
 
-def test_writing_restores_carlas_signs_in_single_precision(path: Path) -> None:
-    write_lidar(path, [[1, 2, 3]], [0.5])
+def test_writing_restores_carlas_signs_in_single_precision_as_float64(path: Path) -> None:
+    write_lidar(path, [[1, 2, 0.1]], [0.5])
     with np.load(path) as archive:
-        np.testing.assert_array_equal(archive["data"], np.array([[1, -2, 3, 0.5]], dtype=np.float32), strict=True)
+        np.testing.assert_array_equal(archive["data"], np.array([[1, -2, np.float32(0.1), 0.5]]), strict=True)
 
 
 @pytest.mark.parametrize(("xyz", "intensity"), [([[1, 2]], [1]), ([[1, 2, 3]], [1, 2]), ([[1, 2, 3]], 1)])

@@ -7,6 +7,7 @@ from strategies import mutations
 
 from deepaccident_devkit.errors import MetaError, MissingFileError
 from deepaccident_devkit.release import Collision, Meta, read_meta, write_meta
+from deepaccident_devkit.taxonomy import META_AGENTS
 
 # format.md's real files
 ACCIDENT = """\
@@ -174,9 +175,25 @@ def test_binary_garbage_and_a_missing_file(write, tmp_path: Path) -> None:
 
 def test_written_text_is_as_the_release_has_it(tmp_path: Path) -> None:
     write_meta(tmp_path / "meta.txt", ACCIDENT_META)
-    assert (tmp_path / "meta.txt").read_text() == ACCIDENT
+    assert (tmp_path / "meta.txt").read_text() == ACCIDENT.removesuffix("\n")
     write_meta(tmp_path / "meta.txt", Meta(weather="Clear", time_of_day="Noon", collision=None, simulated_frames=110))
-    assert (tmp_path / "meta.txt").read_text().splitlines()[0] == NO_COLLISION
+    assert (tmp_path / "meta.txt").read_text().splitlines() == [NO_COLLISION, " colliding agents: none none"]
+
+
+@pytest.mark.parametrize("names", ["other other_behind", "ego none"])
+def test_a_normal_scenario_names_those_who_were_to_collide(write, tmp_path: Path, names: str) -> None:
+    text = f"{NO_COLLISION}\n colliding agents: {names}"
+    meta = read_meta(write(text))
+    first, second = names.split()
+    assert meta.collision is None
+    assert meta.planned_agents == (META_AGENTS[first], META_AGENTS[second])
+    write_meta(tmp_path / "meta.txt", meta)
+    assert (tmp_path / "meta.txt").read_text() == text
+
+
+def test_nobody_is_planned_where_meta_names_nobody_or_a_collision(write) -> None:
+    assert read_meta(write(f"{NO_COLLISION}\n colliding agents: none none")).planned_agents is None
+    assert read_meta(write(ACCIDENT)).planned_agents is None
 
 
 @given(st.data())

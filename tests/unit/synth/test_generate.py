@@ -1,3 +1,4 @@
+import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -7,7 +8,7 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.release import find_release, read_label, read_meta, read_split_file
+from deepaccident_devkit.release import find_release, read_calib, read_label, read_meta, read_split_file
 from deepaccident_devkit.synth import SynthConfig, generate, make_release, recording
 from deepaccident_devkit.synth.plan import plan_scenarios
 from deepaccident_devkit.synth.recording import RecordingJob, _Recorder, parts_of, record_scenario
@@ -35,6 +36,8 @@ def test_accident_and_twin_share_name_and_scene(scenarios):
     assert scenarios[0].name == scenarios[1].name
     accident, normal = (read_meta(s.meta_path) for s in scenarios)
     assert normal.collision is None
+    assert set(normal.planned_agents) == {"ego_vehicle", "other_vehicle"}
+    assert " colliding agents: " in scenarios[1].meta_path.read_text()
     assert set(accident.collision.ids) == {accident.agent_ids[0], accident.agent_ids[2]}
     assert set(accident.collision.agents) == {"ego_vehicle", "other_vehicle"}
     assert accident.agent_ids == normal.agent_ids
@@ -232,6 +235,27 @@ def test_an_unlabelled_test_split_has_calib_images_and_points_alone(tmp_path):
     assert train == {"calib", "label", *CHANNELS}
     assert len(list((root / "train").rglob("meta/*.txt"))) == 2
     assert len(DeepAccident("v1", root, verbose=False).split_scenarios("test")) == 1
+
+
+def test_exact_releases_differ_in_calib_and_counts_alone(tmp_path):
+    usual, exact = (
+        find_release(
+            make_release(tmp_path / str(exact), SynthConfig(scenarios=1, frames=4, sensors=False, seed=7, exact=exact))
+        ).scenarios[0]
+        for exact in (False, True)
+    )
+    counts = []
+    for agent, frame in itertools.product(AGENTS, range(1, 5)):
+        one, other = (read_label(scenario.label_path(agent, frame)) for scenario in (usual, exact))
+        for name in ("center", "size", "yaw", "velocity", "actor_id", "camera_visible"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+        counts.append((one.num_lidar_pts != other.num_lidar_pts).mean())
+        assert read_calib(exact.calib_path(agent, frame), raw=True)["lidar_to_ego"][0, 0] == 1
+    assert 0.01 < np.mean(counts) < 0.4
+    first, second = (read_calib(exact.calib_path("ego_vehicle", frame), raw=True) for frame in (1, 4))
+    np.testing.assert_array_equal(first["lidar_to_Camera_Back"], second["lidar_to_Camera_Back"])
+    first, second = (read_calib(usual.calib_path("ego_vehicle", frame), raw=True) for frame in (1, 4))
+    assert 0 < np.abs(first["lidar_to_Camera_Back"] - second["lidar_to_Camera_Back"]).max() < 3e-4
 
 
 def test_another_seed_another_release(tmp_path, digests):

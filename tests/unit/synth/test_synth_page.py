@@ -13,7 +13,13 @@ DOCS = Path(__file__).parents[3] / "docs"
 
 @pytest.fixture(scope="module")
 def script():
-    """The module that writes the page."""
+    """The module that writes the page; another module of its folder measures what stands beside the real scenario."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(DOCS)
+        return loaded_script()
+
+
+def loaded_script():
     spec = importlib.util.spec_from_file_location("make_synth_page", DOCS / "make_synth_page.py")
     assert spec is not None
     assert spec.loader is not None
@@ -30,7 +36,7 @@ def test_the_tables_are_made_of_what_was_measured(script):
 @pytest.mark.parametrize("number", [0, 4, 19, 34])
 def test_what_was_measured_is_still_so(script, number):
     """Of a few pairs, what needs no sensors; numbers may differ a little between machines."""
-    stored, now = script.measured()[number], script.measure(number, views=False)
+    stored, now = script.measured()["pairs"][number], script.measure(number, views=False)
     message = "the generator has changed; run: python docs/make_synth_page.py"
     for key in ("design", "type", "draws", "frames", "twin_frames", "twin_touches"):
         assert now[key] == stored[key], message
@@ -40,7 +46,7 @@ def test_what_was_measured_is_still_so(script, number):
 
 
 def test_the_generator_keeps_its_promises(script):
-    pairs = script.measured()
+    pairs = script.measured()["pairs"]
     for design in DESIGNS:
         of_design = [pair for pair in pairs if pair["design"] == design]
         assert len(of_design) == script.SEEDS
@@ -55,9 +61,35 @@ def test_the_generator_keeps_its_promises(script):
 
 def test_a_stale_page_is_told(script):
     page = script.PAGE.read_text(encoding="utf-8")
-    pairs = script.measured()
-    pairs[0]["draws"] += 1
-    assert script.with_tables(page, pairs) != page
+    for part, key in (("real", "visible"), ("generated", "parked")):
+        measured = script.measured()
+        measured[part][key] += 0.5
+        assert script.with_tables(page, measured) != page
+    measured = script.measured()
+    measured["pairs"][0]["draws"] += 1
+    assert script.with_tables(page, measured) != page
+
+
+def test_what_was_measured_is_kept_to_the_letter(script, tmp_path, monkeypatch):
+    text = script.MEASURED.read_text(encoding="utf-8")
+    content = script.measured()
+    monkeypatch.setattr(script, "MEASURED", tmp_path / "statistics.json")
+    script.save(content)
+    assert (tmp_path / "statistics.json").read_text(encoding="utf-8") == text
+
+
+def test_a_generated_scenario_is_like_the_real_one(script):
+    """Where it was moved towards it; the page says where it is not."""
+    real, generated = script.measured()["real"], script.measured()["generated"]
+    for key in ("distance, 50 %", "speed, median", "kB, LiDAR", "kB, calib", "points of a vehicle's cloud, mean"):
+        assert generated[key] == pytest.approx(real[key], rel=0.3)
+    for key in ("without points", "visible", "visible 30–50", "without points 50–70"):
+        assert generated[key] == pytest.approx(real[key], abs=0.15)
+    for distance in ("10–20", "20–30", "30–50"):
+        assert generated[f"points on a car {distance}"] == pytest.approx(real[f"points on a car {distance}"], rel=0.35)
+    assert generated["LiDAR above its vehicle"] == pytest.approx(real["LiDAR above its vehicle"], abs=0.001)
+    assert 0 < generated["calib, shift"] < 3e-4
+    assert 0.05 < generated["counts that differ"] < 0.4
 
 
 def test_the_page_s_code_runs(tmp_path, monkeypatch, capsys):

@@ -57,12 +57,12 @@ def actor():
 def rig_of(actor):
     """Make the rig of the four agents and of others in a world; `places` moves agents."""
 
-    def make(world, others=(), *, sky=("Clear", "Noon"), image_size=(320, 180), seed=(0,), images=True, places=None):
+    def make(world, others=(), *, places=None, sky=("Clear", "Noon"), image_size=(320, 180), seed=(0,), **options):
         where = {**AGENT_PLACES, **(places or {})}
         cars = [actor(k, "car", *where[name]) for k, name in enumerate(VEHICLE_AGENTS)]
         ids = {name: car.actor_id for name, car in zip(VEHICLE_AGENTS, cars, strict=True)}
         actors = Actors.of([*cars, *others])
-        return make_rig(world, actors, ids, sky=sky, image_size=image_size, seed=seed, images=images)
+        return make_rig(world, actors, ids, sky=sky, image_size=image_size, seed=seed, **options)
 
     return make
 

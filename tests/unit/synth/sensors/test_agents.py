@@ -3,7 +3,11 @@
 import numpy as np
 import pytest
 
+from deepaccident_devkit.synth.bodies import MEDIAN_SIZES
+from deepaccident_devkit.synth.roads import Junction, RoadSpec
 from deepaccident_devkit.synth.sensors.images.buffers import ray_directions, slopes
+from deepaccident_devkit.synth.solids import face_corners, face_planes
+from deepaccident_devkit.synth.stage import random_world
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 
 
@@ -18,11 +22,58 @@ def test_all_agents_have_six_cameras(rig):
         assert [camera.channel for camera in agent.cameras] == list(CAMERAS)
 
 
-def test_lidar_is_1_94_m_above_the_road_and_on_a_pole_3_to_5(rig):
+def test_lidar_is_half_a_metre_above_its_vehicle_and_on_a_pole_3_to_5_above_the_road(rig):
     scene = rig.scene(0.0)
     heights = [agent.ground_from_lidar(scene).translation[2] for agent in rig.agents]
-    np.testing.assert_allclose(heights[:4], 1.94)
+    np.testing.assert_allclose(heights[:4], 1.52 + 0.5)
     assert 3 <= heights[4] <= 5
+
+
+def test_a_vehicle_s_cameras_are_at_the_faces_of_its_box(rig):
+    """As measured in a real scenario: front and back in the middle, the others at the corners, below the LiDAR."""
+    half_length, half_width = 4.60 / 2, 1.93 / 2
+    for agent in rig.agents[:4]:
+        places = {camera.channel: camera.lidar_from_camera.translation for camera in agent.cameras}
+        expected = {
+            "Camera_Front": (half_length, 0),
+            "Camera_FrontLeft": (half_length, half_width),
+            "Camera_FrontRight": (half_length, -half_width),
+            "Camera_Back": (-half_length, 0),
+            "Camera_BackLeft": (-half_length, half_width),
+            "Camera_BackRight": (-half_length, -half_width),
+        }
+        for channel, xy in expected.items():
+            np.testing.assert_allclose(places[channel], (*xy, -0.3), atol=0.002)
+
+
+def test_the_pole_s_cameras_stand_apart_as_in_a_real_scenario(rig):
+    """Read off its calib files; metres in the LiDAR frame, right-handed; as high as the LiDAR."""
+    pole = rig.agents[4]
+    np.testing.assert_array_equal(pole.ego_from_lidar.matrix, np.eye(4))
+    expected = {
+        "Camera_Front": (0, 2.4686),
+        "Camera_FrontLeft": (-4.4833, 2.4686),
+        "Camera_FrontRight": (4.4833, 2.4686),
+        "Camera_Back": (0, -2.4686),
+        "Camera_BackLeft": (-4.4833, -2.4686),
+        "Camera_BackRight": (4.4833, -2.4686),
+    }
+    for camera in pole.cameras:
+        np.testing.assert_allclose(camera.lidar_from_camera.translation, (*expected[camera.channel], 0), atol=2e-4)
+
+
+@pytest.mark.parametrize("view", ["open", "hidden"])
+@pytest.mark.parametrize("kind", ["four-way", "three-way"])
+def test_the_pole_s_cameras_are_in_no_house_and_above_all_trucks(rig, kind, view):
+    places = np.array([camera.lidar_from_camera.translation for camera in rig.agents[4].cameras])
+    for seed in range(8):
+        junction = Junction(RoadSpec(kind=kind, lanes=1 + seed % 2, kerb_radius=3.0 + seed % 8))
+        town = random_world(np.random.default_rng(seed), junction, view, between=("west", "south"))
+        cameras = town.lidar_pole.apply(places)
+        assert cameras[:, 2].min() > 1.04 * MEDIAN_SIZES["truck"][2]
+        normals, offsets = face_planes(face_corners(town.props.corners))
+        beyond = cameras @ normals.T - offsets
+        assert beyond.reshape(len(cameras), -1, 6).max(axis=2).min() > 0
 
 
 def test_a_tall_vehicle_has_its_lidar_above_the_roof(world, actor):

@@ -8,6 +8,7 @@ from deepaccident_devkit.synth.sensors.lidar import (
     RANGE_NOISE,
     Air,
     _cast_all,
+    _returns,
     intensity,
     scan,
 )
@@ -15,7 +16,7 @@ from deepaccident_devkit.synth.sensors.turn import ray_directions, rays_through,
 from deepaccident_devkit.synth.solids import Block
 
 DRY, RAIN = AIR_OF_WEATHER["Clear"], AIR_OF_WEATHER["HardRain"]
-RED, BLACK = (200, 30, 30), (8, 8, 8)
+RED = (200, 30, 30)
 
 
 def scan_of(rig, agent=0, air=DRY, seed=0, *, boxed=False):
@@ -52,7 +53,7 @@ def test_points_of_the_ground_lie_on_the_terrain(world, hilly_world, rig_of, kin
     ground = pose.apply(points.xyz[points.face == GROUND].astype(np.float64))
     above = ground[:, 2] - scene.setting.terrain.height(ground[:, :2])
     assert len(ground) > 5000
-    assert np.abs(above).max() < 0.06
+    assert np.abs(above).max() < 3 * RANGE_NOISE  # along the ray, which looks down by 30 degrees at most
     assert (np.abs(ground[:, 2]).max() > 0.5) == (kind == "hilly")
 
 
@@ -102,7 +103,7 @@ def test_rays_through_a_box_are_those_with_a_point_in_it():
     through = np.flatnonzero(inside.all(axis=2).any(axis=1))
     rows = rays_through(size, place)
     assert np.isin(through, rows).all()
-    assert len(through) > 0.75 * len(rows) > 1000
+    assert len(through) > 0.7 * len(rows) > 1000
 
 
 @pytest.mark.parametrize("place", ["world", "hilly_world"])
@@ -122,7 +123,7 @@ def test_boxed_all_points_in_boxes_are_there(request, crowd, rig_of, place, air)
         assert len(found[0][0]) > 500
         for one, other in zip(*found, strict=True):
             np.testing.assert_array_equal(one, other)
-        assert len(boxed.xyz) < 0.7 * len(full.xyz)
+        assert len(boxed.xyz) < 0.75 * len(full.xyz)
 
 
 def test_the_own_body_is_met_where_it_is(world, rig_of):
@@ -141,17 +142,17 @@ def test_the_own_body_is_met_where_it_is(world, rig_of):
     assert len(rows) == len(ray_directions())
 
 
-def test_more_gets_lost_far_away_in_rain_and_from_black(world, bare, rig_of):
+def test_more_gets_lost_in_rain_and_of_what_comes_back_weak(world, bare, rig_of):
     far = Block((19.0, 20.0), (-60.0, 60.0), (-0.1, 12.0), RED)
     rig = rig_of(bare(world, [far]), images=False)
     clear, rain = (len(scan_of(rig, air=air)[2].xyz) for air in (DRY, RAIN))
     assert rain < 0.95 * clear
-    sides = [
-        Block((-20.0, -19.0), span, (-0.1, 6.0), color)
-        for span, color in (((-12.0, -1.75), RED), ((-1.75, 8.5), BLACK))
-    ]
-    _, _, points = scan_of(rig_of(bare(world, sides), images=False))
-    assert (points.face == 7).sum() < 0.9 * (points.face == 1).sum()
+    reach = np.repeat(np.array([5.0, 30.0, 69.0], dtype=np.float32), 10_000)
+    luck = np.tile(np.linspace(0, 1, 10_000, dtype=np.float32), 3)
+    kept = _returns(reach, luck, DRY).reshape(3, -1).mean(axis=1)
+    expected = 1 - 0.4 * np.maximum(1 - np.exp(-0.03 * np.array([5.0, 30.0, 69.0])) / 0.8, 0)
+    np.testing.assert_allclose(kept, expected, atol=1e-3)
+    assert not _returns(np.array([70.1, np.inf], dtype=np.float32), np.ones(2, dtype=np.float32), DRY).any()
 
 
 def test_rain_sends_rays_back(world, rig_of):
@@ -160,18 +161,15 @@ def test_rain_sends_rays_back(world, rig_of):
     assert (scan_of(rig, air=RAIN)[2].face == -1).sum() > 20
 
 
-def test_intensity_falls_with_distance_and_darkness(world, bare, rig_of):
-    sides = [
-        Block((-20.0, -19.0), span, (-0.1, 6.0), color)
-        for span, color in (((-12.0, -1.75), RED), ((-1.75, 8.5), BLACK))
-    ]
-    scene, pose, points = scan_of(rig_of(bare(world, sides), images=False))
-    bright = intensity(scene, pose, points, DRY)
+def test_intensity_is_that_of_the_distance_before_the_noise(world, rig_of):
+    """As in a real scenario: exp(−0.03 · distance), whatever the point lies on."""
+    _, _, points = scan_of(rig_of(world, images=False))
+    bright = intensity(points, DRY)
     assert bright.dtype == np.float32
-    assert 0 <= bright.min() < bright.max() <= 1
-    assert bright[points.face == 1].mean() > 1.5 * bright[points.face == 7].mean()
-    wet = intensity(scene, pose, points, RAIN)
-    assert (wet < bright).all()
+    off = np.linalg.norm(points.xyz, axis=1) + np.log(bright) / 0.03
+    assert off.std() == pytest.approx(RANGE_NOISE, rel=0.05)
+    assert abs(off.mean()) < 0.002
+    assert (intensity(points, RAIN) < bright).all()
 
 
 def test_noise_is_the_seeds_alone(world, rig_of):
