@@ -19,13 +19,13 @@ from deepaccident_devkit.evaluation.runs.evaluation_run import (
     ReleaseInfo,
     ResultsInfo,
 )
-from deepaccident_devkit.evaluation.runs.fingerprints import ScenarioHashes, scenario_hashes
 from deepaccident_devkit.evaluation.runs.parquet import read_rows
 from deepaccident_devkit.evaluation.runs.results_text import results_text
 from deepaccident_devkit.evaluation.runs.saving import checked_target, save_run
 from deepaccident_devkit.evaluation.runs.selection import SampleSelection
 from deepaccident_devkit.evaluation.runs.text import summary_text
 from deepaccident_devkit.evaluation.runs.verification import Verification, verify_bundle
+from deepaccident_devkit.release.fingerprints import ScenarioHashes, scenario_hashes
 
 __all__ = [
     "BREAKDOWNS",

@@ -12,8 +12,8 @@ from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.evaluator import Evaluator
 from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
-from deepaccident_devkit.evaluation.runs.fingerprints import digest_of
 from deepaccident_devkit.evaluation.setups import EvaluationSetup
+from deepaccident_devkit.release.fingerprints import digest_of
 
 _ENDING: Final = ".counts.json"
 

@@ -16,9 +16,9 @@ from deepaccident_devkit.evaluation.run import evaluate_samples
 from deepaccident_devkit.evaluation.runs.checkpoints import checkpoint_path, drop_if_damaged
 from deepaccident_devkit.evaluation.runs.coverage import Coverage, coverage
 from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun, Partial, ReleaseInfo, ResultsInfo
-from deepaccident_devkit.evaluation.runs.fingerprints import scenario_hashes
 from deepaccident_devkit.evaluation.runs.selection import SampleList, SampleSelection, ScopeName, scenario_of
 from deepaccident_devkit.evaluation.setups import EvaluationSetup, SampleLoader
+from deepaccident_devkit.release.fingerprints import scenario_hashes
 
 
 def default_selection(

@@ -16,10 +16,10 @@ from deepaccident_devkit.evaluation.breakdowns import Bootstrap, Breakdown, Grou
 from deepaccident_devkit.evaluation.evaluator import Evaluator
 from deepaccident_devkit.evaluation.frozen_mappings import plain
 from deepaccident_devkit.evaluation.headlines import headlines
-from deepaccident_devkit.evaluation.runs.fingerprints import ScenarioHashes, fingerprint
 from deepaccident_devkit.evaluation.runs.selection import SampleSelection
 from deepaccident_devkit.evaluation.setups import EvaluationSetup
 from deepaccident_devkit.parallel import run_batch
+from deepaccident_devkit.release.fingerprints import ScenarioHashes, fingerprint
 
 SUMMARY_FORMAT: Final = "DeepAccident metrics summary"
 SUMMARY_VERSION: Final = 1

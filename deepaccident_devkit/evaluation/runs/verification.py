@@ -29,8 +29,8 @@ from deepaccident_devkit.evaluation.runs.details import sample_rows
 from deepaccident_devkit.evaluation.runs.differences import ABSENT, Difference, differing
 from deepaccident_devkit.evaluation.runs.evaluate import evaluate_results
 from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
-from deepaccident_devkit.evaluation.runs.fingerprints import scenario_hashes
 from deepaccident_devkit.evaluation.runs.parquet import read_rows
+from deepaccident_devkit.release.fingerprints import scenario_hashes
 
 _SHOWN: Final = 10
 """Differences of a kind that the text lists."""

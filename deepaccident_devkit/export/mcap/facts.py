@@ -10,9 +10,9 @@ from google.protobuf.wrappers_pb2 import DoubleValue
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.evaluation.runs.fingerprints import fingerprint, scenario_hashes
 from deepaccident_devkit.export.mcap.moment import Moment
 from deepaccident_devkit.export.mcap.recording import Recording, frame_timestamp
+from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
 from deepaccident_devkit.tables.tokens import frame_token
 
 METADATA: Final = "deepaccident_devkit"

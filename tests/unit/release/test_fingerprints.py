@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.evaluation.runs import ScenarioHashes, scenario_hashes
-from deepaccident_devkit.evaluation.runs.fingerprints import digest_of, fingerprint
+from deepaccident_devkit.release.fingerprints import ScenarioHashes, digest_of, fingerprint, scenario_hashes
 
 Find = Callable[[Path], Path]
 

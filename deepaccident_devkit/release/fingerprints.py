@@ -7,12 +7,10 @@ import json
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
-from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.parallel import run_batch
-from deepaccident_devkit.release import ScenarioFolder, find_release
-from deepaccident_devkit.release.layout import frame_numbers
+from deepaccident_devkit.release.layout import ScenarioFolder, find_release, frame_numbers
 from deepaccident_devkit.taxonomy import AGENTS
 
 _DIGEST_BYTES: Final = 16
@@ -40,8 +38,20 @@ class ScenarioHashes:
         return asdict(self)
 
 
+class Located(Protocol):
+    """What says where a release is, such as a `Dataset`."""
+
+    @property
+    def dataroot(self) -> Path:
+        """The release's folder."""
+
+    @property
+    def version(self) -> str:
+        """`v1` or `v1-mini`."""
+
+
 def scenario_hashes(
-    dataset: Dataset, scenarios: Collection[str], *, workers: int | None = None
+    dataset: Located, scenarios: Collection[str], *, workers: int | None = None
 ) -> dict[str, ScenarioHashes]:
     """The hashes of some scenarios' files, by token in order; those that the release has not are left out.
 
