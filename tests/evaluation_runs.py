@@ -10,9 +10,9 @@ import numpy as np
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import Bootstrap, DetectedBoxes, breakdown, detection_truth, instances_of
-from deepaccident_devkit.evaluation.accident import BoxTruth, accident_context
-from deepaccident_devkit.evaluation.attributes import sample_attributes
-from deepaccident_devkit.evaluation.predictions import Accident
+from deepaccident_devkit.evaluation.metrics.accident import BoxTruth, accident_context
+from deepaccident_devkit.evaluation.metrics.attributes import sample_attributes
+from deepaccident_devkit.evaluation.metrics.predictions import Accident
 from deepaccident_devkit.evaluation.results import Results, ResultsTask, ResultsWriter, read_results
 from deepaccident_devkit.evaluation.runs import (
     EvaluationRun,
@@ -24,7 +24,7 @@ from deepaccident_devkit.evaluation.runs import (
     default_selection,
     evaluate_results,
 )
-from deepaccident_devkit.evaluation.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.motion import MotionLabelConfig
 
 BREAKDOWNS = ("all", "time_to_impact", "accident_visibility", "agent", "scenario_type")

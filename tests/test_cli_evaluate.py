@@ -16,7 +16,7 @@ from deepaccident_devkit.errors import ChoiceError, EvaluationError, ResultsErro
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, accident_context, instances_of
 from deepaccident_devkit.evaluation.results import ResultsWriter
 from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results, read_bundle, save_run
-from deepaccident_devkit.evaluation.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 
 AGENTS = ("ego_vehicle", "infrastructure")
 LIST = ("--split", "train", "--agents", ",".join(AGENTS), "--bootstrap", "0")

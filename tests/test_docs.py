@@ -13,17 +13,17 @@ from click import Context
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.evaluation.accident import PROTOCOLS
-from deepaccident_devkit.evaluation.accident.boxes import BoxAccidents
-from deepaccident_devkit.evaluation.accident.paper import PaperAccidents
-from deepaccident_devkit.evaluation.accident.reading import AccidentReading
-from deepaccident_devkit.evaluation.accident.released import ReleasedAccidents
-from deepaccident_devkit.evaluation.accident.scoring import Scoring
-from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS, DetectionProtocol
-from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS, MotionProtocol
-from deepaccident_devkit.evaluation.panoptic import VpqRules
-from deepaccident_devkit.evaluation.trajectory_errors import TrajectoryRules
-from deepaccident_devkit.evaluation.warning import WARNING_PROTOCOLS, WarningProtocol
+from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS
+from deepaccident_devkit.evaluation.metrics.accident.boxes import BoxAccidents
+from deepaccident_devkit.evaluation.metrics.accident.paper import PaperAccidents
+from deepaccident_devkit.evaluation.metrics.accident.released import ReleasedAccidents
+from deepaccident_devkit.evaluation.metrics.accident.scoring import Scoring
+from deepaccident_devkit.evaluation.metrics.alarms.reading import AccidentReading
+from deepaccident_devkit.evaluation.metrics.detection import DETECTION_PROTOCOLS, DetectionProtocol
+from deepaccident_devkit.evaluation.metrics.motion import MOTION_PROTOCOLS, MotionProtocol
+from deepaccident_devkit.evaluation.metrics.motion.overlaps import VpqRules
+from deepaccident_devkit.evaluation.metrics.trajectories import TrajectoryRules
+from deepaccident_devkit.evaluation.metrics.warning import WARNING_PROTOCOLS, WarningProtocol
 from deepaccident_devkit.geometry import Box
 from deepaccident_devkit.motion import LabelProtocol, PostProcessing
 

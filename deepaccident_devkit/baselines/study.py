@@ -13,7 +13,7 @@ from deepaccident_devkit.baselines.study_result import StudyRow, StudyTable, V2X
 from deepaccident_devkit.baselines.study_samples import study_samples
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.evaluation import SampleAttributes, sample_attributes
-from deepaccident_devkit.evaluation.attributes import tokens_by_value
+from deepaccident_devkit.evaluation.metrics.attributes import tokens_by_value
 
 
 def v2x_study(

@@ -9,7 +9,7 @@ from typing import get_args
 from deepaccident_devkit.baselines.motion_models import MotionModel
 from deepaccident_devkit.baselines.outlook import MOTION_MODELS
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.evaluation.accident import PROTOCOLS
+from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS
 from deepaccident_devkit.motion.sample_lists import Scope
 from deepaccident_devkit.taxonomy import AGENTS, VEHICLE_AGENTS
 

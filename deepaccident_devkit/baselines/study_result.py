@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from deepaccident_devkit.baselines.study_config import StudyConfig
-from deepaccident_devkit.evaluation.frozen_mappings import FrozenMappings
+from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.text import columns_text
 

@@ -8,7 +8,7 @@ from deepaccident_devkit.baselines import MOTION_MODELS, Baseline, StudyConfig, 
 from deepaccident_devkit.baselines.figures import save_study
 from deepaccident_devkit.cli.options import release_parameters
 from deepaccident_devkit.deepaccident import DeepAccident
-from deepaccident_devkit.evaluation.accident import PROTOCOLS
+from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS
 from deepaccident_devkit.evaluation.results import ResultsTask
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.motion.sample_lists import Scope

@@ -13,8 +13,7 @@ from deepaccident_devkit.cli.evaluate_options import selection_of, selection_par
 from deepaccident_devkit.cli.options import release_parameters
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation import Bootstrap
-from deepaccident_devkit.evaluation.attributes import ATTRIBUTES, EVERYTHING
-from deepaccident_devkit.evaluation.explanation import explain
+from deepaccident_devkit.evaluation.metrics.attributes import ATTRIBUTES, EVERYTHING
 from deepaccident_devkit.evaluation.results import Results, read_results
 from deepaccident_devkit.evaluation.runs import (
     BREAKDOWNS,
@@ -25,9 +24,10 @@ from deepaccident_devkit.evaluation.runs import (
     save_run,
     summary_text,
 )
+from deepaccident_devkit.evaluation.runs.explanation import explain
+from deepaccident_devkit.evaluation.runs.sanity import check_sanity
+from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup, TaskName
 from deepaccident_devkit.evaluation.runs.text import SHOWN_BREAKDOWNS
-from deepaccident_devkit.evaluation.sanity import check_sanity
-from deepaccident_devkit.evaluation.setups import TASK_PROTOCOLS, EvaluationSetup, TaskName
 from deepaccident_devkit.render.evaluation import save_report
 
 _RESAMPLES = 200

@@ -13,7 +13,7 @@ from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation import Bootstrap
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.evaluation.runs import compare_bundles, coverage, read_bundle, results_text, verify_bundle
-from deepaccident_devkit.evaluation.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.taxonomy import VERSIONS
 

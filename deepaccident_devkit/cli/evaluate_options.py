@@ -9,7 +9,7 @@ import click
 from deepaccident_devkit.cli.options import Verb, agent_names, agents_parameter
 from deepaccident_devkit.evaluation.runs import SampleSelection, default_selection
 from deepaccident_devkit.evaluation.runs.selection import SampleList, ScopeName
-from deepaccident_devkit.evaluation.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.taxonomy import AGENTS
 
 _SELECTION = (

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, Literal, get_args
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.evaluation.predictions import MotionOutput
+from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
 from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels, PostProcessing, motion_labels
 from deepaccident_devkit.render.axes import axes_or_new, figure_or_new, settled
 from deepaccident_devkit.render.layers import Layer, layers_of

@@ -10,8 +10,8 @@ import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.evaluation.instance_paths import instance_paths
-from deepaccident_devkit.evaluation.predictions import MotionOutput
+from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
+from deepaccident_devkit.evaluation.metrics.trajectories import instance_paths
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import (
     OWN_BOX_ID,

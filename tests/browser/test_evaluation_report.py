@@ -7,7 +7,7 @@ from chromium import Browser
 from evaluation_runs import PARTIAL, evaluation_run
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.evaluation.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.motion import samples
 from deepaccident_devkit.render.evaluation import save_report
 

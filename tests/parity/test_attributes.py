@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from deepaccident_devkit.evaluation.attributes import (
+from deepaccident_devkit.evaluation.metrics.attributes import (
     SampleAttributes,
     ScenarioAttributes,
     scenario_attributes,

@@ -12,14 +12,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from deepaccident_devkit.evaluation.panoptic import (
+from deepaccident_devkit.evaluation.metrics.motion.overlaps import (
     PanopticQuality,
     VpqRules,
+    iou,
+    segmentation_counts,
     separate_selected_as_released,
     vpq,
     vpq_counts,
 )
-from deepaccident_devkit.evaluation.segmentation import iou, segmentation_counts
 
 RANGES = ("30x30", "100x100")
 TOLERANCE = 2e-6

@@ -3,9 +3,8 @@
 schema/results/README.md describes them; `ResultsWriter` writes, `read_results` reads.
 """
 
-from deepaccident_devkit.evaluation.results.contents import Prediction
-from deepaccident_devkit.evaluation.results.form import FORMAT, FORMAT_VERSION, MotionForm, ResultsTask
-from deepaccident_devkit.evaluation.results.reader import Results, read_results
+from deepaccident_devkit.evaluation.results.header import FORMAT, FORMAT_VERSION, MotionForm, ResultsTask
+from deepaccident_devkit.evaluation.results.reader import Prediction, Results, read_results
 from deepaccident_devkit.evaluation.results.schemas import RESULT_SCHEMAS
 from deepaccident_devkit.evaluation.results.writer import ResultsWriter
 

@@ -7,9 +7,8 @@ from types import MappingProxyType
 from typing import Any, Final, get_args
 
 from deepaccident_devkit.evaluation.results.columns import LARGEST
-from deepaccident_devkit.evaluation.results.detection_entries import IGNORED
-from deepaccident_devkit.evaluation.results.form import FORMAT, FORMAT_VERSION, Stored
-from deepaccident_devkit.evaluation.results.header import WORDS
+from deepaccident_devkit.evaluation.results.entries import IGNORED
+from deepaccident_devkit.evaluation.results.header import FORMAT, FORMAT_VERSION, WORDS, Stored
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
 from deepaccident_devkit.motion import LABEL_PROTOCOLS
 from deepaccident_devkit.taxonomy import CATEGORIES
@@ -43,7 +42,6 @@ _FROM_ZERO: Final = {"type": "number", "minimum": 0, "maximum": LARGEST}
 _WHOLE: Final = {"type": "integer"}
 _COUNT: Final = {"type": "integer", "minimum": 1}
 _TOKEN: Final = {"type": "string", "pattern": WORDS}
-
 _ACCIDENT: Final = _object(
     {
         "positions": _said(

@@ -1,21 +1,158 @@
-"""The shards of motion results: opened a few at a time, and checked as a whole."""
+"""Motion results in shards: the manifest that lists them, archives opened a few at a time and checked, their writer."""
 
 from __future__ import annotations
 
+import json
 import os
 import zipfile
 from collections import Counter, OrderedDict
+from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Final
+from pathlib import Path, PurePosixPath
+from types import MappingProxyType
+from typing import Any, Final
 
-from deepaccident_devkit.evaluation.results.arrays_in_shards import member_name
-from deepaccident_devkit.evaluation.results.faults import ContentError, at, told_of
-from deepaccident_devkit.evaluation.results.form import RESULTS_FILE, MotionForm
-from deepaccident_devkit.evaluation.results.manifest import Shard
-from deepaccident_devkit.evaluation.results.motion_arrays import PATHS, check_sample, members
-from deepaccident_devkit.files import DAMAGED_ARCHIVE, file_checksum
+from deepaccident_devkit.arrays import AnyArray
+from deepaccident_devkit.errors import ResultsError
+from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
+from deepaccident_devkit.evaluation.results.faults import ContentError, at, shown, told_of
+from deepaccident_devkit.evaluation.results.header import (
+    RESULTS_FILE,
+    Header,
+    MotionForm,
+    Stored,
+    check_fields,
+    check_token,
+)
+from deepaccident_devkit.evaluation.results.motion_arrays import (
+    PATHS,
+    check_sample,
+    head_arrays,
+    instance_arrays,
+    member_name,
+    members,
+    put_array,
+)
+from deepaccident_devkit.files import DAMAGED_ARCHIVE, file_checksum, irregular_text
+from deepaccident_devkit.geometry import BevGrid
+
+SHARD_FIELDS: Final = ("file", "tokens", "bytes", "checksum")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shard:
+    """An archive of some samples.
+
+    Attributes:
+        file: its path in the folder of the results, with `/`.
+        tokens: of its samples, in order.
+        bytes: its size.
+        checksum: BLAKE2b of its bytes, 16 bytes as hexadecimal digits (`files.file_checksum`).
+    """
+
+    file: str
+    tokens: tuple[str, ...]
+    bytes: int
+    checksum: str
+
+    def as_dict(self) -> dict[str, Any]:
+        """The shard as JSON holds it."""
+        return {"file": self.file, "tokens": list(self.tokens), "bytes": self.bytes, "checksum": self.checksum}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Manifest:
+    """The form and the shards of motion results.
+
+    Attributes:
+        form: how predictions are stored.
+        shards: the archives.
+        shard_of: token → number of its shard, in the order of the shards.
+    """
+
+    form: MotionForm
+    shards: tuple[Shard, ...]
+    shard_of: Mapping[str, int]
+
+
+def read_manifest(document: Mapping[str, Any], root: Path) -> Manifest:
+    """The manifest of the results in a folder, whose shards are there and as long as it says.
+
+    Raises:
+        ContentError: names the field, or the shard.
+    """
+    with at("form"):
+        form = _form(document["form"])
+    told = document["shards"]
+    if not isinstance(told, list) or not told:
+        raise ContentError(f"shards: expected a list of at least one, found {shown(told)}")
+    shards: list[Shard] = []
+    shard_of: dict[str, int] = {}
+    for number, each in enumerate(told):
+        with at(f"shards: entry {number}"):
+            shard = _shard(each)
+            _check_file(shard, root, {other.file for other in shards})
+        for token in shard.tokens:
+            if token in shard_of:
+                others = "twice" if shard_of[token] == number else f"also in {shards[shard_of[token]].file}"
+                raise ContentError(f"{shard.file}: {token}: stands there {others}; store a sample once")
+            shard_of[token] = number
+        shards.append(shard)
+    return Manifest(form, tuple(shards), MappingProxyType(shard_of))
+
+
+def _form(told: object) -> MotionForm:
+    if not isinstance(told, dict):
+        raise ContentError(f"expected an object, found {shown(told)}")
+    check_fields(told, MotionForm.FIELDS)
+    try:
+        return MotionForm.from_dict(told)
+    except ResultsError as error:
+        raise ContentError(str(error)) from error
+
+
+def _shard(told: object) -> Shard:
+    if not isinstance(told, dict):
+        raise ContentError(f"expected an object, found {shown(told)}")
+    check_fields(told, SHARD_FIELDS)
+    file, tokens, size, checksum = (told[name] for name in SHARD_FIELDS)
+    if not isinstance(file, str) or not file.isprintable() or "\\" in file or not _is_inside(PurePosixPath(file)):
+        raise ContentError(f"file: expected a path inside the folder of the results, found {shown(file)}")
+    if not isinstance(tokens, list) or not tokens:
+        raise ContentError(f"tokens: expected a list of at least one token, found {shown(tokens)}")
+    with at("tokens"):
+        names = tuple(check_token(token) for token in tokens)
+    if type(size) is not int or size < 0:
+        raise ContentError(f"bytes: expected the file's size, a whole number, found {shown(size)}")
+    if not isinstance(checksum, str):
+        raise ContentError(f"checksum: expected a text, found {shown(checksum)}")
+    return Shard(file=file, tokens=names, bytes=size, checksum=checksum)
+
+
+def _is_inside(path: PurePosixPath) -> bool:
+    return not path.is_absolute() and path.parts != () and ".." not in path.parts
+
+
+def _check_file(shard: Shard, root: Path, others: AbstractSet[str]) -> None:
+    """Whether a shard's file is there, as long as it should be, in the folder, and not another shard's too."""
+    path = root / shard.file
+    if shard.file in others:
+        raise ContentError(f"file: {shard.file} is another entry's too; list each file once")
+    try:
+        status = path.stat()
+        inside = path.resolve().is_relative_to(root.resolve())
+    except OSError as error:
+        raise ContentError(f"file: {shard.file} cannot be opened ({error.strerror}); copy it to its place") from error
+    if not inside:
+        raise ContentError(f"file: {shard.file} is a link that leads out of the folder; put the file itself there")
+    irregular = irregular_text(status.st_mode)
+    if irregular:
+        raise ContentError(f"file: {shard.file} is {irregular}")
+    if status.st_size != shard.bytes:
+        raise ContentError(f"bytes: {shard.file} should have {shard.bytes}, found {status.st_size}; copy it again")
+
 
 _OPEN_FILES: Final = 8
 
@@ -87,3 +224,115 @@ def _check_members(archive: zipfile.ZipFile, shard: Shard, form: MotionForm) -> 
             raise ContentError(f"{name}: belongs to no sample of the shard; store the arrays of its tokens alone")
         if times > 1:
             raise ContentError(f"{name}: stands there {times} times; store each array once")
+
+
+_MOST_SAMPLES: Final = 64
+_MOST_BYTES: Final = 32 * 2**20
+
+
+class ShardWriter:
+    """Writes the folder of motion results, the manifest last."""
+
+    def __init__(
+        self, folder: Path, header: Header, *, grid: BevGrid | None, step: float, labels: str | None, store: Stored
+    ) -> None:
+        """Write into an empty folder; the other arguments are those of ResultsWriter."""
+        self._folder, self._header = folder, header
+        self._grid, self._step, self._labels, self._store = grid, step, labels, store
+        self._frames = self._predictions = 0
+        self._shards: list[Shard] = []
+        self._archive: zipfile.ZipFile | None = None
+        self._in_shard: list[str] = []
+        (folder / "shards").mkdir()
+
+    def add(self, token: str, prediction: object) -> None:
+        """Write the prediction of a sample; raises ResultsError, and nothing of it is written then."""
+        output = self._checked(prediction)
+        arrays = self._arrays(output)
+        predictions, frames = next(iter(arrays.values())).shape[:2]
+        if self._frames not in (0, frames):
+            raise ResultsError(f"expected {self._frames} frames as of the samples before, found {frames}")
+        self._form(output.grid, predictions, frames)
+        self._grid, self._frames = output.grid, frames
+        self._predictions = max(self._predictions, predictions)
+        if self._archive is None:
+            self._archive = zipfile.ZipFile(self._folder / self._file, "w")
+        for name, array in arrays.items():
+            put_array(self._archive, token, name, array)
+        self._in_shard.append(token)
+        written = sum(entry.compress_size for entry in self._archive.infolist())
+        if len(self._in_shard) >= _MOST_SAMPLES or written >= _MOST_BYTES:
+            self._end_shard()
+
+    def finish(self) -> None:
+        """Write the manifest; raises ResultsError if nothing was added."""
+        self._end_shard()
+        if self._grid is None or not self._shards:
+            raise ResultsError("no prediction was added; results of no sample cannot be read")
+        told = {
+            **self._header.as_dict(),
+            "form": self._form(self._grid, self._predictions, self._frames).as_dict(),
+            "shards": [shard.as_dict() for shard in self._shards],
+        }
+        (self._folder / RESULTS_FILE).write_bytes(f"{json.dumps(told, indent=1)}\n".encode())
+
+    def close(self) -> None:
+        """Close the archive that is being written, if any."""
+        archive, self._archive = self._archive, None
+        if archive is not None:
+            archive.close()
+
+    @property
+    def _file(self) -> str:
+        return f"shards/{len(self._shards):05d}.npz"
+
+    def _form(self, grid: BevGrid, predictions: int, frames: int) -> MotionForm:
+        return MotionForm(
+            stored=self._store,
+            grid=grid,
+            predictions=predictions,
+            frames=frames,
+            step=self._step,
+            labels=self._labels,
+        )
+
+    def _checked(self, prediction: object) -> MotionOutput:
+        if not isinstance(prediction, MotionOutput):
+            raise ResultsError(
+                f"expected a MotionOutput, found {type(prediction).__name__}; make one with "
+                "MotionOutput.from_arrays(…), or of instance maps with instances_of(…)"
+            )
+        if self._grid not in (None, prediction.grid):
+            raise ResultsError(
+                f"expected a prediction on {self._grid}, found one on {prediction.grid}; write others to other results"
+            )
+        return prediction
+
+    def _arrays(self, output: MotionOutput) -> dict[str, AnyArray]:
+        if output.instances is not None and output.instances.min() < 0:
+            raise ResultsError(f"instances: expected ids from 1, and 0 elsewhere, found {output.instances.min()}")
+        if self._store == "instances":
+            return instance_arrays(output, self._labels)
+        if output.heads is None:
+            raise ResultsError("expected heads, found instance maps; write those with store='instances'")
+        if any(heads.ignore_index is not None for heads in output.heads):
+            raise ResultsError(
+                "expected a model's heads, found those of labels, which hold values to ignore; write them with "
+                "store='instances'"
+            )
+        return head_arrays(output)
+
+    def _end_shard(self) -> None:
+        if self._archive is None:
+            return
+        self.close()
+        path = self._folder / self._file
+        self._shards.append(
+            Shard(
+                file=self._file,
+                tokens=tuple(self._in_shard),
+                bytes=path.stat().st_size,
+                checksum=file_checksum(path),
+            )
+        )
+        self._in_shard = []

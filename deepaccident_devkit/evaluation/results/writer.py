@@ -10,13 +10,19 @@ from types import TracebackType
 from typing import Any, Protocol, get_args
 
 from deepaccident_devkit.errors import ChoiceError, ResultsError
-from deepaccident_devkit.evaluation.detection import DetectedBoxes
-from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
-from deepaccident_devkit.evaluation.results.entry_writer import EntryWriter
+from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
+from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
+from deepaccident_devkit.evaluation.results.entries import EntryWriter
 from deepaccident_devkit.evaluation.results.faults import ContentError
-from deepaccident_devkit.evaluation.results.form import MotionForm, ResultsTask, Stored
-from deepaccident_devkit.evaluation.results.header import Header, check_token, json_meta
-from deepaccident_devkit.evaluation.results.shard_writer import ShardWriter
+from deepaccident_devkit.evaluation.results.header import (
+    Header,
+    MotionForm,
+    ResultsTask,
+    Stored,
+    check_token,
+    json_meta,
+)
+from deepaccident_devkit.evaluation.results.shards import ShardWriter
 from deepaccident_devkit.files import replacing, replacing_folder
 from deepaccident_devkit.geometry import BevGrid
 

@@ -4,12 +4,10 @@
 says which differences of two are real.
 """
 
-from deepaccident_devkit.evaluation.runs.bundle_files import Bundle, read_bundle
-from deepaccident_devkit.evaluation.runs.checkpoints import explanation_checkpoint
+from deepaccident_devkit.evaluation.runs.bundles import Bundle, checked_target, read_bundle, save_run
 from deepaccident_devkit.evaluation.runs.compare import compare_bundles
 from deepaccident_devkit.evaluation.runs.comparison import ComparedNumber, Comparison
 from deepaccident_devkit.evaluation.runs.coverage import Coverage, coverage
-from deepaccident_devkit.evaluation.runs.details import sample_rows
 from deepaccident_devkit.evaluation.runs.differences import Difference
 from deepaccident_devkit.evaluation.runs.evaluate import default_selection, evaluate_results
 from deepaccident_devkit.evaluation.runs.evaluation_run import (
@@ -18,12 +16,11 @@ from deepaccident_devkit.evaluation.runs.evaluation_run import (
     Partial,
     ReleaseInfo,
     ResultsInfo,
+    explanation_checkpoint,
 )
-from deepaccident_devkit.evaluation.runs.parquet import read_rows
-from deepaccident_devkit.evaluation.runs.results_text import results_text
-from deepaccident_devkit.evaluation.runs.saving import checked_target, save_run
+from deepaccident_devkit.evaluation.runs.rows import read_rows, sample_rows
 from deepaccident_devkit.evaluation.runs.selection import SampleSelection
-from deepaccident_devkit.evaluation.runs.text import summary_text
+from deepaccident_devkit.evaluation.runs.text import results_text, summary_text
 from deepaccident_devkit.evaluation.runs.verification import Verification, verify_bundle
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, scenario_hashes
 

@@ -8,14 +8,19 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from deepaccident_devkit.evaluation.breakdowns import Bootstrap, middle, numbers_of, resampled
-from deepaccident_devkit.evaluation.headlines import Headline, headlines
+from deepaccident_devkit.errors import EvaluationError
+from deepaccident_devkit.evaluation.metrics.breakdowns import Bootstrap, middle, numbers_of, resampled
+from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
+from deepaccident_devkit.evaluation.metrics.headlines import Headline, headlines
+from deepaccident_devkit.evaluation.runs.bundles import COUNTS_FILE, Bundle, read_bundle
 from deepaccident_devkit.evaluation.runs.comparison import ComparedNumber, Comparison
-from deepaccident_devkit.evaluation.runs.pairing import ComparablePair, comparable_pair
+from deepaccident_devkit.evaluation.runs.differences import differing
+from deepaccident_devkit.evaluation.runs.selection import scenario_of
 
 _LEAST_KNOWN: Final = 0.8
 """Share of the resamples that must have a number. If a single scenario has it, 63 to 75 % do: always with the same
@@ -112,3 +117,107 @@ def _better(difference: float, headline: Headline | None) -> str | None:
 
 def _finite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
+
+
+_SETUP: Final = ("task", "protocol", "switches", "horizon", "settings")
+_SHOWN: Final = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ComparablePair:
+    """Two evaluations of the same samples by the same rules.
+
+    Attributes:
+        bundles: the two.
+        evaluators: of each, with the counts of all its samples.
+        scenarios: scenario → tokens of its samples that both have; in order.
+        left_out: samples that only one of them has.
+    """
+
+    bundles: tuple[Bundle, Bundle]
+    evaluators: tuple[Evaluator[Any], Evaluator[Any]]
+    scenarios: Mapping[str, tuple[str, ...]]
+    left_out: int
+
+    @property
+    def tokens(self) -> list[str]:
+        """All samples that both have, in order."""
+        return [token for tokens in self.scenarios.values() for token in tokens]
+
+
+def comparable_pair(first: Path, second: Path, *, common: bool = False) -> ComparablePair:
+    """Open two bundles and check that their numbers can be compared.
+
+    Args:
+        first: folder of one.
+        second: of the other.
+        common: whether to compare the samples that both have where they have others, too.
+
+    Raises:
+        ResultsError: one of them is no bundle.
+        EvaluationError: they differ in task, rules, truth, or, without `common`, in samples; or counts cannot be read.
+    """
+    one, other = read_bundle(first), read_bundle(second)
+    _check_rules(one, other)
+    evaluators = _counted(one), _counted(other)
+    tokens = _shared_tokens((one, other), evaluators, common=common)
+    scenarios: dict[str, list[str]] = {}
+    for token in tokens:
+        scenarios.setdefault(scenario_of(token), []).append(token)
+    _check_truth(one, other, scenarios)
+    return ComparablePair(
+        bundles=(one, other),
+        evaluators=evaluators,
+        scenarios={name: tuple(those) for name, those in scenarios.items()},
+        left_out=len(evaluators[0].tokens ^ evaluators[1].tokens),
+    )
+
+
+def _check_rules(one: Bundle, other: Bundle) -> None:
+    stated = [{name: bundle.summary.get(name) for name in _SETUP} for bundle in (one, other)]
+    unlike = list(differing(*stated))
+    if unlike:
+        told = "; ".join(f"{where} {first!r} and {second!r}" for where, first, second in unlike[:_SHOWN])
+        more = f", and {len(unlike) - _SHOWN} more" if len(unlike) > _SHOWN else ""
+        raise EvaluationError(
+            f"{one.folder} and {other.folder}: were evaluated by other rules: {told}{more}; evaluate both results alike"
+        )
+
+
+def _check_truth(one: Bundle, other: Bundle, scenarios: Mapping[str, object]) -> None:
+    hashes = [bundle.scenarios() for bundle in (one, other)]
+    changed = [name for name in scenarios if hashes[0].get(name) != hashes[1].get(name)]
+    if changed:
+        raise EvaluationError(
+            f"{one.folder} and {other.folder}: the label, meta or calib files of {len(changed)} scenarios are not the "
+            f"same ({', '.join(_first(changed))}); evaluate both results with the same release"
+        )
+
+
+def _counted(bundle: Bundle) -> Evaluator[Any]:
+    return bundle.setup.evaluator().resume(bundle.folder / COUNTS_FILE)
+
+
+def _shared_tokens(
+    bundles: tuple[Bundle, Bundle], evaluators: tuple[Evaluator[Any], Evaluator[Any]], *, common: bool
+) -> list[str]:
+    mine, theirs = (each.tokens for each in evaluators)
+    if mine != theirs and not common:
+        counted = "; ".join(
+            f"{len(alone)} samples only in {bundle.folder} ({', '.join(_first(sorted(alone)))})"
+            for bundle, alone in zip(bundles, (mine - theirs, theirs - mine), strict=True)
+            if alone
+        )
+        raise EvaluationError(
+            f"{counted}; evaluate both at the same samples, or compare those that both have with common=True (--common)"
+        )
+    shared = sorted(mine & theirs)
+    if not shared:
+        raise EvaluationError(f"{bundles[0].folder} and {bundles[1].folder}: have no sample in common")
+    return shared
+
+
+def _first(names: list[str]) -> Iterator[str]:
+    yield from names[:_SHOWN]
+    if len(names) > _SHOWN:
+        yield "…"

@@ -10,8 +10,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from deepaccident_devkit.evaluation.breakdowns import Bootstrap
-from deepaccident_devkit.evaluation.frozen_mappings import plain
+from deepaccident_devkit.evaluation.metrics.breakdowns import Bootstrap
+from deepaccident_devkit.evaluation.metrics.frozen_mappings import plain
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.text import columns_text
 

@@ -9,15 +9,21 @@ from typing import Any
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ResultsError
-from deepaccident_devkit.evaluation.attributes import sample_attributes
-from deepaccident_devkit.evaluation.evaluator import Evaluator
+from deepaccident_devkit.evaluation.metrics.attributes import sample_attributes
+from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
 from deepaccident_devkit.evaluation.results import Results, read_results
-from deepaccident_devkit.evaluation.run import evaluate_samples
-from deepaccident_devkit.evaluation.runs.checkpoints import checkpoint_path, drop_if_damaged
 from deepaccident_devkit.evaluation.runs.coverage import Coverage, coverage
-from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun, Partial, ReleaseInfo, ResultsInfo
+from deepaccident_devkit.evaluation.runs.evaluation_run import (
+    EvaluationRun,
+    Partial,
+    ReleaseInfo,
+    ResultsInfo,
+    checkpoint_path,
+    drop_if_damaged,
+)
+from deepaccident_devkit.evaluation.runs.many_samples import evaluate_samples
 from deepaccident_devkit.evaluation.runs.selection import SampleList, SampleSelection, ScopeName, scenario_of
-from deepaccident_devkit.evaluation.setups import EvaluationSetup, SampleLoader
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
 from deepaccident_devkit.release.fingerprints import scenario_hashes
 
 

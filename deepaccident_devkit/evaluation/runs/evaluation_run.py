@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import json
+import os
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib.metadata import version as installed_version
+from pathlib import Path
 from typing import Any, Final
 
 from deepaccident_devkit._version import __version__
-from deepaccident_devkit.evaluation.attributes import SampleAttributes
-from deepaccident_devkit.evaluation.breakdowns import Bootstrap, Breakdown, Group, breakdown
-from deepaccident_devkit.evaluation.evaluator import Evaluator
-from deepaccident_devkit.evaluation.frozen_mappings import plain
-from deepaccident_devkit.evaluation.headlines import headlines
+from deepaccident_devkit.errors import EvaluationError
+from deepaccident_devkit.evaluation.metrics.attributes import SampleAttributes
+from deepaccident_devkit.evaluation.metrics.breakdowns import Bootstrap, Breakdown, Group, breakdown
+from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
+from deepaccident_devkit.evaluation.metrics.frozen_mappings import plain
+from deepaccident_devkit.evaluation.metrics.headlines import headlines
 from deepaccident_devkit.evaluation.runs.selection import SampleSelection
-from deepaccident_devkit.evaluation.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.parallel import run_batch
-from deepaccident_devkit.release.fingerprints import ScenarioHashes, fingerprint
+from deepaccident_devkit.release.fingerprints import ScenarioHashes, digest_of, fingerprint
 
 SUMMARY_FORMAT: Final = "DeepAccident metrics summary"
 SUMMARY_VERSION: Final = 1
@@ -226,3 +230,66 @@ class EvaluationRun:
             }
             for group in groups
         ]
+
+
+_ENDING: Final = ".counts.json"
+
+
+def checkpoint_path(
+    out: str | os.PathLike[str],
+    setup: EvaluationSetup,
+    tokens: Collection[str],
+    fingerprints: Mapping[str, str],
+    purpose: str = "evaluation",
+) -> Path:
+    """The file beside `out` that such a run saves its counts to.
+
+    Its name is a digest of all that decides the counts: another setup, other samples, other predictions, other labels
+    and another devkit have another file, and so never go on with these counts.
+
+    Args:
+        out: the folder that the finished evaluation goes to.
+        setup: task and rules.
+        tokens: the samples.
+        fingerprints: of the predictions and of the labels.
+        purpose: what is counted, where that is something else than the evaluation itself.
+    """
+    name = digest_of(
+        {
+            "devkit": __version__,
+            "setup": setup.as_dict(),
+            "tokens": sorted(tokens),
+            "fingerprints": dict(fingerprints),
+            "purpose": purpose,
+        }
+    )
+    return _folder(out) / f"{name}{_ENDING}"
+
+
+def explanation_checkpoint(run: EvaluationRun, out: str | os.PathLike[str]) -> Path:
+    """The same file for the explanation of a run (`explain`), which takes longer than the run itself."""
+    fingerprints = {"results": run.results.fingerprint, "release": run.release.fingerprint}
+    return checkpoint_path(out, run.setup, run.evaluator.tokens, fingerprints, "explanation")
+
+
+def drop_if_damaged(path: Path, evaluator: Evaluator[Any]) -> None:
+    """Remove a file that no counts can be taken from: it costs time, and nothing else."""
+    if path.exists():
+        try:
+            evaluator.fresh().resume(path)
+        except EvaluationError:
+            path.unlink()
+
+
+def remove_checkpoints(out: str | os.PathLike[str]) -> None:
+    """Remove all such files beside `out`, once what they were for is written."""
+    folder = _folder(out)
+    for path in folder.glob(f"*{_ENDING}"):
+        path.unlink(missing_ok=True)
+    with suppress(OSError):  # something else lies there
+        folder.rmdir()
+
+
+def _folder(out: str | os.PathLike[str]) -> Path:
+    target = Path(out).expanduser()
+    return target.with_name(f"{target.absolute().name}.unfinished")

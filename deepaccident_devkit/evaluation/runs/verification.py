@@ -12,9 +12,9 @@ from typing import Any, Final
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import DeepAccidentError, ResultsError
-from deepaccident_devkit.evaluation.breakdowns import Bootstrap
+from deepaccident_devkit.evaluation.metrics.breakdowns import Bootstrap
 from deepaccident_devkit.evaluation.results import Results, read_results
-from deepaccident_devkit.evaluation.runs.bundle_files import (
+from deepaccident_devkit.evaluation.runs.bundles import (
     COUNTS_FILE,
     FILES_FILE,
     ROWS_FILE,
@@ -25,11 +25,10 @@ from deepaccident_devkit.evaluation.runs.bundle_files import (
     read_bundle,
     read_json,
 )
-from deepaccident_devkit.evaluation.runs.details import sample_rows
 from deepaccident_devkit.evaluation.runs.differences import ABSENT, Difference, differing
 from deepaccident_devkit.evaluation.runs.evaluate import evaluate_results
 from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
-from deepaccident_devkit.evaluation.runs.parquet import read_rows
+from deepaccident_devkit.evaluation.runs.rows import read_rows, sample_rows
 from deepaccident_devkit.release.fingerprints import scenario_hashes
 
 _SHOWN: Final = 10

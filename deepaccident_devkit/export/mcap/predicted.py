@@ -9,8 +9,8 @@ import numpy as np
 from foxglove_schemas_protobuf.SpherePrimitive_pb2 import SpherePrimitive
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.evaluation.detection import DetectedBoxes
-from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
+from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
+from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
 from deepaccident_devkit.evaluation.results import Prediction, Results
 from deepaccident_devkit.export.mcap.cells import cell_points
 from deepaccident_devkit.export.mcap.config import Predictions

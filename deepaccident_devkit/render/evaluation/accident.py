@@ -8,15 +8,11 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray
-from deepaccident_devkit.evaluation.accident import (
-    DISTANCES,
-    AccidentEvaluator,
-    AccidentResult,
-    BoxAccidents,
-    PaperAccidents,
-)
-from deepaccident_devkit.evaluation.accident.scoring import Alarm
-from deepaccident_devkit.evaluation.evaluator import Counts, ratio
+from deepaccident_devkit.evaluation.metrics.accident.boxes import BoxAccidents
+from deepaccident_devkit.evaluation.metrics.accident.evaluator import AccidentEvaluator
+from deepaccident_devkit.evaluation.metrics.accident.paper import PaperAccidents
+from deepaccident_devkit.evaluation.metrics.accident.scoring import DISTANCES, AccidentResult, Alarm
+from deepaccident_devkit.evaluation.metrics.evaluator import Counts, ratio
 from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
 from deepaccident_devkit.render.colors import ESTIMATE_COLOR, GRID_COLOR, OUTCOME_COLORS
 from deepaccident_devkit.render.evaluation.panels import PANEL, draw_nothing

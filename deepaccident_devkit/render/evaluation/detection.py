@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.evaluation.detection import DetectionResult
+from deepaccident_devkit.evaluation.metrics.detection import DetectionResult
 from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
 from deepaccident_devkit.render.colors import CATEGORY_COLORS, ESTIMATE_COLOR, SERIES_COLORS
 from deepaccident_devkit.render.evaluation.panels import PANEL, Bar, draw_bars, draw_nothing

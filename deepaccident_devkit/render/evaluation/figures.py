@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 
 from deepaccident_devkit._version import __version__
-from deepaccident_devkit.evaluation.accident import AccidentEvaluator
-from deepaccident_devkit.evaluation.attributes import EVERYTHING
-from deepaccident_devkit.evaluation.breakdowns import Breakdown
-from deepaccident_devkit.evaluation.detection import DetectionEvaluator
-from deepaccident_devkit.evaluation.headlines import Headline, headlines
-from deepaccident_devkit.evaluation.motion import MotionEvaluator
+from deepaccident_devkit.evaluation.metrics.accident.evaluator import AccidentEvaluator
+from deepaccident_devkit.evaluation.metrics.attributes import EVERYTHING
+from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown
+from deepaccident_devkit.evaluation.metrics.detection.evaluator import DetectionEvaluator
+from deepaccident_devkit.evaluation.metrics.headlines import Headline, headlines
+from deepaccident_devkit.evaluation.metrics.motion.evaluator import MotionEvaluator
+from deepaccident_devkit.evaluation.metrics.warning.result import WarningResult
 from deepaccident_devkit.evaluation.runs import EvaluationRun
-from deepaccident_devkit.evaluation.warning import WarningResult
 from deepaccident_devkit.render.axes import detached_figure
 from deepaccident_devkit.render.colors import WARNING_COLOR
 from deepaccident_devkit.render.evaluation import accident, detection, motion, warning

@@ -6,8 +6,8 @@ import math
 from itertools import cycle
 from typing import TYPE_CHECKING, Final
 
-from deepaccident_devkit.evaluation.motion import MotionEvaluator, MotionResult
-from deepaccident_devkit.evaluation.panoptic import panoptic_quality
+from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator, MotionResult
+from deepaccident_devkit.evaluation.metrics.motion.overlaps import panoptic_quality
 from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
 from deepaccident_devkit.render.colors import SERIES_COLORS
 from deepaccident_devkit.render.evaluation.panels import PANEL, draw_nothing

@@ -9,14 +9,14 @@ import numpy as np
 
 from deepaccident_devkit.arrays import BoolArray
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.evaluation.accident import compared_accidents
-from deepaccident_devkit.evaluation.detection import DetectedBoxes
-from deepaccident_devkit.evaluation.frames import frames_there, labels_at_present
-from deepaccident_devkit.evaluation.headlines import headlines
-from deepaccident_devkit.evaluation.predictions import MotionOutput
+from deepaccident_devkit.evaluation.metrics.accident import compared_accidents
+from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
+from deepaccident_devkit.evaluation.metrics.frames import frames_there, labels_at_present
+from deepaccident_devkit.evaluation.metrics.headlines import headlines
+from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import EvaluationRun
-from deepaccident_devkit.evaluation.setups import SampleLoader
+from deepaccident_devkit.evaluation.runs.setups import SampleLoader
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render.axes import axes_or_new, titled_from_above
 from deepaccident_devkit.render.colors import OUTCOME_COLORS

@@ -6,9 +6,9 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
-from deepaccident_devkit.evaluation.attributes import EVERYTHING
-from deepaccident_devkit.evaluation.breakdowns import Breakdown, Group
-from deepaccident_devkit.evaluation.headlines import Headline, headlines, value_text
+from deepaccident_devkit.evaluation.metrics.attributes import EVERYTHING
+from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown, Group
+from deepaccident_devkit.evaluation.metrics.headlines import Headline, headlines, value_text
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.render.evaluation.breakdowns import UNKNOWN
 from deepaccident_devkit.render.evaluation.markup import Markup, facts, joined, scalar, table, tag, tree

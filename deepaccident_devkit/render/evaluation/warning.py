@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from deepaccident_devkit.evaluation.warning import WarningResult
+from deepaccident_devkit.evaluation.metrics.warning import WarningResult
 from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
 from deepaccident_devkit.render.colors import ESTIMATE_COLOR, OUTCOME_COLORS
 from deepaccident_devkit.render.evaluation.panels import PANEL, Bar, draw_bars, draw_nothing

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray
-from deepaccident_devkit.evaluation.accident import AccidentResult, BoxTruth, ComparedAccidents
-from deepaccident_devkit.evaluation.accident.result import AccidentsWithin
-from deepaccident_devkit.evaluation.accident.scoring import position_difference
-from deepaccident_devkit.evaluation.predictions import Accident
+from deepaccident_devkit.evaluation.metrics.accident import AccidentResult, BoxTruth, ComparedAccidents
+from deepaccident_devkit.evaluation.metrics.accident.scoring import AccidentsWithin
+from deepaccident_devkit.evaluation.metrics.alarms.raised import position_difference
+from deepaccident_devkit.evaluation.metrics.predictions import Accident
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.render.axes import axes_or_new, titled_from_above
 from deepaccident_devkit.render.boxes import draw_boxes_from_above, draw_ids_from_above, write_beside

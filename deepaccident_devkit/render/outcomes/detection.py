@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from deepaccident_devkit.arrays import IntArray
-from deepaccident_devkit.evaluation.detection import (
+from deepaccident_devkit.evaluation.metrics.detection import (
     DetectedBoxes,
     DetectionMatches,
     DetectionProtocol,

@@ -8,22 +8,21 @@ from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.evaluation.accident import (
+from deepaccident_devkit.evaluation.metrics.accident import (
     AccidentEvaluator,
     ComparedAccidents,
     accident_context,
     compared_accidents,
 )
-from deepaccident_devkit.evaluation.accident.protocol import Prediction, checked_prediction
-from deepaccident_devkit.evaluation.detection import (
+from deepaccident_devkit.evaluation.metrics.detection import (
     DetectedBoxes,
     DetectionEvaluator,
     detection_matches,
     detection_protocol,
     detection_truth,
 )
-from deepaccident_devkit.evaluation.motion import MotionEvaluator
-from deepaccident_devkit.evaluation.predictions import MotionOutput
+from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator
+from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput, Prediction, checked_prediction
 from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels, motion_labels
 from deepaccident_devkit.render.axes import figure_or_new, settled, titled_from_above
 from deepaccident_devkit.render.layers import Layer, layers_of

@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, IntArray
-from deepaccident_devkit.evaluation.frames import frames_there, labels_at_present
-from deepaccident_devkit.evaluation.motion import MotionProtocol
-from deepaccident_devkit.evaluation.motion.protocol import motion_protocol
-from deepaccident_devkit.evaluation.panoptic import vpq_matches
-from deepaccident_devkit.evaluation.predictions import MotionOutput
-from deepaccident_devkit.evaluation.ranges import cells_within
+from deepaccident_devkit.evaluation.metrics.frames import cells_within, frames_there, labels_at_present
+from deepaccident_devkit.evaluation.metrics.motion import MotionProtocol
+from deepaccident_devkit.evaluation.metrics.motion.overlaps import vpq_matches
+from deepaccident_devkit.evaluation.metrics.motion.protocol import motion_protocol
+from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render.axes import axes_or_new, titled_from_above
 from deepaccident_devkit.render.colors import BEYOND_COLOR, OUTCOME_COLORS

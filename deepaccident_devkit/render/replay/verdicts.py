@@ -8,12 +8,12 @@ from typing import Any, Final
 from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation import Accident, AccidentContext, BoxAccidents, MotionOutput, accident_context
-from deepaccident_devkit.evaluation.accident import Prediction
-from deepaccident_devkit.evaluation.accident.alarms import Pair, named_alarms
-from deepaccident_devkit.evaluation.accident.impact import RELEASED_HORIZON
-from deepaccident_devkit.evaluation.accident.protocol import checked_prediction
+from deepaccident_devkit.evaluation.metrics.accident import Prediction
+from deepaccident_devkit.evaluation.metrics.alarms.raised import Pair, named_alarms
+from deepaccident_devkit.evaluation.metrics.alarms.truth import RELEASED_HORIZON
+from deepaccident_devkit.evaluation.metrics.predictions import checked_prediction
 from deepaccident_devkit.evaluation.results import Results
-from deepaccident_devkit.evaluation.setups import EvaluationSetup, SampleLoader
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render.outcomes.accident import count_words

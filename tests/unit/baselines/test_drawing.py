@@ -8,7 +8,7 @@ from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.baselines.drawing import label_times, motion_of
 from deepaccident_devkit.baselines.oracle import SeenActors, seen_actors
 from deepaccident_devkit.evaluation import MotionEvaluator
-from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS
+from deepaccident_devkit.evaluation.metrics.motion import MOTION_PROTOCOLS
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, MotionLabels
 from deepaccident_devkit.taxonomy import LIDAR, OWN_ACTOR_ID
 

@@ -9,13 +9,13 @@ from numpy.testing import assert_allclose
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError, NotAvailableError
-from deepaccident_devkit.evaluation.accident import BoxTruth, accident_context, box_truth
-from deepaccident_devkit.evaluation.accident.boxes import BoxAccidents
-from deepaccident_devkit.evaluation.accident.evaluator import AccidentEvaluator
-from deepaccident_devkit.evaluation.accident.protocol import AccidentContext
-from deepaccident_devkit.evaluation.accident.reading import AccidentReading
-from deepaccident_devkit.evaluation.accident.scoring import Scoring
-from deepaccident_devkit.evaluation.predictions import Accident
+from deepaccident_devkit.evaluation.metrics.accident import BoxTruth, accident_context, box_truth
+from deepaccident_devkit.evaluation.metrics.accident.boxes import BoxAccidents
+from deepaccident_devkit.evaluation.metrics.accident.evaluator import AccidentEvaluator
+from deepaccident_devkit.evaluation.metrics.accident.scoring import Scoring
+from deepaccident_devkit.evaluation.metrics.alarms.reading import AccidentReading
+from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
+from deepaccident_devkit.evaluation.metrics.predictions import Accident
 from deepaccident_devkit.motion import OWN_BOX_ID
 from deepaccident_devkit.taxonomy import AGENTS
 

@@ -7,7 +7,7 @@ from accident_scenes import as_maps, scene, standing
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, NotAvailableError
 from deepaccident_devkit.evaluation import Accident, MotionOutput
-from deepaccident_devkit.evaluation.accident import (
+from deepaccident_devkit.evaluation.metrics.accident import (
     PROTOCOLS,
     AccidentContext,
     AccidentEvaluator,

@@ -8,14 +8,19 @@ from accident_scenes import FRAMES, as_heads, as_maps, scene, standing
 from numpy.testing import assert_allclose
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
-from deepaccident_devkit.evaluation.accident.evaluator import AccidentEvaluator
-from deepaccident_devkit.evaluation.accident.matching import match_tracks
-from deepaccident_devkit.evaluation.accident.paper import PaperAccidents
-from deepaccident_devkit.evaluation.accident.protocol import AccidentContext
-from deepaccident_devkit.evaluation.accident.reading import AccidentReading, InstanceTracks, accident_of
-from deepaccident_devkit.evaluation.accident.scoring import Scoring, position_difference
-from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
-from deepaccident_devkit.evaluation.switches import switch_names
+from deepaccident_devkit.evaluation.metrics.accident.evaluator import AccidentEvaluator
+from deepaccident_devkit.evaluation.metrics.accident.paper import PaperAccidents
+from deepaccident_devkit.evaluation.metrics.accident.scoring import Scoring
+from deepaccident_devkit.evaluation.metrics.alarms.raised import position_difference
+from deepaccident_devkit.evaluation.metrics.alarms.reading import (
+    AccidentReading,
+    InstanceTracks,
+    accident_of,
+    match_tracks,
+)
+from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
+from deepaccident_devkit.evaluation.metrics.choices import switch_names
+from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
 from deepaccident_devkit.motion import LABEL_PROTOCOLS

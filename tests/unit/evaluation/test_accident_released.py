@@ -10,10 +10,10 @@ import pytest
 from accident_scenes import FRAMES, as_heads, as_maps, scene, standing
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
-from deepaccident_devkit.evaluation.accident import PROTOCOLS, AccidentContext, AccidentEvaluator
-from deepaccident_devkit.evaluation.accident.drawn_paths import DrawnPaths, paths_of_heads, paths_of_instances
-from deepaccident_devkit.evaluation.accident.released import ReleasedAccidents, accident_counts, collision
-from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
+from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS, AccidentContext, AccidentEvaluator
+from deepaccident_devkit.evaluation.metrics.accident.drawn_paths import DrawnPaths, paths_of_heads, paths_of_instances
+from deepaccident_devkit.evaluation.metrics.accident.released import ReleasedAccidents, accident_counts, collision
+from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
 from deepaccident_devkit.motion import POST_PROCESSING, MotionHeads

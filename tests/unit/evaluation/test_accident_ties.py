@@ -9,7 +9,7 @@ from accident_scenes import scene, standing
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError, GeometryError
 from deepaccident_devkit.evaluation import Accident, MotionOutput
-from deepaccident_devkit.evaluation.accident import (
+from deepaccident_devkit.evaluation.metrics.accident import (
     AccidentContext,
     AccidentEvaluator,
     AccidentReading,
@@ -17,7 +17,7 @@ from deepaccident_devkit.evaluation.accident import (
     PaperAccidents,
     accidents_of,
 )
-from deepaccident_devkit.evaluation.accident.reading import accident_of
+from deepaccident_devkit.evaluation.metrics.alarms.reading import accident_of
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
 

@@ -29,8 +29,8 @@ from deepaccident_devkit.evaluation import (
     nuscenes_summary,
     sample_attributes,
 )
-from deepaccident_devkit.evaluation.accident import accident_context
-from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS
+from deepaccident_devkit.evaluation.metrics.accident import accident_context
+from deepaccident_devkit.evaluation.metrics.detection import DETECTION_PROTOCOLS
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.motion import BEV_CLASSES, BevSegmentation, MotionHeads
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit.errors import EvaluationError, GeometryError
-from deepaccident_devkit.evaluation.bev_segmentation import BevSegmentationEvaluator
+from deepaccident_devkit.evaluation.metrics.segmentation import BevSegmentationEvaluator
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import BEV_CLASSES, BevSegmentation
 

@@ -10,7 +10,7 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
-from deepaccident_devkit.evaluation.attributes import (
+from deepaccident_devkit.evaluation.metrics.attributes import (
     ATTRIBUTES,
     NO_IMPACT,
     SampleAttributes,
@@ -20,10 +20,10 @@ from deepaccident_devkit.evaluation.attributes import (
     time_bin,
     tokens_by_value,
 )
-from deepaccident_devkit.evaluation.breakdowns import Bootstrap, breakdown, numbers_of
-from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio, total
-from deepaccident_devkit.evaluation.motion import MotionEvaluator
-from deepaccident_devkit.evaluation.predictions import instances_of
+from deepaccident_devkit.evaluation.metrics.breakdowns import Bootstrap, breakdown, numbers_of
+from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator, ratio, total
+from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator
+from deepaccident_devkit.evaluation.metrics.predictions import instances_of
 from deepaccident_devkit.motion import samples
 from deepaccident_devkit.taxonomy import INFRASTRUCTURE
 

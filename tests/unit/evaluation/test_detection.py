@@ -9,8 +9,8 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError, GeometryError, NotAvailableError
-from deepaccident_devkit.evaluation.breakdowns import numbers_of
-from deepaccident_devkit.evaluation.detection import (
+from deepaccident_devkit.evaluation.metrics.breakdowns import numbers_of
+from deepaccident_devkit.evaluation.metrics.detection import (
     DETECTION_PROTOCOLS,
     DetectedBoxes,
     DetectionEvaluator,
@@ -20,7 +20,7 @@ from deepaccident_devkit.evaluation.detection import (
     released_dict,
     released_text,
 )
-from deepaccident_devkit.evaluation.detection.curves import recall_matches
+from deepaccident_devkit.evaluation.metrics.detection.curves import recall_matches
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID
 

@@ -10,7 +10,7 @@ import pytest
 from evaluating import Sums
 
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.evaluator import Evaluator, ratio
+from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator, ratio
 
 VALUES = {"a": 1e16, "b": 1.0, "c": -1e16, "d": 0.1}
 
@@ -102,7 +102,7 @@ def test_a_run_of_another_evaluator_or_version_does_not_go_on(tmp_path: Path, mo
     path = filled("a").save(tmp_path / "state.json")
     with pytest.raises(EvaluationError, match=r"was saved by Sums of devkit .*, this is Others of .*; begin anew"):
         Others().resume(path)
-    monkeypatch.setattr("deepaccident_devkit.evaluation.evaluator.__version__", "99")
+    monkeypatch.setattr("deepaccident_devkit.evaluation.metrics.evaluator.__version__", "99")
     with pytest.raises(EvaluationError, match=r"was saved by .*, this is Sums of devkit 99"):
         Sums().resume(path)
 

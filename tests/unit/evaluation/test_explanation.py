@@ -13,15 +13,15 @@ from memory_results import MemoryResults
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation import DetectionEvaluator, MotionEvaluator
-from deepaccident_devkit.evaluation.accident import accident_context
-from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS, DetectedBoxes, detection_truth
-from deepaccident_devkit.evaluation.explanation import Explanation, explain
-from deepaccident_devkit.evaluation.explanation.side_by_side import Refusal, SideBySide
-from deepaccident_devkit.evaluation.headlines import headline_numbers
-from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS
-from deepaccident_devkit.evaluation.predictions import MotionOutput, instances_of
+from deepaccident_devkit.evaluation.metrics.accident import accident_context
+from deepaccident_devkit.evaluation.metrics.detection import DETECTION_PROTOCOLS, DetectedBoxes, detection_truth
+from deepaccident_devkit.evaluation.metrics.headlines import headline_numbers
+from deepaccident_devkit.evaluation.metrics.motion import MOTION_PROTOCOLS
+from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput, instances_of
 from deepaccident_devkit.evaluation.results import ResultsWriter, read_results
-from deepaccident_devkit.evaluation.setups import EvaluationSetup, SampleLoader
+from deepaccident_devkit.evaluation.runs.explanation import Explanation, explain
+from deepaccident_devkit.evaluation.runs.explanation.variants import Refusal, SideBySide
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionHeads, MotionLabelConfig, MotionLabels
 
 

@@ -9,11 +9,11 @@ from numpy.testing import assert_array_equal
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, GeometryError
 from deepaccident_devkit.evaluation import AccidentEvaluator, DetectedBoxes, detection_truth, vpq_counts
-from deepaccident_devkit.evaluation.accident import PROTOCOLS, AccidentContext, compared_accidents
-from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS, detection_matches
-from deepaccident_devkit.evaluation.detection.boxes import columns_of
-from deepaccident_devkit.evaluation.detection.frame_counts import frame_counts
-from deepaccident_devkit.evaluation.panoptic import VpqRules, vpq_matches
+from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS, AccidentContext, compared_accidents
+from deepaccident_devkit.evaluation.metrics.detection import DETECTION_PROTOCOLS, detection_matches
+from deepaccident_devkit.evaluation.metrics.detection.boxes import columns_of
+from deepaccident_devkit.evaluation.metrics.detection.frame_counts import frame_counts
+from deepaccident_devkit.evaluation.metrics.motion.overlaps import VpqRules, vpq_matches
 
 
 @pytest.mark.parametrize("stay", [True, False])

@@ -9,13 +9,24 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, GeometryError
-from deepaccident_devkit.evaluation.instance_paths import instance_paths
-from deepaccident_devkit.evaluation.motion import MOTION_PROTOCOLS, MotionEvaluator, MotionProtocol, motion_counts
-from deepaccident_devkit.evaluation.panoptic import VpqRules, separate_selected_as_released, vpq, vpq_counts
-from deepaccident_devkit.evaluation.predictions import MotionOutput, instances_of
-from deepaccident_devkit.evaluation.ranges import cells_within
-from deepaccident_devkit.evaluation.segmentation import SegmentationCounts, iou, segmentation_counts
-from deepaccident_devkit.evaluation.trajectory_errors import TrajectoryRules
+from deepaccident_devkit.evaluation.metrics.frames import cells_within
+from deepaccident_devkit.evaluation.metrics.motion import (
+    MOTION_PROTOCOLS,
+    MotionEvaluator,
+    MotionProtocol,
+    motion_counts,
+)
+from deepaccident_devkit.evaluation.metrics.motion.overlaps import (
+    SegmentationCounts,
+    VpqRules,
+    iou,
+    segmentation_counts,
+    separate_selected_as_released,
+    vpq,
+    vpq_counts,
+)
+from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput, instances_of
+from deepaccident_devkit.evaluation.metrics.trajectories import TrajectoryRules, instance_paths
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
 from deepaccident_devkit.motion import MotionHeads, MotionLabelConfig, MotionLabels, samples

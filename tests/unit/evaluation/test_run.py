@@ -16,7 +16,8 @@ from evaluating import BROKEN, Sums, labels_as_maps, number, number_and_trace
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError
-from deepaccident_devkit.evaluation import MotionEvaluator, evaluate_samples, run
+from deepaccident_devkit.evaluation import MotionEvaluator, evaluate_samples
+from deepaccident_devkit.evaluation.runs import many_samples
 from deepaccident_devkit.parallel import run_unordered
 
 VALUES = {f"{index:02d}": float(10 ** (index % 17)) + index / 10 for index in range(40)}
@@ -24,7 +25,7 @@ VALUES = {f"{index:02d}": float(10 ** (index % 17)) + index / 10 for index in ra
 
 @pytest.fixture
 def often_saved(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run, "_SAVE_SECONDS", 0.0)
+    monkeypatch.setattr(many_samples, "_SAVE_SECONDS", 0.0)
 
 
 def done(folder: Path) -> int:
@@ -133,9 +134,10 @@ class TestCheckpoints:
             from functools import partial
             from pathlib import Path
             from evaluating import Sums, number_and_trace
-            from deepaccident_devkit.evaluation import evaluate_samples, run
+            from deepaccident_devkit.evaluation import evaluate_samples
+            from deepaccident_devkit.evaluation.runs import many_samples
 
-            run._SAVE_SECONDS = 0.0
+            many_samples._SAVE_SECONDS = 0.0
             values = {{f"{{index:03d}}": 0.1 * index for index in range(160)}}
             load = partial(number_and_trace, Path({str(folder)!r}))
             evaluate_samples(Sums(), values, load, workers={workers}, checkpoint={str(path)!r})
@@ -155,7 +157,8 @@ class TestCheckpoints:
         before = done(folder)
         evaluator = evaluate_samples(Sums(), values, partial(number_and_trace, folder), workers=1, checkpoint=path)
         assert evaluator.compute() == evaluate_samples(Sums(), values, number, workers=1).compute()
-        assert done(folder) <= before + 160 - kept + 2 * run._BATCH  # workers of the killed run end a moment later
+        late = 2 * many_samples._BATCH  # workers of the killed run end a moment later
+        assert done(folder) <= before + 160 - kept + late
 
     @pytest.mark.usefixtures("often_saved")
     def test_counts_are_saved_on_the_way(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

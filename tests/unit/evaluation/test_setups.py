@@ -20,12 +20,12 @@ from deepaccident_devkit.evaluation import (
     detection_truth,
     instances_of,
 )
-from deepaccident_devkit.evaluation.accident import PaperAccidents
-from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS
+from deepaccident_devkit.evaluation.metrics.accident import PaperAccidents
+from deepaccident_devkit.evaluation.metrics.choices import switch_names, switched
+from deepaccident_devkit.evaluation.metrics.detection import DETECTION_PROTOCOLS
+from deepaccident_devkit.evaluation.metrics.warning import WarningEvaluator
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
-from deepaccident_devkit.evaluation.setups import TASK_PROTOCOLS, EvaluationSetup, SampleLoader
-from deepaccident_devkit.evaluation.switches import switch_names, switched
-from deepaccident_devkit.evaluation.warning import WarningEvaluator
+from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup, SampleLoader
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import MotionLabels
 

@@ -15,10 +15,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
 from deepaccident_devkit.evaluation import Accident, Bootstrap, breakdown, sample_attributes
-from deepaccident_devkit.evaluation.accident import AccidentContext, BoxTruth, accident_context, box_truth
-from deepaccident_devkit.evaluation.accident.reading import AccidentReading
-from deepaccident_devkit.evaluation.breakdowns import numbers_of
-from deepaccident_devkit.evaluation.warning import WARNING_PROTOCOLS, WarningEvaluator, WarningProtocol
+from deepaccident_devkit.evaluation.metrics.accident import AccidentContext, BoxTruth, accident_context, box_truth
+from deepaccident_devkit.evaluation.metrics.alarms.reading import AccidentReading
+from deepaccident_devkit.evaluation.metrics.breakdowns import numbers_of
+from deepaccident_devkit.evaluation.metrics.warning import WARNING_PROTOCOLS, WarningEvaluator, WarningProtocol
 
 PAIR = (11, 22)
 MEETING = np.array([[20.0, 10.0], [16.0, 10.0]])

@@ -14,7 +14,7 @@ import pytest
 
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, ResultsError, TokenError
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, instances_of
-from deepaccident_devkit.evaluation.results import Results, ResultsWriter, contents, read_results
+from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results, reader
 from deepaccident_devkit.geometry import BevGrid
 
 FIRST, SECOND, THIRD = plain.TOKENS
@@ -58,7 +58,7 @@ class TestWriter:
         def full(*arguments: object, **options: object) -> None:
             raise OSError(28, "No space left on device")
 
-        where = "shard_writer.put_array" if task == "motion" else "entry_writer.EntryWriter.add"
+        where = "shards.put_array" if task == "motion" else "entries.EntryWriter.add"
         writer = ResultsWriter(tmp_path / "x", task)
         with pytest.raises(ResultsError, match="x: a prediction could not be written, so that none is kept"), writer:  # noqa: PT012
             writer.add(FIRST, PREDICTIONS[task]())
@@ -195,7 +195,7 @@ class TestResults:
     def test_a_copy_reads_again(self, results: Results) -> None:
         content = pickle.dumps(results)
         assert len(content) < 1000
-        contents.contents_of.cache_clear()
+        reader.contents_of.cache_clear()
         copy = pickle.loads(content)
         assert (copy.task, copy.path, copy.fingerprint) == (results.task, results.path, results.fingerprint)
         assert (copy.tokens, copy.meta, copy.form) == (results.tokens, results.meta, results.form)
@@ -205,7 +205,7 @@ class TestResults:
         def parsed(content: bytes) -> None:
             raise AssertionError("parsed again")
 
-        monkeypatch.setattr(contents, "parsed_json", parsed)
+        monkeypatch.setattr(reader, "parsed_json", parsed)
         for _ in range(3):
             pickle.loads(pickle.dumps(results)).prediction(FIRST)
         read_results(results.path).prediction(FIRST)
@@ -224,7 +224,7 @@ class TestResults:
         file.write_bytes(file.read_bytes().replace(b'"meta": {}', b'"meta": {"a": 1}'))
         with pytest.raises(ResultsError, match="was changed after it was opened; open it again"):
             results.check()
-        contents.contents_of.cache_clear()
+        reader.contents_of.cache_clear()
         with pytest.raises(ResultsError, match="was changed after it was opened; open it again"):
             pickle.loads(copy).prediction(FIRST)
         assert read_results(results.path).fingerprint != results.fingerprint

@@ -10,7 +10,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import Accident, accident_context, instances_of
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
 from deepaccident_devkit.evaluation.runs import EvaluationRun, SampleSelection, evaluate_results
-from deepaccident_devkit.evaluation.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 
 WriteAccidents = Callable[..., Results]
 WriteMotion = Callable[..., Results]

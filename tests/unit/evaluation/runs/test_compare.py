@@ -14,7 +14,7 @@ import pytest
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError, ResultsError
 from deepaccident_devkit.evaluation import Bootstrap
-from deepaccident_devkit.evaluation.breakdowns import numbers_of
+from deepaccident_devkit.evaluation.metrics.breakdowns import numbers_of
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import (
     Comparison,
@@ -24,7 +24,7 @@ from deepaccident_devkit.evaluation.runs import (
     evaluate_results,
     save_run,
 )
-from deepaccident_devkit.evaluation.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.splits import save_selection
 
 Write = Callable[..., Results]

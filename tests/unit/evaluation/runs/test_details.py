@@ -14,8 +14,8 @@ from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation import DetectedBoxes
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
 from deepaccident_devkit.evaluation.runs import EvaluationRun, SampleSelection, evaluate_results, read_rows, sample_rows
-from deepaccident_devkit.evaluation.runs.parquet import write_rows
-from deepaccident_devkit.evaluation.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.runs.rows import write_rows
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 
 Write = Callable[..., Results]
 

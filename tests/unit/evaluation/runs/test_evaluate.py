@@ -19,8 +19,8 @@ from deepaccident_devkit.evaluation.runs import (
     evaluate_results,
     scenario_hashes,
 )
-from deepaccident_devkit.evaluation.runs.checkpoints import checkpoint_path, remove_checkpoints
-from deepaccident_devkit.evaluation.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.runs.evaluation_run import checkpoint_path, remove_checkpoints
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 
 SETUP = EvaluationSetup(task="accident", protocol="boxes")
 Write = Callable[..., Results]

@@ -22,7 +22,7 @@ from deepaccident_devkit.evaluation.runs import (
     read_rows,
     save_run,
 )
-from deepaccident_devkit.evaluation.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.files import file_checksum
 
 FILES = {"metrics_summary.json", "counts.json", "samples.parquet", "scenarios.json", "files.json"}

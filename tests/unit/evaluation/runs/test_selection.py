@@ -6,7 +6,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
 from deepaccident_devkit.evaluation.runs import SampleSelection, default_selection
 from deepaccident_devkit.evaluation.runs.selection import agent_of, scenario_of
-from deepaccident_devkit.evaluation.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 
 
 def test_the_released_list(da_motion: DeepAccident) -> None:

@@ -18,7 +18,7 @@ from deepaccident_devkit.evaluation.runs import (
     save_run,
     summary_text,
 )
-from deepaccident_devkit.evaluation.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 
 Write = Callable[..., Results]
 

@@ -21,7 +21,7 @@ from deepaccident_devkit.evaluation.runs import (
     verify_bundle,
 )
 from deepaccident_devkit.evaluation.runs.differences import ABSENT, Difference, differing
-from deepaccident_devkit.evaluation.runs.parquet import read_rows, write_rows
+from deepaccident_devkit.evaluation.runs.rows import read_rows, write_rows
 
 Write = Callable[..., Results]
 

@@ -5,11 +5,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from deepaccident_devkit.evaluation.accident import BoxTruth
-from deepaccident_devkit.evaluation.predictions import Accident
-from deepaccident_devkit.evaluation.sanity.accidents import accident_suspicions, accident_tallies
-from deepaccident_devkit.evaluation.sanity.probes import SCALES, candidates_of
-from deepaccident_devkit.evaluation.sanity.symmetries import SYMMETRIES
+from deepaccident_devkit.evaluation.metrics.accident import BoxTruth
+from deepaccident_devkit.evaluation.metrics.predictions import Accident
+from deepaccident_devkit.evaluation.runs.sanity.accidents import accident_suspicions, accident_tallies
+from deepaccident_devkit.evaluation.runs.sanity.probes import SCALES, SYMMETRIES, candidates_of
 
 Change = Callable[[Accident], Accident]
 

@@ -11,13 +11,13 @@ from memory_results import MemoryResults
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError, EvaluationError
-from deepaccident_devkit.evaluation.accident import accident_context
-from deepaccident_devkit.evaluation.detection import DetectedBoxes, detection_truth
-from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, instances_of
+from deepaccident_devkit.evaluation.metrics.accident import accident_context
+from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes, detection_truth
+from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, instances_of
 from deepaccident_devkit.evaluation.results import ResultsWriter, read_results
-from deepaccident_devkit.evaluation.sanity import SanityReport, check_sanity
-from deepaccident_devkit.evaluation.sanity.chosen import telling_samples
-from deepaccident_devkit.evaluation.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.runs.sanity import SanityReport, check_sanity
+from deepaccident_devkit.evaluation.runs.sanity.check import telling_samples
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
 from deepaccident_devkit.motion import MotionHeads, MotionLabelConfig, MotionLabels

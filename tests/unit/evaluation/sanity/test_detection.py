@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.evaluation.detection import DetectedBoxes, detection_truth
-from deepaccident_devkit.evaluation.sanity.detection import (
+from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes, detection_truth
+from deepaccident_devkit.evaluation.runs.sanity.detection import (
     DetectionMoments,
     detection_moments,
     detection_suspicions,
     detection_tallies,
 )
-from deepaccident_devkit.evaluation.sanity.probes import SCALES, candidates_of
-from deepaccident_devkit.evaluation.sanity.symmetries import SYMMETRIES
+from deepaccident_devkit.evaluation.runs.sanity.probes import SCALES, SYMMETRIES, candidates_of
 from deepaccident_devkit.geometry import Boxes
 
 Moments = dict[str, DetectionMoments]

@@ -9,9 +9,9 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.arrays import AnyArray
-from deepaccident_devkit.evaluation.predictions import MotionOutput, instances_of
-from deepaccident_devkit.evaluation.sanity.motion import ids_kept, motion_suspicions, motion_tallies
-from deepaccident_devkit.evaluation.sanity.probes import SCALES, candidates_of
+from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput, instances_of
+from deepaccident_devkit.evaluation.runs.sanity.motion import ids_kept, motion_suspicions, motion_tallies
+from deepaccident_devkit.evaluation.runs.sanity.probes import SCALES, candidates_of
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import MotionHeads, MotionLabelConfig, MotionLabels
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from deepaccident_devkit.evaluation.sanity.symmetries import IDENTITY, SYMMETRIES, Symmetry, orientation_mistaken
+from deepaccident_devkit.evaluation.runs.sanity.probes import IDENTITY, SYMMETRIES, Symmetry, orientation_mistaken
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
 

@@ -5,7 +5,8 @@ from drawing import new_axes, words
 from numpy.testing import assert_array_equal
 
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.evaluation.detection import DetectionEvaluator, DetectionResult
+from deepaccident_devkit.evaluation.metrics.detection.evaluator import DetectionEvaluator
+from deepaccident_devkit.evaluation.metrics.detection.result import DetectionResult
 from deepaccident_devkit.render.evaluation import render_average_precisions, render_precision_recall
 
 

@@ -13,8 +13,8 @@ from report_page import page_of
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.evaluation.headlines import headlines
-from deepaccident_devkit.evaluation.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.metrics.headlines import headlines
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.render.evaluation import save_report
 from deepaccident_devkit.render.evaluation.figures import run_figures
 

@@ -12,7 +12,7 @@ from report_page import page_of
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import instances_of
-from deepaccident_devkit.evaluation.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.render import detached_figure
 from deepaccident_devkit.render.colors import OUTCOME_COLORS

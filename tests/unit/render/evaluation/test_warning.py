@@ -7,8 +7,7 @@ import numpy as np
 from drawing import new_axes, words
 from numpy.testing import assert_array_equal
 
-from deepaccident_devkit.evaluation.warning import WarningResult
-from deepaccident_devkit.evaluation.warning.result import WarningCurve
+from deepaccident_devkit.evaluation.metrics.warning.result import WarningCurve, WarningResult
 from deepaccident_devkit.render.evaluation import (
     render_detection_rates,
     render_false_alarms,

@@ -7,7 +7,8 @@ from numpy.testing import assert_allclose
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError
 from deepaccident_devkit.evaluation import Accident, AccidentEvaluator, accident_context, box_truth, instances_of
-from deepaccident_devkit.evaluation.accident import PROTOCOLS, compared_accidents
+from deepaccident_devkit.evaluation.metrics.accident.compared import compared_accidents
+from deepaccident_devkit.evaluation.metrics.accident.evaluator import PROTOCOLS
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render import detached_figure
 from deepaccident_devkit.render.outcomes.accident import verdict_words

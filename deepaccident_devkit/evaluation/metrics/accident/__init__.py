@@ -1,0 +1,33 @@
+"""How well accidents are foreseen, by three protocols."""
+
+from deepaccident_devkit.evaluation.metrics.accident.boxes import BoxAccidents
+from deepaccident_devkit.evaluation.metrics.accident.compared import ComparedAccidents, compared_accidents
+from deepaccident_devkit.evaluation.metrics.accident.evaluator import PROTOCOLS, AccidentEvaluator, AccidentProtocol
+from deepaccident_devkit.evaluation.metrics.accident.paper import PaperAccidents
+from deepaccident_devkit.evaluation.metrics.accident.released import ReleasedAccidents
+from deepaccident_devkit.evaluation.metrics.accident.scoring import DISTANCES, AccidentResult, AccidentsWithin
+from deepaccident_devkit.evaluation.metrics.alarms.raised import accidents_of
+from deepaccident_devkit.evaluation.metrics.alarms.reading import AccidentReading
+from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext, BoxTruth, accident_context, box_truth
+from deepaccident_devkit.evaluation.metrics.predictions import Prediction
+
+__all__ = [
+    "DISTANCES",
+    "PROTOCOLS",
+    "AccidentContext",
+    "AccidentEvaluator",
+    "AccidentProtocol",
+    "AccidentReading",
+    "AccidentResult",
+    "AccidentsWithin",
+    "BoxAccidents",
+    "BoxTruth",
+    "ComparedAccidents",
+    "PaperAccidents",
+    "Prediction",
+    "ReleasedAccidents",
+    "accident_context",
+    "accidents_of",
+    "box_truth",
+    "compared_accidents",
+]

@@ -1,0 +1,236 @@
+"""Accident metrics for those who would rely on the alarm: against what happens, not against rasters (protocol `boxes`).
+
+The truth is the pair and the moment that the scenario's meta file names, at the places where the labels have them.
+Every alarm counts, nothing of the truth helps to choose one, and what a recording cannot refute is not judged.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any, Final, get_args
+
+import numpy as np
+
+from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
+from deepaccident_devkit.evaluation.metrics.accident.scoring import (
+    AccidentResult,
+    Alarm,
+    Scoring,
+    alarms_tally,
+    exact_parts,
+    foreseen,
+    named,
+    tally_result,
+    united,
+)
+from deepaccident_devkit.evaluation.metrics.alarms.raised import Naming, Pair, named_alarms, position_difference
+from deepaccident_devkit.evaluation.metrics.alarms.reading import AccidentReading
+from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext, BoxTruth
+from deepaccident_devkit.evaluation.metrics.choices import with_others, with_parts
+from deepaccident_devkit.evaluation.metrics.evaluator import Counts
+from deepaccident_devkit.evaluation.metrics.predictions import Accident, Prediction, checked_prediction
+from deepaccident_devkit.motion import MotionLabels
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
+
+_SLACK: Final = FRAME_PERIOD / 2
+"""Seconds: half a recorded frame, so that decimal moments compare as they are meant."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BoxAccidentResult(AccidentResult):
+    """Accident metrics, and what one would ask of an alarm; the latter at the distance of `Scoring.errors_at`.
+
+    Attributes:
+        precision: share of the alarms that foresee a true accident; None without alarms.
+        recall: share of the true accidents that are foreseen; None without any.
+        average_precision: the mean of the precision over the recall, alarms taken from the surest on; None likewise.
+        false_alarm_rate: share of the samples without an accident to come that raise an alarm; None without any.
+        lateness: seconds, mean over the true positives by which the predicted moment is later than the true one,
+            negative if it is earlier; None without any.
+        unjudged: alarms that nothing can refute: no accident is known, and they are for later than the recording shows.
+    """
+
+    precision: float | None
+    recall: float | None
+    average_precision: float | None
+    false_alarm_rate: float | None
+    lateness: float | None
+    unjudged: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BoxAccidents:
+    """Accident metrics against the labels' boxes.
+
+    A list of `Accident`s is a list of alarms: each is true or false, and the surest one that is near enough to the true
+    accident (the earliest of equally sure ones) is the true positive. K motion predictions are one alarm, as sure as
+    the share of them that have an accident; where and when is said by the mean sample (the last) or else by the first
+    that has one. They are not cut at the recording's end, which a model cannot know.
+
+    Attributes:
+        reading: how an accident is read off maps. By the paper's 1 m, the default, traffic side by side is one, since
+            neighbouring cells are 0.5 m apart; at 0.5 m a square contact is none.
+        min_score: alarms less sure than this are none.
+        match_distance: metres: gate of the match of instances with actors, which decides whether a prediction in maps
+            names the right ones; also how far off the `nearest` of `naming` may be.
+        naming: whom an explicit accident without `ids` (actor ids) names: the two actors whose boxes' centres are
+            `nearest` to its positions at its time (at the last moment of the truth, if it is for later), or, with
+            `given`, nobody. Where nobody is near enough, the accident names others than those who collide.
+        unjudged_are_false: alarms that the recording cannot refute are false ones; else they are left out and counted
+            aside.
+        scoring: when an accident counts as foreseen.
+    """
+
+    reading: AccidentReading = field(default_factory=AccidentReading)
+    min_score: float = 0.0
+    match_distance: float = 4.0
+    naming: Naming = "nearest"
+    unjudged_are_false: bool = False
+    scoring: Scoring = field(default_factory=Scoring)
+
+    def __post_init__(self) -> None:
+        """Check the values; raises ChoiceError or ConfigError."""
+        if not math.isfinite(self.min_score):
+            raise ConfigError(f"min_score: expected a number, found {self.min_score!r}")
+        if not 0 < self.match_distance < math.inf:
+            raise ConfigError(f"match_distance: expected metres above 0, found {self.match_distance!r}")
+        if self.naming not in get_args(Naming):
+            raise ChoiceError(f"naming: expected one of {', '.join(get_args(Naming))}, found {self.naming!r}")
+
+    def settings(self) -> dict[str, Any]:
+        """All choices, as JSON can hold them."""
+        return asdict(self)
+
+    def variants(self) -> dict[str, BoxAccidents]:
+        """These metrics with one choice made otherwise, by `name=value`; for explanations."""
+        own: Mapping[str, tuple[Any, ...]] = {
+            "min_score": (0.5,),
+            "match_distance": (2.0, 4.0, 8.0),
+            "naming": get_args(Naming),
+            "unjudged_are_false": (False, True),
+        }
+        return {
+            **with_parts(self, "reading", self.reading.variants()),
+            **with_others(self, own),
+            **with_parts(self, "scoring", self.scoring.variants()),
+        }
+
+    def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
+        """What one sample adds.
+
+        Args:
+            prediction: motion in maps, or explicit accidents; an empty list for no alarm.
+            label: says how far apart in time maps are and how they lie in their cells; None for the released way.
+            context: with `truth`, from `accident_context(dataset, sample, horizon)`; `AccidentEvaluator.update` takes
+                it or the truth as label, too.
+
+        Returns:
+            `positive`: whether an accident comes; `named`: whom the boxes bring nearer to each other than the danger
+            distance (of `NAMED`); `alarms`: the surest first; `unjudged`: how many were left out.
+
+        Raises:
+            EvaluationError: the context has no truth, or the prediction is neither.
+        """
+        truth = context.truth
+        if not isinstance(truth, BoxTruth):
+            raise EvaluationError(
+                "label: the accident protocol 'boxes' compares with boxes; give box_truth(dataset, sample), or "
+                "accident_context(dataset, sample, horizon=2.0), as label or as context"
+            )
+        raised = named_alarms(checked_prediction(prediction), label, truth, self)
+        judged = [alarm for alarm in raised if self._is_judged(alarm[0], truth)]
+        nearest = truth.nearest_pair(self.reading.danger_distance)
+        return {
+            "positive": truth.accident is not None,
+            "named": named(nearest, context),
+            "alarms": [_alarm(accident, ids, truth) for accident, ids in judged],
+            "unjudged": len(raised) - len(judged),
+        }
+
+    def result(self, counts: Collection[Counts]) -> BoxAccidentResult:
+        """The metrics of some samples' counts, in any order."""
+        given = self._united(counts)
+        base = tally_result(given["tally"], self.scoring.errors_at)
+        at = base.within[self.scoring.errors_at]
+        return BoxAccidentResult(
+            **{each.name: getattr(base, each.name) for each in fields(AccidentResult)},
+            precision=_share(at.tp, at.tp + at.fp),
+            recall=_share(at.tp, base.positives),
+            average_precision=_average_precision(given["alarms"], base.positives),
+            false_alarm_rate=_share(given["false_samples"], base.negatives),
+            lateness=_share(math.fsum(given["lateness"]), at.tp),
+            unjudged=given["unjudged"],
+        )
+
+    def pooled(self, counts: Collection[Counts]) -> list[Counts]:
+        """The sums of all counts, which have the same result; alarms stay one by one."""
+        return [self._united(counts)]
+
+    def _united(self, counts: Collection[Counts]) -> dict[str, Any]:
+        """What samples add, those of `pooled` among them.
+
+        Returns:
+            `tally`; `alarms`: [score, whether it is the right one] of each; `lateness`: in sum, of the right ones;
+            `false_samples`: how many raise an alarm without an accident to come; `unjudged`.
+        """
+        given = [each if "tally" in each else self._tallied(each) for each in counts]
+        return {
+            "tally": united(each["tally"] for each in given),
+            "alarms": [alarm for each in given for alarm in each["alarms"]],
+            "lateness": exact_parts(each["lateness"] for each in given),
+            **{name: sum(each[name] for each in given) for name in ("false_samples", "unjudged")},
+        }
+
+    def _tallied(self, sample: Counts) -> dict[str, Any]:
+        alarms: Sequence[Alarm] = sample["alarms"]
+        hit = self.scoring.hit(alarms, self.scoring.errors_at) if sample["positive"] else None
+        return {
+            "tally": alarms_tally(sample, alarms, self.scoring),
+            "alarms": [[alarm["score"], alarm is hit] for alarm in alarms],
+            "lateness": [] if hit is None else [hit["time"]],
+            "false_samples": int(bool(alarms) and not sample["positive"]),
+            "unjudged": sample["unjudged"],
+        }
+
+    def _is_judged(self, accident: Accident, truth: BoxTruth) -> bool:
+        seen = truth.accident is not None or accident.time <= float(truth.time[-1]) + _SLACK
+        return seen or self.unjudged_are_false
+
+
+def _id_error(ids: Pair | None, truth: BoxTruth) -> int | None:
+    """1 if these are not the two that collide; None if nobody is named, or nobody collides."""
+    if ids is None or truth.accident is None or truth.accident.ids is None:
+        return None
+    return int(set(ids) != set(truth.accident.ids))
+
+
+def _alarm(accident: Accident, ids: Pair | None, truth: BoxTruth) -> dict[str, Any]:
+    if truth.accident is None:
+        return foreseen(score=accident.score)
+    return foreseen(
+        position=position_difference(accident.positions, truth.accident.positions),
+        time=accident.time - truth.accident.time,
+        id_error=_id_error(ids, truth),
+        score=accident.score,
+    )
+
+
+def _average_precision(alarms: Sequence[Sequence[float]], positives: int) -> float | None:
+    """The area under the steps of precision over recall; equally sure alarms are one step, so that no order counts."""
+    if not positives:
+        return None
+    if not alarms:
+        return 0.0
+    score, true = np.array(alarms, dtype=np.float64).T
+    steps = np.unique(-score)
+    place = np.searchsorted(steps, -score)
+    raised = np.bincount(place, minlength=len(steps))
+    right = np.bincount(place, true, len(steps))
+    precision = np.cumsum(right) / np.cumsum(raised)
+    return math.fsum((right / positives * precision).tolist())
+
+
+def _share(part: float, whole: float) -> float | None:
+    return part / whole if whole else None

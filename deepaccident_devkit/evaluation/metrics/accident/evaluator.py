@@ -1,0 +1,163 @@
+"""`AccidentEvaluator`: how well accidents are foreseen, and what a protocol for that has to offer."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any, Final, Protocol, runtime_checkable
+
+from deepaccident_devkit.errors import ChoiceError, EvaluationError
+from deepaccident_devkit.evaluation.metrics.accident.boxes import BoxAccidents
+from deepaccident_devkit.evaluation.metrics.accident.paper import PaperAccidents
+from deepaccident_devkit.evaluation.metrics.accident.released import ReleasedAccidents
+from deepaccident_devkit.evaluation.metrics.accident.scoring import AccidentResult
+from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext, BoxTruth
+from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator
+from deepaccident_devkit.evaluation.metrics.predictions import Prediction, checked_prediction
+from deepaccident_devkit.motion import MotionLabels
+
+Truth = MotionLabels | BoxTruth | AccidentContext
+"""What an evaluator takes as label: motion labels, or for a protocol without rasters what it compares with."""
+
+
+@runtime_checkable
+class AccidentProtocol(Protocol):
+    """A frozen dataclass with one field a choice; `PROTOCOLS` has those with names."""
+
+    def settings(self) -> dict[str, Any]:
+        """All that decides the numbers, as JSON can hold it."""
+
+    def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
+        """What one sample adds; raises EvaluationError if it cannot be evaluated so."""
+
+    def result(self, counts: Collection[Counts]) -> AccidentResult:
+        """The metrics of some samples' counts, in any order; of those that `pooled` gives, too."""
+
+    def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
+        """Fewer counts with the same result, to the last bit."""
+
+    def variants(self) -> Mapping[str, AccidentProtocol]:
+        """The same protocol with one choice made otherwise, by the choice's name: what `explain` compares with."""
+
+
+PROTOCOLS: Final[Mapping[str, AccidentProtocol]] = MappingProxyType(
+    {"released": ReleasedAccidents(), "paper": PaperAccidents(), "boxes": BoxAccidents()}
+)
+"""`released` is what the released code computes, `paper` what the paper's text says, `boxes` compares with the labels
+themselves and not with rasters."""
+
+
+class AccidentEvaluator(Evaluator[AccidentResult]):
+    """Accident prediction accuracy and the errors of the accidents that are foreseen.
+
+    >>> evaluator = AccidentEvaluator(protocol="released")
+    >>> len(evaluator)
+    0
+    """
+
+    def __init__(self, protocol: str | AccidentProtocol = "released", *, explain: bool = False) -> None:
+        """Start without samples.
+
+        Args:
+            protocol: of `PROTOCOLS` by name, or your own.
+            explain: count each sample also with each choice of the protocol made otherwise, for `explained`; takes
+                that many times longer.
+
+        Raises:
+            ChoiceError: no protocol has that name, or it is none.
+        """
+        super().__init__()
+        self.protocol = _protocol(protocol)
+        self._variants = dict(self.protocol.variants()) if explain else {}
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The protocol, its choices, and whether they are explained."""
+        return {
+            "protocol": type(self.protocol).__name__,
+            "choices": self.protocol.settings(),
+            "explain": bool(self._variants),
+        }
+
+    def update(
+        self,
+        token: str,
+        prediction: Prediction,
+        label: Truth | None = None,
+        context: AccidentContext | None = None,
+    ) -> None:
+        """Count one sample.
+
+        Args:
+            token: of the sample.
+            prediction: what a model says.
+            label: the sample's motion labels, each frame in its own frame or all at the present. Those in their own
+                frames are warped to the present with bilinear centres, as the released evaluation does. A protocol that
+                compares with boxes needs none; it takes their truth here (`box_truth` or `accident_context`), or in the
+                context.
+            context: what else is known of it; None for nothing.
+
+        Raises:
+            EvaluationError: the protocol cannot evaluate such a prediction or label, or the sample came before with
+                another outcome.
+        """
+        labels, known = _known(label, context)
+        given = checked_prediction(prediction)
+        counts = dict(self.protocol.counts(given, labels, known))
+        if self._variants:
+            counts["variants"] = {
+                name: variant.counts(given, labels, known) for name, variant in self._variants.items()
+            }
+        self.add(token, counts)
+
+    def result_of(self, counts: Collection[Counts]) -> AccidentResult:
+        """The metrics of some samples' counts, in any order."""
+        return self.protocol.result(counts)
+
+    def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
+        """Fewer counts with the same result."""
+        return self.protocol.pooled(counts)
+
+    def explained(self) -> dict[str, AccidentResult]:
+        """For each choice of the protocol the result if it were made otherwise, all else equal.
+
+        Raises:
+            EvaluationError: the evaluator was not made with `explain`.
+        """
+        if not self._variants:
+            raise EvaluationError("nothing to explain: make the evaluator with explain=True")
+        return {
+            name: variant.result([counts["variants"][name] for counts in self._counts.values()])
+            for name, variant in self._variants.items()
+        }
+
+
+def _known(label: Truth | None, context: AccidentContext | None) -> tuple[MotionLabels | None, AccidentContext]:
+    """Motion labels, and all else that is known; raises EvaluationError."""
+    if context is not None and not isinstance(context, AccidentContext):
+        raise EvaluationError(
+            f"context: expected an AccidentContext, found {type(context).__name__}; make it with "
+            "accident_context(dataset, sample, horizon)"
+        )
+    known = context or AccidentContext()
+    if label is None or isinstance(label, MotionLabels):
+        return label, known
+    if isinstance(label, AccidentContext) and context is None:
+        return None, label
+    if isinstance(label, BoxTruth) and known.truth is None:
+        return None, replace(known, truth=label)
+    if isinstance(label, AccidentContext | BoxTruth):
+        raise EvaluationError("label, context: both say what is true; give the truth in one of them")
+    raise EvaluationError(
+        f"label: expected MotionLabels, or for protocol='boxes' a BoxTruth or an AccidentContext, found "
+        f"{type(label).__name__}; give what dataset.motion_labels(token) has of the sample"
+    )
+
+
+def _protocol(protocol: object) -> AccidentProtocol:
+    if isinstance(protocol, AccidentProtocol):
+        return protocol
+    if not isinstance(protocol, str) or protocol not in PROTOCOLS:
+        raise ChoiceError(f"protocol: expected one of {', '.join(PROTOCOLS)}, or your own, found {protocol!r}")
+    return PROTOCOLS[protocol]

@@ -1,0 +1,312 @@
+"""Accident metrics as the paper describes them; where it is silent, as the released code has them (protocol `paper`).
+
+Each choice is a field of `PaperAccidents`, `AccidentReading` or `Scoring`; docs/protocols.md lists them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Final, Literal, get_args
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray
+from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
+from deepaccident_devkit.evaluation.metrics.accident.scoring import (
+    AccidentResult,
+    Alarm,
+    Scoring,
+    actor_of,
+    alarms_tally,
+    foreseen,
+    named,
+    tally_result,
+    united,
+)
+from deepaccident_devkit.evaluation.metrics.alarms.raised import Naming, by_sureness, nearest_two, position_difference
+from deepaccident_devkit.evaluation.metrics.alarms.reading import (
+    AccidentReading,
+    InstanceAccident,
+    accident_of,
+    match_tracks,
+)
+from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
+from deepaccident_devkit.evaluation.metrics.choices import with_others, with_parts
+from deepaccident_devkit.evaluation.metrics.evaluator import Counts
+from deepaccident_devkit.evaluation.metrics.frames import (
+    check_output,
+    check_protocol,
+    first_frames,
+    frames_there,
+    labels_at_present,
+)
+from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, Prediction, checked_prediction
+from deepaccident_devkit.motion import LABEL_PROTOCOLS, LabelProtocol, MotionHeads, MotionLabels
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
+
+SampleChoice = Literal["best", "mean_first"]
+PredictedBy = Literal["any", "mean"]
+PositionTime = Literal["own", "truth"]
+AlarmChoice = Literal["surest", "any"]
+_CHOICES: Final[Mapping[str, tuple[str | None, ...]]] = {
+    "labels": (None, *LABEL_PROTOCOLS),
+    "predicted_by": get_args(PredictedBy),
+    "sample_choice": get_args(SampleChoice),
+    "position_time": get_args(PositionTime),
+    "alarm_choice": get_args(AlarmChoice),
+    "naming": get_args(Naming),
+}
+_FORMS: Final[Mapping[str, str]] = {"instance_maps": "instance maps", "explicit": "explicit accidents"}
+"""Forms of a prediction that are not heads, as counts and as notes have them."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PaperAccidents:
+    """The accident metrics of the paper's text.
+
+    Attributes:
+        labels: protocol of the labels that are the truth; others are refused. None for any labels.
+        reading: how an accident is read off maps, the truth's and the prediction's alike.
+        predicted_by: whose accident counts as predicted: that of `any` of the K predictions, or the `mean` sample's
+            (the last of the K) alone.
+        sample_choice: which of several predictions that have an accident is compared: the `best`, whose positions are
+            nearest to the truth (as the released code; the first of equal ones), or `mean_first`: the mean sample's or
+            else the first, without a look at the truth. Both are counted; this one is the result, the other is beside.
+        position_time: the moment of the predicted positions: its `own` accident's, or that of the `truth`, where both
+            predicted agents are there then. Explicit accidents have only their own.
+        alarm_choice: which of a sample's explicit accidents are predicted: the `surest` (the earliest of equally sure
+            ones), as a prediction in maps shows one at most; or `any`, as if each were one of K predictions, the surest
+            in the mean's place.
+        alarms_cut: explicit accidents for later than the labels' last frame in the recording, by more than half a step,
+            are left out, as the frames of maps are.
+        naming: whom an explicit accident without `ids` names: the two true instances that are `nearest` to its
+            positions at its time, or, with `given`, nobody. (`ids` are actor ids, and are compared with the actors that
+            the true instances are.)
+        match_distance: metres: gate of the match of instances that decides whether a prediction names the right ones;
+            also how far off the `nearest` of `naming` may be.
+        scoring: when an accident counts as foreseen.
+    """
+
+    labels: str | None = "released"
+    reading: AccidentReading = field(default_factory=AccidentReading)
+    predicted_by: PredictedBy = "any"
+    sample_choice: SampleChoice = "best"
+    position_time: PositionTime = "own"
+    alarm_choice: AlarmChoice = "surest"
+    alarms_cut: bool = True
+    naming: Naming = "nearest"
+    match_distance: float = 4.0
+    scoring: Scoring = field(default_factory=Scoring)
+
+    def __post_init__(self) -> None:
+        """Check the values; raises ChoiceError or ConfigError."""
+        for name, allowed in _CHOICES.items():
+            if getattr(self, name) not in allowed:
+                possible = ", ".join(map(str, allowed))
+                raise ChoiceError(f"{name}: expected one of {possible}, found {getattr(self, name)!r}")
+        if not 0 < self.match_distance < np.inf:
+            raise ConfigError(f"match_distance: expected metres above 0, found {self.match_distance!r}")
+
+    def settings(self) -> dict[str, Any]:
+        """All choices, as JSON can hold them."""
+        return asdict(self)
+
+    def variants(self) -> dict[str, PaperAccidents]:
+        """These metrics with one choice made otherwise, by `name=value`; for explanations."""
+        own: Mapping[str, tuple[Any, ...]] = {
+            "predicted_by": get_args(PredictedBy),
+            "sample_choice": get_args(SampleChoice),
+            "position_time": get_args(PositionTime),
+            "alarm_choice": get_args(AlarmChoice),
+            "alarms_cut": (False, True),
+            "naming": get_args(Naming),
+            "match_distance": (2.0, 4.0, 8.0),
+        }
+        return {
+            **with_parts(self, "reading", self.reading.variants()),
+            **with_others(self, own),
+            **with_parts(self, "scoring", self.scoring.variants()),
+        }
+
+    def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
+        """What one sample adds.
+
+        Where heads are predicted, the truth is the labels as heads, through the same grouping and linking; where
+        instance maps or explicit accidents are, it is the labels' warped instance map.
+
+        Returns:
+            `positive`: whether the truth has an accident; `named`: whom it names (of `NAMED`); `instance_maps` and
+            `explicit`: whether the prediction is those; `best` and `mean_first`: the alarm that each choice compares,
+            or None.
+
+        Raises:
+            EvaluationError: the prediction is neither motion nor accidents, no labels or those of another protocol,
+                another grid, too few frames.
+        """
+        given, label = self._checked(prediction, label)
+        frames, rules = frames_there(label), label.config.rules
+        if isinstance(given, MotionOutput):
+            check_output(given, label, frames)
+        label = labels_at_present(label)
+        shown = self.truth_map(given, label, frames)
+        truth = accident_of(shown, label.config.grid, rules, self.reading)
+        seconds = label.config.step * FRAME_PERIOD
+        actors = None
+        if truth.contact is not None:
+            frame, ids = truth.contact.frame, truth.contact.ids
+            actors = [actor_of(shown[frame] == identity, frame, label, context) for identity in ids]
+        alarms: list[Alarm | None]
+        if isinstance(given, MotionOutput):
+            read = self.read_predictions(given, frames, rules)
+            alarms = [self._alarm(found, truth, seconds) if found.contact else None for found in read]
+        else:
+            gate, naming = self.match_distance, self.naming
+            alarms = [
+                explicit_alarm(each, truth, actors, seconds=seconds, naming=naming, gate=gate)
+                for each in self.raised(given, (frames - 0.5) * seconds)
+            ]
+        if self.predicted_by == "mean":
+            alarms = alarms[-1:]
+        return {
+            "positive": truth.contact is not None,
+            "named": named(actors, context),
+            "instance_maps": isinstance(given, MotionOutput) and given.instances is not None,
+            "explicit": not isinstance(given, MotionOutput),
+            "best": _nearest(alarms),
+            "mean_first": next((alarm for alarm in (*alarms[-1:], *alarms[:-1]) if alarm), None),
+        }
+
+    def result(self, counts: Collection[Counts]) -> AccidentResult:
+        """The metrics of some samples' counts, in any order."""
+        given = self._united(counts)
+        chosen, other = sorted(get_args(SampleChoice), key=lambda choice: choice != self.sample_choice)
+        result, beside = (tally_result(given[choice], self.scoring.errors_at) for choice in (chosen, other))
+        notes = _notes(given, result.samples)
+        return replace(result, notes=notes, beside={f"sample_choice={other}": beside})
+
+    def pooled(self, counts: Collection[Counts]) -> list[Counts]:
+        """The sums of all counts, which have the same result."""
+        return [{"tallies": self._united(counts)}]
+
+    def _united(self, counts: Collection[Counts]) -> dict[str, Any]:
+        """The tally of each choice of a sample, and how many predictions were given in which form."""
+        given = [each["tallies"] if "tallies" in each else self._tallies(each) for each in counts]
+        return {
+            **{choice: united(each[choice] for each in given) for choice in get_args(SampleChoice)},
+            **{form: sum(each[form] for each in given) for form in _FORMS},
+        }
+
+    def _tallies(self, sample: Counts) -> dict[str, Any]:
+        alarms = {choice: [sample[choice]] if sample[choice] else [] for choice in get_args(SampleChoice)}
+        return {
+            **{choice: alarms_tally(sample, each, self.scoring) for choice, each in alarms.items()},
+            **{form: int(sample[form]) for form in _FORMS},
+        }
+
+    def _checked(
+        self, prediction: Prediction, label: MotionLabels | None
+    ) -> tuple[MotionOutput | list[Accident], MotionLabels]:
+        if label is None:
+            raise EvaluationError("label: the accident protocol 'paper' needs the sample's motion labels")
+        check_protocol(label, self.labels)
+        return checked_prediction(prediction), label
+
+    def truth_map(self, given: MotionOutput | list[Accident], label: MotionLabels, frames: int) -> AnyArray:
+        """(T, H, W) the instances that a prediction is compared with, of labels at the present; as the labels lie."""
+        if not isinstance(given, MotionOutput) or given.heads is None:
+            return label.instance[:frames]
+        return self.reading.instances(first_frames(MotionHeads.from_labels(label), frames))
+
+    def read_predictions(self, output: MotionOutput, frames: int, rules: LabelProtocol) -> list[InstanceAccident]:
+        """What is read off each of the K predictions, cut to so many frames."""
+        if output.heads is not None:
+            maps = [self.reading.instances(first_frames(heads, frames)) for heads in output.heads]
+        else:
+            maps = [] if output.instances is None else [each[:frames] for each in output.instances]
+        return [accident_of(each, output.grid, rules, self.reading) for each in maps]
+
+    def raised(self, accidents: list[Accident], last: float) -> list[Accident]:
+        """The explicit accidents that count as predicted, the surest last, as the mean sample is."""
+        raised = sorted((each for each in accidents if not self.alarms_cut or each.time <= last), key=by_sureness)
+        return raised[:1] if self.alarm_choice == "surest" else [*raised[1:], *raised[:1]]
+
+    def _alarm(self, found: InstanceAccident, truth: InstanceAccident, seconds: float) -> Alarm:
+        """A predicted accident against the true one, if there is one; `seconds` from frame to frame."""
+        if found.contact is None or truth.contact is None:
+            return foreseen()
+        positions = found.positions
+        if self.position_time == "truth":
+            then = found.tracks.at(truth.contact.frame, found.contact.ids)
+            positions = then if np.isfinite(then).all() else positions
+        match = match_tracks(found.tracks, truth.tracks, self.match_distance)
+        same = {match.get(identity) for identity in found.contact.ids} == set(truth.contact.ids)
+        return foreseen(
+            position=position_difference(positions, truth.positions),
+            time=(found.contact.frame - truth.contact.frame) * seconds,
+            id_error=int(not same),
+        )
+
+
+def _nearest(alarms: Sequence[Alarm | None]) -> Alarm | None:
+    """The first with the smallest difference of positions; the first at all where there is no truth to differ from."""
+    there = [alarm for alarm in alarms if alarm]
+    return min(there, key=lambda alarm: alarm["position"] or 0.0, default=None)
+
+
+def _notes(given: Mapping[str, Any], samples: int) -> tuple[str, ...]:
+    """Sentences on predictions whose truth is not that of heads."""
+    return tuple(
+        f"{given[form]} of {samples} predictions were given as {words}: their truth is the labels' instance map, not "
+        "the released grouping and linking of the labels"
+        for form, words in _FORMS.items()
+        if given[form]
+    )
+
+
+def explicit_alarm(
+    predicted: Accident,
+    truth: InstanceAccident,
+    actors: Sequence[int | None] | None,
+    *,
+    seconds: float,
+    naming: Naming,
+    gate: float,
+) -> Alarm:
+    """A predicted accident against the true one, if there is one.
+
+    Args:
+        predicted: in the present ego frame, as the truth.
+        truth: read off the labels' maps.
+        actors: who the two true instances are, None for one that is not known; None without a true accident.
+        seconds: from frame to frame of the maps.
+        naming: whom the predicted one names if it has no `ids`.
+        gate: metres: how far off the nearest instances may be.
+    """
+    if truth.contact is None:
+        return foreseen()
+    return foreseen(
+        position=position_difference(predicted.positions, truth.positions),
+        time=predicted.time - truth.contact.frame * seconds,
+        id_error=_id_error(predicted, truth, actors, seconds, naming, gate),
+    )
+
+
+def _id_error(
+    predicted: Accident,
+    truth: InstanceAccident,
+    actors: Sequence[int | None] | None,
+    seconds: float,
+    naming: Naming,
+    gate: float,
+) -> int | None:
+    """1 if others are named than the two true instances; None if nobody is named, or it is not known who those are."""
+    if truth.contact is None or actors is None:
+        return None
+    if predicted.ids is not None:
+        return None if None in actors else int(set(predicted.ids) != set(actors))
+    if naming == "given":
+        return None
+    frame = min(round(predicted.time / seconds), len(truth.tracks.center) - 1)
+    nearest = nearest_two(predicted.positions, truth.tracks.identity, truth.tracks.center[frame], gate)
+    return int(set(nearest) != set(truth.contact.ids))

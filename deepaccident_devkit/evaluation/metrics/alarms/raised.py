@@ -1,0 +1,165 @@
+"""The alarms that predictions raise, the surest first, where, and whom each of them names."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final, Literal, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from deepaccident_devkit.arrays import FloatArray, IntArray
+from deepaccident_devkit.errors import ChoiceError, ConfigError
+from deepaccident_devkit.evaluation.metrics.alarms.reading import (
+    AccidentReading,
+    InstanceTracks,
+    accident_of,
+    match_tracks,
+)
+from deepaccident_devkit.evaluation.metrics.alarms.truth import BoxTruth
+from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, instances_of
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionLabelConfig, MotionLabels
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
+
+LABEL_STEP: Final = 0.5
+"""Seconds from one frame of the released labels to the next."""
+Naming = Literal["nearest", "given"]
+"""Whom an explicit accident without `ids` names: who is `nearest` to its positions then, or nobody."""
+Pair = tuple[int | None, int | None]
+"""Ids of those who are named; None for one who is nobody that is known."""
+NamedAlarm = tuple[Accident, Pair | None]
+"""An alarm and whom it names; None if it names nobody."""
+_RELEASED_LABELS: Final = MotionLabelConfig()
+
+
+class AlarmRules(Protocol):
+    """The choices that decide which alarms there are, and whom they name; see `BoxAccidents`."""
+
+    @property
+    def reading(self) -> AccidentReading:
+        """How an accident is read off maps."""
+
+    @property
+    def min_score(self) -> float:
+        """Alarms less sure than this are none."""
+
+    @property
+    def match_distance(self) -> float:
+        """Metres: gate of the matches with actors."""
+
+    @property
+    def naming(self) -> Naming:
+        """Whom an explicit accident without ids names."""
+
+
+def named_alarms(
+    prediction: MotionOutput | list[Accident], label: MotionLabels | None, truth: BoxTruth, rules: AlarmRules
+) -> list[NamedAlarm]:
+    """The alarms of one sample, the surest first, of equally sure ones the earliest.
+
+    K motion predictions are at most one alarm, as sure as the share of them that have an accident; where and when is
+    said by the mean sample (the last) or else by the first that has one.
+
+    Args:
+        prediction: motion in maps, or explicit accidents.
+        label: says how far apart in time maps are and how they lie in their cells; None for the released way.
+        truth: the actors that can be named.
+        rules: the choices.
+    """
+    if isinstance(prediction, MotionOutput):
+        found = _alarms_of_maps(prediction, label.config if label else _RELEASED_LABELS, truth, rules)
+    else:
+        found = [(alarm, _named(alarm, truth, rules)) for alarm in prediction]
+    return sorted((each for each in found if each[0].score >= rules.min_score), key=lambda each: by_sureness(each[0]))
+
+
+def by_sureness(alarm: Accident) -> tuple[Any, ...]:
+    """The surest first, of equally sure ones the earliest; the rest is so that no order of a list counts."""
+    return -alarm.score, alarm.time, alarm.positions.tolist(), alarm.ids or ()
+
+
+def nearest_two(positions: FloatArray, identity: IntArray, center: FloatArray, gate: float) -> Pair:
+    """Who is nearest to two positions, a different one each, by the least sum of distances.
+
+    Args:
+        positions: (2, 2) x forward, y left, metres.
+        identity: (I,) int64, ascending: of those who can be named.
+        center: (I, 2) where they are, in the same frame; NaN where they are not.
+        gate: metres: whoever is farther away is not named.
+    """
+    places = InstanceTracks(identity=np.arange(2), center=positions[None])
+    match = match_tracks(places, InstanceTracks(identity=identity, center=center[None]), gate)
+    return match.get(0), match.get(1)
+
+
+def position_difference(first: FloatArray, second: FloatArray) -> float:
+    """The differences of two pairs of positions (2, 2), metres: the sum over the two, whichever way they fit better."""
+    apart = np.linalg.norm(first[:, None] - second, axis=-1)
+    return float(min(apart[0, 0] + apart[1, 1], apart[0, 1] + apart[1, 0]))
+
+
+def accidents_of(
+    instance: ArrayLike,
+    grid: BevGrid,
+    *,
+    step: float = LABEL_STEP,
+    labels: str | None = "released",
+    reading: AccidentReading | None = None,
+) -> list[Accident]:
+    """The accidents that instance maps show, as the protocol `paper` reads them: at most one of each prediction.
+
+    Args:
+        instance: (T, H, W), or K predictions (K, T, H, W): ids from 1 that stay the same over the frames, 0 or less
+            elsewhere; in the present ego frame, the present first.
+        grid: its cells; its orientation is how the maps lie.
+        step: seconds from one frame to the next.
+        labels: protocol of the labels that the maps are, or were learned from: where it has the half-cell shift, that
+            is undone in positions. None for maps without any.
+        reading: how an accident is read off maps; its foreground, link distance and redrawing are for heads alone. None
+            for the protocol `paper`'s.
+
+    Returns:
+        In the order of the predictions, without those that have no accident. Positions are x forward, y left, metres;
+        `ids` are those of the maps, ascending, and not actors'.
+
+    Raises:
+        GeometryError: the maps' shape is not the grid's, or they are not whole numbers.
+        ChoiceError: no such labels.
+        ConfigError: the step is not above 0.
+    """
+    if labels is not None and labels not in LABEL_PROTOCOLS:
+        raise ChoiceError(f"labels: expected one of {', '.join(LABEL_PROTOCOLS)}, or None, found {labels!r}")
+    if not 0 < step < math.inf:
+        raise ConfigError(f"step: expected seconds above 0, found {step!r}")
+    rules = None if labels is None else LABEL_PROTOCOLS[labels]
+    maps = instances_of(instance, grid).instances
+    read = [accident_of(each, grid, rules, reading or AccidentReading()) for each in (() if maps is None else maps)]
+    return [
+        Accident(positions=each.positions, time=each.contact.frame * step, ids=each.contact.ids)
+        for each in read
+        if each.contact is not None
+    ]
+
+
+def _named(alarm: Accident, truth: BoxTruth, rules: AlarmRules) -> Pair | None:
+    if alarm.ids is not None or rules.naming == "given":
+        return alarm.ids
+    frame = min(round(alarm.time / FRAME_PERIOD), len(truth.time) - 1)
+    return nearest_two(alarm.positions, truth.actor_id, truth.footprint[frame, :, :2], rules.match_distance)
+
+
+def _alarms_of_maps(
+    output: MotionOutput, config: MotionLabelConfig, truth: BoxTruth, rules: AlarmRules
+) -> list[NamedAlarm]:
+    """At most one alarm of K predictions."""
+    reading, seconds = rules.reading, config.step * FRAME_PERIOD
+    maps = output.instances if output.heads is None else [reading.instances(heads) for heads in output.heads]
+    read = [accident_of(each, output.grid, config.rules, reading) for each in (() if maps is None else maps)]
+    there = [(each, each.contact) for each in (*read[-1:], *read[:-1]) if each.contact is not None]
+    if not there:
+        return []
+    found, contact = there[0]
+    accident = Accident(positions=found.positions, time=contact.frame * seconds, score=len(there) / len(read))
+    match = match_tracks(found.tracks, truth.tracks(seconds, len(found.tracks.center)), rules.match_distance)
+    return [(accident, (match.get(contact.ids[0]), match.get(contact.ids[1])))]

@@ -1,0 +1,304 @@
+"""`AccidentReading`: how an accident is read off instance maps, by the paper's words (evaluation.md, last tables)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final, Literal, get_args
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, FloatArray, FrozenArrays, IntArray
+from deepaccident_devkit.errors import ChoiceError, ConfigError
+from deepaccident_devkit.evaluation.metrics.alarms.hulls import convex_hulls, hull_distances
+from deepaccident_devkit.evaluation.metrics.choices import with_others
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.geometry.bev_grid import Orientation
+from deepaccident_devkit.motion import LabelProtocol, MotionHeads, PostProcessing, predict_instances
+from deepaccident_devkit.motion.orientations import cells_in
+from deepaccident_devkit.motion.postprocessing.predict import Foreground
+
+Outline = Literal["centers", "cells"]
+Moment = Literal["closest", "first", "last"]
+TIE: Final = 1e-9
+"""Metres that two lengths must differ by to be different: means of cells are off by the last bits."""
+_TIE_DECIMALS: Final = 9
+_CHOICES: Final[Mapping[str, tuple[str, ...]]] = {"outline": get_args(Outline), "moment": get_args(Moment)}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AccidentReading:
+    """Which instances are said to collide, and when; the defaults are the protocol `paper`'s.
+
+    Attributes:
+        foreground: of heads: which cells are actors, as `PostProcessing` has it. The released accident evaluation has
+            `sigmoid`; the paper is silent, and `argmax` is what the same paper's motion metrics use.
+        link_distance: of heads: cells, as `PostProcessing` has it. The released accident evaluation has 8.
+        redraw: of heads: take the boxes that the released code draws along the paths instead of the instances.
+        outline: what the distance of two instances is between: the convex hulls of their cells' `centers` (points and
+            straight lines allowed), or of their whole `cells`, which are nearer by about a cell.
+        danger_distance: metres; what comes nearer to each other collides.
+        present: whether the present frame counts.
+        moment: the frame of a pair's accident: where it is `closest` (the earliest if there are several), the `first`
+            with less than the danger distance, or the `last` frame alone, as in the released code.
+    """
+
+    foreground: Foreground = "argmax"
+    link_distance: float = 10.0
+    redraw: bool = False
+    outline: Outline = "centers"
+    danger_distance: float = 1.0
+    present: bool = True
+    moment: Moment = "closest"
+
+    def __post_init__(self) -> None:
+        """Check the values; raises ChoiceError or ConfigError."""
+        for name, allowed in _CHOICES.items():
+            if getattr(self, name) not in allowed:
+                raise ChoiceError(f"{name}: expected one of {', '.join(allowed)}, found {getattr(self, name)!r}")
+        if not 0 < self.danger_distance < np.inf:
+            raise ConfigError(f"danger_distance: expected metres above 0, found {self.danger_distance!r}")
+        _ = self.post_processing
+
+    @property
+    def post_processing(self) -> PostProcessing:
+        """What heads go through."""
+        return PostProcessing(foreground=self.foreground, link_distance=self.link_distance, redraw=self.redraw)
+
+    def instances(self, heads: MotionHeads) -> AnyArray:
+        """(T, H, W) the instances of heads, in their orientation."""
+        linked = predict_instances(heads, self.post_processing)
+        return linked.instance if linked.redrawn is None else linked.redrawn
+
+    def variants(self) -> dict[str, AccidentReading]:
+        """This reading with one choice made otherwise, by `name=value`; for explanations."""
+        return with_others(
+            self,
+            {
+                "foreground": ("argmax", "sigmoid"),
+                "link_distance": (3.0, 8.0, 10.0),
+                "redraw": (False, True),
+                "outline": get_args(Outline),
+                "danger_distance": (0.5, 1.0, 1.5, 2.5),
+                "present": (False, True),
+                "moment": get_args(Moment),
+            },
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class InstanceTracks(FrozenArrays):
+    """Where instances are at T moments; arrays are read-only.
+
+    Attributes:
+        identity: (I,) int64, ascending.
+        center: (T, I, 2) float64 mean of their cells, x forward, y left, metres; NaN where they are not.
+    """
+
+    identity: IntArray
+    center: FloatArray
+
+    def at(self, frame: int, identities: tuple[int, int]) -> FloatArray:
+        """(2, 2) where two instances are at a moment; NaN where they are not."""
+        positions: FloatArray = self.center[frame, self.identity.searchsorted(identities)]
+        return positions
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Contact:
+    """The two instances that collide.
+
+    Attributes:
+        frame: of the maps, from 0.
+        ids: ascending.
+        distance: metres between their outlines.
+    """
+
+    frame: int
+    ids: tuple[int, int]
+    distance: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class InstanceAccident:
+    """What is read off one set of instance maps.
+
+    Attributes:
+        tracks: of all instances.
+        contact: None if nothing comes near enough.
+    """
+
+    tracks: InstanceTracks
+    contact: Contact | None
+
+    @property
+    def positions(self) -> FloatArray:
+        """(2, 2) x forward, y left of the two that collide, at that moment; of those with a contact."""
+        if self.contact is None:
+            return np.full((2, 2), np.nan)
+        return self.tracks.at(self.contact.frame, self.contact.ids)
+
+
+def even(length: FloatArray) -> FloatArray:
+    """Lengths in metres of which those that differ by less than `TIE` in their last bits are equal floats."""
+    return np.round(length, _TIE_DECIMALS)
+
+
+def accident_of(
+    instance: AnyArray, grid: BevGrid, rules: LabelProtocol | None, reading: AccidentReading
+) -> InstanceAccident:
+    """Where instances are, and which pair of them collides when, if any does.
+
+    Of several pairs and moments the one with the smallest distance is taken (`moment` may prefer others); of equal ones
+    the earlier, then that with the nearer centres, then that with the lower ids.
+
+    Args:
+        instance: (T, H, W) ids from 1 that stay the same over the frames, 0 or less elsewhere.
+        grid: its cells and orientation.
+        rules: of the labels that the maps are, or were learned from: where they have the half-cell shift, it is undone
+            in positions. None for maps without any.
+        reading: the choices.
+    """
+    shapes = _shapes(instance, grid.orientation)
+    size = np.array([grid.x[2], grid.y[2]])
+    contact = _contact(shapes, size, len(instance), reading)
+    identity, which = np.unique(shapes.identity, return_inverse=True)
+    center = np.full((len(instance), len(identity), 2), np.nan)
+    center[shapes.frame, which] = [grid.x[0], grid.y[0]] + (shapes.center + _within_cell(rules)) * size
+    return InstanceAccident(tracks=InstanceTracks(identity=identity, center=center), contact=contact)
+
+
+def match_tracks(predicted: InstanceTracks, truth: InstanceTracks, gate: float) -> dict[int, int]:
+    """Instances that go the same way, one to one: predicted id → true id.
+
+    The distance of two is the mean of that of their centres over the moments at which both are there. Of all ways to
+    match, as many pairs as possible within `gate`, and of those with as many the least sum of distances. (So a distant
+    pair cannot use up an instance that another one needs, as it does in the released code.)
+
+    Args:
+        predicted: over T moments.
+        truth: over the same.
+        gate: metres; pairs farther apart, and those that are never there together, are no match.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    apart = np.linalg.norm(predicted.center[:, :, None] - truth.center[:, None], axis=-1)
+    common = np.isfinite(apart)
+    sums = np.where(common, apart, 0).sum(axis=0)
+    distance = np.where(common.any(axis=0), even(sums / np.maximum(common.sum(axis=0), 1)), np.inf)
+    allowed = distance <= gate + TIE
+    # a pair more within the gate outweighs all that distances can add up to
+    refused = (gate + 1) * (min(distance.shape) + 1)
+    rows, columns = linear_sum_assignment(np.where(allowed, distance, refused))
+    return {
+        int(predicted.identity[row]): int(truth.identity[column])
+        for row, column in zip(rows.tolist(), columns.tolist(), strict=True)
+        if allowed[row, column]
+    }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Shapes:
+    """N instances at frames, by frame and id; cells are counted along x forward and y left.
+
+    Attributes:
+        frame: (N,) int64.
+        identity: (N,) int64.
+        center: (N, 2) float64 mean of the cells.
+        low: (N, 2) int64 lowest cells.
+        high: (N, 2) int64 highest cells.
+        cells: (P, 2) int64, and `group` (P,) whose each is.
+    """
+
+    frame: IntArray
+    identity: IntArray
+    center: FloatArray
+    low: IntArray
+    high: IntArray
+    cells: IntArray
+    group: IntArray
+
+    def hulls(self, which: IntArray, outline: Outline) -> FloatArray:
+        """(len(which), V, 2) the outlines of some, in cells."""
+        number = np.full(len(self.frame), -1)
+        number[which] = np.arange(len(which))
+        group = number[self.group]
+        cells, group = self.cells[group >= 0], group[group >= 0]
+        if outline == "centers":
+            return convex_hulls(cells, group)
+        corners = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+        doubled = (2 * cells[:, None] + corners).reshape(-1, 2)  # so that half cells are whole numbers
+        return convex_hulls(doubled, np.repeat(group, 4)) / 2
+
+
+def _shapes(instance: AnyArray, orientation: Orientation) -> _Shapes:
+    rows, columns = instance.shape[1:]
+    flat = np.flatnonzero(instance > 0)  # of a mask: much faster than of integers
+    frame, cell = np.divmod(flat, rows * columns)
+    row, column = np.divmod(cell, columns)
+    y, x = cells_in(row, column, (rows, columns), orientation, "devkit")
+    identity = instance.reshape(-1)[flat].astype(np.int64)
+    key, group = np.unique(frame * (identity.max(initial=0) + 1) + identity, return_inverse=True)
+    count = np.bincount(group, minlength=len(key))
+    order = np.argsort(group, kind="stable")
+    begin = np.cumsum(count) - count
+    cells = np.stack([x, y], axis=1)
+    center = np.stack([np.bincount(group, along, len(key)) for along in cells.T], axis=1) / count[:, None]
+    of_each = cells[order]
+    return _Shapes(
+        frame=frame[order][begin],
+        identity=identity[order][begin],
+        center=center,
+        low=np.minimum.reduceat(of_each, begin) if len(key) else cells,
+        high=np.maximum.reduceat(of_each, begin) if len(key) else cells,
+        cells=cells,
+        group=group,
+    )
+
+
+def _contact(shapes: _Shapes, size: FloatArray, frames: int, reading: AccidentReading) -> Contact | None:
+    first, second = _candidates(shapes, size, reading)
+    if not reading.present:
+        first, second = (each[shapes.frame[first] > 0] for each in (first, second))
+    if reading.moment == "last":
+        first, second = (each[shapes.frame[first] == frames - 1] for each in (first, second))
+    if not len(first):
+        return None
+    which, place = np.unique(np.concatenate([first, second]), return_inverse=True)
+    unit = size.min()  # square cells stay whole numbers
+    hulls = shapes.hulls(which, reading.outline) * (size / unit)
+    distance = even(hull_distances(hulls[place[: len(first)]], hulls[place[len(first) :]]) * unit)
+    near = np.flatnonzero(distance < reading.danger_distance)
+    if not len(near):
+        return None
+    first, second, distance = first[near], second[near], distance[near]
+    between = even(np.linalg.norm((shapes.center[first] - shapes.center[second]) * size, axis=1))
+    frame = shapes.frame[first]
+    by_nearness = (shapes.identity[second], shapes.identity[first], between)
+    by_moment = (distance, frame) if reading.moment == "first" else (frame, distance)
+    best = np.lexsort((*by_nearness, *by_moment))[0]
+    return Contact(
+        frame=int(frame[best]),
+        ids=(int(shapes.identity[first[best]]), int(shapes.identity[second[best]])),
+        distance=float(distance[best]),
+    )
+
+
+def _candidates(shapes: _Shapes, size: FloatArray, reading: AccidentReading) -> tuple[IntArray, IntArray]:
+    """Pairs of rows of one frame whose bounding boxes are nearer than the danger distance."""
+    firsts, seconds = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+    slack = 1.0 if reading.outline == "cells" else 0.0
+    starts = np.append(np.flatnonzero(np.diff(shapes.frame, prepend=-1)), len(shapes.frame))
+    for start, end in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True):
+        low, high = shapes.low[start:end], shapes.high[start:end]
+        gap = np.maximum(low[:, None] - high, low - high[:, None]) - slack
+        near = np.hypot(*np.moveaxis(np.maximum(gap, 0) * size, -1, 0)) < reading.danger_distance
+        first, second = np.nonzero(np.triu(near, 1))
+        firsts.append(first + start)
+        seconds.append(second + start)
+    return np.concatenate(firsts), np.concatenate(seconds)
+
+
+def _within_cell(rules: LabelProtocol | None) -> FloatArray:
+    """The point of a cell, in cells along x and y from its low corner, that its drawn place stands for."""
+    return np.array([0.5, 0.5] if rules is None else rules.place_in_cell)

@@ -1,0 +1,33 @@
+"""Detection metrics: average precision and errors of boxes, by the released code's rules, the paper's and others."""
+
+from deepaccident_devkit.evaluation.metrics.detection.boxes import DetectedBoxes, detection_truth
+from deepaccident_devkit.evaluation.metrics.detection.evaluator import DetectionEvaluator
+from deepaccident_devkit.evaluation.metrics.detection.matches import DetectionMatches, detection_matches
+from deepaccident_devkit.evaluation.metrics.detection.protocols import (
+    DETECTION_PROTOCOLS,
+    DetectionProtocol,
+    detection_protocol,
+)
+from deepaccident_devkit.evaluation.metrics.detection.result import (
+    DetectionResult,
+    NuScenesSummary,
+    nuscenes_summary,
+    released_dict,
+    released_text,
+)
+
+__all__ = [
+    "DETECTION_PROTOCOLS",
+    "DetectedBoxes",
+    "DetectionEvaluator",
+    "DetectionMatches",
+    "DetectionProtocol",
+    "DetectionResult",
+    "NuScenesSummary",
+    "detection_matches",
+    "detection_protocol",
+    "detection_truth",
+    "nuscenes_summary",
+    "released_dict",
+    "released_text",
+]

@@ -1,0 +1,90 @@
+"""`WarningProtocol`: what counts as an alarm, and as a right one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, Final, Literal, get_args
+
+from deepaccident_devkit.errors import ChoiceError, ConfigError
+from deepaccident_devkit.evaluation.metrics.alarms.raised import Naming
+from deepaccident_devkit.evaluation.metrics.alarms.reading import AccidentReading
+from deepaccident_devkit.evaluation.metrics.choices import with_others, with_parts
+
+CorrectBy = Literal["either", "pair", "place"]
+_CHOICES: Final[Mapping[str, tuple[str, ...]]] = {"naming": get_args(Naming), "correct_by": get_args(CorrectBy)}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WarningProtocol:
+    """Which alarms are right, against the labels' boxes and the pair and the moment of the meta file.
+
+    Unlike an accident that counts for APA, the impact may be later than the model looks ahead: whoever is told early of
+    the right pair or the right place is warned.
+
+    Attributes:
+        reading: how an accident is read off maps, as `BoxAccidents` has it. Their cells are coarse, so that they raise
+            more false alarms than explicit accidents.
+        min_score: alarms less sure than this are none; all but the curve is of these alarms.
+        match_distance: metres: gate of the matches that decide which actors an alarm without actor ids names.
+        naming: whom an explicit accident without `ids` names, as `BoxAccidents` has it.
+        correct_by: what makes an alarm right: that it names the `pair` that collides, whichever way round; the `place`,
+            as its positions differ from where the two meet by less than `distance`; or `either` of these.
+        distance: metres: what the differences of the two positions may add up to, whichever way round fits better; as
+            strict as, and by default the distance of, the errors of the accident protocol `paper`.
+        time_tolerance: seconds: how far off the time of a right alarm may be from the impact; None for any.
+        unjudged_are_false: where nobody collides, alarms for later than the recording goes on are false ones; else they
+            are left out and counted aside, since nothing refutes them.
+        leads: seconds before the impact by which a detection rate is asked for.
+        curve_lead: seconds before the impact: of the curve's detection rate.
+        curve_rows: how many thresholds the curve has at most.
+    """
+
+    reading: AccidentReading = field(default_factory=AccidentReading)
+    min_score: float = 0.0
+    match_distance: float = 4.0
+    naming: Naming = "nearest"
+    correct_by: CorrectBy = "either"
+    distance: float = 10.0
+    time_tolerance: float | None = None
+    unjudged_are_false: bool = False
+    leads: tuple[float, ...] = (1.0, 2.0, 3.0)
+    curve_lead: float = 1.0
+    curve_rows: int = 101
+
+    def __post_init__(self) -> None:
+        """Check the values; raises ChoiceError or ConfigError."""
+        for name, allowed in _CHOICES.items():
+            if getattr(self, name) not in allowed:
+                raise ChoiceError(f"{name}: expected one of {', '.join(allowed)}, found {getattr(self, name)!r}")
+        if not math.isfinite(self.min_score):
+            raise ConfigError(f"min_score: expected a number, found {self.min_score!r}")
+        for name in ("match_distance", "distance"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ConfigError(f"{name}: expected metres above 0, found {getattr(self, name)!r}")
+        if self.time_tolerance is not None and not self.time_tolerance >= 0:
+            raise ConfigError(f"time_tolerance: expected seconds from 0, or None, found {self.time_tolerance!r}")
+        object.__setattr__(self, "leads", tuple(float(lead) for lead in self.leads))
+        for lead in (*self.leads, self.curve_lead):
+            if not 0 < lead < math.inf:
+                raise ConfigError(f"leads, curve_lead: expected seconds above 0, found {lead!r}")
+        if type(self.curve_rows) is not int or self.curve_rows < 2:
+            raise ConfigError(f"curve_rows: expected a whole number from 2, found {self.curve_rows!r}")
+
+    def settings(self) -> dict[str, Any]:
+        """All choices, as JSON can hold them."""
+        return asdict(self) | {"leads": list(self.leads)}
+
+    def variants(self) -> dict[str, WarningProtocol]:
+        """These metrics with one choice made otherwise, by `name=value`; for explanations."""
+        own: Mapping[str, tuple[Any, ...]] = {
+            "min_score": (0.5,),
+            "match_distance": (2.0, 4.0, 8.0),
+            "naming": get_args(Naming),
+            "correct_by": get_args(CorrectBy),
+            "distance": (5.0, 10.0, 15.0),
+            "time_tolerance": (None, 0.5),
+            "unjudged_are_false": (False, True),
+        }
+        return {**with_parts(self, "reading", self.reading.variants()), **with_others(self, own)}

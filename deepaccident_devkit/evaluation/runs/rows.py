@@ -1,0 +1,150 @@
+"""`sample_rows`: what the samples of a run add, one flat row each, and such rows as a Parquet file."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from deepaccident_devkit.errors import ResultsError
+from deepaccident_devkit.evaluation.metrics.accident import AccidentResult
+from deepaccident_devkit.evaluation.metrics.detection import DetectionProtocol
+from deepaccident_devkit.evaluation.metrics.evaluator import Counts
+from deepaccident_devkit.evaluation.metrics.frozen_mappings import plain
+from deepaccident_devkit.evaluation.metrics.motion import MotionResult
+from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
+
+Row = dict[str, Any]
+Cells = Iterator[tuple[str, Any]]
+
+
+def sample_rows(run: EvaluationRun) -> list[Row]:
+    """One row a sample, by token: names → texts, numbers, or None where there is nothing to tell.
+
+    The first columns say which sample: token, scenario, agent, frame (from 1), time_to_impact (seconds to the recorded
+    impact), accident_visibility. The others are what the sample alone has as result:
+
+    - motion: by range IoU and PQ (percent) and instances over all frames, cells of IoU, paths and their errors (m);
+    - accident: `positive` (an accident comes), whom the truth names, by metres allowed tp, fp and fn, and the errors
+      (m, s) of what is foreseen within the largest distance;
+    - detection: true boxes and detections that count, and true positives by threshold, over all classes and ranges;
+    - warning: the plain values of the sample's counts, and how many entries its lists have.
+    """
+    counts, cells = run.evaluator.counts, _CELLS[run.setup.task]
+    rows = (
+        _which(run, token) | dict(cells(run.evaluator.compute([token]), counts[token], run.setup.rules))
+        for token in sorted(run.evaluator.tokens)
+    )
+    return [{name: plain(value) for name, value in row.items()} for row in rows]
+
+
+def _which(run: EvaluationRun, token: str) -> Row:
+    attributes = run.attributes[token]
+    return {
+        "token": token,
+        "scenario": attributes.scenario,
+        "agent": attributes.agent,
+        "frame": int(token.rsplit("/", 1)[1]),
+        "time_to_impact": run.times_to_impact[token],
+        "accident_visibility": attributes.accident_visibility,
+    }
+
+
+def _motion_cells(result: MotionResult, counts: Counts, _rules: object) -> Cells:
+    yield "frames", result.frames
+    for (name, part), cells in zip(result.ranges.items(), counts["cells"], strict=True):
+        yield f"iou_{name}", part.iou
+        yield f"pq_{name}", part.pq
+        yield from zip((f"{each}_{name}" for each in ("tp", "fp", "fn")), _instances(part), strict=True)
+        yield from zip((f"cells_{each}_{name}" for each in ("tp", "fp", "fn")), cells, strict=True)
+    for name in ("paths", "path_true_positive", "path_false_positive", "path_false_negative"):
+        yield name, getattr(result, name)
+    for name in ("min_ade", "min_fde", "miss_rate"):
+        yield name, getattr(result, name)
+
+
+def _instances(part: Any) -> tuple[int, int, int]:
+    return part.true_positive, part.false_positive, part.false_negative
+
+
+def _accident_cells(result: AccidentResult, _counts: Counts, _rules: object) -> Cells:
+    yield "positive", bool(result.positives)
+    yield "truth", next((name for name, count in result.truths.items() if count), None)
+    for distance, within in result.within.items():
+        for case in ("tp", "fp", "fn"):
+            yield f"{case}_{distance:g}m", getattr(within, case)
+    widest = result.within[max(result.within)]
+    for error in ("position_error", "time_error", "id_error"):
+        value = getattr(widest, error)
+        yield error, None if value is None else float(value)
+
+
+def _detection_cells(_result: object, counts: Counts, rules: DetectionProtocol) -> Cells:
+    levels = len(rules.thresholds)
+    found = Counter(cell % levels for cell in counts["tp"][0])
+    yield "truths", sum(counts["truths"])
+    yield "detections", len(counts["detections"][0])
+    for level, threshold in enumerate(rules.thresholds):
+        yield f"tp_{threshold:g}", found[level]
+
+
+def _plain_cells(_result: object, counts: Counts, _rules: object) -> Cells:
+    for name, value in counts.items():
+        if isinstance(value, list | tuple | Mapping):
+            yield f"{name}_count", len(value)
+        else:
+            yield name, value
+
+
+_CELLS: Final[Mapping[str, Callable[[Any, Counts, Any], Cells]]] = {
+    "motion": _motion_cells,
+    "accident": _accident_cells,
+    "detection": _detection_cells,
+    "warning": _plain_cells,
+}
+STAMP_KEY: Final = b"deepaccident"
+"""Of the metadata: one JSON object."""
+
+
+def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], stamp: Mapping[str, Any]) -> None:
+    """Write rows; columns are those of any row, in the order met, null where a row has none.
+
+    Args:
+        path: of the file.
+        rows: names → texts, numbers, booleans or None; of one kind in a column.
+        stamp: for the metadata.
+    """
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    columns = {name: [row.get(name) for row in rows] for name in names}
+    arrays = [_column(values) for values in columns.values()]
+    table = pa.Table.from_arrays(arrays, names=names).replace_schema_metadata({STAMP_KEY: json.dumps(dict(stamp))})
+    parquet.write_table(table, path)
+
+
+def read_rows(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Rows and stamp that `write_rows` wrote; raises ResultsError."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    try:
+        table = parquet.read_table(path)
+        stamp = json.loads((table.schema.metadata or {})[STAMP_KEY])
+    except (OSError, pa.ArrowException, KeyError, ValueError) as error:
+        raise ResultsError(f"{path}: is no table of samples ({error}); evaluate again") from error
+    rows: list[dict[str, Any]] = table.to_pylist()
+    return rows, stamp
+
+
+def _column(values: Sequence[Any]) -> Any:
+    """An Arrow array of the values' kind; of whole numbers and fractions, and of nothing at all, fractions."""
+    import pyarrow as pa
+
+    kinds = {type(value) for value in values if value is not None}
+    if kinds <= {float, int} and kinds != {int}:
+        return pa.array([None if value is None else float(value) for value in values], pa.float64())
+    return pa.array(values)

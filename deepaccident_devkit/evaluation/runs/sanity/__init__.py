@@ -1,0 +1,6 @@
+"""Whether predictions are wrong as a whole: mirrored, turned, shifted in time, scaled, in another frame."""
+
+from deepaccident_devkit.evaluation.runs.sanity.check import SanityReport, check_sanity
+from deepaccident_devkit.evaluation.runs.sanity.probes import Candidate
+
+__all__ = ["Candidate", "SanityReport", "check_sanity"]

@@ -1,0 +1,201 @@
+"""What a sample says for and against the ways in which predictions may be wrong as a whole.
+
+A suspicion is tried by setting the predictions right as though it were true. Where it is, they fit the truth then, and
+not as they were given. Each tells of its own: a share of cells or of actors, of both readings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from math import fsum
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, FloatArray
+from deepaccident_devkit.evaluation.metrics.evaluator import Counts
+from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation, turned
+
+Group = Literal["place", "time", "size", "heading", "offset", "flow"]
+MARGIN: Final = 2.0
+"""By how much a suspicion has to beat the predictions as they were given."""
+SCALES: Final[Mapping[str, float]] = {f"scaled by {scale:g}": scale for scale in (0.5, 0.8, 1.25, 2.0)}
+"""Name → how many times too far from the ego all is; cell sizes of 0.25, 0.4, 0.625 and 1 m for 0.5 m."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Suspicion:
+    """A way in which predictions may be wrong as a whole.
+
+    Attributes:
+        name: short: `mirrored y`, `one step late`.
+        group: of those that exclude one another; the best of a group is told.
+        says: what is wrong then, a clause.
+        remedy: what to do about it, a clause.
+        measure: what the scores are.
+        least: the score that it has to reach.
+        evidence: of how many cells, actors or samples at least.
+        also: names of further tallies in which it has to fit better than as given.
+    """
+
+    name: str
+    group: Group
+    says: str
+    remedy: str
+    measure: str
+    least: float
+    evidence: int
+    also: tuple[str, ...] = ()
+
+
+def tally(
+    part: float, whole: float, given_part: float, given_whole: float | None = None, misfit: float = 0.0
+) -> list[float]:
+    """What a sample says of a suspicion: part of the whole that fits so; the same as given; and how badly it fits."""
+    return [part, whole, given_part, whole if given_whole is None else given_whole, misfit]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Candidate:
+    """How well predictions fit the truth if one thing were wrong with all of them.
+
+    Attributes:
+        name: of the suspicion.
+        description: what is wrong then, and what to do about it.
+        score: in [0, 1], of the predictions set right; None where no sample tells.
+        given: the same of the predictions as they were given.
+        suspected: whether the score is so much better that it should be looked into.
+    """
+
+    name: str
+    description: str
+    score: float | None
+    given: float | None
+    suspected: bool
+
+
+def candidates_of(suspicions: Iterable[Suspicion], samples: Iterable[Mapping[str, Any]]) -> tuple[Candidate, ...]:
+    """All that was looked for, of the tallies of samples by the suspicions' names.
+
+    At most one of a group is suspected: the one that the predictions fit best. Times are looked at only where places
+    are right: predictions at other places tell nothing of when.
+    """
+    every = list(samples)
+    sums = {each.name: _sum(each.name, every) for each in suspicions}
+    by_group: dict[str, list[Suspicion]] = {}
+    for each in suspicions:
+        if _is_suspected(each, sums[each.name]) and all(_fits_better(_sum(name, every)) for name in each.also):
+            by_group.setdefault(each.group, []).append(each)
+    best = {
+        group: min(among, key=lambda each: (sums[each.name][4], -(_share(*sums[each.name][:2]) or 0.0))).name
+        for group, among in by_group.items()
+    }
+    if "place" in best:
+        best = {"place": best["place"]}
+    return tuple(
+        Candidate(
+            name=each.name,
+            description=f"{each.says}; {each.remedy}",
+            score=_share(*sums[each.name][:2]),
+            given=_share(*sums[each.name][2:4]),
+            suspected=best.get(each.group) == each.name,
+        )
+        for each in suspicions
+    )
+
+
+def scale_says(scale: float) -> str:
+    """What is wrong if all is so many times as far away: a clause."""
+    return f"all is {scale:g} times as far from the agent as it should be"
+
+
+def warning_of(suspicion: Suspicion, candidate: Candidate) -> str:
+    """A sentence for a candidate that is suspected."""
+    return (
+        f"{suspicion.name}: it looks as though {candidate.description} ({suspicion.measure} "
+        f"{candidate.score or 0.0:.2f} if so, {candidate.given or 0.0:.2f} as given)"
+    )
+
+
+def _sum(name: str, samples: Iterable[Counts]) -> list[float]:
+    rows = [each[name] for each in samples if name in each]
+    return [fsum(column) for column in zip(*rows, strict=True)] if rows else [0.0] * 5
+
+
+def _is_suspected(suspicion: Suspicion, sums: list[float]) -> bool:
+    score, given = _share(*sums[:2]), _share(*sums[2:4]) or 0.0
+    enough = sums[1] >= suspicion.evidence
+    return enough and score is not None and score >= suspicion.least and score >= MARGIN * given
+
+
+def _fits_better(sums: list[float]) -> bool:
+    return (_share(*sums[:2]) or 0.0) > (_share(*sums[2:4]) or 0.0)
+
+
+def _share(part: float, whole: float) -> float | None:
+    return part / whole if whole else None
+
+
+@dataclass(frozen=True, slots=True)
+class Symmetry:
+    """A point x forward, y left of the truth is found at x_sign · x, y_sign · y, or with x and y swapped before that.
+
+    Attributes:
+        name: `mirrored x`, `turned by 90°`, …
+        says: what one sees then.
+        swapped: whether x and y change places.
+        x_sign: 1 or −1.
+        y_sign: 1 or −1.
+    """
+
+    name: str
+    says: str
+    swapped: bool
+    x_sign: int
+    y_sign: int
+
+    @property
+    def matrix(self) -> FloatArray:
+        """(2, 2) from true to found, of columns x, y."""
+        x, y = float(self.x_sign), float(self.y_sign)
+        return np.array([[0.0, x], [y, 0.0]] if self.swapped else [[x, 0.0], [0.0, y]])
+
+    def apply(self, points: FloatArray) -> FloatArray:
+        """Points (…, 2) where they are found."""
+        result: FloatArray = points @ self.matrix.T
+        return result
+
+    def undo(self, points: FloatArray) -> FloatArray:
+        """Points (…, 2) as found, where they should be."""
+        result: FloatArray = points @ self.matrix
+        return result
+
+    def undo_raster(self, raster: AnyArray) -> AnyArray:
+        """A raster (…, rows, columns) in the devkit's orientation as found, with each cell where it should be."""
+        flipped = raster[..., :: self.y_sign, :: self.x_sign]
+        return flipped.swapaxes(-1, -2) if self.swapped else flipped
+
+
+IDENTITY: Final = Symmetry("as given", "", swapped=False, x_sign=1, y_sign=1)
+SYMMETRIES: Final = (
+    Symmetry("mirrored x", "what is ahead is behind", swapped=False, x_sign=-1, y_sign=1),
+    Symmetry("mirrored y", "what is on the left is on the right", swapped=False, x_sign=1, y_sign=-1),
+    Symmetry("transposed", "x and y have changed places", swapped=True, x_sign=1, y_sign=1),
+    Symmetry("anti-transposed", "x and y have changed places, both negated", swapped=True, x_sign=-1, y_sign=-1),
+    Symmetry("turned by 90°", "what is ahead is on the left", swapped=True, x_sign=-1, y_sign=1),
+    Symmetry("turned by 180°", "what is ahead on the left is behind on the right", swapped=False, x_sign=-1, y_sign=-1),
+    Symmetry("turned by 270°", "what is ahead is on the right", swapped=True, x_sign=1, y_sign=-1),
+)
+"""All but the one that changes nothing; turns are counter-clockwise, seen from above."""
+_PATTERN: Final = np.arange(4).reshape(2, 2)
+"""The smallest raster that no symmetry leaves as it is."""
+
+
+def orientation_mistaken(symmetry: Symmetry, stated: Orientation) -> Orientation | None:
+    """The orientation that maps must be in to look like this where another one is stated; None if there is none."""
+    found = turned(_PATTERN, stated)
+    for other in ORIENTATIONS:
+        if other != stated and np.array_equal(symmetry.undo_raster(found), turned(_PATTERN, other)):
+            return other
+    return None

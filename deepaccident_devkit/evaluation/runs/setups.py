@@ -1,0 +1,189 @@
+"""`EvaluationSetup`: a task, its protocol and how far ahead, and what an evaluator of them takes of a sample."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Any, Final, Literal, get_args
+
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
+from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS as ACCIDENT_PROTOCOLS
+from deepaccident_devkit.evaluation.metrics.accident import AccidentEvaluator, ReleasedAccidents, accident_context
+from deepaccident_devkit.evaluation.metrics.choices import switched
+from deepaccident_devkit.evaluation.metrics.detection import (
+    DETECTION_PROTOCOLS,
+    DetectedBoxes,
+    DetectionEvaluator,
+    detection_truth,
+)
+from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
+from deepaccident_devkit.evaluation.metrics.motion import MOTION_PROTOCOLS, MotionEvaluator
+from deepaccident_devkit.evaluation.metrics.warning import WARNING_PROTOCOLS, WarningEvaluator
+from deepaccident_devkit.evaluation.results import Results
+from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels, motion_labels
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
+
+TaskName = Literal["motion", "accident", "detection", "warning"]
+TASK_PROTOCOLS: Final[Mapping[str, Mapping[str, Any]]] = MappingProxyType(
+    {
+        "motion": MOTION_PROTOCOLS,
+        "accident": ACCIDENT_PROTOCOLS,
+        "detection": DETECTION_PROTOCOLS,
+        "warning": WARNING_PROTOCOLS,
+    }
+)
+"""Task → its protocols by name."""
+TASK_RESULTS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
+    {
+        "motion": ("motion",),
+        "accident": ("motion", "accident"),
+        "detection": ("detection",),
+        "warning": ("motion", "accident"),
+    }
+)
+"""Task → the kinds of results that it is evaluated from."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvaluationSetup:
+    """What is evaluated, and by which rules; two of equal ones give comparable numbers.
+
+    Attributes:
+        task: `motion`, `accident`, `detection` or `warning`.
+        protocol: the name of one of the task's (`TASK_PROTOCOLS`).
+        switches: choices of the protocol that are made otherwise, by name (`choices.switch_names`).
+        horizon: seconds that the predictions look ahead; detection has none.
+    """
+
+    task: TaskName
+    protocol: str = "released"
+    switches: Mapping[str, Any] = field(default_factory=dict)
+    horizon: float = 2.0
+
+    def __post_init__(self) -> None:
+        """Check; raises ChoiceError or ConfigError."""
+        if self.task not in get_args(TaskName):
+            raise ChoiceError(f"task: expected one of {', '.join(get_args(TaskName))}, found {self.task!r}")
+        if self.protocol not in TASK_PROTOCOLS[self.task]:
+            raise ChoiceError(
+                f"protocol: expected one of {', '.join(TASK_PROTOCOLS[self.task])} for {self.task}, "
+                f"found {self.protocol!r}"
+            )
+        if not 0 < self.horizon < math.inf:
+            raise ConfigError(f"horizon: expected seconds above 0, found {self.horizon!r}")
+        object.__setattr__(self, "switches", MappingProxyType(dict(self.switches)))
+        switched(TASK_PROTOCOLS[self.task][self.protocol], self.switches)  # refuses what cannot be
+
+    @property
+    def rules(self) -> Any:
+        """The protocol itself, with the switches."""
+        return switched(TASK_PROTOCOLS[self.task][self.protocol], self.switches)
+
+    def evaluator(self) -> Evaluator[Any]:
+        """A new evaluator of these rules."""
+        return _EVALUATORS[self.task](self.rules)
+
+    def as_dict(self) -> dict[str, Any]:
+        """All of it, as JSON holds it, with the evaluator's own `settings`: every choice."""
+        return {
+            "task": self.task,
+            "protocol": self.protocol,
+            "switches": dict(self.switches),
+            "horizon": self.horizon,
+            "settings": self.evaluator().settings,
+        }
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle without the view of the switches, which cannot be."""
+        return _setup, (self.task, self.protocol, dict(self.switches), self.horizon)
+
+
+def _setup(task: TaskName, protocol: str, switches: dict[str, Any], horizon: float) -> EvaluationSetup:
+    return EvaluationSetup(task=task, protocol=protocol, switches=switches, horizon=horizon)
+
+
+_EVALUATORS: Final[Mapping[str, Callable[[Any], Evaluator[Any]]]] = {
+    "motion": MotionEvaluator,
+    "accident": AccidentEvaluator,
+    "detection": DetectionEvaluator,
+    "warning": WarningEvaluator,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class SampleLoader:
+    """Gives what a setup's evaluator takes of a sample after its token; cheap to pickle.
+
+    Attributes:
+        dataset: where the truth is.
+        results: where the predictions are; of a kind that the task is evaluated from.
+        setup: the rules.
+    """
+
+    dataset: Dataset
+    results: Results
+    setup: EvaluationSetup
+
+    def __post_init__(self) -> None:
+        """Check that the results are of a kind that the rules take, and look far enough; raises EvaluationError."""
+        kinds = TASK_RESULTS[self.setup.task]
+        if self.results.task not in kinds:
+            raise EvaluationError(
+                f"{self.results.path}: holds {self.results.task} results; {self.setup.task} is evaluated from "
+                f"{' or '.join(kinds)} results"
+            )
+        if self.results.task == "accident" and isinstance(self.setup.rules, ReleasedAccidents):
+            raise EvaluationError(
+                f"{self.results.path}: holds explicit accidents; the protocol {self.setup.protocol!r} compares motion: "
+                "give motion results, or choose protocol 'paper' or 'boxes'"
+            )
+        form = self.results.form
+        if form is not None and (form.frames - 1) * form.step < self.setup.horizon - FRAME_PERIOD / 2:
+            raise EvaluationError(
+                f"{self.results.path}: its predictions look {(form.frames - 1) * form.step:g} s ahead "
+                f"({form.frames} frames, {form.step:g} s apart); evaluate them with a horizon of no more, not "
+                f"{self.setup.horizon:g} s"
+            )
+
+    def __call__(self, token: str) -> tuple[Any, ...]:
+        """Prediction, truth and what else the evaluator takes."""
+        prediction = self.results.prediction(token)
+        if isinstance(prediction, DetectedBoxes):
+            return self._detection(token, prediction)
+        if self.setup.task == "motion":
+            return prediction, self.label(token)
+        context = accident_context(self.dataset, token, self.setup.horizon)
+        return prediction, self.label(token), context
+
+    def label_config(self) -> MotionLabelConfig | None:
+        """What the labels show that motion results are compared with; None for explicit accidents of other setups."""
+        form = self.results.form
+        labels = getattr(self.setup.rules, "labels", None)
+        if form is None:
+            if not hasattr(self.setup.rules, "labels"):
+                return None
+            return _reaching(MotionLabelConfig(protocol=labels or "released"), self.setup.horizon)
+        config = MotionLabelConfig(
+            grid=form.grid, step=round(form.step / FRAME_PERIOD), protocol=labels or form.labels or "clean"
+        )
+        return _reaching(config, self.setup.horizon)
+
+    def label(self, token: str) -> MotionLabels | None:
+        """The sample's motion labels as `label_config` says; None where there is none to compare with."""
+        config = self.label_config()
+        return None if config is None else motion_labels(self.dataset, token, config)
+
+    def _detection(self, token: str, prediction: DetectedBoxes) -> tuple[Any, ...]:
+        rules = self.setup.rules
+        frame_from_world = self.dataset.world_from(token, rules.frame).inverse()
+        boxes = prediction.boxes.transform(frame_from_world, rules.frame)
+        detected = DetectedBoxes(boxes=boxes, scores=prediction.scores)
+        return detected, detection_truth(self.dataset, token, rules)
+
+
+def _reaching(config: MotionLabelConfig, horizon: float) -> MotionLabelConfig:
+    """Labels that look as far ahead."""
+    return replace(config, future_frames=round(horizon / (config.step * FRAME_PERIOD)))

@@ -1,7 +1,0 @@
-"""How early an accident is warned of, and how often an alarm is false."""
-
-from deepaccident_devkit.evaluation.warning.evaluator import WARNING_PROTOCOLS, WarningEvaluator
-from deepaccident_devkit.evaluation.warning.protocol import WarningProtocol
-from deepaccident_devkit.evaluation.warning.result import WarningCurve, WarningResult
-
-__all__ = ["WARNING_PROTOCOLS", "WarningCurve", "WarningEvaluator", "WarningProtocol", "WarningResult"]
