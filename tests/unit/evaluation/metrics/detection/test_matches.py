@@ -7,31 +7,11 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError, EvaluationError, GeometryError
-from deepaccident_devkit.evaluation import AccidentEvaluator, DetectedBoxes, detection_truth, vpq_counts
-from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS, AccidentContext, compared_accidents
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.evaluation import DetectedBoxes, detection_truth
 from deepaccident_devkit.evaluation.metrics.detection import DETECTION_PROTOCOLS, detection_matches
 from deepaccident_devkit.evaluation.metrics.detection.boxes import columns_of
 from deepaccident_devkit.evaluation.metrics.detection.frame_counts import frame_counts
-from deepaccident_devkit.evaluation.metrics.motion.overlaps import VpqRules, vpq_matches
-
-
-@pytest.mark.parametrize("stay", [True, False])
-@pytest.mark.parametrize("large", [0, 7_000_000])
-def test_instances_match_as_vpq_counts(stay: bool, large: int) -> None:
-    rng = np.random.default_rng(3)
-    label = np.kron(rng.integers(0, 5, (3, 5, 5)), np.ones((4, 4), dtype=np.int64))
-    prediction = np.roll(np.where(label > 0, label + 10, 0), 1, axis=2)
-    prediction[2] = np.where(prediction[2] == 12, 40, prediction[2])
-    prediction = np.where(prediction > 0, prediction + large, -1)
-    rules = VpqRules(ids_must_stay=stay)
-    matches, counts = vpq_matches(prediction, label, rules), vpq_counts(prediction, label, rules)
-    assert_array_equal(np.bincount(matches[:, 0], minlength=3), counts.true_positive[:, 1])
-    for frame, predicted, true in matches.tolist():
-        mine, theirs = prediction[frame] == predicted, label[frame] == true
-        assert 2 * (mine & theirs).sum() > (mine | theirs).sum()
-    with pytest.raises(GeometryError, match=r"prediction: expected \(T, H, W\) as the label's"):
-        vpq_matches(prediction[0], label)
 
 
 @pytest.mark.parametrize("protocol", DETECTION_PROTOCOLS)
@@ -61,20 +41,3 @@ def test_detections_match_as_they_are_counted(da_b: DeepAccident, protocol: str)
         assert not np.isin(found.detection, found.false).any()
     with pytest.raises(ChoiceError, match=r"threshold: expected one of .*, found 77"):
         detection_matches(detected, truth, rules, 77)
-
-
-def test_protocols_that_compare_with_nothing_are_refused() -> None:
-    for name, words in (("released", "compares motion"), ("paper", "motion labels"), ("boxes", "needs its truth")):
-        with pytest.raises(EvaluationError, match=words):
-            compared_accidents([], None, AccidentContext(), PROTOCOLS[name])
-
-
-def test_a_protocol_of_ones_own_has_its_accidents_as_given() -> None:
-    class Own:
-        """Not one of the devkit's."""
-
-        settings = counts = result = pooled = variants = lambda *_: {}
-
-    assert AccidentEvaluator(Own()).protocol is not None
-    compared = compared_accidents([], None, AccidentContext(), Own())
-    assert (compared.true, compared.predicted) == (None, ())

@@ -8,19 +8,17 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError, GeometryError, NotAvailableError
+from deepaccident_devkit.errors import ChoiceError, EvaluationError, GeometryError
 from deepaccident_devkit.evaluation.metrics.breakdowns import numbers_of
 from deepaccident_devkit.evaluation.metrics.detection import (
     DETECTION_PROTOCOLS,
     DetectedBoxes,
     DetectionEvaluator,
-    detection_protocol,
     detection_truth,
     nuscenes_summary,
     released_dict,
     released_text,
 )
-from deepaccident_devkit.evaluation.metrics.detection.curves import recall_matches
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID
 
@@ -94,13 +92,6 @@ def test_nothing_there_and_no_samples(protocol: str) -> None:
         mean = evaluator.compute().mean_average_precision
         assert mean == 0 if zero else math.isnan(mean)
         assert json.dumps(evaluator.compute().as_dict(), allow_nan=False)
-
-
-def test_levels_of_recall_are_sums_in_double_precision() -> None:
-    """A match for each level that recall exceeds: 7 of 56 is just 5/40, and does not exceed the sum of five 0.025."""
-    assert (recall_matches(np.array([56]), 40) <= 7).sum() == 4
-    assert (recall_matches(np.array([40]), 40) <= 40).sum() == 39
-    assert recall_matches(np.array([2, 0]), 4).tolist() == [[1, 2, 2, 3], [1, 1, 1, 2]]
 
 
 def test_an_ignored_detection_uses_up_the_truth() -> None:
@@ -264,27 +255,6 @@ def test_boxes_of_another_frame_are_refused() -> None:
         DetectionEvaluator().update("a", found_at(), Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), []))
 
 
-def test_protocols_and_switches_that_cannot_be() -> None:
-    with pytest.raises(ChoiceError, match="expected one of released"):
-        DetectionEvaluator("kitti")
-    with pytest.raises(ChoiceError, match="no switch 'treshold'"):
-        DetectionEvaluator("paper", treshold=1)
-    with pytest.raises(ChoiceError, match="curve: expected one of"):
-        DetectionEvaluator("paper", curve="coco")
-    for switches, said in (
-        ({"thresholds": (1.0,)}, "error_threshold"),
-        ({"thresholds": (), "error_threshold": None}, "at least one"),
-        ({"frame": "world"}, "around the agent"),
-        ({"classes": [["road", ["lane"]]]}, "expected names with categories"),
-        ({"small_thresholds": (1.0,)}, "as many as thresholds"),
-        ({"global_sort": False}, "curve='voc'"),
-        ({"min_precision": 1.0}, "below 1"),
-    ):
-        with pytest.raises(ConfigError, match=said):
-            detection_protocol("paper", **switches)
-    assert detection_protocol("paper", thresholds=[1, 2, 4]).thresholds == (1, 2, 4)
-
-
 def test_detected_boxes_are_checked_and_read_only() -> None:
     with pytest.raises(GeometryError, match="scores"):
         DetectedBoxes(boxes=truth_at((1, 1)), scores=[0.5, 0.6])
@@ -296,28 +266,6 @@ def test_detected_boxes_are_checked_and_read_only() -> None:
     assert len(detected) == 1
 
 
-def test_the_truth_of_each_protocol(da: DeepAccident) -> None:
-    sample = da.get_sample(da.scenario[0]["token"], "ego_vehicle", 3)
-    every = da.boxes(sample, "lidar")
-    released = detection_truth(da, sample)
-    assert released.actor_id.tolist() == every.actor_id.tolist()
-    rows = da.annotation_rows(sample)
-    np.testing.assert_array_equal(released.velocity[:, :2], da.columns("annotation")["velocity_label"][rows])
-    paper = detection_truth(da, sample, "paper")
-    assert paper.actor_id.tolist() == da.boxes(sample, "lidar", "released").actor_id.tolist()
-    cooperative = detection_truth(da, sample, "opencood")
-    alone = detection_truth(da, sample, "opencood", agents="single")
-    own = da.get("agent", sample["agent_token"])["actor_id"]
-    assert own not in cooperative.actor_id
-    assert own in detection_truth(da, sample, detection_protocol("opencood", own_box=True)).actor_id
-    assert set(alone.actor_id.tolist()) <= set(cooperative.actor_id.tolist())
-    assert {each.frame for each in (released, paper, cooperative)} == {"lidar"}
-    with pytest.raises(ConfigError, match="choose truth='cooperative'"):
-        detection_truth(da, sample, "paper", agents="single")
-    with pytest.raises(ConfigError, match="label_velocity"):
-        detection_truth(da, sample, detection_protocol("opencood", label_velocity=True))
-
-
 @pytest.mark.parametrize("protocol", ["paper", "opencood"])
 def test_the_truth_of_a_release_scores_100(da: DeepAccident, protocol: str) -> None:
     evaluator = DetectionEvaluator(protocol)
@@ -325,12 +273,3 @@ def test_the_truth_of_a_release_scores_100(da: DeepAccident, protocol: str) -> N
         truth = detection_truth(da, sample, protocol)
         evaluator.update(sample["token"], DetectedBoxes(boxes=truth, scores=np.ones(len(truth))), truth)
     assert evaluator.compute().mean_average_precision == 100
-
-
-def test_a_sample_without_label_has_no_truth(own_release: Path) -> None:
-    for path in own_release.rglob("label"):
-        for file in path.rglob("*.txt"):
-            file.unlink()
-    opened = DeepAccident("v1", own_release, verbose=False, on_error="skip")
-    with pytest.raises(NotAvailableError, match="has no label"):
-        detection_truth(opened, opened.sample[0])

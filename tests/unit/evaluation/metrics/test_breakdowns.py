@@ -11,20 +11,16 @@ import pytest
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
 from deepaccident_devkit.evaluation.metrics.attributes import (
-    ATTRIBUTES,
     NO_IMPACT,
     SampleAttributes,
     ScenarioAttributes,
     sample_attributes,
     scenario_attributes,
-    time_bin,
-    tokens_by_value,
 )
 from deepaccident_devkit.evaluation.metrics.breakdowns import Bootstrap, breakdown, numbers_of
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator, ratio, total
 from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator
 from deepaccident_devkit.evaluation.metrics.predictions import instances_of
-from deepaccident_devkit.motion import samples
 from deepaccident_devkit.taxonomy import INFRASTRUCTURE
 
 STORY = ScenarioAttributes(
@@ -231,33 +227,6 @@ def test_attributes_of_scenarios() -> None:
     unknown = story(weather=None, time_of_day=None, collision=None, road_type=None)
     names = ("weather_group", "time_of_day_group", "collision_status", "junction", "trajectory_type")
     assert [getattr(unknown, name) for name in names] == [None] * 5
-
-
-@pytest.mark.parametrize(
-    ("frames", "second", "step"), [(0, "0 s", "0 s"), (1, "1 s", "0.5 s"), (5, "1 s", "0.5 s"), (6, "1 s", "1 s")]
-)
-def test_bins_of_time_have_their_upper_edge(frames: int, second: str, step: str) -> None:
-    assert (time_bin(frames, 10), time_bin(frames, 5)) == (second, step)
-    assert (time_bin(frames + 30, 10), time_bin(frames + 30, 5)) == tuple(
-        f"{float(text.split()[0]) + 3:g} s" for text in (second, step)
-    )
-
-
-def test_attributes_of_a_releases_samples(da_motion: DeepAccident) -> None:
-    tokens = samples(da_motion, "train", "evaluate")
-    attributes = sample_attributes(da_motion, tokens)
-    assert list(attributes) == tokens
-    by_end = tokens_by_value(attributes, "time_to_end")
-    assert sorted(value or "" for value in by_end) == ["0.5", "1.0", "1.5", "2.0"]
-    assert {len(each) for each in by_end.values()} == {5}
-    by_second = tokens_by_value(attributes, "time_to_impact")
-    assert {value: len(each) for value, each in by_second.items()} == {"2 s": 10, "1 s": 10}
-    for name in ATTRIBUTES:
-        assert sum(map(len, tokens_by_value(attributes, name).values())) == len(tokens)
-    everywhere = sample_attributes(
-        da_motion, [f"{record['token']}/infrastructure/005" for record in da_motion.scenario]
-    )
-    assert set(tokens_by_value(everywhere, "impact_step")) == {"3 s", NO_IMPACT}
 
 
 def test_a_breakdown_of_motion_metrics(da_motion: DeepAccident) -> None:

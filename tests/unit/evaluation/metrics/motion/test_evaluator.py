@@ -17,9 +17,7 @@ from deepaccident_devkit.evaluation.metrics.motion import (
     motion_counts,
 )
 from deepaccident_devkit.evaluation.metrics.motion.overlaps import (
-    SegmentationCounts,
     VpqRules,
-    iou,
     segmentation_counts,
     separate_selected_as_released,
     vpq,
@@ -182,14 +180,6 @@ def test_a_predicted_id_that_jumps_to_another_is_not_punished() -> None:
     assert result.ranges["100x100"].pq == 100.0
 
 
-def test_half_of_the_union_is_no_match() -> None:
-    label, prediction = np.zeros((2, 1, 6, 6), dtype=np.int64)
-    label[0, :2, :4], prediction[0, :2, :2] = 3, 5
-    assert vpq_counts(prediction, label).true_positive.tolist() == [[1, 0]]
-    prediction[0, 0, 2] = 5
-    assert vpq_counts(prediction, label).iou[0, 1] == 5 / 8
-
-
 def test_large_ids_are_numbered_anew() -> None:
     small = np.stack([boxes(_1=100, _2=60, _3=20)] * 3)
     large = np.array([0, 7, 10**9, 2 * 10**9])[small]
@@ -319,29 +309,6 @@ def test_labels_of_another_protocol_are_refused() -> None:
         assert evaluated(still(boxes(_1=100)), label, MotionProtocol(labels=labels)).ranges["30x30"].pq == 100.0
     with pytest.raises(ChoiceError, match=r"labels: expected one of released, clean, .*or None for any, found 'dirty'"):
         MotionProtocol(labels="dirty")
-
-
-def test_iou_of_classes() -> None:
-    prediction, label = np.array([0, 1, 2, 2, 7]), np.array([0, 2, 2, 1, 2])
-    counts = segmentation_counts(prediction, label, classes=3)
-    assert counts[2] == SegmentationCounts(true_positive=1, false_positive=1, false_negative=2)
-    assert [iou([each]) for each in counts] == [1.0, 0.0, 0.25]
-    assert iou([counts[2], counts[0]]) == 2 / 5
-    assert iou([]) == 0.0
-    assert math.isnan(iou([], absent=math.nan))
-
-
-@pytest.mark.parametrize("orientation", ORIENTATIONS)
-def test_the_cells_of_a_range(orientation) -> None:
-    grid = BevGrid((-20.0, 60.0, 0.5), (-30.0, 10.0, 0.25), orientation)
-    for extent in (30.0, 41.0, 1.0, 300.0):
-        inside = np.abs(grid.centers()) < extent / 2
-        expected = inside.all(axis=-1)
-        found = np.zeros(grid.shape, dtype=bool)
-        found[cells_within(grid, extent)] = True
-        np.testing.assert_array_equal(found, expected)
-    away = BevGrid((20.0, 60.0, 0.5), (-30.0, 10.0, 0.25), orientation)
-    assert not np.zeros(away.shape)[cells_within(away, 30.0)].size
 
 
 def test_the_released_ranges_are_the_released_cells() -> None:

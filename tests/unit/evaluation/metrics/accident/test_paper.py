@@ -12,21 +12,14 @@ from deepaccident_devkit.evaluation.metrics.accident.evaluator import AccidentEv
 from deepaccident_devkit.evaluation.metrics.accident.paper import PaperAccidents
 from deepaccident_devkit.evaluation.metrics.accident.scoring import Scoring
 from deepaccident_devkit.evaluation.metrics.alarms.raised import position_difference
-from deepaccident_devkit.evaluation.metrics.alarms.reading import (
-    AccidentReading,
-    InstanceTracks,
-    accident_of,
-    match_tracks,
-)
+from deepaccident_devkit.evaluation.metrics.alarms.reading import AccidentReading, accident_of
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
 from deepaccident_devkit.evaluation.metrics.choices import switch_names
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
-from deepaccident_devkit.motion import LABEL_PROTOCOLS
 
 PAPER = PaperAccidents()
-RELEASED = LABEL_PROTOCOLS["released"]
 
 
 def follower(*gaps: float, y: float = 10.0):
@@ -193,15 +186,6 @@ def test_instances_beyond_the_gate_are_no_match() -> None:
     assert result(far, label, replace(PAPER, match_distance=5.0)).id_error == 0
 
 
-def test_pairs_beyond_the_gate_use_nobody_up() -> None:
-    """1 is 3 m from 7 and 5 m from 8; 2 stands on 7 and is 3 m from 8: the least sum of all would leave 1 alone."""
-    truth = InstanceTracks(identity=np.array([7, 8]), center=np.array([[[0.0, 0.0], [3.0, 0.0]]]))
-    x = -7 / 6
-    predicted = InstanceTracks(identity=np.array([1, 2]), center=np.array([[[x, math.sqrt(9 - x * x)], [0.0, 0.0]]]))
-    assert match_tracks(predicted, truth, 4.0) == {1: 7, 2: 8}
-    assert match_tracks(predicted, truth, 6.0) == {1: 8, 2: 7}
-
-
 def test_ties() -> None:
     """Pairs that come to within 0.5 m: the earlier; at one time, those with the nearer centres; then lower ids."""
     ahead = lambda gap, y: [(0.0, y), (4.0 + gap, y)]  # noqa: E731
@@ -248,26 +232,6 @@ def test_an_instance_that_leaves_the_grid() -> None:
     assert (made.apa, made.id_error) == (1, 0)
     never = read(scene({1: standing(100, 0), 2: standing(20, 0)}))
     assert never.tracks.identity.tolist() == [2]
-
-
-def test_points_and_lines_have_distances_too() -> None:
-    grid = BevGrid()
-    maps = np.zeros((1, 200, 200), dtype=np.int32)
-    maps[0, 100, 100:104] = 5
-    maps[0, 101, 105] = 7
-    found = accident_of(maps, grid, RELEASED, AccidentReading(danger_distance=2.0))
-    assert found.contact.ids == (5, 7)
-    assert found.contact.distance == pytest.approx(math.sqrt(5) / 2)
-
-
-def test_a_metre_across_is_no_accident_either() -> None:
-    """A line of direction (3, 4) and a cell exactly two cells from it; their bounding boxes are nearer."""
-    maps = np.zeros((1, 200, 200), dtype=np.int32)
-    maps[0, [100, 104, 108], [100, 103, 106]] = 1
-    maps[0, 102, 99] = 2
-    found = accident_of(maps, BevGrid(), RELEASED, AccidentReading(danger_distance=1.01))
-    assert found.contact.distance == 1
-    assert accident_of(maps, BevGrid(), RELEASED, AccidentReading()).contact is None
 
 
 def test_whole_cells_are_nearer_by_a_cell() -> None:

@@ -1,0 +1,53 @@
+"""Who overlaps whom: shares of cells, and instances that match."""
+
+import math
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from deepaccident_devkit.errors import GeometryError
+from deepaccident_devkit.evaluation.metrics.motion.overlaps import (
+    SegmentationCounts,
+    VpqRules,
+    iou,
+    segmentation_counts,
+    vpq_counts,
+    vpq_matches,
+)
+
+
+@pytest.mark.parametrize("stay", [True, False])
+@pytest.mark.parametrize("large", [0, 7_000_000])
+def test_instances_match_as_vpq_counts(stay: bool, large: int) -> None:
+    rng = np.random.default_rng(3)
+    label = np.kron(rng.integers(0, 5, (3, 5, 5)), np.ones((4, 4), dtype=np.int64))
+    prediction = np.roll(np.where(label > 0, label + 10, 0), 1, axis=2)
+    prediction[2] = np.where(prediction[2] == 12, 40, prediction[2])
+    prediction = np.where(prediction > 0, prediction + large, -1)
+    rules = VpqRules(ids_must_stay=stay)
+    matches, counts = vpq_matches(prediction, label, rules), vpq_counts(prediction, label, rules)
+    assert_array_equal(np.bincount(matches[:, 0], minlength=3), counts.true_positive[:, 1])
+    for frame, predicted, true in matches.tolist():
+        mine, theirs = prediction[frame] == predicted, label[frame] == true
+        assert 2 * (mine & theirs).sum() > (mine | theirs).sum()
+    with pytest.raises(GeometryError, match=r"prediction: expected \(T, H, W\) as the label's"):
+        vpq_matches(prediction[0], label)
+
+
+def test_half_of_the_union_is_no_match() -> None:
+    label, prediction = np.zeros((2, 1, 6, 6), dtype=np.int64)
+    label[0, :2, :4], prediction[0, :2, :2] = 3, 5
+    assert vpq_counts(prediction, label).true_positive.tolist() == [[1, 0]]
+    prediction[0, 0, 2] = 5
+    assert vpq_counts(prediction, label).iou[0, 1] == 5 / 8
+
+
+def test_iou_of_classes() -> None:
+    prediction, label = np.array([0, 1, 2, 2, 7]), np.array([0, 2, 2, 1, 2])
+    counts = segmentation_counts(prediction, label, classes=3)
+    assert counts[2] == SegmentationCounts(true_positive=1, false_positive=1, false_negative=2)
+    assert [iou([each]) for each in counts] == [1.0, 0.0, 0.25]
+    assert iou([counts[2], counts[0]]) == 2 / 5
+    assert iou([]) == 0.0
+    assert math.isnan(iou([], absent=math.nan))
