@@ -15,7 +15,7 @@ import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, FloatArray, IntArray
 from deepaccident_devkit.evaluation.results.faults import ContentError, at, shown
-from deepaccident_devkit.evaluation.results.header import check_token
+from deepaccident_devkit.evaluation.results.header import check_fields, check_token
 
 Entry = Mapping[str, Any]
 Columns = Mapping[str, AnyArray]
@@ -90,13 +90,7 @@ def check_entries(entries: Sequence[object], required: Sequence[str], optional: 
         raise ContentError(f"expected an object, found {shown(entries[0])}")
     layouts: set[tuple[str, ...]] = set(map(tuple, entries))  # type: ignore[arg-type]  # these are objects
     for names in layouts:
-        missing = [name for name in required if name not in names]
-        if missing:
-            raise ContentError(f"{missing[0]}: is missing (expected {', '.join(required)})")
-        unknown = [name for name in names if name not in required and name not in optional]
-        if unknown:
-            known = ", ".join([*required, *optional])
-            raise ContentError(f"{unknown[0]}: is no field of the format (expected {known})")
+        check_fields(dict.fromkeys(names), required, optional)
 
 
 def numbers(

@@ -9,7 +9,6 @@ from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from importlib.metadata import version as installed_version
 from pathlib import Path
 from typing import Any, Final
 
@@ -176,6 +175,8 @@ class EvaluationRun:
 
     def summary(self) -> dict[str, Any]:
         """All numbers but those of single samples, and what they depend on, as JSON holds it."""
+        from importlib.metadata import version as installed_version
+
         made = {
             "format": SUMMARY_FORMAT,
             "version": SUMMARY_VERSION,

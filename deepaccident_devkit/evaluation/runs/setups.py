@@ -150,9 +150,9 @@ class SampleLoader:
 
     def __call__(self, token: str) -> tuple[Any, ...]:
         """Prediction, truth and what else the evaluator takes."""
-        prediction = self.results.prediction(token)
+        prediction, rules = self.results.prediction(token), self.setup.rules
         if isinstance(prediction, DetectedBoxes):
-            return self._detection(token, prediction)
+            return self.detected(token, prediction, rules.frame), detection_truth(self.dataset, token, rules)
         if self.setup.task == "motion":
             return prediction, self.label(token)
         context = accident_context(self.dataset, token, self.setup.horizon)
@@ -176,12 +176,10 @@ class SampleLoader:
         config = self.label_config()
         return None if config is None else motion_labels(self.dataset, token, config)
 
-    def _detection(self, token: str, prediction: DetectedBoxes) -> tuple[Any, ...]:
-        rules = self.setup.rules
-        frame_from_world = self.dataset.world_from(token, rules.frame).inverse()
-        boxes = prediction.boxes.transform(frame_from_world, rules.frame)
-        detected = DetectedBoxes(boxes=boxes, scores=prediction.scores)
-        return detected, detection_truth(self.dataset, token, rules)
+    def detected(self, token: str, prediction: DetectedBoxes, frame: str) -> DetectedBoxes:
+        """A sample's boxes, which results hold in the world, in a frame of its agent."""
+        boxes = prediction.boxes.transform(self.dataset.world_from(token, frame).inverse(), frame)
+        return DetectedBoxes(boxes=boxes, scores=prediction.scores)
 
 
 def _reaching(config: MotionLabelConfig, horizon: float) -> MotionLabelConfig:

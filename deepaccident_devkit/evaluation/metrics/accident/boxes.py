@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
-from typing import Any, Final, get_args
+from typing import Any, get_args
 
 import numpy as np
 
@@ -27,15 +27,11 @@ from deepaccident_devkit.evaluation.metrics.accident.scoring import (
 )
 from deepaccident_devkit.evaluation.metrics.alarms.raised import Naming, Pair, named_alarms, position_difference
 from deepaccident_devkit.evaluation.metrics.alarms.reading import AccidentReading
-from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext, BoxTruth
+from deepaccident_devkit.evaluation.metrics.alarms.truth import SLACK, AccidentContext, BoxTruth
 from deepaccident_devkit.evaluation.metrics.choices import with_others, with_parts
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, Prediction, checked_prediction
 from deepaccident_devkit.motion import MotionLabels
-from deepaccident_devkit.taxonomy import FRAME_PERIOD
-
-_SLACK: Final = FRAME_PERIOD / 2
-"""Seconds: half a recorded frame, so that decimal moments compare as they are meant."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -195,7 +191,7 @@ class BoxAccidents:
         }
 
     def _is_judged(self, accident: Accident, truth: BoxTruth) -> bool:
-        seen = truth.accident is not None or accident.time <= float(truth.time[-1]) + _SLACK
+        seen = truth.accident is not None or accident.time <= float(truth.time[-1]) + SLACK
         return seen or self.unjudged_are_false
 
 

@@ -20,6 +20,8 @@ from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
 RELEASED_HORIZON: Final = 2.0
 """Seconds that the released models look ahead."""
+SLACK: Final = FRAME_PERIOD / 2
+"""Seconds: half a recorded frame, so that decimal moments compare as they are meant."""
 _MOVES: Final = 0.5
 """Metres that an actor covers in the window if it does more than stand."""
 
@@ -165,7 +167,7 @@ def box_truth(dataset: Dataset, sample: RowArgument, horizon: float = RELEASED_H
     footprint = np.full((last - present + 1, len(actors), 5), np.nan)
     footprint[tracks.index[inside] - present, which] = footprints[inside]
     time_to_impact, impact = there["time_to_impact"], None
-    within = time_to_impact is not None and time_to_impact <= horizon + FRAME_PERIOD / 2
+    within = time_to_impact is not None and time_to_impact <= horizon + SLACK
     if time_to_impact is not None and (within or np.isin(scenario["collision"]["ids"], tracks.actor_id).all()):
         first, second = scenario["collision"]["ids"]
         positions = [_last_position(tracks, footprints, actor, scenario["token"]) for actor in (first, second)]

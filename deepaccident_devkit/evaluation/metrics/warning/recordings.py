@@ -13,7 +13,7 @@ from typing import Any, Final, Literal, get_args
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.alarms.raised import NamedAlarm, named_alarms, position_difference
 from deepaccident_devkit.evaluation.metrics.alarms.reading import TIE
-from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext, BoxTruth
+from deepaccident_devkit.evaluation.metrics.alarms.truth import SLACK, AccidentContext, BoxTruth
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
 from deepaccident_devkit.evaluation.metrics.predictions import Prediction, checked_prediction
 from deepaccident_devkit.evaluation.metrics.warning.protocol import WarningProtocol
@@ -38,8 +38,6 @@ early, and the score of the surest right alarm as early of each that has one.
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 _NUMBERS: Final = ("samples", "alarms", "right", "unjudged")
 _LISTS: Final = ("reach", "first", "steady", "gains")
-_SLACK: Final = FRAME_PERIOD / 2
-"""Seconds: half a recorded frame, so that decimal moments compare as they are meant."""
 
 
 def sample_counts(
@@ -68,7 +66,7 @@ def sample_counts(
         )
     raised = named_alarms(checked_prediction(prediction), label, truth, protocol)
     ahead = context.time_to_impact
-    seen = to_end + _SLACK
+    seen = to_end + SLACK
     judged = [each for each in raised if ahead is not None or protocol.unjudged_are_false or each[0].time <= seen]
     return {
         "recording": recording,

@@ -181,14 +181,9 @@ class _Detections:
         asked = rules.frame, rules.truth, rules.label_velocity, rules.own_box
         dataset, token = self._loader.dataset, self._token
         return (
-            _kept(self._found, rules.frame, lambda: self._detected(rules.frame)),
+            _kept(self._found, rules.frame, lambda: self._loader.detected(token, self._prediction, rules.frame)),
             _kept(self._truth, asked, lambda: detection_truth(dataset, token, rules)),
         )
-
-    def _detected(self, frame: str) -> DetectedBoxes:
-        frame_from_world = self._loader.dataset.world_from(self._token, frame).inverse()
-        boxes = self._prediction.boxes.transform(frame_from_world, frame)
-        return DetectedBoxes(boxes=boxes, scores=self._prediction.scores)
 
 
 class _Motions:
