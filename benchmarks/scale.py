@@ -20,10 +20,9 @@ from deepaccident_devkit.release import Calibs, Collision, Labels, Meta, Scenari
 from deepaccident_devkit.tables.build import ScenarioFiles, scenario_rows
 from deepaccident_devkit.tables.index import INDEX_FOLDER
 from deepaccident_devkit.tables.indexing import table_file_states
-from deepaccident_devkit.tables.join import join_tables
 from deepaccident_devkit.tables.manifest import SCHEMA_VERSION, Manifest, write_manifest
 from deepaccident_devkit.tables.scan import ScenarioScan, folder_digest
-from deepaccident_devkit.tables.shards import write_shard
+from deepaccident_devkit.tables.shards import join_tables, write_shard
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, OWN_ACTOR_ID
 
 SCENARIOS, FRAMES, BOXES = 691, 83, 30

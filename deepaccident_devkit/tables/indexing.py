@@ -15,7 +15,6 @@ from deepaccident_devkit.parallel import run_batch
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder
 from deepaccident_devkit.tables.build import read_scenario, scenario_rows
 from deepaccident_devkit.tables.findings import Finding
-from deepaccident_devkit.tables.join import join_tables
 from deepaccident_devkit.tables.manifest import (
     SCHEMA_VERSION,
     Manifest,
@@ -25,7 +24,7 @@ from deepaccident_devkit.tables.manifest import (
     write_manifest,
 )
 from deepaccident_devkit.tables.scan import ScenarioScan, scan_scenario, scenario_digest
-from deepaccident_devkit.tables.shards import shard_digest, shard_path, write_shard
+from deepaccident_devkit.tables.shards import join_tables, shard_digest, shard_path, write_shard
 from deepaccident_devkit.tables.split_assignment import SplitAssignment, assign_splits
 
 SHARDS_FOLDER = "shards"

@@ -1,17 +1,23 @@
-"""A scenario's rows on disk, between reading its files and joining all scenarios; kept for resuming and refreshing.
+"""A scenario's rows on disk, kept for resuming and refreshing, and how all scenarios' rows are joined into tables.
 
 A shard is a compressed Arrow stream a table, one after the other, and at its end a checksum of all of it.
 """
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.tables.arrow import Columns, arrow_schema, record_batch, unpacked, views
-from deepaccident_devkit.tables.columns import TableSpec
+from deepaccident_devkit.tables.columns import NULL_INTEGER, Key, TableSpec
+from deepaccident_devkit.tables.sensor_rows import sensor_rows
 from deepaccident_devkit.tables.specs import table_specs
+from deepaccident_devkit.tables.store import TableWriter, write_table
+from deepaccident_devkit.taxonomy import CATEGORIES, SPLITS
 
 SHARED_TABLES = ("sensor", "category")
 """Tables that are the same for every scenario and stand in no shard."""
@@ -71,3 +77,47 @@ def shard_digest(path: Path) -> str | None:
 
 def _checksum(content: bytes) -> bytes:
     return hashlib.blake2b(content, digest_size=_CHECKSUM_SIZE).digest()
+
+
+def join_tables(folder: Path, shards: Sequence[Path], splits: Sequence[str | None]) -> None:
+    """Write every table to `folder`, which must exist: row keys count on, scenario after scenario.
+
+    Args:
+        folder: where the tables go.
+        shards: the scenarios' shards, in the order that their rows shall have.
+        splits: each scenario's split, None if unknown.
+    """
+    specs = table_specs()
+    with ExitStack() as stack:
+        writers = {
+            name: stack.enter_context(TableWriter(folder, spec))
+            for name, spec in specs.items()
+            if name not in SHARED_TABLES
+        }
+        for path, split in zip(shards, splits, strict=True):
+            tables = read_shard(path)
+            tables["scenario"]["split"] = [NULL_INTEGER if split is None else SPLITS.index(split)]
+            first_rows = {name: writer.num_rows for name, writer in writers.items()}
+            first_rows["ego_pose"] = first_rows["sample"]
+            for name, writer in writers.items():
+                writer.append(_counted_on(specs[name], tables[name], first_rows))
+        for writer in writers.values():
+            writer.finish()
+    write_shared_tables(folder)
+
+
+def write_shared_tables(folder: Path) -> None:
+    """Write the tables that are the same for every release."""
+    codes = np.arange(len(CATEGORIES))
+    write_table(folder, table_specs()["sensor"], sensor_rows())
+    write_table(folder, table_specs()["category"], {"name": codes, "index": codes})
+
+
+def _counted_on(spec: TableSpec, rows: Mapping[str, Any], first_rows: Mapping[str, int]) -> dict[str, Any]:
+    """The same rows with keys that count from the joined tables' start; nulls and shared tables' keys stay."""
+    result = dict(rows)
+    for column in spec.stored_columns:
+        if isinstance(column.kind, Key) and column.stored and column.kind.table not in SHARED_TABLES:
+            local = np.asarray(rows[column.stored], dtype=np.int64)
+            result[column.stored] = np.where(local == NULL_INTEGER, local, local + first_rows[column.kind.table])
+    return result
