@@ -1,6 +1,7 @@
 """The pages' code runs as it stands, and what must be listed is."""
 
 import ast
+import importlib.util
 import inspect
 import re
 from dataclasses import fields
@@ -27,7 +28,8 @@ from deepaccident_devkit.evaluation.metrics.warning import WARNING_PROTOCOLS, Wa
 from deepaccident_devkit.geometry import Box
 from deepaccident_devkit.motion import LabelProtocol, PostProcessing
 
-DOCS = Path(__file__).parents[1] / "docs"
+TOP = Path(__file__).parents[1]
+DOCS = TOP / "docs"
 FROM_NUSCENES = (DOCS / "from_nuscenes.md").read_text(encoding="utf-8")
 COUNTERPARTS = sorted(
     {
@@ -169,7 +171,27 @@ def test_every_counterpart_of_a_nuscenes_call_exists(code: str) -> None:
     inspect.signature(named(expression.func)).bind(*([None] if of_instance else []), *expression.args, **keywords)
 
 
-@pytest.mark.parametrize("page", [DOCS / "../README.md", DOCS / "../CONTRIBUTING.md"], ids=lambda page: page.stem)
-def test_the_links_of_pages_that_are_not_on_the_site_lead_somewhere(page: Path) -> None:
-    links = re.findall(r"\]\((?!http)([^)#]+)", page.read_text(encoding="utf-8"))
-    assert [link for link in links if not (page.parent / link).exists()] == []
+@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "ARCHITECTURE.md"])
+def test_the_links_of_pages_that_are_not_on_the_site_lead_somewhere(page: str) -> None:
+    links = re.findall(r"\]\((?!http)([^)#]+)", (TOP / page).read_text(encoding="utf-8"))
+    assert [link for link in links if not (TOP / link).exists()] == []
+
+
+def test_the_functions_on_a_labels_way_are_where_architecture_says() -> None:
+    page = (TOP / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    steps = re.findall(r"\]\((deepaccident_devkit/[^)]+\.py)\), `([^`]+)`", page)
+    assert len(steps) >= 5
+    for module, name in steps:
+        found: Any = import_module(module.removesuffix(".py").replace("/", "."))
+        for part in name.split("."):
+            found = getattr(found, part)
+        assert Path(inspect.getfile(found)).as_posix().endswith(module)
+
+
+def test_the_picture_of_the_layers_is_that_of_the_contract() -> None:
+    spec = importlib.util.spec_from_file_location("make_architecture", DOCS / "make_architecture.py")
+    assert spec
+    assert spec.loader
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    assert script.PICTURE.read_text(encoding="utf-8") == script.picture(), "run: python docs/make_architecture.py"
