@@ -1,4 +1,4 @@
-"""Measure the tables of docs/conventions.md on a real scenario: `python docs/make_real_tables.py DATAROOT`."""
+"""Measure the docs' tables that need a real scenario: `python docs/make_real_tables.py DATAROOT`, from a checkout."""
 
 import re
 import sys
@@ -12,16 +12,19 @@ from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.release.velocities import turned
 from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES, CHANNELS, LIDAR, VELOCITY_FRAMES
 
-PAGE = Path(__file__).parent / "conventions.md"
+HERE = Path(__file__).parent
+CONVENTIONS, BENCHMARKS = HERE / "conventions.md", HERE.parent / "benchmarks" / "README.md"
 LEAST_SPEED = 1.0
+BYTES_A_SAMPLE, BOXES_A_SAMPLE = 310e9 / 285e3, 8.6e6 / 285e3
 
 
 def main() -> None:
-    """Write all tables into the page."""
+    """Write all tables into their pages."""
     with tempfile.TemporaryDirectory() as folder:
         dataset = DeepAccident("v1", sys.argv[1], index_dir=folder, verbose=False)
-        put("velocity-real", velocity_table(dataset))
-        put("calibration-real", calibration_table(dataset))
+        put(CONVENTIONS, "velocity-real", velocity_table(dataset))
+        put(CONVENTIONS, "calibration-real", calibration_table(dataset))
+        put(BENCHMARKS, "index-real", index_table(dataset))
 
 
 def velocity_table(dataset: DeepAccident) -> str:
@@ -79,16 +82,33 @@ def calibration_table(dataset: DeepAccident) -> str:
     return "\n".join(lines)
 
 
-def put(name: str, table: str) -> None:
+def index_table(dataset: DeepAccident) -> str:
+    """What the index costs, and how much more it would with as many boxes a sample as the whole release has."""
+    index, samples = dataset.tables_folder.parent, len(dataset.sample)
+    boxes = len(dataset.annotation) / samples
+    size = {path: path.stat().st_size / samples for path in index.rglob("*.arrow")}
+    of_boxes = sum(value for path, value in size.items() if path.stem in ("annotation", "track"))
+    shards = sum(value for path, value in size.items() if "shards" in path.parts)
+    whole = sum(size.values()) + (of_boxes + shards) * (BOXES_A_SAMPLE / boxes - 1)  # all of a shard, so too much
+    lines = ["| index of a real scenario | bytes a sample | share of the raw data |", "| --- | ---: | ---: |"]
+    for words, value in (
+        (f"measured, {boxes:.0f} boxes a sample", sum(size.values())),
+        (f"with {BOXES_A_SAMPLE:.0f} boxes a sample, as the whole release has (at most)", whole),
+    ):
+        lines.append(f"| {words} | {value:,.0f} | {value / BYTES_A_SAMPLE:.2%} |")
+    return "\n".join(lines)
+
+
+def put(path: Path, name: str, table: str) -> None:
     """Replace what stands between a table's two marks."""
-    page = PAGE.read_text(encoding="utf-8")
+    page = path.read_text(encoding="utf-8")
     marks = f"<!-- {name} -->\n", f"<!-- /{name} -->"
     changed, count = re.subn(
         f"{re.escape(marks[0])}.*?{re.escape(marks[1])}", f"{marks[0]}{table}\n{marks[1]}", page, flags=re.DOTALL
     )
     if count != 1:
-        raise SystemExit(f"{PAGE}: expected the marks of {name} once, found {count}")
-    PAGE.write_text(changed, encoding="utf-8")
+        raise SystemExit(f"{path}: expected the marks of {name} once, found {count}")
+    path.write_text(changed, encoding="utf-8")
 
 
 if __name__ == "__main__":

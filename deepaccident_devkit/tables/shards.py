@@ -4,14 +4,17 @@ A shard is a compressed Arrow stream a table, one after the other, and at its en
 """
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.tables.arrow import Columns, arrow_schema, record_batch, unpacked, views
 from deepaccident_devkit.tables.columns import NULL_INTEGER, Key, TableSpec
 from deepaccident_devkit.tables.sensor_rows import sensor_rows
@@ -21,6 +24,10 @@ from deepaccident_devkit.taxonomy import CATEGORIES, SPLITS
 
 SHARED_TABLES = ("sensor", "category")
 """Tables that are the same for every scenario and stand in no shard."""
+_FROM_OTHERS: Mapping[str, Mapping[str, Callable[[Columns], AnyArray]]] = {
+    "annotation": {"rotation": lambda rows: quaternions.from_yaw(rows["yaw"])}
+}
+"""Table → column that a shard does without, since it follows from others: a twentieth of the index."""
 _DIGEST = b"digest"
 _CHECKSUM_SIZE = 16
 
@@ -31,8 +38,14 @@ def shard_path(folder: Path, scenario_token: str) -> Path:
 
 
 def shard_specs() -> list[TableSpec]:
-    """The tables of a shard, in its order."""
-    return [spec for name, spec in table_specs().items() if name not in SHARED_TABLES]
+    """The tables of a shard, in its order, with the columns that it stores."""
+    return [
+        replace(
+            spec, columns=tuple(column for column in spec.columns if column.stored not in _FROM_OTHERS.get(name, ()))
+        )
+        for name, spec in table_specs().items()
+        if name not in SHARED_TABLES
+    ]
 
 
 def write_shard(path: Path, tables: Mapping[str, Columns], digest: str) -> None:
@@ -57,7 +70,8 @@ def read_shard(path: Path) -> dict[str, dict[str, Any]]:
     with pa.OSFile(str(path), "rb") as source:
         for spec in shard_specs():
             (batch,) = list(pa.ipc.open_stream(source))  # to the stream's end, where the next one starts
-            tables[spec.name] = {name: unpacked(view) for name, view in views(spec, batch).items()}
+            rows = {name: unpacked(view) for name, view in views(spec, batch).items()}
+            tables[spec.name] = rows | {name: of(rows) for name, of in _FROM_OTHERS.get(spec.name, {}).items()}
     return tables
 
 
