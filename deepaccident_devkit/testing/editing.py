@@ -87,7 +87,7 @@ class ScenarioEditor:
 
     def write_rows(self, agent: str, frame: int, rows: Rows) -> None:
         """Replace a label."""
-        self.write(self.file(agent, "label", frame), "".join(" ".join(row) + "\n" for row in rows).encode("ascii"))
+        self.write(self.file(agent, "label", frame), "\n".join(" ".join(row) for row in rows).encode("ascii"))
 
     def edit_rows(
         self, agent: str, frames: Sequence[int], edit: Callable[[list[str]], None], *, actor: int | None = None
@@ -132,4 +132,4 @@ class ScenarioEditor:
 
     def write_meta_lines(self, lines: Sequence[str]) -> None:
         """Replace the meta file."""
-        self.write(self.scenario.meta_path, "".join(f"{line}\n" for line in lines).encode("ascii"))
+        self.write(self.scenario.meta_path, "\n".join(lines).encode("ascii"))

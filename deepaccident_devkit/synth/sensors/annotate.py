@@ -16,7 +16,7 @@ LABEL_RANGE = 120.0
 """Actors up to here are annotated, metres over the ground from the LiDAR to the box's centre."""
 TRACKING_RANGE = 115.0
 """Actors beyond have no id."""
-COUNTED_LATER = 0.004
+COUNTED_LATER = 0.0015
 """Seconds from the point cloud to the boxes that its points are counted in: others who move have gone on by then."""
 _PEDESTRIAN = CATEGORIES.index("pedestrian")
 

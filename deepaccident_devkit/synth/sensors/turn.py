@@ -15,7 +15,7 @@ ELEVATION = (-30.0, 10.0)
 AZIMUTHS = 1400
 """The release's LiDAR sends out 2,750 rays a turn and channel, of which it drops 48 % by chance."""
 RANGE = 70.0
-_SPARE = 0.1
+_SPARE = 0.06
 """Metres around a box that count as in it: more than anybody goes between the cloud and the count."""
 _CLOSER = 0.98
 """By this a box is taken to be nearer than it is: on a slope it leans."""

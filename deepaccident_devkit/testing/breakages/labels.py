@@ -93,7 +93,7 @@ def label_line_twice(victim: Victim) -> Path:
     return victim.file("label")
 
 
-@MEANING.enter("headings-differ", "own-velocity", "positions-differ")
+@MEANING.enter("headings-differ", "own-velocity", "positions-differ", "velocity-off")
 def label_right_handed(victim: Victim) -> Path:
     """One agent's labels have the other handedness: y, yaw and vy with the wrong sign."""
 

@@ -44,7 +44,7 @@ def test_velocities_are_those_of_the_world_poses(accident, world_boxes):
             step = after.center[after.actor_id == actor][0] - before.center[before.actor_id == actor][0]
             label = read_label(accident.label_path(agent, 2))
             velocity = world_from_label_velocity(label.velocity, label.yaw)[row]
-            np.testing.assert_allclose(velocity, step[:2] / 0.2, atol=2e-2)
+            np.testing.assert_allclose(velocity, step[:2] / 0.2, atol=0.2)
             if actor == -100:
                 np.testing.assert_array_equal(label.velocity[row], label.agent_velocity[0])
 
