@@ -16,15 +16,19 @@ from deepaccident_devkit.synth.roads import Junction
 from deepaccident_devkit.synth.spec import ScenarioSpec
 from deepaccident_devkit.synth.spec.model import Role
 from deepaccident_devkit.synth.stage import World, random_world
-from deepaccident_devkit.synth.traffic.drama import Performance, Stage, perform_accident, perform_twin, set_stage
-from deepaccident_devkit.synth.traffic.kinematics import PERIOD
-from deepaccident_devkit.synth.traffic.recorded import (
+from deepaccident_devkit.synth.traffic.drama import (
+    Performance,
     Recorded,
+    Stage,
     latest_end,
+    perform_accident,
+    perform_twin,
     recorded_accident,
     recorded_normal,
+    set_stage,
     usual_duration,
 )
+from deepaccident_devkit.synth.traffic.kinematics import PERIOD
 from deepaccident_devkit.synth.traffic.signals import SignalPlan
 from deepaccident_devkit.synth.traffic.unplanned import unplanned
 from deepaccident_devkit.taxonomy import STATIC_ACTOR_ID, VEHICLE_AGENTS, WARM_UP_FRAMES, AgentName

@@ -1,13 +1,15 @@
-"""The ground as a raster of codes: what lies where, in the ground frame."""
+"""The ground as a raster of codes, in the ground frame: what lies where, and how a junction is painted on it."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deepaccident_devkit.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays
 from deepaccident_devkit.release.bev_camera import TAGS
-from deepaccident_devkit.synth.roads.terrain import EXTENT
+from deepaccident_devkit.synth.roads.layout import LANE_WIDTH, RoadSpec, slot_edges
+from deepaccident_devkit.synth.roads.terrain import EXTENT, OUTWARD, Arm
 
 MAP_EXTENT = EXTENT
 """The raster covers ±this, metres, in x and y."""
@@ -70,3 +72,101 @@ def tag_of_code() -> ByteArray:
     for code, tag in _CODE_TAGS.items():
         tags[code] = tag
     return tags
+
+
+_HALF = MAP_CELLS // 2
+_DASH = (3.0, 6.0)
+"""Metres: length of a dash, and from one to the next."""
+_TOOTH = (0.5, 0.9)
+"""The same for the teeth of a yield line."""
+_STRIPE = 0.5
+"""About the width of the stripes of a crosswalk and of the gaps between them, metres."""
+
+
+@lru_cache(maxsize=4)
+def paint_junction(spec: RoadSpec) -> GroundMap:
+    """The ground of a junction; the last few are kept, since scenarios often share one."""
+    axis = cell_axis()
+    band = np.digitize(np.abs(axis), (spec.road_edge, spec.sidewalk_edge))
+    kinds = np.array([ROAD, SIDEWALK, GRASS], dtype=np.uint8)[band]
+    codes = np.minimum.outer(kinds, kinds)  # where two roads' strips cross, the lower code is that nearer the traffic
+    if spec.kind == "three-way":
+        beyond = axis > spec.road_edge
+        codes[beyond] = kinds[beyond, None]
+    views = {arm: _outward_view(codes, arm) for arm in spec.arms}
+    for arm, view in views.items():
+        if _has_left_neighbour(arm, spec):
+            _round_left_corner(view, axis, spec)
+    for arm, view in views.items():
+        _paint_arm(view, axis, spec, yields=arm in spec.yielding_arms)
+    return GroundMap(codes)
+
+
+def _outward_view(codes: ByteArray, arm: Arm) -> ByteArray:
+    """The map seen along an arm: columns outward from the middle, rows from its right to its left; shares memory."""
+    x, y = OUTWARD[arm]
+    whole = codes if x else codes.T
+    whole = whole if (x or -y) > 0 else whole[::-1]
+    return whole[:, _HALF:] if (x or y) > 0 else whole[:, _HALF - 1 :: -1]
+
+
+def _has_left_neighbour(arm: Arm, spec: RoadSpec) -> bool:
+    """Whether there is an arm to the left, looking outward."""
+    x, y = OUTWARD[arm]
+    return any(OUTWARD[other] == (-y, x) for other in spec.arms)
+
+
+def _round_left_corner(view: ByteArray, axis: FloatArray, spec: RoadSpec) -> None:
+    """Cut the corner between an arm and the one to its left round, in place."""
+    along = axis[_HALF:]
+    low, high = spec.road_edge, spec.road_edge + spec.kerb_radius
+    rows, columns = np.flatnonzero((axis > low) & (axis < high)), np.flatnonzero((along > low) & (along < high))
+    off = np.hypot(axis[rows, None] - high, along[None, columns] - high)
+    patch = view[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    patch[off > spec.kerb_radius] = ROAD
+
+
+def _paint_arm(view: ByteArray, beside: FloatArray, spec: RoadSpec, *, yields: bool) -> None:
+    """Paint the lines of one arm, in place; who comes towards the junction drives at its left, seen outward."""
+    along = beside[_HALF:]
+    before = along > spec.stop_line[1]
+    across = np.abs(beside)
+    dashes = before & _every(along, *_DASH)
+    _paint(view, (across > 0.05) & (across < 0.2), before, YELLOW)
+    for divider in range(1, spec.lanes):
+        _paint(view, np.abs(across - divider * LANE_WIDTH) < 0.06, dashes, WHITE)
+    edge = np.abs(across - spec.lanes_edge) < 0.06
+    _paint(view, edge, dashes if spec.parking else before, WHITE)
+    if spec.parking:
+        _paint(view, (across > spec.lanes_edge) & (across < spec.road_edge), _slot_lines(along, spec), WHITE)
+    if spec.crosswalks:
+        low, high = spec.crosswalk
+        _paint(view, _stripes(beside, spec.road_edge), (along > low) & (along < high), WHITE)
+    incoming = (beside > 0.2) & (beside < spec.lanes_edge)
+    stop = (along > spec.stop_line[0]) & (along < spec.stop_line[1])
+    if spec.signalized or yields:
+        _paint(view, incoming & _every(beside, *_TOOTH) if yields else incoming, stop, WHITE)
+
+
+def _slot_lines(along: FloatArray, spec: RoadSpec) -> BoolArray:
+    edges = slot_edges(spec)
+    return np.asarray(np.abs(along[:, None] - edges).min(axis=1) < 0.06)
+
+
+def _stripes(beside: FloatArray, kerb: float) -> BoolArray:
+    """Where the stripes of a crosswalk are: one in the middle, and a gap at each kerb."""
+    more = round((2 * kerb / _STRIPE - 3) / 4)
+    width = 2 * kerb / (4 * more + 3)
+    return _every(beside, width, 2 * width) & (np.abs(beside) < kerb)
+
+
+def _every(values: FloatArray, length: float, period: float) -> BoolArray:
+    """Stretches of a length, one a period, that mirror themselves at 0, where the middle of one is."""
+    return np.asarray((np.abs(values) + length / 2) % period < length)
+
+
+def _paint(view: ByteArray, rows: BoolArray, columns: BoolArray, code: int) -> None:
+    """Paint the road, and only the road, where rows and columns are both wanted, in place."""
+    window = np.ix_(rows, columns)
+    block = view[window]
+    view[window] = np.where(block == ROAD, np.uint8(code), block)

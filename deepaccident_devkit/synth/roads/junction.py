@@ -8,13 +8,19 @@ import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray, readonly
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.synth.roads.ground import GroundMap
-from deepaccident_devkit.synth.roads.layout import RoadSpec
-from deepaccident_devkit.synth.roads.parking import parking_places
-from deepaccident_devkit.synth.roads.paths import Meeting, Path, bent, crossing, straight
-from deepaccident_devkit.synth.roads.raster import paint_junction
+from deepaccident_devkit.synth.roads.ground import GroundMap, paint_junction
+from deepaccident_devkit.synth.roads.layout import RoadSpec, parking_places
+from deepaccident_devkit.synth.roads.paths import (
+    Meeting,
+    Path,
+    bent,
+    crossing,
+    quarter_turn,
+    straight,
+    tangent_of_corner,
+    tangent_of_radius,
+)
 from deepaccident_devkit.synth.roads.terrain import ARMS, OUTWARD, Arm, Terrain
-from deepaccident_devkit.synth.roads.turns import quarter_turn, tangent_of_corner, tangent_of_radius
 
 Turn = Literal["straight", "left", "right"]
 TURNS: tuple[Turn, ...] = get_args(Turn)

@@ -9,7 +9,7 @@ from deepaccident_devkit.arrays import ByteArray, Float32Array
 from deepaccident_devkit.release import BevImage, Calib, Labels
 from deepaccident_devkit.synth.actors import Actors
 from deepaccident_devkit.synth.roads import Arm
-from deepaccident_devkit.synth.sensors.agents import Agent, make_agents
+from deepaccident_devkit.synth.sensors.agents import Agent, make_agents, with_single_precision
 from deepaccident_devkit.synth.sensors.annotate import annotate
 from deepaccident_devkit.synth.sensors.bev import bev_picture
 from deepaccident_devkit.synth.sensors.images.render import Studio, render
@@ -17,7 +17,6 @@ from deepaccident_devkit.synth.sensors.images.shading import Surroundings
 from deepaccident_devkit.synth.sensors.lidar import AIR_OF_WEATHER, Air, Lidar, Scan, intensity, make_lidar, scan
 from deepaccident_devkit.synth.sensors.scene import Scene, make_scene
 from deepaccident_devkit.synth.sensors.setting import Setting
-from deepaccident_devkit.synth.sensors.single_precision import with_single_precision
 from deepaccident_devkit.synth.stage import World
 from deepaccident_devkit.taxonomy import AGENTS, AgentName
 
@@ -88,7 +87,7 @@ class Rig:
     def surroundings(self, scene: Scene, signals: Mapping[Arm, int]) -> Surroundings | None:
         """What the images of all agents at a moment have in common; None where none are made.
 
-        `signals` are the traffic lights' states, as `images.signals.lit_lamps` takes them.
+        `signals` are the traffic lights' states, as `images.lamplight.lit_lamps` takes them.
         """
         return self.studio.surroundings(scene, signals) if self.studio else None
 

@@ -9,8 +9,7 @@ from deepaccident_devkit.arrays import AnyArray, FloatArray, IntArray
 from deepaccident_devkit.geometry.boxes import CORNER_SIGNS
 from deepaccident_devkit.synth.actors import Actors, Snapshot
 from deepaccident_devkit.synth.sensors.caster import Caster, make_caster
-from deepaccident_devkit.synth.sensors.placing import moved
-from deepaccident_devkit.synth.sensors.setting import Setting, Surfaces
+from deepaccident_devkit.synth.sensors.setting import Setting, Surfaces, moved
 from deepaccident_devkit.synth.shapes import BOX_CLEARANCE
 
 
@@ -21,7 +20,7 @@ class Scene:
     Attributes:
         setting: what stands still.
         snapshot: where the road users are, seen from above.
-        frames: (A, 4, 4) their frames on the ground, as in `placing.placed_on`.
+        frames: (A, 4, 4) their frames on the ground, as in `setting.placed_on`.
         movers: surfaces of those who are not parked.
         caster: for rays against these.
     """

@@ -3,14 +3,14 @@
 from collections.abc import Callable
 
 from deepaccident_devkit.synth import solids
-from deepaccident_devkit.synth.shapes import cars, riders, vans
+from deepaccident_devkit.synth.shapes import riders, vehicles
 from deepaccident_devkit.synth.shapes.parts import BOX_CLEARANCE, INSET, LAMP, TAIL, Frame
 from deepaccident_devkit.synth.solids import Block, Color, Solids
 
 MODELS: dict[str, tuple[Callable[[Frame], list[Block]], ...]] = {
-    "car": (cars.saloon, cars.hatchback, cars.off_roader),
-    "van": (vans.delivery_van, vans.minibus),
-    "truck": (vans.box_truck, vans.tank_truck),
+    "car": (vehicles.saloon, vehicles.hatchback, vehicles.off_roader),
+    "van": (vehicles.delivery_van, vehicles.minibus),
+    "truck": (vehicles.box_truck, vehicles.tank_truck),
     "motorcycle": (riders.motorcycle, riders.scooter),
     "cyclist": (riders.cyclist,),
     "pedestrian": (riders.walker, riders.stroller),

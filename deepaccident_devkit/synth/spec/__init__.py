@@ -1,12 +1,19 @@
 """Scenario files: what they can say, how they are read, and the paper's twelve designs as such files.
 
 A file is read into a `SpecTemplate`, whose ranges and choices are still open; `draw` makes a `ScenarioSpec` of it. The
-parts, from below: `bounds`, `model` (the fields), `yaml_nodes`, `choices`, `reading` (types), `checks` (what types
-cannot say), `template`, `files`, `catalogue` (the designs), `tables` (the fields as text).
+parts, from below: `model` (the fields), `yaml_nodes`, `choices`, `reading` (types), `checks` (what types cannot say),
+`template`, `catalogue` (files, the designs, and the fields as text).
 """
 
-from deepaccident_devkit.synth.spec.catalogue import DESIGN_NUMBERS, DESIGNS, design_text
-from deepaccident_devkit.synth.spec.files import parse_spec, read_spec
+from deepaccident_devkit.synth.spec.catalogue import (
+    DESIGN_NUMBERS,
+    DESIGNS,
+    design_text,
+    designs_text,
+    field_tables,
+    parse_spec,
+    read_spec,
+)
 from deepaccident_devkit.synth.spec.model import (
     ActorSpec,
     BackgroundSpec,
@@ -15,7 +22,6 @@ from deepaccident_devkit.synth.spec.model import (
     ScenarioSpec,
     View,
 )
-from deepaccident_devkit.synth.spec.tables import designs_text, field_tables
 from deepaccident_devkit.synth.spec.template import SpecTemplate, draw
 
 __all__ = [

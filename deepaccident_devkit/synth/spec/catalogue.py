@@ -1,13 +1,60 @@
-"""The paper's twelve designs, each a scenario file that ships with the package."""
+"""Scenario files from text to template: reading them, the paper's twelve designs, and what a file can hold."""
 
+import dataclasses
+import os
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from typing import Final
+from inspect import cleandoc
+from pathlib import Path
+from typing import Any, Final
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.synth.spec.files import parse_spec
+from deepaccident_devkit.synth.spec.checks import check_scenario
+from deepaccident_devkit.synth.spec.choices import default_of, key_of
+from deepaccident_devkit.synth.spec.model import ScenarioSpec
+from deepaccident_devkit.synth.spec.reading import FieldType, field_types, read_part, required_fields
 from deepaccident_devkit.synth.spec.template import SpecTemplate
+from deepaccident_devkit.synth.spec.yaml_nodes import parse_yaml
+from deepaccident_devkit.text import columns_text
+
+_MOST_CHARACTERS = 200_000
+"""PyYAML reads as many in a few seconds."""
+
+
+def read_spec(path: str | os.PathLike[str]) -> SpecTemplate:
+    """The scenario of a YAML file (docs/scenarios.md says what one can hold).
+
+    Raises:
+        ConfigError: there is no such file, or it cannot be carried out; the message names line, field and remedy.
+    """
+    try:
+        with Path(path).open(encoding="utf-8") as file:
+            text = file.read(_MOST_CHARACTERS + 1)
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read ({error}); give a YAML file in UTF-8") from error
+    if len(text) > _MOST_CHARACTERS:
+        raise ConfigError(
+            f"{path}: has more than {_MOST_CHARACTERS} characters; give a scenario file, it has a few dozen lines"
+        )
+    return parse_spec(text, str(path))
+
+
+def parse_spec(text: str, source: str = "scenario") -> SpecTemplate:
+    """The scenario of a YAML text.
+
+    Args:
+        text: as in a file.
+        source: what messages call it.
+
+    Raises:
+        ConfigError: it cannot be carried out; the message names line, field and remedy.
+    """
+    root = read_part(parse_yaml(text, source), ScenarioSpec)
+    check_scenario(root)
+    return SpecTemplate(root)
+
 
 DESIGN_NUMBERS: Final = tuple(range(1, 13))
 """1 to 6 at signalised junctions, 7 to 12 at unsignalised ones."""
@@ -47,3 +94,94 @@ def design_text(number: int) -> str:
 @cache
 def _design(number: int) -> SpecTemplate:
     return parse_spec(design_text(number), f"design {number}")
+
+
+@dataclass(frozen=True, slots=True)
+class FieldEntry:
+    """A line of the table of fields.
+
+    Attributes:
+        key: in the file.
+        values: what it can be.
+        default: if the file does not name it.
+        meaning: one or more sentences.
+    """
+
+    key: str
+    values: str
+    default: str
+    meaning: str
+
+
+def field_tables() -> dict[str, tuple[FieldEntry, ...]]:
+    """The fields of a scenario file, by where they stand, such as `road.hump`; the file itself is the empty text."""
+    return dict(_tables(ScenarioSpec, ""))
+
+
+def designs_text() -> str:
+    """The twelve designs: number, name, junction."""
+    rows = [("design  name", "junction")]
+    for number, template in DESIGNS.items():
+        (road,) = template.root.values("road")
+        lights = "signalised" if road.values("signalized")[0] else "unsignalised"
+        rows.append((f"{number:>6}  {template.name}", f"{road.values('kind')[0]}, {lights}"))
+    return columns_text(rows)
+
+
+def _tables(kind: type[Any], path: str) -> Iterator[tuple[str, tuple[FieldEntry, ...]]]:
+    types_of, meanings = field_types(kind), _meanings(kind)
+    required = required_fields(kind)
+    yield (
+        path,
+        tuple(
+            FieldEntry(
+                key_of(name),
+                _values(wanted),
+                "required" if name in required else _default(default_of(kind, name)),
+                meanings[name],
+            )
+            for name, wanted in types_of.items()
+        ),
+    )
+    for name, wanted in types_of.items():
+        inner, ending = (wanted.items, "[]") if wanted.items else (wanted, "")
+        if dataclasses.is_dataclass(inner.base):
+            yield from _tables(inner.base, f"{path}.{key_of(name)}{ending}".lstrip("."))
+
+
+def _values(wanted: FieldType) -> str:
+    if wanted.items is not None:
+        many = f"list of {wanted.length}" if wanted.length else "list"
+        return f"{many}: {_values(wanted.items)}"
+    if dataclasses.is_dataclass(wanted.base):
+        text = "keys and values"
+    elif wanted.words:
+        text = ", ".join(wanted.words)
+    else:
+        names = {str: "text", bool: "true, false", int: "whole number", float: "number"}
+        text = names[wanted.base] + (f", {wanted.bounds}" if wanted.bounds else "")
+    return f"{text}; or null" if wanted.optional else text
+
+
+def _default(value: Any) -> str:
+    if dataclasses.is_dataclass(value):
+        return "its defaults"
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(str, value))}]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "null" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _meanings(kind: type[Any]) -> dict[str, str]:
+    """Field name → its text in the docstring's section Attributes."""
+    lines = cleandoc(kind.__doc__ or "").partition("Attributes:\n")[2].splitlines()
+    meanings: dict[str, str] = {}
+    name = ""
+    for line in lines:
+        if line.startswith(" " * 8):
+            meanings[name] += f" {line.strip()}"
+        elif line.strip():
+            name, _, text = line.strip().partition(": ")
+            meanings[name] = text
+    return meanings

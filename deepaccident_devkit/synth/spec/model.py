@@ -8,7 +8,26 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from deepaccident_devkit.synth.roads import ARMS, Arm, RoadSpec, Turn
-from deepaccident_devkit.synth.spec.bounds import Bounds
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """The span of a number, both ends included.
+
+    Attributes:
+        low: the least.
+        high: the most.
+        unit: such as `m/s`; empty for a count.
+    """
+
+    low: float
+    high: float
+    unit: str = ""
+
+    def __str__(self) -> str:
+        """Such as `0 to 30 m/s`."""
+        return f"{self.low:g} to {self.high:g} {self.unit}".rstrip()
+
 
 Side = Literal["left", "right"]
 View = Literal["open", "hidden"]

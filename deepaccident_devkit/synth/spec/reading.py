@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.synth.spec.bounds import Bounds
 from deepaccident_devkit.synth.spec.choices import Choice, Fixed, Items, OneOf, Part, Range, key_of
+from deepaccident_devkit.synth.spec.model import Bounds
 from deepaccident_devkit.synth.spec.yaml_nodes import Node
 from deepaccident_devkit.text import possible_text
 

@@ -16,9 +16,9 @@ from deepaccident_devkit.synth.stage.furniture import (
     mast,
     signal_head,
     traffic_light,
+    trees,
     yield_sign,
 )
-from deepaccident_devkit.synth.stage.greenery import trees
 from deepaccident_devkit.synth.stage.houses import houses, kerb_house
 from deepaccident_devkit.synth.stage.props import Prop, overlap, settled, solids_of, top_map
 

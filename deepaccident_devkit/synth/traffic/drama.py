@@ -1,4 +1,7 @@
-"""A scenario on stage: all who take part at its beginning, and what happens with broken and with kept rules."""
+"""A scenario on stage: all who take part at its beginning, and what happens with broken and with kept rules.
+
+A part of that is recorded: it ends with the impact, or when ego has arrived, or when time is over.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,14 +12,14 @@ from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.synth.roads import Junction
 from deepaccident_devkit.synth.spec import ScenarioSpec
 from deepaccident_devkit.synth.spec.model import Role
-from deepaccident_devkit.synth.traffic.background import background_users
-from deepaccident_devkit.synth.traffic.casting import Cast, cast_actors
-from deepaccident_devkit.synth.traffic.parked import ParkedVehicle, parked_vehicles
+from deepaccident_devkit.synth.traffic.background import ParkedVehicle, background_users, parked_vehicles
+from deepaccident_devkit.synth.traffic.casting import WARM_UP, Cast, cast_actors
+from deepaccident_devkit.synth.traffic.impact import Impact, impact_of, least_gap, touching_pairs
 from deepaccident_devkit.synth.traffic.rights import find_rights
 from deepaccident_devkit.synth.traffic.signals import AXIS_OF_ARM, SignalPlan, plan_with_green
 from deepaccident_devkit.synth.traffic.simulate import Simulation, simulate
-from deepaccident_devkit.synth.traffic.touching import least_gap, touching_pairs
-from deepaccident_devkit.synth.traffic.users import RoadUser
+from deepaccident_devkit.synth.traffic.users import RoadUser, middle_of
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 _GREEN_TIMES = (14.0, 20.0)
 _GREEN_SHARE = (0.35, 0.75)
@@ -194,3 +197,84 @@ def _signal_plan(rng: np.random.Generator, cast: Cast) -> SignalPlan:
     arms = [user.route.from_arm for user in lawful if user.route is not None]
     axis = AXIS_OF_ARM[arms[0]] if arms else "west-east"
     return plan_with_green(axis, 0.0, float(rng.uniform(*_GREEN_TIMES)), float(rng.uniform(*_GREEN_SHARE)))
+
+
+_LEAST_FRAMES, _MOST_FRAMES = 40, 100
+"""Of a recording of natural length, as in the release."""
+_EARLIEST = 5.5
+"""Seconds from the beginning until the pair meets, at least."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Recorded:
+    """A part of a performance.
+
+    Attributes:
+        performance: what happens.
+        start: time of the first recorded frame, in the simulation's time, seconds.
+        frames: how many are recorded.
+        impact: with which it ends, if it does.
+    """
+
+    performance: Performance
+    start: float
+    frames: int
+    impact: Impact | None
+
+
+def usual_duration(rng: np.random.Generator, spec: ScenarioSpec, frames: int | None) -> float:
+    """Seconds from the beginning until the pair meets: as is natural, or as long as the frames asked for need."""
+    natural = float(rng.uniform(_EARLIEST, max(spec.end.time, _EARLIEST) + 0.3))
+    return natural if frames is None else max(natural, frames * FRAME_PERIOD + 1.5)
+
+
+def latest_end(stage: Stage, frames: int | None) -> float:
+    """The time until which a normal scenario is simulated, seconds."""
+    longest = max(stage.spec.end.time, (frames or 0) * FRAME_PERIOD)
+    return stage.cast.begin + WARM_UP + longest
+
+
+def recorded_accident(stage: Stage, performance: Performance, frames: int | None) -> Recorded:
+    """The recording that ends with the impact.
+
+    Args:
+        stage: who took part.
+        performance: with a contact of the pair.
+        frames: how many are recorded; None for as many as there are, within limits.
+    """
+    pair = stage.cast.pair or (0, 0)
+    size = np.array([stage.users[row].body.size[:2] for row in pair])
+    impact = impact_of(performance.simulation, pair, size)
+    count = frames or _natural_frames(stage, impact.time, _MOST_FRAMES)
+    return Recorded(
+        performance=performance, start=impact.time - FRAME_PERIOD * (count - 1), frames=count, impact=impact
+    )
+
+
+def recorded_normal(stage: Stage, performance: Performance, frames: int | None) -> Recorded:
+    """The recording that ends when ego has arrived, or when time is over; arguments as in `recorded_accident`."""
+    begin = stage.cast.begin + WARM_UP
+    longest = round(stage.spec.end.time / FRAME_PERIOD)
+    arrival = _arrival_time(stage, performance)
+    natural = _natural_frames(stage, min(arrival, begin + stage.spec.end.time), max(longest, _LEAST_FRAMES))
+    if frames is None:
+        return Recorded(performance=performance, start=begin, frames=natural, impact=None)
+    end = max(begin + FRAME_PERIOD * (natural - 1), begin + FRAME_PERIOD * (frames - 1))
+    return Recorded(performance=performance, start=end - FRAME_PERIOD * (frames - 1), frames=frames, impact=None)
+
+
+def _natural_frames(stage: Stage, end: float, most: int) -> int:
+    since = end - (stage.cast.begin + WARM_UP)
+    return int(np.clip(int(since / FRAME_PERIOD + 1e-6) + 1, _LEAST_FRAMES, most))
+
+
+def _arrival_time(stage: Stage, performance: Performance) -> float:
+    """When ego is far enough past the junction, infinite if it never is."""
+    row = stage.cast.row_of("ego")
+    ego, simulation = stage.users[row], performance.simulation
+    if ego.route is None:
+        return np.inf
+    coarse = slice(None, None, 5)
+    along, _ = ego.path.project(simulation.poses[coarse, performance.present.index(row), :2])
+    arrived = along > middle_of(ego.route) + stage.spec.end.arrival
+    return float(simulation.time[coarse][arrived.argmax()]) if arrived.any() else np.inf

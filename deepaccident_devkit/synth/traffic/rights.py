@@ -1,14 +1,86 @@
-"""The rules of the road between all pairs of road users."""
+"""The rules of the road between all pairs of road users: where their ways cross or join, and who has to wait."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray
+from deepaccident_devkit.arrays import BoolArray, FloatArray
+from deepaccident_devkit.synth.roads.paths import Path
 from deepaccident_devkit.synth.roads.terrain import OUTWARD, Arm
-from deepaccident_devkit.synth.traffic.conflicts import Zones, find_zones
 from deepaccident_devkit.synth.traffic.users import RoadUser
+
+_SPACING = 0.5
+_MARGIN = 0.5
+"""Metres between two bodies that pass each other in a zone."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Zones:
+    """For each ordered pair of road users, the stretch of the first one's path on which it meets the second's.
+
+    Attributes:
+        enter: (A, A) metres along the path of the row's, where its front comes too near to the column's way; infinite
+            where the two never meet.
+        leave: (A, A) where its rear is clear of it.
+    """
+
+    enter: FloatArray
+    leave: FloatArray
+
+
+def find_zones(
+    paths: Sequence[Path],
+    spans: Sequence[tuple[float, float]],
+    widths: FloatArray,
+    together: BoolArray,
+) -> Zones:
+    """The zones of all pairs.
+
+    Args:
+        paths: of the road users.
+        spans: from, to: the stretch of each path on which it can meet others, metres.
+        widths: (A,) of their bodies, metres.
+        together: (A, A) bool, pairs that follow each other, or never mind each other, and so have no zone.
+    """
+    count = len(paths)
+    enter, leave = np.full((count, count), np.inf), np.full((count, count), np.inf)
+    known: dict[tuple[int, int, float], tuple[tuple[float, float], tuple[float, float]] | None] = {}
+    points = [_points(path, span) for path, span in zip(paths, spans, strict=True)]
+    for i in range(count):
+        for j in range(i + 1, count):
+            if together[i, j]:
+                continue
+            reach = round(float(widths[i] + widths[j]) / 2 + _MARGIN, 1)
+            key = (id(paths[i]), id(paths[j]), reach)
+            if key not in known:
+                known[key] = _meeting(points[i], points[j], reach)
+            zone = known[key]
+            if zone is not None:
+                (enter[i, j], leave[i, j]), (enter[j, i], leave[j, i]) = zone
+    return Zones(enter, leave)
+
+
+def _points(path: Path, span: tuple[float, float]) -> FloatArray:
+    """(K, 3) x, y and how far along, metres."""
+    along = np.arange(max(span[0], 0.0), min(span[1], path.length), _SPACING)
+    x, y, _, _ = path.at(along)
+    return np.stack([x, y, along], axis=-1)
+
+
+def _meeting(
+    first: FloatArray, second: FloatArray, reach: float
+) -> tuple[tuple[float, float], tuple[float, float]] | None:
+    """From, to on each of two lines of points (K, 3) where they are within reach of each other; None if nowhere."""
+    if not len(first) or not len(second):
+        return None
+    square = (first[:, None, 0] - second[None, :, 0]) ** 2 + (first[:, None, 1] - second[None, :, 1]) ** 2
+    near = square < reach**2
+    rows, columns = near.any(axis=1), near.any(axis=0)
+    if not rows.any():
+        return None
+    on_first, on_second = first[rows, 2], second[columns, 2]
+    return (float(on_first[0]), float(on_first[-1])), (float(on_second[0]), float(on_second[-1]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,3 +151,52 @@ def _waits(one: RoadUser, other: RoadUser, minor: Sequence[Arm]) -> bool:
         return one.route.from_arm in minor
     opposite = OUTWARD[one.route.from_arm] == tuple(-value for value in OUTWARD[other.route.from_arm])
     return opposite and one.route.turn == "left" and other.route.turn != "left"
+
+
+_ACCELERATION = (1.5, 1.0)
+"""m/s²: how others may speed up towards a zone, and how one speeds up oneself to leave it."""
+_GAP_BEFORE, _GAP_AFTER = 1.2, 0.6
+"""Seconds that must pass between one's leaving a zone and the other's coming, and the other way round."""
+_CREEPING = 0.5
+"""m/s: who is slower counts as so fast."""
+_HARD_BRAKING = 4.5
+"""m/s²: who would have to brake harder than this before a zone drives on."""
+_BEFORE_ZONE = 1.0
+"""Metres before a zone at which one waits."""
+
+
+def waiting_gap(
+    rights: Rights, front: FloatArray, rear: FloatArray, speed: FloatArray, top_speed: FloatArray, held: BoolArray
+) -> FloatArray:
+    """(A,) metres to where each has to stop for others, infinite for those who may go.
+
+    Args:
+        rights: of all pairs.
+        front: (A,) how far along its path the front of each is, metres.
+        rear: (A,) and its rear.
+        speed: (A,) m/s.
+        top_speed: (A,) m/s, which each does not exceed.
+        held: (A,) bool, whether it stands or will stand before a red light.
+    """
+    to_enter = rights.zones.enter - front[:, None]
+    to_leave = rights.zones.leave - rear[:, None]
+    with np.errstate(invalid="ignore"):
+        comes = _earliest(np.maximum(to_enter, 0.0), speed[:, None], top_speed[:, None], _ACCELERATION[0])
+        goes = _earliest(np.maximum(to_leave, 0.0), speed[:, None], top_speed[:, None], _ACCELERATION[1])
+        gone = np.maximum(to_leave, 0.0) / np.maximum(speed[:, None], _CREEPING)
+    inside = (to_enter <= 0) & (to_leave > 0)
+    cannot_stop = (to_enter > 0) & (speed[:, None] ** 2 > 2 * _HARD_BRAKING * np.maximum(to_enter - 0.3, 0.0))
+    coming = (to_leave.T > 0) & (np.isfinite(to_enter.T)) & ~held[None, :]
+    first = goes + _GAP_BEFORE < comes.T
+    reaching = to_enter / np.maximum(speed[:, None], _CREEPING)
+    second = reaching > gone.T + _GAP_AFTER
+    matters = coming & ~first & ~second & (to_enter > 0) & ~cannot_stop & rights.sees
+    must = rights.waits | inside.T | (cannot_stop & ~inside).T
+    gap = np.where(matters & must, np.maximum(to_enter - _BEFORE_ZONE, 0.0), np.inf)
+    return np.asarray(gap.min(axis=1))
+
+
+def _earliest(distance: FloatArray, speed: FloatArray, top_speed: FloatArray, acceleration: float) -> FloatArray:
+    """Seconds until someone is so many metres on, who speeds up as much as is likely, up to a top speed."""
+    speeding_up = (np.sqrt(speed**2 + 2 * acceleration * distance) - speed) / acceleration
+    return np.asarray(np.maximum(speeding_up, distance / top_speed))

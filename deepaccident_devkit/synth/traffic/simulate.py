@@ -7,7 +7,6 @@ import numpy as np
 
 from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays
 from deepaccident_devkit.synth.collision import separation
-from deepaccident_devkit.synth.traffic.alarm import Alarm
 from deepaccident_devkit.synth.traffic.following import (
     Temper,
     can_stop,
@@ -16,13 +15,11 @@ from deepaccident_devkit.synth.traffic.following import (
     interaction,
     stopping,
 )
-from deepaccident_devkit.synth.traffic.kinematics import DECISION_STEPS, HARDEST_BRAKING, PERIOD, Wheels, step
-from deepaccident_devkit.synth.traffic.perception import Bodies, leaders
-from deepaccident_devkit.synth.traffic.rights import Rights
+from deepaccident_devkit.synth.traffic.kinematics import DECISION_STEPS, HARDEST_BRAKING, PERIOD, Tracks, Wheels, step
+from deepaccident_devkit.synth.traffic.perception import Alarm, Bodies, leaders
+from deepaccident_devkit.synth.traffic.rights import Rights, waiting_gap
 from deepaccident_devkit.synth.traffic.signals import AMBER, GREEN, SignalPlan
-from deepaccident_devkit.synth.traffic.tracks import Tracks
 from deepaccident_devkit.synth.traffic.users import RoadUser, temper_of
-from deepaccident_devkit.synth.traffic.yielding import waiting_gap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -13,7 +13,7 @@ from deepaccident_devkit.arrays import AnyArray, Float32Array, IntArray
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.synth.sensors.agents import Camera
 from deepaccident_devkit.synth.sensors.scene import Scene
-from deepaccident_devkit.synth.sensors.windows import nearest_movers
+from deepaccident_devkit.synth.sensors.visibility import nearest_movers
 
 _SUBPIXELS = ((-0.25, -0.25), (0.25, 0.25))
 """Offsets of the rays of a pixel on an outline, pixels."""

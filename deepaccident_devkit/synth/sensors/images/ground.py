@@ -9,9 +9,8 @@ from deepaccident_devkit.synth import roads
 from deepaccident_devkit.synth.roads import MAP_CELLS, MAP_EXTENT, GroundMap
 from deepaccident_devkit.synth.sensors.images.light import Light
 from deepaccident_devkit.synth.sensors.images.shadows import above_ground, with_shadows
-from deepaccident_devkit.synth.sensors.placing import moved
 from deepaccident_devkit.synth.sensors.scene import Scene
-from deepaccident_devkit.synth.sensors.setting import Setting
+from deepaccident_devkit.synth.sensors.setting import Setting, moved
 
 _COLORS = {
     roads.TERRAIN: (126, 134, 100),

@@ -1,11 +1,14 @@
-"""Light of headlamps on the ground and on what is low above it, at dusk and at night."""
+"""Lamps: light of headlamps on the ground and on what is low above it, and which lamps of the traffic lights shine."""
+
+from collections.abc import Mapping
 
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, Float32Array
-from deepaccident_devkit.synth.roads import MAP_EXTENT
+from deepaccident_devkit.synth.roads import MAP_EXTENT, Arm
 from deepaccident_devkit.synth.sensors.scene import Scene
-from deepaccident_devkit.synth.stage import LANTERN_COLOR
+from deepaccident_devkit.synth.solids import Color
+from deepaccident_devkit.synth.stage import LAMP_COLORS, LANTERN_COLOR, World
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 _CELLS = 600
@@ -72,3 +75,14 @@ def _around(x: float, y: float, reach: float) -> tuple[slice, slice, AnyArray, A
         for span, middle in ((rows, y), (columns, x))
     )
     return rows, columns, east[None, :], north[:, None]
+
+
+def lit_lamps(world: World, signals: Mapping[Arm, int]) -> dict[int, Color]:
+    """Rows of the lamps among `World.props` that shine, and their colours.
+
+    Args:
+        world: where the lights stand.
+        signals: of each arm: 0 red, 1 amber, 2 green, as in `traffic.signals`; arms that are not there are dark.
+    """
+    states = {head: signals[head.arm] for head in world.signals if head.arm in signals}
+    return {head.rows[state]: LAMP_COLORS[state] for head, state in states.items()}

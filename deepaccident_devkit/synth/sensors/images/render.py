@@ -12,14 +12,11 @@ from deepaccident_devkit.synth.sensors.caster import GROUND
 from deepaccident_devkit.synth.sensors.images.buffers import Buffers, look, ray_directions, slopes
 from deepaccident_devkit.synth.sensors.images.facades import facades_of
 from deepaccident_devkit.synth.sensors.images.ground import ground_of, still_ground
-from deepaccident_devkit.synth.sensors.images.lamplight import lamplight
-from deepaccident_devkit.synth.sensors.images.light import light_of
+from deepaccident_devkit.synth.sensors.images.lamplight import lamplight, lit_lamps
+from deepaccident_devkit.synth.sensors.images.light import light_of, make_sky, rain_streaks
 from deepaccident_devkit.synth.sensors.images.paint import moving_palette, packed, still_palette
-from deepaccident_devkit.synth.sensors.images.rain import rain_streaks
 from deepaccident_devkit.synth.sensors.images.shading import Surroundings, shade
-from deepaccident_devkit.synth.sensors.images.signals import lit_lamps
-from deepaccident_devkit.synth.sensors.images.sky import make_sky
-from deepaccident_devkit.synth.sensors.images.wall_shadows import wall_shadows
+from deepaccident_devkit.synth.sensors.images.shadows import wall_shadows
 from deepaccident_devkit.synth.sensors.scene import Scene
 from deepaccident_devkit.synth.sensors.setting import Setting
 

@@ -11,10 +11,9 @@ from deepaccident_devkit.synth.sensors.images.buffers import Rays
 from deepaccident_devkit.synth.sensors.images.facades import Facades, on_facades, windows_on
 from deepaccident_devkit.synth.sensors.images.ground import Ground
 from deepaccident_devkit.synth.sensors.images.lamplight import light_at
-from deepaccident_devkit.synth.sensors.images.light import Light
+from deepaccident_devkit.synth.sensors.images.light import Light, Sky
 from deepaccident_devkit.synth.sensors.images.paint import FACADE, SHINES, Colors
-from deepaccident_devkit.synth.sensors.images.sky import Sky
-from deepaccident_devkit.synth.sensors.images.wall_shadows import WallShadows, shadows_on
+from deepaccident_devkit.synth.sensors.images.shadows import WallShadows, shadows_on
 
 _COARSER = (1.0, 4.0)
 """Metres of ground that a pixel spans, from which on the coarser pictures of the ground are looked up."""

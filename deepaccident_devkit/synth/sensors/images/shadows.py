@@ -1,9 +1,16 @@
-"""Shadows on the ground."""
+"""Shadows on the ground, and on façades that face the sun."""
+
+from dataclasses import dataclass
 
 import numpy as np
 
-from deepaccident_devkit.arrays import ByteArray, FloatArray, IntArray
+from deepaccident_devkit.arrays import ByteArray, Float32Array, FloatArray, IntArray
 from deepaccident_devkit.synth.roads import MAP_CELLS, MAP_EXTENT, MAP_RESOLUTION, Terrain
+from deepaccident_devkit.synth.sensors.caster import NOTHING
+from deepaccident_devkit.synth.sensors.images.facades import Facades, OnFacades
+from deepaccident_devkit.synth.sensors.images.light import Light
+from deepaccident_devkit.synth.sensors.images.paint import Colors
+from deepaccident_devkit.synth.sensors.setting import Setting
 
 
 def with_shadows(picture: ByteArray, corners: FloatArray, to_sun: FloatArray, brightness: float) -> ByteArray:
@@ -45,3 +52,93 @@ def _outlines(corners: FloatArray, to_sun: FloatArray) -> IntArray:
     fallen: FloatArray = corners[..., :2] - np.maximum(corners[..., 2:], 0.0) * (to_sun[:2] / to_sun[2])
     cells: IntArray = np.floor((fallen + MAP_EXTENT) / MAP_RESOLUTION).astype(np.int64)
     return cells
+
+
+_CELL = 0.4
+"""Metres of a façade from ray to ray to the sun."""
+_OFF = 0.05
+"""Metres before the wall where these begin."""
+_AT_ONCE = 32000
+"""Points to look up in one call: OpenCV takes no wider picture."""
+_GRAZING = 0.02
+"""Cosine of the angle at which the sun has to meet a façade to be looked for."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WallShadows:
+    """How much sun reaches the façades.
+
+    Attributes:
+        lit: (R, C) uint8, 0 in the shadow to 255 in the sun; a first column in the sun, then those of one façade after
+            another, with a further one at either end; rows upwards.
+        column: (F,) float32, where among these each face begins; 0 for those that are not looked at.
+        density: (F,) float32, columns a metre.
+    """
+
+    lit: ByteArray
+    column: Float32Array
+    density: Float32Array
+
+
+def wall_shadows(setting: Setting, facades: Facades, light: Light) -> WallShadows:
+    """The shadows on the façades of what stands still."""
+    normals, _ = setting.still.planes
+    sunny = np.flatnonzero((facades.length > 0) & (normals @ light.to_sun > _GRAZING))
+    column, density = np.zeros((2, len(normals)), dtype=np.float32)
+    if not len(sunny):
+        return WallShadows(np.full((1, 1), 255, dtype=np.uint8), column, density)
+    counts = np.ceil(facades.length[sunny] / _CELL).astype(np.int64)
+    density[sunny] = counts / facades.length[sunny]
+    first = 1 + (counts + 2).cumsum() - (counts + 2)
+    column[sunny] = first + 0.5
+    lit = _sun_on(setting, light, sunny, counts)
+    return WallShadows(np.concatenate([np.full((len(lit), 1), 255, dtype=np.uint8), lit], axis=1), column, density)
+
+
+def _sun_on(setting: Setting, light: Light, faces: IntArray, counts: IntArray) -> ByteArray:
+    """Which cells of façades the sun reaches, (R, all of `counts` and two more each) uint8, 0 or 255."""
+    quads, normals = setting.still.quads[faces], setting.still.planes[0][faces]
+    along, foot, top = quads[..., :2].sum(axis=2), quads[..., 2].min(axis=1), quads[..., 2].max(axis=1)
+    every = np.arange(len(faces))
+    first, last = quads[every, along.argmin(axis=1)], quads[every, along.argmax(axis=1)]
+    strips = counts + 2
+    which = np.repeat(every, strips)
+    cell = (np.arange(len(which)) - np.repeat(strips.cumsum() - strips, strips) - 1).clip(0, counts[which] - 1)
+    share = (cell + 0.5) / counts[which]
+    places = first[which] + (last - first)[which] * share[:, None] + normals[which] * _OFF
+    rows = int(np.ceil((top - foot).max() / _CELL))
+    points = np.broadcast_to(places, (rows, *places.shape)).copy()
+    points[..., 2] = foot[which] + (np.arange(rows)[:, None] + 0.5) * _CELL
+    rays = np.broadcast_to(light.to_sun.astype(np.float32), (points.size // 3, 3))
+    _, met = setting.caster.cast(points.reshape(-1, 3), rays)
+    return np.where(met == NOTHING, np.uint8(255), np.uint8(0)).reshape(rows, -1)
+
+
+def shadows_on(picture: ByteArray, places: OnFacades, shadows: WallShadows, colors: Colors) -> None:
+    """Darken the façades that pixels show where the sun does not reach them, in place.
+
+    Args:
+        picture: (R, C, 3).
+        places: the pixels that show façades.
+        shadows: on these.
+        colors: of the faces.
+    """
+    import cv2
+
+    if shadows.lit.size == 1:
+        return
+    column = places.across * shadows.density[places.face] + shadows.column[places.face]
+    row = places.up * np.float32(1 / _CELL) - np.float32(0.5)
+    seen = np.empty(len(row), dtype=np.uint8)
+    for start in range(0, len(row), _AT_ONCE):
+        block = slice(start, start + _AT_ONCE)
+        found = cv2.remap(
+            shadows.lit, column[None, block], row[None, block], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        seen[block] = np.asarray(found)[0]
+    flat = picture.reshape(-1, 3)
+    dark, edge = np.flatnonzero(seen == 0), np.flatnonzero((seen > 0) & (seen < 255))
+    flat[places.pixel[dark]] = colors.shaded[places.face[dark]]
+    weight = seen[edge, None] / np.float32(255)
+    mixed = flat[places.pixel[edge]] * weight + colors.shaded[places.face[edge]] * (1 - weight)
+    flat[places.pixel[edge]] = mixed.astype(np.uint8)

@@ -7,7 +7,7 @@ from deepaccident_devkit.synth.sensors.caster import GROUND, NOTHING
 from deepaccident_devkit.synth.sensors.images.buffers import look, ray_directions, slopes
 from deepaccident_devkit.synth.sensors.images.facades import facades_of, on_facades
 from deepaccident_devkit.synth.sensors.images.light import light_of
-from deepaccident_devkit.synth.sensors.images.wall_shadows import wall_shadows
+from deepaccident_devkit.synth.sensors.images.shadows import wall_shadows
 from deepaccident_devkit.synth.solids import FACES_A_SOLID, FRONT, REAR, Block
 from deepaccident_devkit.taxonomy import TIMES_OF_DAY, WEATHERS
 

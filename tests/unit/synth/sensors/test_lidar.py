@@ -10,9 +10,11 @@ from deepaccident_devkit.synth.sensors.lidar import (
     _cast_all,
     _returns,
     intensity,
+    ray_directions,
+    rays_through,
+    rays_to_boxes,
     scan,
 )
-from deepaccident_devkit.synth.sensors.turn import ray_directions, rays_through, rays_to_boxes
 from deepaccident_devkit.synth.solids import Block
 
 DRY, RAIN = AIR_OF_WEATHER["Clear"], AIR_OF_WEATHER["HardRain"]

@@ -5,7 +5,7 @@ import pytest
 
 from deepaccident_devkit.synth.sensors.images.buffers import ray_directions as camera_rays
 from deepaccident_devkit.synth.sensors.images.buffers import slopes
-from deepaccident_devkit.synth.sensors.turn import AZIMUTHS, CHANNELS, turned_rays
+from deepaccident_devkit.synth.sensors.lidar import AZIMUTHS, CHANNELS, turned_rays
 
 KINDS = ("lidar", "camera")
 

@@ -7,8 +7,7 @@ import pytest
 
 from deepaccident_devkit.synth.bodies import random_body
 from deepaccident_devkit.synth.roads import Junction, RoadSpec, straight
-from deepaccident_devkit.synth.traffic.users import RoadUser
-from deepaccident_devkit.synth.traffic.ways import lane_span
+from deepaccident_devkit.synth.traffic.users import RoadUser, lane_span
 
 
 @lru_cache(maxsize=8)

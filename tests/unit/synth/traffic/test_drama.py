@@ -9,7 +9,7 @@ from deepaccident_devkit.synth.roads import Junction
 from deepaccident_devkit.synth.spec import DESIGNS, draw
 from deepaccident_devkit.synth.traffic.casting import WARM_UP
 from deepaccident_devkit.synth.traffic.drama import perform_accident, perform_twin, set_stage
-from deepaccident_devkit.synth.traffic.touching import least_gap, touching_pairs
+from deepaccident_devkit.synth.traffic.impact import least_gap, touching_pairs
 
 SEEDS = range(4)
 ANGLES = {

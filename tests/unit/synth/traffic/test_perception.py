@@ -1,8 +1,10 @@
 import numpy as np
 import pytest
 
-from deepaccident_devkit.synth.traffic.perception import Bodies, leaders
-from deepaccident_devkit.synth.traffic.tracks import Tracks
+from deepaccident_devkit.synth.traffic.kinematics import Tracks
+from deepaccident_devkit.synth.traffic.perception import Alarm, Bodies, leaders
+from deepaccident_devkit.synth.traffic.rights import find_rights
+from deepaccident_devkit.synth.traffic.simulate import simulate
 
 SEES = ~np.eye(2, dtype=bool)
 
@@ -52,3 +54,51 @@ def test_one_sees_round_its_own_bend(driver):
     gap, _ = look(users)
     along = exit_gap - turning.start - (turning.body.size[0] + users[1].body.size[0]) / 2
     assert gap[0] == pytest.approx(along, abs=0.5)
+
+
+SIZE = np.array([[4.0, 2.0], [4.0, 2.0]])
+BYSTANDER = [50.0, 50.0, 0.0]
+
+
+def crossing_poses(seconds):
+    """Two at right angles and one who stands aside; they touch in so many seconds, at 10 m/s each."""
+    back = 10.0 * seconds
+    poses = np.array([BYSTANDER, [-2.0 - back, 0.0, 0.0], [1.0, -3.0 - back, np.pi / 2]])
+    return poses, np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]])
+
+
+def alarm(*alert):
+    return Alarm(np.array([1, 2]), SIZE, np.array(alert))
+
+
+@pytest.mark.parametrize("seconds", [0.13, 0.27, 0.44])
+def test_each_notices_the_contact_so_long_before_it(seconds):
+    found = alarm(0.4, 0.2).rows(*crossing_poses(seconds)).tolist()
+    assert found == [row for row, alert in ((1, 0.4), (2, 0.2)) if seconds < alert]
+
+
+def test_one_who_is_never_alert_notices_nothing():
+    assert alarm(0.0, 0.0).rows(*crossing_poses(0.0)).tolist() == []
+
+
+def test_who_has_noticed_brakes_until_the_end():
+    both = alarm(0.2, 0.6)
+    assert both.rows(*crossing_poses(0.13)).tolist() == [1, 2]
+    assert both.rows(*crossing_poses(0.44)).tolist() == [1, 2]
+    assert both.rows(*crossing_poses(5.0)).tolist() == [1, 2]
+
+
+def test_nobody_notices_one_who_comes_from_behind():
+    poses = np.array([BYSTANDER, [0.0, 0.0, 0.0], [-6.0, 0.0, 0.0]])
+    assert alarm(1.0, 1.0).rows(poses, np.array([[0.0, 0.0], [2.0, 0.0], [12.0, 0.0]])).tolist() == [2]
+
+
+@pytest.mark.parametrize("alert", [0.0, 0.3])
+def test_in_a_simulation_only_the_alert_one_is_slower_at_the_impact(driver, alert):
+    users = [driver("west", alert=alert), driver("south")]
+    run = simulate(users, begin=0.0, end=12.0, rights=find_rights(users, blind=(0, 1)), watched=(0, 1))
+    assert run.contact is not None
+    speed = run.states[:, :2, 3]
+    lost = speed.max(axis=0) - speed[-1]
+    assert (lost[0] > 0.5) == (alert > 0)
+    assert lost[1] < 0.01
