@@ -50,8 +50,8 @@ class Labels:
         center: (N, 3) float64, metres, box centre in the agent's LiDAR frame.
         size: (N, 3) float64, full length, width, height, metres.
         yaw: (N,) float64, radians about z in the LiDAR frame.
-        velocity: (N, 2) float64, m/s, as the label says; NaN where the label's is NaN or infinite. Its frame is
-            doubtful (format.md): the LiDAR's by its author's word, the world's for the agent's own row.
+        velocity: (N, 2) float64, m/s, as the label says; NaN where the label's is NaN or infinite. The world's, turned
+            once more by `yaw` (`world_from_label_velocity`).
         actor_id: (N,) int64; −100 the recording agent, −1 untracked, from 20000 on parked.
         num_lidar_pts: (N,) int64.
         camera_visible: (N,) bool.
