@@ -91,6 +91,7 @@ CODES: dict[str, Code] = {
     "pose-tilted": Code("warning", "An agent leans by more than 45°.", _RESTORE),
     "pose-jump": Code("warning", "An agent's path has a jump that no vehicle can make.", _RESTORE),
     # labels
+    "label-cut": Code("warning", "A label ends within a class: boxes may be missing.", _RESTORE_ONE),
     "own-row-missing": Code("warning", "A vehicle's label lacks its own row (id −100).", _RESTORE_ONE),
     "own-row-odd": Code("warning", "A label has several own rows, or a pole has one.", _RESTORE_ONE),
     "own-box-off": Code(

@@ -50,6 +50,16 @@ def check_labels(subject: Subject) -> Iterator[Finding]:
         yield from check(subject)
 
 
+def _cut_files(subject: Subject) -> Iterator[Finding]:
+    """Labels that end within a class: readers skip lines of one word, so that nothing else shows the cut."""
+    for agent in subject.files.scan.labelled:
+        for frame in range(1, subject.num_frames + 1):
+            path = subject.files.scenario.label_path(agent, frame)
+            words = path.read_bytes().rpartition(b"\n")[2].decode("ascii", errors="replace").split()
+            if len(words) == 1 and any(name.startswith(words[0]) for name in CATEGORIES):
+                yield subject.finding("label-cut", str(path), f"its last line is cut off after '{words[0]}'")
+
+
 def _ids(subject: Subject) -> Iterator[Finding]:
     label_id = subject.label_id
     odd = (label_id < UNTRACKED_ID) & (label_id != OWN_ACTOR_ID) | (label_id >= MOST_ACTOR_ID)
@@ -183,6 +193,7 @@ def _repeated(keys: AnyArray) -> BoolArray:
 
 
 _CHECKS: tuple[Callable[[Subject], Iterator[Finding]], ...] = (
+    _cut_files,
     _ids,
     _same_places,
     _sizes_and_points,
