@@ -462,7 +462,7 @@ class Dataset:
         elif velocity == "derived":
             columns["velocity"] = self._derived_velocity(sample_row)
         elif velocity != "decoded":
-            raise ChoiceError(f"velocity: expected one of {', '.join(get_args(VelocitySource))}, found {velocity!r}")
+            raise ChoiceError(f"velocity: expected 'decoded', 'derived' or 'label', found {velocity!r}")
         return trusted_boxes("lidar", columns)
 
     def _derived_velocity(self, sample_row: int) -> FloatArray:

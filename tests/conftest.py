@@ -46,10 +46,10 @@ def pytest_configure(config: pytest.Config) -> None:
 def release_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A synthetic release in layout A with all sensors; read-only by agreement. The path has a blank in it.
 
-    In its accidents ego and other collide, as designed.
+    In its accidents ego and other collide, as designed. Its labels count the very points of its clouds.
     """
     root = tmp_path_factory.mktemp("synthetic") / "deep accident"
-    config = SynthConfig(scenarios=4, frames=6, image_size=(64, 36), layout="A", seed=3, unplanned=0)
+    config = SynthConfig(scenarios=4, frames=6, image_size=(64, 36), layout="A", seed=3, unplanned=0, exact=True)
     return make_release(root, config, workers=2)
 
 

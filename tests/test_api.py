@@ -90,7 +90,7 @@ def test_unknown_tables_fields_channels_and_frames(da: DeepAccident) -> None:
         da.boxes(sample, "camera")
     with pytest.raises(ChoiceError, match="visible: expected None, 'camera' or 'released'"):
         da.boxes(sample, visible="lidar")  # type: ignore[arg-type]
-    with pytest.raises(ChoiceError, match="velocity: expected 'derived' or 'label'"):
+    with pytest.raises(ChoiceError, match="velocity: expected 'decoded', 'derived' or 'label'"):
         da.boxes(sample, velocity="mine")  # type: ignore[arg-type]
     with pytest.raises(ChoiceError, match="split: expected one of train, val, test"):
         da.split_scenarios("training")
