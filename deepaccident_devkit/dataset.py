@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
-from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
+from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import SE3, Box, Boxes, LidarPointCloud
 from deepaccident_devkit.geometry.boxes import trusted_boxes
 from deepaccident_devkit.geometry.se3 import stored_transforms, trusted_se3
-from deepaccident_devkit.release import BevImage, read_bev, read_image, read_lidar, read_split_file
-from deepaccident_devkit.tables import (
-    Problem,
-    Table,
-    Tables,
-    displacement_velocities,
-    table_names,
-    visible_ids,
-    visible_mask,
-)
+from deepaccident_devkit.release import BevImage, read_bev, read_image, read_lidar
+from deepaccident_devkit.tables import OpenTables, RowArgument, displacement_velocities, visible_ids, visible_mask
+from deepaccident_devkit.tables.opened import token_of
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     BEV_CAMERA,
@@ -31,227 +22,20 @@ from deepaccident_devkit.taxonomy import (
     CHANNELS,
     INFRASTRUCTURE,
     LIDAR,
-    MINI_SPLITS,
     OWN_ACTOR_ID,
-    SPLITS,
     UNTRACKED_ID,
     Frame,
-    OnError,
 )
 
-if TYPE_CHECKING:
-    from deepaccident_devkit.tables import records
+__all__ = ["Dataset", "RowArgument", "VelocitySource", "Visible"]
 
-RowArgument = str | Mapping[str, Any]
-"""How a row is named wherever the API takes one: by its token, or by its record."""
 Visible = Literal["camera", "released"]
 VelocitySource = Literal["decoded", "derived", "label"]
 _FRAMES = frozenset((*get_args(Frame), *CHANNELS))
 
 
-class Dataset:
-    """One release: its tables, boxes, poses and sensor files.
-
-    Attributes:
-        dataroot: the release's folder.
-        version: `v1` or `v1-mini`.
-        layout: how the release lies on disk: `A`, `B` or `A+B` (format.md).
-        problems: the broken scenarios that were left out (`on_error='skip'`).
-    """
-
-    dataroot: Path
-    version: str
-    layout: str
-    problems: tuple[Problem, ...]
-
-    def __init__(
-        self,
-        *,
-        dataroot: Path,
-        version: str,
-        layout: str,
-        split_files: Mapping[str, Path],
-        tables_folder: Path,
-        problems: tuple[Problem, ...] = (),
-    ) -> None:
-        """Open the tables of an index; raises IndexStoreError if they cannot be read."""
-        self.dataroot = dataroot
-        self.version = version
-        self.layout = layout
-        self.problems = problems
-        self._split_files = dict(split_files)
-        self._tables = Tables(tables_folder)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle paths, not tables: the copy opens the same files again."""
-        return _reopened, (
-            type(self),
-            {
-                "dataroot": self.dataroot,
-                "version": self.version,
-                "layout": self.layout,
-                "split_files": self._split_files,
-                "tables_folder": self.tables_folder,
-                "problems": self.problems,
-            },
-        )
-
-    @property
-    def tables_folder(self) -> Path:
-        """The folder of the index's tables."""
-        return self._tables.folder
-
-    # tables
-
-    @property
-    def table_names(self) -> list[str]:
-        """The names of the tables."""
-        return table_names()
-
-    @property
-    def scenario(self) -> Table[records.ScenarioRecord]:
-        """Recordings."""
-        return self._tables.table("scenario")
-
-    @property
-    def agent(self) -> Table[records.AgentRecord]:
-        """Recorders of each scenario."""
-        return self._tables.table("agent")
-
-    @property
-    def frame(self) -> Table[records.FrameRecord]:
-        """Moments of each scenario."""
-        return self._tables.table("frame")
-
-    @property
-    def sample(self) -> Table[records.SampleRecord]:
-        """Agents at moments."""
-        return self._tables.table("sample")
-
-    @property
-    def sample_data(self) -> Table[records.SampleDataRecord]:
-        """Sensor files."""
-        return self._tables.table("sample_data")
-
-    @property
-    def sensor(self) -> Table[records.SensorRecord]:
-        """Kinds of sensors."""
-        return self._tables.table("sensor")
-
-    @property
-    def calibrated_sensor(self) -> Table[records.CalibratedSensorRecord]:
-        """Sensors on agents."""
-        return self._tables.table("calibrated_sensor")
-
-    @property
-    def ego_pose(self) -> Table[records.EgoPoseRecord]:
-        """Poses of agents."""
-        return self._tables.table("ego_pose")
-
-    @property
-    def instance(self) -> Table[records.InstanceRecord]:
-        """Actors of each scenario."""
-        return self._tables.table("instance")
-
-    @property
-    def annotation(self) -> Table[records.AnnotationRecord]:
-        """Boxes."""
-        return self._tables.table("annotation")
-
-    @property
-    def track(self) -> Table[records.TrackRecord]:
-        """Actors at moments, in world."""
-        return self._tables.table("track")
-
-    @property
-    def category(self) -> Table[records.CategoryRecord]:
-        """Classes of road users."""
-        return self._tables.table("category")
-
-    def get(self, table: str, token: RowArgument) -> dict[str, Any]:
-        """The record of a token, as a fresh dict; raises TableError or TokenError."""
-        record: dict[str, Any] = self._tables.table(table).get(_token(token))
-        return record
-
-    def getind(self, table: str, token: RowArgument) -> int:
-        """The row of a token; raises TableError or TokenError."""
-        return self._tables.table(table).row(_token(token))
-
-    def field2token(self, table: str, field: str, query: Any) -> list[str]:
-        """The tokens of all rows of a table whose field equals `query`; raises TableError or FieldError."""
-        return self._tables.table(table).tokens_where(field, query)
-
-    def arrow(self, table: str) -> Any:
-        """A table as `pyarrow.Table`, without copying; `…_row` columns hold row numbers instead of tokens."""
-        return self._tables.table(table).arrow
-
-    def columns(self, table: str) -> Mapping[str, Any]:
-        """A table's stored columns by name as read-only arrays, without copying; raises TableError.
-
-        Numbers are numpy views (row keys, choices as codes, null as −1 or NaN), words Arrow arrays.
-        """
-        return self._tables.views[self._tables.table(table).name]
-
-    def get_sample(self, scenario: RowArgument, agent: str, frame: int) -> records.SampleRecord:
-        """The sample of an agent at frame number `frame` (from 1) of a scenario; raises TokenError."""
-        if not isinstance(frame, int | np.integer):
-            raise TokenError(f"frame: expected a number from 1, found {frame!r}")
-        return self.sample.get(f"{_token(scenario)}/{agent}/{frame:03d}")
-
-    def samples_of(self, frame: RowArgument) -> list[records.SampleRecord]:
-        """The samples of one moment, one for each agent that is there, in the order of `taxonomy.AGENTS`."""
-        row = self.frame.row(_token(frame))
-        record = self.frame[row]
-        scenario_row = self.scenario.row(record["scenario_token"])
-        agents = self._tables.resolver.agents_of(scenario_row).values()
-        return [self.sample[self._tables.resolver.sample_at(agent, record["index"])] for agent in agents]
-
-    def split_scenarios(self, split: str | os.PathLike[str], *, missing: OnError = "raise") -> set[str]:
-        """The tokens of this release's scenarios that belong to a split.
-
-        Args:
-            split: `train`, `val`, `test`, `train_mini` or `val_mini`: those of it that are here. Or a split file of
-                your own, as a path object or a text that ends in `.txt`: blank lines, CRLF and a byte order mark are
-                fine, the same scenario in two lines is a fault.
-            missing: a file's scenarios that are not in this release: `raise`, or `skip` them.
-
-        Raises:
-            ChoiceError: no such split, or no such way with the missing.
-            NotAvailableError: nothing says which scenario belongs where: no split file, and no split folders; or
-                scenarios of your file are not in this release.
-            MissingFileError: there is no such file.
-            SplitFileError: your file is none: a line has not two words, or a scenario stands twice.
-        """
-        if missing not in get_args(OnError):
-            raise ChoiceError(f"missing: expected one of {', '.join(get_args(OnError))}, found {missing!r}")
-        if not isinstance(split, str | os.PathLike):
-            raise ChoiceError(f"split: expected the name of one, or the path of a split file, found {split!r}")
-        if not isinstance(split, str) or split.endswith(".txt"):
-            return self._listed_scenarios(Path(split).expanduser(), missing)
-        if split in MINI_SPLITS:
-            if split not in self._split_files:
-                raise NotAvailableError(f"{self.dataroot}: has no {split}.txt; put the release's split files there")
-            return set(read_split_file(self._split_files[split])) & set(self._tables.resolver.scenario_tokens)
-        if split not in SPLITS:
-            raise ChoiceError(f"split: expected one of {', '.join((*SPLITS, *MINI_SPLITS))}, found {split!r}")
-        known = self._tables.views["scenario"]["split"]
-        if (known < 0).all():
-            raise NotAvailableError(
-                f"{self.dataroot}: the split of its scenarios is unknown: it has neither split files ({split}.txt) nor "
-                f"split folders ({split}/); put the release's split files into it"
-            )
-        return set(self.scenario.tokens_where("split", split))
-
-    def _listed_scenarios(self, path: Path, missing: OnError) -> set[str]:
-        listed = read_split_file(path, unique=True)
-        here = set(self._tables.resolver.scenario_tokens)
-        absent = [token for token in listed if token not in here]
-        if absent and missing == "raise":
-            raise NotAvailableError(
-                f"{path}: {len(absent)} of its {len(listed)} scenarios are not in {self.dataroot}: "
-                f"{', '.join(absent[:3])}{', …' if len(absent) > 3 else ''}; pass missing='skip' to go without them"
-            )
-        return here.intersection(listed)
+class Dataset(OpenTables):
+    """One release: its tables (`OpenTables`), poses, boxes and sensor files."""
 
     # poses
 
@@ -272,7 +56,7 @@ class Dataset:
         Raises:
             TokenError: no such sample or sensor.
         """
-        row = self.getind("sample_data", f"{_token(sample)}/{channel}")
+        row = self.getind("sample_data", f"{token_of(sample)}/{channel}")
         return trusted_se3(stored_transforms(self.columns("sample_data")["matrix"][row]))
 
     def frame_name(self, frame: str) -> str:
@@ -367,7 +151,7 @@ class Dataset:
 
     def get_sample_data_path(self, sample_data: RowArgument) -> Path:
         """The path of a sensor file, whether it is there or not; raises TokenError."""
-        return self.dataroot / self._tables.resolver.filename(self.sample_data.row(_token(sample_data)))
+        return self.dataroot / self._tables.resolver.filename(self.sample_data.row(token_of(sample_data)))
 
     def get_sample_data(self, sample_data: RowArgument) -> tuple[Path, list[Box], FloatArray | None]:
         """A sensor file's path, all boxes of its sample in the sensor's frame, and K (3, 3) of a camera.
@@ -377,7 +161,7 @@ class Dataset:
         Raises:
             TokenError: no such sensor file.
         """
-        row = self.sample_data.row(_token(sample_data))
+        row = self.sample_data.row(token_of(sample_data))
         sample_row, channel_code = divmod(row, len(CHANNELS))
         channel = CHANNELS[channel_code]
         intrinsic = None
@@ -398,7 +182,7 @@ class Dataset:
             SensorFileError: it cannot be read.
         """
         path = self.get_sample_data_path(sample_data)
-        channel = CHANNELS[self.sample_data.row(_token(sample_data)) % len(CHANNELS)]
+        channel = CHANNELS[self.sample_data.row(token_of(sample_data)) % len(CHANNELS)]
         if channel not in CAMERAS:
             raise ChoiceError(f"{channel} holds no images; the cameras are {', '.join(CAMERAS)}")
         return read_image(path)
@@ -433,7 +217,7 @@ class Dataset:
     # rows and columns beneath
 
     def _sample_row(self, sample: RowArgument) -> int:
-        return self._tables.resolver.row("sample", _token(sample))
+        return self._tables.resolver.row("sample", token_of(sample))
 
     def _channel_path(self, sample_row: int, channel: str) -> Path:
         row = sample_row * len(CHANNELS) + CHANNELS.index(channel)
@@ -519,18 +303,3 @@ class Dataset:
         channel = LIDAR if frame == "lidar" else frame
         sample_data_row = sample_row * len(CHANNELS) + CHANNELS.index(channel)
         return trusted_se3(pose @ stored_transforms(views["sample_data"]["matrix"][sample_data_row]))
-
-
-def _reopened(kind: type[Dataset], arguments: dict[str, Any]) -> Dataset:
-    """Undo `Dataset.__reduce__`, without looking for changes on disk."""
-    dataset = kind.__new__(kind)
-    Dataset.__init__(dataset, **arguments)
-    return dataset
-
-
-def _token(row: RowArgument) -> str:
-    """The token of a row named by token or record: said once for the whole API; raises TokenError."""
-    token = row.get("token") if isinstance(row, Mapping) else row
-    if not isinstance(token, str):
-        raise TokenError(f"expected a token or a record with one, found {row!r}")
-    return token

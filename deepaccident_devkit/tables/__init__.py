@@ -4,6 +4,7 @@ from deepaccident_devkit.tables.clearing import Cleared, clear_index
 from deepaccident_devkit.tables.findings import SEVERITIES, Finding, Severity
 from deepaccident_devkit.tables.index import Index, open_index
 from deepaccident_devkit.tables.manifest import Problem
+from deepaccident_devkit.tables.opened import OpenTables, RowArgument
 from deepaccident_devkit.tables.report import IndexInfo, IndexReport, index_report
 from deepaccident_devkit.tables.tables import Table, Tables, table_names
 from deepaccident_devkit.tables.velocities import displacement_velocities
@@ -16,7 +17,9 @@ __all__ = [
     "Index",
     "IndexInfo",
     "IndexReport",
+    "OpenTables",
     "Problem",
+    "RowArgument",
     "Severity",
     "Table",
     "Tables",
