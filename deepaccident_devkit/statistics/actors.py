@@ -91,13 +91,13 @@ def distances(selected: Selected) -> tuple[Histogram, QuantileTable]:
 
 
 def speeds(selected: Selected) -> tuple[Histogram, QuantileTable]:
-    """Horizontal speeds of actors that are not parked, once an actor and moment, by differences at 10 Hz."""
+    """Horizontal speeds of actors that are not parked, once an actor and moment, by the labels' velocities."""
     parked = selected.column("instance", "actor_id") >= STATIC_ACTOR_ID
     x, y = selected.column("track", "velocity")[:, :2].T
     speed = np.hypot(x, y)
     known: BoolArray = np.isfinite(speed)
     groups = np.where(parked[selected.column("track", "instance_row")], np.int8(-1), selected.group("track"))
-    what = "moments of actors that no agent saw in the frame before or after"
+    what = "moments of actors whose label has no velocity, and that no agent saw in the frame before or after"
     return _distribution(
         ("speeds", "Speed of actors that are not parked", "speed", "m/s"),
         "moments of actors",

@@ -28,10 +28,10 @@ def test_five_agents_win_on_the_demos_seed(da_hidden: DeepAccident) -> None:
 
 @pytest.mark.parametrize("seed", [1, 3])
 def test_five_agents_win_on_other_seeds(tmp_path: Path, seed: int) -> None:
-    """On maps the less, the more of the traffic is on the ego vehicle's own road."""
+    """On maps the less, the more of the traffic is parked, or on the ego vehicle's own road."""
     config = SynthConfig(scenarios=1, frames=30, sensors=False, view="hidden", seed=seed)
     root = make_release(tmp_path / "hidden", config, workers=1)
-    assert_five_agents_win(DeepAccident("v1", root, verbose=False), map_gain=5)
+    assert_five_agents_win(DeepAccident("v1", root, verbose=False), map_gain=3)
 
 
 def test_a_scenario_without_an_accident_is_refused(da_motion: DeepAccident) -> None:

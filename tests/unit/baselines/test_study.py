@@ -53,7 +53,7 @@ def test_noise_and_delay_make_it_worse(study: V2XStudy) -> None:
     for table, field in (("pose_noise", "pose_noise"), ("latency", "latency")):
         values = [row.metrics["iou_100"] for row in rows(study, table, agents="all")]
         assert values == sorted(values, reverse=True), field
-        assert values[0] > values[-1] + 5  # type: ignore[operator]
+        assert values[0] > values[-1] + 3  # type: ignore[operator]
 
 
 def test_the_same_samples_stand_in_all_rows(study: V2XStudy) -> None:

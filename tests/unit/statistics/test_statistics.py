@@ -152,10 +152,10 @@ def test_distances_leave_out_the_agents_own_row(of_tiny: DatasetStatistics) -> N
 def test_speeds_are_the_tracks(of_tiny: DatasetStatistics) -> None:
     quantiles, histogram = of_tiny.quantiles["speed_quantiles"], of_tiny.histograms["speeds"]
     assert quantiles.median("speed", "van") == pytest.approx(2.0)
-    assert quantiles.row("speed", "van").number == 4 + 35 + 2 + 2
+    assert quantiles.row("speed", "van").number == 4 + 35 + 2 + 2 + 1
     assert quantiles.row("speed", "car", "train").values == pytest.approx((0, 0, 0, 0, 10, 10, 10), abs=1e-9)
     assert histogram.left_out is not None
-    assert histogram.left_out.counts["train"] == 2  # ego and van of the scenario with one frame
+    assert histogram.left_out.counts["train"] == 0  # the scenario with one frame has its labels' velocities
 
 
 def test_the_pair_as_ego_sees_it(of_tiny: DatasetStatistics) -> None:
