@@ -16,8 +16,10 @@ LABEL_RANGE = 120.0
 """Actors up to here are annotated, metres over the ground from the LiDAR to the box's centre."""
 TRACKING_RANGE = 115.0
 """Actors beyond have no id."""
-COUNTED_LATER = 0.0015
+COUNTED_LATER = 0.003
 """Seconds from the point cloud to the boxes that its points are counted in: others who move have gone on by then."""
+MOST_AHEAD = 0.012
+"""Metres that they have gone on at most: with more, a fast one of whom only the back is seen would be off too much."""
 _PEDESTRIAN = CATEGORIES.index("pedestrian")
 
 
@@ -45,9 +47,8 @@ def annotate(scene: Scene, agent: Agent, world_from_ground: SE3, scan: Scan, *, 
         actor_id[agent.row] = OWN_ACTOR_ID
         agent_velocity[0] = world_velocity[agent.row]
         lidar_yaw[agent.row], lidar_velocity[agent.row] = 0.0, 0.0
-    later = 0.0 if exact else COUNTED_LATER
-    size = scene.actors.size[rows]
-    counted = Boxes.from_arrays(lidar_center[rows] + later * lidar_velocity[rows], size, lidar_yaw[rows], frame="lidar")
+    size, ahead = scene.actors.size[rows], np.zeros((len(rows), 3)) if exact else _ahead(lidar_velocity[rows])
+    counted = Boxes.from_arrays(lidar_center[rows] + ahead, size, lidar_yaw[rows], frame="lidar")
     return Labels(
         raw=False,
         num_boxes=np.array([len(rows)]),
@@ -61,6 +62,12 @@ def annotate(scene: Scene, agent: Agent, world_from_ground: SE3, scan: Scan, *, 
         num_lidar_pts=counted.count_points(scan.xyz),
         camera_visible=camera_visible(scene, agent, ground_from_lidar, rows),
     )
+
+
+def _ahead(velocity: FloatArray) -> FloatArray:
+    """How far those with velocities (N, 3) have gone on (N, 3), metres, when points are counted."""
+    way = COUNTED_LATER * velocity
+    return np.asarray(way * np.minimum(1.0, MOST_AHEAD / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)))
 
 
 def _in_order(scene: Scene, wanted: BoolArray) -> IntArray:
