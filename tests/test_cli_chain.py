@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 TASKS = {
     ("motion", "motion"): ("released", "paper"),
     ("accident", "motion"): ("released", "paper", "boxes"),

@@ -8,6 +8,8 @@ from nbclient import NotebookClient
 
 from deepaccident_devkit import DeepAccident
 
+pytestmark = pytest.mark.slow
+
 TUTORIALS = Path(__file__).parents[1] / "tutorials"
 LAST_WORDS = {
     "01_first_steps": "gap one frame before",

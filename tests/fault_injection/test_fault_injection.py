@@ -9,6 +9,8 @@ from fault_injection.mutations import BEYOND, HARMLESS, MUTATIONS
 from fault_injection.run import NUM_MUTATIONS, jobs
 from fault_injection.table import rows_of, verdicts_of
 
+pytestmark = pytest.mark.slow
+
 TABLE = Path(__file__).parents[2] / "docs" / "fault_table.md"
 
 

@@ -119,7 +119,7 @@ def test_velocities_in_another_frame_are_told_and_decoded(
     assert {scenario["velocity_frame"] for scenario in release.scenario} == {name}
     assert {scenario["token"]: scenario["velocity_frame"] for scenario in release.scenario} == report.velocity_frames
     for token, velocity in truth.items():
-        np.testing.assert_allclose(release.boxes(token).velocity[:, :2], velocity[:, :2], atol=5e-3)
+        np.testing.assert_allclose(release.boxes(token).velocity[:, :2], velocity[:, :2], atol=0.02)
 
 
 def test_velocities_of_no_frame_are_told(own_release: Path) -> None:
