@@ -5,6 +5,8 @@ evaluates them into bundles that others can check, and tells why a number is wha
 `runs.explanation`). `breakdown` sums by attribute; `metrics.warning` says how early accidents are warned of.
 """
 
+from typing import TYPE_CHECKING, Any
+
 from deepaccident_devkit.evaluation.metrics.accident import (
     AccidentContext,
     AccidentEvaluator,
@@ -34,7 +36,9 @@ from deepaccident_devkit.evaluation.metrics.segmentation import BevSegmentationE
 from deepaccident_devkit.evaluation.metrics.trajectories import match_trajectories
 from deepaccident_devkit.evaluation.metrics.warning import WarningEvaluator, WarningResult
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
-from deepaccident_devkit.evaluation.runs.many_samples import evaluate_samples
+
+if TYPE_CHECKING:
+    from deepaccident_devkit.evaluation.runs.many_samples import evaluate_samples
 
 __all__ = [
     "Accident",
@@ -78,3 +82,16 @@ __all__ = [
     "vpq",
     "vpq_counts",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Import `runs`, the uppermost room, when something of it is asked for: most who measure need none of it."""
+    if name != "evaluate_samples":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from deepaccident_devkit.evaluation.runs.many_samples import evaluate_samples
+
+    return evaluate_samples
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
