@@ -49,6 +49,7 @@ def test_nothing_else_was_imported():
 """
 
 
+@pytest.mark.slow
 def test_a_foreign_project_has_the_fixtures_in_both_layouts(foreign) -> None:
     (foreign.folder / "test_mine.py").write_text(FOREIGN)
     ran = foreign.pytest()
