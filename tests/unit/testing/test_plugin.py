@@ -1,5 +1,7 @@
 """The plugin in a pytest of somebody else: found by its entry point, slow at nothing, and to be turned off."""
 
+import pytest
+
 FOREIGN = """
 import pytest
 
