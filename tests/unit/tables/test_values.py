@@ -7,6 +7,7 @@ import pytest
 import tiny
 
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.release import read_calib, write_raw_calib
 
 FRAME_2 = f"{tiny.TOKEN}/ego_vehicle/002"
 
@@ -152,6 +153,24 @@ def test_cameras_are_optical_and_sit_where_calib_says(hand_made: DeepAccident) -
     data = hand_made.get("sample_data", f"{FRAME_2}/Camera_Back")
     assert (data["width"], data["height"]) == (1600, 900)
     assert hand_made.get("sample_data", f"{FRAME_2}/lidar01")["width"] is None
+
+
+@pytest.mark.parametrize(("shift", "rows"), [(0.0005, 1), (0.005, 2)])
+def test_a_sensor_has_one_row_where_rounding_alone_differs(tmp_path: Path, shift: float, rows: int) -> None:
+    """Half a millimetre is the release's jitter, half a centimetre a sensor that moved; matrices are exact in both."""
+    root = tiny.write_tiny_release(tmp_path)
+    path = root / tiny.TYPE / "ego_vehicle" / "calib" / tiny.NAME / f"{tiny.NAME}_003.pkl"
+    raw = read_calib(path, raw=True)
+    raw["lidar_to_ego"][0, 3] += shift
+    write_raw_calib(path, raw)
+    da = DeepAccident("v1", root, verbose=False)
+    tokens = [record["token"] for record in da.calibrated_sensor if record["agent_token"].endswith("/ego_vehicle")]
+    lidar = f"{tiny.TOKEN}/ego_vehicle/lidar01"
+    assert [token for token in tokens if token.startswith(lidar)] == [lidar, f"{lidar}/2"][:rows]
+    exact = [da.ego_from(f"{tiny.TOKEN}/ego_vehicle/{frame:03d}", "lidar01").translation[0] for frame in (1, 3)]
+    assert exact == [0.0, shift]
+    named = {finding.code for finding in da.findings(tiny.TOKEN)}
+    assert ("calib-changes" in named) == (rows == 2)
 
 
 def test_sensor_data_comes_with_boxes_in_the_sensors_frame(hand_made: DeepAccident, tmp_path: Path) -> None:
