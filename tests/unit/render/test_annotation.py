@@ -18,7 +18,7 @@ def test_an_annotation_is_shown_large_from_above_and_in_words(da: DeepAccident, 
     assert camera.get_title() == "Camera_Front"
     assert np.ptp(camera.get_xlim()) <= 64
     center = np.mean([above.get_xlim(), above.get_ylim()], axis=1)
-    np.testing.assert_allclose(center, boxes.center[row, :2])
+    np.testing.assert_allclose(center, boxes.center[row, :2], atol=1e-9)
     assert np.ptp(above.get_xlim()) == pytest.approx(16)
     text = "\n".join(one.get_text() for one in words.texts)
     length, width, height = boxes.size[row]
