@@ -8,9 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.geometry import quaternions
-from deepaccident_devkit.release.velocities import turned
-from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES, CHANNELS, LIDAR, VELOCITY_FRAMES
+from deepaccident_devkit.release import find_release
+from deepaccident_devkit.tables.boxes import world_centers
+from deepaccident_devkit.tables.build import read_scenario, scenario_boxes
+from deepaccident_devkit.tables.scan import scan_scenario
+from deepaccident_devkit.tables.velocities import decoded_velocities, displacement_velocities
+from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES, CHANNELS, VELOCITY_FRAMES
 
 HERE = Path(__file__).parent
 CONVENTIONS, BENCHMARKS = HERE / "conventions.md", HERE.parent / "benchmarks" / "README.md"
@@ -22,43 +25,32 @@ def main() -> None:
     """Write all tables into their pages."""
     with tempfile.TemporaryDirectory() as folder:
         dataset = DeepAccident("v1", sys.argv[1], index_dir=folder, verbose=False)
-        put(CONVENTIONS, "velocity-real", velocity_table(dataset))
+        put(CONVENTIONS, "velocity-real", velocity_table(Path(sys.argv[1])))
         put(CONVENTIONS, "calibration-real", calibration_table(dataset))
         put(BENCHMARKS, "index-real", index_table(dataset))
 
 
-def velocity_table(dataset: DeepAccident) -> str:
+def velocity_table(root: Path) -> str:
     """How far the labels' velocities, read in each frame, are from the displacements of the boxes that move."""
-    rows = [_errors(dataset, sample["token"]) for sample in dataset.sample]
-    category = np.concatenate([classes for classes, _ in rows])
+    scenario = find_release(root).scenarios[0]
+    files, _ = read_scenario(scenario, scan_scenario(scenario))
+    boxes = scenario_boxes(files)
+    label_id = boxes.labels.actor_id
+    moved = displacement_velocities(world_centers(boxes), boxes.agent, label_id, boxes.frame)
+    speed = np.linalg.norm(moved[:, :2], axis=1)
+    telling = (speed > LEAST_SPEED) & (label_id > 0)
+    category = boxes.labels.category[telling]
     lines = ["| read as | boxes | median error | within 10 % | " + " | ".join(CATEGORIES) + " |"]
     lines.append("| --- " * (4 + len(CATEGORIES)) + "|")
     for name, meaning in VELOCITY_FRAMES.items():
-        error = np.concatenate([errors[name] for _, errors in rows])
+        off = np.linalg.norm((decoded_velocities(boxes, moved, name) - moved)[telling, :2], axis=1)
+        error = off / speed[telling]
         shares = [error[category == code] < 0.1 for code in range(len(CATEGORIES))]
         by_class = " | ".join(f"{np.mean(share):.0%}" if len(share) else "–" for share in shares)
         lines.append(
             f"| {meaning} | {len(error):,} | {np.median(error):.1%} | {(error < 0.1).mean():.0%} | {by_class} |"
         )
     return "\n".join(lines)
-
-
-def _errors(dataset: DeepAccident, sample: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """The classes of a sample's moving, tracked boxes of others; their errors as shares of the speed, by frame."""
-    world, lidar = dataset.boxes(sample, velocity="derived"), dataset.boxes(sample, "lidar", velocity="label")
-    moved, said = world.velocity[:, :2], lidar.velocity[:, :2]
-    speed = np.linalg.norm(moved, axis=1)
-    telling = (speed > LEAST_SPEED) & (world.actor_id > 0)
-    heading = np.full(len(said), quaternions.yaw_of(dataset.world_from(sample, LIDAR).quaternion.elements[None])[0])
-    angles = {
-        "released": -lidar.yaw,
-        "lidar": heading,
-        "world": np.zeros(len(said)),
-        "turned-wrong": -heading,
-        "box": world.yaw,
-    }
-    off = {name: np.linalg.norm(turned(said, angle) - moved, axis=1) for name, angle in angles.items()}
-    return world.category[telling], {name: error[telling] / speed[telling] for name, error in off.items()}
 
 
 def calibration_table(dataset: DeepAccident) -> str:

@@ -29,6 +29,8 @@ _LEAST_SPEED = 1.0
 _FITS = (0.5, 0.15)
 """m/s, and as a share of the speed, within which a velocity fits."""
 _LEAST_SHARE = 0.5
+_AS_GOOD = 0.95
+"""Share of the best frame's boxes from which the release's own frame is taken instead."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,8 +47,13 @@ class VelocityFit:
 
     @property
     def best(self) -> str | None:
-        """The frame that fits most boxes; None if there are too few, or none fits half of them."""
+        """The frame that fits most boxes; None if there are too few, or none fits half of them.
+
+        The release's own counts where it fits nearly as many: on a straight road along x all frames are alike.
+        """
         name = max(self.fits, key=lambda frame: self.fits[frame])
+        if self.fits[RELEASED_VELOCITY_FRAME] >= _AS_GOOD * self.fits[name]:
+            name = RELEASED_VELOCITY_FRAME
         return name if self.boxes >= LEAST_BOXES and self.fits[name] >= _LEAST_SHARE * self.boxes else None
 
 
