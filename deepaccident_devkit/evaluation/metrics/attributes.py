@@ -21,6 +21,16 @@ TURNING: Final = "one_of_the_agents_turning"
 NO_IMPACT: Final = "no impact"
 
 
+def cluster_of(scenario: str) -> str:
+    """What an accident and its twin share, which show the same junction, traffic and weather: `type1_subtype1/Town03…`.
+
+    Args:
+        scenario: its token, `type1_subtype1_accident/Town03…`.
+    """
+    kind, _, name = scenario.partition("/")
+    return f"{kind.rpartition('_')[0]}/{name}"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScenarioAttributes:
     """What a scenario's name and meta file say, in the released evaluation's words (evaluation.md f); None unknown.
