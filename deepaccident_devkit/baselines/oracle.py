@@ -1,93 +1,22 @@
-"""What a set of agents knows of a moment, by the labels: the actors that they see, where these are and how they move.
-
-An oracle, since no detector is asked: every actor that the released rule calls seen (evaluation.md f) is known exactly,
-but for what the link between the agents does. Velocities are the labels', decoded.
-"""
+"""How fast the actors turn that a set of agents sees, by the labels; who these are says `v2x.seen`."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, FloatArray, FrozenArrays
+from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.geometry.boxes import concatenate
 from deepaccident_devkit.tables.tokens import sample_token
-from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, OWN_ACTOR_ID, AgentName
-from deepaccident_devkit.v2x import Agents, Link, cooperative_view
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.v2x import Agents, Link
+from deepaccident_devkit.v2x.seen import SeenActors, seen_actors
+
+__all__ = ["HISTORY", "SeenActors", "seen_actors", "turn_rates"]
 
 HISTORY: Final = 5
 """Recorded frames that turn rates look back, at most: 0.5 s."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SeenActors(FrozenArrays):
-    """Who is known at a sample; arrays are read-only.
-
-    Attributes:
-        boxes: N boxes, one an actor; the ego's own comes first and has the id −100, as in its label.
-        seen_by: (N,) uint8, bit mask over `taxonomy.AGENTS`: who sees it; of the ego, the ego.
-        own_actor_id: the ego's id among the actors; None for the pole, or where meta does not say.
-    """
-
-    boxes: Boxes
-    seen_by: AnyArray
-    own_actor_id: int | None
-
-    @property
-    def has_own(self) -> bool:
-        """Whether the ego has a box of its own: the pole has none."""
-        return bool((self.boxes.actor_id == OWN_ACTOR_ID).any())
-
-
-def seen_actors(
-    dataset: Dataset,
-    sample: RowArgument,
-    *,
-    agents: Agents = "single",
-    link: Link | None = None,
-    frame: str = "ego",
-) -> SeenActors:
-    """The actors that at least one of some agents sees at a sample's moment, and the ego itself.
-
-    A partner's box of itself does not count, as nowhere in the released rule: it is known if another of the agents
-    sees it. Untracked actors (−1) are never seen.
-
-    Args:
-        dataset: the release.
-        sample: token or record: its agent is the ego, its frame the present.
-        agents: who cooperates, as of `v2x.cooperating_agents`.
-        link: what happens to the partners' data; None for nothing. Nothing makes up for a delay: what moves lags.
-        frame: of the boxes: `ego`, `world`, `lidar` or a camera channel of the sample.
-
-    Raises:
-        TokenError: no such sample.
-        NotAvailableError: the sample has no label, or an agent is not in this (partial) release.
-        ChoiceError: no such agent, configuration or frame.
-        ConfigError: `link` is no Link, or its latency is longer than the scenario's past.
-    """
-    record = dataset.get("sample", sample)
-    if not record["labelled"]:
-        raise NotAvailableError(
-            f"{record['token']}: has no label (the test split ships without), so that an oracle knows nothing; choose "
-            "a labelled sample"
-        )
-    view = cooperative_view(dataset, sample, agents=agents, frame=frame, visible="released", link=link)
-    own_actor_id = dataset.get("agent", record["agent_token"])["actor_id"]
-    others = view.boxes.actor_id != (OWN_ACTOR_ID if own_actor_id is None else own_actor_id)
-    labelled = dataset.boxes(sample, frame)
-    own = labelled.select(np.flatnonzero(labelled.actor_id == OWN_ACTOR_ID)[:1])
-    ego: AgentName = record["agent"]
-    bits = np.full(len(own), 1 << AGENTS.index(ego), dtype=np.uint8)
-    return SeenActors(
-        boxes=concatenate([own, view.boxes.select(others)], own.frame),
-        seen_by=np.concatenate([bits, view.seen_by[others]]),
-        own_actor_id=own_actor_id,
-    )
 
 
 def turn_rates(

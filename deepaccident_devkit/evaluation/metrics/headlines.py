@@ -58,14 +58,14 @@ _ROWS: Final[Mapping[str, tuple[_Row, ...]]] = MappingProxyType(
         ),
         "accident": (
             _Row("apa", "apa", "share", "higher"),
+            _Row("precision", "precision", "share", "higher"),
+            _Row("recall", "recall", "share", "higher"),
+            _Row("false_alarm_rate", "false_alarm_rate", "share"),
+            _Row("average_precision", "average_precision", "share", "higher"),
             _Row("within/*/accuracy", "accuracy@*", "share", "higher"),
             _Row("id_error", "id_error", "share"),
             _Row("position_error", "position_error", "m"),
             _Row("time_error", "time_error", "s"),
-            _Row("precision", "precision", "share", "higher"),
-            _Row("recall", "recall", "share", "higher"),
-            _Row("average_precision", "average_precision", "share", "higher"),
-            _Row("false_alarm_rate", "false_alarm_rate", "share"),
             _Row("lateness", "lateness", "s", "neither"),
         ),
         "detection": (
@@ -77,10 +77,24 @@ _ROWS: Final[Mapping[str, tuple[_Row, ...]]] = MappingProxyType(
             _Row("class_average_precision/*", "AP *", "%", "higher"),
         ),
         "warning": (
+            _Row("groups/*/auc_ahead", "auc_ahead *", "share", "higher"),
+            _Row("groups/*/twin_wins", "twin_wins *", "share", "higher"),
+            _Row("groups/*/average_precision", "AP *", "share", "higher"),
+            _Row("groups/*/operating/precision", "precision *", "share", "higher"),
+            _Row("groups/*/operating/time_in_alarm", "time_in_alarm *", "share"),
+            _Row("groups/*/operating/recall", "recall *", "share", "higher"),
+            _Row("groups/*/operating/tta0", "tta0 *", "s", "higher"),
+            _Row("recording_precision", "recording_precision", "share", "higher"),
+            _Row("time_in_alarm/normal", "time_in_alarm normal", "share"),
             _Row("warned_share", "warned_share", "share", "higher"),
+            _Row("tta0", "tta0", "s", "higher"),
             _Row("mean_warning", "mean_warning", "s", "higher"),
             _Row("detection_rate/*", "detection_rate@*s", "share", "higher"),
+            _Row("time_in_alarm/accident", "time_in_alarm accident", "share"),
             _Row("false_alarms_per_minute/*", "false_alarms *", "1/min"),
+            _Row("figures/*/average_precision", "AP *", "share", "higher"),
+            _Row("figures/*/mean_time", "mTTA *", "s", "higher"),
+            _Row("figures/*/time_at_r80", "TTA@R80 *", "s", "higher"),
         ),
     }
 )
@@ -134,17 +148,14 @@ def value_text(value: float | None, unit: Unit, *, signed: bool = False) -> str:
 def _found(result: object, path: str) -> Iterator[tuple[str, Any]]:
     """Keys that stand for the `*` (an empty one without) and the values there."""
     head, _, rest = path.partition("/")
-    if not hasattr(result, head):
-        return
-    value: Any = getattr(result, head)
-    if not rest:
-        yield "", value
-        return
-    key, _, leaf = rest.partition("/")
-    for name, each in value.items():
-        text = f"{name:g}" if isinstance(name, float) else str(name)
-        if key in ("*", text):
-            yield text, getattr(each, leaf) if leaf else each
+    if isinstance(result, Mapping):
+        for name, each in result.items():
+            text = f"{name:g}" if isinstance(name, float) else str(name)
+            if head in ("*", text):
+                yield from ((text, value) for _, value in (_found(each, rest) if rest else [("", each)]))
+    elif hasattr(result, head):
+        value = getattr(result, head)
+        yield from _found(value, rest) if rest else [("", value)]
 
 
 def _known(value: float | None) -> float | None:

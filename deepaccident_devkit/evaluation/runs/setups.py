@@ -155,7 +155,7 @@ class SampleLoader:
             return self.detected(token, prediction, rules.frame), detection_truth(self.dataset, token, rules)
         if self.setup.task == "motion":
             return prediction, self.label(token)
-        context = accident_context(self.dataset, token, self.setup.horizon)
+        context = accident_context(self.dataset, token, self.setup.horizon, references=self.setup.task == "warning")
         return prediction, self.label(token), context
 
     def label_config(self) -> MotionLabelConfig | None:

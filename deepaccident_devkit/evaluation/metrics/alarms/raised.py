@@ -16,7 +16,7 @@ from deepaccident_devkit.evaluation.metrics.alarms.reading import (
     accident_of,
     match_tracks,
 )
-from deepaccident_devkit.evaluation.metrics.alarms.truth import BoxTruth
+from deepaccident_devkit.evaluation.metrics.alarms.truth import SLACK, BoxTruth
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, instances_of
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionLabelConfig, MotionLabels
@@ -72,6 +72,11 @@ def named_alarms(
     else:
         found = [(alarm, _named(alarm, truth, rules)) for alarm in prediction]
     return sorted((each for each in found if each[0].score >= rules.min_score), key=lambda each: by_sureness(each[0]))
+
+
+def within_horizon(alarms: list[NamedAlarm], truth: BoxTruth) -> list[NamedAlarm]:
+    """The alarms for no later than predictions look ahead, within half a recorded frame; others are none."""
+    return [each for each in alarms if each[0].time <= truth.horizon + SLACK]
 
 
 def by_sureness(alarm: Accident) -> tuple[Any, ...]:

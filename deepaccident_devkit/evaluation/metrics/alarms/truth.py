@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError, TokenError
+from deepaccident_devkit.evaluation.metrics.alarms.constant_velocity import constant_velocity_alarms
 from deepaccident_devkit.evaluation.metrics.alarms.reading import InstanceTracks
 from deepaccident_devkit.evaluation.metrics.predictions import Accident
 from deepaccident_devkit.geometry.footprints import gaps
-from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.taxonomy import FRAME_PERIOD, INFRASTRUCTURE, OWN_ACTOR_ID
+from deepaccident_devkit.v2x.seen import seen_actors
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
 RELEASED_HORIZON: Final = 2.0
@@ -24,6 +27,10 @@ SLACK: Final = FRAME_PERIOD / 2
 """Seconds: half a recorded frame, so that decimal moments compare as they are meant."""
 _MOVES: Final = 0.5
 """Metres that an actor covers in the window if it does more than stand."""
+Involvement = Literal["ego_involved", "bystander", "infrastructure"]
+"""Of the agent whose recording it is: one of the pair that collides, a vehicle that is not, or the roadside pole.
+Where nobody collides, of the pair of the twin; without a known twin `ego_vehicle` and `other_vehicle`, whom all designs
+lead to the impact, are taken for the pair."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -37,6 +44,7 @@ class BoxTruth(FrozenArrays):
             NaN where nobody annotated the actor.
         accident: what meta says will happen within the horizon: the pair at the impact; None if nothing does.
         impact: the same however far ahead; None also if it is beyond the horizon and no label shows one of the pair.
+        horizon: seconds that predictions look ahead: an alarm for later is none. Infinite if nothing bounds it.
     """
 
     time: FloatArray
@@ -44,6 +52,7 @@ class BoxTruth(FrozenArrays):
     footprint: FloatArray
     accident: Accident | None
     impact: Accident | None = None
+    horizon: float = math.inf
 
     def tracks(self, seconds: float, frames: int) -> InstanceTracks:
         """The actors' centres at so many frames, so many seconds apart, from the present on; NaN beyond the window."""
@@ -83,6 +92,10 @@ class BoxTruth(FrozenArrays):
         return int(self.actor_id[one]), int(self.actor_id[other])
 
 
+REFERENCES: Final = ("TTC < 3 s, true tracks", "TTC < 3 s, seen")
+"""Predictors that foresee what constant velocities lead to: of all actors as they are, and of those that the agent
+itself sees by the released rule."""
+_DESIGNED_PAIR: Final = ("ego_vehicle", "other_vehicle")
 _OTHER_ENDING: Final[Mapping[str, str]] = MappingProxyType({"normal": "accident", "accident": "normal"})
 
 
@@ -100,6 +113,10 @@ class AccidentContext:
         time_to_end: seconds to the recording's last frame; None if not known.
         twin: whether nobody collides here, but somebody does in the scenario's twin; None if that is not known, such
             as where the release has no twin of it.
+        time_to_twin_impact: where `twin`, seconds to the moment at which the twin ends in its accident; negative after.
+        involvement: whose recording it is; None if not known.
+        references: what the predictors foresee that every evaluation of warnings is compared with, by name; empty if
+            not asked for.
     """
 
     pair: tuple[int, int] | None = None
@@ -109,15 +126,21 @@ class AccidentContext:
     time_to_impact: float | None = None
     time_to_end: float | None = None
     twin: bool | None = None
+    time_to_twin_impact: float | None = None
+    involvement: Involvement | None = None
+    references: Mapping[str, tuple[Accident, ...]] = field(default_factory=dict)
 
 
-def accident_context(dataset: Dataset, sample: RowArgument, horizon: float | None = None) -> AccidentContext:
+def accident_context(
+    dataset: Dataset, sample: RowArgument, horizon: float | None = None, *, references: bool = False
+) -> AccidentContext:
     """What a release knows of a sample beside its motion labels, for the accident metrics.
 
     Args:
         dataset: the release.
         sample: token or record.
         horizon: seconds that the protocol `boxes` looks ahead; None leaves out what it alone needs.
+        references: whether to foresee what the reference predictors do (`REFERENCES`), which takes some milliseconds.
 
     Raises:
         TokenError: no such sample.
@@ -125,15 +148,22 @@ def accident_context(dataset: Dataset, sample: RowArgument, horizon: float | Non
     """
     there = labelled_sample(dataset, sample)
     scenario = dataset.get("scenario", there["scenario_token"])
-    collision = scenario["collision"]
+    collision, other = scenario["collision"], _twin_of(dataset, scenario)
+    twin = None if collision is None and other is None else collision is None and _collides(other)
+    own_actor_id = dataset.get("agent", there["agent_token"])["actor_id"]
+    involvement = _involvement(there["agent"], own_actor_id, collision, other)
+    present = int(there["token"].rsplit("/", 1)[1])
     return AccidentContext(
         pair=None if collision is None else (collision["ids"][0], collision["ids"][1]),
         known=scenario["weather"] is not None,
-        own_actor_id=dataset.get("agent", there["agent_token"])["actor_id"],
+        own_actor_id=own_actor_id,
         truth=None if horizon is None else box_truth(dataset, there, horizon),
         time_to_impact=there["time_to_impact"],
         time_to_end=there["time_to_end"],
-        twin=_is_twin_of_an_accident(dataset, scenario),
+        twin=twin,
+        time_to_twin_impact=(other["num_frames"] - present) * FRAME_PERIOD if twin and other is not None else None,
+        involvement=involvement,
+        references=_references(dataset, there, own_actor_id, involvement) if references else {},
     )
 
 
@@ -178,6 +208,7 @@ def box_truth(dataset: Dataset, sample: RowArgument, horizon: float = RELEASED_H
         footprint=footprint,
         accident=impact if within else None,
         impact=impact,
+        horizon=horizon,
     )
 
 
@@ -200,15 +231,47 @@ def _last_position(tracks: ScenarioTracks, footprints: FloatArray, actor: int, s
     return position
 
 
-def _is_twin_of_an_accident(dataset: Dataset, scenario: Mapping[str, Any]) -> bool | None:
-    """Whether nobody collides in a scenario, but somebody in that of the same family and name with the other ending."""
-    if scenario["collision"] is not None:
-        return False
+def _twin_of(dataset: Dataset, scenario: Mapping[str, Any]) -> Any:
+    """The scenario of the same family and name with the other ending; None if there is none, or nobody knows of it."""
     family, _, ending = scenario["scenario_type"].rpartition("_")
     try:
         twin = dataset.scenario.get(f"{family}_{_OTHER_ENDING.get(ending, ending)}/{scenario['name']}")
     except TokenError:
         return None
-    if scenario["weather"] is None or twin["weather"] is None:  # no meta file, so nobody knows
-        return None
-    return twin["collision"] is not None
+    unknown = scenario["weather"] is None or twin["weather"] is None  # no meta file
+    return None if unknown or twin["token"] == scenario["token"] else twin
+
+
+def _collides(scenario: Mapping[str, Any] | None) -> bool:
+    return scenario is not None and scenario["collision"] is not None
+
+
+def _involvement(
+    agent: str, own_actor_id: int | None, collision: Mapping[str, Any] | None, twin: Mapping[str, Any] | None
+) -> Involvement:
+    if agent == INFRASTRUCTURE:
+        return "infrastructure"
+    if collision is not None:
+        involved = own_actor_id in collision["ids"]
+    else:
+        there = twin["collision"] if twin is not None and _collides(twin) else None
+        involved = agent in ((there and there["agents"]) or _DESIGNED_PAIR)
+    return "ego_involved" if involved else "bystander"
+
+
+def _references(
+    dataset: Dataset, sample: Mapping[str, Any], own_actor_id: int | None, involvement: Involvement
+) -> dict[str, tuple[Accident, ...]]:
+    """What constant velocities lead to, in the present ego frame; for one who is involved, of its own pairs alone."""
+    present = int(sample["token"].rsplit("/", 1)[1])
+    ego_from_world = dataset.world_from(sample["token"], "ego").inverse()
+    seen = seen_actors(dataset, sample["token"])
+    boxes = (
+        scenario_tracks(dataset, sample["scenario_token"]).at(present).transform(ego_from_world, "ego"),
+        seen.boxes,
+    )
+    own = own_actor_id if involvement == "ego_involved" else None
+    return {
+        name: constant_velocity_alarms(each, {OWN_ACTOR_ID: own_actor_id}, own)
+        for name, each in zip(REFERENCES, boxes, strict=True)
+    }

@@ -1,7 +1,33 @@
 """How early an accident is warned of, and how often an alarm is false."""
 
+from deepaccident_devkit.evaluation.metrics.warning.anticipation import (
+    AnticipationFigures,
+    AnticipationResult,
+    CleanWarnings,
+)
+from deepaccident_devkit.evaluation.metrics.warning.clean import CleanScores, OperatingPoint
 from deepaccident_devkit.evaluation.metrics.warning.evaluator import WARNING_PROTOCOLS, WarningEvaluator
+from deepaccident_devkit.evaluation.metrics.warning.field import FieldFigures, FieldQuirks, field_figures
 from deepaccident_devkit.evaluation.metrics.warning.protocol import WarningProtocol
+from deepaccident_devkit.evaluation.metrics.warning.published import FieldResult, FieldWarnings
 from deepaccident_devkit.evaluation.metrics.warning.result import WarningCurve, WarningResult
+from deepaccident_devkit.evaluation.metrics.warning.series import ScoreSeries
 
-__all__ = ["WARNING_PROTOCOLS", "WarningCurve", "WarningEvaluator", "WarningProtocol", "WarningResult"]
+__all__ = [
+    "WARNING_PROTOCOLS",
+    "AnticipationFigures",
+    "AnticipationResult",
+    "CleanScores",
+    "CleanWarnings",
+    "FieldFigures",
+    "FieldQuirks",
+    "FieldResult",
+    "FieldWarnings",
+    "OperatingPoint",
+    "ScoreSeries",
+    "WarningCurve",
+    "WarningEvaluator",
+    "WarningProtocol",
+    "WarningResult",
+    "field_figures",
+]

@@ -2,35 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Final
 
+from deepaccident_devkit.arrays import IntArray
 from deepaccident_devkit.errors import ChoiceError, EvaluationError
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.metrics.predictions import Prediction
+from deepaccident_devkit.evaluation.metrics.warning.anticipation import AnticipationResult, CleanWarnings
+from deepaccident_devkit.evaluation.metrics.warning.drives import PART, parts_of
 from deepaccident_devkit.evaluation.metrics.warning.protocol import WarningProtocol
+from deepaccident_devkit.evaluation.metrics.warning.published import FieldResult, FieldWarnings
 from deepaccident_devkit.evaluation.metrics.warning.recordings import sample_counts, tally_of
 from deepaccident_devkit.evaluation.metrics.warning.result import WarningResult, warning_result
 from deepaccident_devkit.motion import MotionLabels
 
-WARNING_PROTOCOLS: Final[Mapping[str, WarningProtocol]] = MappingProxyType({"boxes": WarningProtocol()})
-"""`boxes` compares with the labels' boxes, as the accident protocol of that name; the paper has no such metrics."""
+Protocol = CleanWarnings | WarningProtocol | FieldWarnings
+Result = AnticipationResult | WarningResult | FieldResult
+WARNING_PROTOCOLS: Final[Mapping[str, Protocol]] = MappingProxyType(
+    {"clean": CleanWarnings(), "boxes": WarningProtocol(), "field": FieldWarnings()}
+)
+"""`clean` ranks predictors, recording by recording; `boxes` looks at alarms one by one; `field` is what published codes
+print. All compare with the labels' boxes, as the accident protocol `boxes`; the paper has no such metrics."""
 
 
-class WarningEvaluator(Evaluator[WarningResult]):
+class WarningEvaluator(Evaluator[Any]):
     """What those ask who would rely on the alarm: seconds of warning, detection in time, false alarms a minute.
 
     Give it whole recordings, normal scenarios among them: samples of a recording that are not given are as if nobody
     had driven then.
+
+    `compute` gives an `AnticipationResult`, a `WarningResult` or a `FieldResult`, by the protocol.
 
     >>> evaluator = WarningEvaluator()
     >>> evaluator.compute().samples
     0
     """
 
-    def __init__(self, protocol: str | WarningProtocol = "boxes") -> None:
+    def __init__(self, protocol: str | Protocol = "clean") -> None:
         """Start without samples.
 
         Args:
@@ -61,8 +72,8 @@ class WarningEvaluator(Evaluator[WarningResult]):
             prediction: what a model says: motion in maps, which is at most one alarm, or a list of alarms.
             label: says how far apart in time the maps of a prediction are, and how they lie in their cells; None for
                 the released way. Alarms need none.
-            context: what happens, from `accident_context(dataset, sample, horizon)`; the horizon says up to when actors
-                can be named.
+            context: what happens, from `accident_context(dataset, sample, horizon, references=True)`; the horizon says
+                up to when actors can be named, and that an alarm for later is none.
 
         Raises:
             EvaluationError: the token is no sample's, the context or something in it is missing, the prediction is
@@ -79,20 +90,30 @@ class WarningEvaluator(Evaluator[WarningResult]):
             )
         self.add(token, sample_counts(token, prediction, label, context, self.protocol))
 
-    def result_of(self, counts: Collection[Counts]) -> WarningResult:
+    def result_of(self, counts: Collection[Counts]) -> Result:
         """The metrics of some samples' counts, in any order; of what `pooled` gives, too."""
-        return warning_result(tally_of(counts, self.protocol), self.protocol)
+        if isinstance(self.protocol, WarningProtocol):
+            return warning_result(tally_of(counts, self.protocol), self.protocol)
+        return self.protocol.result(counts)
 
     def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
-        """The tally of whole recordings, which has the same result.
+        """Counts with the same result: of the protocol `boxes` the tally of whole recordings.
 
-        Its recordings stay apart from those of others, so that a scenario that a bootstrap draws twice counts twice.
+        Their recordings stay apart from those of others, so that a scenario that is drawn twice counts twice.
         """
-        return [tally_of(counts, self.protocol)]
+        if isinstance(self.protocol, WarningProtocol):
+            return [tally_of(counts, self.protocol)]
+        return [{PART: [sample for part in parts_of(counts) for sample in part]}]
+
+    def resampled(self, parts: Sequence[Sequence[Counts]], times: IntArray) -> Iterator[Any]:
+        """The result of each draw; without references. Of the protocol `field` there are none: it has no intervals."""
+        if isinstance(self.protocol, CleanWarnings):
+            return self.protocol.resampled(parts, times)
+        return iter(()) if isinstance(self.protocol, FieldWarnings) else super().resampled(parts, times)
 
 
-def _protocol(protocol: object) -> WarningProtocol:
-    if isinstance(protocol, WarningProtocol):
+def _protocol(protocol: object) -> Protocol:
+    if isinstance(protocol, CleanWarnings | WarningProtocol | FieldWarnings):
         return protocol
     if not isinstance(protocol, str) or protocol not in WARNING_PROTOCOLS:
         raise ChoiceError(f"protocol: expected one of {', '.join(WARNING_PROTOCOLS)}, or your own, found {protocol!r}")

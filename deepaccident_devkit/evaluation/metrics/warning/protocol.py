@@ -1,4 +1,4 @@
-"""`WarningProtocol`: what counts as an alarm, and as a right one."""
+"""What counts as an alarm and as a right one: `WarningRules` of all warning protocols, and the protocol `boxes`."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ _CHOICES: Final[Mapping[str, tuple[str, ...]]] = {"naming": get_args(Naming), "c
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WarningProtocol:
+class WarningRules:
     """Which alarms are right, against the labels' boxes and the pair and the moment of the meta file.
 
-    Unlike an accident that counts for APA, the impact may be later than the model looks ahead: whoever is told early of
-    the right pair or the right place is warned.
+    An alarm for later than the horizon is none. Unlike an accident that counts for APA, the impact may be later than
+    the model looks ahead: whoever is told early of the right pair or the right place is warned.
 
     Attributes:
         reading: how an accident is read off maps, as `BoxAccidents` has it. Their cells are coarse, so that they raise
             more false alarms than explicit accidents.
-        min_score: alarms less sure than this are none; all but the curve is of these alarms.
+        min_score: alarms less sure than this are none.
         match_distance: metres: gate of the matches that decide which actors an alarm without actor ids names.
         naming: whom an explicit accident without `ids` names, as `BoxAccidents` has it.
         correct_by: what makes an alarm right: that it names the `pair` that collides, whichever way round; the `place`,
@@ -34,11 +34,6 @@ class WarningProtocol:
         distance: metres: what the differences of the two positions may add up to, whichever way round fits better; as
             strict as, and by default the distance of, the errors of the accident protocol `paper`.
         time_tolerance: seconds: how far off the time of a right alarm may be from the impact; None for any.
-        unjudged_are_false: where nobody collides, alarms for later than the recording goes on are false ones; else they
-            are left out and counted aside, since nothing refutes them.
-        leads: seconds before the impact by which a detection rate is asked for.
-        curve_lead: seconds before the impact: of the curve's detection rate.
-        curve_rows: how many thresholds the curve has at most.
     """
 
     reading: AccidentReading = field(default_factory=AccidentReading)
@@ -48,10 +43,6 @@ class WarningProtocol:
     correct_by: CorrectBy = "either"
     distance: float = 10.0
     time_tolerance: float | None = None
-    unjudged_are_false: bool = False
-    leads: tuple[float, ...] = (1.0, 2.0, 3.0)
-    curve_lead: float = 1.0
-    curve_rows: int = 101
 
     def __post_init__(self) -> None:
         """Check the values; raises ChoiceError or ConfigError."""
@@ -65,6 +56,54 @@ class WarningProtocol:
                 raise ConfigError(f"{name}: expected metres above 0, found {getattr(self, name)!r}")
         if self.time_tolerance is not None and not self.time_tolerance >= 0:
             raise ConfigError(f"time_tolerance: expected seconds from 0, or None, found {self.time_tolerance!r}")
+
+    def settings(self) -> dict[str, Any]:
+        """All choices, as JSON can hold them."""
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
+
+    def variants(self) -> Mapping[str, WarningRules]:
+        """These metrics with one choice made otherwise, by `name=value`; for explanations."""
+        return {
+            **with_parts(self, "reading", self.reading.variants()),
+            **with_others(
+                self,
+                {
+                    "min_score": (0.5,),
+                    "match_distance": (2.0, 4.0, 8.0),
+                    "naming": get_args(Naming),
+                    "correct_by": get_args(CorrectBy),
+                    "distance": (5.0, 10.0, 15.0),
+                    "time_tolerance": (None, 0.5),
+                    **self._own_others(),
+                },
+            ),
+        }
+
+    def _own_others(self) -> Mapping[str, tuple[Any, ...]]:
+        """Other values of the choices that a protocol has beside these."""
+        return {}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WarningProtocol(WarningRules):
+    """Alarms one by one: how early the first right one is, how often and how long false ones are.
+
+    Attributes:
+        unjudged_are_false: where nobody collides, alarms for later than the recording goes on are false ones; else they
+            are left out and counted aside, since nothing refutes them.
+        leads: seconds before the impact by which a detection rate is asked for.
+        curve_lead: seconds before the impact: of the curve's detection rate.
+        curve_rows: how many thresholds the curve has at most.
+    """
+
+    unjudged_are_false: bool = False
+    leads: tuple[float, ...] = (1.0, 2.0, 3.0)
+    curve_lead: float = 1.0
+    curve_rows: int = 101
+
+    def __post_init__(self) -> None:
+        """Check the values; raises ChoiceError or ConfigError."""
+        WarningRules.__post_init__(self)
         object.__setattr__(self, "leads", tuple(float(lead) for lead in self.leads))
         for lead in (*self.leads, self.curve_lead):
             if not 0 < lead < math.inf:
@@ -72,19 +111,5 @@ class WarningProtocol:
         if type(self.curve_rows) is not int or self.curve_rows < 2:
             raise ConfigError(f"curve_rows: expected a whole number from 2, found {self.curve_rows!r}")
 
-    def settings(self) -> dict[str, Any]:
-        """All choices, as JSON can hold them."""
-        return asdict(self) | {"leads": list(self.leads)}
-
-    def variants(self) -> dict[str, WarningProtocol]:
-        """These metrics with one choice made otherwise, by `name=value`; for explanations."""
-        own: Mapping[str, tuple[Any, ...]] = {
-            "min_score": (0.5,),
-            "match_distance": (2.0, 4.0, 8.0),
-            "naming": get_args(Naming),
-            "correct_by": get_args(CorrectBy),
-            "distance": (5.0, 10.0, 15.0),
-            "time_tolerance": (None, 0.5),
-            "unjudged_are_false": (False, True),
-        }
-        return {**with_parts(self, "reading", self.reading.variants()), **with_others(self, own)}
+    def _own_others(self) -> Mapping[str, tuple[Any, ...]]:
+        return {"unjudged_are_false": (False, True)}

@@ -11,12 +11,17 @@ from operator import itemgetter
 from typing import Any, Final, Literal, get_args
 
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.metrics.alarms.raised import NamedAlarm, named_alarms, position_difference
+from deepaccident_devkit.evaluation.metrics.alarms.raised import (
+    NamedAlarm,
+    named_alarms,
+    position_difference,
+    within_horizon,
+)
 from deepaccident_devkit.evaluation.metrics.alarms.reading import TIE
 from deepaccident_devkit.evaluation.metrics.alarms.truth import SLACK, AccidentContext, BoxTruth
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
 from deepaccident_devkit.evaluation.metrics.predictions import Prediction, checked_prediction
-from deepaccident_devkit.evaluation.metrics.warning.protocol import WarningProtocol
+from deepaccident_devkit.evaluation.metrics.warning.protocol import WarningProtocol, WarningRules
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
@@ -25,18 +30,20 @@ Kind = Literal["accident", "twins", "others"]
 Tally = Mapping[str, Any]
 """Of some recordings, as JSON holds it; `united` adds several up.
 
-Numbers: `samples`, `alarms`, `right` (alarms that are), `unjudged`. `step`: frames, the smallest from a sample to the
-next one of its recording; None where no recording has two. For each `Kind` under its name: `recordings`, `frames` (that
-the samples of recordings with several stand for), `lone` (recordings of a single sample), `false` (the score of the
-surest false alarm of each sample that has one) and `lasting` (the lower one of two such scores, of samples next to each
-other). Of accidents: `reach`, `first` and `steady`: frames before the impact of the first sample, of the first right
-alarm, and of that from which on each sample has one, of each recording that has it; `gains`: rows of score, how many
-frames more the first right alarm is before the impact if alarms of this score count too, and whether it is the
-recording's surest; `reached` and `in_time`: for each lead, the curve's at last, how many recordings have samples as
-early, and the score of the surest right alarm as early of each that has one.
+Numbers: `samples`, `alarms`, `right` (alarms that are), `unjudged`, `beyond`. `step`: frames, the smallest from a
+sample to the next one of its recording; None where no recording has two. For each `Kind` under its name: `recordings`,
+`alarmed` (those with a false alarm), `seen` (samples before the impact), `frames` (that the samples of recordings with
+several stand for), `lone` (recordings of a single sample), `false` (the score of the surest false alarm of each sample
+that has one) and `lasting` (the lower one of two such scores, of samples next to each other). Of accidents: `reach`,
+`first` and `steady`: frames before the impact of the first sample, of the first right alarm, and of that from which on
+each sample has one, of each recording that has it; `gains`: rows of score, how many frames more the first right alarm
+is before the impact if alarms of this score count too, and whether it is the recording's surest; `reached` and
+`in_time`: for each lead, the curve's at last, how many recordings have samples as early, and the score of the surest
+right alarm as early of each that has one.
 """
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
-_NUMBERS: Final = ("samples", "alarms", "right", "unjudged")
+_NUMBERS: Final = ("samples", "alarms", "right", "unjudged", "beyond")
+_KIND_NUMBERS: Final = ("recordings", "alarmed", "seen", "frames", "lone")
 _LISTS: Final = ("reach", "first", "steady", "gains")
 
 
@@ -45,14 +52,16 @@ def sample_counts(
     prediction: Prediction,
     label: MotionLabels | None,
     context: AccidentContext,
-    protocol: WarningProtocol,
+    rules: WarningRules,
 ) -> Counts:
-    """What one sample adds.
+    """What one sample adds, the same for all warning protocols.
 
     Returns:
-        `recording`: scenario and agent; `frame`: its number there; `kind`: of the recording; `ahead`: recorded frames
-        to the impact, None without one; `alarms`: [score, whether it is right], the surest first; `unjudged`: how
-        many alarms were left out.
+        `recording`: scenario and agent; `frame`: its number there; `kind` and `involvement` of the recording; `ahead`:
+        recorded frames to the impact, None without one; `to_end`: the same, of a twin to the accident's impact;
+        `alarms`: [score, whether it is right], the surest first; `unjudged`: scores of those that nothing can refute;
+        `beyond`: how many are for later than the horizon, and so none; `references`: of each of `REFERENCES` the scores
+        of its surest right alarm and its surest one, empty without any.
 
     Raises:
         EvaluationError: the token is no sample's, the context lacks something, or the prediction is neither motion nor
@@ -64,18 +73,35 @@ def sample_counts(
         raise EvaluationError(
             "context: warnings need to know what happens, and when; give accident_context(dataset, sample, horizon=2.0)"
         )
-    raised = named_alarms(checked_prediction(prediction), label, truth, protocol)
-    ahead = context.time_to_impact
-    seen = to_end + SLACK
-    judged = [each for each in raised if ahead is not None or protocol.unjudged_are_false or each[0].time <= seen]
+    raised = named_alarms(checked_prediction(prediction), label, truth, rules)
+    within = within_horizon(raised, truth)
+    ahead, kind = context.time_to_impact, _kind(context)
+    judged = [each for each in within if ahead is not None or each[0].time <= to_end + SLACK]
+    end = context.time_to_twin_impact if kind == "twins" else ahead
     return {
         "recording": recording,
         "frame": frame,
-        "kind": _kind(context),
+        "kind": kind,
+        "involvement": context.involvement,
         "ahead": None if ahead is None else round(ahead / FRAME_PERIOD),
-        "alarms": [[each[0].score, int(_is_right(each, truth, context, protocol))] for each in judged],
-        "unjudged": len(raised) - len(judged),
+        "to_end": None if end is None else round(end / FRAME_PERIOD),
+        "alarms": [[each[0].score, int(_is_right(each, truth, context, rules))] for each in judged],
+        "unjudged": [each[0].score for each in within if each not in judged] if len(judged) < len(within) else [],
+        "beyond": len(raised) - len(within),
+        "references": [
+            surest([[each.score, int(_is_right((each, each.ids), truth, context, rules))] for each in alarms], kind)
+            for alarms in context.references.values()
+        ],
     }
+
+
+def surest(alarms: Sequence[Sequence[float]], kind: Kind) -> list[float]:
+    """The scores of the surest right alarm and of the surest one, 0 for none; [score, whether it is right] of each.
+
+    Where nobody collides no alarm is right, and both are of the surest one.
+    """
+    best = max((score for score, _ in alarms), default=0.0)
+    return [max((score for score, right in alarms if right), default=0.0) if kind == "accident" else best, best]
 
 
 def tally_of(counts: Collection[Counts], protocol: WarningProtocol) -> Tally:
@@ -109,7 +135,7 @@ def kind_united(tallies: Iterable[Tally]) -> dict[str, Any]:
     """Of one kind of recordings, or of several kinds."""
     given = list(tallies)
     return {
-        **{name: sum(each[name] for each in given) for name in ("recordings", "frames", "lone")},
+        **{name: sum(each[name] for each in given) for name in _KIND_NUMBERS},
         **{name: list(chain.from_iterable(each[name] for each in given)) for name in ("false", "lasting")},
     }
 
@@ -130,33 +156,39 @@ def _kind(context: AccidentContext) -> Kind:
     return "twins" if context.twin else "others"
 
 
-def _is_right(alarm: NamedAlarm, truth: BoxTruth, context: AccidentContext, protocol: WarningProtocol) -> bool:
+def _is_right(alarm: NamedAlarm, truth: BoxTruth, context: AccidentContext, rules: WarningRules) -> bool:
     accident, ids = alarm
     ahead, impact = context.time_to_impact, truth.impact
     if ahead is None or context.pair is None:
         return False
-    tolerance = protocol.time_tolerance
+    tolerance = rules.time_tolerance
     if tolerance is not None and abs(accident.time - ahead) > tolerance + TIE:
         return False
-    if protocol.correct_by != "place" and ids is not None and set(ids) == set(context.pair):
+    if rules.correct_by != "place" and ids is not None and set(ids) == set(context.pair):
         return True
-    if protocol.correct_by == "pair" or impact is None:
+    if rules.correct_by == "pair" or impact is None:
         return False
-    return position_difference(accident.positions, impact.positions) < protocol.distance - TIE
+    return position_difference(accident.positions, impact.positions) < rules.distance - TIE
 
 
 def _recording_tally(given: Sequence[Counts], protocol: WarningProtocol) -> Tally:
     """Of one recording's samples, in the order of time."""
     kind = given[0]["kind"]
     samples = [each for each in given if each["ahead"] is None or each["ahead"] > 0]
+    if protocol.unjudged_are_false:
+        samples = [
+            {**each, "alarms": [*each["alarms"], *([score, 0] for score in each["unjudged"])]} for each in samples
+        ]
     step = min((after["frame"] - before["frame"] for before, after in pairwise(samples)), default=None)
     alarms = [alarm for each in samples for alarm in each["alarms"]]
+    unjudged = [] if protocol.unjudged_are_false else [score for each in given for score in each["unjudged"]]
     nothing: dict[str, Any] = {name: kind_united([]) for name in KINDS}
     return {
         "samples": len(given),
         "alarms": len(alarms),
         "right": sum(right for _, right in alarms),
-        "unjudged": sum(each["unjudged"] for each in given),
+        "unjudged": len(unjudged),
+        "beyond": sum(each["beyond"] for each in given),
         "step": step,
         **nothing,
         kind: _false_alarms(samples, step),
@@ -172,6 +204,8 @@ def _false_alarms(samples: Sequence[Counts], step: int | None) -> dict[str, Any]
     false = [max((score for score, right in each["alarms"] if not right), default=None) for each in samples]
     return {
         "recordings": int(bool(samples)),
+        "alarmed": int(any(score is not None for score in false)),
+        "seen": len(samples),
         "frames": len(samples) * (step or 0),
         "lone": int(len(samples) == 1),
         "false": [score for score in false if score is not None],

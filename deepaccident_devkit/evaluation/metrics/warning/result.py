@@ -57,7 +57,10 @@ class WarningResult(FrozenArrays, FrozenMappings):
         minutes: by kind: what the samples cover. Each stands for the smallest step from a sample to the next in its
             recording (of all recordings, where it has only one), so that a missing sample is not counted.
         warned_share: share of the accident recordings with a right alarm.
-        mean_warning: seconds from the first right alarm to the impact, mean over the recordings that have one.
+        recording_precision: of the recordings with an alarm the share that end in the accident: those with a right
+            alarm, of these and of the normal ones with a false alarm.
+        tta0: seconds from the first right alarm to the impact, mean over all accident recordings, 0 for those without.
+        mean_warning: likewise, mean over the recordings that have one.
         median_warning: likewise.
         warning_seconds: (W,) float64 likewise, of each of them, ascending; read-only.
         lasting_share: share of the accident recordings with a right alarm that lasts: one at every sample to the last,
@@ -69,11 +72,14 @@ class WarningResult(FrozenArrays, FrozenMappings):
         detection_rate: seconds before the impact → share of the accident recordings with a right alarm that early or
             earlier, within half a recorded frame.
         detection_recordings: seconds before the impact → the recordings that is a share of: with samples as early.
+        time_in_alarm: by kind, share of the samples with a false alarm.
+        alarm_seconds_per_minute: likewise, in seconds of each minute.
         false_alarms: by kind. Samples with a false alarm one after another have one together; a missing sample ends it.
         false_alarms_per_minute: by kind.
         alarms: how many alarms are judged.
         precision: share of them that are right.
         unjudged: alarms that nothing can refute: nobody collides, and they are for later than the recording goes on.
+        beyond: alarms for later than the horizon, which are none.
         curve: the same over the score.
         notes: sentences that a reader of the numbers should know.
     """
@@ -82,6 +88,8 @@ class WarningResult(FrozenArrays, FrozenMappings):
     recordings: Mapping[str, int]
     minutes: Mapping[str, float]
     warned_share: float
+    recording_precision: float
+    tta0: float
     mean_warning: float
     median_warning: float
     warning_seconds: FloatArray
@@ -91,11 +99,14 @@ class WarningResult(FrozenArrays, FrozenMappings):
     mean_reach: float
     detection_rate: Mapping[float, float]
     detection_recordings: Mapping[float, int]
+    time_in_alarm: Mapping[str, float]
+    alarm_seconds_per_minute: Mapping[str, float]
     false_alarms: Mapping[str, int]
     false_alarms_per_minute: Mapping[str, float]
     alarms: int
     precision: float
     unjudged: int
+    beyond: int
     curve: WarningCurve
     notes: tuple[str, ...] = ()
 
@@ -117,11 +128,15 @@ def warning_result(tally: Tally, protocol: WarningProtocol) -> WarningResult:
     minutes = {kind: _minutes(each, tally["step"]) for kind, each in by_kind.items()}
     false = {kind: len(each["false"]) - len(each["lasting"]) for kind, each in by_kind.items()}
     leads = list(enumerate(protocol.leads))
+    in_alarm = {kind: ratio(len(each["false"]), each["seen"]) for kind, each in by_kind.items()}
+    warned = len(tally["first"])
     return WarningResult(
         samples=tally["samples"],
         recordings={kind: each["recordings"] for kind, each in by_kind.items()},
         minutes=minutes,
-        warned_share=ratio(len(tally["first"]), accidents),
+        warned_share=ratio(warned, accidents),
+        recording_precision=ratio(warned, warned + by_kind["normal"]["alarmed"]),
+        tta0=ratio(sum(tally["first"]), accidents * _PER_SECOND),
         mean_warning=_mean_seconds(tally["first"]),
         median_warning=_median_seconds(tally["first"]),
         warning_seconds=np.sort(np.array(tally["first"], dtype=np.float64)) / _PER_SECOND,
@@ -131,11 +146,14 @@ def warning_result(tally: Tally, protocol: WarningProtocol) -> WarningResult:
         mean_reach=_mean_seconds(tally["reach"]),
         detection_rate={lead: ratio(len(tally["in_time"][at]), tally["reached"][at]) for at, lead in leads},
         detection_recordings={lead: tally["reached"][at] for at, lead in leads},
+        time_in_alarm=in_alarm,
+        alarm_seconds_per_minute={kind: 60 * share for kind, share in in_alarm.items()},
         false_alarms=false,
         false_alarms_per_minute={kind: ratio(false[kind], minutes[kind]) for kind in by_kind},
         alarms=tally["alarms"],
         precision=ratio(tally["right"], tally["alarms"]),
         unjudged=tally["unjudged"],
+        beyond=tally["beyond"],
         curve=_curve(tally, by_kind, minutes, protocol.curve_rows),
         notes=tuple(_notes(tally, protocol)),
     )
@@ -209,6 +227,8 @@ def _notes(tally: Tally, protocol: WarningProtocol) -> Iterator[str]:
             yield f"only {reached} of {accidents} accident recordings have samples {lead:g} s before the impact"
     if tally["unjudged"]:
         yield f"{tally['unjudged']} alarms are for later than their recording goes on and were left out"
+    if tally["beyond"]:
+        yield f"{tally['beyond']} alarms are for later than the horizon and are none"
     lone = sum(tally[kind]["lone"] for kind in KINDS)
     if lone:
         yield f"{lone} recordings have a single sample, which says nothing of how far apart samples are"

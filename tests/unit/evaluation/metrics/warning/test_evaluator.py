@@ -288,7 +288,7 @@ def bits(made) -> str:
 
 
 def test_a_scenario_that_is_drawn_twice_counts_twice() -> None:
-    evaluator = WarningEvaluator()
+    evaluator = WarningEvaluator("boxes")
     drive(evaluator, "s", every(3))
     drive(evaluator, "n", every(3, 0, FALSE), "twins")
     pooled = evaluator.pooled(list(evaluator.counts.values()))
@@ -303,7 +303,7 @@ def test_maps_are_one_alarm_as_sure_as_the_share_of_them_that_see_it() -> None:
     cars = {1: standing(20, 10), 2: [(16.0 - gap, 10.5) for gap in (10, 7.5, 5, 2.5, 0)]}
     hit, calm = scene(cars), scene({1: standing(20, 10)})
     for output in (as_maps(calm, hit), as_heads(hit, calm)):
-        evaluator = WarningEvaluator()
+        evaluator = WarningEvaluator("boxes")
         evaluator.update("t/s/ego_vehicle/041", output, hit, context(41))
         [counts] = evaluator.counts.values()
         assert counts["alarms"] == [[0.5, 1]]
@@ -315,7 +315,7 @@ def test_maps_are_one_alarm_as_sure_as_the_share_of_them_that_see_it() -> None:
 
 
 def test_results_can_be_copied_written_and_resumed(tmp_path) -> None:
-    evaluator = WarningEvaluator()
+    evaluator = WarningEvaluator("boxes")
     drive(evaluator, "s", every(3))
     drive(evaluator, "n", every(3, 0, []), "twins")
     made = evaluator.compute()
@@ -325,8 +325,8 @@ def test_results_can_be_copied_written_and_resumed(tmp_path) -> None:
         made.curve.threshold[:] = 0
     with pytest.raises(TypeError, match="cannot be changed"):
         made.recordings["accident"] = 5
-    assert bits(WarningEvaluator().resume(evaluator.save(tmp_path / "w.json")).compute()) == bits(made)
-    empty = WarningEvaluator().compute()
+    assert bits(WarningEvaluator("boxes").resume(evaluator.save(tmp_path / "w.json")).compute()) == bits(made)
+    empty = WarningEvaluator("boxes").compute()
     assert (empty.samples, len(empty.curve.threshold), empty.notes) == (0, 0, ())
     assert set(empty.minutes.values()) == {0}
     json.dumps(empty.as_dict(), allow_nan=False)
@@ -356,7 +356,7 @@ def test_choices_are_checked_and_each_has_a_variant() -> None:
     ):
         with pytest.raises(ConfigError, match=message):
             WarningProtocol(**choices)
-    with pytest.raises(ChoiceError, match="protocol: expected one of boxes, or your own, found 'released'"):
+    with pytest.raises(ChoiceError, match="protocol: expected one of clean, boxes, field, or your own, found 'released'"):
         WarningEvaluator("released")
 
 
@@ -373,13 +373,13 @@ def test_choices_are_checked_and_each_has_a_variant() -> None:
 )
 def test_what_cannot_be_evaluated(token, prediction, label, known, message) -> None:
     with pytest.raises(EvaluationError, match=message):
-        WarningEvaluator().update(token, prediction, label, known)
+        WarningEvaluator("boxes").update(token, prediction, label, known)
 
 
 @pytest.fixture(scope="module")
 def foreseen(da_motion: DeepAccident) -> WarningEvaluator:
     """Of two agents, every half second: foreseen for the last 2 s, and in the twin falsely 1 s before its end."""
-    evaluator = WarningEvaluator()
+    evaluator = WarningEvaluator("boxes")
     for scenario in da_motion.scenario:
         for agent in ("ego_vehicle", "infrastructure"):
             for frame in range(scenario["num_frames"], 0, -5):

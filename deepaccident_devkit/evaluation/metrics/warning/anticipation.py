@@ -1,0 +1,226 @@
+"""`CleanWarnings`: anticipation metrics over recordings that no siren, silence or chance can win (protocol `clean`)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final, get_args
+
+import numpy as np
+
+from deepaccident_devkit.arrays import FloatArray, IntArray
+from deepaccident_devkit.errors import ChoiceError, ConfigError
+from deepaccident_devkit.evaluation.metrics.evaluator import Counts, ratio
+from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
+from deepaccident_devkit.evaluation.metrics.warning.clean import CleanScores, OperatingPoint
+from deepaccident_devkit.evaluation.metrics.warning.drives import (
+    GIVEN,
+    GROUPS,
+    PREDICTORS,
+    Drive,
+    ScoresOf,
+    by_group,
+    drives_of,
+    parts_of,
+    series_of,
+    twin_pairs,
+)
+from deepaccident_devkit.evaluation.metrics.warning.protocol import WarningRules
+
+LATENCIES: Final = (0.0, 0.1, 0.3)
+"""Seconds that a warning may take from who sees to who collides."""
+_ANY: Final = float(np.nextafter(0.0, 1.0))
+_FIXED: Final[Mapping[str, float]] = {"always": 1.0, "never": 1.0, "random per frame": 0.5, "random per recording": 0.5}
+"""Operating points of the predictors that know nothing; of the other references any alarm is one."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnticipationFigures(FrozenMappings):
+    """How well one predictor foresees the accidents of one group of recordings. NaN: nothing to count.
+
+    Attributes:
+        auc_ahead: the headline: the chance that an accident recording's highest score, up to `lead` before the impact,
+            is above another recording's up to as long before its end; ties half. 0.5 for always, never and chance.
+        twin_wins: the chance that an accident recording's highest score is above its twin's, ties half; a twin is cut
+            to the accident's length.
+        average_precision: AP over recordings, by their highest scores; depends on how many of each there are.
+        area_under_curve: AUC, likewise up to the impact.
+        mean_time: mTTA over the curve of recall, seconds; a missed recording is in no time, so read it beside the AP.
+        operating: the figures at the operating point: the threshold that was given, or, without one, `at_r80`.
+        at_r80: at the highest threshold with a recall of 0.8.
+        at_p80: at the threshold of the highest recall with a precision of 0.8.
+        best_f1: threshold: of the best F1 over these recordings; to be given when another split is evaluated.
+        quiet: threshold: the lowest with at most one second a minute in alarm without an accident to come; likewise.
+        tta0_after: for who sees an accident of others: latency → seconds of `operating.tta0` that are left when the two
+            who collide are told, a lead below 0 as 0; empty for `ego_involved`.
+        recordings: by kind: `accident`, `twins`, `others`.
+        twins: pairs of an accident recording and its twin.
+    """
+
+    auc_ahead: float
+    twin_wins: float
+    average_precision: float
+    area_under_curve: float
+    mean_time: float
+    operating: OperatingPoint
+    at_r80: OperatingPoint
+    at_p80: OperatingPoint
+    best_f1: float
+    quiet: float
+    tta0_after: Mapping[float, float]
+    recordings: Mapping[str, int]
+    twins: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnticipationResult(FrozenMappings):
+    """What the protocol `clean` says.
+
+    Attributes:
+        samples: how many.
+        operating_by: `given` threshold, or `R80`.
+        groups: involvement of the agent → figures; agents of one scenario are never pooled.
+        references: predictor (of `PREDICTORS` but the given one) → the same; empty for resamples.
+        beyond: alarms for later than the horizon, which are none.
+        notes: sentences that a reader of the numbers should know.
+    """
+
+    samples: int
+    operating_by: str
+    groups: Mapping[str, AnticipationFigures]
+    references: Mapping[str, Mapping[str, AnticipationFigures]]
+    beyond: int
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CleanWarnings(WarningRules):
+    """The accidents that are foreseen, recording by recording, without the quirks of published anticipation metrics.
+
+    A recording's score at a sample is that of its surest alarm, 0 without one; from the impact on nothing counts.
+
+    Attributes:
+        scores_of: whose alarms count where somebody collides: those of the `pair` that does (right ones), or all of the
+            `recording`, for predictors that name nobody. Where nobody collides, all do.
+        lead: seconds before the impact up to which the headline looks.
+        threshold: the lowest score that is an alarm, chosen on another split (`best_f1` or `quiet` there); None if none
+            was.
+    """
+
+    scores_of: ScoresOf = "pair"
+    lead: float = 1.0
+    threshold: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check the values; raises ChoiceError or ConfigError."""
+        WarningRules.__post_init__(self)
+        if self.scores_of not in get_args(ScoresOf):
+            raise ChoiceError(f"scores_of: expected one of {', '.join(get_args(ScoresOf))}, found {self.scores_of!r}")
+        if not 0 <= self.lead < math.inf:
+            raise ConfigError(f"lead: expected seconds from 0, found {self.lead!r}")
+        if self.threshold is not None and not math.isfinite(self.threshold):
+            raise ConfigError(f"threshold: expected a number, or None, found {self.threshold!r}")
+
+    def _own_others(self) -> Mapping[str, tuple[Any, ...]]:
+        return {"scores_of": get_args(ScoresOf), "lead": (0.5, 1.0, 1.5)}
+
+    def result(self, counts: Collection[Counts]) -> AnticipationResult:
+        """The metrics of some samples' counts."""
+        parts = parts_of(counts)
+        drives, samples = drives_of(parts), [sample for part in parts for sample in part]
+        groups = dict(by_group(drives))
+        made = {
+            predictor: {group: _Table(those, predictor, self).figures() for group, those in groups.items()}
+            for predictor in PREDICTORS
+        }
+        return AnticipationResult(
+            samples=len(samples),
+            operating_by="R80" if self.threshold is None else "given",
+            groups=made.pop(GIVEN),
+            references=made,
+            beyond=sum(each["beyond"] for each in samples),
+            notes=tuple(_notes(samples, drives, self)),
+        )
+
+    def resampled(self, parts: Sequence[Sequence[Counts]], times: IntArray) -> Iterator[AnticipationResult]:
+        """The result of each draw, without references; see `Evaluator.resampled`."""
+        tables = {group: _Table(those, GIVEN, self) for group, those in by_group(drives_of(parts))}
+        samples, beyond = (
+            np.array([sum(count(each) for each in part) for part in parts], dtype=np.int64)
+            for count in (lambda _: 1, lambda each: each["beyond"])
+        )
+        for draw in times:
+            yield AnticipationResult(
+                samples=int(samples @ draw),
+                operating_by="R80" if self.threshold is None else "given",
+                groups={group: table.figures(draw) for group, table in tables.items()},
+                references={},
+                beyond=int(beyond @ draw),
+            )
+
+
+class _Table:
+    """One predictor's scores of one group of recordings, to be asked with any weights."""
+
+    def __init__(self, drives: Sequence[Drive], predictor: str, rules: CleanWarnings) -> None:
+        self._predictor, self._rules = predictor, rules
+        self._scores = CleanScores(series_of(drives, predictor, rules.scores_of))
+        ahead = self._scores.series.highest(rules.lead)
+        self._ahead = np.where(np.isfinite(ahead), ahead, np.nan)
+        self._pairs = twin_pairs(drives)
+        self._part = np.array([each.part for each in drives], dtype=np.int64)
+        self._kind = np.array([each.kind for each in drives])
+        self._sees_others = drives[0].group not in (GROUPS[0], GROUPS[-1])
+
+    def figures(self, draw: IntArray | None = None) -> AnticipationFigures:
+        """The figures of recordings that count as often as their part is drawn; None for once each."""
+        weight = np.ones(len(self._part)) if draw is None else draw[self._part].astype(np.float64)
+        scores = self._scores
+        r80 = scores.threshold_of_recall(weight)
+        operating = self._rules.threshold
+        if self._predictor != GIVEN:
+            operating = _FIXED.get(self._predictor, _ANY)
+        threshold = r80 if operating is None else operating
+        counted = {kind: int(weight[self._kind == kind].sum()) for kind in ("accident", "twins", "others")}
+        after = partial(scores.tta0_after, threshold, weight)
+        return AnticipationFigures(
+            auc_ahead=scores.area_under_curve(weight, self._ahead),
+            twin_wins=self._twin_wins(weight),
+            average_precision=scores.average_precision(weight),
+            area_under_curve=scores.area_under_curve(weight),
+            mean_time=scores.mean_time(weight),
+            operating=scores.at(threshold, weight),
+            at_r80=scores.at(r80, weight),
+            at_p80=scores.at(scores.threshold_of_precision(weight), weight),
+            best_f1=scores.threshold_of_best_f1(weight),
+            quiet=scores.threshold_of_alarm_time(weight),
+            tta0_after={latency: after(latency) for latency in LATENCIES} if self._sees_others else {},
+            recordings=counted,
+            twins=int(weight[self._pairs[:, 0]].sum()),
+        )
+
+    def _twin_wins(self, weight: FloatArray) -> float:
+        accident, twin = (self._scores.highest[self._pairs[:, side]] for side in (0, 1))
+        pairs = weight[self._pairs[:, 0]]
+        won = np.where(accident == twin, 0.5, accident > twin)
+        return ratio(float((won * pairs).sum()), float(pairs.sum()))
+
+
+def _notes(counts: Collection[Counts], drives: Sequence[Drive], rules: CleanWarnings) -> Iterator[str]:
+    kinds = {each.kind for each in drives}
+    if drives and "accident" not in kinds:
+        yield "no recording of an accident was evaluated; give accident scenarios too for warnings"
+    if drives and kinds == {"accident"}:
+        yield "no recording without an accident was evaluated; give normal scenarios too for false alarms"
+    if drives and rules.threshold is None:
+        yield (
+            "the operating point is that of a recall of 0.8 on these very recordings; choose it on another split with "
+            "--threshold-from, or give it with --switch threshold=…"
+        )
+    beyond = sum(each["beyond"] for each in counts)
+    if beyond:
+        yield f"{beyond} alarms are for later than the horizon and are none"
+    if drives and not any(each["references"] for each in counts):
+        yield "the rows 'TTC < 3 s' need what constant velocities lead to: accident_context(…, references=True)"

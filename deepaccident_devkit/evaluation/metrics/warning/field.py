@@ -1,0 +1,293 @@
+"""Anticipation metrics as four published evaluations compute them, each of their quirks a named switch.
+
+UString (Bao et al. 2020), DSTA (Karim et al. 2022), DRIVE (Bao et al. 2021) and DAD (Chan et al. 2016) print numbers of
+one name that are not comparable with each other; docs/protocols.md says what is odd in each. They are here so that a
+number can be put beside a published one. To rank predictors take the protocol `clean`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final, Literal, get_args
+
+import numpy as np
+
+from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.evaluation.metrics.warning.series import ScoreSeries
+
+FieldCode = Literal["ustring", "dsta", "drive", "dad"]
+FIELD_CODES: Final[tuple[FieldCode, ...]] = get_args(FieldCode)
+_DAD_SECONDS: Final = 5.0
+_NUDGE: Final = 1e-6
+"""By which DRIVE moves its thresholds 0 and 1 inwards."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FieldQuirks:
+    """What the published evaluations do; each switch made otherwise is what one would expect in its place.
+
+    Attributes:
+        zero_alarms_negatives: at the threshold 0 a recording without an accident is a true positive, since its scores
+            are multiplied by its label, and 0 ≥ 0; so recall and AP can be above 1 (UString, DSTA).
+        highest_recall_takes_first: of the thresholds of the highest recall the lowest one counts; else, as of all other
+            recalls, the best precision and the longest time (all four).
+        lowest_recall_left_out: the lowest recall is dropped, by which the zeros of unused places are meant (UString,
+            DSTA, DRIVE).
+        as_many_thresholds_as_frames: there is room for one threshold a frame; more raise an error (UString, DSTA).
+        missed_left_out: recordings without a warning do not count in times; else as 0 s (all four).
+        time_by_length: times are shares of `toa`, made seconds by the length of the array of scores; else by `toa`
+            (UString, DSTA).
+        five_seconds: shares are made seconds by 5 s, whatever the recordings' length; else by the array's length (DAD).
+        nonsense_kept: numbers that can be no recall or precision are given as they come; else NaN, with a note.
+    """
+
+    zero_alarms_negatives: bool = True
+    highest_recall_takes_first: bool = True
+    lowest_recall_left_out: bool = True
+    as_many_thresholds_as_frames: bool = True
+    missed_left_out: bool = True
+    time_by_length: bool = True
+    five_seconds: bool = True
+    nonsense_kept: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FieldFigures:
+    """What one of the four prints; NaN where it raises an error or divides by 0.
+
+    Attributes:
+        average_precision: area under precision over recall; of recordings, of DRIVE of frames.
+        mean_time: mTTA, seconds: mean over the recalls.
+        time_at_r80: TTA@R80, seconds: at the recall nearest to 0.8.
+        precision_at_r80: at the first recall of at least 0.8; None but for DSTA.
+        precision_at_half: at the threshold 0.5, of frames; None but for DRIVE.
+        recall_at_half: likewise.
+        time_at_half: likewise, seconds.
+        note: why numbers are NaN; empty if none is.
+    """
+
+    average_precision: float
+    mean_time: float
+    time_at_r80: float
+    precision_at_r80: float | None = None
+    precision_at_half: float | None = None
+    recall_at_half: float | None = None
+    time_at_half: float | None = None
+    note: str = ""
+
+
+def field_figures(series: ScoreSeries, code: FieldCode, quirks: FieldQuirks | None = None) -> FieldFigures:
+    """The numbers that a published evaluation has for these scores.
+
+    Args:
+        series: the recordings; missing scores are as their recording's lowest. Of recordings without an accident all T
+            columns count, as in these codes.
+        code: whose evaluation. DAD knows no `toa`: it takes the array's length, and so does this where they are equal.
+        quirks: None for those that the code has.
+
+    Raises:
+        ChoiceError: no such code.
+    """
+    if code not in FIELD_CODES:
+        raise ChoiceError(f"code: expected one of {', '.join(FIELD_CODES)}, found {code!r}")
+    chosen = quirks or FieldQuirks()
+    if not series.scores.size:
+        return _nothing(code, "there is no score")
+    try:
+        figures, highest_recall = _FIGURES[code](_filled(series), code, chosen)
+    except IndexError as error:
+        return _nothing(code, f"the published code raises an error here: {error}")
+    if not chosen.nonsense_kept and max(highest_recall, figures.average_precision) > 1 + 1e-9:
+        return _nothing(
+            code,
+            f"recall {highest_recall:.3g}, AP {figures.average_precision:.3g}: at the threshold 0 recordings without "
+            "an accident count as true positives",
+        )
+    if math.isnan(figures.average_precision) or math.isnan(figures.mean_time):
+        return FieldFigures(
+            **{name: getattr(figures, name) for name in FieldFigures.__slots__ if name != "note"},
+            note="the published code divides 0 by 0: no accident, or thresholds at which none is warned of",
+        )
+    return figures
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Points:
+    """Of K thresholds, as a published code keeps them; unused places are 0."""
+
+    precision: FloatArray
+    recall: FloatArray
+    time: FloatArray
+
+
+def _recordings(series: ScoreSeries, code: FieldCode, quirks: FieldQuirks) -> tuple[FieldFigures, float]:
+    """UString and DSTA: recordings are counted, at thresholds 0.001 apart from the lowest score on."""
+    valid = series.valid
+    lowest = float(np.min(series.scores, initial=np.inf, where=valid))
+    thresholds = np.arange(max(lowest, 0.0), 1.0, 0.001)
+    scale = np.full(len(series.toa), float(series.scores.shape[1])) if quirks.time_by_length else series.toa
+    points, raised = _counted(series, thresholds, scale / series.fps, quirks)
+    there = raised & np.isfinite(points.time) & np.isfinite(points.recall)
+    if quirks.as_many_thresholds_as_frames:
+        room, used = int(valid.sum()), np.cumsum(there, dtype=np.int64) - there
+        if (raised & (used >= room)).any():
+            raise IndexError("more thresholds than frames")
+    else:
+        room = int(there.sum()) + 1
+    kept = np.flatnonzero(there)
+    padded = [np.zeros(max(room, len(kept))) for _ in range(3)]
+    for column, values in zip(padded, (points.precision, points.recall, points.time), strict=True):
+        column[: len(kept)] = values[kept]
+    levels = _levels(_Points(*padded), quirks, drop_lowest=quirks.lowest_recall_left_out)
+    high = np.flatnonzero(levels.recall >= 0.8)
+    if code == "dsta" and not len(high):
+        raise IndexError("no recall of 0.8")
+    figures = FieldFigures(
+        average_precision=_area(levels),
+        mean_time=float(np.mean(levels.time)),
+        time_at_r80=_time_at_r80(levels),
+        precision_at_r80=float(levels.precision[high[0]]) if code == "dsta" else None,
+    )
+    return figures, float(levels.recall[-1])
+
+
+def _dad(series: ScoreSeries, _code: FieldCode, quirks: FieldQuirks) -> tuple[FieldFigures, float]:
+    """DAD: recordings are counted, at every score of every frame but 0."""
+    thresholds = np.sort(series.scores, axis=None)
+    thresholds = thresholds[thresholds != 0]
+    whole = _DAD_SECONDS if quirks.five_seconds else series.scores.shape[1] / series.fps
+    points, _ = _counted(series, thresholds, np.full(len(series.toa), whole), quirks)
+    unused = np.zeros(series.scores.size - len(thresholds))
+    columns = (np.concatenate([each, unused]) for each in (points.precision, points.recall, points.time))
+    levels = _levels(_Points(*columns), quirks, drop_lowest=False)
+    known = np.isfinite(levels.precision)
+    if not known.any():
+        return _nothing("dad", "no alarm at any threshold"), math.nan
+    levels = _Points(levels.precision[known], levels.recall[known], levels.time[known])
+    figures = FieldFigures(
+        average_precision=_area(levels), mean_time=float(np.mean(levels.time)), time_at_r80=_time_at_r80(levels)
+    )
+    return figures, float(levels.recall[-1])
+
+
+def _drive(series: ScoreSeries, _code: FieldCode, quirks: FieldQuirks) -> tuple[FieldFigures, float]:
+    """DRIVE: frames are counted, at eleven thresholds; times are of recordings."""
+    thresholds = np.arange(0, 1.1, 0.1)
+    thresholds[[0, -1]] += (_NUDGE, -_NUDGE)
+    counted = _frames(series, np.append(thresholds, 0.5), quirks)
+    at_half = (each[-1].item() for each in (counted.precision, counted.recall, counted.time))
+    points = _Points(counted.precision[:-1], counted.recall[:-1], counted.time[:-1])
+    several = len(np.unique(points.recall)) > 1
+    levels = _levels(points, quirks, drop_lowest=quirks.lowest_recall_left_out and several)
+    precision, recall, time = at_half
+    figures = FieldFigures(
+        average_precision=_area(levels),
+        mean_time=float(np.mean(levels.time)),
+        time_at_r80=_time_at_r80(levels),
+        precision_at_half=precision,
+        recall_at_half=recall,
+        time_at_half=time,
+    )
+    return figures, float(levels.recall[-1])
+
+
+_FIGURES: Final = {"ustring": _recordings, "dsta": _recordings, "drive": _drive, "dad": _dad}
+
+
+def _filled(series: ScoreSeries) -> ScoreSeries:
+    """The same with numbers everywhere, since these codes know no missing score; negatives count to the array's end."""
+    lowest = np.min(series.scores, axis=1, initial=np.inf, where=np.isfinite(series.scores))
+    lowest = np.where(np.isfinite(lowest), lowest, 0.0)
+    columns = series.scores.shape[1]
+    return ScoreSeries(
+        scores=np.where(np.isfinite(series.scores), series.scores, lowest[:, None]),
+        positive=series.positive,
+        toa=np.where(series.positive, series.toa, columns + 1.0),
+        fps=series.fps,
+    )
+
+
+def _counted(
+    series: ScoreSeries, thresholds: FloatArray, seconds: FloatArray, quirks: FieldQuirks
+) -> tuple[_Points, BoolArray]:
+    """Recordings counted at each threshold, NaN for 0 / 0; and (K,) whether any recording raises an alarm.
+
+    Times are shares of `toa` before the impact times `seconds` (N,).
+    """
+    share = series.leads(thresholds) * series.fps / series.toa[:, None]
+    alarmed = np.isfinite(share)
+    by_zero = alarmed & ~series.positive[:, None] & (thresholds <= 0) & quirks.zero_alarms_negatives
+    share[by_zero] = 1.0  # their first frame is one already
+    warned = (alarmed & series.positive[:, None]) | by_zero
+    count = warned.sum(axis=0)
+    accidents = int(series.positive.sum())
+    timed = count if quirks.missed_left_out else np.where(count > 0, max(accidents, 1), 0)
+    time = np.where(warned, share * seconds[:, None], 0.0).sum(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        points = _Points(count / alarmed.sum(axis=0), count / np.float64(accidents), time / timed)
+    points.time[count == 0] = np.nan
+    if not accidents:
+        points.recall[:] = np.nan
+    return points, np.asarray(alarmed.any(axis=0))
+
+
+def _frames(series: ScoreSeries, thresholds: FloatArray, quirks: FieldQuirks) -> _Points:
+    """Frames counted at each threshold, 0 for 0 / 0."""
+    valid = series.valid
+    right = np.sort(series.scores[valid & series.positive[:, None]])
+    wrong = np.sort(series.scores[valid & ~series.positive[:, None]])
+    true = len(right) - np.searchsorted(right, thresholds, side="left")
+    false = len(wrong) - np.searchsorted(wrong, thresholds, side="left")
+    leads = series.leads(thresholds)[series.positive]
+    warned: IntArray = np.isfinite(leads).sum(axis=0)
+    timed = warned if quirks.missed_left_out else np.full(len(thresholds), len(leads))
+    return _Points(
+        _over(true, true + false),
+        _over(true, np.full(len(thresholds), len(right))),
+        _over(np.nansum(leads, axis=0), timed),
+    )
+
+
+def _levels(points: _Points, quirks: FieldQuirks, *, drop_lowest: bool) -> _Points:
+    """One point a recall: the best precision and time of its thresholds, in the codes' order (a stable sort).
+
+    Raises:
+        IndexError: no recall is left.
+    """
+    order = np.argsort(points.recall, kind="stable")
+    precision, recall, time = (each[order] for each in (points.precision, points.recall, points.time))
+    starts = np.unique(recall, return_index=True)[1]
+    starts = starts[1:] if drop_lowest else starts
+    if not len(starts):
+        raise IndexError("no threshold has another recall than the others")
+    best = [np.maximum.reduceat(each, starts) for each in (precision, time)]
+    if quirks.highest_recall_takes_first:
+        for levels, each in zip(best, (precision, time), strict=True):
+            levels[-1] = each[starts[-1]]
+    return _Points(best[0], recall[starts], best[1])
+
+
+def _area(levels: _Points) -> float:
+    first = levels.precision[0] * levels.recall[0] if levels.recall[0] != 0 else 0.0
+    between = (levels.precision[1:] + levels.precision[:-1]) * np.diff(levels.recall) / 2
+    return float(first + between.sum())
+
+
+def _time_at_r80(levels: _Points) -> float:
+    return float(levels.time[np.argmin(np.abs(levels.recall - 0.8))])
+
+
+def _over(part: IntArray | FloatArray, whole: IntArray) -> FloatArray:
+    shares: FloatArray = np.divide(part, whole, out=np.zeros(len(whole)), where=whole > 0)
+    return shares
+
+
+def _nothing(code: FieldCode, why: str) -> FieldFigures:
+    known: Mapping[str, float] = {
+        "dsta": {"precision_at_r80": math.nan},
+        "drive": dict.fromkeys(("precision_at_half", "recall_at_half", "time_at_half"), math.nan),
+    }.get(code, {})
+    return FieldFigures(average_precision=math.nan, mean_time=math.nan, time_at_r80=math.nan, note=why, **known)

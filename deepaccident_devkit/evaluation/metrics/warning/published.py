@@ -1,0 +1,91 @@
+"""`FieldWarnings`: the numbers of four published anticipation codes, quirks and all (protocol `field`)."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, get_args
+
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.evaluation.metrics.choices import with_others, with_parts
+from deepaccident_devkit.evaluation.metrics.evaluator import Counts
+from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
+from deepaccident_devkit.evaluation.metrics.warning.drives import (
+    GIVEN,
+    PREDICTORS,
+    ScoresOf,
+    by_group,
+    drives_of,
+    parts_of,
+    series_of,
+)
+from deepaccident_devkit.evaluation.metrics.warning.field import FIELD_CODES, FieldFigures, FieldQuirks, field_figures
+from deepaccident_devkit.evaluation.metrics.warning.protocol import WarningRules
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FieldResult(FrozenMappings):
+    """What the protocol `field` says: not comparable from code to code, and won by predictors that know nothing.
+
+    Attributes:
+        samples: how many.
+        figures: code and involvement of the agent, such as `ustring ego_involved` → what that code prints.
+        references: predictor (of `PREDICTORS` but the given one) → the same.
+        beyond: alarms for later than the horizon, which are none.
+        notes: sentences that a reader of the numbers should know: why numbers are NaN.
+    """
+
+    samples: int
+    figures: Mapping[str, FieldFigures]
+    references: Mapping[str, Mapping[str, FieldFigures]]
+    beyond: int
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FieldWarnings(WarningRules):
+    """Published anticipation metrics, for numbers beside published ones; a recording's score is as of `CleanWarnings`.
+
+    Attributes:
+        scores_of: as `CleanWarnings` has it; dash-cam sets know recordings alone.
+        quirks: which of the published codes' quirks are kept.
+    """
+
+    scores_of: ScoresOf = "recording"
+    quirks: FieldQuirks = field(default_factory=FieldQuirks)
+
+    def __post_init__(self) -> None:
+        """Check the values; raises ChoiceError or ConfigError."""
+        WarningRules.__post_init__(self)
+        if self.scores_of not in get_args(ScoresOf):
+            raise ChoiceError(f"scores_of: expected one of {', '.join(get_args(ScoresOf))}, found {self.scores_of!r}")
+
+    def _own_others(self) -> Mapping[str, tuple[Any, ...]]:
+        return {"scores_of": get_args(ScoresOf)}
+
+    def variants(self) -> Mapping[str, WarningRules]:
+        """These metrics with one choice made otherwise; each quirk among them."""
+        quirks = with_others(self.quirks, {each.name: (False, True) for each in fields(FieldQuirks)})
+        return {**WarningRules.variants(self), **with_parts(self, "quirks", quirks)}
+
+    def result(self, counts: Collection[Counts]) -> FieldResult:
+        """The metrics of some samples' counts."""
+        parts = parts_of(counts)
+        groups, samples = dict(by_group(drives_of(parts))), [sample for part in parts for sample in part]
+        made = {
+            predictor: {
+                f"{code} {group}": field_figures(series_of(those, predictor, self.scores_of), code, self.quirks)
+                for group, those in groups.items()
+                for code in FIELD_CODES
+            }
+            for predictor in PREDICTORS
+        }
+        given = made.pop(GIVEN)
+        notes = [f"{name}: {each.note}" for name, each in given.items() if each.note]
+        return FieldResult(
+            samples=len(samples),
+            figures=given,
+            references=made,
+            beyond=sum(each["beyond"] for each in samples),
+            notes=(*notes, "times and precisions of different codes are not comparable; the protocol clean ranks"),
+        )
