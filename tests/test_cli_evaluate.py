@@ -106,7 +106,9 @@ def bundle(da_motion: DeepAccident, folder: Path, accidents: Path) -> Path:
         ("detection", "boxes", "released", "mAP"),
         ("detection", "boxes", "paper", "mAP"),
         ("detection", "boxes", "opencood", "mAP"),
+        ("warning", "accidents", "clean", "auc_ahead ego_involved"),
         ("warning", "accidents", "boxes", "warned_share"),
+        ("warning", "accidents", "field", "AP ustring ego_involved"),
     ],
 )
 def test_every_task_and_protocol(
@@ -288,7 +290,7 @@ def test_tasks_have_the_grammar_of_all_verbs_on_a_release() -> None:
         text = evaluate(name, "--help").output
         for word in ("DATAROOT", "--version", "--index-dir", "--workers", "--on-error", "--results", "--protocol"):
             assert word in text
-    assert "[boxes]" in evaluate("warning", "--help").output
+    assert "[clean|boxes|field]" in evaluate("warning", "--help").output
 
 
 def test_the_group_names_its_verbs() -> None:

@@ -1,6 +1,7 @@
 """`deepaccident evaluate motion|accident|detection|warning`: the metrics of a results file, on a release."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -25,6 +26,7 @@ from deepaccident_devkit.evaluation.runs import (
     summary_text,
 )
 from deepaccident_devkit.evaluation.runs.explanation import explain
+from deepaccident_devkit.evaluation.runs.predictors import Chooser, chosen_threshold
 from deepaccident_devkit.evaluation.runs.sanity import check_sanity
 from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup, TaskName
 from deepaccident_devkit.evaluation.runs.text import SHOWN_BREAKDOWNS
@@ -46,6 +48,27 @@ def evaluate() -> None:
     """Evaluate results files; check and compare evaluations."""
 
 
+def _threshold_options(task: TaskName) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Where the task is warnings: which bundle of another split says from which score on there is an alarm."""
+    if task != "warning":
+        return lambda verb: verb
+    options = (
+        click.option(
+            "--threshold-from",
+            type=click.Path(path_type=Path),
+            help="Bundle of another split's evaluation, which chooses the operating point (protocol clean).",
+        ),
+        click.option(
+            "--threshold-by",
+            type=click.Choice(get_args(Chooser)),
+            default="best_f1",
+            show_default=True,
+            help="Its threshold of the best F1, or of at most one second a minute in false alarm.",
+        ),
+    )
+    return lambda verb: options[0](options[1](verb))
+
+
 def _task_verb(task: TaskName) -> click.Command:
     """The verb of one task."""
     protocols = list(TASK_PROTOCOLS[task])
@@ -55,6 +78,7 @@ def _task_verb(task: TaskName) -> click.Command:
     @click.option("--results", required=True, type=click.Path(path_type=Path), help="What was predicted.")
     @selection_parameters
     @click.option("--protocol", type=click.Choice(protocols), default=protocols[0], show_default=True)
+    @_threshold_options(task)
     @click.option("--switch", "switches", multiple=True, metavar="NAME=VALUE", help="Make a choice of it otherwise.")
     @click.option("--allow-partial", is_flag=True, help="Evaluate the samples there are; all is marked as partial.")
     @click.option("--by", multiple=True, type=click.Choice(ATTRIBUTES), help="Break down by this; may be repeated.")
@@ -71,10 +95,18 @@ def _task_verb(task: TaskName) -> click.Command:
     @click.option("--overwrite", is_flag=True, help="Replace the evaluation in --out.")
     @click.option("--include-results", is_flag=True, help="Copy RESULTS into --out, to check it by itself.")
     @click.option("--json", "as_json", is_flag=True, help="One JSON object, for programs.")
-    def verb(results: Path, protocol: str, switches: tuple[str, ...], **options: Any) -> None:
-        setup = EvaluationSetup(
-            task=task, protocol=protocol, switches=switches_of(switches), horizon=options["horizon"]
-        )
+    def verb(
+        results: Path,
+        protocol: str,
+        switches: tuple[str, ...],
+        threshold_from: Path | None = None,
+        threshold_by: Chooser = "best_f1",
+        **options: Any,
+    ) -> None:
+        chosen = switches_of(switches)
+        if threshold_from is not None:
+            chosen["threshold"] = chosen_threshold(threshold_from, threshold_by, split=options["split"])
+        setup = EvaluationSetup(task=task, protocol=protocol, switches=chosen, horizon=options["horizon"])
         _evaluate(setup, results, **options)
 
     return verb

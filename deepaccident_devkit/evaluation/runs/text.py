@@ -8,13 +8,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 from deepaccident_devkit.evaluation.results import Results
+from deepaccident_devkit.evaluation.runs.predictors import predictors_text
 from deepaccident_devkit.evaluation.runs.selection import agent_of, scenario_of
 from deepaccident_devkit.text import columns_text
 
 SHOWN_BREAKDOWNS: Final = ("time_to_impact", "accident_visibility")
 _COLUMNS: Final = 5
 """Headlines that a breakdown shows."""
-_NOT_COUNTED: Final = ("beside", "notes", "curve")
+_NOT_COUNTED: Final = ("beside", "notes", "curve", "references")
 """Parts of the metrics that hold no counts of the samples."""
 Json = Mapping[str, Any]
 
@@ -30,6 +31,7 @@ def summary_text(summary: Json, by: Sequence[str] = SHOWN_BREAKDOWNS) -> str:
     blocks = [
         ("evaluated", _head(summary)),
         ("results", _headlines(summary)),
+        *((("predictors", table),) if (table := predictors_text(summary["metrics"])) else ()),
         ("counts", "\n".join(_counts(summary["metrics"]))),
         *((f"by {name}", _breakdown(summary, name)) for name in by if name in summary["breakdowns"]),
     ]

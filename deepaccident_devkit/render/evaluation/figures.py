@@ -37,7 +37,7 @@ MAIN_NUMBERS: Final = {
     "motion": ("ranges/100x100/pq", "ranges/100x100/iou"),
     "accident": ("apa", "position_error"),
     "detection": ("mean_average_precision",),
-    "warning": ("warned_share",),
+    "warning": ("groups/ego_involved/auc_ahead", "recording_precision"),
 }
 """Task → paths of the headline numbers that figures show by attribute: the first by all attributes, and samples are
 ranked by it; the others by time to impact alone."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, get_args
 
 import numpy as np
@@ -25,7 +25,13 @@ from deepaccident_devkit.evaluation.metrics.accident.scoring import (
     tally_result,
     united,
 )
-from deepaccident_devkit.evaluation.metrics.alarms.raised import Naming, Pair, named_alarms, position_difference
+from deepaccident_devkit.evaluation.metrics.alarms.raised import (
+    Naming,
+    Pair,
+    named_alarms,
+    position_difference,
+    within_horizon,
+)
 from deepaccident_devkit.evaluation.metrics.alarms.reading import AccidentReading
 from deepaccident_devkit.evaluation.metrics.alarms.truth import SLACK, AccidentContext, BoxTruth
 from deepaccident_devkit.evaluation.metrics.choices import with_others, with_parts
@@ -33,10 +39,15 @@ from deepaccident_devkit.evaluation.metrics.evaluator import Counts
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, Prediction, checked_prediction
 from deepaccident_devkit.motion import MotionLabels
 
+_LEFT_OUT = ("unjudged", "beyond", "at_impact")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoxAccidentResult(AccidentResult):
     """Accident metrics, and what one would ask of an alarm; the latter at the distance of `Scoring.errors_at`.
+
+    Where no accident comes at all nothing can be foreseen: then APA and the accuracies are NaN, and the false alarm
+    rate says how good predictions are.
 
     Attributes:
         precision: share of the alarms that foresee a true accident; None without alarms.
@@ -46,6 +57,8 @@ class BoxAccidentResult(AccidentResult):
         lateness: seconds, mean over the true positives by which the predicted moment is later than the true one,
             negative if it is earlier; None without any.
         unjudged: alarms that nothing can refute: no accident is known, and they are for later than the recording shows.
+        beyond: alarms for later than the horizon, which are none.
+        at_impact: samples at the impact itself, where nothing is foreseen any more; they are left out of all else.
     """
 
     precision: float | None
@@ -54,6 +67,8 @@ class BoxAccidentResult(AccidentResult):
     false_alarm_rate: float | None
     lateness: float | None
     unjudged: int
+    beyond: int
+    at_impact: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,7 +78,8 @@ class BoxAccidents:
     A list of `Accident`s is a list of alarms: each is true or false, and the surest one that is near enough to the true
     accident (the earliest of equally sure ones) is the true positive. K motion predictions are one alarm, as sure as
     the share of them that have an accident; where and when is said by the mean sample (the last) or else by the first
-    that has one. They are not cut at the recording's end, which a model cannot know.
+    that has one. They are not cut at the recording's end, which a model cannot know. An alarm for later than the
+    horizon is none, and at the impact itself there is nothing to foresee.
 
     Attributes:
         reading: how an accident is read off maps. By the paper's 1 m, the default, traffic side by side is one, since
@@ -124,7 +140,8 @@ class BoxAccidents:
 
         Returns:
             `positive`: whether an accident comes; `named`: whom the boxes bring nearer to each other than the danger
-            distance (of `NAMED`); `alarms`: the surest first; `unjudged`: how many were left out.
+            distance (of `NAMED`); `alarms`: the surest first; `unjudged` and `beyond`: how many were left out, and how
+            many are none; `at_impact`: whether the impact is now, so that nothing else of the sample counts.
 
         Raises:
             EvaluationError: the context has no truth, or the prediction is neither.
@@ -136,28 +153,36 @@ class BoxAccidents:
                 "accident_context(dataset, sample, horizon=2.0), as label or as context"
             )
         raised = named_alarms(checked_prediction(prediction), label, truth, self)
-        judged = [alarm for alarm in raised if self._is_judged(alarm[0], truth)]
+        within = within_horizon(raised, truth)
+        judged = [alarm for alarm in within if self._is_judged(alarm[0], truth)]
         nearest = truth.nearest_pair(self.reading.danger_distance)
         return {
             "positive": truth.accident is not None,
             "named": named(nearest, context),
             "alarms": [_alarm(accident, ids, truth) for accident, ids in judged],
-            "unjudged": len(raised) - len(judged),
+            "unjudged": len(within) - len(judged),
+            "beyond": len(raised) - len(within),
+            "at_impact": truth.accident is not None and truth.accident.time < SLACK,
         }
 
     def result(self, counts: Collection[Counts]) -> BoxAccidentResult:
         """The metrics of some samples' counts, in any order."""
         given = self._united(counts)
         base = tally_result(given["tally"], self.scoring.errors_at)
+        if not base.positives:
+            nothing = {distance: replace(each, accuracy=math.nan) for distance, each in base.within.items()}
+            base = replace(base, apa=math.nan, within=nothing)
         at = base.within[self.scoring.errors_at]
+        beyond = [f"{given['beyond']} alarms are for later than the horizon and are none"] if given["beyond"] else []
         return BoxAccidentResult(
-            **{each.name: getattr(base, each.name) for each in fields(AccidentResult)},
+            **{each.name: getattr(base, each.name) for each in fields(AccidentResult) if each.name != "notes"},
+            notes=(*base.notes, *beyond),
             precision=_share(at.tp, at.tp + at.fp),
             recall=_share(at.tp, base.positives),
             average_precision=_average_precision(given["alarms"], base.positives),
             false_alarm_rate=_share(given["false_samples"], base.negatives),
             lateness=_share(math.fsum(given["lateness"]), at.tp),
-            unjudged=given["unjudged"],
+            **{name: given[name] for name in _LEFT_OUT},
         )
 
     def pooled(self, counts: Collection[Counts]) -> list[Counts]:
@@ -169,17 +194,23 @@ class BoxAccidents:
 
         Returns:
             `tally`; `alarms`: [score, whether it is the right one] of each; `lateness`: in sum, of the right ones;
-            `false_samples`: how many raise an alarm without an accident to come; `unjudged`.
+            `false_samples`: how many raise an alarm without an accident to come; `unjudged`, `beyond`, `at_impact`.
         """
         given = [each if "tally" in each else self._tallied(each) for each in counts]
         return {
             "tally": united(each["tally"] for each in given),
             "alarms": [alarm for each in given for alarm in each["alarms"]],
             "lateness": exact_parts(each["lateness"] for each in given),
-            **{name: sum(each[name] for each in given) for name in ("false_samples", "unjudged")},
+            **{name: sum(each[name] for each in given) for name in ("false_samples", *_LEFT_OUT)},
         }
 
     def _tallied(self, sample: Counts) -> dict[str, Any]:
+        if sample["at_impact"]:
+            return (
+                {"tally": united([]), "alarms": [], "lateness": []}
+                | dict.fromkeys(("false_samples", *_LEFT_OUT), 0)
+                | {"at_impact": 1}
+            )
         alarms: Sequence[Alarm] = sample["alarms"]
         hit = self.scoring.hit(alarms, self.scoring.errors_at) if sample["positive"] else None
         return {
@@ -188,6 +219,8 @@ class BoxAccidents:
             "lateness": [] if hit is None else [hit["time"]],
             "false_samples": int(bool(alarms) and not sample["positive"]),
             "unjudged": sample["unjudged"],
+            "beyond": sample["beyond"],
+            "at_impact": 0,
         }
 
     def _is_judged(self, accident: Accident, truth: BoxTruth) -> bool:

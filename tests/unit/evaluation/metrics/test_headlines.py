@@ -18,7 +18,8 @@ def test_each_headline_is_a_number_of_the_result_by_its_path(task: str, protocol
     result = EvaluationSetup(task=task, protocol=protocol).evaluator().compute()
     known = numbers_of(result)
     found = headlines(task, result)
-    assert len({each.name for each in found}) == len(found) > 2
+    assert len({each.name for each in found}) == len(found)
+    assert len(found) > 2 or protocol in ("clean", "field")  # by group, of which there is none yet
     for each in found:
         value = known.get(each.path, math.nan)
         assert each.value == (None if math.isnan(value) else value)

@@ -11,6 +11,7 @@ from deepaccident_devkit.evaluation import Accident, accident_context, instances
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
 from deepaccident_devkit.evaluation.runs import EvaluationRun, SampleSelection, evaluate_results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.synth import SynthConfig, make_release
 
 WriteAccidents = Callable[..., Results]
 WriteMotion = Callable[..., Results]
@@ -18,10 +19,22 @@ SETUP = EvaluationSetup(task="accident", protocol="boxes")
 
 
 @pytest.fixture(scope="session")
+def release_root_b(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The labels-only release with half a second more: at the impact itself nothing can be foreseen."""
+    root = tmp_path_factory.mktemp("runs") / "layout_b"
+    return make_release(root, SynthConfig(scenarios=6, frames=6, layout="B", seed=4, sensors=False), workers=2)
+
+
+@pytest.fixture(scope="session")
+def da_b(release_root_b: Path) -> DeepAccident:
+    return DeepAccident(dataroot=release_root_b)
+
+
+@pytest.fixture(scope="session")
 def selection() -> SampleSelection:
     """Two scenarios, an accident and its normal twin, of three agents: six samples."""
     agents = ("ego_vehicle", "other_vehicle", "infrastructure")
-    return SampleSelection(split="val", samples="all", scope="all", agents=agents)
+    return SampleSelection(split="val", samples="evaluate", scope="all", agents=agents)
 
 
 @pytest.fixture(scope="session")

@@ -27,10 +27,10 @@ def column(rows: list[dict[str, Any]], name: str) -> list[Any]:
 def test_which_sample(run: EvaluationRun, da_b: DeepAccident) -> None:
     rows = sample_rows(run)
     assert column(rows, "token") == sorted(run.evaluator.tokens)
-    assert {row["time_to_impact"] for row in rows} == {0.0, None}
+    assert {row["time_to_impact"] for row in rows} == {0.5, None}
     for row in rows:
         sample = da_b.sample.get(row["token"])
-        assert (row["scenario"], row["agent"], row["frame"]) == (sample["scenario_token"], sample["agent"], 4)
+        assert (row["scenario"], row["agent"], row["frame"]) == (sample["scenario_token"], sample["agent"], 1)
         assert row["time_to_impact"] == sample["time_to_impact"]
         assert row["accident_visibility"] == run.attributes[row["token"]].accident_visibility
 

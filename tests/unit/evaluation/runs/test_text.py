@@ -31,14 +31,16 @@ def test_what_it_tells(run: EvaluationRun) -> None:
     lines = lines_of(summary_text(run.broken_down(["all", "agent"], Bootstrap(resamples=10)).summary(), ["agent"]))
     assert lines[:2] == ["evaluated", "task accident, protocol boxes"]
     assert lines[2].startswith(
-        "samples 6 of 2 scenarios: split val, list all, scope all, ego_vehicle, other_vehicle, inf"
+        "samples 6 of 2 scenarios: split val, list evaluate, scope all, ego_vehicle, other_vehicle, inf"
     )
     assert "number value 95% interval" in lines
     assert "apa 1.000 [1.000, 1.000]" in lines
     assert "position_error 0.283 m [0.283, 0.283]" in lines
-    assert "samples 6, positives 3, negatives 3, unjudged 0" in lines
+    assert "samples 6, positives 3, negatives 3, unjudged 0, beyond 0, at_impact 0" in lines
     assert "within/5 tp 3, fp 0, fn 0" in lines
-    assert lines[lines.index("by agent") + 1].startswith("value samples scenarios apa accuracy@5")
+    assert lines[lines.index("by agent") + 1].startswith(
+        "value samples scenarios apa precision recall false_alarm_rate"
+    )
     assert "ego_vehicle 2 2 1.000 1.000 1.000 1.000 0.000" in lines
 
 

@@ -13,6 +13,8 @@ from deepaccident_devkit.evaluation.metrics.accident.scoring import Scoring
 from deepaccident_devkit.render.evaluation import render_accuracy, render_alarms, render_errors, render_outcomes
 from deepaccident_devkit.render.evaluation.accident import accuracy_by_distance, alarm_precision_recall
 
+LEFT_OUT = {"unjudged": 0, "beyond": 0, "at_impact": False}
+
 
 def alarm(position: float | None, score: float, time: float | None = 0.0) -> dict[str, Any]:
     return {"position": position, "time": time, "id": 0, "score": score}
@@ -30,7 +32,10 @@ def boxes(**choices: Any) -> AccidentEvaluator:
     }
     for token, (positive, alarms) in samples.items():
         named = "meta" if positive else "none"
-        evaluator.add(token, {"positive": positive, "named": named, "alarms": alarms, "unjudged": 0})
+        evaluator.add(
+            token,
+            {"positive": positive, "named": named, "alarms": alarms, **LEFT_OUT},
+        )
     return evaluator
 
 
@@ -74,7 +79,10 @@ def test_equally_sure_alarms_come_in_together() -> None:
     evaluator = AccidentEvaluator("boxes")
     for token, positive in {"a": True, "b": False}.items():
         alarms = [alarm(1.0 if positive else None, 0.5, 0.0 if positive else None)]
-        evaluator.add(token, {"positive": positive, "named": "none", "alarms": alarms, "unjudged": 0})
+        evaluator.add(
+            token,
+            {"positive": positive, "named": "none", "alarms": alarms, **LEFT_OUT},
+        )
     assert [each.tolist() for each in alarm_precision_recall(evaluator)] == [[1.0], [0.5]]
 
 
@@ -89,7 +97,17 @@ def test_outcomes_and_errors_are_counted() -> None:
     drawn = {round(bar.get_x()): bar.get_height() for bar in ax.patches if bar.get_height()}
     assert drawn == {3: 1, 12: 1}  # of the surest alarm of each accident
     far = AccidentEvaluator("boxes")
-    far.add("a", {"positive": True, "named": "meta", "alarms": [alarm(99.0, 0.5)], "unjudged": 0})
+    far.add(
+        "a",
+        {
+            "positive": True,
+            "named": "meta",
+            "alarms": [alarm(99.0, 0.5)],
+            "unjudged": 0,
+            "beyond": 0,
+            "at_impact": False,
+        },
+    )
     ax = render_errors(far, "position", ax=new_axes())
     assert [bar.get_x() for bar in ax.patches if bar.get_height()] == [20]  # the last bin: and more
     ax = render_errors(boxes(), "time", ax=new_axes())

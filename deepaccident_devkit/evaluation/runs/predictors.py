@@ -1,0 +1,115 @@
+"""Predictions beside predictors that know nothing, and an operating point that another split chose: task `warning`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from deepaccident_devkit.errors import EvaluationError
+from deepaccident_devkit.evaluation.metrics.warning.drives import GIVEN, GROUPS
+from deepaccident_devkit.evaluation.runs.bundles import read_bundle
+from deepaccident_devkit.text import columns_text
+
+Json = Mapping[str, Any]
+Chooser = Literal["best_f1", "quiet"]
+"""Which threshold of an evaluation is taken: of the best F1, or of at most one second a minute in false alarm."""
+_COLUMNS: Final[Mapping[str, str]] = {
+    "auc_ahead": "auc_ahead",
+    "twin_wins": "twin_wins",
+    "AP": "average_precision",
+    "mTTA": "mean_time",
+    "precision": "operating/precision",
+    "in alarm": "operating/time_in_alarm",
+    "s/min": "operating/alarm_seconds_per_minute",
+    "runs/min": "operating/episodes_per_minute",
+    "recall": "operating/recall",
+    "tta0": "operating/tta0",
+    "tta_hit": "operating/tta_hit",
+}
+"""Of the protocol `clean`. Recall and seconds never stand without precision and the time in alarm."""
+_FIELD_COLUMNS: Final[Mapping[str, str]] = {
+    "AP": "average_precision",
+    "mTTA": "mean_time",
+    "TTA@R80": "time_at_r80",
+    "P@R80": "precision_at_r80",
+    "P@0.5": "precision_at_half",
+    "R@0.5": "recall_at_half",
+    "TTA@0.5": "time_at_half",
+}
+
+
+def predictors_text(metrics: Json) -> str:
+    """A table for each group of recordings: the given predictions, and the references; empty if there are none.
+
+    Args:
+        metrics: of a summary, as JSON holds an `AnticipationResult` or a `FieldResult`.
+    """
+    references: Mapping[str, Json] | None = metrics.get("references")
+    if not references:
+        return ""
+    clean = "groups" in metrics
+    groups: Mapping[str, Json] = metrics["groups" if clean else "figures"]
+    columns = _COLUMNS if clean else _FIELD_COLUMNS
+    blocks = []
+    for group, given in groups.items():
+        shown = {name: path for name, path in columns.items() if clean or (path in given and given[path] is not None)}
+        rows: list[Sequence[str]] = [(group, *shown)]
+        for name, figures in {GIVEN: given, **{name: each[group] for name, each in references.items()}}.items():
+            rows.append((name, *(_cell(figures, path) for path in shown.values())))
+        blocks.append("\n".join([columns_text(rows), *(_operating(metrics, given) if clean else ())]))
+    return "\n\n".join(blocks)
+
+
+def chosen_threshold(folder: Path, by: Chooser, *, split: str) -> float:
+    """The threshold that an evaluation of another split found best for the agents that are involved.
+
+    A car does not know whether it will be involved, so that there is one threshold for all groups.
+
+    Args:
+        folder: bundle of an evaluation of the task `warning`, protocol `clean`.
+        by: which of the thresholds found there.
+        split: that is to be evaluated with it.
+
+    Raises:
+        ResultsError: there is no bundle.
+        EvaluationError: it is of another task or protocol, of the same split, or found no threshold.
+    """
+    bundle = read_bundle(folder)
+    kind = tuple(bundle.summary.get(name) for name in ("task", "protocol"))
+    if kind != ("warning", "clean"):
+        raise EvaluationError(
+            f"{folder}: is an evaluation of {' '.join(map(str, kind))}; expected one of warning, protocol clean"
+        )
+    if bundle.selection.split == split:
+        raise EvaluationError(
+            f"{folder}: is an evaluation of the split {split}, too; a threshold that is chosen on the recordings it is "
+            "tried on flatters: give one of another split, such as train or val"
+        )
+    groups: Mapping[str, Json] = bundle.summary["metrics"]["groups"]
+    group = next((name for name in GROUPS if name in groups), None)
+    threshold = None if group is None else groups[group][by]
+    if not isinstance(threshold, float) or not math.isfinite(threshold):
+        raise EvaluationError(
+            f"{folder}: found no threshold by {by}; choose another, or give one with --switch threshold=…"
+        )
+    return threshold
+
+
+def _cell(figures: Json, path: str) -> str:
+    value: Any = figures
+    for name in path.split("/"):
+        value = value[name]
+    return "–" if value is None else f"{value:.3f}" if abs(value) < 10 else f"{value:.1f}"
+
+
+def _operating(metrics: Json, given: Json) -> Iterator[str]:
+    operating, after = given["operating"], given["tta0_after"]
+    threshold = operating["threshold"]
+    found = "none" if threshold is None else f"{threshold:.4g}"
+    how = "given" if metrics["operating_by"] == "given" else "recall 0.8 on these recordings"
+    yield f"threshold {found} ({how}); over these recordings best_f1 {given['best_f1']}, quiet {given['quiet']}"
+    if after:
+        told = ", ".join(f"{latency} s: {'–' if left is None else f'{left:.3f} s'}" for latency, left in after.items())
+        yield f"tta0 if the two who collide are told after a latency of {told}"
