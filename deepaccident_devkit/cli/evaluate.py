@@ -17,8 +17,8 @@ from deepaccident_devkit.evaluation import Bootstrap
 from deepaccident_devkit.evaluation.metrics.attributes import ATTRIBUTES, EVERYTHING
 from deepaccident_devkit.evaluation.results import Results, read_results
 from deepaccident_devkit.evaluation.runs import (
-    BREAKDOWNS,
     EvaluationRun,
+    breakdowns_of,
     checked_target,
     evaluate_results,
     explanation_checkpoint,
@@ -129,7 +129,7 @@ def _evaluate(setup: EvaluationSetup, results: Path, *, by: tuple[str, ...], as_
         progress=True,
     )
     drawn = Bootstrap(resamples=options["bootstrap"])
-    run = run.broken_down((EVERYTHING, *(by or BREAKDOWNS)), drawn, workers=options["workers"])
+    run = run.broken_down((EVERYTHING, *(by or breakdowns_of(setup.task))), drawn, workers=options["workers"])
     run, texts = _examined(run, dataset, opened, options)
     summary = run.summary()
     shown = summary_text(summary, by or SHOWN_BREAKDOWNS)

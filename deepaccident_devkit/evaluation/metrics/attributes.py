@@ -19,6 +19,8 @@ _WEATHER_GROUPS: Final = {"Rain": "Rainy", "Cloudy": "Cloudy", "Clear": "Clear"}
 STRAIGHT: Final = "straight_straight"
 TURNING: Final = "one_of_the_agents_turning"
 NO_IMPACT: Final = "no impact"
+WITHIN_RECORDINGS: Final = ("time_to_impact", "impact_step", "time_to_end", "accident_visibility")
+"""Attributes that cut recordings apart: of no use to a task that is about whole ones."""
 
 
 def cluster_of(scenario: str) -> str:

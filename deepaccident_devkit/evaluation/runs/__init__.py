@@ -16,6 +16,7 @@ from deepaccident_devkit.evaluation.runs.evaluation_run import (
     Partial,
     ReleaseInfo,
     ResultsInfo,
+    breakdowns_of,
     explanation_checkpoint,
 )
 from deepaccident_devkit.evaluation.runs.rows import read_rows, sample_rows
@@ -38,6 +39,7 @@ __all__ = [
     "SampleSelection",
     "ScenarioHashes",
     "Verification",
+    "breakdowns_of",
     "checked_target",
     "compare_bundles",
     "coverage",

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.metrics.attributes import SampleAttributes
+from deepaccident_devkit.evaluation.metrics.attributes import WITHIN_RECORDINGS, SampleAttributes
 from deepaccident_devkit.evaluation.metrics.breakdowns import Bootstrap, Breakdown, Group, breakdown
 from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import plain
@@ -40,6 +40,13 @@ BREAKDOWNS: Final = (
     "collision_status",
 )
 """What results are broken down by if nothing else is asked for; `all` for intervals of the result itself."""
+
+
+def breakdowns_of(task: str) -> tuple[str, ...]:
+    """What a task's results are broken down by if nothing else is asked for: warnings by whole recordings alone."""
+    return tuple(name for name in BREAKDOWNS if task != "warning" or name not in WITHIN_RECORDINGS)
+
+
 _LIBRARIES: Final = ("numpy", "scipy")
 """Whose versions stand in a summary: arithmetic is theirs."""
 
@@ -158,20 +165,21 @@ class EvaluationRun:
         }
 
     def broken_down(
-        self, by: Sequence[str] = BREAKDOWNS, bootstrap: Bootstrap | None = None, *, workers: int | None = 1
+        self, by: Sequence[str] | None = None, bootstrap: Bootstrap | None = None, *, workers: int | None = 1
     ) -> EvaluationRun:
         """The same run with results by these attributes, in place of those it has.
 
         Args:
-            by: of `attributes.ATTRIBUTES`; one that is given twice counts once.
+            by: of `attributes.ATTRIBUTES`; one that is given twice counts once. None for `breakdowns_of` the task.
             bootstrap: how intervals are drawn; None for the defaults.
             workers: processes, which share the attributes among them; None takes what the work is worth.
 
         Raises:
             ChoiceError: no such attribute.
         """
+        chosen = breakdowns_of(self.setup.task) if by is None else by
         work = partial(breakdown, self.evaluator, self.attributes, bootstrap=bootstrap)
-        return replace(self, breakdowns=tuple(run_batch(work, list(dict.fromkeys(by)), workers=workers)))
+        return replace(self, breakdowns=tuple(run_batch(work, list(dict.fromkeys(chosen)), workers=workers)))
 
     def summary(self) -> dict[str, Any]:
         """All numbers but those of single samples, and what they depend on, as JSON holds it."""

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args
 
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.warning.drives import GIVEN, GROUPS
@@ -29,37 +30,53 @@ _COLUMNS: Final[Mapping[str, str]] = {
     "tta_hit": "operating/tta_hit",
 }
 """Of the protocol `clean`. Recall and seconds never stand without precision and the time in alarm."""
-_FIELD_COLUMNS: Final[Mapping[str, str]] = {
-    "AP": "average_precision",
-    "mTTA": "mean_time",
-    "TTA@R80": "time_at_r80",
-    "P@R80": "precision_at_r80",
-    "P@0.5": "precision_at_half",
-    "R@0.5": "recall_at_half",
-    "TTA@0.5": "time_at_half",
+_PRINTED: Final = {"AP": "average_precision", "mTTA": "mean_time", "TTA@R80": "time_at_r80"}
+_AT_HALF: Final = {"P@0.5": "precision_at_half", "R@0.5": "recall_at_half", "TTA@0.5": "time_at_half"}
+_FIELD_COLUMNS: Final[Mapping[str, Mapping[str, str]]] = {
+    "ustring": _PRINTED,
+    "dsta": _PRINTED | {"P@R80": "precision_at_r80"},
+    "drive": _PRINTED | _AT_HALF,
+    "dad": _PRINTED,
 }
 
 
-def predictors_text(metrics: Json) -> str:
-    """A table for each group of recordings: the given predictions, and the references; empty if there are none.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PredictorTable:
+    """One group of recordings: the given predictions, and the references.
+
+    Attributes:
+        rows: of texts; the first has the names of the group and of the numbers.
+        notes: lines below it.
+    """
+
+    rows: tuple[tuple[str, ...], ...]
+    notes: tuple[str, ...]
+
+
+def predictor_tables(metrics: Json) -> list[PredictorTable]:
+    """A table for each group of recordings; none if the result has no references.
 
     Args:
         metrics: of a summary, as JSON holds an `AnticipationResult` or a `FieldResult`.
     """
     references: Mapping[str, Json] | None = metrics.get("references")
     if not references:
-        return ""
+        return []
     clean = "groups" in metrics
     groups: Mapping[str, Json] = metrics["groups" if clean else "figures"]
-    columns = _COLUMNS if clean else _FIELD_COLUMNS
-    blocks = []
+    tables = []
     for group, given in groups.items():
-        shown = {name: path for name, path in columns.items() if clean or (path in given and given[path] is not None)}
-        rows: list[Sequence[str]] = [(group, *shown)]
-        for name, figures in {GIVEN: given, **{name: each[group] for name, each in references.items()}}.items():
-            rows.append((name, *(_cell(figures, path) for path in shown.values())))
-        blocks.append("\n".join([columns_text(rows), *(_operating(metrics, given) if clean else ())]))
-    return "\n\n".join(blocks)
+        everyone = {GIVEN: given, **{name: each[group] for name, each in references.items()}}
+        columns = _COLUMNS if clean else _FIELD_COLUMNS[group.partition(" ")[0]]
+        rows = [(name, *(_cell(figures, path) for path in columns.values())) for name, figures in everyone.items()]
+        notes = tuple(_operating(metrics, given)) if clean else ()
+        tables.append(PredictorTable(rows=((group, *columns), *rows), notes=notes))
+    return tables
+
+
+def predictors_text(metrics: Json) -> str:
+    """All tables of `predictor_tables`, as aligned lines; empty without any."""
+    return "\n\n".join("\n".join([columns_text(each.rows), *each.notes]) for each in predictor_tables(metrics))
 
 
 def chosen_threshold(folder: Path, by: Chooser, *, split: str) -> float:
@@ -108,8 +125,9 @@ def _operating(metrics: Json, given: Json) -> Iterator[str]:
     operating, after = given["operating"], given["tta0_after"]
     threshold = operating["threshold"]
     found = "none" if threshold is None else f"{threshold:.4g}"
-    how = "given" if metrics["operating_by"] == "given" else "recall 0.8 on these recordings"
-    yield f"threshold {found} ({how}); over these recordings best_f1 {given['best_f1']}, quiet {given['quiet']}"
+    how = "given" if metrics["operating_by"] == "given" else "of recall 0.8, or the highest, on these recordings"
+    others = ", ".join(f"{name} {_cell(given, name)}" for name in get_args(Chooser))
+    yield f"threshold {found} ({how}); for another split: {others}"
     if after:
         told = ", ".join(f"{latency} s: {'–' if left is None else f'{left:.3f} s'}" for latency, left in after.items())
         yield f"tta0 if the two who collide are told after a latency of {told}"

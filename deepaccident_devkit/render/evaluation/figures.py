@@ -13,7 +13,7 @@ import numpy as np
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.evaluation.metrics.accident.evaluator import AccidentEvaluator
-from deepaccident_devkit.evaluation.metrics.attributes import EVERYTHING
+from deepaccident_devkit.evaluation.metrics.attributes import EVERYTHING, WITHIN_RECORDINGS
 from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown
 from deepaccident_devkit.evaluation.metrics.detection.evaluator import DetectionEvaluator
 from deepaccident_devkit.evaluation.metrics.headlines import Headline, headlines
@@ -42,8 +42,6 @@ MAIN_NUMBERS: Final = {
 """Task → paths of the headline numbers that figures show by attribute: the first by all attributes, and samples are
 ranked by it; the others by time to impact alone."""
 _BY_TIME: Final = "time_to_impact"
-_WITHIN_RECORDINGS: Final = (_BY_TIME, "impact_step", "time_to_end", "accident_visibility")
-"""Attributes that cut recordings apart: of no use to a task that is about whole ones."""
 
 
 class Draw(Protocol):
@@ -101,7 +99,7 @@ def save_figure(run: EvaluationRun, drawn: RunFigure, folder: Path) -> Path:
 def run_figures(run: EvaluationRun) -> tuple[RunFigure, ...]:
     """All figures of a run, those of its task first, then the breakdowns that have more than one group."""
     own = _FIGURES[run.setup.task](run)
-    left_out = (EVERYTHING, *(_WITHIN_RECORDINGS if run.setup.task == "warning" else ()))
+    left_out = (EVERYTHING, *(WITHIN_RECORDINGS if run.setup.task == "warning" else ()))
     broken = {each.by: each for each in run.breakdowns if each.by not in left_out and len(each.groups) > 1}
     numbers = [path for path in MAIN_NUMBERS[run.setup.task] if _headline(run.setup.task, run.result, path) is not None]
     pairs = [(path, each) for path in numbers[:1] for each in broken.values()]

@@ -67,6 +67,7 @@ def report_html(run: EvaluationRun, figures: Sequence[tuple[RunFigure, Path]]) -
     title = f"{run.setup.task.capitalize()}, protocol {run.setup.protocol}"
     parts = {
         "Headline numbers": sections.headline_table(run),
+        **({"Predictors": table} if (table := sections.predictors(run)) else {}),
         "Counts": sections.counts(run),
         "Figures": tag("div", *(_figure(*each) for each in figures), class_="figures"),
         "Breakdowns": joined(sections.breakdowns(run)),

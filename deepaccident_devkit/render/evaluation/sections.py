@@ -10,6 +10,7 @@ from deepaccident_devkit.evaluation.metrics.attributes import EVERYTHING
 from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown, Group
 from deepaccident_devkit.evaluation.metrics.headlines import Headline, headlines, value_text
 from deepaccident_devkit.evaluation.runs import EvaluationRun
+from deepaccident_devkit.evaluation.runs.predictors import predictor_tables
 from deepaccident_devkit.render.evaluation.breakdowns import UNKNOWN
 from deepaccident_devkit.render.evaluation.markup import Markup, facts, joined, scalar, table, tag, tree
 
@@ -64,6 +65,16 @@ def headline_table(run: EvaluationRun) -> Markup:
     ]
     percent = f"{100 * everything.bootstrap.confidence:g} % interval" if everything is not None else "interval"
     return tag("div", table(["number", "value", percent, "better"], rows), class_="big")
+
+
+def predictors(run: EvaluationRun) -> Markup:
+    """The predictions beside predictors that know nothing or the present alone; empty but for warnings."""
+    return joined(
+        joined(
+            [table(list(each.rows[0]), [list(row) for row in each.rows[1:]]), *(tag("p", note) for note in each.notes)]
+        )
+        for each in predictor_tables(run.result.as_dict())
+    )
 
 
 def counts(run: EvaluationRun) -> Markup:

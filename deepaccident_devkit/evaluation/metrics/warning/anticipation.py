@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial
 from typing import Any, Final, get_args
 
@@ -14,7 +14,7 @@ from deepaccident_devkit.arrays import FloatArray, IntArray
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, ratio
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
-from deepaccident_devkit.evaluation.metrics.warning.clean import CleanScores, OperatingPoint
+from deepaccident_devkit.evaluation.metrics.warning.clean import WINDOW, CleanScores, OperatingPoint
 from deepaccident_devkit.evaluation.metrics.warning.drives import (
     GIVEN,
     GROUPS,
@@ -29,6 +29,7 @@ from deepaccident_devkit.evaluation.metrics.warning.drives import (
 )
 from deepaccident_devkit.evaluation.metrics.warning.protocol import WarningRules
 
+RANDOM_DRAWS: Final = 20
 LATENCIES: Final = (0.0, 0.1, 0.3)
 """Seconds that a warning may take from who sees to who collides."""
 _ANY: Final = float(np.nextafter(0.0, 1.0))
@@ -41,15 +42,17 @@ class AnticipationFigures(FrozenMappings):
     """How well one predictor foresees the accidents of one group of recordings. NaN: nothing to count.
 
     Attributes:
-        auc_ahead: the headline: the chance that an accident recording's highest score, up to `lead` before the impact,
-            is above another recording's up to as long before its end; ties half. 0.5 for always, never and chance.
+        auc_ahead: the headline: the chance that an accident recording's score is above another recording's as long
+            before the end, ties half, mean over the moments of the last `window` seconds. 0.5 for always and never, and
+            on average for chance.
         twin_wins: the chance that an accident recording's highest score is above its twin's, ties half; a twin is cut
             to the accident's length.
         average_precision: AP over recordings, by their highest scores; depends on how many of each there are.
         area_under_curve: AUC, likewise up to the impact.
         mean_time: mTTA over the curve of recall, seconds; a missed recording is in no time, so read it beside the AP.
-        operating: the figures at the operating point: the threshold that was given, or, without one, `at_r80`.
-        at_r80: at the highest threshold with a recall of 0.8.
+        operating: the figures at the operating point: the threshold that was given; without one that of `at_r80`, or of
+            the highest recall where 0.8 is not reached.
+        at_r80: at the highest threshold with a recall of 0.8; NaN where none has it.
         at_p80: at the threshold of the highest recall with a precision of 0.8.
         best_f1: threshold: of the best F1 over these recordings; to be given when another split is evaluated.
         quiet: threshold: the lowest with at most one second a minute in alarm without an accident to come; likewise.
@@ -80,7 +83,7 @@ class AnticipationResult(FrozenMappings):
 
     Attributes:
         samples: how many.
-        operating_by: `given` threshold, or `R80`.
+        operating_by: `given` threshold, or `recall`.
         groups: involvement of the agent → figures; agents of one scenario are never pooled.
         references: predictor (of `PREDICTORS` but the given one) → the same; empty for resamples.
         beyond: alarms for later than the horizon, which are none.
@@ -104,13 +107,13 @@ class CleanWarnings(WarningRules):
     Attributes:
         scores_of: whose alarms count where somebody collides: those of the `pair` that does (right ones), or all of the
             `recording`, for predictors that name nobody. Where nobody collides, all do.
-        lead: seconds before the impact up to which the headline looks.
+        window: seconds before the impact whose moments the headline compares.
         threshold: the lowest score that is an alarm, chosen on another split (`best_f1` or `quiet` there); None if none
             was.
     """
 
     scores_of: ScoresOf = "pair"
-    lead: float = 1.0
+    window: float = WINDOW
     threshold: float | None = None
 
     def __post_init__(self) -> None:
@@ -118,26 +121,26 @@ class CleanWarnings(WarningRules):
         WarningRules.__post_init__(self)
         if self.scores_of not in get_args(ScoresOf):
             raise ChoiceError(f"scores_of: expected one of {', '.join(get_args(ScoresOf))}, found {self.scores_of!r}")
-        if not 0 <= self.lead < math.inf:
-            raise ConfigError(f"lead: expected seconds from 0, found {self.lead!r}")
+        if not 0 < self.window < math.inf:
+            raise ConfigError(f"window: expected seconds above 0, found {self.window!r}")
         if self.threshold is not None and not math.isfinite(self.threshold):
             raise ConfigError(f"threshold: expected a number, or None, found {self.threshold!r}")
 
     def _own_others(self) -> Mapping[str, tuple[Any, ...]]:
-        return {"scores_of": get_args(ScoresOf), "lead": (0.5, 1.0, 1.5)}
+        return {"scores_of": get_args(ScoresOf), "window": (1.0, 2.0, 3.0)}
 
-    def result(self, counts: Collection[Counts]) -> AnticipationResult:
-        """The metrics of some samples' counts."""
+    def result(self, counts: Collection[Counts], *, references: bool = False) -> AnticipationResult:
+        """The metrics of some samples' counts, with those of the reference predictors or without."""
         parts = parts_of(counts)
         drives, samples = drives_of(parts), [sample for part in parts for sample in part]
         groups = dict(by_group(drives))
         made = {
-            predictor: {group: _Table(those, predictor, self).figures() for group, those in groups.items()}
-            for predictor in PREDICTORS
+            predictor: {group: _figures(those, predictor, self) for group, those in groups.items()}
+            for predictor in (PREDICTORS if references else PREDICTORS[:1])
         }
         return AnticipationResult(
             samples=len(samples),
-            operating_by="R80" if self.threshold is None else "given",
+            operating_by="recall" if self.threshold is None else "given",
             groups=made.pop(GIVEN),
             references=made,
             beyond=sum(each["beyond"] for each in samples),
@@ -154,7 +157,7 @@ class CleanWarnings(WarningRules):
         for draw in times:
             yield AnticipationResult(
                 samples=int(samples @ draw),
-                operating_by="R80" if self.threshold is None else "given",
+                operating_by="recall" if self.threshold is None else "given",
                 groups={group: table.figures(draw) for group, table in tables.items()},
                 references={},
                 beyond=int(beyond @ draw),
@@ -164,11 +167,9 @@ class CleanWarnings(WarningRules):
 class _Table:
     """One predictor's scores of one group of recordings, to be asked with any weights."""
 
-    def __init__(self, drives: Sequence[Drive], predictor: str, rules: CleanWarnings) -> None:
+    def __init__(self, drives: Sequence[Drive], predictor: str, rules: CleanWarnings, draw: int = 0) -> None:
         self._predictor, self._rules = predictor, rules
-        self._scores = CleanScores(series_of(drives, predictor, rules.scores_of))
-        ahead = self._scores.series.highest(rules.lead)
-        self._ahead = np.where(np.isfinite(ahead), ahead, np.nan)
+        self._scores = CleanScores(series_of(drives, predictor, rules.scores_of, draw), rules.window)
         self._pairs = twin_pairs(drives)
         self._part = np.array([each.part for each in drives], dtype=np.int64)
         self._kind = np.array([each.kind for each in drives])
@@ -182,11 +183,14 @@ class _Table:
         operating = self._rules.threshold
         if self._predictor != GIVEN:
             operating = _FIXED.get(self._predictor, _ANY)
-        threshold = r80 if operating is None else operating
+        if operating is None:
+            threshold = scores.threshold_of_highest_recall(weight) if math.isnan(r80) else r80
+        else:
+            threshold = operating
         counted = {kind: int(weight[self._kind == kind].sum()) for kind in ("accident", "twins", "others")}
         after = partial(scores.tta0_after, threshold, weight)
         return AnticipationFigures(
-            auc_ahead=scores.area_under_curve(weight, self._ahead),
+            auc_ahead=scores.area_at_moments(weight),
             twin_wins=self._twin_wins(weight),
             average_precision=scores.average_precision(weight),
             area_under_curve=scores.area_under_curve(weight),
@@ -208,6 +212,27 @@ class _Table:
         return ratio(float((won * pairs).sum()), float(pairs.sum()))
 
 
+def _figures(drives: Sequence[Drive], predictor: str, rules: CleanWarnings) -> AnticipationFigures:
+    """One predictor's figures; of a random one their means over some draws, so that no luck ranks it."""
+    draws = RANDOM_DRAWS if predictor.startswith("random") else 1
+    drawn = [_Table(drives, predictor, rules, draw).figures() for draw in range(draws)]
+    return drawn[0] if draws == 1 else _mean(drawn)
+
+
+def _mean(parts: Sequence[Any]) -> Any:
+    """Of floats, and of those in mappings and dataclasses of one form, NaN left out. All else is as in the first."""
+    first = parts[0]
+    if isinstance(first, float):
+        known = [each for each in parts if not math.isnan(each)]
+        return math.fsum(known) / len(known) if known else math.nan
+    if isinstance(first, Mapping):
+        return {name: _mean([each[name] for each in parts]) for name in first}
+    if is_dataclass(first) and not isinstance(first, type):
+        names = [each.name for each in fields(first)]
+        return replace(first, **{name: _mean([getattr(each, name) for each in parts]) for name in names})
+    return first
+
+
 def _notes(counts: Collection[Counts], drives: Sequence[Drive], rules: CleanWarnings) -> Iterator[str]:
     kinds = {each.kind for each in drives}
     if drives and "accident" not in kinds:
@@ -216,8 +241,8 @@ def _notes(counts: Collection[Counts], drives: Sequence[Drive], rules: CleanWarn
         yield "no recording without an accident was evaluated; give normal scenarios too for false alarms"
     if drives and rules.threshold is None:
         yield (
-            "the operating point is that of a recall of 0.8 on these very recordings; choose it on another split with "
-            "--threshold-from, or give it with --switch threshold=…"
+            "the operating point is that of a recall of 0.8, or the highest, on these very recordings; choose it on "
+            "another split with --threshold-from, or give it with --switch threshold=…"
         )
     beyond = sum(each["beyond"] for each in counts)
     if beyond:

@@ -12,10 +12,12 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.evaluation.metrics.evaluator import ratio
 from deepaccident_devkit.evaluation.metrics.warning.series import ScoreSeries
 
+WINDOW: Final = 3.0
+"""Seconds before the impact in which the headline compares scores."""
 SAME_RECALL: Final = 0.8
 """R80 and P80: recall and precision that operating points are asked for."""
 EARLY: Final = 5.0
@@ -62,10 +64,17 @@ class CleanScores:
         highest: (N,) the highest score of each.
     """
 
-    def __init__(self, series: ScoreSeries) -> None:
-        """Count what figures at any threshold need."""
+    def __init__(self, series: ScoreSeries, window: float = WINDOW) -> None:
+        """Count what figures at any threshold need.
+
+        Args:
+            series: the scores.
+            window: seconds before the end whose moments `area_at_moments` looks at.
+        """
         self.series = series
         self.highest = series.highest()
+        self._ranks = _ranks(self.highest)
+        self._moments = [_ranks(scores) for scores in series.before(window).T]
         valid = series.valid
         self._frames = valid.sum(axis=1).astype(np.float64)
         self._scores = np.where(valid, series.scores, -np.inf)
@@ -79,41 +88,43 @@ class CleanScores:
         self._leads = series.leads(self._levels)
 
     def average_precision(self, weight: FloatArray) -> float:
-        """Σ (R_k − R_{k−1}) P_k over the recordings' highest scores, falling; NaN without an accident."""
-        true, false = self._raised(weight)
-        if not true.size or true[-1] <= 0:
+        """Σ (R_k − R_{k−1}) P_k over the recordings' highest scores, falling; NaN without an accident.
+
+        Recall that no threshold reaches adds nothing.
+        """
+        if not self._accidents(weight):
             return math.nan
+        true, false = self._raised(weight)
         gained = np.diff(true, prepend=0.0) / self._accidents(weight)
         return math.fsum((gained * _shares(true, true + false)).tolist())
 
-    def area_under_curve(self, weight: FloatArray, highest: FloatArray | None = None) -> float:
-        """The chance that an accident's highest score is above another recording's, ties half; NaN without both.
+    def area_under_curve(self, weight: FloatArray) -> float:
+        """The chance that an accident's highest score is above another recording's, ties half; NaN without both."""
+        return _area(self._ranks, self.series.positive, weight)
 
-        Args:
-            weight: (N,) of each recording.
-            highest: (N,) other scores to rank; NaN for recordings that have none.
+    def area_at_moments(self, weight: FloatArray) -> float:
+        """The chance that an accident's score is above another recording's as long before the end, ties half.
+
+        Mean over the moments of the last seconds at which there are both kinds; NaN without any.
         """
-        scores = self.highest if highest is None else highest
-        known = np.isfinite(weight) & (weight > 0) & ~np.isnan(scores)
-        scores, positive, weight = scores[known], self.series.positive[known], weight[known]
-        accidents, others = weight[positive].sum(), weight[~positive].sum()
-        if not accidents or not others:
-            return math.nan
-        place = np.unique(scores, return_inverse=True)[1].reshape(-1)
-        below = np.bincount(place, np.where(positive, 0.0, weight))
-        here = np.bincount(place, np.where(positive, weight, 0.0), len(below))
-        ranked = (here * (np.cumsum(below) - below / 2)).sum()
-        return float(ranked / (accidents * others))
+        areas = [_area(ranks, self.series.positive, weight) for ranks in self._moments]
+        known = [area for area in areas if not math.isnan(area)]
+        return math.fsum(known) / len(known) if known else math.nan
 
     def mean_time(self, weight: FloatArray) -> float:
         """MTTA over the curve: Σ (R_k − R_{k−1}) · seconds of the warned at the highest threshold that reaches R_k."""
-        true, _ = self._raised(weight)
-        if not true.size or true[-1] <= 0:
+        if not self._accidents(weight):
             return math.nan
+        true, _ = self._raised(weight)
         gained = np.diff(true, prepend=0.0) / self._accidents(weight)
         positive = self.series.positive
         seconds = np.where(np.isfinite(self._leads), self._leads, 0.0)[positive] * weight[positive, None]
         return math.fsum((gained * _shares(seconds.sum(axis=0), true)).tolist())
+
+    def threshold_of_highest_recall(self, weight: FloatArray) -> float:
+        """The highest threshold with the highest recall of all; NaN without an accident or an alarm."""
+        recalls = self._recalls(weight)
+        return float(self._levels[np.argmax(recalls)]) if recalls.any() else math.nan
 
     def threshold_of_recall(self, weight: FloatArray, recall: float = SAME_RECALL) -> float:
         """The highest threshold with at least a recall; NaN if none has."""
@@ -131,7 +142,7 @@ class CleanScores:
     def threshold_of_best_f1(self, weight: FloatArray) -> float:
         """The highest threshold of the best F1 over recordings; NaN without an accident."""
         true, false = self._raised(weight)
-        if not true.size or true[-1] <= 0:
+        if not true.any():
             return math.nan
         return float(self._levels[np.argmax(2 * true / (true + false + self._accidents(weight)))])
 
@@ -143,7 +154,8 @@ class CleanScores:
             return math.nan
         below = np.array([np.searchsorted(row, self._levels) for row in np.sort(self._scores[others], axis=1)])
         alarmed = ((self._scores.shape[1] - below) * weight[others, None]).sum(axis=0)
-        good = np.flatnonzero(alarmed * _MINUTE <= seconds_per_minute * frames + _SLACK)
+        raised = np.diff(sum(self._raised(weight)), prepend=0.0) > 0  # levels of recordings that count
+        good = np.flatnonzero((alarmed * _MINUTE <= seconds_per_minute * frames + _SLACK) & raised)
         return float(self._levels[good[-1]]) if len(good) else math.nan
 
     def at(self, threshold: float, weight: FloatArray) -> OperatingPoint:
@@ -202,6 +214,26 @@ class CleanScores:
         true, _ = self._raised(weight)
         accidents = self._accidents(weight)
         return true / accidents if accidents else np.zeros(len(true))
+
+
+def _ranks(scores: FloatArray) -> IntArray:
+    """(N,) places of scores in their order, equal ones the same; −1 for NaN."""
+    known = ~np.isnan(scores)
+    ranks = np.full(len(scores), -1, dtype=np.int64)
+    ranks[known] = np.unique(scores[known], return_inverse=True)[1].reshape(-1)
+    return ranks
+
+
+def _area(ranks: IntArray, positive: BoolArray, weight: FloatArray) -> float:
+    """The area under the ROC curve; NaN without both kinds."""
+    known = ranks >= 0
+    sides = [
+        np.bincount(ranks[chosen], weight[chosen], int(ranks.max(initial=0)) + 1)
+        for chosen in (known & positive, known & ~positive)
+    ]
+    here, below = sides
+    pairs = here.sum() * below.sum()
+    return float((here * (np.cumsum(below) - below / 2)).sum() / pairs) if pairs else math.nan
 
 
 def _shares(part: FloatArray, whole: FloatArray) -> FloatArray:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import zlib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from operator import itemgetter
@@ -43,8 +44,8 @@ class Drive(FrozenArrays):
         part: which of several groups of samples it is of.
         frame: (S,) int64 frame numbers of the samples, ascending.
         end: frame of the impact; of a twin, that of the accident's impact; else the one after the last sample.
-        scores: predictor → (S, 2) of its surest right alarm and of its surest one, 0 for none; equal where nobody
-            collides.
+        scores: predictor, but for those of `TRIVIAL` → (S, 2) of its surest right alarm and of its surest one, −inf for
+            none; equal where nobody collides.
     """
 
     name: str
@@ -75,15 +76,23 @@ def drives_of(parts: Sequence[Collection[Counts]]) -> list[Drive]:
     ]
 
 
-def series_of(drives: Sequence[Drive], predictor: str, scores_of: ScoresOf) -> ScoreSeries:
-    """The scores of some recordings, a column a step: the smallest from a sample to the next of any of them."""
+def series_of(drives: Sequence[Drive], predictor: str, scores_of: ScoresOf, draw: int = 0) -> ScoreSeries:
+    """The scores of some recordings, a column a step: the smallest from a sample to the next of any of them.
+
+    Args:
+        drives: the recordings.
+        predictor: of `PREDICTORS`.
+        scores_of: whose alarms count where somebody collides.
+        draw: of a random predictor.
+    """
     gaps = [int(np.diff(each.frame).min()) for each in drives if len(each.frame) > 1]
     step = max(min(gaps, default=1), 1)
     begin = np.array([each.frame[0] for each in drives], dtype=np.float64)
     columns = [np.rint((each.frame - each.frame[0]) / step).astype(np.int64) for each in drives]
     scores = np.full((len(drives), 1 + max((int(each[-1]) for each in columns), default=0)), np.nan)
     for row, (drive, column) in enumerate(zip(drives, columns, strict=True)):
-        scores[row, column] = drive.scores[predictor][:, _COLUMN[scores_of]]
+        known = drive.scores.get(predictor)
+        scores[row, column] = _trivial(predictor, drive, draw) if known is None else known[:, _COLUMN[scores_of]]
     return ScoreSeries(
         scores=scores,
         positive=np.array([each.kind == "accident" for each in drives], dtype=bool),
@@ -108,11 +117,10 @@ def _drive(name: str, samples: Sequence[Counts], part: int) -> Drive:
     kind: Kind = first["kind"]
     ends = [each["frame"] + each["to_end"] for each in samples if each["to_end"] is not None]
     given = [[*each["alarms"], *([score, 0] for score in each["unjudged"])] for each in samples]
-    scores = {GIVEN: np.array([surest(each, kind) for each in given], dtype=np.float64).reshape(-1, 2)}
-    scores |= {each: _trivial(each, name, frame) for each in TRIVIAL}
+    scores = {GIVEN: _scores(surest(each, kind) for each in given)}
     for number, each in enumerate(REFERENCES):
-        known = [sample["references"][number] if sample["references"] else [0.0, 0.0] for sample in samples]
-        scores[each] = np.array(known, dtype=np.float64).reshape(-1, 2)
+        known = [sample["references"][number] if sample["references"] else [None, None] for sample in samples]
+        scores[each] = _scores(known)
     return Drive(
         name=name,
         story=f"{cluster_of(scenario)}/{agent}",
@@ -125,13 +133,19 @@ def _drive(name: str, samples: Sequence[Counts], part: int) -> Drive:
     )
 
 
-def _trivial(predictor: str, name: str, frame: IntArray) -> FloatArray:
-    """(S, 2) scores of a predictor that knows nothing; random ones are seeded by the recording."""
+def _scores(pairs: Iterable[Sequence[float | None]]) -> FloatArray:
+    """(S, 2) of pairs of scores, None for no alarm."""
+    scores = np.array([[math.nan if each is None else each for each in pair] for pair in pairs], dtype=np.float64)
+    return np.nan_to_num(scores.reshape(-1, 2), nan=-np.inf, neginf=-np.inf)
+
+
+def _trivial(predictor: str, drive: Drive, draw: int) -> FloatArray:
+    """(S,) scores of a predictor that knows nothing; random ones are seeded by the recording and the draw."""
     if predictor in ("always", "never"):
-        return np.full((len(frame), 2), float(predictor == "always"))
-    source = np.random.default_rng([zlib.crc32(name.encode()), TRIVIAL.index(predictor)])
-    drawn = source.random(int(frame[-1]) + 1)[frame] if predictor == "random per frame" else source.random()
-    return np.repeat(np.broadcast_to(drawn, len(frame))[:, None], 2, axis=1)
+        return np.full(len(drive.frame), 1.0 if predictor == "always" else -np.inf)
+    source = np.random.default_rng([zlib.crc32(drive.name.encode()), TRIVIAL.index(predictor), draw])
+    frames = 1 if predictor == "random per recording" else int(drive.frame[-1]) + 1
+    return source.random(frames)[drive.frame % frames]
 
 
 def by_group(drives: Sequence[Drive]) -> Iterator[tuple[str, list[Drive]]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -95,6 +95,13 @@ class WarningEvaluator(Evaluator[Any]):
         if isinstance(self.protocol, WarningProtocol):
             return warning_result(tally_of(counts, self.protocol), self.protocol)
         return self.protocol.result(counts)
+
+    def compute(self, tokens: Iterable[str] | None = None) -> Result:
+        """The metrics of all samples, beside those of the reference predictors; or of some, without."""
+        if tokens is None and not isinstance(self.protocol, WarningProtocol):
+            return self.protocol.result(list(self._counts.values()), references=True)
+        result: Result = super().compute(tokens)
+        return result
 
     def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
         """Counts with the same result: of the protocol `boxes` the tally of whole recordings.

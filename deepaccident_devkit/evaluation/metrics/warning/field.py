@@ -83,8 +83,8 @@ def field_figures(series: ScoreSeries, code: FieldCode, quirks: FieldQuirks | No
     """The numbers that a published evaluation has for these scores.
 
     Args:
-        series: the recordings; missing scores are as their recording's lowest. Of recordings without an accident all T
-            columns count, as in these codes.
+        series: the recordings; missing scores are as their recording's lowest, and no alarm at all is 0. Of recordings
+            without an accident all T columns count, as in these codes.
         code: whose evaluation. DAD knows no `toa`: it takes the array's length, and so does this where they are equal.
         quirks: None for those that the code has.
 
@@ -94,7 +94,7 @@ def field_figures(series: ScoreSeries, code: FieldCode, quirks: FieldQuirks | No
     if code not in FIELD_CODES:
         raise ChoiceError(f"code: expected one of {', '.join(FIELD_CODES)}, found {code!r}")
     chosen = quirks or FieldQuirks()
-    if not series.scores.size:
+    if not series.valid.any():
         return _nothing(code, "there is no score")
     try:
         figures, highest_recall = _FIGURES[code](_filled(series), code, chosen)
@@ -104,7 +104,7 @@ def field_figures(series: ScoreSeries, code: FieldCode, quirks: FieldQuirks | No
         return _nothing(
             code,
             f"recall {highest_recall:.3g}, AP {figures.average_precision:.3g}: at the threshold 0 recordings without "
-            "an accident count as true positives",
+            "an accident count as true positives (switch quirks.zero_alarms_negatives)",
         )
     if math.isnan(figures.average_precision) or math.isnan(figures.mean_time):
         return FieldFigures(
@@ -199,11 +199,12 @@ _FIGURES: Final = {"ustring": _recordings, "dsta": _recordings, "drive": _drive,
 
 def _filled(series: ScoreSeries) -> ScoreSeries:
     """The same with numbers everywhere, since these codes know no missing score; negatives count to the array's end."""
-    lowest = np.min(series.scores, axis=1, initial=np.inf, where=np.isfinite(series.scores))
+    given = np.where(np.isneginf(series.scores), 0.0, series.scores)
+    lowest = np.min(given, axis=1, initial=np.inf, where=~np.isnan(given))
     lowest = np.where(np.isfinite(lowest), lowest, 0.0)
     columns = series.scores.shape[1]
     return ScoreSeries(
-        scores=np.where(np.isfinite(series.scores), series.scores, lowest[:, None]),
+        scores=np.where(np.isnan(given), lowest[:, None], given),
         positive=series.positive,
         toa=np.where(series.positive, series.toa, columns + 1.0),
         fps=series.fps,

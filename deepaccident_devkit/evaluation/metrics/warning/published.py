@@ -68,8 +68,8 @@ class FieldWarnings(WarningRules):
         quirks = with_others(self.quirks, {each.name: (False, True) for each in fields(FieldQuirks)})
         return {**WarningRules.variants(self), **with_parts(self, "quirks", quirks)}
 
-    def result(self, counts: Collection[Counts]) -> FieldResult:
-        """The metrics of some samples' counts."""
+    def result(self, counts: Collection[Counts], *, references: bool = False) -> FieldResult:
+        """The metrics of some samples' counts, with those of the reference predictors or without."""
         parts = parts_of(counts)
         groups, samples = dict(by_group(drives_of(parts))), [sample for part in parts for sample in part]
         made = {
@@ -78,7 +78,7 @@ class FieldWarnings(WarningRules):
                 for group, those in groups.items()
                 for code in FIELD_CODES
             }
-            for predictor in PREDICTORS
+            for predictor in (PREDICTORS if references else PREDICTORS[:1])
         }
         given = made.pop(GIVEN)
         notes = [f"{name}: {each.note}" for name, each in given.items() if each.note]

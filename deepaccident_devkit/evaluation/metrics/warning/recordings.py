@@ -95,13 +95,13 @@ def sample_counts(
     }
 
 
-def surest(alarms: Sequence[Sequence[float]], kind: Kind) -> list[float]:
-    """The scores of the surest right alarm and of the surest one, 0 for none; [score, whether it is right] of each.
+def surest(alarms: Sequence[Sequence[float]], kind: Kind) -> list[float | None]:
+    """The scores of the surest right alarm and of the surest one, None for none; [score, whether it is right] of each.
 
     Where nobody collides no alarm is right, and both are of the surest one.
     """
-    best = max((score for score, _ in alarms), default=0.0)
-    return [max((score for score, right in alarms if right), default=0.0) if kind == "accident" else best, best]
+    best = max((score for score, _ in alarms), default=None)
+    return [max((score for score, right in alarms if right), default=None) if kind == "accident" else best, best]
 
 
 def tally_of(counts: Collection[Counts], protocol: WarningProtocol) -> Tally:

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays
+
+_SLACK: Final = 1e-6
+"""Columns: times are decimal numbers, which binary ones only come near."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -14,7 +18,8 @@ class ScoreSeries(FrozenArrays):
     """How sure a predictor is, at each frame of N recordings, that an accident comes; arrays are read-only.
 
     Attributes:
-        scores: (N, T) float64, higher is surer; NaN after a recording's end, and where a frame is missing.
+        scores: (N, T) float64, higher is surer; −inf where no threshold makes an alarm of it; NaN after a recording's
+            end, and where a frame is missing.
         positive: (N,) bool, whether the recording ends in an accident.
         toa: (N,) float64, time of the accident: the column of the impact, which is no frame of the recording any more.
             Of recordings without an accident the column after the last one that counts.
@@ -29,14 +34,22 @@ class ScoreSeries(FrozenArrays):
     @property
     def valid(self) -> BoolArray:
         """(N, T) whether there is a score that counts: all from the impact on do not exist."""
-        there: BoolArray = np.isfinite(self.scores) & (np.arange(self.scores.shape[1]) < self.toa[:, None])
+        there: BoolArray = ~np.isnan(self.scores) & (np.arange(self.scores.shape[1]) < self.toa[:, None])
         return there
 
-    def highest(self, seconds: float = 0.0) -> FloatArray:
-        """(N,) the highest score of each recording, at least so many seconds before its `toa`; −inf without any."""
-        early = np.arange(self.scores.shape[1]) <= self.toa[:, None] - seconds * self.fps + 1e-6
-        highest: FloatArray = np.max(self.scores, axis=1, initial=-np.inf, where=self.valid & early)
+    def highest(self) -> FloatArray:
+        """(N,) the highest score of each recording; −inf without any."""
+        highest: FloatArray = np.max(self.scores, axis=1, initial=-np.inf, where=self.valid)
         return highest
+
+    def before(self, seconds: float) -> FloatArray:
+        """(N, M) scores at the M moments of the last seconds before `toa`, the latest first; NaN where is none."""
+        moments = np.arange(1, round(seconds * self.fps) + 1)
+        column = np.ceil(self.toa[:, None] - moments - _SLACK).astype(np.int64)
+        there = (column >= 0) & (column < self.scores.shape[1])
+        rows = np.arange(len(self.toa))[:, None]
+        scores: FloatArray = np.where(there, np.where(self.valid, self.scores, np.nan)[rows, column * there], np.nan)
+        return scores
 
     def leads(self, thresholds: FloatArray) -> FloatArray:
         """(N, K) seconds from the first score of at least each of K thresholds to `toa`; NaN where there is none."""
