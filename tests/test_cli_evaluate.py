@@ -297,3 +297,24 @@ def test_the_group_names_its_verbs() -> None:
     text = evaluate("--help").output
     for name in ("motion", "accident", "detection", "warning", "validate", "verify", "compare"):
         assert f"  {name} " in text
+
+
+def test_an_operating_point_from_another_split(
+    da_motion: DeepAccident, accidents: Path, bundle: Path, folder: Path
+) -> None:
+    """The release has one pair of twins; its evaluation stands for one of others once their names are changed."""
+    out, samples = folder / "chooses", ("--samples", "evaluate", "--scope", "accident")
+    words = ("warning", da_motion.dataroot, "--results", accidents, *LIST, *samples)
+    evaluate(*words, "--out", out)
+    with pytest.raises(EvaluationError, match=r"or its twin, too; a threshold that is chosen on the recordings it is"):
+        evaluate(*words, "--threshold-from", out)
+    with pytest.raises(EvaluationError, match="is an evaluation of accident boxes; expected one of warning, protocol"):
+        evaluate(*words, "--threshold-from", bundle)
+    scenarios = json.loads((out / "scenarios.json").read_text())
+    others = {name.replace("_type001_", "_type009_"): each for name, each in scenarios["scenarios"].items()}
+    (out / "scenarios.json").write_text(json.dumps(scenarios | {"scenarios": others}))
+    printed = evaluate(*words, "--threshold-from", out, "--json").output
+    summary = json.loads(printed[printed.index("{") :])
+    stored = json.loads((out / "metrics_summary.json").read_text())["metrics"]["groups"]["ego_involved"]
+    assert summary["switches"] == {"threshold": stored["best_f1"]}
+    assert summary["metrics"]["operating_by"] == "given"

@@ -95,18 +95,10 @@ def _task_verb(task: TaskName) -> click.Command:
     @click.option("--overwrite", is_flag=True, help="Replace the evaluation in --out.")
     @click.option("--include-results", is_flag=True, help="Copy RESULTS into --out, to check it by itself.")
     @click.option("--json", "as_json", is_flag=True, help="One JSON object, for programs.")
-    def verb(
-        results: Path,
-        protocol: str,
-        switches: tuple[str, ...],
-        threshold_from: Path | None = None,
-        threshold_by: Chooser = "best_f1",
-        **options: Any,
-    ) -> None:
-        chosen = switches_of(switches)
-        if threshold_from is not None:
-            chosen["threshold"] = chosen_threshold(threshold_from, threshold_by, split=options["split"])
-        setup = EvaluationSetup(task=task, protocol=protocol, switches=chosen, horizon=options["horizon"])
+    def verb(results: Path, protocol: str, switches: tuple[str, ...], **options: Any) -> None:
+        setup = EvaluationSetup(
+            task=task, protocol=protocol, switches=switches_of(switches), horizon=options["horizon"]
+        )
         _evaluate(setup, results, **options)
 
     return verb
@@ -118,11 +110,15 @@ def _evaluate(setup: EvaluationSetup, results: Path, *, by: tuple[str, ...], as_
         checked_target(out, overwrite=options["overwrite"])  # before the release is indexed
     opened = read_results(results)
     dataset = DeepAccident(**{name: options[name] for name in _RELEASE})
+    selection = selection_of(setup, options)
+    if options.get("threshold_from") is not None:
+        threshold = chosen_threshold(options["threshold_from"], options["threshold_by"], selection.tokens(dataset))
+        setup = replace(setup, switches={**setup.switches, "threshold": threshold})
     run = evaluate_results(
         dataset,
         opened,
         setup,
-        selection_of(setup, options),
+        selection,
         allow_partial=options["allow_partial"],
         workers=options["workers"],
         out=out,

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
 
 from deepaccident_devkit.errors import EvaluationError
+from deepaccident_devkit.evaluation.metrics.attributes import cluster_of
 from deepaccident_devkit.evaluation.metrics.warning.drives import GIVEN, GROUPS
 from deepaccident_devkit.evaluation.runs.bundles import read_bundle
+from deepaccident_devkit.evaluation.runs.selection import scenario_of
 from deepaccident_devkit.text import columns_text
 
 Json = Mapping[str, Any]
@@ -79,7 +81,7 @@ def predictors_text(metrics: Json) -> str:
     return "\n\n".join("\n".join([columns_text(each.rows), *each.notes]) for each in predictor_tables(metrics))
 
 
-def chosen_threshold(folder: Path, by: Chooser, *, split: str) -> float:
+def chosen_threshold(folder: Path, by: Chooser, tokens: Iterable[str]) -> float:
     """The threshold that an evaluation of another split found best for the agents that are involved.
 
     A car does not know whether it will be involved, so that there is one threshold for all groups.
@@ -87,11 +89,12 @@ def chosen_threshold(folder: Path, by: Chooser, *, split: str) -> float:
     Args:
         folder: bundle of an evaluation of the task `warning`, protocol `clean`.
         by: which of the thresholds found there.
-        split: that is to be evaluated with it.
+        tokens: of the samples that are to be evaluated with it.
 
     Raises:
         ResultsError: there is no bundle.
-        EvaluationError: it is of another task or protocol, of the same split, or found no threshold.
+        EvaluationError: it is of another task or protocol, has a scenario of these samples or its twin, or found no
+            threshold.
     """
     bundle = read_bundle(folder)
     kind = tuple(bundle.summary.get(name) for name in ("task", "protocol"))
@@ -99,10 +102,12 @@ def chosen_threshold(folder: Path, by: Chooser, *, split: str) -> float:
         raise EvaluationError(
             f"{folder}: is an evaluation of {' '.join(map(str, kind))}; expected one of warning, protocol clean"
         )
-    if bundle.selection.split == split:
+    own = {cluster_of(scenario) for scenario in bundle.scenarios()}
+    shared = sorted({scenario for scenario in map(scenario_of, tokens) if cluster_of(scenario) in own})
+    if shared:
         raise EvaluationError(
-            f"{folder}: is an evaluation of the split {split}, too; a threshold that is chosen on the recordings it is "
-            "tried on flatters: give one of another split, such as train or val"
+            f"{folder}: is an evaluation of {shared[0]} or its twin, too; a threshold that is chosen on the recordings "
+            "it is tried on flatters: give one of another split, such as train or val"
         )
     groups: Mapping[str, Json] = bundle.summary["metrics"]["groups"]
     group = next((name for name in GROUPS if name in groups), None)

@@ -32,14 +32,14 @@ Tally = Mapping[str, Any]
 
 Numbers: `samples`, `alarms`, `right` (alarms that are), `unjudged`, `beyond`. `step`: frames, the smallest from a
 sample to the next one of its recording; None where no recording has two. For each `Kind` under its name: `recordings`,
-`alarmed` (those with a false alarm), `seen` (samples before the impact), `frames` (that the samples of recordings with
-several stand for), `lone` (recordings of a single sample), `false` (the score of the surest false alarm of each sample
-that has one) and `lasting` (the lower one of two such scores, of samples next to each other). Of accidents: `reach`,
-`first` and `steady`: frames before the impact of the first sample, of the first right alarm, and of that from which on
-each sample has one, of each recording that has it; `gains`: rows of score, how many frames more the first right alarm
-is before the impact if alarms of this score count too, and whether it is the recording's surest; `reached` and
-`in_time`: for each lead, the curve's at last, how many recordings have samples as early, and the score of the surest
-right alarm as early of each that has one.
+`alarmed` (those with a false alarm), `seen` (samples before the impact whose alarms are judged), `frames` (that the
+samples of recordings with several stand for), `lone` (recordings of a single sample), `false` (the score of the surest
+false alarm of each sample that has one) and `lasting` (the lower one of two such scores, of samples next to each
+other). Of accidents: `reach`, `first` and `steady`: frames before the impact of the first sample, of the first right
+alarm, and of that from which on each sample has one, of each recording that has it; `gains`: rows of score, how many
+frames more the first right alarm is before the impact if alarms of this score count too, and whether it is the
+recording's surest; `reached` and `in_time`: for each lead, the curve's at last, how many recordings have samples as
+early, and the score of the surest right alarm as early of each that has one.
 """
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 _NUMBERS: Final = ("samples", "alarms", "right", "unjudged", "beyond")
@@ -205,7 +205,7 @@ def _false_alarms(samples: Sequence[Counts], step: int | None) -> dict[str, Any]
     return {
         "recordings": int(bool(samples)),
         "alarmed": int(any(score is not None for score in false)),
-        "seen": len(samples),
+        "seen": sum(score is not None or not sample["unjudged"] for score, sample in zip(false, samples, strict=True)),
         "frames": len(samples) * (step or 0),
         "lone": int(len(samples) == 1),
         "false": [score for score in false if score is not None],

@@ -296,3 +296,37 @@ def test_a_pair_that_no_label_shows(da_motion: DeepAccident, monkeypatch: pytest
     monkeypatch.setattr(da_motion, "get", get)
     with pytest.raises(NotAvailableError, match="no label shows actor 999999"):
         box_truth(da_motion, token)
+
+
+def test_an_alarm_for_later_than_the_horizon_is_none() -> None:
+    """900 s off it was as good as the truth once."""
+    crash = replace(CRASH, horizon=2.0)
+    made = result([alarm(time=900.0)], crash)
+    assert (made.apa, made.precision, made.recall, made.beyond) == (0, None, 0, 1)
+    assert tallies(made) == [(0, 0, 1)] * 3
+    assert result([alarm(time=2.04)], crash).apa == 1
+    assert result([alarm(time=2.06)], crash).beyond == 1
+    assert result([alarm(time=900.0, score=0.9), alarm(score=0.5)], crash).apa == 1
+    assert "1 alarms are for later than the horizon and are none" in made.notes
+
+
+def test_at_the_impact_itself_nothing_is_foreseen() -> None:
+    impact = truth_of([0.0], seconds=0.0)
+    made = result([alarm(time=0.0)], impact)
+    assert (made.samples, made.positives, made.negatives, made.at_impact) == (0, 0, 0, 1)
+    assert math.isnan(made.apa)
+    assert (made.precision, made.false_alarm_rate) == (None, None)
+    both = BOXES.result([counted([alarm(time=0.0)], impact), counted([alarm()], CRASH)])
+    assert replace(both, at_impact=0) == result([alarm()], CRASH)
+    assert result([alarm(time=0.1)], truth_of([0.5, 0.0], seconds=0.1)).apa == 1
+
+
+def test_where_no_accident_comes_there_is_no_accuracy_but_false_alarms() -> None:
+    """An APA of 0.000 said nothing: no predictor could have had more."""
+    made = result([alarm(time=1.0)], PASSING)
+    assert math.isnan(made.apa)
+    assert all(math.isnan(each.accuracy) for each in made.within.values())
+    assert (made.recall, made.false_alarm_rate) == (None, 1.0)
+    assert tallies(made) == [(0, 1, 0)] * 3
+    some = BOXES.result([counted([alarm(time=1.0)], PASSING), counted([alarm()], CRASH)])
+    assert some.apa == pytest.approx(1 / 1.5)

@@ -444,3 +444,36 @@ def test_twins_that_are_not_there_or_not_known(da_motion: DeepAccident, monkeypa
     assert with_twin() is True
     assert with_twin(collision=None) is False
     assert with_twin(weather=None) is None
+
+
+def test_a_siren_pays_in_precision_and_in_the_time_it_lasts() -> None:
+    """Three recordings of accidents, of which it misses none, and three normal ones, in which it never stops."""
+    siren = result(*[every(3)] * 3, *[(every(2.5, 0, FALSE), "twins")] * 3)
+    assert (siren.warned_share, siren.tta0, siren.mean_warning) == (1, 3, 3)
+    assert siren.recording_precision == 0.5
+    assert (siren.time_in_alarm["normal"], siren.alarm_seconds_per_minute["normal"]) == (1, 60)
+    assert siren.time_in_alarm["accident"] == 0
+    assert siren.false_alarms["normal"] == 3
+
+
+def test_shares_of_recordings_and_of_samples_are_of_all_of_them() -> None:
+    """One of two accidents is warned of, two seconds before; one normal recording of four has an alarm, at a sixth."""
+    warned, missed = every(3, what=[]) | {2.0: RIGHT}, every(3, what=[])
+    alarmed, quiet = (every(2.5, 0, []) | {1.0: FALSE}, "twins"), (every(2.5, 0, []), "others")
+    made = result(warned, missed, alarmed, quiet, quiet, quiet)
+    assert (made.warned_share, made.tta0, made.mean_warning) == (1 / 2, 1, 2)
+    assert made.recording_precision == 1 / 2
+    assert made.time_in_alarm == {"accident": 0, "normal": 1 / 24, "twins": 1 / 6, "others": 0}
+    assert made.alarm_seconds_per_minute["normal"] == 2.5
+
+
+def test_an_alarm_for_later_than_the_horizon_is_none() -> None:
+    evaluator = WarningEvaluator("boxes")
+    there = context(31)
+    evaluator.update("t/s/ego_vehicle/031", [alarm(time=900.0, ids=PAIR)], None, there)
+    assert evaluator.compute().warned_share == 1  # nothing bounds this context
+    evaluator = WarningEvaluator("boxes")
+    bounded = replace(there, truth=replace(there.truth, horizon=2.0))
+    evaluator.update("t/s/ego_vehicle/031", [alarm(time=900.0, ids=PAIR)], None, bounded)
+    made = evaluator.compute()
+    assert (made.warned_share, made.alarms, made.beyond) == (0, 0, 1)
