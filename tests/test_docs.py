@@ -24,7 +24,13 @@ from deepaccident_devkit.evaluation.metrics.detection import DETECTION_PROTOCOLS
 from deepaccident_devkit.evaluation.metrics.motion import MOTION_PROTOCOLS, MotionProtocol
 from deepaccident_devkit.evaluation.metrics.motion.overlaps import VpqRules
 from deepaccident_devkit.evaluation.metrics.trajectories import TrajectoryRules
-from deepaccident_devkit.evaluation.metrics.warning import WARNING_PROTOCOLS, WarningProtocol
+from deepaccident_devkit.evaluation.metrics.warning import (
+    WARNING_PROTOCOLS,
+    CleanWarnings,
+    FieldQuirks,
+    FieldWarnings,
+    WarningProtocol,
+)
 from deepaccident_devkit.geometry import Box
 from deepaccident_devkit.motion import LabelProtocol, PostProcessing
 
@@ -101,6 +107,9 @@ def test_the_code_on_evaluating_runs(
         Scoring,
         BoxAccidents,
         WarningProtocol,
+        CleanWarnings,
+        FieldWarnings,
+        FieldQuirks,
     ],
 )
 def test_every_choice_of_the_metrics_is_explained(choices: type[Any]) -> None:

@@ -169,7 +169,9 @@ class _Table:
 
     def __init__(self, drives: Sequence[Drive], predictor: str, rules: CleanWarnings, draw: int = 0) -> None:
         self._predictor, self._rules = predictor, rules
-        self._scores = CleanScores(series_of(drives, predictor, rules.scores_of, draw), rules.window)
+        series = series_of(drives, predictor, rules.scores_of, draw)
+        everyone = None if rules.scores_of == "recording" else series_of(drives, predictor, "recording", draw).highest()
+        self._scores = CleanScores(series, rules.window, everyone)
         self._pairs = twin_pairs(drives)
         self._part = np.array([each.part for each in drives], dtype=np.int64)
         self._kind = np.array([each.kind for each in drives])

@@ -34,7 +34,8 @@ class OperatingPoint:
     Attributes:
         threshold: the lowest score that is an alarm; NaN where no threshold has what is asked for.
         recall: share of the accident recordings with an alarm before the impact.
-        precision: share of the recordings with an alarm that end in an accident; depends on how many of each there are.
+        precision: share of the recordings with an alarm that end in an accident and have a right one; depends on how
+            many of each there are.
         tta_hit: seconds from the first alarm to the impact, mean over the warned recordings alone.
         tta0: likewise over all accident recordings, a missed one as 0 s.
         time_in_alarm: share of the frames without an accident to come that are in alarm.
@@ -64,15 +65,18 @@ class CleanScores:
         highest: (N,) the highest score of each.
     """
 
-    def __init__(self, series: ScoreSeries, window: float = WINDOW) -> None:
+    def __init__(self, series: ScoreSeries, window: float = WINDOW, any_alarm: FloatArray | None = None) -> None:
         """Count what figures at any threshold need.
 
         Args:
             series: the scores.
             window: seconds before the end whose moments `area_at_moments` looks at.
+            any_alarm: (N,) highest scores of all alarms, where those of the series are of right ones alone; None where
+                they are of all.
         """
         self.series = series
         self.highest = series.highest()
+        self._any_alarm = self.highest if any_alarm is None else any_alarm
         self._ranks = _ranks(self.highest)
         self._moments = [_ranks(scores) for scores in series.before(window).T]
         valid = series.valid
@@ -122,9 +126,9 @@ class CleanScores:
         return math.fsum((gained * _shares(seconds.sum(axis=0), true)).tolist())
 
     def threshold_of_highest_recall(self, weight: FloatArray) -> float:
-        """The highest threshold with the highest recall of all; NaN without an accident or an alarm."""
+        """The highest threshold with the highest recall of all; infinite without any alarm that is right."""
         recalls = self._recalls(weight)
-        return float(self._levels[np.argmax(recalls)]) if recalls.any() else math.nan
+        return float(self._levels[np.argmax(recalls)]) if recalls.any() else math.inf
 
     def threshold_of_recall(self, weight: FloatArray, recall: float = SAME_RECALL) -> float:
         """The highest threshold with at least a recall; NaN if none has."""
@@ -168,6 +172,7 @@ class CleanScores:
         hits, accidents = float(weight[positive & warned].sum()), self._accidents(weight)
         seconds = math.fsum((np.where(warned, leads, 0.0) * weight)[positive].tolist())
         false = float(weight[~positive & warned].sum())
+        misled = float(weight[positive & ~warned & (self._any_alarm >= threshold)].sum())
         in_alarm = (self._scores >= threshold)[~positive]
         begun = in_alarm & ~(self._lasting >= threshold)[~positive]
         others = weight[~positive]
@@ -177,7 +182,7 @@ class CleanScores:
         return OperatingPoint(
             threshold=threshold,
             recall=ratio(hits, accidents),
-            precision=ratio(hits, hits + false),
+            precision=ratio(hits, hits + false + misled),
             tta_hit=ratio(seconds, hits),
             tta0=ratio(seconds, accidents),
             time_in_alarm=share,
