@@ -119,11 +119,13 @@ def sanity(report: Mapping[str, Any]) -> Markup:
         for each in report["candidates"]
     ]
     found = [tag("p", each, class_="warning") for each in report["warnings"]]
+    found += [tag("p", report["verdict"])] * bool(report["verdict"])
+    found += [tag("p", f"Not looked at: {each}") for each in report["unchecked"]]
     heading = ["mistake", "fits as given", "fits set right", "suspected", "what it is"]
     return joined(
         [
             table(["number", *_SIDES.values()], rows, f"of {report['samples']:,} samples"),
-            *(found or [tag("p", "Nothing looks wrong with the predictions.")]),
+            *found,
             tag("details", tag("summary", "All that was looked for"), table(heading, looked)),
         ]
     )

@@ -6,20 +6,39 @@ not as they were given. Each tells of its own: a share of cells or of actors, of
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from math import fsum
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, FloatArray
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation, turned
 
-Group = Literal["place", "time", "size", "heading", "offset", "flow"]
+Group = Literal[
+    "channels",
+    "place",
+    "time",
+    "size",
+    "height",
+    "heading",
+    "velocity",
+    "score",
+    "exchange",
+    "offset",
+    "flow",
+]
 MARGIN: Final = 2.0
-"""By how much a suspicion has to beat the predictions as they were given."""
+"""By how much most suspicions have to beat the predictions as they were given."""
+_AFTER_PLACES: Final[frozenset[Group]] = frozenset(get_args(Group)) - {"channels", "place"}
+_HIDES: Final[Mapping[Group, frozenset[Group]]] = {
+    "channels": _AFTER_PLACES | {"place"},
+    "place": _AFTER_PLACES,
+    "exchange": frozenset({"offset", "flow"}),
+}
+"""Group → those that tell nothing where one of it is suspected."""
 SCALES: Final[Mapping[str, float]] = {f"scaled by {scale:g}": scale for scale in (0.5, 0.8, 1.25, 2.0)}
 """Name → how many times too far from the ego all is; cell sizes of 0.25, 0.4, 0.625 and 1 m for 0.5 m."""
 
@@ -35,8 +54,10 @@ class Suspicion:
         remedy: what to do about it, a clause.
         measure: what the scores are.
         least: the score that it has to reach.
-        evidence: of how many cells, actors or samples at least.
+        evidence: of how many cells, actors, samples or metres at least: the whole of the tallies.
         also: names of further tallies in which it has to fit better than as given.
+        margin: by how much it has to fit better than as given.
+        deviations: by how many standard deviations of a coin's tosses it fits more often than as given; 0 for any.
     """
 
     name: str
@@ -45,8 +66,10 @@ class Suspicion:
     remedy: str
     measure: str
     least: float
-    evidence: int
+    evidence: float
     also: tuple[str, ...] = ()
+    margin: float = MARGIN
+    deviations: float = 0.0
 
 
 def tally(
@@ -54,6 +77,29 @@ def tally(
 ) -> list[float]:
     """What a sample says of a suspicion: part of the whole that fits so; the same as given; and how badly it fits."""
     return [part, whole, given_part, whole if given_whole is None else given_whole, misfit]
+
+
+def nearer_tally(before: FloatArray, after: FloatArray, change: FloatArray, misfit: float = 0.0) -> list[float]:
+    """What points say of a suspicion by how much nearer they are then to where they should be.
+
+    Args:
+        before: (N,) distances of the points found from the true ones.
+        after: (N,) distances of the points found from where the true ones would be found.
+        change: (N,) how far apart these two are, at most the sum of the other two: what a point counts.
+        misfit: how badly the suspicion fits.
+
+    Returns:
+        A tally in which a point half way counts half for and half against.
+    """
+    part = float((change + np.clip(before - after, -change, change)).sum()) / 2
+    whole = float(change.sum())
+    return tally(part, whole, whole - part, misfit=misfit)
+
+
+def overlap(predicted: BoolArray, true: BoolArray, where: BoolArray) -> tuple[int, int]:
+    """Cells of the intersection and of the union, of some cells."""
+    both = int(np.count_nonzero(predicted & true & where))
+    return both, int(np.count_nonzero((predicted | true) & where))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,8 +124,8 @@ class Candidate:
 def candidates_of(suspicions: Iterable[Suspicion], samples: Iterable[Mapping[str, Any]]) -> tuple[Candidate, ...]:
     """All that was looked for, of the tallies of samples by the suspicions' names.
 
-    At most one of a group is suspected: the one that the predictions fit best. Times are looked at only where places
-    are right: predictions at other places tell nothing of when.
+    At most one of a group is suspected: the one that the predictions fit best. Groups that hide others (`_HIDES`) come
+    first: predictions at other places tell nothing of when.
     """
     every = list(samples)
     sums = {each.name: _sum(each.name, every) for each in suspicions}
@@ -91,8 +137,9 @@ def candidates_of(suspicions: Iterable[Suspicion], samples: Iterable[Mapping[str
         group: min(among, key=lambda each: (sums[each.name][4], -(_share(*sums[each.name][:2]) or 0.0))).name
         for group, among in by_group.items()
     }
-    if "place" in best:
-        best = {"place": best["place"]}
+    for group, hidden in _HIDES.items():
+        if group in best:
+            best = {each: name for each, name in best.items() if each not in hidden}
     return tuple(
         Candidate(
             name=each.name,
@@ -120,13 +167,15 @@ def warning_of(suspicion: Suspicion, candidate: Candidate) -> str:
 
 def _sum(name: str, samples: Iterable[Counts]) -> list[float]:
     rows = [each[name] for each in samples if name in each]
-    return [fsum(column) for column in zip(*rows, strict=True)] if rows else [0.0] * 5
+    return [math.fsum(column) for column in zip(*rows, strict=True)] if rows else [0.0] * 5
 
 
 def _is_suspected(suspicion: Suspicion, sums: list[float]) -> bool:
     score, given = _share(*sums[:2]), _share(*sums[2:4]) or 0.0
     enough = sums[1] >= suspicion.evidence
-    return enough and score is not None and score >= suspicion.least and score >= MARGIN * given
+    if suspicion.deviations:
+        enough &= sums[0] - sums[2] >= suspicion.deviations * math.sqrt(sums[1])
+    return enough and score is not None and score >= suspicion.least and score >= suspicion.margin * given
 
 
 def _fits_better(sums: list[float]) -> bool:

@@ -92,6 +92,8 @@ def test_names_from_elsewhere_are_harmless(da_motion: DeepAccident, tokens: list
         "units": {"apa": "share"},
         "candidates": [{"name": EVIL, "description": EVIL, "score": 0.5, "given": None, "suspected": True}],
         "warnings": [EVIL],
+        "unchecked": [EVIL],
+        "verdict": EVIL,
     }
     explanation = {
         "samples": 6,
@@ -110,7 +112,7 @@ def test_names_from_elsewhere_are_harmless(da_motion: DeepAccident, tokens: list
     page = page_of(path)
     assert not page.all("script")
     assert all(str(image["src"]).startswith("data:") for image in page.all("img"))
-    assert page.text.count(EVIL) >= 11
+    assert page.text.count(EVIL) >= 13
     assert "+0.250" in page.text
     assert "No number changes with: idle=no." in page.text
     assert "http" not in re.sub(r"http-equiv", "", path.read_text().replace("http://x.example/y.png", ""))

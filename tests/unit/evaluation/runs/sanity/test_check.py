@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes, dete
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, instances_of
 from deepaccident_devkit.evaluation.results import ResultsWriter, read_results
 from deepaccident_devkit.evaluation.runs.sanity import SanityReport, check_sanity
-from deepaccident_devkit.evaluation.runs.sanity.check import telling_samples
+from deepaccident_devkit.evaluation.runs.sanity.samples import telling_samples
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
@@ -124,6 +125,23 @@ def test_a_mistake_of_detections_is_told_with_its_remedy(da_motion: DeepAccident
     assert report.to_text().endswith(f"WARNING: {warning}")
 
 
+def test_swapped_classes_are_told_unless_the_boxes_are_elsewhere(da_motion: DeepAccident, tokens: list[str]) -> None:
+    swapped, elsewhere = {}, {}
+    for token, right in detections(da_motion, tokens).predictions.items():
+        boxes = replace(right.boxes, category=np.array([1, 0, 2, 3, 4, 5])[right.boxes.category])
+        swapped[token] = DetectedBoxes(boxes=boxes, scores=right.scores)
+        there = replace(boxes, center=boxes.center * (1, -1, 1))
+        elsewhere[token] = DetectedBoxes(boxes=there, scores=right.scores)
+    setup = EvaluationSetup(task="detection", protocol="paper")
+    (warning,) = sanity(da_motion, MemoryResults("detection", swapped), setup, tokens).warnings
+    assert warning.startswith("classes swapped: car is called truck")
+    assert "; the classes are, in this order, car, truck, van" in warning
+    report = sanity(da_motion, MemoryResults("detection", elsewhere), setup, tokens)
+    (warning,) = report.warnings
+    assert warning.startswith("left-handed world: ")
+    assert [each.name for each in report.candidates if each.suspected] == ["left-handed world"]
+
+
 @pytest.mark.parametrize(("task", "protocol"), [("accident", "boxes"), ("accident", "paper"), ("warning", "boxes")])
 def test_explicit_accidents(da_motion: DeepAccident, tokens: list[str], task: Any, protocol: str) -> None:
     setup = EvaluationSetup(task=task, protocol=protocol)
@@ -167,6 +185,30 @@ def test_empty_predictions_are_told(da_motion: DeepAccident, tokens: list[str]) 
     report = sanity(da_motion, results, MOTION, tokens[::5])
     assert report.warnings == ("all 4 predictions looked at are empty: nothing is predicted in them",)
     assert report.given == report.empty
+
+
+def test_near_nothing_is_told_where_no_check_explains_it(da_motion: DeepAccident, tokens: list[str]) -> None:
+    def elsewhere(label: MotionLabels) -> MotionOutput:
+        return instances_of(np.roll(label.instance, (37, 61), (1, 2)), label.config.grid)
+
+    report = sanity(da_motion, motion(da_motion, tokens[::5], elsewhere), MOTION, tokens[::5])
+    assert report.warnings == ()
+    assert report.verdict.startswith("Near nothing: iou 30x30 is ")
+    assert report.verdict.endswith(f"to the truth; none of the {len(report.candidates)} checks explains it.")
+    assert report.to_text().endswith(report.verdict)
+
+
+def test_what_maps_do_not_hold_is_said(da_motion: DeepAccident, tokens: list[str]) -> None:
+    maps, heads = (
+        sanity(da_motion, motion(da_motion, tokens[::5], predict), MOTION, tokens[::5])
+        for predict in (as_maps, as_heads)
+    )
+    (said,) = maps.unchecked
+    assert "offset, flow and the heads' channels, which instance maps do not hold" in said
+    assert "store='heads'" in said
+    assert f"Not looked at: {said}" in maps.to_text()
+    assert heads.unchecked == ()
+    assert maps.verdict == heads.verdict == "Nothing looks wrong with the predictions."
 
 
 def test_ids_that_are_not_linked_are_told(da_motion: DeepAccident, tokens: list[str]) -> None:

@@ -1,4 +1,4 @@
-"""Maps that were mirrored, turned, shifted or scaled are named as exactly that, and no others are."""
+"""Maps and heads with a mistake are named as exactly that, noisy ones too; good and bad ones without one are not."""
 
 import functools
 from collections.abc import Callable
@@ -10,7 +10,8 @@ import pytest
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput, instances_of
-from deepaccident_devkit.evaluation.runs.sanity.motion import ids_kept, motion_suspicions, motion_tallies
+from deepaccident_devkit.evaluation.runs.sanity.facts import ids_kept
+from deepaccident_devkit.evaluation.runs.sanity.motion import motion_suspicions, motion_tallies
 from deepaccident_devkit.evaluation.runs.sanity.probes import SCALES, candidates_of
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import MotionHeads, MotionLabelConfig, MotionLabels
@@ -44,6 +45,8 @@ MISTAKES: dict[str, Change] = {
     "turned by 270°": lambda maps: np.rot90(maps, 1, axes=(-2, -1)),
     "one step late": lambda maps: np.concatenate([maps[:1], maps[:-1]]),
     "one step early": lambda maps: np.concatenate([maps[1:], maps[-1:]]),
+    "frames reversed": lambda maps: maps[::-1],
+    "actors and background swapped": lambda maps: np.where(maps > 0, 0, 1).astype(np.int32),
     **{name: lambda maps, scale=scale: scaled(maps, scale) for name, scale in SCALES.items()},
 }
 
@@ -63,6 +66,32 @@ def rolled_out(label: MotionLabels) -> AnyArray:
     return result
 
 
+def shifted(maps: AnyArray, rows: int, columns: int) -> AnyArray:
+    """Maps (…, H, W) with all so many cells further; what leaves them is lost."""
+    result = np.zeros_like(maps)
+    height, width = maps.shape[-2:]
+    there = tuple(slice(max(0, by), min(size, size + by)) for by, size in ((rows, height), (columns, width)))
+    here = tuple(slice(max(0, -by), min(size, size - by)) for by, size in ((rows, height), (columns, width)))
+    result[(..., *there)] = maps[(..., *here)]
+    return result
+
+
+def uncertain(
+    maps: AnyArray, seed: int, cells: float = 2.0, missing: float = 0.2, false: float = 0.2, parts: int = 1
+) -> AnyArray:
+    """Each instance (T, H, W) some cells off, some missing or in parts, and false ones that stand between them."""
+    source = np.random.default_rng([seed, int(maps.sum())])
+    result, names = np.zeros_like(maps), np.unique(maps[maps > 0])
+    part = np.arange(maps.shape[-1]) // 3 % parts
+    for name in names:
+        if source.uniform() >= missing:
+            moved = shifted(maps == name, *np.round(source.normal(0, cells, 2)).astype(int))
+            result[moved] = (name + 1000 * part * np.ones(maps.shape, dtype=int))[moved]
+    for row, column in source.integers(0, 190, (int(np.ceil(false * len(names))), 2)):
+        result[:, row : row + 4, column : column + 9] = 5000 + row
+    return result
+
+
 def noisy(maps: AnyArray, seed: int) -> AnyArray:
     """A tenth of the cells is lost, and as many of the others are taken for somebody."""
     source = np.random.default_rng(seed)
@@ -75,10 +104,17 @@ GOOD: dict[str, Callable[[MotionLabels], AnyArray]] = {
     "perfect": lambda label: label.instance,
     "constant velocity": rolled_out,
     "noisy": lambda label: noisy(rolled_out(label), 0),
+    "uncertain": lambda label: uncertain(label.instance, 1),
+    "more uncertain": lambda label: uncertain(label.instance, 2, 3.0, 0.4, 0.5),
+    "half missing": lambda label: uncertain(label.instance, 3, 0.0, 0.5, 0.0),
+    "in parts": lambda label: uncertain(label.instance, 4, 0.5, 0.1, 0.1, parts=2),
+    "false ones": lambda label: uncertain(label.instance, 5, 0.5, 0.0, 1.0),
 }
 BAD: dict[str, Callable[[MotionLabels], AnyArray]] = {
     "empty": lambda label: np.zeros_like(label.instance),
     "nobody moves": lambda label: label.instance[:1].repeat(5, axis=0),
+    "nobody moves, uncertain": lambda label: uncertain(label.instance[:1].repeat(5, axis=0), 6),
+    "half as fast": lambda label: rolled_out(label)[[0, 0, 1, 1, 2]],
     "twice as fast": lambda label: rolled_out(label)[[0, 2, 4, 4, 4]],
     **{f"random {seed}": lambda label, seed=seed: noisy(np.zeros_like(label.instance) + 1, seed) for seed in (1, 2)},
     **{
@@ -96,10 +132,28 @@ def suspected(labels: Labels, predict: Callable[[MotionLabels], AnyArray]) -> li
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-@pytest.mark.parametrize("prediction", ["perfect", "constant velocity"])
+@pytest.mark.parametrize("prediction", ["perfect", "constant velocity", "uncertain"])
 def test_each_mistake_is_named_as_exactly_that(crossing_labels: Labels, prediction: str, mistake: str) -> None:
     change, good = MISTAKES[mistake], GOOD[prediction]
     assert suspected(crossing_labels, lambda label: change(good(label))) == [mistake]
+
+
+@pytest.mark.parametrize("prediction", ["perfect", "uncertain"])
+def test_frames_that_were_not_warped_are_named(da_motion: DeepAccident, prediction: str) -> None:
+    tallies = []
+    for token in da_motion.samples("train", "evaluate")[:4]:
+        label = da_motion.motion_labels(token)
+        tallies.append(motion_tallies(instances_of(GOOD[prediction](label), label.config.grid), label))
+    found = [each.name for each in candidates_of(motion_suspicions("devkit", heads=False), tallies) if each.suspected]
+    assert found == ["frames not warped"]
+
+
+def test_nobody_who_drives_along_is_taken_for_frames_that_were_not_warped(da_motion: DeepAccident) -> None:
+    tallies = []
+    for token in da_motion.samples("train", "evaluate")[:4]:
+        label = da_motion.motion_labels(token)
+        tallies.append(motion_tallies(instances_of(label.instance[:1].repeat(5, axis=0), label.config.grid), label))
+    assert not any(each.suspected for each in candidates_of(motion_suspicions("devkit", heads=False), tallies))
 
 
 @pytest.mark.parametrize("prediction", [*GOOD, *BAD])
@@ -111,31 +165,60 @@ def channels(heads: MotionHeads, head: str, change: Change) -> MotionHeads:
     return replace(heads, **{head: change(getattr(heads, head))})
 
 
-@pytest.mark.parametrize(
-    ("head", "mistake", "change"),
-    [
-        ("offset", "offset: its channels swapped", lambda maps: maps[:, ::-1]),
-        ("offset", "offset: both channels negated", lambda maps: -maps),
-        ("offset", "offset: channel 0 negated", lambda maps: maps * np.array([-1, 1])[:, None, None]),
-        ("flow", "flow: both channels negated", lambda maps: -maps),
-        ("flow", "flow: channel 1 negated", lambda maps: maps * np.array([1, -1])[:, None, None]),
-        (
-            "flow",
-            "flow: its channels swapped, then channel 0 negated",
-            lambda maps: np.stack([-maps[:, 1], maps[:, 0]], 1),
-        ),
-        ("flow", None, lambda maps: maps + 0.4),
-    ],
-)
-def test_vectors_in_other_channels_are_named(
-    few_labels: Labels, head: str, mistake: str | None, change: Change
-) -> None:
+SIGNS = np.array([-1, 1])[:, None, None]
+VECTORS: dict[str, Callable[[MotionHeads], MotionHeads]] = {
+    "offset: its channels swapped": lambda heads: channels(heads, "offset", lambda maps: maps[:, ::-1]),
+    "offset: both channels negated": lambda heads: channels(heads, "offset", lambda maps: -maps),
+    "offset: channel 0 negated": lambda heads: channels(heads, "offset", lambda maps: maps * SIGNS),
+    "flow: its channels swapped": lambda heads: channels(heads, "flow", lambda maps: maps[:, ::-1]),
+    "flow: both channels negated": lambda heads: channels(heads, "flow", lambda maps: -maps),
+    "flow: channel 1 negated": lambda heads: channels(heads, "flow", lambda maps: -maps * SIGNS),
+    "flow: its channels swapped, then channel 0 negated": lambda heads: channels(
+        heads, "flow", lambda maps: maps[:, ::-1] * SIGNS
+    ),
+    "offset and flow swapped": lambda heads: replace(heads, offset=heads.flow, flow=heads.offset),
+    "actors and background swapped": lambda heads: channels(heads, "segmentation", lambda maps: maps[:, ::-1]),
+    "frames reversed": lambda heads: replace(
+        heads, **{name: getattr(heads, name)[::-1] for name in ("segmentation", "centerness", "offset", "flow")}
+    ),
+}
+
+
+def rough(heads: MotionHeads) -> MotionHeads:
+    """Vectors more than a cell off, a tenth of the cells on the wrong side."""
+    source = np.random.default_rng(int(heads.segmentation.sum()))
+    off = {name: getattr(heads, name) + source.normal(0, 1.2, heads.flow.shape) for name in ("offset", "flow")}
+    wrong = source.uniform(size=heads.segmentation[:, :1].shape) < 0.1 * (heads.segmentation[:, 1:] > 0)
+    return replace(heads, segmentation=np.where(wrong, heads.segmentation[:, ::-1], heads.segmentation), **off)
+
+
+RIGHT_VECTORS: dict[str, Callable[[MotionHeads], MotionHeads]] = {
+    "perfect": lambda heads: heads,
+    "noisy": rough,
+    "no flow": lambda heads: channels(rough(heads), "flow", lambda maps: 0 * maps),
+    "no offset": lambda heads: channels(rough(heads), "offset", lambda maps: 0 * maps),
+    "short": lambda heads: channels(channels(heads, "flow", lambda maps: maps / 2), "offset", lambda maps: 0.7 * maps),
+    "a cell aside": lambda heads: channels(heads, "flow", lambda maps: maps + 1),
+}
+
+
+def suspected_heads(labels: Labels, change: Callable[[MotionHeads], MotionHeads]) -> list[str]:
     tallies = []
-    for label in few_labels.values():
-        wrong = channels(replace(MotionHeads.from_labels(label), ignore_index=None), head, change)
-        tallies.append(motion_tallies(MotionOutput(grid=label.config.grid, heads=(wrong,)), label))
-    found = [each.name for each in candidates_of(motion_suspicions("devkit", heads=True), tallies) if each.suspected]
-    assert found == ([] if mistake is None else [mistake])
+    for label in labels.values():
+        heads = change(replace(MotionHeads.from_labels(label), ignore_index=None))
+        tallies.append(motion_tallies(MotionOutput(grid=label.config.grid, heads=(heads,)), label))
+    return [each.name for each in candidates_of(motion_suspicions("devkit", heads=True), tallies) if each.suspected]
+
+
+@pytest.mark.parametrize("base", ["perfect", "noisy"])
+@pytest.mark.parametrize("mistake", VECTORS)
+def test_heads_with_a_mistake_are_named(few_labels: Labels, mistake: str, base: str) -> None:
+    assert suspected_heads(few_labels, lambda heads: VECTORS[mistake](RIGHT_VECTORS[base](heads))) == [mistake]
+
+
+@pytest.mark.parametrize("heads", RIGHT_VECTORS)
+def test_other_heads_are_not_suspected(few_labels: Labels, heads: str) -> None:
+    assert suspected_heads(few_labels, RIGHT_VECTORS[heads]) == []
 
 
 def test_maps_longer_than_wide_cannot_be_turned_by_90_degrees(da_motion: DeepAccident) -> None:

@@ -1,0 +1,93 @@
+"""`SanityReport`: what a few samples say of predictions as a whole, and how that is put into words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
+from deepaccident_devkit.evaluation.metrics.headlines import Headline, Unit, value_text
+from deepaccident_devkit.evaluation.runs.sanity.probes import Candidate
+from deepaccident_devkit.text import columns_text
+
+NEAR_NOTHING: Final = 0.05
+"""Share of the way from what nothing scores to what the truth scores; who is below it has next to nothing."""
+NOTHING_WRONG: Final = "Nothing looks wrong with the predictions."
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SanityReport(FrozenMappings):
+    """What a few samples say of predictions as a whole.
+
+    Attributes:
+        samples: how many were looked at.
+        perfect: headline → value if the truth were predicted, in the form of the results: the most there is to reach.
+        empty: headline → value if nothing were predicted.
+        given: headline → value of the predictions, of these samples alone.
+        units: headline → unit.
+        candidates: all that was looked for, suspected or not.
+        warnings: sentences; none if nothing looks wrong.
+        unchecked: sentences: what such results do not hold, so that nobody could look at it.
+        verdict: what there is to say beside the warnings, a sentence: that nothing looks wrong, or that the score is
+            near nothing and no check explains it; empty if a warning does.
+    """
+
+    samples: int
+    perfect: Mapping[str, float | None]
+    empty: Mapping[str, float | None]
+    given: Mapping[str, float | None]
+    units: Mapping[str, Unit]
+    candidates: tuple[Candidate, ...]
+    warnings: tuple[str, ...]
+    unchecked: tuple[str, ...]
+    verdict: str
+
+    def to_text(self) -> str:
+        """A table of the three, what was looked for, then the warnings and the verdict."""
+        rows = [["", "nothing predicted", "given", "perfect"]]
+        for name, value in self.given.items():
+            texts = [value_text(each, self.units[name]) for each in (self.empty[name], value, self.perfect[name])]
+            rows.append([name, *texts])
+        head = f"Sanity, of {self.samples} samples; what the protocol gives to nothing and to the truth itself:"
+        looked = f"{len(self.candidates)} mistakes were looked for: mirrored, turned, shifted, scaled and others."
+        unchecked = [f"Not looked at: {each}" for each in self.unchecked]
+        found = [f"WARNING: {each}" for each in self.warnings]
+        return "\n".join([head, columns_text(rows), looked, *unchecked, *found, *([self.verdict] * bool(self.verdict))])
+
+
+def verdict_of(
+    given: Iterable[Headline],
+    empty: Mapping[str, float | None],
+    perfect: Mapping[str, float | None],
+    *,
+    explained: bool,
+    warned: bool,
+    checks: int,
+) -> str:
+    """The sentence beside the warnings.
+
+    The score is the first headline of which more is better and in which the truth beats nothing.
+
+    Args:
+        given: headlines of the predictions, the most important first.
+        empty: headline → value if nothing were predicted.
+        perfect: headline → value if the truth were predicted.
+        explained: whether a warning says why a score may be near nothing.
+        warned: whether there is any warning.
+        checks: how many mistakes were looked for.
+    """
+    if explained:
+        return ""
+    for each in given:
+        low, high = empty[each.name] or 0.0, perfect[each.name]
+        if not each.higher_is_better or high is None or high <= low:
+            continue
+        share = ((each.value or 0.0) - low) / (high - low)
+        if share < NEAR_NOTHING:
+            return (
+                f"Near nothing: {each.name} is {max(share, 0.0):.1%} of the way from an empty prediction to the truth; "
+                f"none of the {checks} checks explains it."
+            )
+        break
+    return "" if warned else NOTHING_WRONG
