@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.evaluation import Bootstrap, DetectedBoxes, breakdown, detection_truth, instances_of
+from deepaccident_devkit.evaluation import DetectedBoxes, Resampling, breakdown, detection_truth, instances_of
 from deepaccident_devkit.evaluation.metrics.accident import BoxTruth, accident_context
 from deepaccident_devkit.evaluation.metrics.attributes import sample_attributes
 from deepaccident_devkit.evaluation.metrics.predictions import Accident
@@ -55,7 +55,7 @@ def evaluation_run(
         partial=partial,
         attributes=attributes,
         times_to_impact={token: dataset.get("sample", token)["time_to_impact"] for token in tokens},
-        breakdowns=tuple(breakdown(evaluator, attributes, by, Bootstrap(resamples=20)) for by in BREAKDOWNS),
+        breakdowns=tuple(breakdown(evaluator, attributes, by, Resampling(resamples=20)) for by in BREAKDOWNS),
         release=ReleaseInfo(dataroot="/data/DeepAccident", version="v1", scenarios=hashes),
         results=ResultsInfo(path="results", task=setup.task, fingerprint="5e5e", meta=meta, form=None),
         **more,
@@ -107,4 +107,4 @@ def stored_run(dataset: DeepAccident, setup: EvaluationSetup, path: Path) -> tup
             writer.add(token, prediction)
     results = read_results(path)
     run = evaluate_results(dataset, results, setup, selection, workers=1)
-    return run.broken_down(BREAKDOWNS, Bootstrap(resamples=20)), results
+    return run.broken_down(BREAKDOWNS, Resampling(resamples=20)), results

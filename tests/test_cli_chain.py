@@ -56,7 +56,7 @@ def test_each_evaluation_is_verified(release: Path, folder: Path, task: str, nam
     out = folder / f"{task}_{name}_{protocol}"
     text = deepaccident(
         *("evaluate", task, release, "--results", folder / "all" / name, "--split", "train"),
-        *("--protocol", protocol, "--out", out, "--bootstrap", 0),
+        *("--protocol", protocol, "--out", out, "--resamples", 0),
     )
     assert f"{task}, protocol {protocol}" in text
     summary = json.loads((out / "metrics_summary.json").read_text())
@@ -72,7 +72,7 @@ def test_five_agents_are_compared_with_one(release: Path, folder: Path) -> None:
         results = folder / agents / "motion"
         deepaccident(
             *("evaluate", "motion", release, "--results", results, "--split", "train", "--out", bundles[-1]),
-            *("--bootstrap", 0),
+            *("--resamples", 0),
         )
     text = deepaccident("evaluate", "compare", *bundles, "--out", folder / "compared.json")
     assert "motion, protocol released: 20 samples of 1 scenarios" in text

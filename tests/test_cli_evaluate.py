@@ -19,7 +19,7 @@ from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_result
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 
 AGENTS = ("ego_vehicle", "infrastructure")
-LIST = ("--split", "train", "--agents", ",".join(AGENTS), "--bootstrap", "0")
+LIST = ("--split", "train", "--agents", ",".join(AGENTS), "--resamples", "0")
 
 
 def evaluate(*arguments: object, status: int = 0) -> Result:
@@ -211,13 +211,13 @@ def two(da_motion: DeepAccident, folder: Path) -> list[Path]:
 class TestCompare:
     def test_text_and_files(self, two: list[Path], tmp_path: Path) -> None:
         for name in ("numbers.csv", "numbers.json"):
-            text = evaluate("compare", *two, "--bootstrap", 20, "--out", tmp_path / name).output
-            # one accident says nothing of others
+            text = evaluate("compare", *two, "--resamples", 20, "--out", tmp_path / name).output
+            # one cluster says nothing of others
             error = next(line.split() for line in text.splitlines() if line.startswith("position_error"))
-            assert (error[2:5], error[-1]) == (["0.283", "2.828", "+2.546"], "no")
+            assert (error[2:5], error[-2:]) == (["0.283", "2.828", "+2.546"], ["are", "needed"])
             assert f"written: {tmp_path / name}" in text
         stated = json.loads((tmp_path / "numbers.json").read_text())
-        assert stated == json.loads(evaluate("compare", *two, "--bootstrap", 20, "--json").stdout)
+        assert stated == json.loads(evaluate("compare", *two, "--resamples", 20, "--json").stdout)
         assert (tmp_path / "numbers.csv").read_text().count("\n") == len(stated["numbers"]) + 1
 
     def test_refused(self, two: list[Path], bundle: Path, tmp_path: Path) -> None:

@@ -10,10 +10,15 @@ from typing import Any, get_args
 import click
 
 from deepaccident_devkit.cli.evaluate_bundles import compare, validate, verify
-from deepaccident_devkit.cli.evaluate_options import selection_of, selection_parameters, switches_of
+from deepaccident_devkit.cli.evaluate_options import (
+    resamples_parameter,
+    selection_of,
+    selection_parameters,
+    switches_of,
+)
 from deepaccident_devkit.cli.options import release_parameters
 from deepaccident_devkit.deepaccident import DeepAccident
-from deepaccident_devkit.evaluation import Bootstrap
+from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.metrics.attributes import ATTRIBUTES, EVERYTHING
 from deepaccident_devkit.evaluation.results import Results, read_results
 from deepaccident_devkit.evaluation.runs import (
@@ -32,8 +37,6 @@ from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, Evaluatio
 from deepaccident_devkit.evaluation.runs.text import SHOWN_BREAKDOWNS
 from deepaccident_devkit.render.evaluation import save_report
 
-_RESAMPLES = 200
-"""For intervals: there are ten breakdowns of each evaluation, and of detections one resample takes a while."""
 _HELP = {
     "motion": "Tell how well motion is foreseen: IoU, VPQ and errors of paths.",
     "accident": "Tell how well accidents are foreseen: APA, and errors of who, where and when.",
@@ -82,13 +85,7 @@ def _task_verb(task: TaskName) -> click.Command:
     @click.option("--switch", "switches", multiple=True, metavar="NAME=VALUE", help="Make a choice of it otherwise.")
     @click.option("--allow-partial", is_flag=True, help="Evaluate the samples there are; all is marked as partial.")
     @click.option("--by", multiple=True, type=click.Choice(ATTRIBUTES), help="Break down by this; may be repeated.")
-    @click.option(
-        "--bootstrap",
-        type=click.IntRange(min=0),
-        default=_RESAMPLES,
-        show_default=True,
-        help="Resamples for intervals; 0 for none.",
-    )
+    @resamples_parameter
     @click.option("--sanity", is_flag=True, help="Look whether predictions are mirrored, turned, shifted, scaled, …")
     @click.option("--explain", "explained", is_flag=True, help="Tell what each choice of the protocol changes.")
     @click.option("--out", type=click.Path(path_type=Path), help="Folder for all numbers, figures and a report.")
@@ -124,8 +121,8 @@ def _evaluate(setup: EvaluationSetup, results: Path, *, by: tuple[str, ...], as_
         out=out,
         progress=True,
     )
-    drawn = Bootstrap(resamples=options["bootstrap"])
-    run = run.broken_down((EVERYTHING, *(by or breakdowns_of(setup.task))), drawn, workers=options["workers"])
+    resampling = Resampling(resamples=options["resamples"])
+    run = run.broken_down((EVERYTHING, *(by or breakdowns_of(setup.task))), resampling, workers=options["workers"])
     run, texts = _examined(run, dataset, opened, options)
     summary = run.summary()
     shown = summary_text(summary, by or SHOWN_BREAKDOWNS)

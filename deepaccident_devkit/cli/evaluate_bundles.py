@@ -7,10 +7,10 @@ from typing import Any, Literal
 
 import click
 
-from deepaccident_devkit.cli.evaluate_options import selection_of, selection_parameters
+from deepaccident_devkit.cli.evaluate_options import resamples_parameter, selection_of, selection_parameters
 from deepaccident_devkit.cli.options import on_error_parameter
 from deepaccident_devkit.deepaccident import DeepAccident
-from deepaccident_devkit.evaluation import Bootstrap
+from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.evaluation.runs import compare_bundles, coverage, read_bundle, results_text, verify_bundle
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
@@ -77,14 +77,14 @@ def verify(
 @click.argument("a", type=click.Path(path_type=Path))
 @click.argument("b", type=click.Path(path_type=Path))
 @click.option("--common", is_flag=True, help="Compare the samples that both have, where one has others, too.")
-@click.option("--bootstrap", type=click.IntRange(min=0), default=1000, show_default=True, help="Resamples.")
+@resamples_parameter
 @click.option("--out", type=click.Path(path_type=Path), help="A file for all numbers: ….csv or ….json.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object, for programs.")
-def compare(a: Path, b: Path, common: bool, bootstrap: int, out: Path | None, as_json: bool) -> None:
+def compare(a: Path, b: Path, common: bool, resamples: int, out: Path | None, as_json: bool) -> None:
     """Compare the evaluations in the folders A and B, and say which differences are real."""
     if out is not None and out.suffix not in (".csv", ".json"):
         raise click.BadParameter(f"--out: expected a file ….csv or ….json, found {str(out)!r}")
-    comparison = compare_bundles(a, b, Bootstrap(resamples=bootstrap), common=common)
+    comparison = compare_bundles(a, b, Resampling(resamples=resamples), common=common)
     as_text = json.dumps(comparison.as_dict(), indent=1)
     click.echo(as_text if as_json else comparison.to_text())
     if out is None:

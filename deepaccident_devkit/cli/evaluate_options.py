@@ -7,6 +7,7 @@ from typing import Any, get_args
 import click
 
 from deepaccident_devkit.cli.options import Verb, agent_names, agents_parameter
+from deepaccident_devkit.evaluation.metrics.intervals import RESAMPLES
 from deepaccident_devkit.evaluation.runs import SampleSelection, default_selection
 from deepaccident_devkit.evaluation.runs.selection import SampleList, ScopeName
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
@@ -33,6 +34,14 @@ _SELECTION = (
     ),
     agents_parameter,
     click.option("--horizon", default=2.0, show_default=True, help="Seconds that predictions look ahead."),
+)
+resamples_parameter = click.option(
+    "--resamples",
+    type=click.IntRange(min=0),
+    default=RESAMPLES,
+    show_default=True,
+    help="How often, at most, numbers are computed of other counts, to see how sure they are; 0 for no intervals and "
+    "no tests.",
 )
 
 

@@ -19,7 +19,7 @@ from deepaccident_devkit.evaluation.metrics.accident import (
     box_truth,
 )
 from deepaccident_devkit.evaluation.metrics.attributes import SampleAttributes, sample_attributes
-from deepaccident_devkit.evaluation.metrics.breakdowns import Bootstrap, Breakdown, breakdown
+from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown, breakdown
 from deepaccident_devkit.evaluation.metrics.detection import (
     DetectedBoxes,
     DetectionEvaluator,
@@ -28,6 +28,7 @@ from deepaccident_devkit.evaluation.metrics.detection import (
     nuscenes_summary,
 )
 from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
+from deepaccident_devkit.evaluation.metrics.intervals import Resampling
 from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator, MotionResult, motion_counts
 from deepaccident_devkit.evaluation.metrics.motion.losses import LostInstance, lost_instances
 from deepaccident_devkit.evaluation.metrics.motion.overlaps import segmentation_counts, vpq, vpq_counts
@@ -47,7 +48,6 @@ __all__ = [
     "AccidentResult",
     "BevSegmentationEvaluator",
     "BevSegmentationResult",
-    "Bootstrap",
     "BoxAccidents",
     "BoxTruth",
     "Breakdown",
@@ -60,6 +60,7 @@ __all__ = [
     "MotionOutput",
     "MotionResult",
     "PaperAccidents",
+    "Resampling",
     "Results",
     "ResultsWriter",
     "SampleAttributes",

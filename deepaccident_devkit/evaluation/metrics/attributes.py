@@ -29,8 +29,8 @@ def cluster_of(scenario: str) -> str:
     Args:
         scenario: its token, `type1_subtype1_accident/Town03…`.
     """
-    kind, _, name = scenario.partition("/")
-    return f"{kind.rpartition('_')[0]}/{name}"
+    kind, slash, name = scenario.partition("/")
+    return f"{kind.rpartition('_')[0] or kind}{slash}{name}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

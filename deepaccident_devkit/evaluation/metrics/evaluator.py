@@ -55,6 +55,11 @@ class Evaluator(ABC, Generic[Result]):
         """
         return list(counts)
 
+    @property
+    def has_intervals(self) -> bool:
+        """Whether its numbers may be asked for again and again; else there are no intervals and no tests of them."""
+        return True
+
     def resampled(self, parts: Sequence[Sequence[Counts]], times: IntArray) -> Iterator[Result]:
         """The result of each of D draws, as of samples some of which come several times, and others not at all.
 

@@ -11,6 +11,8 @@ from typing import Any, Final, Literal
 from deepaccident_devkit.errors import ChoiceError
 
 Unit = Literal["%", "share", "m", "s", "rad", "m/s", "1 - overlap", "1/min"]
+LIMITS: Final[Mapping[Unit, float]] = MappingProxyType({"%": 100.0, "share": 1.0, "1 - overlap": 1.0})
+"""The most that a number of a unit can be; others have no limit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,6 +100,10 @@ _ROWS: Final[Mapping[str, tuple[_Row, ...]]] = MappingProxyType(
         ),
     }
 )
+HEADLINE_UNITS: Final[Mapping[str, Unit]] = MappingProxyType(
+    {row.path: row.unit for rows in _ROWS.values() for row in rows}
+)
+"""Path of a headline, `*` for any key → its unit."""
 
 
 def headlines(task: str, result: object) -> tuple[Headline, ...]:

@@ -8,14 +8,15 @@ import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
-from deepaccident_devkit.evaluation.metrics.breakdowns import Bootstrap
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import plain
+from deepaccident_devkit.evaluation.metrics.intervals import Resampling
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.text import columns_text
 
-_COLUMNS: Final = ("number", "headline", "unit", "a", "b", "difference", "low", "high", "reversed", "real", "better")
+Family = Literal["main", "headlines", "other"]
+"""What a number is tested with: by itself, with all other headlines, or not at all."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,12 +30,15 @@ class ComparedNumber:
         a: of the first; None where it has nothing to count.
         b: of the second; likewise.
         difference: b − a; None if one of them is.
-        low: where the middle share of the resamples' differences begins; None without resamples.
+        low: where the interval of the true difference begins; None for no interval.
         high: where it ends.
-        reversed: share of the resamples whose difference has the other sign; None without resamples or difference.
-        real: whether the interval from low to high lies on one side of 0, and more than one scenario has the number;
-            False without one.
+        family: `main` for the task's first headline, which is tested by itself; `headlines` for the others, which are
+            tested together; `other` for numbers that are not tested, but for exploration.
+        p: of the paired permutation test of this number for itself; None without difference or resamples.
+        adjusted_p: the same by Holm's rule over the headlines; of others like p.
+        real: whether the adjusted p is at most 1 − confidence; False of numbers that are not tested.
         better: `a` or `b`, where a difference is real and one knows which way is better; else None.
+        decision: for people: `b is better`, or why nothing is decided, and how many scenarios would.
     """
 
     number: str
@@ -45,9 +49,15 @@ class ComparedNumber:
     difference: float | None
     low: float | None
     high: float | None
-    reversed: float | None
+    family: Family
+    p: float | None
+    adjusted_p: float | None
     real: bool
     better: str | None
+    decision: str
+
+
+_COLUMNS: Final = tuple(ComparedNumber.__dataclass_fields__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,9 +71,12 @@ class Comparison:
         protocol: of both.
         samples: compared.
         scenarios: that they are of.
+        clusters: that these are, where an accident and its twin are one.
         left_out: samples that only one of them has.
         partial: marks of those that are partial themselves.
-        bootstrap: how resamples were drawn.
+        resampling: how differences were tested.
+        swaps: how many swaps of the two runs' counts, cluster by cluster, p is of.
+        all_swaps: whether these are all there are (but for the sign); else they are random.
         numbers: headlines first.
     """
 
@@ -73,9 +86,12 @@ class Comparison:
     protocol: str
     samples: int
     scenarios: int
+    clusters: int
     left_out: int
     partial: tuple[str, ...]
-    bootstrap: Bootstrap
+    resampling: Resampling
+    swaps: int
+    all_swaps: bool
     numbers: tuple[ComparedNumber, ...]
 
     def to_text(self) -> str:
@@ -83,35 +99,34 @@ class Comparison:
         marks = [f"a, b: only the samples that both have; {self.left_out} left out"] if self.left_out else []
         head = [
             f"{self.task}, protocol {self.protocol}: {self.samples} samples of {self.scenarios} scenarios",
+            f"clusters: {self.clusters} (an accident and its twin are one)",
             f"a: {self.a}",
             f"b: {self.b}",
             *self.partial,
             *marks,
         ]
         shown = [each for each in self.numbers if each.headline]
-        percent = f"{self.bootstrap.confidence:.0%}"
-        rows: list[Sequence[str]] = [("number", "a", "b", "b − a", f"{percent} interval", "reversed", "real")]
+        percent = f"{self.resampling.confidence:.0%}"
+        rows: list[Sequence[str]] = [("number", "a", "b", "b − a", f"{percent} interval", "p", "decision")]
         rows += [_text_row(each) for each in shown]
         return "\n".join([*head, "", columns_text(rows), "", *self.notes()])
 
     def notes(self) -> list[str]:
         """What a reader of the table has to know."""
-        drawn = [each for each in self.numbers if each.reversed is not None]
-        if not drawn:
-            why = f"they are drawn over scenarios, of which there are {self.scenarios}"
-            return [f"no intervals: {why if self.bootstrap.resamples else 'no resamples were asked for'}"]
-        others = [each for each in self.numbers if not each.headline]
-        by_chance = (1 - self.bootstrap.confidence) * len(drawn)
-        meaning = (
-            f"real: the interval over {self.bootstrap.resamples} resamples of whole scenarios, the same for both, "
-            "excludes 0, and several scenarios have the number; reversed: share of the resamples with the other sign"
-        )
-        honesty = (
-            f"{len(drawn)} numbers are compared: if the two were equally good, about {by_chance:.1f} would be called "
-            "real by chance; decide on one headline before you look"
-        )
-        rest = f"beside the headlines: {sum(each.real for each in others)} of {len(others)} numbers differ really"
-        return [meaning, honesty, rest]
+        if not self.resampling.resamples:
+            return ["no intervals and no tests: no resamples were asked for"]
+        level = 1 - self.resampling.confidence
+        main = next((each.headline for each in self.numbers if each.family == "main"), None)
+        others = [each for each in self.numbers if each.family == "other" and each.p is not None]
+        low = sum(each.p is not None and each.p <= level for each in others)
+        drawn = f"all {self.swaps:,}" if self.all_swaps else f"{self.swaps:,} random"
+        by_chance = f"of equal runs about {level * len(others):.1f} would be"
+        return [
+            f"p: share of {drawn} swaps of clusters between the two after which the two differ as much",
+            f"tested at {level:.0%}: {main}; and the other headlines together, whose p is adjusted by Holm's rule",
+            "scenarios that would decide: with a chance of 80 %, if the true difference is the observed one",
+            f"for exploration: {low} of {len(others)} other numbers have a p of at most {level:.0%}; {by_chance}",
+        ]
 
     def as_dict(self) -> dict[str, Any]:
         """All of it, as JSON holds it."""
@@ -137,6 +152,6 @@ def _text_row(each: ComparedNumber) -> tuple[str, ...]:
         *("–" if value is None else f"{value:.3f}" for value in (each.a, each.b)),
         "–" if each.difference is None else f"{each.difference:+.3f}",
         interval,
-        "–" if each.reversed is None else f"{each.reversed:.1%}",
-        f"yes, {each.better} is better" if each.better else "yes" if each.real else "no",
+        "–" if each.adjusted_p is None else f"{each.adjusted_p:.3f}",
+        each.decision,
     )

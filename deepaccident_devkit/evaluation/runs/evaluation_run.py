@@ -15,10 +15,11 @@ from typing import Any, Final
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.attributes import WITHIN_RECORDINGS, SampleAttributes
-from deepaccident_devkit.evaluation.metrics.breakdowns import Bootstrap, Breakdown, Group, breakdown
+from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown, Group, breakdown
 from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import plain
 from deepaccident_devkit.evaluation.metrics.headlines import headlines
+from deepaccident_devkit.evaluation.metrics.intervals import Resampling
 from deepaccident_devkit.evaluation.runs.selection import SampleSelection
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.parallel import run_batch
@@ -165,20 +166,20 @@ class EvaluationRun:
         }
 
     def broken_down(
-        self, by: Sequence[str] | None = None, bootstrap: Bootstrap | None = None, *, workers: int | None = 1
+        self, by: Sequence[str] | None = None, resampling: Resampling | None = None, *, workers: int | None = 1
     ) -> EvaluationRun:
         """The same run with results by these attributes, in place of those it has.
 
         Args:
             by: of `attributes.ATTRIBUTES`; one that is given twice counts once. None for `breakdowns_of` the task.
-            bootstrap: how intervals are drawn; None for the defaults.
+            resampling: how intervals are made; None for the defaults.
             workers: processes, which share the attributes among them; None takes what the work is worth.
 
         Raises:
             ChoiceError: no such attribute.
         """
         chosen = breakdowns_of(self.setup.task) if by is None else by
-        work = partial(breakdown, self.evaluator, self.attributes, bootstrap=bootstrap)
+        work = partial(breakdown, self.evaluator, self.attributes, resampling=resampling)
         return replace(self, breakdowns=tuple(run_batch(work, list(dict.fromkeys(chosen)), workers=workers)))
 
     def summary(self) -> dict[str, Any]:
@@ -222,7 +223,7 @@ class EvaluationRun:
 
     def _breakdown(self, given: Breakdown[Any]) -> dict[str, Any]:
         return {
-            "bootstrap": plain(given.bootstrap),
+            "resampling": plain(given.resampling),
             "groups": self._groups(given.groups),
             "without_infrastructure": self._groups(given.without_infrastructure),
         }
@@ -233,9 +234,11 @@ class EvaluationRun:
                 "value": group.value,
                 "samples": group.samples,
                 "scenarios": group.scenarios,
+                "clusters": group.clusters,
                 "headlines": {each.path: each.value for each in headlines(self.setup.task, group.result)},
                 "metrics": group.result.as_dict(),
                 "intervals": plain(group.intervals),
+                "notes": list(group.notes),
             }
             for group in groups
         ]

@@ -61,13 +61,13 @@ def _headlines(summary: Json) -> str:
     groups = everyone["groups"] if everyone else []
     intervals = groups[0]["intervals"] if groups else {}
     beside: Mapping[str, Any] = summary["metrics"].get("beside") or {}
-    percent = f"{everyone['bootstrap']['confidence']:.0%} interval" if intervals else ""
+    percent = f"{everyone['resampling']['confidence']:.0%} interval" if intervals else ""
     rows = [("number", "value", *([percent] if percent else []), *(f"if {name}" for name in beside))]
     for each in summary["headlines"]:
         interval = [_interval(intervals.get(each["path"]))] if percent else []
         others = (_number(_at(part, each["path"])) for part in beside.values())
         rows.append((each["name"], each["text"], *interval, *others))
-    return columns_text(rows)
+    return "\n".join([columns_text(rows), *(groups[0]["notes"] if groups else [])])
 
 
 def _counts(metrics: Json) -> Iterator[str]:

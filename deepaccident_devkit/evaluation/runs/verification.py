@@ -12,7 +12,7 @@ from typing import Any, Final
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import DeepAccidentError, ResultsError
-from deepaccident_devkit.evaluation.metrics.breakdowns import Bootstrap
+from deepaccident_devkit.evaluation.metrics.intervals import Resampling
 from deepaccident_devkit.evaluation.results import Results, read_results
 from deepaccident_devkit.evaluation.runs.bundles import (
     COUNTS_FILE,
@@ -146,10 +146,10 @@ def _again(bundle: Bundle, dataset: Dataset, results: Results, *, workers: int |
     if not isinstance(breakdowns, Mapping) or not breakdowns:
         return run
     try:
-        drawn = Bootstrap(**next(iter(breakdowns.values()))["bootstrap"])
+        resampling = Resampling(**next(iter(breakdowns.values()))["resampling"])
     except (TypeError, KeyError) as error:
-        raise ResultsError(f"{SUMMARY_FILE}: does not say how intervals were drawn ({error})") from error
-    return run.broken_down(list(breakdowns), drawn, workers=workers)
+        raise ResultsError(f"{SUMMARY_FILE}: does not say how intervals were made ({error})") from error
+    return run.broken_down(list(breakdowns), resampling, workers=workers)
 
 
 def _version(bundle: Bundle) -> Iterator[Difference]:

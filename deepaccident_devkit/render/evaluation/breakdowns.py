@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown, Group
-from deepaccident_devkit.evaluation.metrics.headlines import Headline, headlines
+from deepaccident_devkit.evaluation.metrics.headlines import LIMITS, Headline, headlines
 from deepaccident_devkit.render.axes import axes_or_new
 from deepaccident_devkit.render.colors import AGENT_COLORS, ESTIMATE_COLOR
 from deepaccident_devkit.render.evaluation.panels import PANEL, Bar, draw_bars
@@ -15,12 +15,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 UNKNOWN: Final = "not known"
-_LIMITS: Final = {"%": 100.0, "share": 1.0, "1 - overlap": 1.0}
-"""Unit → the most that a number of it can be; others have no limit."""
 
 
 def render_breakdown(task: str, broken: Breakdown[Any], number: str, *, ax: Axes | None = None) -> Axes:
-    """Draw one headline number of each group as a bar, with its interval over scenarios as a whisker.
+    """Draw one headline number of each group as a bar, with its interval as a whisker.
 
     Args:
         task: whose headline numbers there are.
@@ -36,7 +34,7 @@ def render_breakdown(task: str, broken: Breakdown[Any], number: str, *, ax: Axes
         headline = next((each for each in headlines(task, group.result) if each.path == number), None)
         shown = headline or shown
         bars.append(_bar(group, headline, AGENT_COLORS.get(group.value or "", ESTIMATE_COLOR)))
-    draw_bars(bars, ax, None if shown is None else _LIMITS.get(shown.unit))
+    draw_bars(bars, ax, None if shown is None else LIMITS.get(shown.unit))
     ax.set_title(f"{number if shown is None else shown.name} by {broken.by.replace('_', ' ')}", fontsize=10)
     ax.set_xlabel("" if shown is None else _with_unit(shown))
     return ax

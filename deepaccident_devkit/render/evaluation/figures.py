@@ -236,10 +236,10 @@ def _by(task: str, broken: Breakdown[Any], path: str) -> RunFigure:
     values = [(group.value or UNKNOWN, _headline(task, group.result, path)) for group in broken.groups]
     name = next(headline.name for _, headline in values if headline is not None)
     words = ", ".join(f"{value} {'–' if headline is None else headline.text()}" for value, headline in values)
-    by, percent = broken.by.replace("_", " "), 100 * broken.bootstrap.confidence
+    by, percent = broken.by.replace("_", " "), 100 * broken.resampling.confidence
     return RunFigure(
         name=f"{path.rsplit('/', 1)[-1]}_by_{broken.by}",
-        caption=f"{name} by {by}; whiskers: {percent:g} % intervals over scenarios, where there are several.",
+        caption=f"{name} by {by}; whiskers: {percent:g} % intervals over clusters of scenarios, if there are enough.",
         alt=f"{name} by {by}: {words}.",
         draw=partial(render_breakdown, task, broken, path),
         rows=len(broken.groups),

@@ -9,6 +9,7 @@ from typing import Any, Final
 from deepaccident_devkit.evaluation.metrics.attributes import EVERYTHING
 from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown, Group
 from deepaccident_devkit.evaluation.metrics.headlines import Headline, headlines, value_text
+from deepaccident_devkit.evaluation.metrics.intervals import LEAST_CLUSTERS
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.evaluation.runs.predictors import predictor_tables
 from deepaccident_devkit.render.evaluation.breakdowns import UNKNOWN
@@ -63,8 +64,9 @@ def headline_table(run: EvaluationRun) -> Markup:
         [each.name, each.text(), _interval_text(each, group), _BETTER[each.higher_is_better]]
         for each in headlines(run.setup.task, run.result)
     ]
-    percent = f"{100 * everything.bootstrap.confidence:g} % interval" if everything is not None else "interval"
-    return tag("div", table(["number", "value", percent, "better"], rows), class_="big")
+    percent = f"{100 * everything.resampling.confidence:g} % interval" if everything is not None else "interval"
+    notes = [tag("p", note, class_="note") for note in (() if group is None else group.notes)]
+    return joined([tag("div", table(["number", "value", percent, "better"], rows), class_="big"), *notes])
 
 
 def predictors(run: EvaluationRun) -> Markup:
@@ -204,7 +206,7 @@ def _groups(task: str, broken: Breakdown[Any], groups: Sequence[Group[Any]], who
         cells = [_cell(known.get(name), group) for name in names]
         label = UNKNOWN if group.value is None else group.value
         rows.append([label, f"{group.samples:,}", f"{group.scenarios:,}", *cells])
-    how = f"{100 * broken.bootstrap.confidence:g} % intervals of {broken.bootstrap.resamples:,} resamples of scenarios"
+    how = f"{100 * broken.resampling.confidence:g} % intervals, if there are {LEAST_CLUSTERS} clusters"
     return table([broken.by.replace("_", " "), "samples", "scenarios", *names], rows, f"{whose}; {how}")
 
 

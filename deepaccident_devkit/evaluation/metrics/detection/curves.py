@@ -1,6 +1,6 @@
 """From the counts of many samples to precision, recall and average precision, by three rules.
 
-Each sample may be taken several times, or not at all: draws of a bootstrap share all that does not depend on how often.
+Each sample may be taken several times, or not at all: resamples share all that does not depend on how often.
 """
 
 from __future__ import annotations

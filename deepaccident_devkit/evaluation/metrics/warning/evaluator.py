@@ -113,10 +113,15 @@ class WarningEvaluator(Evaluator[Any]):
         return [{PART: [sample for part in parts_of(counts) for sample in part]}]
 
     def resampled(self, parts: Sequence[Sequence[Counts]], times: IntArray) -> Iterator[Any]:
-        """The result of each draw; without references. Of the protocol `field` there are none: it has no intervals."""
+        """The result of each draw, without references."""
         if isinstance(self.protocol, CleanWarnings):
             return self.protocol.resampled(parts, times)
-        return iter(()) if isinstance(self.protocol, FieldWarnings) else super().resampled(parts, times)
+        return super().resampled(parts, times)
+
+    @property
+    def has_intervals(self) -> bool:
+        """Of the protocol `field` there are none: its numbers take long, and are for a look beside published ones."""
+        return not isinstance(self.protocol, FieldWarnings)
 
 
 def _protocol(protocol: object) -> Protocol:

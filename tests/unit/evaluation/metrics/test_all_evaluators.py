@@ -11,18 +11,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError, GeometryError
 from deepaccident_devkit.evaluation import (
     AccidentEvaluator,
     BevSegmentationEvaluator,
-    Bootstrap,
     DetectedBoxes,
     DetectionEvaluator,
     Evaluator,
     MotionEvaluator,
     MotionOutput,
+    Resampling,
     breakdown,
     detection_truth,
     instances_of,
@@ -31,6 +32,8 @@ from deepaccident_devkit.evaluation import (
 )
 from deepaccident_devkit.evaluation.metrics.accident import accident_context
 from deepaccident_devkit.evaluation.metrics.detection import DETECTION_PROTOCOLS
+from deepaccident_devkit.evaluation.metrics.numbers import numbers_of
+from deepaccident_devkit.evaluation.runs.paired import Swaps, swapped_differences
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.motion import BEV_CLASSES, BevSegmentation, MotionHeads
 
@@ -159,6 +162,22 @@ def test_pooled_counts_have_the_same_result(samples: Samples, tokens: list[str],
 
 
 @of_all
+def test_two_runs_can_be_swapped(samples: Samples, tokens: list[str], name: str) -> None:
+    """Where nothing is swapped they differ as observed; where all is, by the same with the other sign."""
+    runs = [
+        evaluated(name, tokens, lambda token, given=given: given(name, token))
+        for given in (samples.some, samples.perfect)
+    ]
+    first, second = (numbers_of(run.compute()) for run in runs)
+    names = [path for path in first if path in second]
+    observed = np.array([second[path] - first[path] for path in names])
+    clusters = [[[run.counts[token]] for token in tokens] for run in runs]
+    swapped = np.array([[False] * len(tokens), [True] * len(tokens)])
+    made = swapped_differences(runs[0], clusters, Swaps(swapped=swapped, complete=False), names)
+    assert_allclose(made, [observed, -observed], atol=1e-12)
+
+
+@of_all
 def test_empty_predictions_score_0(samples: Samples, tokens: list[str], name: str) -> None:
     evaluator = evaluated(name, tokens, lambda token: samples.empty(name, token))
     result = evaluator.compute()
@@ -180,8 +199,8 @@ def test_empty_predictions_score_0(samples: Samples, tokens: list[str], name: st
 def test_results_can_be_copied_and_written(samples: Samples, tokens: list[str], name: str) -> None:
     evaluator = evaluated(name, tokens, lambda token: samples.some(name, token))
     attributes = sample_attributes(samples.dataset, tokens)
-    whole, bootstrap = evaluator.compute(), Bootstrap(resamples=2)
-    results = [whole, ALL[name]().compute(), breakdown(evaluator, attributes, "scenario_type", bootstrap)]
+    whole, resampling = evaluator.compute(), Resampling(resamples=2)
+    results = [whole, ALL[name]().compute(), breakdown(evaluator, attributes, "scenario_type", resampling)]
     if name == "detection paper":
         results.append(nuscenes_summary(whole))
     for result in results:

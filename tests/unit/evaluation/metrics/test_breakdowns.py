@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import pytest
+from generated_bundles import motion_counts
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
@@ -17,8 +18,9 @@ from deepaccident_devkit.evaluation.metrics.attributes import (
     sample_attributes,
     scenario_attributes,
 )
-from deepaccident_devkit.evaluation.metrics.breakdowns import Bootstrap, breakdown, numbers_of
+from deepaccident_devkit.evaluation.metrics.breakdowns import breakdown
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator, ratio, total
+from deepaccident_devkit.evaluation.metrics.intervals import Resampling
 from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator
 from deepaccident_devkit.evaluation.metrics.predictions import instances_of
 from deepaccident_devkit.taxonomy import INFRASTRUCTURE
@@ -111,9 +113,10 @@ def test_groups_are_the_results_of_their_samples() -> None:
         tokens = [token for token in MANY if int(token) // 10 % 3 == index]
         assert group.result == evaluator.compute(tokens)
         assert (group.samples, group.scenarios) == (len(tokens), len(tokens) // 10)
-        low, high = group.intervals["share"]
-        assert low <= group.result.share <= high
-        assert set(group.intervals) == {"share"}
+        assert group.intervals == {}
+        count = len(tokens) // 10
+        text = f"no intervals: of {count} clusters (an accident and its twin are one); at least 6 are needed"
+        assert group.notes == (text,)
     assert sum(group.result.hits for group in found.groups) == evaluator.compute().hits
 
 
@@ -121,14 +124,17 @@ def test_everything_is_a_breakdown_too() -> None:
     (group,) = breakdown(filled(), MANY, "all").groups
     assert (group.value, group.samples, group.scenarios) == ("all", 100, 10)
     assert group.result == filled().compute()
+    low, high = group.intervals["share"]
+    assert 0 < low < group.result.share < high < 1
+    assert (set(group.intervals), group.notes) == ({"share"}, ())
 
 
 def test_times_are_in_order_and_what_is_unknown_comes_last() -> None:
     changed = {"time_to_impact": None, "impact_step": NO_IMPACT}
     attributes = MANY | {token: attributes_of(int(token), **changed) for token in ("000", "013")}
-    by_second = breakdown(filled(), attributes, "time_to_impact", Bootstrap(resamples=0))
+    by_second = breakdown(filled(), attributes, "time_to_impact", Resampling(resamples=0))
     assert [group.value for group in by_second.groups] == ["0 s", "1 s", "2 s", "3 s", "4 s", None]
-    by_step = breakdown(filled(), attributes, "impact_step", Bootstrap(resamples=0))
+    by_step = breakdown(filled(), attributes, "impact_step", Resampling(resamples=0))
     values = [group.value for group in by_step.groups]
     assert values == ["0 s", "0.5 s", "1 s", "1.5 s", "2 s", "2.5 s", "3 s", "3.5 s", "4 s", "4.5 s", NO_IMPACT]
     assert by_step.groups[-1].samples == 2
@@ -137,10 +143,10 @@ def test_times_are_in_order_and_what_is_unknown_comes_last() -> None:
 
 def test_the_pole_is_left_out_beside() -> None:
     poles = {token: replace(each, agent=INFRASTRUCTURE) for token, each in MANY.items() if int(token) % 10 < 4}
-    found = breakdown(filled(), MANY | poles, "town", Bootstrap(resamples=0))
+    found = breakdown(filled(), MANY | poles, "town", Resampling(resamples=0))
     assert [group.samples for group in found.groups] == [40, 30, 30]
     assert [group.samples for group in found.without_infrastructure] == [24, 18, 18]
-    by_agent = breakdown(filled(), MANY | poles, "agent", Bootstrap(resamples=0))
+    by_agent = breakdown(filled(), MANY | poles, "agent", Resampling(resamples=0))
     assert [group.value for group in by_agent.groups] == ["ego_vehicle", INFRASTRUCTURE]
     assert [group.value for group in by_agent.without_infrastructure] == ["ego_vehicle"]
 
@@ -157,45 +163,57 @@ def test_no_order_makes_a_difference(kind: type[Shares]) -> None:
     ]
 
 
-def test_intervals_are_drawn_by_scenario_and_seed() -> None:
-    """Ten scenarios of equal samples: whole scenarios are drawn, so that shares are tenths."""
-    evaluator = Shares()
-    for number in range(100):
-        evaluator.add(f"{number:03d}", {"hit": float(number // 10 < 4)})
-    (group,) = breakdown(evaluator, MANY, "all", Bootstrap(resamples=400)).groups
-    low, high = group.intervals["share"]
-    assert 0.0 <= low < 0.3
-    assert 0.5 < high <= 0.9
-    assert {round(10 * bound, 9) % 1 for bound in (low, high)} == {0.0}
-    again = [breakdown(evaluator, MANY, "all", Bootstrap(resamples=5, seed=seed)).groups[0] for seed in (1, 1, 2, 3)]
-    assert again[0].intervals == again[1].intervals
-    assert len({tuple(each.intervals["share"]) for each in again}) > 1
-    narrow = breakdown(evaluator, MANY, "all", Bootstrap(resamples=400, confidence=0.5)).groups[0].intervals["share"]
-    assert low < narrow[0] <= narrow[1] < high
+def test_an_accident_and_its_twin_are_one_cluster() -> None:
+    """Twins that are equal tell nothing new: the interval is that of the accidents alone."""
+    accidents, both = Shares(), Shares()
+    attributes = {}
+    for number in range(80):
+        for kind in ("accident", "normal"):
+            token = f"{number:03d} {kind}"
+            story = f"type1_subtype1_{kind}/Town03_{number // 10}"
+            attributes[token] = attributes_of(number, scenario=story)
+            for evaluator in (accidents, both) if kind == "accident" else (both,):
+                evaluator.add(token, {"hit": float(number // 10 % 2)})
+    [one], [two] = (breakdown(each, attributes, "all").groups for each in (accidents, both))
+    assert (two.scenarios, two.clusters, one.scenarios, one.clusters) == (16, 8, 8, 8)
+    assert two.intervals["share"] == pytest.approx(one.intervals["share"])
 
 
-def test_one_scenario_has_no_interval() -> None:
-    (group,) = breakdown(filled(range(10)), MANY, "all").groups
-    assert (group.scenarios, dict(group.intervals)) == (1, {})
+def test_a_percentage_that_is_always_100_is_not_sure() -> None:
+    evaluator = MotionEvaluator()
+    for number in range(120):
+        evaluator.add(f"{number:03d}", motion_counts(found=50, missed=0))
+    attributes = {token: attributes_of(int(token)) for token in evaluator.tokens}
+    (group,) = breakdown(evaluator, attributes, "all").groups
+    low, high = group.intervals["ranges/30x30/iou"]
+    assert 60 < low < 80
+    assert high == group.result.ranges["30x30"].iou == 100
+    assert "min_ade" not in group.intervals  # NaN
 
 
-def test_a_number_that_is_often_nan() -> None:
+def test_confidence_makes_intervals_wide() -> None:
+    wide, narrow = (
+        breakdown(filled(), MANY, "all", Resampling(confidence=share)).groups[0].intervals["share"]
+        for share in (0.95, 0.5)
+    )
+    assert wide[0] < narrow[0] < narrow[1] < wide[1]
+
+
+def test_without_resamples_there_are_no_intervals() -> None:
+    (group,) = breakdown(filled(), MANY, "all", Resampling(resamples=0)).groups
+    assert (dict(group.intervals), group.notes) == ({}, ())
+
+
+def test_a_number_that_is_nan_has_no_interval() -> None:
     class Ratios(Shares):
         def result_of(self, counts: Collection[Counts]) -> Share:
             hits = total(counts, "hit")
             return Share(hits=int(hits), share=ratio(hits, hits), unknown=math.nan)
 
-    (group,) = breakdown(filled(range(20), Ratios), MANY, "all").groups
-    assert group.intervals["share"] == (1.0, 1.0)
-    assert all(math.isnan(bound) for bound in group.intervals["unknown"])
-
-
-def test_the_numbers_of_a_result() -> None:
-    numbers = numbers_of(MotionEvaluator().compute())
-    assert numbers["ranges/30x30/iou"] == 0.0
-    assert {"min_ade", "min_fde", "miss_rate", "path_accuracy", "ranges/100x100/pq"} <= set(numbers)
-    assert "samples" not in numbers
-    assert numbers_of({5.0: [Share(1, 0.5)]}) == {"5/0/share": 0.5}
+    (group,) = breakdown(filled(kind=Ratios), MANY, "all").groups
+    assert set(group.intervals) == {"share"}
+    low, high = group.intervals["share"]
+    assert 0.5 < low < high == 1.0  # not [1, 1]
 
 
 def test_what_cannot_be_broken_down() -> None:
@@ -204,9 +222,9 @@ def test_what_cannot_be_broken_down() -> None:
     with pytest.raises(ChoiceError, match=r"by: expected one of all, scenario_type, town.* found 'moon'"):
         breakdown(filled(), MANY, "moon")
     with pytest.raises(ConfigError, match="resamples: expected a whole number from 0"):
-        Bootstrap(resamples=-1)
+        Resampling(resamples=-1)
     with pytest.raises(ConfigError, match="confidence: expected a share between 0 and 1"):
-        Bootstrap(confidence=95)
+        Resampling(confidence=95)
 
 
 def test_attributes_of_scenarios() -> None:
@@ -244,7 +262,7 @@ def test_a_breakdown_of_motion_metrics(da_motion: DeepAccident) -> None:
     ]
     assert [group.samples for group in found.without_infrastructure] == [1, 1]
     (everything,) = breakdown(evaluator, sample_attributes(da_motion, tokens), "all").groups
-    assert everything.intervals["ranges/30x30/pq"] == (100.0, 100.0)
+    assert (everything.clusters, dict(everything.intervals)) == (1, {})
     copied = pickle.loads(pickle.dumps(found))
     assert str(copied) == str(found)
     with pytest.raises(TypeError):

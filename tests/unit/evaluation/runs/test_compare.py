@@ -3,18 +3,20 @@
 import csv
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from generated_bundles import MAIN, write_bundle
+from scipy.stats import binom
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError, ResultsError
-from deepaccident_devkit.evaluation import Bootstrap
-from deepaccident_devkit.evaluation.metrics.breakdowns import numbers_of
+from deepaccident_devkit.evaluation import Resampling
+from deepaccident_devkit.evaluation.metrics.numbers import numbers_of
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import (
     Comparison,
@@ -25,11 +27,10 @@ from deepaccident_devkit.evaluation.runs import (
     save_run,
 )
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.splits import save_selection
 
 Write = Callable[..., Results]
 Save = Callable[..., Path]
-FEW = Bootstrap(resamples=40)
+FEW = Resampling(resamples=40)
 
 
 @pytest.fixture(scope="module")
@@ -61,81 +62,124 @@ def by_name(comparison: Comparison) -> dict[str, Any]:
     return {each.headline or each.number: each for each in comparison.numbers}
 
 
-class TestNumbers:
-    def test_the_better_one_is_named(self, motion_bundles: tuple[Path, Path]) -> None:
-        comparison = compare_bundles(*motion_bundles, FEW)
-        numbers = by_name(comparison)
-        iou, error = numbers["iou 100x100"], numbers["min_ade"]
-        assert (iou.real, iou.better, error.real, error.better) == (True, "b", True, "b")
-        assert iou.difference == pytest.approx(iou.b - iou.a)
-        assert 0 < iou.low <= iou.difference <= iou.high
-        assert error.low <= error.high < 0
-        assert (iou.reversed, iou.unit) == (0.0, "%")
-        assert (comparison.samples, comparison.scenarios, comparison.left_out) == (6, 2, 0)
+@pytest.fixture
+def generated(tmp_path: Path) -> Callable[..., Comparison]:
+    """Compare two runs of the given cells found, of 100 true ones a cluster."""
 
-    def test_the_other_way_round_all_turns(self, motion_bundles: tuple[Path, Path]) -> None:
-        forth = by_name(compare_bundles(*motion_bundles, FEW))
-        back = by_name(compare_bundles(*motion_bundles[::-1], FEW))
+    def compare(a: Sequence[int], b: Sequence[int], resampling: Resampling | None = None, **how: Any) -> Comparison:
+        folders = [
+            write_bundle(
+                tmp_path / f"{name}{len(list(tmp_path.iterdir()))}", [(each, 100 - each) for each in run], **how
+            )
+            for name, run in (("a", a), ("b", b))
+        ]
+        return compare_bundles(*folders, resampling)
+
+    return compare
+
+
+HARD = [5 * number for number in range(16)]
+"""Cells found in clusters that differ by far more than two runs do."""
+
+
+class TestNumbers:
+    def test_the_better_one_is_named(self, generated: Callable[..., Comparison]) -> None:
+        better = [each + 3 + number % 3 for number, each in enumerate(HARD)]
+        iou = by_name(generated(HARD, better))[MAIN]
+        assert (iou.family, iou.real, iou.better, iou.decision) == ("main", True, "b", "b is better")
+        assert iou.difference == pytest.approx(iou.b - iou.a)
+        assert 3 < iou.low < iou.difference < iou.high < 5
+        assert iou.p == iou.adjusted_p == pytest.approx(1 / 1001)
+        assert iou.unit == "%"
+
+    def test_pairs_are_compared(self, generated: Callable[..., Comparison]) -> None:
+        """Were the clusters of one run in another order, the same numbers would tell nothing."""
+        better = [each + 3 for each in HARD]
+        apart = by_name(generated(HARD, better[5:] + better[:5]))[MAIN]
+        assert apart.difference == pytest.approx(3)
+        assert not apart.real
+        assert apart.low < -5 < 10 < apart.high
+
+    def test_the_other_way_round_all_turns(self, generated: Callable[..., Comparison]) -> None:
+        better = [each + number % 4 for number, each in enumerate(HARD)]
+        forth, back = (by_name(generated(*runs)) for runs in ((HARD, better), (better, HARD)))
         for name, each in forth.items():
             other = back[name]
-            assert (other.a, other.b, other.real, other.reversed) == (each.b, each.a, each.real, each.reversed)
+            assert (other.a, other.b, other.real, other.p) == (each.b, each.a, each.real, each.p)
             if each.low is not None:
-                assert (other.low, other.high) == (-each.high, -each.low)
-        assert back["min_ade"].better == "a"
+                assert (other.low, other.high) == pytest.approx((-each.high, -each.low))
+        assert back[MAIN].better == "a"
 
     def test_headlines_first_then_every_number(self, motion_bundles: tuple[Path, Path], run: EvaluationRun) -> None:
         numbers = compare_bundles(*motion_bundles, FEW).numbers
-        headlines = [each.headline is not None for each in numbers]
-        assert headlines == sorted(headlines, reverse=True)
         assert [each.headline for each in numbers][:2] == ["iou 30x30", "iou 100x100"]
+        families = [each.family for each in numbers]
+        assert families == ["main", *["headlines"] * families.count("headlines"), *["other"] * families.count("other")]
+        assert [each.headline is None for each in numbers] == [each == "other" for each in families]
         assert "ranges/30x30/sq" in {each.number for each in numbers}
         assert len({each.number for each in numbers}) == len(numbers) > 10
         assert set(numbers_of(run.result)) != {each.number for each in numbers}
 
-    def test_itself_differs_in_nothing(self, motion_bundles: tuple[Path, Path]) -> None:
-        comparison = compare_bundles(motion_bundles[0], motion_bundles[0], FEW)
-        for each in comparison.numbers:
-            assert (each.real, each.better) == (False, None)
+    def test_the_other_headlines_are_tested_together(self, generated: Callable[..., Comparison]) -> None:
+        """Both ranges have the same numbers: by itself one is real, of several it is not."""
+        worse = [1, -1, 2, -1, 3, 3, 1, 2, 2, 1]
+        numbers = by_name(generated([50] * 10, [50 + each for each in worse]))
+        alone, together = numbers[MAIN], numbers["iou 100x100"]
+        assert alone.p == together.p == alone.adjusted_p <= 0.05 < together.adjusted_p
+        assert (alone.real, together.real, together.better) == (True, False, None)
+        tested = [each for each in numbers.values() if each.family == "headlines" and each.p is not None]
+        assert together.adjusted_p == pytest.approx(min(len(tested) * together.p, 1))
+        others = [each for each in numbers.values() if each.family == "other"]
+        assert {each.decision for each in others} == {"for exploration"}
+        assert not any(each.real for each in others)
+
+    def test_itself_differs_in_nothing(self, generated: Callable[..., Comparison]) -> None:
+        for each in generated(HARD, HARD).numbers:
+            assert (each.real, each.better, each.low) == (False, None, None)
             assert each.difference in (0.0, None)
-        assert "beside the headlines: 0 of" in comparison.notes()[2]
+            assert each.decision in ("the difference is 0", "nothing to compare", "for exploration")
 
-    def test_pairs_make_the_interval_narrow(self, saved: Save, da_b: DeepAccident, tmp_path: Path) -> None:
-        """Scenarios differ by far more than the two runs do; resamples that were not paired would not tell them."""
-        everything = str(save_selection(da_b.scenario, tmp_path / "everything.txt"))
-        comparison = compare_bundles(saved("a", split=everything), saved("b", 0.2, split=everything), FEW)
-        apart = by_name(comparison)["position_error"]
-        assert apart.difference == pytest.approx(2 * 0.1 * np.sqrt(2))
-        assert (apart.real, apart.better) == (True, "a")
-        assert apart.high - apart.low < 1e-9
+    def test_twins_are_one_cluster(self, generated: Callable[..., Comparison]) -> None:
+        better = [each + 3 + number % 3 for number, each in enumerate(HARD)]
+        alone, both = (generated(HARD, better, twins=twins) for twins in (False, True))
+        assert (alone.scenarios, alone.clusters, both.scenarios, both.clusters) == (16, 16, 32, 16)
+        assert [each.p for each in both.numbers] == [each.p for each in alone.numbers]
+        assert by_name(both)[MAIN].high == pytest.approx(by_name(alone)[MAIN].high)
 
-    def test_a_number_of_a_single_scenario_is_never_called_real(self, saved: Save) -> None:
-        """An accident and a normal scenario: each resample that has errors of positions has the same one."""
-        error = by_name(compare_bundles(saved("a"), saved("b", 1.0), FEW))["position_error"]
-        assert error.low == error.high == error.difference
-        assert error.difference > 0
-        assert not error.real
+    def test_few_clusters_cannot_decide(self, generated: Callable[..., Comparison]) -> None:
+        iou = by_name(generated(HARD[:5], [each + 9 for each in HARD[:5]]))[MAIN]
+        assert (iou.real, iou.low) == (False, None)
+        assert iou.decision == "no decision is possible with 5 clusters; at least 6 are needed"
+        assert by_name(generated(HARD[:6], [each + 9 for each in HARD[:6]]))[MAIN].real
 
-    def test_one_scenario_has_no_interval(self, saved: Save) -> None:
-        comparison = compare_bundles(saved("a", scope="accident"), saved("b", 1.0, scope="accident"), FEW)
-        number = by_name(comparison)["position_error"]
-        assert (number.low, number.high, number.reversed, number.real) == (None, None, None, False)
-        assert number.difference > 1
-        assert comparison.notes() == ["no intervals: they are drawn over scenarios, of which there are 1"]
+    def test_what_would_decide(self, generated: Callable[..., Comparison]) -> None:
+        iou = by_name(generated([50] * 20, [50 + 3 * (-1) ** number + 1 for number in range(20)]))[MAIN]
+        assert not iou.real
+        assert iou.decision == "not decided: about 75 scenarios would decide it"  # 7.849 · 9 · 20 / 19
 
-    def test_without_resamples(self, motion_bundles: tuple[Path, Path]) -> None:
-        assert not any(each.real for each in compare_bundles(*motion_bundles, Bootstrap(resamples=0)).numbers)
+    def test_without_resamples(self, generated: Callable[..., Comparison]) -> None:
+        comparison = generated(HARD, [each + 9 for each in HARD], Resampling(resamples=0))
+        assert {(each.p, each.low, each.real) for each in comparison.numbers} == {(None, None, False)}
+        assert comparison.notes() == ["no intervals and no tests: no resamples were asked for"]
 
 
 class TestForms:
     def test_text(self, motion_bundles: tuple[Path, Path]) -> None:
         comparison = compare_bundles(*motion_bundles, FEW)
         text = comparison.to_text()
-        assert text.startswith(f"motion, protocol released: 6 samples of 2 scenarios\na: {motion_bundles[0]}\n")
+        head = "motion, protocol released: 6 samples of 2 scenarios\nclusters: 1 (an accident and its twin are one)"
+        assert text.startswith(f"{head}\na: {motion_bundles[0]}\n")
         (line,) = (line for line in text.splitlines() if line.startswith("iou 100x100"))
-        assert "yes, b is better" in line
-        drawn = [each for each in comparison.numbers if each.reversed is not None]
-        by_chance = 0.05 * len(drawn)
-        assert f"{len(drawn)} numbers are compared: if the two were equally good, about {by_chance:.1f} would" in text
+        assert line.endswith("no decision is possible with 1 cluster; at least 8 are needed")
+        assert "p: share of all 1 swaps of clusters between the two" in text
+        assert "tested at 5%: iou 30x30; and the other headlines together" in text
+
+    def test_text_of_a_decision(self, generated: Callable[..., Comparison]) -> None:
+        text = generated(HARD, [each + 3 + number % 3 for number, each in enumerate(HARD)]).to_text()
+        (line,) = (line.split() for line in text.splitlines() if line.startswith("iou 30x30"))
+        assert line[3:6] == ["37.500", "41.438", "+3.938"]
+        assert line[-5:] == ["+4.393]", "0.001", "b", "is", "better"]
+        assert "p: share of 1,000 random swaps" in text
 
     def test_json_and_csv_have_every_number(self, motion_bundles: tuple[Path, Path], tmp_path: Path) -> None:
         comparison = compare_bundles(*motion_bundles, FEW)
@@ -144,7 +188,7 @@ class TestForms:
             rows = list(csv.DictReader(file))
         assert len(rows) == len(stated["numbers"]) == len(comparison.numbers)
         assert float(rows[0]["a"]) == stated["numbers"][0]["a"] == comparison.numbers[0].a
-        assert stated["bootstrap"] == {"resamples": 40, "confidence": 0.95, "seed": 0}
+        assert stated["resampling"] == {"resamples": 40, "confidence": 0.95, "seed": 0}
 
     def test_the_release_is_not_needed(self, motion_bundles: tuple[Path, Path], tmp_path: Path) -> None:
         copies = [shutil.copytree(each, tmp_path / each.name) for each in motion_bundles]
@@ -212,3 +256,22 @@ class TestRefused:
     def test_no_bundle(self, tmp_path: Path, saved: Save) -> None:
         with pytest.raises(ResultsError, match=r"nowhere: no such folder"):
             compare_bundles(saved("a"), tmp_path / "nowhere")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("clusters", "pairs"), [(8, 300), (12, 200), (24, 200)])
+def test_equally_good_runs_are_rarely_called_really_different(tmp_path: Path, clusters: int, pairs: int) -> None:
+    """Of two runs of the same law, with clusters that are hard for both, at most 5 % but for chance."""
+    source, real = np.random.default_rng(clusters), 0
+    for pair in range(pairs):
+        hard = source.normal(0, 1, clusters)
+        folders = []
+        for name in "ab":
+            share = 1 / (1 + np.exp(hard + source.normal(0, 0.7, clusters)))
+            found = source.binomial(20, share)
+            folders.append(
+                write_bundle(tmp_path / f"{pair}{name}", [(each, 20 - each) for each in found.tolist()], twins=True)
+            )
+        real += by_name(compare_bundles(*folders, Resampling(resamples=200, seed=pair)))[MAIN].real
+    assert real <= binom.ppf(0.995, pairs, 0.05)
+    assert real > 0

@@ -9,7 +9,7 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, ResultsError
-from deepaccident_devkit.evaluation import AccidentEvaluator, Bootstrap, accident_context, sample_attributes
+from deepaccident_devkit.evaluation import AccidentEvaluator, Resampling, accident_context, sample_attributes
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter
 from deepaccident_devkit.evaluation.runs import (
     BREAKDOWNS,
@@ -73,14 +73,14 @@ class TestRun:
         assert 0 < one.result.ranges["100x100"].iou < 100
 
     def test_breakdowns_on_two_workers_are_the_same(self, run: EvaluationRun) -> None:
-        one, two = (run.broken_down(["all", "agent"], Bootstrap(resamples=20), workers=workers) for workers in (1, 2))
+        one, two = (run.broken_down(["all", "agent"], Resampling(resamples=20), workers=workers) for workers in (1, 2))
         assert one.summary() == two.summary() != run.summary()
 
     def test_breakdowns(self, run: EvaluationRun) -> None:
-        broken = run.broken_down(["agent", "all", "agent"], Bootstrap(resamples=5))
+        broken = run.broken_down(["agent", "all", "agent"], Resampling(resamples=5))
         assert [each.by for each in broken.breakdowns] == ["agent", "all"]
         assert broken.breakdowns[1].groups[0].result == run.result
-        assert [each.by for each in run.broken_down(bootstrap=Bootstrap(resamples=0)).breakdowns] == list(BREAKDOWNS)
+        assert [each.by for each in run.broken_down(resampling=Resampling(resamples=0)).breakdowns] == list(BREAKDOWNS)
         with pytest.raises(ChoiceError, match=r"by: expected one of all, .*, found 'wether'"):
             run.broken_down(["wether"])
 

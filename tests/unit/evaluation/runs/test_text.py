@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.evaluation import Bootstrap
+from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import (
     EvaluationRun,
@@ -28,20 +28,31 @@ def lines_of(text: str) -> list[str]:
 
 
 def test_what_it_tells(run: EvaluationRun) -> None:
-    lines = lines_of(summary_text(run.broken_down(["all", "agent"], Bootstrap(resamples=10)).summary(), ["agent"]))
+    lines = lines_of(summary_text(run.broken_down(["all", "agent"], Resampling(resamples=10)).summary(), ["agent"]))
     assert lines[:2] == ["evaluated", "task accident, protocol boxes"]
     assert lines[2].startswith(
         "samples 6 of 2 scenarios: split val, list evaluate, scope all, ego_vehicle, other_vehicle, inf"
     )
-    assert "number value 95% interval" in lines
-    assert "apa 1.000 [1.000, 1.000]" in lines
-    assert "position_error 0.283 m [0.283, 0.283]" in lines
+    assert "number value" in lines
+    assert "position_error 0.283 m" in lines
+    assert "no intervals: of 1 cluster (an accident and its twin are one); at least 6 are needed" in lines
     assert "samples 6, positives 3, negatives 3, unjudged 0, beyond 0, at_impact 0" in lines
     assert "within/5 tp 3, fp 0, fn 0" in lines
     assert lines[lines.index("by agent") + 1].startswith(
         "value samples scenarios apa precision recall false_alarm_rate"
     )
     assert "ego_vehicle 2 2 1.000 1.000 1.000 1.000 0.000" in lines
+
+
+def test_intervals_and_why_there_is_none(run: EvaluationRun) -> None:
+    summary = run.broken_down(["all"], Resampling(confidence=0.9)).summary()
+    [group] = summary["breakdowns"]["all"]["groups"]
+    group.update(intervals={"apa": [0.651, 1.0]}, notes=["no interval of id_error: fewer than 6 clusters have it"])
+    lines = lines_of(summary_text(summary, []))
+    assert "number value 90% interval" in lines
+    assert "apa 1.000 [0.651, 1.000]" in lines
+    assert "id_error 0.000 –" in lines
+    assert group["notes"][0] in lines
 
 
 def test_switches_and_no_intervals(run: EvaluationRun) -> None:
@@ -52,7 +63,7 @@ def test_switches_and_no_intervals(run: EvaluationRun) -> None:
 
 
 def test_the_bundle_on_disk_reads_alike(run: EvaluationRun, tmp_path: Path) -> None:
-    broken = run.broken_down(["all", "agent"], Bootstrap(resamples=10))
+    broken = run.broken_down(["all", "agent"], Resampling(resamples=10))
     stored = read_bundle(save_run(broken, tmp_path / "bundle")).summary
     assert summary_text(stored) == summary_text(broken.summary())
 
@@ -69,7 +80,7 @@ def test_results_of_other_choices_stand_beside(
 
 def test_every_block_of_a_partial_one_says_so(run: EvaluationRun) -> None:
     partial = replace(run, partial=Partial(missing=2, extra=0, expected=8, evaluated=6))
-    text = summary_text(partial.broken_down(["all", "agent"], Bootstrap(resamples=0)).summary(), ["agent"])
+    text = summary_text(partial.broken_down(["all", "agent"], Resampling(resamples=0)).summary(), ["agent"])
     titles = [block.splitlines()[0] for block in text.split("\n\n")]
     assert titles == [f"{name}   PARTIAL: 6 of 8 samples" for name in ("evaluated", "results", "counts", "by agent")]
 

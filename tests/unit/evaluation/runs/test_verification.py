@@ -10,7 +10,7 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ResultsError
-from deepaccident_devkit.evaluation import Bootstrap
+from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import (
     EvaluationRun,
@@ -28,7 +28,7 @@ Write = Callable[..., Results]
 
 @pytest.fixture
 def bundle(run: EvaluationRun, tmp_path: Path) -> Path:
-    return save_run(run.broken_down(["all", "agent"], Bootstrap(resamples=10)), tmp_path / "bundle")
+    return save_run(run.broken_down(["all", "agent"], Resampling(resamples=10)), tmp_path / "bundle")
 
 
 def verify(bundle: Path, dataset: DeepAccident, **named: Any) -> Verification:
@@ -80,13 +80,12 @@ class TestNamed:
             "found": 1.0,
         }
 
-    def test_a_number_in_an_interval_by_the_last_bit(self, bundle: Path, da_b: DeepAccident) -> None:
+    def test_a_number_in_a_breakdown_by_the_last_bit(self, bundle: Path, da_b: DeepAccident) -> None:
         def change(summary: Any) -> None:
-            interval = summary["breakdowns"]["all"]["groups"][0]["intervals"]["position_error"]
-            interval[0] += 1e-15
+            summary["breakdowns"]["all"]["groups"][0]["metrics"]["position_error"] += 1e-15
 
         changed(bundle / "metrics_summary.json", change)
-        assert ("number", "breakdowns/all/groups/0/intervals/position_error/0") in found(verify(bundle, da_b))
+        assert ("number", "breakdowns/all/groups/0/metrics/position_error") in found(verify(bundle, da_b))
 
     def test_another_version(self, bundle: Path, da_b: DeepAccident) -> None:
         changed(bundle / "metrics_summary.json", lambda summary: summary.update(devkit_version="0.0.9"))

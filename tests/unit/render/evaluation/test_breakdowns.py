@@ -3,7 +3,7 @@
 from drawing import new_axes
 from numpy.testing import assert_allclose, assert_array_equal
 
-from deepaccident_devkit.evaluation import Bootstrap
+from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown, Group
 from deepaccident_devkit.evaluation.metrics.detection.evaluator import DetectionEvaluator
 from deepaccident_devkit.evaluation.metrics.detection.result import DetectionResult
@@ -17,10 +17,20 @@ def test_breakdowns_have_a_bar_and_an_interval_a_group(detected: DetectionResult
         result=detected,
         samples=5,
         scenarios=2,
+        clusters=2,
+        notes=(),
         intervals={"mean_average_precision": (40.0, 50.0)},
     )
-    single = Group(value=None, result=DetectionEvaluator("paper").compute(), samples=1, scenarios=1, intervals={})
-    broken = Breakdown(by="agent", groups=(group, single), without_infrastructure=(), bootstrap=Bootstrap())
+    single = Group(
+        value=None,
+        result=DetectionEvaluator("paper").compute(),
+        samples=1,
+        scenarios=1,
+        clusters=1,
+        intervals={},
+        notes=(),
+    )
+    broken = Breakdown(by="agent", groups=(group, single), without_infrastructure=(), resampling=Resampling())
     ax = render_breakdown("detection", broken, "mean_average_precision", ax=new_axes())
     (bar,) = ax.patches
     assert bar.get_width() == 43.75

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -55,10 +56,21 @@ def test_a_report_holds_all_and_asks_for_nothing(
     for headline in headlines(setup.task, run.result):
         assert headline.name in page.text
         assert headline.text() in page.text
+    assert "no intervals: of 1 cluster (an accident and its twin are one); at least 6 are needed" in page.text
     for told in (run.release.fingerprint, run.results.fingerprint, setup.protocol, "deepaccident evaluate verify"):
         assert told in page.text
     for switch in re.findall(r"'(\w+)':", str(run.setup.as_dict()["settings"])):
         assert switch in page.text
+
+
+def test_intervals_stand_beside_their_numbers(da_motion: DeepAccident, tokens: list[str], tmp_path: Path) -> None:
+    run = evaluation_run(da_motion, SETUPS[1], tokens)
+    everything, *others = run.breakdowns
+    group = replace(everything.groups[0], intervals={"apa": (0.6123, 0.9)}, notes=())
+    run = replace(run, breakdowns=(replace(everything, groups=(group,)), *others))
+    page = page_of(save_report(run, tmp_path))
+    assert "0.612 to 0.900" in page.text
+    assert "no intervals" not in page.text
 
 
 def test_the_same_run_makes_the_same_bytes(da_motion: DeepAccident, tokens: list[str], tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, GeometryError
-from deepaccident_devkit.evaluation.metrics.breakdowns import numbers_of
 from deepaccident_devkit.evaluation.metrics.detection import (
     DETECTION_PROTOCOLS,
     DetectedBoxes,
@@ -19,6 +18,7 @@ from deepaccident_devkit.evaluation.metrics.detection import (
     released_dict,
     released_text,
 )
+from deepaccident_devkit.evaluation.metrics.numbers import numbers_of
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID
 

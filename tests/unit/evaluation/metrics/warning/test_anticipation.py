@@ -14,8 +14,8 @@ from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.evaluation import Accident
 from deepaccident_devkit.evaluation.metrics.accident import AccidentContext, BoxTruth, accident_context
 from deepaccident_devkit.evaluation.metrics.alarms.constant_velocity import constant_velocity_alarms
-from deepaccident_devkit.evaluation.metrics.breakdowns import numbers_of
 from deepaccident_devkit.evaluation.metrics.headlines import headlines
+from deepaccident_devkit.evaluation.metrics.numbers import numbers_of
 from deepaccident_devkit.evaluation.metrics.warning import (
     AnticipationResult,
     CleanScores,

@@ -14,10 +14,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
-from deepaccident_devkit.evaluation import Accident, Bootstrap, breakdown, sample_attributes
+from deepaccident_devkit.evaluation import Accident, Resampling, breakdown, sample_attributes
 from deepaccident_devkit.evaluation.metrics.accident import AccidentContext, BoxTruth, accident_context, box_truth
 from deepaccident_devkit.evaluation.metrics.alarms.reading import AccidentReading
-from deepaccident_devkit.evaluation.metrics.breakdowns import numbers_of
+from deepaccident_devkit.evaluation.metrics.numbers import numbers_of
 from deepaccident_devkit.evaluation.metrics.warning import WARNING_PROTOCOLS, WarningEvaluator, WarningProtocol
 
 PAIR = (11, 22)
@@ -403,14 +403,13 @@ def test_the_scenarios_of_a_release(da_motion: DeepAccident, foreseen: WarningEv
     assert made.minutes["twins"] == pytest.approx(2 * 7 * 0.5 / 60)
 
 
-def test_breakdowns_draw_whole_scenarios(da_motion: DeepAccident, foreseen: WarningEvaluator) -> None:
+def test_breakdowns_take_whole_clusters(da_motion: DeepAccident, foreseen: WarningEvaluator) -> None:
     attributes = sample_attributes(da_motion, foreseen.tokens)
-    [everything] = breakdown(foreseen, attributes, "all", Bootstrap(resamples=20)).groups
+    [everything] = breakdown(foreseen, attributes, "all", Resampling(resamples=20)).groups
     assert bits(everything.result) == bits(foreseen.compute())
-    assert everything.intervals["mean_warning"] == (2, 2)
-    assert set(everything.intervals) <= set(numbers_of(everything.result)) | {"false_alarms_per_minute/others"}
-    assert not any("curve" in name for name in everything.intervals)
-    by_agent = breakdown(foreseen, attributes, "agent", Bootstrap(resamples=2)).groups
+    assert (everything.clusters, dict(everything.intervals)) == (1, {})
+    assert not any("curve" in name for name in numbers_of(everything.result))
+    by_agent = breakdown(foreseen, attributes, "agent", Resampling(resamples=2)).groups
     assert [group.result.recordings["accident"] for group in by_agent] == [1, 1]
 
 

@@ -1,0 +1,74 @@
+"""Intervals hold the truth as often as they say, and differences are not called real by chance: a quick look.
+
+docs/statistics.md has the whole tables; `python docs/make_statistics_page.py` measures them.
+"""
+
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+TOP = Path(__file__).parents[1]
+PAGE = (TOP / "docs" / "statistics.md").read_text(encoding="utf-8")
+DRAWS = 400
+
+
+@pytest.fixture(scope="module")
+def benchmark() -> Iterator[ModuleType]:
+    """The checkout's `benchmarks.coverage`."""
+    sys.path.insert(0, str(TOP))
+    try:
+        from benchmarks import coverage
+
+        yield coverage
+    finally:
+        sys.path.remove(str(TOP))
+
+
+@pytest.mark.parametrize("kind", ["shares", "ratios of areas", "means", "differences of two runs' shares"])
+@pytest.mark.parametrize(("clusters", "least"), [(8, 0.86), (52, 0.9)])
+def test_intervals_hold_the_truth(benchmark: ModuleType, kind: str, clusters: int, least: float) -> None:
+    """An interval of 90 % called one of 95 %, or the percentile bootstrap of before, fails."""
+    cells = list(benchmark.coverage(kind, clusters, DRAWS))
+    inner = [cell.new for cell in cells if not cell.ends]
+    assert 0.93 <= benchmark.mean(inner) <= 0.975
+    assert min(cell.new for cell in cells) >= least
+    narrow = [cell.new for cell in benchmark.coverage(kind, clusters, DRAWS, confidence=0.9) if not cell.ends]
+    assert benchmark.mean(narrow) < 0.93 + 0.005 * (clusters < 52)
+    assert benchmark.mean([cell.old for cell in cells]) < 0.93
+
+
+def test_differences_are_not_called_real_by_chance(benchmark: ModuleType) -> None:
+    made = list(benchmark.power(DRAWS))
+    falsely = [each for each in made if not each.effect]
+    assert max(each.new for each in falsely) <= 0.05 + 3 * (0.05 * 0.95 / DRAWS) ** 0.5
+    assert max(each.old for each in falsely) > 0.1
+    for each in made:
+        if each.effect and each.clusters >= 16:
+            assert each.new >= each.old - 0.1 - 3 * (0.25 / DRAWS) ** 0.5
+    assert max(each.new for each in made) > 0.9
+
+
+def test_the_tables_are_those_of_the_script(benchmark: ModuleType) -> None:
+    [draws] = re.findall(r"<!-- draws -->(.*?)<!-- /draws -->", PAGE)
+    assert draws == f"{benchmark.DRAWS:,}"
+    for kind in benchmark.KINDS:
+        for clusters in benchmark.SHOWN:
+            assert len(re.findall(rf"^\| {kind} \| {clusters} \|", PAGE, re.MULTILINE)) == 1
+    for clusters in benchmark.TESTED:
+        for correlation in benchmark.CORRELATIONS:
+            assert len(re.findall(rf"^\| {clusters} \| {correlation} \|", PAGE, re.MULTILINE)) == 1
+
+
+def test_the_bounds_hold_on_the_page(benchmark: ModuleType) -> None:
+    """What is promised of 4,000 draws: means of 93 to 97 %, and nowhere much less."""
+    rows = re.findall(
+        r"^\| ([a-z' ]+?) \| (\d+) \| \d+ \| ([\d.]+)% \| (?:[\d.]+%)? \| ([\d.]+)% \|", PAGE, re.MULTILINE
+    )
+    assert len(rows) == len(benchmark.KINDS) * len(benchmark.SHOWN)
+    for _, clusters, mean, lowest in rows:
+        assert 93 <= float(mean) <= 97
+        assert float(lowest) >= (88 if int(clusters) <= 8 else 90)

@@ -1,0 +1,151 @@
+"""Intervals of numbers: by Student's t and Wilson's formula, and where there is none."""
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator, ratio, total
+from deepaccident_devkit.evaluation.metrics.intervals import (
+    LEAST_CLUSTERS,
+    Intervals,
+    Resampling,
+    interval_ends,
+    intervals_of,
+    parts_of,
+    standard_errors,
+)
+
+
+@dataclass(frozen=True)
+class Ratio:
+    ratio: float
+    nothing: float = math.nan
+    median_of_all: float = 0.5
+
+
+class Ratios(Evaluator[Ratio]):
+    """The ratio of two sums."""
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return {}
+
+    def update(self, token: str, *arguments: Any) -> None:
+        self.add(token, {"above": arguments[0], "below": arguments[1]})
+
+    def result_of(self, counts: Collection[Counts]) -> Ratio:
+        return Ratio(ratio(total(counts, "above"), total(counts, "below")))
+
+
+def made(
+    above: Sequence[float], below: Sequence[float] | None = None, resampling: Resampling | None = None
+) -> Intervals:
+    """Of one sample a cluster."""
+    given = zip(above, below or [1.0] * len(above), strict=True)
+    clusters = [[{"above": float(one), "below": float(other)}] for one, other in given]
+    evaluator = Ratios()
+    result = evaluator.result_of([sample for samples in clusters for sample in samples])
+    return intervals_of(evaluator, clusters, result, resampling)
+
+
+def wilson(share: float, count: float, t: float) -> tuple[float, float]:
+    """Wilson's interval of `count` independent draws."""
+    middle = (share + t**2 / 2 / count) / (1 + t**2 / count)
+    half = t / (1 + t**2 / count) * math.sqrt(share * (1 - share) / count + t**2 / 4 / count**2)
+    return middle - half, middle + half
+
+
+@pytest.mark.parametrize(("confidence", "t"), [(0.95, 2.0930), (0.9, 1.7291)])
+def test_a_share_of_independent_clusters_is_wilsons(confidence: float, t: float) -> None:
+    """Of 10 of 20: as many draws as clusters but for n / (n − 1), and 19 degrees of freedom."""
+    ends = made([0, 1] * 10, resampling=Resampling(confidence=confidence)).ends["ratio"]
+    assert ends == pytest.approx(wilson(0.5, 19, t), abs=1e-4)
+
+
+@pytest.mark.parametrize(("hit", "at"), [(0.0, 0), (1.0, 1)])
+def test_a_share_that_all_clusters_agree_on_is_not_sure(hit: float, at: int) -> None:
+    """Not [0, 0] nor [1, 1]: it is as of one draw a cluster, however many samples these have."""
+    for samples in (1.0, 20.0):
+        ends = made([hit * samples] * 12, [samples] * 12).ends["ratio"]
+        assert ends == pytest.approx(wilson(hit, 12, 2.2010), abs=1e-4)
+        assert ends[at] == hit
+        assert abs(ends[1 - at] - hit) > 0.25
+    few = made([hit] * 8 + [0] * 50, [1] * 8 + [0] * 50).ends["ratio"]  # 50 clusters have nothing to count
+    assert few == pytest.approx(wilson(hit, 8, 2.3646), abs=1e-4)
+
+
+def test_a_mean_from_0_on_has_an_interval_by_factors() -> None:
+    low, high = made([1.0, 3.0] * 10).ends["ratio"]
+    assert low * high == pytest.approx(2.0**2)
+    assert math.log(high / 2) == pytest.approx(2.0930 * math.sqrt(1 / 19) / 2, abs=1e-4)
+
+
+def test_a_mean_of_both_signs_has_a_symmetric_one() -> None:
+    low, high = made([-1.0, 3.0] * 10).ends["ratio"]
+    assert (low, high) == pytest.approx((1 - 2.0930 * 2 / math.sqrt(19), 1 + 2.0930 * 2 / math.sqrt(19)), abs=1e-3)
+
+
+def test_errors_of_numbers_that_hang_on_one_cluster_are_uncertain() -> None:
+    even, mostly_one = np.array([[1.0], [-1.0]] * 10), np.where(np.arange(20) == 3, 10.0, 0.1)[:, None]
+    assert standard_errors(np.zeros(1), even)[1] == 19
+    assert standard_errors(np.zeros(1), mostly_one)[1] == pytest.approx(20 / 19, abs=0.01)
+
+
+class TestNone:
+    def test_of_few_clusters(self) -> None:
+        few = made([0.0, 1.0] * 2 + [1.0])
+        text = "no intervals: of 5 clusters (an accident and its twin are one); at least 6 are needed"
+        assert (few.ends, few.notes) == ({}, (text,))
+        assert made([0.0, 1.0] * 3).ends
+
+    def test_of_a_number_that_few_clusters_have(self) -> None:
+        few = made([0.3, 0.4, 0.5, 0.2, 0.1] + [0] * 20, [1] * 5 + [0] * 20)
+        assert few.ends == {}
+        assert few.notes == ("no interval of ratio: fewer than 6 clusters have such a number",)
+
+    def test_of_a_length_that_is_the_same_everywhere(self) -> None:
+        same = made([2.5] * 20)
+        assert same.ends == {}
+        assert same.notes == ("no interval of ratio: fewer than 6 clusters change it",)
+
+    def test_of_rounding(self) -> None:
+        assert made([0.1 * 3, 0.3] * 10, [0.1, 0.1] * 10).ends == {}
+
+    def test_of_nan_and_of_medians(self) -> None:
+        assert set(made([0.0, 1.0] * 10).ends) == {"ratio"}
+
+    def test_without_resamples(self) -> None:
+        assert made([0, 1] * 10, resampling=Resampling(resamples=0)) == Intervals(ends={}, notes=())
+
+
+def test_many_clusters_are_joined() -> None:
+    clusters = [[{"number": number}] for number in range(345)]
+    parts = parts_of(clusters, Resampling())
+    assert [len(part) for part in parts] == [4] * 45 + [3] * 55
+    assert sorted(each["number"] for part in parts for each in part) == list(range(345))
+    assert parts == parts_of(clusters, Resampling()) != parts_of(clusters, Resampling(seed=1))
+    assert len(parts_of(clusters, Resampling(resamples=40))) == 40
+    assert len(parts_of(clusters, Resampling(resamples=2))) == LEAST_CLUSTERS
+    assert parts_of(clusters[:100], Resampling()) == clusters[:100]
+
+
+def test_intervals_of_joined_clusters_are_nearly_the_same() -> None:
+    above = np.random.default_rng(0).uniform(size=345).round(3).tolist()
+    joined, errors = made(above).ends["ratio"], np.std(above) / math.sqrt(345)
+    assert joined == pytest.approx((np.mean(above) - 1.97 * errors, np.mean(above) + 1.97 * errors), abs=0.012)
+
+
+def test_each_number_for_itself() -> None:
+    """Several numbers at once have the intervals of each alone."""
+    left_out = np.random.default_rng(0).uniform(0.4, 0.6, (20, 3))
+    values, ranges = np.full(3, 0.5), np.array([[0, 1], [0, math.inf], [-math.inf, math.inf]])
+    together = interval_ends(values, left_out, ranges, 0.95)
+    for at in range(3):
+        alone = interval_ends(values[at : at + 1], left_out[:, at : at + 1], ranges[at : at + 1], 0.95)
+        assert_array_equal(np.ravel(alone), [together[0][at], together[1][at]])
+    assert_allclose(interval_ends(values * 100, left_out * 100, ranges * [1, 100], 0.95)[0][0], 100 * together[0][0])
