@@ -41,7 +41,7 @@ def test_what_it_tells(run: EvaluationRun) -> None:
     assert lines[lines.index("by agent") + 1].startswith(
         "value samples scenarios apa precision recall false_alarm_rate"
     )
-    assert "ego_vehicle 2 2 1.000 1.000 1.000 1.000 0.000" in lines
+    assert "ego_vehicle 2 2 1.000 1.000 1.000 0.000 1.000" in lines
 
 
 def test_intervals_and_why_there_is_none(run: EvaluationRun) -> None:
