@@ -35,7 +35,14 @@ from deepaccident_devkit.evaluation.metrics.motion.overlaps import segmentation_
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, instances_of
 from deepaccident_devkit.evaluation.metrics.segmentation import BevSegmentationEvaluator, BevSegmentationResult
 from deepaccident_devkit.evaluation.metrics.trajectories import match_trajectories
-from deepaccident_devkit.evaluation.metrics.warning import WarningEvaluator, WarningResult
+from deepaccident_devkit.evaluation.metrics.warning import (
+    AnticipationResult,
+    CleanWarnings,
+    FieldResult,
+    FieldWarnings,
+    WarningEvaluator,
+    WarningResult,
+)
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
 
 if TYPE_CHECKING:
@@ -46,15 +53,19 @@ __all__ = [
     "AccidentContext",
     "AccidentEvaluator",
     "AccidentResult",
+    "AnticipationResult",
     "BevSegmentationEvaluator",
     "BevSegmentationResult",
     "BoxAccidents",
     "BoxTruth",
     "Breakdown",
+    "CleanWarnings",
     "DetectedBoxes",
     "DetectionEvaluator",
     "DetectionResult",
     "Evaluator",
+    "FieldResult",
+    "FieldWarnings",
     "LostInstance",
     "MotionEvaluator",
     "MotionOutput",

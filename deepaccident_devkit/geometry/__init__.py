@@ -4,7 +4,17 @@ from deepaccident_devkit.geometry.bev_grid import BevGrid
 from deepaccident_devkit.geometry.box import Box
 from deepaccident_devkit.geometry.boxes import Boxes
 from deepaccident_devkit.geometry.camera import BoxVisibility, PinholeCamera
+from deepaccident_devkit.geometry.conflicts import time_to_collision
 from deepaccident_devkit.geometry.pointcloud import LidarPointCloud
 from deepaccident_devkit.geometry.se3 import SE3
 
-__all__ = ["SE3", "BevGrid", "Box", "BoxVisibility", "Boxes", "LidarPointCloud", "PinholeCamera"]
+__all__ = [
+    "SE3",
+    "BevGrid",
+    "Box",
+    "BoxVisibility",
+    "Boxes",
+    "LidarPointCloud",
+    "PinholeCamera",
+    "time_to_collision",
+]

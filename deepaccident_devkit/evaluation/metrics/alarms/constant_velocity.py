@@ -9,7 +9,7 @@ import numpy as np
 
 from deepaccident_devkit.evaluation.metrics.predictions import Accident
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.geometry.time_to_collision import time_to_collision
+from deepaccident_devkit.geometry.conflicts import time_to_collision
 
 ALARM_TIME: Final = 3.0
 """Seconds of time to collision below which there is an alarm."""

@@ -1,4 +1,4 @@
-"""When boxes touch that go on as they do now: time to collision in two dimensions, exact for constant velocities."""
+"""Conflicts of two road users, seen from above: when boxes touch that go on as they do now."""
 
 from __future__ import annotations
 
