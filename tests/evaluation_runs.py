@@ -71,8 +71,8 @@ def _arguments(
         boxes = truth.select(keep)
         boxes = replace(boxes, center=boxes.center + source.normal(0, 0.6, (len(boxes), 3)) * (1, 1, 0))
         return DetectedBoxes(boxes=boxes, scores=np.round(source.uniform(size=len(boxes)), 2)), truth
-    context = accident_context(dataset, token, setup.horizon)
-    if setup.protocol == "boxes":  # of the tasks accident and warning
+    context = accident_context(dataset, token, setup.horizon, references=setup.task == "warning")
+    if setup.protocol == "boxes" or setup.task == "warning":
         return _alarms(context.truth, source), None, context
     label = dataset.motion_labels(token, MotionLabelConfig(protocol=setup.rules.labels)).to_present("bilinear")
     maps = np.roll(label.instance, source.integers(-2, 3, 2), (1, 2))

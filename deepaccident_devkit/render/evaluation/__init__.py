@@ -14,6 +14,7 @@ from deepaccident_devkit.render.evaluation.samples import draw_motion_outcome
 from deepaccident_devkit.render.evaluation.warning import (
     render_detection_rates,
     render_false_alarms,
+    render_predictors,
     render_warning_curve,
     render_warning_times,
 )
@@ -29,6 +30,7 @@ __all__ = [
     "render_false_alarms",
     "render_outcomes",
     "render_precision_recall",
+    "render_predictors",
     "render_quality_by_time",
     "render_ranges",
     "render_warning_curve",

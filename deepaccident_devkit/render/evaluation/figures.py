@@ -18,7 +18,7 @@ from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown
 from deepaccident_devkit.evaluation.metrics.detection.evaluator import DetectionEvaluator
 from deepaccident_devkit.evaluation.metrics.headlines import Headline, headlines
 from deepaccident_devkit.evaluation.metrics.motion.evaluator import MotionEvaluator
-from deepaccident_devkit.evaluation.metrics.warning.result import WarningResult
+from deepaccident_devkit.evaluation.metrics.warning import AnticipationResult, WarningResult
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.render.axes import detached_figure
 from deepaccident_devkit.render.colors import WARNING_COLOR
@@ -195,6 +195,13 @@ def _motion(run: EvaluationRun) -> Iterator[RunFigure]:
 
 def _warning(run: EvaluationRun) -> Iterator[RunFigure]:
     result = run.result
+    if isinstance(result, AnticipationResult):
+        yield RunFigure(
+            name="predictors",
+            caption="Accidents told from other recordings, beside predictors that know nothing or the present alone.",
+            alt="Chance that an accident's score is above another recording's at the same moment, by predictor.",
+            draw=partial(warning.render_predictors, result),
+        )
     if not isinstance(result, WarningResult):
         return
     rates = _listed((f"{seconds:g} s before", rate) for seconds, rate in result.detection_rate.items())

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from deepaccident_devkit.evaluation.metrics.warning import WarningResult
+from deepaccident_devkit.evaluation.metrics.warning import AnticipationResult, WarningResult
 from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
-from deepaccident_devkit.render.colors import ESTIMATE_COLOR, OUTCOME_COLORS
+from deepaccident_devkit.render.colors import ESTIMATE_COLOR, OUTCOME_COLORS, TRUE_PLACE_COLOR
 from deepaccident_devkit.render.evaluation.panels import PANEL, Bar, draw_bars, draw_nothing
 
 if TYPE_CHECKING:
@@ -45,6 +45,36 @@ def render_warning_times(result: WarningResult, *, ax: Axes | None = None) -> Ax
     ax.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
     ax.legend(fontsize=8)
     return with_light_grid(ax, "y")
+
+
+def render_predictors(result: AnticipationResult, *, ax: Axes | None = None) -> Axes:
+    """Draw how well accidents are told from other recordings before they happen, beside the reference predictors.
+
+    Args:
+        result: of `WarningEvaluator("clean").compute`.
+        ax: axes to draw on; new ones if None.
+
+    Returns:
+        The axes drawn on; of the first group of recordings, a bar a predictor; a line is at 0.5, which chance has.
+    """
+    ax, group = axes_or_new(ax, PANEL), next(iter(result.groups), None)
+    if group is None:
+        return draw_nothing(ax, "no recording")
+    everyone = {"given": result.groups[group], **{name: each[group] for name, each in result.references.items()}}
+    bars = [
+        Bar(
+            label=name,
+            value=_known(each.auc_ahead),
+            text=f"{each.auc_ahead:.3f}",
+            color=ESTIMATE_COLOR if name == "given" else TRUE_PLACE_COLOR,
+        )
+        for name, each in everyone.items()
+    ]
+    ax = draw_bars(bars, ax, 1.0)
+    ax.axvline(0.5, color="black", linestyle="--", linewidth=1)
+    ax.set(xlabel="chance that an accident's score is above another's at the same moment")
+    ax.set_title(f"Accidents told from other recordings: {group}", fontsize=10)
+    return ax
 
 
 def render_detection_rates(result: WarningResult, *, ax: Axes | None = None) -> Axes:
