@@ -79,6 +79,9 @@ def drives_of(parts: Sequence[Collection[Counts]]) -> list[Drive]:
 def series_of(drives: Sequence[Drive], predictor: str, scores_of: ScoresOf, draw: int = 0) -> ScoreSeries:
     """The scores of some recordings, a column a step: the smallest from a sample to the next of any of them.
 
+    Lest length tell which end in an accident, twins end where theirs does, and others at the latest after the median
+    length of the accidents.
+
     Args:
         drives: the recordings.
         predictor: of `PREDICTORS`.
@@ -93,12 +96,11 @@ def series_of(drives: Sequence[Drive], predictor: str, scores_of: ScoresOf, draw
     for row, (drive, column) in enumerate(zip(drives, columns, strict=True)):
         known = drive.scores.get(predictor)
         scores[row, column] = _trivial(predictor, drive, draw) if known is None else known[:, _COLUMN[scores_of]]
-    return ScoreSeries(
-        scores=scores,
-        positive=np.array([each.kind == "accident" for each in drives], dtype=bool),
-        toa=(np.array([each.end for each in drives], dtype=np.float64) - begin) / step,
-        fps=1 / (step * FRAME_PERIOD),
-    )
+    kinds = np.array([each.kind for each in drives])
+    toa = (np.array([each.end for each in drives], dtype=np.float64) - begin) / step
+    if (kinds == "accident").any():
+        toa[kinds == "others"] = np.minimum(toa, np.median(toa[kinds == "accident"]))[kinds == "others"]
+    return ScoreSeries(scores=scores, positive=kinds == "accident", toa=toa, fps=1 / (step * FRAME_PERIOD))
 
 
 def twin_pairs(drives: Sequence[Drive]) -> IntArray:

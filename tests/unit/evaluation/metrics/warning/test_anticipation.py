@@ -177,6 +177,24 @@ def test_twins_are_cut_to_the_accidents_length_and_the_impact_is_no_frame() -> N
     assert figures.operating.time_in_alarm == 0
 
 
+def test_length_does_not_tell_the_label() -> None:
+    """Recordings without a twin are longer; who is the less sure the longer it drives is no better than chance."""
+
+    def wearing_off(crash: bool, ahead: np.ndarray) -> np.ndarray:
+        return 1 / (1 + np.arange(len(ahead)))
+
+    evaluator = evaluated(wearing_off, pairs=6)
+    others = {
+        token: dict(counts, kind="others", to_end=None)
+        for token, counts in evaluator.counts.items()
+        if counts["kind"] == "twins"
+    }
+    alone = [counts for counts in evaluator.counts.values() if counts["kind"] == "accident"]
+    figures = CleanWarnings().result([*alone, *others.values()]).groups["ego_involved"]
+    assert figures.recordings == {"accident": 6, "twins": 0, "others": 6}
+    assert figures.auc_ahead == 0.5
+
+
 def test_alarms_for_later_than_the_horizon_are_none() -> None:
     result = evaluated(always, pairs=2, time=2.04).compute()
     assert result.beyond == 0
