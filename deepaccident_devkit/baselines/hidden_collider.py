@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import takewhile
 from typing import TYPE_CHECKING, Final
 
 from deepaccident_devkit.baselines.conditions import Condition
@@ -11,6 +12,7 @@ from deepaccident_devkit.baselines.counting import Counting, counted
 from deepaccident_devkit.baselines.predict import predict_accidents
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
+from deepaccident_devkit.evaluation.metrics.evaluator import ratio
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import FRAME_PERIOD, VEHICLE_AGENTS
 from deepaccident_devkit.text import columns_text
@@ -36,6 +38,8 @@ class HiddenCollider:
         apa: accident prediction accuracy by the protocol `boxes`, in [0, 1].
         warning: seconds before the impact from which on every moment (each 0.1 s) has an alarm that names the pair;
             0 if the last one has none.
+        precision: share of the alarms of the last 4 s that name the pair; NaN without any.
+        false_time: share of these moments with an alarm that names others.
     """
 
     agents: str
@@ -43,6 +47,8 @@ class HiddenCollider:
     vpq: float
     apa: float
     warning: float
+    precision: float
+    false_time: float
 
 
 def demo_table(dataset: Dataset, scenario: RowArgument | None = None) -> tuple[tuple[HiddenCollider, ...], str]:
@@ -72,8 +78,8 @@ def demo_table(dataset: Dataset, scenario: RowArgument | None = None) -> tuple[t
     for condition in conditions:
         far = evaluators[condition].motion.compute().ranges["100x100"]
         apa = evaluators[condition].boxes.compute().apa
-        warning = _warning(dataset, record, pair, condition.agents)
-        rows.append(HiddenCollider(agents=condition.agents, iou=far.iou, vpq=far.pq, apa=apa, warning=warning))
+        alarms = _alarms(dataset, record, pair, condition.agents)
+        rows.append(HiddenCollider(agents=condition.agents, iou=far.iou, vpq=far.pq, apa=apa, **alarms))
     return tuple(rows), _text(rows)
 
 
@@ -87,21 +93,31 @@ def _accident(dataset: Dataset, scenario: RowArgument | None) -> tuple[ScenarioR
     raise NotAvailableError(f"{place}: nobody collides; choose a scenario with an accident")
 
 
-def _warning(dataset: Dataset, record: ScenarioRecord, pair: set[int], agents: str) -> float:
-    warned = 0.0
+def _alarms(dataset: Dataset, record: ScenarioRecord, pair: set[int], agents: str) -> dict[str, float]:
+    """The numbers of `HiddenCollider` on alarms."""
+    right, false = [], []
     for back in range(1, min(record["num_frames"], round(_WARNING_HORIZON / FRAME_PERIOD) + 1)):
         token = sample_token(record["token"], VEHICLE_AGENTS[0], record["num_frames"] - back)
-        alarms = predict_accidents(dataset, token, agents=agents, horizon=_WARNING_HORIZON)
-        if not any(alarm.ids is not None and set(alarm.ids) == pair for alarm in alarms):
-            break
-        warned = back * FRAME_PERIOD
-    return warned
+        named = [
+            alarm.ids is not None and set(alarm.ids) == pair
+            for alarm in predict_accidents(dataset, token, agents=agents, horizon=_WARNING_HORIZON)
+        ]
+        right.append(sum(named))
+        false.append(len(named) - sum(named))
+    return {
+        "warning": sum(1 for _ in takewhile(bool, right)) * FRAME_PERIOD,
+        "precision": ratio(sum(right), sum(right) + sum(false)),
+        "false_time": ratio(sum(map(bool, false)), len(false)),
+    }
 
 
 def _text(rows: list[HiddenCollider]) -> str:
-    heading = ["", "IoU (%)", "VPQ (%)", "APA (boxes)", "warning (s)"]
+    heading = ["", "IoU (%)", "VPQ (%)", "APA (boxes)", "warning (s)", "precision", "false alarm (% of 4 s)"]
     lines = [
-        [_AGENTS[row.agents], f"{row.iou:.1f}", f"{row.vpq:.1f}", _number(row.apa), f"{row.warning:.1f}"]
+        [
+            *(_AGENTS[row.agents], f"{row.iou:.1f}", f"{row.vpq:.1f}", _number(row.apa), f"{row.warning:.1f}"),
+            *(_number(row.precision), f"{100 * row.false_time:.0f}"),
+        ]
         for row in rows
     ]
     return columns_text([heading, *lines])

@@ -17,9 +17,12 @@ def assert_five_agents_win(da: DeepAccident, *, map_gain: float) -> None:
     assert five.warning >= single.warning + 0.5
     assert single.warning < 1.25  # the house at the corner hides the other until then
     heading, alone, together = text.splitlines()
-    assert heading.split() == ["IoU", "(%)", "VPQ", "(%)", "APA", "(boxes)", "warning", "(s)"]
+    columns = "IoU (%) VPQ (%) APA (boxes) warning (s) precision false alarm (% of 4 s)"
+    assert " ".join(heading.split()) == columns  # seconds of warning never stand without what they cost
     assert alone.startswith("single vehicle ")
-    assert together.split()[-1] == f"{five.warning:.1f}"
+    assert 0 < five.precision <= 1
+    assert 0 <= five.false_time < 1
+    assert together.split()[-3:] == [f"{five.warning:.1f}", f"{five.precision:.2f}", f"{100 * five.false_time:.0f}"]
 
 
 def test_five_agents_win_on_the_demos_seed(da_hidden: DeepAccident) -> None:
