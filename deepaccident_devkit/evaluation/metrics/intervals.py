@@ -174,9 +174,9 @@ def interval_ends(
     known = np.where(
         same, share & (having >= LEAST_CLUSTERS), np.count_nonzero(left_out - values, axis=0) >= LEAST_CLUSTERS
     )
-    t = as_floats(stdtrit(np.where(same, having - 1, freedom), (1 + confidence) / 2))
+    t, plain_t = (as_floats(stdtrit(each, (1 + confidence) / 2)) for each in (freedom, np.maximum(having - 1, 1)))
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        shares = _wilson((values - least) / width, np.where(same, math.nan, errors / width), having, t)
+        shares = _wilson((values - least) / width, np.where(same, math.nan, errors / width), having, t, plain_t)
         factors = np.exp(t * errors / values)
         kinds = [share, least == 0]
         low = np.select(kinds, [least + width * shares[0], values / factors], values - t * errors)
@@ -185,10 +185,17 @@ def interval_ends(
     return np.where(known, low, math.nan), np.where(known, high, math.nan)
 
 
-def _wilson(shares: FloatArray, errors: FloatArray, having: IntArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Wilson's interval of as many independent draws as have these errors; NaN as an error takes each part for one."""
+def _wilson(
+    shares: FloatArray, errors: FloatArray, having: IntArray, t: FloatArray, plain_t: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Wilson's interval of as many independent draws as have these errors; NaN as an error takes each part for one.
+
+    What few degrees of freedom add is bounded by one draw a part: a share is no less sure than that.
+    """
     inside = np.clip(shares, 0, 1)
-    unsure = t**2 * np.where(np.isnan(errors), 1 / having, errors**2 / (inside * (1 - inside)))
+    by_errors = errors**2 / (inside * (1 - inside))
+    bounded = np.maximum(plain_t**2 * by_errors, np.minimum(t**2 * by_errors, plain_t**2 / having))
+    unsure = np.where(np.isnan(errors), plain_t**2 / having, bounded)
     middle, half = inside + unsure / 2, np.sqrt(unsure * inside * (1 - inside) + unsure**2 / 4)
     return np.maximum((middle - half) / (1 + unsure), 0), np.minimum((middle + half) / (1 + unsure), 1)
 
