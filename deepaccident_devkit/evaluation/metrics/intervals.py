@@ -27,6 +27,7 @@ _MOST_PARTS: Final = 100
 """More clusters are joined to so many parts: it costs less, and t hardly changes from 99 degrees of freedom on."""
 _ROUNDING: Final = 1e-9
 """Changes below this share of a number (or of its range) are of rounding."""
+_NAMED: Final = 3
 Clusters = Sequence[Sequence[Counts]]
 """The counts of each cluster's samples."""
 
@@ -205,6 +206,11 @@ def _notes(having: Mapping[str, int]) -> Iterator[str]:
     few = [name for name, count in having.items() if count < LEAST_CLUSTERS]
     alike = [name for name, count in having.items() if count >= LEAST_CLUSTERS]
     if few:
-        yield f"no interval of {', '.join(few)}: fewer than {LEAST_CLUSTERS} clusters have such a number"
+        yield f"no interval of {_some(few)}: fewer than {LEAST_CLUSTERS} clusters have such a number"
     if alike:
-        yield f"no interval of {', '.join(alike)}: fewer than {LEAST_CLUSTERS} clusters change it"
+        yield f"no interval of {_some(alike)}: fewer than {LEAST_CLUSTERS} clusters change it"
+
+
+def _some(names: Sequence[str]) -> str:
+    more = len(names) - _NAMED
+    return ", ".join(names) if more <= 0 else f"{', '.join(names[:_NAMED])} and {more} others"
