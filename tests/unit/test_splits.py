@@ -3,6 +3,7 @@
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
@@ -20,7 +21,7 @@ from deepaccident_devkit.errors import (
 )
 from deepaccident_devkit.release import read_split_file
 from deepaccident_devkit.splits import official_split, save_selection, split_records, split_report
-from deepaccident_devkit.taxonomy import META_AGENTS
+from deepaccident_devkit.taxonomy import META_AGENTS, SCENARIO_ATTRIBUTES
 
 DESIGNED = ("ego", "other_behind")
 THREE, FOUR = "three-way junction", "four-way junction"
@@ -68,6 +69,12 @@ def test_shares_of_designed_twins_and_of_the_others() -> None:
         assert [len(names(split, prefix)) for prefix in "abc"] == [4, 3, 16]
         assert len(split) == 30
     assert [len(names(made.train, prefix)) for prefix in "abc"] == [2, 14, 108]
+
+
+def test_shares_are_rounded_to_the_nearest_count() -> None:
+    made = split_records(singles(12, "subtype1_normal", "t"))  # 0.15 of 12 are 1.8, a fifth of 8 are 1.6, of 2 are 0.4
+    assert [len(tokens) for tokens in (made.train, made.val, made.test)] == [8, 2, 2]
+    assert [len(tokens) for tokens in (made.train_mini, made.val_mini)] == [2, 0]
 
 
 @pytest.mark.parametrize(
@@ -234,8 +241,16 @@ def test_only_scenarios_with_more_than_five_labels_of_ego_count(tmp_path: Path) 
     assert (report.scenarios["train"], report.frames["train"]) == (1, 6)
 
 
+def test_the_report_has_numbers_by_size_and_what_is_unknown_last() -> None:
+    unknown = dict.fromkeys((*SCENARIO_ATTRIBUTES, "collision"))
+    scenarios = {str(number): {**unknown, "num_frames": 1, "accident_type": number} for number in (12, None, 9)}
+    report = split_report(SimpleNamespace(scenario=scenarios, dataroot=".", version="v1"), {"all": scenarios})
+    assert list(report.attributes["accident_type"]) == ["9", "12", "none"]
+
+
 def test_the_report_counts_every_attribute_of_every_split(da_b: DeepAccident) -> None:
     tokens = [scenario["token"] for scenario in da_b.scenario]
+    assert "2 ( 67 %)" in split_report(da_b, {"three": tokens[:3]}).to_text()  # two of three collide
     report = split_report(da_b, {"one": tokens[:1], "rest": tokens[1:], "none": []})
     assert report.scenarios == {"one": 1, "rest": 5, "none": 0}
     assert report.frames == {"one": 4, "rest": 20, "none": 0}

@@ -180,6 +180,9 @@ def test_comparing_needs_one_frame_with_a_ground(two: Boxes, compare: str) -> No
     in_camera = two.transform(SE3.identity(), "Camera_Back")
     with pytest.raises(GeometryError, match=r"Camera_Back have no ground plane, .*; transform them to ego or lidar"):
         getattr(in_camera, compare)(in_camera)
+    assert two.center_distance(two, in_3d=True).shape == (2, 2)
+    with pytest.raises(GeometryError, match="cannot be compared"):
+        two.center_distance(elsewhere, in_3d=True)
 
 
 def test_counts_are_those_of_contains(two: Boxes) -> None:

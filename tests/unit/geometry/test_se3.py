@@ -5,6 +5,7 @@ from pyquaternion import Quaternion
 
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import SE3, Box, Boxes, LidarPointCloud
+from deepaccident_devkit.geometry.se3 import stored_transforms
 
 QUARTER_LEFT = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 
@@ -30,6 +31,13 @@ def test_constructors_agree() -> None:
     assert_array_equal(SE3.identity().matrix, np.eye(4))
 
 
+def test_stored_transforms_have_the_last_row_of_every_transform() -> None:
+    pose = SE3.from_yaw(0.3, (1, 2, 3)).matrix
+    for kept in (12, 16):
+        numbers = np.tile(pose.ravel()[:kept], (2, 5, 1))
+        assert_array_equal(stored_transforms(numbers), np.tile(pose, (2, 5, 1, 1)))
+
+
 def test_the_matrix_is_a_read_only_copy_and_the_callers_stays_writable() -> None:
     mine = np.eye(4)
     pose = SE3(mine)
@@ -53,6 +61,7 @@ def test_no_points_and_integer_points() -> None:
         (np.diag([1.0, np.nan, 1, 1]), "holds NaN or infinity"),
         (np.diag([1.0, -1, 1, 1]), "mirror image"),
         (np.diag([2.0, 2, 2, 1]), "not orthonormal"),
+        (np.block([[np.full((3, 3), 1e200) * [1, -1, 1], np.zeros((3, 1))], [np.eye(4)[3]]]), "not orthonormal"),
         (np.diag([1.0, 1, 1, 2]), "last row"),
         (np.vstack([np.eye(4)[:3], [1, 0, 0, 1]]), "last row"),
         ("no matrix", r"SE3.matrix: expected an array of shape \(4, 4\)"),

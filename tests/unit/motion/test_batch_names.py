@@ -40,6 +40,8 @@ def test_a_batch_read_back_is_the_same_labels(names, orientation) -> None:
         assert_array_equal(getattr(back, name), getattr(labels, name))
         assert getattr(back, name).dtype == getattr(labels, name).dtype
     assert_array_equal(back.valid, labels.valid if names != "fiery" else np.ones(7))
+    assert not back.at_present
+    assert MotionLabels.from_batch(labels.as_batch(names), labels.config, names, at_present=True).at_present
 
 
 @pytest.mark.parametrize("orientation", ["devkit", "released", "fiery"])

@@ -257,6 +257,9 @@ def test_heads_that_cannot_be() -> None:
         MotionHeads.from_arrays(good, heat, good, good[:1])
     with pytest.raises(GeometryError, match=r"at least one frame of one cell, found \(0, 2, 3, 4\)"):
         MotionHeads.from_arrays(good[:0], heat[:0], good[:0], good[:0])
+    certain = good.copy()
+    certain[1, 0, 2, 3], certain[1, 1, 2, 3] = -np.inf, np.inf
+    assert MotionHeads.from_arrays(certain, heat, good, good).segmentation[1, 0, 2, 3] == -np.inf
     broken = good.copy()
     broken[1, 0, 2, 3] = np.nan
     with pytest.raises(GeometryError, match=r"segmentation: nan at \(1, 0, 2, 3\) is no value to work with"):

@@ -6,11 +6,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, TokenError
-from deepaccident_devkit.geometry import Boxes, LidarPointCloud
+from deepaccident_devkit.geometry import Boxes, LidarPointCloud, PinholeCamera
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 from deepaccident_devkit.v2x import Link
 from deepaccident_devkit.v2x.clouds import moved_points
 from deepaccident_devkit.v2x.messages import messages
+from deepaccident_devkit.v2x.projection import _colors_at
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 
@@ -111,6 +112,14 @@ def test_a_cloud_in_an_image_of_its_own_agent(da: DeepAccident, sample: str) -> 
     assert u.max() < width
     assert v.max() < height
     assert da.map_pointcloud_to_image(camera, colors=False).color is None
+
+
+def test_an_image_that_was_stored_smaller_is_read_at_the_same_place() -> None:
+    image = np.arange(75, dtype=np.uint8).reshape(5, 5, 3)
+    last = np.nextafter(13.0, 0)  # times 5/13 that is 5, which is no column any more
+    lens, pixels = PinholeCamera(np.eye(3), 13, 10), np.array([[last, 9.9], [0, 2.0], [20, 1]])
+    colors = _colors_at(image, lens, pixels, np.array([True, True, False]))
+    assert_array_equal(colors, [image[4, 4], image[1, 0], [0, 0, 0]])
 
 
 def test_points_of_any_agent_in_any_camera_and_frame(da: DeepAccident, sample: str) -> None:

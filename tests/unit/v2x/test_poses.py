@@ -15,6 +15,7 @@ def test_transforms_are_taken_as_they_are() -> None:
         assert_array_equal(relative_pose_to_ego(given), relative_pose_to_ego(matrices))
         assert_array_equal(future_egomotion(given), future_egomotion(matrices))
     assert_allclose(relative_pose_to_ego(POSES)[1], (POSES[0].inverse() @ POSES[1]).to_six(), atol=1e-9)
+    assert_allclose(future_egomotion(POSES)[0], (POSES[1].inverse() @ POSES[0]).to_six(), atol=1e-9)
     valid = [True, False, True]
     assert_array_equal(future_egomotion([POSES[0], np.full((4, 4), np.nan), POSES[2]], valid), np.zeros((2, 6)))
 

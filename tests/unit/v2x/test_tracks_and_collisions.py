@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
 from deepaccident_devkit.statistics import dataset_statistics
+from deepaccident_devkit.v2x.collisions import first_accident
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 
@@ -60,7 +61,7 @@ def test_tracks_of_every_scenario_are_its_own(da: DeepAccident) -> None:
 
 def test_synthetic_accidents_end_in_contact(da: DeepAccident) -> None:
     accidents = [scenario for scenario in da.scenario if scenario["collision"]]
-    assert accidents
+    assert first_accident(da) == accidents[0]["token"]
     for scenario in accidents:
         found = da.collision(scenario)
         assert found.agrees, found.disagreements
@@ -133,6 +134,42 @@ def test_what_meta_says_against_the_recording(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("origin")
+@pytest.mark.parametrize(("heading", "side"), [(0, "rear"), (90, "left"), (180, "front"), (-90, "right"), (60, "left")])
+def test_the_side_of_a_car_that_is_driven_into_along_x(tmp_path: Path, heading: float, side: str) -> None:
+    def lines(frame: int) -> list[str]:
+        return [
+            f"car {17.0 + frame} 0.0 0.0 4.0 2.0 1.5 0.0 0 0 1223 9 True",
+            f"car 24.5 0.0 0.0 4.0 2.0 1.5 {-np.radians(heading)} 0 0 1212 9 True",
+        ]
+
+    assert accident(tmp_path, lines).collision(tiny.TOKEN).sides == ("front", side)
+
+
+@pytest.mark.usefixtures("origin")
+@pytest.mark.parametrize(("gap", "agrees"), [(1.4, True), (1.6, False)])
+def test_how_far_apart_a_pair_may_be_that_collides(tmp_path: Path, gap: float, agrees: bool) -> None:
+    def lines(frame: int) -> list[str]:
+        return [
+            f"car {17.0 + frame} 0.0 0.0 4.0 2.0 1.5 0.0 0 0 1223 9 True",
+            f"car {24.0 + gap} 0.0 0.0 4.0 2.0 1.5 {np.pi} 0 0 1212 9 True",
+        ]
+
+    assert accident(tmp_path, lines).collision(tiny.TOKEN).agrees == agrees
+
+
+def test_an_agent_that_labels_itself_alone_has_the_speed_of_its_displacement(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The ego, 1223, drives at 10 m/s and says that it stands, as after the blow."""
+    monkeypatch.setattr(tiny, "ego_to_world", lambda _, frame: tiny.pose(x=float(frame)))
+    lines = lambda frame: [  # noqa: E731
+        "car 0 0 -1.2 4.0 2.0 1.5 0.0 0 0 -100 9 True",
+        f"car {9.0 - frame} 0.0 -1.2 4.0 2.0 1.5 0.0 0 0 1212 9 True",
+    ]
+    assert_allclose(accident(tmp_path, lines).collision(tiny.TOKEN).speeds, (10, 0), atol=1e-6)
+
+
+@pytest.mark.usefixtures("origin")
 def test_overlapping_boxes_have_no_gap_and_still_a_side(tmp_path: Path) -> None:
     def lines(frame: int) -> list[str]:
         return [
@@ -152,6 +189,8 @@ def test_collisions_that_cannot_be_told(tmp_path: Path) -> None:
     silent = DeepAccident(dataroot=tiny.write_tiny_release(tmp_path / "silent", meta=None), verbose=False)
     with pytest.raises(NotAvailableError, match="has no meta file"):
         silent.collision(tiny.TOKEN)
+    with pytest.raises(NotAvailableError, match="no scenario ends in an accident that a meta file names"):
+        first_accident(silent)
     unseen = accident(tmp_path / "unseen", lambda _: [])
     with pytest.raises(NotAvailableError, match="no label shows the colliding pair 1223 and 1212"):
         unseen.collision(tiny.TOKEN)

@@ -11,6 +11,7 @@ from deepaccident_devkit.evaluation.metrics.attributes import (
     tokens_by_value,
 )
 from deepaccident_devkit.motion import samples
+from deepaccident_devkit.selection import accident_visible
 
 
 @pytest.mark.parametrize(
@@ -32,6 +33,10 @@ def test_attributes_of_a_releases_samples(da_motion: DeepAccident) -> None:
     assert {len(each) for each in by_end.values()} == {5}
     by_second = tokens_by_value(attributes, "time_to_impact")
     assert {value: len(each) for value, each in by_second.items()} == {"2 s": 10, "1 s": 10}
+    words = {True: "visible", False: "invisible", None: None}
+    assert all(
+        each.accident_visibility == words[accident_visible(da_motion, token)] for token, each in attributes.items()
+    )
     for name in ATTRIBUTES:
         assert sum(map(len, tokens_by_value(attributes, name).values())) == len(tokens)
     everywhere = sample_attributes(

@@ -30,6 +30,11 @@ class TestSwitches:
                     value = getattr(value, part)
                 assert switched(rules, {name: json.loads(json.dumps(value)) if value != np.inf else value}) == rules
 
+    def test_no_variant_is_the_protocol_itself(self) -> None:
+        for task, protocol in ALL:
+            rules = TASK_PROTOCOLS[task][protocol]
+            assert [name for name, variant in rules.variants().items() if variant == rules] == []
+
     def test_a_choice_within_a_part(self) -> None:
         changed = switched(PaperAccidents(), {"scoring.far_is_missed": False, "match_distance": 2})
         assert (changed.scoring.far_is_missed, changed.match_distance) == (False, 2)

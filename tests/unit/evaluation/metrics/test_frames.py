@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from deepaccident_devkit.evaluation.metrics.frames import cells_within
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.evaluation.metrics.frames import cells_within, labels_at_present
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
 
@@ -19,3 +20,10 @@ def test_the_cells_of_a_range(orientation) -> None:
         np.testing.assert_array_equal(found, expected)
     away = BevGrid((20.0, 60.0, 0.5), (-30.0, 10.0, 0.25), orientation)
     assert not np.zeros(away.shape)[cells_within(away, 30.0)].size
+
+
+def test_labels_are_compared_at_the_present_with_bilinear_centres(da_motion: DeepAccident) -> None:
+    label = da_motion.motion_labels(f"{da_motion.scenario[0]['token']}/ego_vehicle/010")
+    moved = label.to_present(centerness="bilinear")
+    assert (labels_at_present(label).centerness == moved.centerness).all()
+    assert labels_at_present(moved) is moved

@@ -2,9 +2,11 @@
 
 import math
 
+import numpy as np
 import pytest
 
 from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.evaluation.metrics.frozen_mappings import plain
 from deepaccident_devkit.evaluation.metrics.headlines import headline_numbers, headlines, value_text
 from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator
 from deepaccident_devkit.evaluation.metrics.numbers import numbers_of
@@ -44,8 +46,16 @@ def test_names() -> None:
 )
 def test_texts(value: float | None, unit: str, signed: bool, text: str) -> None:
     assert value_text(value, unit, signed=signed) == text
+    assert signed or value_text(value, unit) == text
 
 
 def test_an_unknown_task_is_refused() -> None:
     with pytest.raises(ChoiceError, match="task: expected one of motion, accident, detection, warning, found 'maps'"):
         headlines("maps", None)
+
+
+def test_results_within_others_and_arrays_are_plain_too() -> None:
+    result = MotionEvaluator().compute()
+    nested = plain({2.0: np.array([1.0, np.nan]), "of": [result]})
+    assert nested == {"2": [1.0, None], "of": [result.as_dict()]}
+    assert nested["of"][0]["ranges"]

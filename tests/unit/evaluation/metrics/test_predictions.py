@@ -89,6 +89,14 @@ class TestMotionOutput:
 
 
 class TestAccident:
+    def test_its_positions_and_the_maps_of_an_output_are_read_only(self) -> None:
+        positions, maps = np.zeros((2, 2)), np.zeros((1, 5, *GRID.shape), dtype=np.int32)
+        accident, output = Accident(positions=positions, time=1.0), instances_of(maps, GRID)
+        for array in (accident.positions, output.instances):
+            with pytest.raises(ValueError, match="read-only"):
+                array[0] = 1
+        positions[0] = maps[0] = 1  # the caller's own stay as they were
+
     def test_numbers_of_numpy_become_pythons(self) -> None:
         accident = Accident(
             positions=[[0, 1], [2, 3]],  # type: ignore[arg-type]  # lists are taken

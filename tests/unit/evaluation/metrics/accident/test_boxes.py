@@ -12,6 +12,7 @@ from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
 from deepaccident_devkit.evaluation.metrics.accident import BoxTruth, accident_context, box_truth
 from deepaccident_devkit.evaluation.metrics.accident.boxes import BoxAccidents
 from deepaccident_devkit.evaluation.metrics.accident.evaluator import AccidentEvaluator
+from deepaccident_devkit.evaluation.metrics.accident.paper import PaperAccidents
 from deepaccident_devkit.evaluation.metrics.accident.scoring import Scoring
 from deepaccident_devkit.evaluation.metrics.alarms.reading import AccidentReading
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
@@ -227,6 +228,8 @@ def test_the_labels_of_a_release(da_motion: DeepAccident) -> None:
     for actor, position in zip(contact.actor_ids, truth.accident.positions, strict=True):
         path = da_motion.trajectory(f"{scenario['token']}/actor/{actor}", token, "ego")
         assert_allclose(position, path.center[-1, :2], atol=1e-9)
+        [seen] = np.flatnonzero(truth.actor_id == actor)
+        assert_allclose(truth.footprint[:, seen, :2], path.center[-16:, :2], atol=1e-9)
         assert_allclose(
             world_from_ego @ path.center, da_motion.trajectory(f"{scenario['token']}/actor/{actor}").center, atol=1e-6
         )
@@ -236,6 +239,9 @@ def test_the_labels_of_a_release(da_motion: DeepAccident) -> None:
     made = BOXES.result([BOXES.counts(perfect, None, context)])
     assert (made.apa, made.truths["meta"]) == (1, 1)
     assert box_truth(da_motion, token, horizon=1.0).accident is None
+    # half a recorded frame of slack
+    assert box_truth(da_motion, token, horizon=1.46).accident.time == truth.accident.time
+    assert box_truth(da_motion, token, horizon=1.44).accident is None
     assert len(box_truth(da_motion, token, horizon=1.0).time) == 11
 
 
@@ -272,6 +278,7 @@ def test_label_maps_against_the_boxes_of_a_release(da_motion: DeepAccident) -> N
 
 
 def test_what_cannot_be_evaluated(da_motion: DeepAccident) -> None:
+    assert json.loads(json.dumps(BOXES.settings()))["match_distance"] == BOXES.match_distance
     with pytest.raises(EvaluationError, match="accident_context"):
         BOXES.counts([alarm()], None, META)
     with pytest.raises(EvaluationError, match="list of Accidents"):
@@ -280,6 +287,11 @@ def test_what_cannot_be_evaluated(da_motion: DeepAccident) -> None:
         BoxAccidents(min_score=math.nan)
     with pytest.raises(ChoiceError, match="naming: expected one of nearest, given, found 'all'"):
         BoxAccidents(naming="all")
+    assert [BOXES.variants()[f"match_distance={metres}"].match_distance for metres in (2.0, 8.0)] == [2, 8]
+    for protocol in (BoxAccidents, PaperAccidents):
+        for metres in (0, math.inf):
+            with pytest.raises(ConfigError, match="match_distance"):
+                protocol(match_distance=metres)
 
 
 def test_a_pair_that_no_label_shows(da_motion: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:

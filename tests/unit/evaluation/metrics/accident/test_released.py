@@ -189,6 +189,21 @@ def test_of_several_overlapping_pairs_the_first_ids_count() -> None:
     assert collision(DrawnPaths(paths={}, drawn=drawn), [4], 5.0, 0.1) is None
 
 
+def test_a_lower_level_draws_outlines_farther_out() -> None:
+    """An empty column lies between: 0.2 cells at level 0.1, one cell at 0.5."""
+    apart = DrawnPaths(paths={name: np.zeros((FRAMES, 2)) for name in (1, 2)}, drawn=touching())
+    apart.drawn[:, :, 18] = 0
+    assert collision(apart, [4], 0.5, 0.1).pair == (1, 2)
+    assert collision(apart, [4], 0.5, 0.5) is None
+
+
+def test_an_instance_of_which_one_cell_is_left_is_drawn_as_long_as_at_first() -> None:
+    maps = np.zeros((FRAMES, 200, 200), dtype=np.int32)
+    maps[0, 100:104, 100:108], maps[1:, 102, 104] = 5, 5
+    drawn = paths_of_instances(maps, BevGrid(), redraw=True).drawn == 5
+    assert (drawn.sum(axis=(1, 2)) > 20).all()
+
+
 def test_of_equally_near_frames_the_earliest_counts() -> None:
     paths = {name: np.zeros((FRAMES, 2)) for name in (1, 2)}
     assert collision(DrawnPaths(paths=paths, drawn=touching()), range(1, FRAMES), 5.0, 0.1).frame == 1

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 from accident_scenes import scene, standing
@@ -14,6 +15,7 @@ from deepaccident_devkit.evaluation.metrics.accident import (
     BoxTruth,
     PaperAccidents,
 )
+from deepaccident_devkit.evaluation.metrics.accident.scoring import actor_of
 from deepaccident_devkit.evaluation.metrics.alarms.reading import accident_of
 from deepaccident_devkit.geometry import BevGrid
 
@@ -40,6 +42,14 @@ def counted(predicted: np.ndarray, truth: np.ndarray):
     label = replace(label, instance=maps)
     counts = protocol.counts(MotionOutput(grid=GRID, instances=given), label, AccidentContext())
     return counts, protocol.result([counts])
+
+
+def test_an_instance_is_of_the_actor_that_most_of_its_labelled_cells_are() -> None:
+    drawn = np.array([[[0, 0, 0, 0, 7, 7, 9]]])
+    label = SimpleNamespace(instance=drawn, id_map={70: 7, 90: 9})
+    assert actor_of(np.ones((1, 7), dtype=bool), 0, label, AccidentContext()) == 70
+    assert actor_of(drawn[0] == 9, 0, label, AccidentContext()) == 90
+    assert actor_of(drawn[0] == 0, 0, label, AccidentContext()) is None
 
 
 def test_of_two_pairs_alike_that_with_the_lower_ids_collides() -> None:

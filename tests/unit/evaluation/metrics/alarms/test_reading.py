@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from deepaccident_devkit.evaluation.metrics.alarms.hulls import convex_hulls
 from deepaccident_devkit.evaluation.metrics.alarms.reading import (
     AccidentReading,
     InstanceTracks,
@@ -34,6 +35,17 @@ def test_points_and_lines_have_distances_too() -> None:
     found = accident_of(maps, grid, RELEASED, AccidentReading(danger_distance=2.0))
     assert found.contact.ids == (5, 7)
     assert found.contact.distance == pytest.approx(math.sqrt(5) / 2)
+
+
+def test_of_no_points_there_are_no_hulls() -> None:
+    assert convex_hulls(np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.int64)).shape == (0, 1, 2)
+
+
+def test_where_nothing_comes_near_there_are_no_positions() -> None:
+    calm = accident_of(np.zeros((1, 200, 200), dtype=np.int32), BevGrid(), RELEASED, AccidentReading())
+    assert calm.contact is None
+    assert calm.positions.shape == (2, 2)
+    assert np.isnan(calm.positions).all()
 
 
 def test_a_metre_across_is_no_accident_either() -> None:

@@ -115,6 +115,14 @@ def test_a_detection_that_counts_goes_before_an_ignored_one() -> None:
     assert one.recall[0, 0, 2, 0] == 1.0
 
 
+def test_a_detection_of_a_truth_that_does_not_count_is_no_false_alarm() -> None:
+    """The other way round: the detection is within |x| = 84.85 m, its truth beyond."""
+    found = found_at((84.5, 0, 0.9), (10, 0, 0.5)), truth_at((85.5, 0), (10, 0))
+    result = evaluated("released", found).compute()
+    assert (result.truths[0, 0], result.detections[0, 0]) == (1, 2)
+    assert result.precision[0, 0, :, 0].tolist() == [0.5, 0.5, 1, 1]  # at 2 m and 4 m the two match
+
+
 def test_the_released_range_is_of_x_alone() -> None:
     truth = truth_at((10, 200))
     assert evaluated("released", (perfect(truth), truth)).compute().truths[0, 0] == 1
@@ -191,6 +199,36 @@ def test_opencood_has_one_vehicle_class_and_includes_the_threshold() -> None:
 def test_opencood_counts_boxes_that_are_wholly_in_range() -> None:
     truth = truth_at((138.1, 0), (137.9, 0))
     assert evaluated("opencood", (perfect(truth), truth)).compute().truths[0, 0] == 1
+
+
+def test_a_box_of_which_a_corner_is_out_of_range_does_not_count() -> None:
+    """Turned by 45°, a car of 4 × 2 m reaches 2.12 m along each axis, with another corner each time."""
+    for reach, counted in ((1.8, 0), (2.2, 4)):
+        places = (140 - reach, 0), (reach - 140, 0), (0, 40 - reach), (0, reach - 40)
+        center = np.array([(*place, 0.75) for place in places])
+        truth = Boxes.from_arrays(center, np.tile(SIZE, (4, 1)), np.full(4, np.pi / 4), frame="lidar")
+        assert evaluated("opencood", (perfect(truth), truth)).compute().truths[0, 0] == counted
+
+
+def test_beyond_the_recall_that_is_reached_opencoods_precision_is_0() -> None:
+    result = evaluated("opencood", (found_at((10, 0, 0.9)), truth_at((10, 0), (30, 0)))).compute()
+    precision = result.precision[0, 0, 0]
+    assert (precision[0], precision[-1]) == (1, 0)
+
+
+@pytest.mark.parametrize(("found", "error"), [(10, 1), (11, 0)])
+def test_errors_of_the_paper_begin_where_recall_exceeds_a_tenth(found: int, error: int) -> None:
+    places = [(9.0 * row - 45, 9.0 * column - 45) for row in range(10) for column in range(10)]
+    prediction = found_at(*((*place, 0.9) for place in places[:found]))
+    assert evaluated("paper", (prediction, truth_at(*places))).compute().errors[0].tolist() == [error] * 4
+
+
+def test_errors_of_the_paper_are_means_over_the_points_of_recall_that_are_reached() -> None:
+    """Of 100 cars 12 are found, the least sure one 1.2 m off: 0 on average up to recall 0.11, 0.1 m up to 0.12."""
+    places = [(9.0 * row - 45, 9.0 * column - 45) for row in range(10) for column in range(10)]
+    found = [(x, y + 1.2 * (rank == 11), 0.9 - 0.01 * rank) for rank, (x, y) in enumerate(places[:12])]
+    result = evaluated("paper", (found_at(*found), truth_at(*places))).compute()
+    assert result.errors[0, 0] == pytest.approx(0.05)
 
 
 def test_scores_sorted_over_all_samples_or_by_sample() -> None:

@@ -12,6 +12,7 @@ from deepaccident_devkit.evaluation import DetectedBoxes, detection_truth
 from deepaccident_devkit.evaluation.metrics.detection import DETECTION_PROTOCOLS, detection_matches
 from deepaccident_devkit.evaluation.metrics.detection.boxes import columns_of
 from deepaccident_devkit.evaluation.metrics.detection.frame_counts import frame_counts
+from deepaccident_devkit.geometry import Boxes
 
 
 @pytest.mark.parametrize("protocol", DETECTION_PROTOCOLS)
@@ -41,3 +42,22 @@ def test_detections_match_as_they_are_counted(da_b: DeepAccident, protocol: str)
         assert not np.isin(found.detection, found.false).any()
     with pytest.raises(ChoiceError, match=r"threshold: expected one of .*, found 77"):
         detection_matches(detected, truth, rules, 77)
+
+
+@pytest.mark.parametrize("nearest_first", [True, False])
+@pytest.mark.parametrize("protocol", DETECTION_PROTOCOLS)
+def test_of_several_that_are_near_enough_the_nearest_is_matched(protocol: str, *, nearest_first: bool) -> None:
+    """A detection looks for its true box or, in the released way, a true box for its detection: here one for two."""
+    rules = DETECTION_PROTOCOLS[protocol]
+    one, two = [(10.0, 0.0)], [(10.1, 0.0), (10.3, 0.0)][:: 1 if nearest_first else -1]
+    truth_places, places = (two, one) if rules.matching == "by_score" else (one, two)
+
+    def columns(found: list[tuple[float, float]]) -> dict[str, Any]:
+        center = np.array([(*place, 0.75) for place in found])
+        return {"center": center, "size": np.full((len(found), 3), 4.0), "yaw": np.zeros(len(found))}
+
+    truth = Boxes.from_arrays(**columns(truth_places), frame=rules.frame)
+    detected = DetectedBoxes.from_arrays(**columns(places), scores=np.ones(len(places)), frame=rules.frame)
+    found = detection_matches(detected, truth, rules, rules.thresholds[0])
+    of_two = found.truth if rules.matching == "by_score" else found.detection
+    assert of_two.tolist() == [0 if nearest_first else 1]

@@ -3,7 +3,12 @@
 import pytest
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError
-from deepaccident_devkit.evaluation.metrics.detection import DetectionEvaluator, detection_protocol
+from deepaccident_devkit.evaluation.metrics.detection import (
+    DETECTION_PROTOCOLS,
+    DetectionEvaluator,
+    DetectionProtocol,
+    detection_protocol,
+)
 
 
 def test_protocols_and_switches_that_cannot_be() -> None:
@@ -25,3 +30,36 @@ def test_protocols_and_switches_that_cannot_be() -> None:
         with pytest.raises(ConfigError, match=said):
             detection_protocol("paper", **switches)
     assert detection_protocol("paper", thresholds=[1, 2, 4]).thresholds == (1, 2, 4)
+
+
+@pytest.mark.parametrize("protocol", DETECTION_PROTOCOLS.values(), ids=DETECTION_PROTOCOLS)
+def test_each_variant_of_a_protocol_makes_the_choice_that_it_is_named_by(protocol: DetectionProtocol) -> None:
+    variants = protocol.variants()
+    for name, variant in variants.items():
+        choice, value = name.split("=", 1)
+        assert str(getattr(variant, choice)) == value != str(getattr(protocol, choice))
+    always = {
+        "truth",
+        "frame",
+        "measure",
+        "curve",
+        "area",
+        "matching",
+        "own_box",
+        "single_precision",
+        "threshold_included",
+    }
+    assert {name.split("=")[0] for name in variants} >= always
+    in_metres = protocol.measure.startswith("distance")
+    assert any(name.startswith("thresholds=") for name in variants) == in_metres
+    of_one_agent = protocol.frame == "lidar" and protocol.truth != "cooperative"
+    assert (f"label_velocity={not protocol.label_velocity}" in variants) == of_one_agent
+
+
+def test_the_numbers_of_published_procedures() -> None:
+    paper, released_iou = DETECTION_PROTOCOLS["paper"], DETECTION_PROTOCOLS["released_iou"]
+    assert (paper.min_recall, paper.min_precision, paper.error_threshold) == (0.1, 0.1, 2.0)
+    assert (paper.thresholds, paper.points) == ((1.0, 2.0, 4.0), 101)
+    assert released_iou.thresholds == (0.3, 0.15)
+    assert DETECTION_PROTOCOLS["opencood"].thresholds == (0.3, 0.5, 0.7)
+    assert DETECTION_PROTOCOLS["released"].points == 40

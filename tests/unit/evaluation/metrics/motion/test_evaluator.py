@@ -24,7 +24,12 @@ from deepaccident_devkit.evaluation.metrics.motion.overlaps import (
     vpq_counts,
 )
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput, instances_of
-from deepaccident_devkit.evaluation.metrics.trajectories import TrajectoryRules, instance_paths
+from deepaccident_devkit.evaluation.metrics.trajectories import (
+    TrajectoryRules,
+    instance_paths,
+    match_trajectories,
+    trajectory_errors,
+)
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
 from deepaccident_devkit.motion import MotionHeads, MotionLabelConfig, MotionLabels, samples
@@ -195,12 +200,31 @@ def test_paths_of_the_best_prediction() -> None:
     assert evaluated(still(boxes(_1=106)), label).min_fde == 3.0
 
 
+def test_cells_and_instances_are_of_the_last_prediction() -> None:
+    label = boxes_label(*[boxes(_4=100)] * 5)
+    assert evaluated(still(boxes(_1=50), boxes(_7=100)), label).ranges["30x30"].pq == 100
+    assert evaluated(still(boxes(_7=100), boxes(_1=50)), label).ranges["30x30"].pq == 0
+
+
 def test_a_path_too_far_away_is_no_partner() -> None:
     label = boxes_label(*[boxes(_4=100)] * 5)
     result = evaluated(still(boxes(_1=109)), label)
     assert (result.paths, result.path_false_positive, result.path_false_negative) == (0, 1, 1)
     wide = evaluated(still(boxes(_1=109)), label, MotionProtocol(gate=5.0))
     assert (wide.paths, wide.min_fde, wide.path_accuracy) == (1, 4.5, 1.0)
+
+
+def test_paths_that_are_matched_too_far_apart_are_told_by_their_own_ids() -> None:
+    found = match_trajectories({5: np.zeros((3, 2))}, {8: np.full((3, 2), 99.0)})
+    assert (found.pairs, found.unmatched_prediction, found.unmatched_truth) == ((), (5,), (8,))
+
+
+def test_of_several_predictions_that_with_the_least_error_at_the_end_counts() -> None:
+    truth = {1: np.zeros((3, 2))}
+    good_at_first, good_at_last = ({7: np.array([(0.0, y) for y in ys])} for ys in ((0, 0, 4), (3, 2, 1)))
+    predictions = [good_at_first, good_at_last]
+    found = trajectory_errors(predictions, truth, [match_trajectories(each, truth) for each in predictions])
+    assert (found.ade, found.fde, found.missed, found.count) == (2, 1, 0, 1)
 
 
 def test_a_path_that_ends_early_goes_on_ever_faster() -> None:
@@ -229,8 +253,22 @@ def test_large_errors_are_cut_off() -> None:
     assert (result.min_ade, result.min_fde, result.miss_rate) == (2.0, 17.5, 0.0)
 
 
+def test_each_part_of_the_protocol_has_variants() -> None:
+    protocol = MotionEvaluator("released").protocol
+    variants = protocol.variants()
+    assert not variants["vpq.ids_must_stay=False"].vpq.ids_must_stay
+    assert variants["paths.link_distance=10.0"].paths.link_distance == 10
+    assert variants["instances.center_threshold=0.3"].instances.center_threshold == 0.3
+    assert variants["trajectories.miss_distance=2.0"].trajectories.miss_distance == 2
+    assert {name.split(".")[0].split("=")[0] for name in variants} >= {"instances", "gate", "nothing_is_zero"}
+    assert protocol not in variants.values()
+
+
 def test_paths_can_be_left_out() -> None:
     evaluator = MotionEvaluator(trajectories=False)
+    assert evaluator.settings["trajectories"] is False
+    assert json.loads(json.dumps(evaluator.settings)) == evaluator.settings
+    assert evaluator.settings["protocol"] == MotionEvaluator().settings["protocol"]
     evaluator.update("a", still(boxes(_1=100)), boxes_label(*[boxes(_1=100)] * 5))
     assert evaluator.counts["a"]["paths"] is None
     result = evaluator.compute()

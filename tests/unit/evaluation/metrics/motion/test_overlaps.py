@@ -43,6 +43,13 @@ def test_half_of_the_union_is_no_match() -> None:
     assert vpq_counts(prediction, label).iou[0, 1] == 5 / 8
 
 
+def test_of_the_background_too_half_of_the_union_is_no_match() -> None:
+    for cells, overlap in ((4, 0), (5, 3 / 5)):
+        label, prediction = np.zeros((2, 1, 1, cells), dtype=np.int64)
+        label[..., -1], prediction[..., 0] = 1, 1
+        assert vpq_counts(prediction, label).iou[0, 0] == overlap
+
+
 def test_iou_of_classes() -> None:
     prediction, label = np.array([0, 1, 2, 2, 7]), np.array([0, 2, 2, 1, 2])
     counts = segmentation_counts(prediction, label, classes=3)

@@ -156,6 +156,25 @@ def test_false_alarms_before_an_accident_count_apart() -> None:
     assert "no recording without an accident was evaluated" in made.notes[0]
 
 
+def test_every_share_is_of_its_own_whole() -> None:
+    """Three accidents, one of them warned of and one short; alarms in vain, and one that nothing refutes."""
+    told = every(3, what=[]) | {2.0: RIGHT, 1.0: [RIGHT, FALSE, alarm(x=60)]}
+    twin = every(5.5, 0.0, []) | {5.0: [FALSE, FALSE], 1.0: replace(FALSE, time=1.5)}
+    recordings = told, every(3, what=[]), every(1.5, what=[]), (twin, "twins"), (every(5.5, 0.0, []), "others")
+    made = result(*recordings, protocol=WarningProtocol(curve_lead=2.0))
+    assert (made.samples, made.alarms, made.unjudged) == (39, 6, 1)
+    assert (made.warned_share, made.lasting_share, made.precision) == (1 / 3, 0, 2 / 6)
+    assert made.detection_rate == {1.0: 1 / 3, 2.0: 1 / 2, 3.0: 0}
+    assert made.curve.detection_rate[-1] == 1 / 2
+    assert made.false_alarms == {"accident": 1, "normal": 1, "twins": 1, "others": 0}
+    minutes = {"accident": 0.125, "normal": 0.2, "twins": 0.1, "others": 0.1}
+    assert made.minutes == pytest.approx(minutes)
+    assert made.false_alarms_per_minute == pytest.approx({"accident": 8, "normal": 5, "twins": 10, "others": 0})
+    nobody_told = result(every(3, what=[]))
+    assert (nobody_told.warned_share, math.isnan(nobody_told.mean_warning)) == (0, True)
+    assert math.isnan(nobody_told.precision)
+
+
 @pytest.mark.parametrize(
     ("raised", "by_pair", "by_place"),
     [
