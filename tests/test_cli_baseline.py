@@ -67,7 +67,8 @@ def test_the_study_is_printed_and_written(
     monkeypatch.setattr(conditions, "_QUICK_HORIZONS", (2.0,))
     monkeypatch.setattr(conditions, "_QUICK_STEPS", (0.0, 0.5))
     out = tmp_path / "study"
-    text = run("v2x", da_motion.dataroot, "--split", "train", "--quick", "--workers", 1, "--out", out)
+    options = "--split train --quick --seed 3 --seed 5 --resamples 20 --workers 1"
+    text = run("v2x", da_motion.dataroot, *options.split(), "--out", out)
     assert "Who cooperates" in text
     assert "written: 11 files in" in text
     names = ("configurations", "horizons", "latency", "pose_noise", "visibility")
@@ -76,6 +77,8 @@ def test_the_study_is_printed_and_written(
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in out.glob("*.png"))
     described = json.loads((out / "v2x_study.json").read_text(encoding="utf-8"))
     assert described["config"]["protocol"] == "paper"
+    assert described["config"]["seeds"] == [3, 5]
+    assert described["config"]["resampling"]["resamples"] == 20
     with (out / "configurations.csv").open(encoding="utf-8") as file:
         assert next(csv.DictReader(file))["agents"] == "single"
 

@@ -42,6 +42,17 @@ class Condition:
             return None
         return Link(latency=self.latency, pose_noise=self.pose_noise or None, seed=seed)
 
+    @property
+    def base(self) -> Condition:
+        """What it is compared with: the same agents with a perfect link; of these, a single vehicle."""
+        if self.pose_noise or self.latency:
+            return replace(self, pose_noise=0.0, latency=0.0)
+        return replace(self, agents="single")
+
+    def seeds(self, wanted: Sequence[int]) -> Sequence[int]:
+        """The seeds that are needed: without noise nothing is drawn, so that one is enough."""
+        return wanted if self.pose_noise else wanted[:1]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TablePlan:

@@ -12,42 +12,60 @@ from deepaccident_devkit.baselines.conditions import Condition
 from deepaccident_devkit.baselines.drawing import label_times, motion_of
 from deepaccident_devkit.baselines.motion_models import MotionModel
 from deepaccident_devkit.baselines.outlook import outlook
+from deepaccident_devkit.baselines.predict import detections_of
 from deepaccident_devkit.baselines.predict_results import Baseline
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.evaluation import AccidentEvaluator, MotionEvaluator, accident_context
+from deepaccident_devkit.evaluation import (
+    AccidentEvaluator,
+    DetectedBoxes,
+    DetectionEvaluator,
+    MotionEvaluator,
+    accident_context,
+    detection_truth,
+)
 from deepaccident_devkit.motion import motion_labels
 from deepaccident_devkit.parallel import run_unordered
 from deepaccident_devkit.taxonomy import LIDAR
 
 _BATCH: Final = 4
 """Samples that a worker counts before it reports."""
+_DETECTION: Final = "paper"
+"""The protocol of detections: what any agent sees is to be found, whoever cooperates, so that rows compare."""
+
+
+def drawn(token: str, seed: int) -> str:
+    """What a sample is called in the evaluators, where each seed's draw of it has its own counts."""
+    return f"{token}#{seed}"
 
 
 @dataclass(frozen=True, slots=True)
 class Evaluators:
-    """The evaluators of one condition.
+    """The evaluators of one condition, with samples called as `drawn` says.
 
     Attributes:
         motion: of the instance maps.
         maps: of the accidents in them, by the study's protocol.
         boxes: of the accidents named explicitly, by the protocol `boxes`.
+        detection: of the boxes that are seen, by the protocol `paper`.
     """
 
     motion: MotionEvaluator
     maps: AccidentEvaluator
     boxes: AccidentEvaluator
+    detection: DetectionEvaluator
 
     @classmethod
     def of(cls, protocol: str) -> Evaluators:
         """New ones; the released protocol's motion metrics go with its accident metrics, the paper's with all else."""
         motion = MotionEvaluator("released" if protocol == "released" else "paper", trajectories=False)
-        return cls(motion, AccidentEvaluator(protocol), AccidentEvaluator("boxes"))
+        return cls(motion, AccidentEvaluator(protocol), AccidentEvaluator("boxes"), DetectionEvaluator(_DETECTION))
 
     def merge(self, other: Evaluators) -> None:
         """Take all samples of others of the same condition."""
         self.motion.merge(other.motion)
         self.maps.merge(other.maps)
         self.boxes.merge(other.boxes)
+        self.detection.merge(other.detection)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,13 +76,13 @@ class Counting:
         dataset: the release.
         model: how actors go on.
         protocol: of the accidents in maps.
-        seed: of the links.
+        seeds: of the links.
     """
 
     dataset: Dataset
     model: MotionModel
     protocol: str
-    seed: int
+    seeds: Sequence[int]
 
 
 def counted(
@@ -119,13 +137,17 @@ def _count_sample(
     """Add a sample to the evaluators of conditions that look equally far ahead."""
     dataset, config = counting.dataset, Baseline(horizon=horizon).config
     label = motion_labels(dataset, token, config).to_present("bilinear")
-    context = accident_context(dataset, token, horizon)
+    context, truth = accident_context(dataset, token, horizon), detection_truth(dataset, token, _DETECTION)
+    ego_from_lidar = dataset.ego_from(token, LIDAR)
     for condition in conditions:
-        ahead = outlook(
-            dataset, token, agents=condition.agents, model=counting.model, link=condition.link(counting.seed)
-        )
-        output = motion_of(ahead.seen, ahead.poses(label_times(config)), dataset.ego_from(token, LIDAR), config)
         evaluators = result.setdefault(condition, Evaluators.of(counting.protocol))
-        evaluators.motion.update(token, output, label)
-        evaluators.maps.update(token, output, label, context)
-        evaluators.boxes.update(token, accidents_ahead(ahead, horizon), context)
+        for seed in condition.seeds(counting.seeds):
+            link, name = condition.link(seed), drawn(token, seed)
+            ahead = outlook(dataset, token, agents=condition.agents, model=counting.model, link=link)
+            output = motion_of(ahead.seen, ahead.poses(label_times(config)), ego_from_lidar, config)
+            found = detections_of(ahead.seen)
+            boxes = found.boxes.transform(ego_from_lidar.inverse(), truth.frame)
+            evaluators.motion.update(name, output, label)
+            evaluators.maps.update(name, output, label, context)
+            evaluators.boxes.update(name, accidents_ahead(ahead, horizon), context)
+            evaluators.detection.update(name, DetectedBoxes(boxes=boxes, scores=found.scores), truth)

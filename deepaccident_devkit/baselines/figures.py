@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from deepaccident_devkit.baselines.study_result import METRICS, StudyRow, StudyTable, V2XStudy
+from deepaccident_devkit.baselines.study_result import METRICS, PERCENT, StudyRow, StudyTable, V2XStudy
 from deepaccident_devkit.render.baselines import Panel, save_panels
 
-_SHOWN: Final = ("iou_100", "vpq_100", "apa", "boxes_apa")
-_PERCENT: Final = ("iou_100", "vpq_100")
+_SHOWN: Final = ("iou_100", "vpq_100", "apa", "boxes_apa", "mAP")
 _XLABELS: Final = {"pose_noise": "pose noise (m)", "latency": "latency (s)"}
 _EVERYONE: Final = "all samples"
 
@@ -39,12 +38,17 @@ def study_panels(table: StudyTable) -> list[list[Panel]]:
 
 def _panel(rows: Sequence[StudyRow], metric: str, swept: str | None, ahead: str) -> Panel:
     values: dict[str, dict[str | float, float | None]] = {}
+    intervals: dict[str, dict[str | float, tuple[float, float]]] = {}
     for row in rows:
         group = _EVERYONE if row.group == "all" else row.group
-        values.setdefault(row.agents, {})[getattr(row, swept) if swept else group] = row.metrics[metric]
-    percent = metric in _PERCENT
+        place = getattr(row, swept) if swept else group
+        values.setdefault(row.agents, {})[place] = row.metrics[metric]
+        if metric in row.intervals:
+            intervals.setdefault(row.agents, {})[place] = row.intervals[metric]
+    percent = metric in PERCENT
     return Panel(
         values=values,
+        intervals=intervals,
         title=f"{METRICS[metric]}{ahead}",
         ylabel=f"{METRICS[metric]} (%)" if percent else METRICS[metric],
         top=100.0 if percent else 1.0,

@@ -72,7 +72,7 @@ def demo_table(dataset: Dataset, scenario: RowArgument | None = None) -> tuple[t
     if not keys:
         raise NotAvailableError(f"{token}: has {length} frames; choose a scenario of more than 0.5 s")
     conditions = [Condition(agents=name) for name in _AGENTS]
-    counting = Counting(dataset=dataset, model="constant_velocity", protocol="paper", seed=0)
+    counting = Counting(dataset=dataset, model="constant_velocity", protocol="paper", seeds=(0,))
     evaluators = counted(counting, dict.fromkeys(keys, conditions), workers=1)
     rows = []
     for condition in conditions:

@@ -9,7 +9,7 @@ import numpy as np
 from deepaccident_devkit.baselines.collisions import DANGER_DISTANCE, accidents_ahead
 from deepaccident_devkit.baselines.drawing import label_times, motion_of
 from deepaccident_devkit.baselines.motion_models import MotionModel
-from deepaccident_devkit.baselines.oracle import seen_actors
+from deepaccident_devkit.baselines.oracle import SeenActors, seen_actors
 from deepaccident_devkit.baselines.outlook import outlook
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError
@@ -98,7 +98,11 @@ def predict_detections(
     Raises:
         DeepAccidentError: as of `oracle.seen_actors`.
     """
-    seen = seen_actors(dataset, sample, agents=agents, link=link, frame="world")
+    return detections_of(seen_actors(dataset, sample, agents=agents, link=link, frame="world"))
+
+
+def detections_of(seen: SeenActors) -> DetectedBoxes:
+    """The detections of `predict_detections`, in the frame in which actors are seen."""
     watchers = np.unpackbits(seen.seen_by[:, None], axis=1).sum(axis=1)
     points = seen.boxes.num_lidar_pts
     scores = (watchers + points / (points + _ENOUGH_POINTS)) / (len(AGENTS) + 1)

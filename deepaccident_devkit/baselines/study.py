@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping, Sequence
 
 from deepaccident_devkit.baselines.conditions import Condition, TablePlan, study_plan
 from deepaccident_devkit.baselines.counting import Counting, Evaluators, counted
 from deepaccident_devkit.baselines.study_config import StudyConfig
-from deepaccident_devkit.baselines.study_result import StudyRow, StudyTable, V2XStudy
-from deepaccident_devkit.baselines.study_samples import study_samples
+from deepaccident_devkit.baselines.study_result import StudyTable, V2XStudy
+from deepaccident_devkit.baselines.study_rows import study_row
+from deepaccident_devkit.baselines.study_samples import StudySamples, study_samples
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.evaluation import SampleAttributes, sample_attributes
 from deepaccident_devkit.evaluation.metrics.attributes import tokens_by_value
@@ -26,7 +26,7 @@ def v2x_study(
 ) -> V2XStudy:
     """Compare what seven sets of agents foresee: overall, by visibility and time, and with noisy and late data.
 
-    All rows of a horizon are of the same samples.
+    All rows of a horizon are of the same samples. Intervals are over clusters (an accident and its twin are one).
 
     Args:
         dataset: the release.
@@ -55,7 +55,7 @@ def v2x_study(
     for condition in wanted:
         for token in samples.tokens[condition.horizon]:
             conditions.setdefault(token, []).append(condition)
-    counting = Counting(dataset=dataset, model=how.model, protocol=how.protocol, seed=how.seed)
+    counting = Counting(dataset=dataset, model=how.model, protocol=how.protocol, seeds=how.seeds)
     evaluators = counted(counting, conditions, workers=workers, progress=progress)
     attributes = sample_attributes(dataset, conditions)
     return V2XStudy(
@@ -63,62 +63,38 @@ def v2x_study(
         version=dataset.version,
         split=str(split),
         config=how,
-        tables={table.name: _table(table, evaluators, attributes) for table in plan},
+        tables={table.name: _table(table, evaluators, samples, attributes, how) for table in plan},
         notes=samples.notes,
     )
 
 
 def _table(
-    plan: TablePlan, evaluators: Mapping[Condition, Evaluators], attributes: Mapping[str, SampleAttributes]
+    plan: TablePlan,
+    evaluators: Mapping[Condition, Evaluators],
+    samples: StudySamples,
+    attributes: Mapping[str, SampleAttributes],
+    config: StudyConfig,
 ) -> StudyTable:
     rows = [
-        (group, condition, evaluators[condition], tokens)
+        (condition, group, tokens)
         for condition in plan.conditions
         if condition in evaluators
-        for group, tokens in _groups(evaluators[condition], attributes, plan.by).items()
+        for group, tokens in _groups(samples.tokens[condition.horizon], attributes, plan.by).items()
     ]
     grouped = plan.by != ("all",)
     if grouped:
-        rows.sort(key=lambda row: (row[1].horizon, row[0]))
-    by = ("agents", *plan.varied, *(("group",) if grouped else ()))
-    return StudyTable(name=plan.name, title=plan.title, by=by, rows=tuple(_row(*row) for row in rows))
-
-
-def _groups(
-    evaluators: Evaluators, attributes: Mapping[str, SampleAttributes], by: Sequence[str]
-) -> dict[str, list[str]]:
-    """The samples of each value of each attribute."""
-    here = {token: attributes[token] for token in sorted(evaluators.motion.tokens)}
-    return {group or "not known": tokens for name in by for group, tokens in tokens_by_value(here, name).items()}
-
-
-def _row(group: str, condition: Condition, evaluators: Evaluators, tokens: Sequence[str]) -> StudyRow:
-    motion, maps = evaluators.motion.compute(tokens), evaluators.maps.compute(tokens)
-    boxes = evaluators.boxes.compute(tokens)
-    near, far = motion.ranges["30x30"], motion.ranges["100x100"]
-    at = boxes.within[10.0]
-    return StudyRow(
-        agents=condition.agents,
-        horizon=condition.horizon,
-        pose_noise=condition.pose_noise,
-        latency=condition.latency,
-        group=group,
-        samples=len(tokens),
-        positives=maps.positives,
-        metrics={
-            "iou_30": _known(near.iou),
-            "vpq_30": _known(near.pq),
-            "iou_100": _known(far.iou),
-            "vpq_100": _known(far.pq),
-            "apa": _known(maps.apa),
-            "id_error": _known(maps.id_error),
-            "position_error": _known(maps.position_error),
-            "time_error": _known(maps.time_error),
-            "boxes_apa": _known(boxes.apa),
-            "boxes_recall": at.tp / boxes.positives if boxes.positives else None,
-        },
+        rows.sort(key=lambda row: (row[0].horizon, row[1]))
+    return StudyTable(
+        name=plan.name,
+        title=plan.title,
+        by=("agents", *plan.varied, *(("group",) if grouped else ())),
+        rows=tuple(study_row(*row, evaluators, config) for row in rows),
     )
 
 
-def _known(value: float | None) -> float | None:
-    return None if value is None or math.isnan(value) else value
+def _groups(
+    tokens: Sequence[str], attributes: Mapping[str, SampleAttributes], by: Sequence[str]
+) -> dict[str, list[str]]:
+    """The samples of each value of each attribute."""
+    here = {token: attributes[token] for token in sorted(tokens)}
+    return {group or "not known": found for name in by for group, found in tokens_by_value(here, name).items()}

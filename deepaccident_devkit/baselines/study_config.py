@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import get_args
 
 from deepaccident_devkit.baselines.motion_models import MotionModel
 from deepaccident_devkit.baselines.outlook import MOTION_MODELS
-from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.errors import ChoiceError, ConfigError
+from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS
 from deepaccident_devkit.motion.sample_lists import Scope
 from deepaccident_devkit.taxonomy import AGENTS, VEHICLE_AGENTS
@@ -26,7 +27,8 @@ class StudyConfig:
         protocol: of the accidents that are read off maps: `released`, `paper` or `boxes`. Those named explicitly are
             always evaluated by `boxes`.
         quick: fewer horizons and steps of noise and latency.
-        seed: of the links' draws.
+        seeds: of the links' draws of pose noise, kept as a tuple: a noisy row is of all of them together.
+        resampling: how intervals are made.
     """
 
     egos: Sequence[str] = VEHICLE_AGENTS[:1]
@@ -34,10 +36,11 @@ class StudyConfig:
     model: MotionModel = "constant_velocity"
     protocol: str = "paper"
     quick: bool = False
-    seed: int = 0
+    seeds: Sequence[int] = (0, 1, 2)
+    resampling: Resampling = field(default_factory=Resampling)
 
     def __post_init__(self) -> None:
-        """Check the choices; raises ChoiceError."""
+        """Check the choices; raises ChoiceError, and ConfigError for seeds that cannot be."""
         if isinstance(self.egos, str):
             raise ChoiceError(f"egos: expected several agents, found {self.egos!r}; give [{self.egos!r}] for one")
         object.__setattr__(self, "egos", tuple(self.egos))
@@ -46,3 +49,7 @@ class StudyConfig:
         for name, choices in (("scope", get_args(Scope)), ("model", MOTION_MODELS), ("protocol", PROTOCOLS)):
             if getattr(self, name) not in choices:
                 raise ChoiceError(f"{name}: expected one of {', '.join(choices)}, found {getattr(self, name)!r}")
+        object.__setattr__(self, "seeds", tuple(self.seeds))
+        whole = [each for each in self.seeds if type(each) is int]
+        if not whole or len(set(whole)) < len(self.seeds):
+            raise ConfigError(f"seeds: expected one or more whole numbers, each once, found {self.seeds}")

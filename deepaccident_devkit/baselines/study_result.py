@@ -5,15 +5,17 @@ from __future__ import annotations
 import csv
 import io
 import json
-import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Final
 
 from deepaccident_devkit.baselines.study_config import StudyConfig
+from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
+from deepaccident_devkit.evaluation.metrics.intervals import LEAST_CLUSTERS
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.text import columns_text
 
@@ -28,9 +30,14 @@ METRICS: Final[Mapping[str, str]] = {
     "time_error": "time (s)",
     "boxes_apa": "APA boxes",
     "boxes_recall": "recall boxes",
+    "mAP": "mAP",
 }
-"""Numbers of a row → how tables call them. IoU and VPQ are percent, accuracies and shares in [0, 1]; errors are means
-over the accidents foreseen within 10 m. What ends in `boxes` is by the protocol of that name."""
+"""Numbers of a row → how tables call them. IoU, VPQ and mAP are percent, accuracies and shares in [0, 1]; errors are
+means over the accidents foreseen within 10 m. What ends in `boxes` is by the protocol of that name; mAP is of the boxes
+that are seen, by the protocol `paper` of detections."""
+PERCENT: Final = ("iou_30", "vpq_30", "iou_100", "vpq_100", "mAP")
+_PRINTED: Final = ("iou_100", "vpq_100", "apa", "boxes_apa", "mAP")
+"""Numbers that the text has room for; CSV and JSON have all."""
 _FIELDS: Final[Mapping[str, str]] = {
     "agents": "agents",
     "horizon": "ahead (s)",
@@ -38,6 +45,7 @@ _FIELDS: Final[Mapping[str, str]] = {
     "latency": "late (s)",
     "group": "samples of",
 }
+_NONE: Final = (None, None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,8 +59,14 @@ class StudyRow(FrozenMappings):
         latency: seconds.
         group: the value of the table's attribute; `all` for every sample.
         samples: how many.
+        scenarios: how many they are of.
+        clusters: how many these are, where an accident and its twin are one (`attributes.cluster_of`).
         positives: of which an accident comes, by the study's protocol.
-        metrics: of `METRICS`; None where there is no value.
+        metrics: of `METRICS`, with pose noise of all seeds together; None where there is no value.
+        intervals: name of a metric → (low, high); those without one (docs/statistics.md) are not there.
+        gains: name of a metric → (low, high) of how much more it is than with a single vehicle, of rows with noise or
+            delay than with the same agents and a perfect link; those without such an interval are not there.
+        spread: name of a metric → the least and the most that a single seed gives; empty where one seed is enough.
     """
 
     agents: str
@@ -61,8 +75,13 @@ class StudyRow(FrozenMappings):
     latency: float
     group: str
     samples: int
+    scenarios: int
+    clusters: int
     positives: int
     metrics: Mapping[str, float | None]
+    intervals: Mapping[str, tuple[float, float]]
+    gains: Mapping[str, tuple[float, float]]
+    spread: Mapping[str, tuple[float, float]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,28 +101,41 @@ class StudyTable:
     rows: tuple[StudyRow, ...]
 
     def to_text(self) -> str:
-        """Aligned columns under the title."""
-        heading = [*(_FIELDS[name] for name in self.by), "samples", *METRICS.values()]
+        """Aligned columns under the title: numbers with their intervals, and beneath them what single seeds give."""
+        heading = [*(_FIELDS[name] for name in self.by), "samples", "scenarios", *(METRICS[name] for name in _PRINTED)]
         lines = [
-            [
-                *(_cell(getattr(row, name)) for name in self.by),
-                str(row.samples),
-                *(_number(row.metrics[name], 1 if name.startswith(("iou", "vpq")) else 2) for name in METRICS),
-            ]
+            [*self._names(row), str(row.samples), str(row.scenarios), *(sure_text(row, name) for name in _PRINTED)]
             for row in self.rows
         ]
-        return f"{self.title}\n{columns_text([heading, *lines])}"
+        text = f"{self.title}\n{columns_text([heading, *lines])}"
+        single = [[*self._names(row), *(_range(row, name) for name in _PRINTED)] for row in self.rows if row.spread]
+        if not single:
+            return text
+        heading = [*(_FIELDS[name] for name in self.by), *(METRICS[name] for name in _PRINTED)]
+        return f"{text}\n\n{self.title}: least and most of single seeds\n{columns_text([heading, *single])}"
 
     def to_csv(self) -> str:
-        """A heading, then a row a line; nothing where there is no value."""
-        names = (*_FIELDS, "samples", "positives")
+        """A heading, then a row a line; nothing where there is no value.
+
+        Of each number there are also the ends of its interval (`…_low`, `…_high`) and of its gain's (`…_gain_low`,
+        `…_gain_high`), and the least and the most of single seeds (`…_least`, `…_most`).
+        """
+        names = (*_FIELDS, "samples", "scenarios", "clusters", "positives")
         text = io.StringIO(newline="")
         writer = csv.writer(text, lineterminator="\n")
-        writer.writerow([*names, *METRICS])
-        writer.writerows(
-            [*(getattr(row, name) for name in names), *(row.metrics[name] for name in METRICS)] for row in self.rows
-        )
+        ends = ("", "_low", "_high", "_gain_low", "_gain_high", "_least", "_most")
+        writer.writerow([*names, *(f"{name}{end}" for name in METRICS for end in ends)])
+        for row in self.rows:
+            pairs = (row.intervals, row.gains, row.spread)
+            numbers = [
+                (row.metrics[name], *(end for each in pairs for end in each.get(name, _NONE))) for name in METRICS
+            ]
+            writer.writerow([*(getattr(row, name) for name in names), *chain.from_iterable(numbers)])
         return text.getvalue()
+
+    def _names(self, row: StudyRow) -> list[str]:
+        """What tells a row apart."""
+        return [_cell(getattr(row, name)) for name in self.by]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,7 +164,9 @@ class V2XStudy(FrozenMappings):
         how = f"{config.model.replace('_', ' ')}; accidents in maps by the protocol {config.protocol!r}"
         head = [
             f"V2X study of {self.split} in {self.dataroot} ({self.version})",
-            f"ego: {', '.join(config.egos)}; scenarios: {config.scope}; {how}; link seed {config.seed}",
+            f"ego: {', '.join(config.egos)}; scenarios: {config.scope}; {how}; detections: 'paper'",
+            f"pose noise: of the seeds {', '.join(map(str, config.seeds))} together",
+            *_intervals_text(config.resampling),
             *self.notes,
         ]
         return "\n\n".join(["\n".join(head), *(table.to_text() for table in self.tables.values())])
@@ -150,9 +184,32 @@ class V2XStudy(FrozenMappings):
         return paths
 
 
+def _intervals_text(resampling: Resampling) -> list[str]:
+    """What stands in brackets, and why elsewhere nothing does."""
+    if not resampling.resamples:
+        return []
+    what = f"[low, high]: intervals of {100 * resampling.confidence:g} %; a number has none where fewer than"
+    return [f"{what} {LEAST_CLUSTERS} clusters (an accident and its twin are one) have and change it"]
+
+
 def _cell(value: str | float) -> str:
     return value if isinstance(value, str) else f"{value:g}"
 
 
-def _number(value: float | None, digits: int) -> str:
-    return "–" if value is None or math.isnan(value) else f"{value:.{digits}f}"
+def sure_text(row: StudyRow, name: str) -> str:
+    """A row's metric as tables print it, with its interval if it has one: `73.0 [61.2, 82.4]`."""
+    number = number_text(row.metrics[name], name)
+    return f"{number} [{_ends(row.intervals[name], name)}]" if name in row.intervals else number
+
+
+def _range(row: StudyRow, name: str) -> str:
+    return _ends(row.spread[name], name) if name in row.spread else number_text(None, name)
+
+
+def _ends(ends: tuple[float, float], name: str) -> str:
+    return ", ".join(number_text(end, name) for end in ends)
+
+
+def number_text(value: float | None, name: str) -> str:
+    """A value of a metric as tables print it."""
+    return "–" if value is None else f"{value:.{1 if name in PERCENT else 2}f}"

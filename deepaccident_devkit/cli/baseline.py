@@ -6,8 +6,10 @@ import click
 
 from deepaccident_devkit.baselines import MOTION_MODELS, Baseline, StudyConfig, predict_results, v2x_study
 from deepaccident_devkit.baselines.figures import save_study
+from deepaccident_devkit.cli.evaluate_options import resamples_parameter
 from deepaccident_devkit.cli.options import release_parameters
 from deepaccident_devkit.deepaccident import DeepAccident
+from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS
 from deepaccident_devkit.evaluation.results import ResultsTask
 from deepaccident_devkit.files import write_bytes
@@ -88,13 +90,18 @@ def predict(split: str, tasks: tuple[str, ...], purpose: Any, scope: Scope, out:
     show_default=True,
     help="Of the accidents in maps; those named explicitly are always evaluated by boxes.",
 )
-@_SEED
+@click.option(
+    "--seed", "seeds", multiple=True, type=int, help="Of the pose noise; may be repeated.  [default: 0, 1, 2]"
+)
+@resamples_parameter
 @click.option("--quick", is_flag=True, help="Fewer horizons and steps of noise and latency.")
 @_OUT
-def v2x(split: str, egos: tuple[str, ...], out: str, **options: Any) -> None:
+def v2x(split: str, egos: tuple[str, ...], seeds: tuple[int, ...], resamples: int, out: str, **options: Any) -> None:
     """Print what seven sets of agents foresee of the release under DATAROOT; write a CSV and a picture a table."""
-    how = {name: options.pop(name) for name in ("model", "scope", "protocol", "seed", "quick")}
-    config = StudyConfig(egos=egos or StudyConfig().egos, **how)
+    how = {name: options.pop(name) for name in ("model", "scope", "protocol", "quick")}
+    usual = StudyConfig()
+    how |= {"egos": egos or usual.egos, "seeds": seeds or usual.seeds, "resampling": Resampling(resamples=resamples)}
+    config = StudyConfig(**how)
     folder = writable_folder(out)
     study = v2x_study(DeepAccident(**options), split, config, workers=options["workers"], progress=True)
     click.echo(study.to_text())

@@ -6,9 +6,9 @@ They take plain numbers: the study itself lies above this layer.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.render.axes import axes_or_new, detached_figure, figure_or_new, with_light_grid
 from deepaccident_devkit.render.pictures import write_figure
@@ -28,6 +28,7 @@ CONFIGURATION_COLORS: Final[Mapping[str, str]] = {
 }
 """Of the paper's seven."""
 _OTHER: Final = "#b5651d"
+_DARK: Final = "#333333"
 _PANEL: Final = (4.2, 3.8)
 _LEGEND: Final = 0.6
 _DPI: Final = 120
@@ -46,6 +47,7 @@ class Panel:
         ylabel: what the results are.
         top: the largest result that there can be.
         xlabel: what is varied: then there are lines; None for bars in groups.
+        intervals: configuration → group, or number varied → (low, high); drawn where there is one.
     """
 
     values: Mapping[str, Mapping[str | float, float | None]]
@@ -53,6 +55,7 @@ class Panel:
     ylabel: str
     top: float
     xlabel: str | None = None
+    intervals: Mapping[str, Mapping[str | float, tuple[float, float]]] = field(default_factory=dict)
 
 
 def render_panel(panel: Panel, *, ax: Axes | None = None) -> Axes:
@@ -114,6 +117,10 @@ def _draw_bars(panel: Panel, ax: Axes) -> None:
         middle = [index + (place - (len(panel.values) - 1) / 2) * width for index, _ in known]
         color = CONFIGURATION_COLORS.get(name, _OTHER)
         ax.bar(middle, [value for _, value in known], width=width * 0.92, color=color, label=name)
+        ends = panel.intervals.get(name, {})
+        _draw_intervals(
+            ax, [(x, ends[groups[at]]) for x, (at, _) in zip(middle, known, strict=True) if groups[at] in ends]
+        )
     ax.set_xticks(range(len(groups)), [str(group) for group in groups])
 
 
@@ -129,3 +136,9 @@ def _draw_lines(panel: Panel, ax: Axes) -> None:
             marker="so"[place % 2],
             markersize=6 - 2 * (place % 2),
         )
+        _draw_intervals(ax, list(panel.intervals.get(name, {}).items()), CONFIGURATION_COLORS.get(name, _OTHER))
+
+
+def _draw_intervals(ax: Axes, ends: Sequence[tuple[Any, tuple[float, float]]], color: str = _DARK) -> None:
+    """Upright lines from low to high ends at places along x."""
+    ax.vlines([x for x, _ in ends], [low for _, (low, _) in ends], [high for _, (_, high) in ends], color, linewidth=1)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 
 from deepaccident_devkit.render import detached_figure
@@ -36,6 +38,16 @@ def test_lines_go_over_the_number_that_is_varied() -> None:
     assert list(second.get_ydata()) == [95.0, 50.0]
     assert first.get_linestyle() != second.get_linestyle()
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("latency (s)", "IoU (%)")
+
+
+@pytest.mark.parametrize(("panel", "place"), [(BARS, "visible"), (LINES, 0.5)])
+def test_intervals_stand_at_their_numbers(panel: Panel, place: str | float) -> None:
+    given = replace(panel, intervals={"all": {place: (0.25, 0.9)}})
+    ax = render_panel(given, ax=detached_figure((3, 3)).subplots())
+    drawn = [segment for lines in ax.collections for segment in lines.get_segments()]  # type: ignore[attr-defined]
+    assert [segment[:, 1].tolist() for segment in drawn] == [[0.25, 0.9]]
+    bar = ax.containers[1][0] if panel is BARS else None  # type: ignore[index]
+    assert drawn[0][0, 0] == pytest.approx(bar.get_x() + bar.get_width() / 2 if bar else place)
 
 
 def test_panels_share_a_title_and_a_legend() -> None:
