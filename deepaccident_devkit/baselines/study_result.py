@@ -29,6 +29,7 @@ METRICS: Final[Mapping[str, str]] = {
     "position_error": "position (m)",
     "time_error": "time (s)",
     "boxes_apa": "APA boxes",
+    "boxes_precision": "precision boxes",
     "boxes_recall": "recall boxes",
     "mAP": "mAP",
 }

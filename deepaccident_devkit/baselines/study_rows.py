@@ -35,7 +35,7 @@ _PATHS: Final[Mapping[str, Mapping[str, str]]] = {
         "vpq_100": "ranges/100x100/pq",
     },
     "maps": {"apa": "apa", "id_error": "id_error", "position_error": "position_error", "time_error": "time_error"},
-    "boxes": {"boxes_apa": "apa", "boxes_recall": "recall"},
+    "boxes": {"boxes_apa": "apa", "boxes_precision": "precision", "boxes_recall": "recall"},
     "detection": {"mAP": "mean_average_precision"},
 }
 """Evaluator → number of a row → its path in that evaluator's result."""
