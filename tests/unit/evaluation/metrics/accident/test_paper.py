@@ -145,6 +145,15 @@ def test_one_seen_only_by_the_third_of_six_predictions() -> None:
     assert tallies(result(only_mean, label, replace(PAPER, predicted_by="mean"))) == [(1, 0, 0)] * 3
 
 
+def test_the_mean_is_the_last_prediction_and_no_other() -> None:
+    label, calm = scene(HIT), scene(CALM)
+    by_mean = replace(PAPER, predicted_by="mean")
+    for output in (as_maps(calm, label, calm), as_heads(calm, label, calm)):
+        assert tallies(result(output, label)) == [(1, 0, 0)] * 3
+        assert tallies(result(output, label, by_mean)) == [(0, 0, 1)] * 3
+        assert tallies(result(output, calm, by_mean)) == [(0, 0, 0)] * 3
+
+
 def test_which_of_several_predictions_is_compared() -> None:
     label, calm = scene(HIT), scene(CALM)
     near, far, farther = scene(moved(HIT, y=1)), scene(moved(HIT, y=3)), scene(moved(HIT, y=4))
@@ -164,6 +173,14 @@ def test_time_error_and_each_sides_own_time() -> None:
     assert (made.time_error, made.position_error, made.id_error) == (0.5, 0, 0)
     made = result(as_maps(early), label, replace(PAPER, position_time="truth"))
     assert (made.time_error, made.position_error) == (0.5, 1.0)
+
+
+def test_who_is_gone_at_the_true_time_is_compared_where_the_accident_was_predicted() -> None:
+    """Predicted half a second early; then the follower is nowhere, though the other one still stands there."""
+    gone = scene({1: standing(20, 10), 2: [*follower(4, 3, 0.5), None, None]})
+    for moment in ("own", "truth"):
+        counted = replace(PAPER, position_time=moment).counts(as_maps(gone), scene(HIT), AccidentContext())
+        assert (counted["best"]["time"], counted["best"]["position"]) == (-0.5, 0)
 
 
 def test_ids_are_judged_by_a_match_of_all_instances() -> None:

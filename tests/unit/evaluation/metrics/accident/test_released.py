@@ -237,6 +237,16 @@ def test_whom_the_truth_names() -> None:
     assert name(ego, pair=(2, 77), known=True) == "unknown"
 
 
+def test_the_truth_names_who_is_there_at_the_present() -> None:
+    """A frame later a third car is where one of the two was."""
+    there, passing = (4, 13), (4, 10.5)
+    label = scene({**HIT, 3: [there, passing, there, there, there]})
+    meta = AccidentContext(pair=(1, 2), known=True)
+    for rules in (RELEASED, replace(RELEASED, truth_through_heads=False)):
+        found = counts(as_heads(label), label, rules, meta)
+        assert (found["positive"], found["named"]) == (True, "meta")
+
+
 def evaluated(evaluator: AccidentEvaluator | None = None, tokens: str = "abcd") -> AccidentEvaluator:
     """A true positive, one 7 m off, a missed one, a false alarm."""
     evaluator = AccidentEvaluator() if evaluator is None else evaluator

@@ -26,10 +26,13 @@ def test_protocols_and_switches_that_cannot_be() -> None:
         ({"small_thresholds": (1.0,)}, "as many as thresholds"),
         ({"global_sort": False}, "curve='voc'"),
         ({"min_precision": 1.0}, "below 1"),
+        ({"min_recall": 1.0}, "below 1"),
+        ({"points": 1}, "at least 2"),
     ):
         with pytest.raises(ConfigError, match=said):
             detection_protocol("paper", **switches)
     assert detection_protocol("paper", thresholds=[1, 2, 4]).thresholds == (1, 2, 4)
+    assert detection_protocol("paper", points=2, min_recall=0.99).points == 2
 
 
 @pytest.mark.parametrize("protocol", DETECTION_PROTOCOLS.values(), ids=DETECTION_PROTOCOLS)

@@ -206,6 +206,15 @@ def test_cells_and_instances_are_of_the_last_prediction() -> None:
     assert evaluated(still(boxes(_7=100), boxes(_1=50)), label).ranges["30x30"].pq == 0
 
 
+def test_a_cell_that_is_as_much_background_as_actor_is_background() -> None:
+    logits = np.zeros((5, 2, 200, 200), dtype=np.float32)
+    logits[:, 1, 100:104, 100:102] = 1e-6
+    vectors = np.zeros_like(logits)
+    heads = MotionHeads.from_arrays(logits, vectors[:, :1], vectors, vectors)
+    result = evaluated(MotionOutput(grid=CONFIG.grid, heads=(heads,)), boxes_label(*[boxes(_1=100)] * 5))
+    assert [each.iou for each in result.ranges.values()] == [50.0, 50.0]
+
+
 def test_a_path_too_far_away_is_no_partner() -> None:
     label = boxes_label(*[boxes(_4=100)] * 5)
     result = evaluated(still(boxes(_1=109)), label)
@@ -262,6 +271,15 @@ def test_each_part_of_the_protocol_has_variants() -> None:
     assert variants["trajectories.miss_distance=2.0"].trajectories.miss_distance == 2
     assert {name.split(".")[0].split("=")[0] for name in variants} >= {"instances", "gate", "nothing_is_zero"}
     assert protocol not in variants.values()
+
+
+def test_limits_of_errors_are_explained_by_the_released_ones_and_by_none() -> None:
+    def limits(protocol: MotionProtocol) -> set[float]:
+        variants = protocol.variants()
+        return {each.trajectories.fde_limit for name, each in variants.items() if "fde_limit" in name}
+
+    assert limits(MotionProtocol()) == {math.inf}
+    assert limits(MotionProtocol(trajectories=TrajectoryRules(fde_limit=3.0))) == {10.0, math.inf}
 
 
 def test_paths_can_be_left_out() -> None:
