@@ -19,11 +19,8 @@ from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
 from deepaccident_devkit.evaluation.metrics.intervals import (
     LEAST_CLUSTERS,
     Clusters,
-    interval_ends,
+    difference_intervals,
     intervals_of,
-    leaving_out,
-    numbers_of_draws,
-    parts_of,
 )
 from deepaccident_devkit.evaluation.metrics.numbers import numbers_of
 
@@ -112,11 +109,8 @@ def _gains(
     if not resampling.resamples or len(counts) < LEAST_CLUSTERS:
         return {}
     found = [numbers_of(evaluator.result_of([*chain.from_iterable(each)])) for each in (base, counts)]
-    values, others = (np.array([each.get(path, math.nan) for path in paths]) for each in found)
-    parts = [parts_of(each, resampling) for each in (base, counts)]
-    without, left_out = (numbers_of_draws(evaluator, each, leaving_out(len(each)), paths) for each in parts)
-    unlimited = np.broadcast_to((-math.inf, math.inf), (len(paths), 2))
-    low, high = interval_ends(others - values, left_out - without, unlimited, resampling.confidence)
+    gained = {path: found[1].get(path, math.nan) - found[0].get(path, math.nan) for path in paths}
+    low, high, _ = difference_intervals(evaluator, (base, counts), gained, resampling)
     return {path: (float(low[at]), float(high[at])) for at, path in enumerate(paths) if np.isfinite(low[at])}
 
 

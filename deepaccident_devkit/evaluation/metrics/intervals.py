@@ -100,6 +100,31 @@ def intervals_of(
     return Intervals(ends=ends, notes=tuple(_notes(without)))
 
 
+def difference_intervals(
+    evaluator: Evaluator[Any],
+    pair: tuple[Clusters, Clusters],
+    differences: Mapping[str, float],
+    resampling: Resampling,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Intervals of how two sets of counts of the same clusters differ, the same clusters left out of both.
+
+    Args:
+        evaluator: that knows the counts.
+        pair: of each set the counts of the same clusters, in the same order.
+        differences: number, by its path → second − first, of all clusters together.
+        resampling: how.
+
+    Returns:
+        (M,) low and (M,) high ends, NaN for none (`interval_ends`), and (M,) standard errors.
+    """
+    names, values = list(differences), np.array(list(differences.values()))
+    parts = [parts_of(each, resampling) for each in pair]
+    first, second = (numbers_of_draws(evaluator, each, leaving_out(len(each)), names) for each in parts)
+    unlimited = np.broadcast_to((-math.inf, math.inf), (len(names), 2))
+    low, high = interval_ends(values, second - first, unlimited, resampling.confidence)
+    return low, high, standard_errors(values, second - first)[0]
+
+
 def few_clusters(count: int) -> str:
     """Says that there are fewer clusters than intervals need."""
     return (

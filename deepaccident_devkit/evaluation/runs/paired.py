@@ -20,11 +20,8 @@ from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
 from deepaccident_devkit.evaluation.metrics.intervals import (
     Clusters,
     Resampling,
-    interval_ends,
-    leaving_out,
+    difference_intervals,
     numbers_of_draws,
-    parts_of,
-    standard_errors,
 )
 from deepaccident_devkit.evaluation.metrics.numbers import has_interval
 
@@ -107,11 +104,7 @@ def paired_test(
         ordered = [[run[at] for at in np.argsort(np.logical_not(unlike), kind="stable")] for run in runs]
         p = p_values(observed, swapped_differences(evaluator, ordered, swaps, names), swaps)
     if resampling.resamples and len(unlike) > 1:
-        parts = [parts_of(run, resampling) for run in runs]
-        first, second = (numbers_of_draws(evaluator, run, leaving_out(len(run)), names) for run in parts)
-        unlimited = np.broadcast_to((-math.inf, math.inf), (len(names), 2))
-        low, high = interval_ends(observed, second - first, unlimited, resampling.confidence)
-        errors, _ = standard_errors(observed, second - first)
+        low, high, errors = difference_intervals(evaluator, runs, differences, resampling)
     without = [not has_interval(name) for name in names]
     for column in (low, high, errors):
         column[without] = math.nan

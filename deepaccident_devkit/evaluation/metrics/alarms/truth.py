@@ -153,17 +153,20 @@ def accident_context(
     own_actor_id = dataset.get("agent", there["agent_token"])["actor_id"]
     involvement = _involvement(there["agent"], own_actor_id, collision, other)
     present = int(there["token"].rsplit("/", 1)[1])
+    tracks = scenario_tracks(dataset, scenario) if horizon is not None or references else None
     return AccidentContext(
         pair=None if collision is None else (collision["ids"][0], collision["ids"][1]),
         known=scenario["weather"] is not None,
         own_actor_id=own_actor_id,
-        truth=None if horizon is None else box_truth(dataset, there, horizon),
+        truth=None if horizon is None or tracks is None else _box_truth(dataset, there, scenario, tracks, horizon),
         time_to_impact=there["time_to_impact"],
         time_to_end=there["time_to_end"],
         twin=twin,
         time_to_twin_impact=(other["num_frames"] - present) * FRAME_PERIOD if twin and other is not None else None,
         involvement=involvement,
-        references=_references(dataset, there, own_actor_id, involvement) if references else {},
+        references=(
+            {} if not references or tracks is None else _references(dataset, there, tracks, own_actor_id, involvement)
+        ),
     )
 
 
@@ -185,11 +188,17 @@ def box_truth(dataset: Dataset, sample: RowArgument, horizon: float = RELEASED_H
     """
     there = labelled_sample(dataset, sample)
     scenario = dataset.get("scenario", there["scenario_token"])
+    return _box_truth(dataset, there, scenario, scenario_tracks(dataset, scenario), horizon)
+
+
+def _box_truth(
+    dataset: Dataset, there: Mapping[str, Any], scenario: Mapping[str, Any], tracks: ScenarioTracks, horizon: float
+) -> BoxTruth:
+    """`box_truth` of a sample whose scenario's tracks are read."""
     if scenario["weather"] is None:
         raise NotAvailableError(f"{scenario['token']} has no meta file, which names the colliding pair; unpack meta")
-    tracks = scenario_tracks(dataset, scenario)
     present = int(there["token"].rsplit("/", 1)[1])
-    boxes = tracks.boxes.transform(dataset.world_from(there, "ego").inverse(), "ego")
+    boxes = tracks.boxes.transform(dataset.world_from(there["token"], "ego").inverse(), "ego")
     footprints = np.column_stack([boxes.center[:, :2], boxes.size[:, :2], boxes.yaw])
     last = min(scenario["num_frames"], present + round(horizon / FRAME_PERIOD))
     inside = (tracks.index >= present) & (tracks.index <= last)
@@ -260,16 +269,17 @@ def _involvement(
 
 
 def _references(
-    dataset: Dataset, sample: Mapping[str, Any], own_actor_id: int | None, involvement: Involvement
+    dataset: Dataset,
+    sample: Mapping[str, Any],
+    tracks: ScenarioTracks,
+    own_actor_id: int | None,
+    involvement: Involvement,
 ) -> dict[str, tuple[Accident, ...]]:
     """What constant velocities lead to, in the present ego frame; for one who is involved, of its own pairs alone."""
     present = int(sample["token"].rsplit("/", 1)[1])
     ego_from_world = dataset.world_from(sample["token"], "ego").inverse()
     seen = seen_actors(dataset, sample["token"])
-    boxes = (
-        scenario_tracks(dataset, sample["scenario_token"]).at(present).transform(ego_from_world, "ego"),
-        seen.boxes,
-    )
+    boxes = (tracks.at(present).transform(ego_from_world, "ego"), seen.boxes)
     own = own_actor_id if involvement == "ego_involved" else None
     return {
         name: constant_velocity_alarms(each, {OWN_ACTOR_ID: own_actor_id}, own)

@@ -28,6 +28,7 @@ from deepaccident_devkit.evaluation.metrics.warning.drives import (
     twin_pairs,
 )
 from deepaccident_devkit.evaluation.metrics.warning.protocol import WarningRules
+from deepaccident_devkit.evaluation.metrics.warning.recordings import KINDS
 
 RANDOM_DRAWS: Final = 20
 LATENCIES: Final = (0.0, 0.1, 0.3)
@@ -102,7 +103,8 @@ class AnticipationResult(FrozenMappings):
 class CleanWarnings(WarningRules):
     """The accidents that are foreseen, recording by recording, without the quirks of published anticipation metrics.
 
-    A recording's score at a sample is that of its surest alarm, 0 without one; from the impact on nothing counts.
+    A recording's score at a sample is that of its surest alarm, below all thresholds without one; from the impact on
+    nothing counts.
 
     Attributes:
         scores_of: whose alarms count where somebody collides: those of the `pair` that does (right ones), or all of the
@@ -189,7 +191,7 @@ class _Table:
             threshold = scores.threshold_of_highest_recall(weight) if math.isnan(r80) else r80
         else:
             threshold = operating
-        counted = {kind: int(weight[self._kind == kind].sum()) for kind in ("accident", "twins", "others")}
+        counted: dict[str, int] = {kind: int(weight[self._kind == kind].sum()) for kind in KINDS}
         after = partial(scores.tta0_after, threshold, weight)
         return AnticipationFigures(
             auc_ahead=scores.area_at_moments(weight),

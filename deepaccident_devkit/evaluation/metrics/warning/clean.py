@@ -90,6 +90,9 @@ class CleanScores:
         # beyond all thresholds of use: those that a recording's highest score is
         self._levels = np.unique(self.highest[np.isfinite(self.highest)])[::-1]
         self._leads = series.leads(self._levels)
+        self._place = np.searchsorted(-self._levels, -self.highest, side="left")
+        below = [np.searchsorted(row, self._levels) for row in np.sort(self._scores, axis=1)]
+        self._alarmed = self._scores.shape[1] - np.array(below).reshape(len(below), len(self._levels))
 
     def average_precision(self, weight: FloatArray) -> float:
         """Σ (R_k − R_{k−1}) P_k over the recordings' highest scores, falling; NaN without an accident.
@@ -156,8 +159,7 @@ class CleanScores:
         frames = float((self._frames[others] * weight[others]).sum())
         if not frames:
             return math.nan
-        below = np.array([np.searchsorted(row, self._levels) for row in np.sort(self._scores[others], axis=1)])
-        alarmed = ((self._scores.shape[1] - below) * weight[others, None]).sum(axis=0)
+        alarmed = (self._alarmed[others] * weight[others, None]).sum(axis=0)
         raised = np.diff(sum(self._raised(weight)), prepend=0.0) > 0  # levels of recordings that count
         good = np.flatnonzero((alarmed * _MINUTE <= seconds_per_minute * frames + _SLACK) & raised)
         return float(self._levels[good[-1]]) if len(good) else math.nan
@@ -207,12 +209,13 @@ class CleanScores:
 
     def _raised(self, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(K,) accident recordings, and others, whose highest score is at least each level."""
-        place = np.searchsorted(-self._levels, -self.highest, side="left")
         there = np.isfinite(self.highest)
         sums: list[FloatArray] = []
         for kind in (self.series.positive, ~self.series.positive):
             chosen = kind & there
-            sums.append(np.cumsum(np.bincount(place[chosen], weight[chosen], len(self._levels)).astype(np.float64)))
+            sums.append(
+                np.cumsum(np.bincount(self._place[chosen], weight[chosen], len(self._levels)).astype(np.float64))
+            )
         return sums[0], sums[1]
 
     def _recalls(self, weight: FloatArray) -> FloatArray:

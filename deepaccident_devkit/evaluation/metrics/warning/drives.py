@@ -13,7 +13,7 @@ from typing import Final, Literal, get_args
 import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray, FrozenArrays, IntArray
-from deepaccident_devkit.evaluation.metrics.alarms.truth import REFERENCES
+from deepaccident_devkit.evaluation.metrics.alarms.truth import REFERENCES, Involvement
 from deepaccident_devkit.evaluation.metrics.attributes import cluster_of
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
 from deepaccident_devkit.evaluation.metrics.warning.recordings import Kind, surest
@@ -26,7 +26,7 @@ GIVEN: Final = "given"
 TRIVIAL: Final = ("always", "never", "random per frame", "random per recording")
 PREDICTORS: Final = (GIVEN, *TRIVIAL, *REFERENCES)
 """Rows of every table: the predictions, four predictors that know nothing, and two that know the present."""
-GROUPS: Final = ("ego_involved", "bystander", "infrastructure", "unknown")
+GROUPS: Final = (*get_args(Involvement), "unknown")
 """Of recordings, never pooled: by `Involvement`; `unknown` where no context says it."""
 _PLACE: Final = itemgetter("recording", "frame")
 _COLUMN: Final[Mapping[ScoresOf, int]] = {name: column for column, name in enumerate(get_args(ScoresOf))}
