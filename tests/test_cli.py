@@ -59,6 +59,7 @@ def test_errors_are_one_message_and_status_2(tmp_path: Path) -> None:
         assert failed.stdout == ""
 
 
+@pytest.mark.slow
 def test_a_broken_release_is_listed_and_may_be_skipped(own_release: Path) -> None:
     broken = next(own_release.glob("train/*/ego_vehicle/label/*/*_002.txt"))
     broken.write_text("0 0\ncar 1 2 3 4\n")
@@ -90,6 +91,7 @@ def test_help_names_the_verbs_and_wrong_usage_is_status_2() -> None:
     assert "0.1.0" in runner.invoke(deepaccident, ["--version"]).output
 
 
+@pytest.mark.slow
 def test_index_check_sees_an_edit_that_folder_times_hide(own_release: Path) -> None:
     run("index", own_release)
     label = next(own_release.glob("train/*/ego_vehicle/label/*/*_001.txt"))
@@ -110,6 +112,7 @@ def test_a_verb_does_not_wait_for_what_others_import() -> None:
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=60, check=False).returncode == 0
 
 
+@pytest.mark.slow
 def test_demo_draws_its_accident(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     demo_module = importlib.import_module("deepaccident_devkit.cli.demo")
     monkeypatch.setattr(
@@ -136,6 +139,7 @@ def test_demo_draws_its_accident(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert "using the release that is in" in again.output
 
 
+@pytest.mark.slow
 def test_split_makes_the_official_split_and_writes_it(tmp_path: Path) -> None:
     root = tmp_path / "release"
     name = "Town03_type001_subtype0001_scenario000"
@@ -154,6 +158,7 @@ def test_split_makes_the_official_split_and_writes_it(tmp_path: Path) -> None:
     assert tuple(read_split_file(tmp_path / "new" / "train.txt")) != by_library["train"]
 
 
+@pytest.mark.slow
 def test_split_saves_a_selection(own_release: Path, tmp_path: Path) -> None:
     saved = run(
         "split", own_release, "--where", "collision=true", "--where", "split=train", "--save", tmp_path / "a.txt"
@@ -172,6 +177,7 @@ def test_split_saves_a_selection(own_release: Path, tmp_path: Path) -> None:
     assert (wrong.returncode, wrong.stderr.startswith("error: scenarios cannot be found by 'wether'")) == (2, True)
 
 
+@pytest.mark.slow
 def test_info_counts_only_the_scenarios_of_where(own_release: Path) -> None:
     whole = json.loads(run("info", own_release, "--json").stdout)
     some = json.loads(run("info", own_release, "--json", "--where", "designed_accident=true").stdout)
@@ -183,6 +189,7 @@ def test_info_counts_only_the_scenarios_of_where(own_release: Path) -> None:
     assert (wrong.returncode, "town: found 'Twon03'; possible are Town03" in wrong.stderr) == (2, True)
 
 
+@pytest.mark.slow
 def test_stats_prints_and_writes_tables_and_figures(own_release: Path, tmp_path: Path) -> None:
     out = tmp_path / "new" / "stats"
     made = run("stats", own_release, "--where", "designed_accident=true", "--out", out, "--format", "png")
@@ -201,6 +208,7 @@ def test_stats_prints_and_writes_tables_and_figures(own_release: Path, tmp_path:
     assert (misplaced.returncode, "--format is for figures; give --out FOLDER too" in misplaced.stderr) == (2, True)
 
 
+@pytest.mark.slow
 def test_stats_says_before_anything_else_what_it_cannot_write(own_release: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     faults = {
@@ -215,6 +223,7 @@ def test_stats_says_before_anything_else_what_it_cannot_write(own_release: Path,
         assert "Traceback" not in failed.stderr
 
 
+@pytest.mark.slow
 def test_stats_of_nothing(own_release: Path, tmp_path: Path) -> None:
     nothing = run("stats", own_release, "--where", "length=1..2")
     assert nothing.returncode == run("info", own_release, "--where", "length=1..2").returncode == 0
@@ -226,6 +235,7 @@ def test_stats_of_nothing(own_release: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.slow
 def test_labels_writes_a_split_and_goes_on_where_it_stopped(own_release: Path, tmp_path: Path) -> None:
     out, agents = tmp_path / "new" / "labels", ("ego_vehicle", "infrastructure")
     verb = ("labels", own_release, "--split", "train", "--out", out, "--workers", 2)
@@ -250,6 +260,7 @@ def test_labels_writes_a_split_and_goes_on_where_it_stopped(own_release: Path, t
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "told"),
     [
@@ -291,6 +302,7 @@ def test_labels_looks_at_its_folder_before_it_indexes(own_release: Path, tmp_pat
     assert not (own_release / ".deepaccident").exists()
 
 
+@pytest.mark.slow
 def test_labels_of_what_has_none(tmp_path: Path) -> None:
     write_tiny_release(tmp_path / "test", labelled=False)
     (tmp_path / "mine.txt").write_text(f"{TYPE} {NAME}\n")

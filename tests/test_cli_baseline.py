@@ -13,6 +13,8 @@ from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.v2x import Link
 
+pytestmark = pytest.mark.slow
+
 
 def run(*arguments: object) -> str:
     result = CliRunner().invoke(deepaccident, ["baseline", *map(str, arguments)], catch_exceptions=False)

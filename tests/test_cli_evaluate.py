@@ -93,6 +93,7 @@ def bundle(da_motion: DeepAccident, folder: Path, accidents: Path) -> Path:
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("task", "results", "protocol", "headline"),
     [
@@ -123,6 +124,7 @@ def test_every_task_and_protocol(
     assert "PARTIAL" not in text
 
 
+@pytest.mark.slow
 def test_a_bundle_with_all_there_is(bundle: Path, accidents: Path, da_motion: DeepAccident) -> None:
     names = {path.name for path in bundle.iterdir()}
     assert names == {
@@ -137,6 +139,7 @@ def test_a_bundle_with_all_there_is(bundle: Path, accidents: Path, da_motion: De
     assert not bundle.with_name("bundle.unfinished").exists()
 
 
+@pytest.mark.slow
 def test_json_is_the_summary(da_motion: DeepAccident, accidents: Path, tmp_path: Path) -> None:
     words = ("accident", da_motion.dataroot, "--results", accidents, *LIST, "--protocol", "boxes")
     done = evaluate(*words, "--by", "town", "--switch", "scoring.limit_counts=true", "--json", "--out", tmp_path / "b")
@@ -148,6 +151,7 @@ def test_json_is_the_summary(da_motion: DeepAccident, accidents: Path, tmp_path:
 
 
 class TestPartial:
+    @pytest.mark.slow
     def test_refused_unless_allowed_and_marked_everywhere(
         self, da_motion: DeepAccident, tokens: list[str], tmp_path: Path
     ) -> None:

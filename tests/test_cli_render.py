@@ -40,6 +40,7 @@ def accident(da: DeepAccident) -> str:
     return next(record["token"] for record in da.scenario if record["collision"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verb", sorted(set(_PICTURES) - {"evaluation"}))
 def test_every_view_draws_the_first_accident_when_no_token_is_given(
     da: DeepAccident, accident: str, tmp_path: Path, verb: str
@@ -88,6 +89,7 @@ def test_several_rows_go_into_a_folder(da: DeepAccident, accident: str, tmp_path
     assert sorted(path.name for path in out.iterdir()) == names
 
 
+@pytest.mark.slow
 def test_a_range_of_frames_of_a_scenario(da: DeepAccident, accident: str, tmp_path: Path) -> None:
     run("sample", da.dataroot, accident, "--frame-range", "2..3", "--out", tmp_path, "--size", "640x240", "--dpi", 40)
     assert [path.name[-15:] for path in sorted(tmp_path.iterdir())] == ["vehicle_002.png", "vehicle_003.png"]

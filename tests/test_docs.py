@@ -34,6 +34,8 @@ from deepaccident_devkit.evaluation.metrics.warning import (
 from deepaccident_devkit.geometry import Box
 from deepaccident_devkit.motion import LabelProtocol, PostProcessing
 
+pytestmark = pytest.mark.slow
+
 TOP = Path(__file__).parents[1]
 DOCS = TOP / "docs"
 FROM_NUSCENES = (DOCS / "from_nuscenes.md").read_text(encoding="utf-8")

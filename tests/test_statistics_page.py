@@ -28,6 +28,7 @@ def benchmark() -> Iterator[ModuleType]:
         sys.path.remove(str(TOP))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["shares", "ratios of areas", "means", "differences of two runs' shares"])
 @pytest.mark.parametrize(("clusters", "least"), [(8, 0.86), (52, 0.9)])
 def test_intervals_hold_the_truth(benchmark: ModuleType, kind: str, clusters: int, least: float) -> None:
@@ -41,6 +42,7 @@ def test_intervals_hold_the_truth(benchmark: ModuleType, kind: str, clusters: in
     assert benchmark.mean([cell.old for cell in cells]) < 0.93
 
 
+@pytest.mark.slow
 def test_differences_are_not_called_real_by_chance(benchmark: ModuleType) -> None:
     made = list(benchmark.power(DRAWS))
     falsely = [each for each in made if not each.effect]

@@ -11,6 +11,8 @@ from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.motion import samples
 from deepaccident_devkit.render.evaluation import save_report
 
+pytestmark = pytest.mark.slow
+
 LONG = "a_name_without_any_blank_that_is_much_longer_than_a_telephone_is_wide_" * 3
 SETUPS = (
     EvaluationSetup(task="motion"),

@@ -17,6 +17,8 @@ from deepaccident_devkit.render.replay import render_replay
 from deepaccident_devkit.render.replay.recording import recording_of
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 35
 PIXELS = """
 const canvas = document.getElementById('ground');

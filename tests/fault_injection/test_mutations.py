@@ -8,6 +8,8 @@ from fault_injection.mutations import MUTATIONS
 from fault_injection.place import Place
 from fault_injection.run import Job, mutate, places
 
+pytestmark = pytest.mark.slow
+
 SEED = 1
 
 

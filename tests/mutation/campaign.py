@@ -32,6 +32,7 @@ TESTS = {
     "property/test_motion_metrics parity/test_accident parity/test_attributes parity/test_detection parity/test_motion",
     "evaluation/results": "unit/evaluation/results",
     "evaluation/runs": "unit/evaluation/runs",
+    "evaluation/__init__": "unit/evaluation/runs",
     "v2x": "unit/v2x property/test_v2x parity/test_poses parity/test_visibility",
     "splits": "unit/test_splits",
 }
@@ -76,7 +77,7 @@ class Campaign:
         places = [place for room in rooms for place in _places(room)]
         found = {path for place in places for path in ROOT.glob(f"{place}*")}
         paths = map(str, sorted(found, reverse=True))  # the package after its tests: as pytest does by itself
-        return pytest.main(["-q", "-p", "no:cacheprovider", "-p", "no:xdist", *paths], plugins=[self])
+        return pytest.main(["-q", "-m", "", "-p", "no:cacheprovider", "-p", "no:xdist", *paths], plugins=[self])
 
     @staticmethod
     def pytest_collection() -> None:

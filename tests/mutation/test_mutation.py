@@ -76,6 +76,7 @@ def test_a_mutant_is_planted_wherever_it_is_held(tmp_path: Path, monkeypatch, be
     assert (near.__wrapped__(2), *limits()) == found
 
 
+@pytest.mark.slow
 def test_fewer_mutants_are_the_first_of_more() -> None:
     many = drawn(400, 17)
     assert drawn(50, 17) == many[:50]

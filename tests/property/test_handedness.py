@@ -127,6 +127,7 @@ LIDAR_TO_EGO = carla_matrix(np.array([0.1, -0.2, 1.94]), 0.12, 0.02, -0.03)
 RAW_CORNERS = np.array([[x, y, z] for x in (1, -1) for y, z in ((-1, 1), (1, 1), (1, -1), (-1, -1))])
 
 
+@pytest.mark.slow
 @given(
     one_to_world=vehicle_poses(),
     other_to_world=vehicle_poses(),

@@ -25,10 +25,12 @@ def assert_five_agents_win(da: DeepAccident, *, map_gain: float) -> None:
     assert together.split()[-3:] == [f"{five.warning:.1f}", f"{five.precision:.2f}", f"{100 * five.false_time:.0f}"]
 
 
+@pytest.mark.slow
 def test_five_agents_win_on_the_demos_seed(da_hidden: DeepAccident) -> None:
     assert_five_agents_win(da_hidden, map_gain=10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 3])
 def test_five_agents_win_on_other_seeds(tmp_path: Path, seed: int) -> None:
     """On maps the less, the more of the traffic is parked, or on the ego vehicle's own road."""

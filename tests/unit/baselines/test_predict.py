@@ -131,6 +131,7 @@ def test_what_cannot_be_is_refused(
         predict_accidents(da_hidden, tokens[0], **options)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_results_are_the_predictions_and_the_same_bytes_with_two_workers(
     da_hidden: DeepAccident, tokens: list[str], tmp_path_factory: pytest.TempPathFactory
 ) -> None:

@@ -25,6 +25,8 @@ from deepaccident_devkit.evaluation import DetectedBoxes, DetectionEvaluator, Re
 from deepaccident_devkit.evaluation.metrics.intervals import intervals_of
 from deepaccident_devkit.v2x import AGENT_CONFIGS
 
+pytestmark = pytest.mark.slow
+
 QUICK = StudyConfig(quick=True, seeds=[0, 1])
 TABLES = ["configurations", "visibility", "horizons", "pose_noise", "latency"]
 

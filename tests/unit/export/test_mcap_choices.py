@@ -66,6 +66,7 @@ def test_labels_can_be_left_out(da: DeepAccident, scenario: str, tmp_path: Path)
     assert topics == {"/log", "/tf", "/ego_vehicle/pose", "/time_to_impact"}
 
 
+@pytest.mark.slow
 def test_scenarios_without_labels_have_poses_and_no_boxes(own_release: Path, tmp_path: Path) -> None:
     for folder in list(own_release.glob("*/*/*/label")):
         shutil.rmtree(folder)

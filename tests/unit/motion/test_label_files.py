@@ -116,6 +116,7 @@ def write(release: DeepAccident, folder: Path, tokens: list[str], config: Motion
 
 
 class TestRoundTrip:
+    @pytest.mark.slow
     def test_every_sample_reads_as_it_is_made(self, da_motion: DeepAccident, tmp_path: Path) -> None:
         tokens = [record["token"] for record in da_motion.sample]
         done = write(da_motion, tmp_path / "a" / "new folder", tokens, workers=2)
@@ -125,6 +126,7 @@ class TestRoundTrip:
         for token in tokens[::3]:
             assert_same(files[token], motion_labels(da_motion, token))
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("name", CONFIGS)
     def test_every_configuration(self, da_motion: DeepAccident, tmp_path: Path, name: str) -> None:
         tokens = tokens_of(da_motion, 1, 27, agents=("ego_vehicle", "infrastructure"))
@@ -133,6 +135,7 @@ class TestRoundTrip:
         for token in random.Random(0).sample(tokens, len(tokens)):  # noqa: S311 - any order
             assert_same(files[token], motion_labels(da_motion, token, CONFIGS[name]))
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("name", ["clean, everybody, untracked too", "everybody", "slips of one's own"])
     def test_untracked_actors(self, small: DeepAccident, tmp_path: Path, name: str) -> None:
         """Each row is an instance without an actor, or all are actor −1."""
@@ -172,6 +175,7 @@ class TestRoundTrip:
         labels = motion_labels(small, tokens_of(small, 12)[0], id_map={**before, 77: 400})
         assert_same(StoredLabels.of(labels).labels(labels.config), labels)
 
+    @pytest.mark.slow
     def test_bytes_do_not_depend_on_time_workers_or_order(self, da_motion: DeepAccident, tmp_path: Path) -> None:
         tokens = tokens_of(da_motion, 5, 30)
         write(da_motion, tmp_path / "one", tokens)
@@ -185,6 +189,7 @@ class TestRoundTrip:
 class TestPage:
     """schema/motion_labels.md."""
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("name", ["deepaccident", "fiery", "clean", "released orientation", "oblong, as fiery"])
     def test_its_lines_rebuild_the_maps(self, da_motion: DeepAccident, tmp_path: Path, name: str) -> None:
         """With numpy alone, to the bit; a sample in the midst and one whose future is beyond the recording."""
@@ -373,6 +378,7 @@ class TestReading:
         monkeypatch.chdir("/")
         assert_same(relative[next(iter(files))], files[next(iter(files))])
 
+    @pytest.mark.slow
     def test_threads_and_spawned_processes_read_the_same(self, files: LabelFiles) -> None:
         tokens = random.Random(1).choices(list(files), k=60)  # noqa: S311
         expected = {token: files[token] for token in files}
@@ -383,6 +389,7 @@ class TestReading:
             assert_same(processes.submit(operator.getitem, files, tokens[0]).result(), expected[tokens[0]])
         assert_same(pickle.loads(pickle.dumps(files))[tokens[1]], expected[tokens[1]])
 
+    @pytest.mark.slow
     def test_forked_processes_read_at_once(self, files: LabelFiles) -> None:
         script = """
 import os, sys
@@ -419,6 +426,7 @@ class TestDamage:
     def path(self, folder: Path) -> Path:
         return folder / f"{tiny.TOKEN}" / "ego_vehicle.npz"
 
+    @pytest.mark.slow
     def test_any_byte_of_a_file(self, small: DeepAccident, folder: Path, path: Path) -> None:
         """The labels or our error, whatever byte is another."""
         whole, token = path.read_bytes(), tokens_of(small, 3)[0]
@@ -436,6 +444,7 @@ class TestDamage:
         assert told.endswith("; remove it and run `deepaccident labels` again")
         assert refused > 20
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("keep", [0, 1, 500, -1, None])
     def test_a_file_cut_short_or_gone_is_made_again(
         self, small: DeepAccident, folder: Path, path: Path, keep: int | None
@@ -462,6 +471,7 @@ class TestDamage:
         assert write(small, folder, [token]).written == 1
         assert_same(LabelFiles(folder)[token], motion_labels(small, token))
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("member", ["instance", "center", "flow", "actor", "future_egomotion", "valid"])
     def test_arrays_that_cannot_be_the_samples(
         self, small: DeepAccident, path: Path, folder: Path, member: str
@@ -478,6 +488,7 @@ class TestDamage:
         with pytest.raises(LabelFilesError, match=r"ego_vehicle\.npz: .*expected .*found"):
             LabelFiles(folder)[tokens_of(small, 3)[0]]
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         "text",
         ["", "{", "[]", "null", "3", "\0", "[" * 100_000, "\xff", '{"format": "DeepAccident motion labels"}'],
@@ -490,6 +501,7 @@ class TestDamage:
                 use()
         assert contents(folder) == before
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         "change",
         [
@@ -592,6 +604,7 @@ def labels_verb(*arguments: object) -> list[str]:
 
 
 class TestStops:
+    @pytest.mark.slow
     def test_killed_around_every_renaming(self, root: Path, tmp_path: Path) -> None:
         small = opened(root)
         tokens = tokens_of(small, 3, 7, agents=("ego_vehicle", "infrastructure"))
@@ -611,6 +624,7 @@ class TestStops:
                 assert contents(folder) == contents(tmp_path / "fresh")
         assert kept
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("workers", [1, 2])
     def test_killed_at_any_moment(self, da_motion: DeepAccident, tmp_path: Path, workers: int) -> None:
         verb = labels_verb(
@@ -634,6 +648,7 @@ class TestStops:
         assert done.kept > 0
         assert contents(tmp_path / "labels") == contents(tmp_path / "fresh")
 
+    @pytest.mark.slow
     def test_a_full_disk(self, root: Path, tmp_path: Path) -> None:
         small, out = opened(root), tmp_path / "labels"
         for limit, there in ((100, 0), (12_000, 1)):
@@ -670,6 +685,7 @@ class TestStops:
         assert not any(path.exists() for path in own)
         assert all(path.exists() for path in foreign)
 
+    @pytest.mark.slow
     def test_two_processes_that_write_at_once(self, da_motion: DeepAccident, tmp_path: Path) -> None:
         """Other frames of the same agents: nothing of either is lost."""
         purposes = ("train", "evaluate")

@@ -59,6 +59,7 @@ def changed(**switches: object) -> MotionLabelConfig:
     return MotionLabelConfig(protocol=replace(LABEL_PROTOCOLS["released"], **switches))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "config",
     [

@@ -188,6 +188,7 @@ WORDS = st.one_of(
 )
 
 
+@pytest.mark.slow
 @given(st.lists(st.lists(WORDS, min_size=9, max_size=9), min_size=1, max_size=8))
 def test_numbers_are_what_float_says_to_the_bit(tmp_path_factory: pytest.TempPathFactory, rows: list) -> None:
     path = tmp_path_factory.getbasetemp() / "numbers.txt"

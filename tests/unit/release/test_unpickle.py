@@ -316,6 +316,7 @@ PIECES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_little_memory")
 @settings(max_examples=400)
 @given(data=st.data(), protocol=st.sampled_from(PROTOCOLS))

@@ -11,6 +11,8 @@ from deepaccident_devkit.render.statistics import STATISTICS_FIGURES, render_sta
 from deepaccident_devkit.render.statistics_panels import render_angles
 from deepaccident_devkit.statistics import DatasetStatistics, dataset_statistics
 
+pytestmark = pytest.mark.slow
+
 
 def test_every_group_is_drawn_on_the_figure_given(statistics: DatasetStatistics) -> None:
     for group in STATISTICS_FIGURES:

@@ -48,6 +48,7 @@ def sees(folder, agent, actor, frame):
     return actor in boxes.actor_id[mask]
 
 
+@pytest.mark.slow
 def test_ego_and_other_see_each_other_late_and_the_pole_sees_the_other(folder):
     scenario = build(HIDDEN[read_meta(folder.meta_path).spawn_side])
     ego, other = scenario.agents[EGO], scenario.agents[OTHER]

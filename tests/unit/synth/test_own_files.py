@@ -30,12 +30,14 @@ def test_the_page_has_four_files():
     assert list(EXAMPLES) == ["mine", "pedestrian", "rear_end", "quiet"]
 
 
+@pytest.mark.slow
 def test_ego_hits_the_pedestrian(made):
     da = made("pedestrian")
     (accident,) = da.find(collision=True)
     assert da.get("scenario", accident["token"])["collision"]["classes"] == ["car", "pedestrian"]
 
 
+@pytest.mark.slow
 def test_ego_runs_into_the_rear_of_the_one_who_changed_lanes(made):
     """The first of meet.actors has the later row of the two, which once kept any draw from counting."""
     da = made("rear_end")

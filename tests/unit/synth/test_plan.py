@@ -160,6 +160,7 @@ def test_plans_survive_pickling():
     assert again.draw(np.random.default_rng(1)) == plan.draw(np.random.default_rng(1))
 
 
+@pytest.mark.slow
 def test_the_lists_are_what_the_official_procedure_makes_of_what_is_built():
     config = SynthConfig(scenarios=24, frames=1, unplanned=0.3, seed=3)
     plans = plan_scenarios(config)

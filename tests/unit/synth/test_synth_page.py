@@ -8,6 +8,8 @@ import pytest
 
 from deepaccident_devkit.synth.spec import DESIGNS
 
+pytestmark = pytest.mark.slow
+
 DOCS = Path(__file__).parents[3] / "docs"
 
 

@@ -242,6 +242,7 @@ def test_only_what_changed_is_read_again(two_scenarios: Path, monkeypatch: pytes
     assert sorted(path.stem for path in two_scenarios.glob(".deepaccident/v1/shards/*/*.arrow")) == [third, tiny.NAME]
 
 
+@pytest.mark.slow
 def test_one_and_two_workers_write_the_same_bytes(release_root_b: Path, tmp_path: Path) -> None:
     contents = []
     for workers in (1, 2):
@@ -288,6 +289,7 @@ def test_a_stop_while_writing_leaves_the_old_index(two_scenarios: Path, monkeypa
     assert after == before
 
 
+@pytest.mark.slow
 def test_a_script_without_a_main_guard_may_index_with_workers(two_scenarios: Path) -> None:
     script = two_scenarios.parent / "script.py"
     script.write_text(

@@ -24,6 +24,8 @@ from deepaccident_devkit.tables import index as index_module
 from deepaccident_devkit.tables.index import find_indexes
 from deepaccident_devkit.tables.manifest import MANIFEST_FILE, SCHEMA_VERSION
 
+pytestmark = pytest.mark.slow
+
 OTHER = "Town05_type001_subtype0001_scenario00007"
 THIRD = "Town01_type001_subtype0001_scenario00001"
 KILLS = {1: 22, 2: 8}

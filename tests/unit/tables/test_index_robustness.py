@@ -52,6 +52,7 @@ def test_a_home_folder_is_found(root: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert len(opened(f"~/{root.name}").scenario) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", ["cut", "one byte", "empty", "a folder"])
 def test_a_damaged_shard_is_made_again(root: Path, damage: str) -> None:
     opened(root)
@@ -191,6 +192,7 @@ def test_workers_below_one_are_refused(root: Path) -> None:
         opened(root, workers=0)
 
 
+@pytest.mark.slow
 def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
     script = (
         "import os, pathlib, sys\n"

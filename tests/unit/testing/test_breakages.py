@@ -23,6 +23,8 @@ from deepaccident_devkit.taxonomy import BEV_CAMERA, LIDAR
 from deepaccident_devkit.testing import BREAKAGES, SmallRelease, break_release, broken_release
 from deepaccident_devkit.validation import CODES, validate_release
 
+pytestmark = pytest.mark.slow
+
 CAMERA = "Camera_Front"
 BARE = SmallRelease(splits=("train",), channels=())
 READERS: dict[str, Callable[[Path], Any]] = {

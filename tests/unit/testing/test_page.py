@@ -4,10 +4,15 @@ import importlib.util
 import re
 from pathlib import Path
 
+import pytest
+
+pytestmark = pytest.mark.slow
+
 DOCS = Path(__file__).parents[3] / "docs"
 PAGE = (DOCS / "testing.md").read_text(encoding="utf-8")
 TESTS, CONFTEST, ALONE, STRATEGIES = re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
 MINE = """
+import pytest
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit import DeepAccidentError as MyError
 from deepaccident_devkit.errors import MissingFileError

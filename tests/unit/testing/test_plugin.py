@@ -58,12 +58,14 @@ def test_a_foreign_project_has_the_fixtures_in_both_layouts(foreign) -> None:
     assert "12 passed" in ran.stdout, ran.stdout + ran.stderr
 
 
+@pytest.mark.slow
 def test_it_imports_nothing_until_a_fixture_is_asked_for(foreign) -> None:
     (foreign.folder / "test_mine.py").write_text(LIGHT)
     ran = foreign.pytest()
     assert "1 passed" in ran.stdout, ran.stdout + ran.stderr
 
 
+@pytest.mark.slow
 def test_it_can_be_turned_off(foreign) -> None:
     (foreign.folder / "test_mine.py").write_text("def test_release(deepaccident_release): pass\n")
     ran = foreign.pytest("-p", "no:deepaccident")

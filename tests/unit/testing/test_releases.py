@@ -32,11 +32,13 @@ def opened(deepaccident_release: Path) -> DeepAccident:
     return DeepAccident("v1", deepaccident_release, verbose=False)
 
 
+@pytest.mark.slow
 def test_nothing_is_wrong_with_it(deepaccident_release: Path) -> None:
     report = validate_release(deepaccident_release, deep=True, workers=1)
     assert {(finding.severity, finding.code) for finding in report.findings} == {("note", "unlabelled")}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frames", [1, 12])
 @pytest.mark.parametrize("seed", [1, 7])
 def test_nothing_is_wrong_with_others(tmp_path: Path, frames: int, seed: int) -> None:

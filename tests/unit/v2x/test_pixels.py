@@ -75,6 +75,7 @@ def hits_and_tries(da: DeepAccident, scene: Scene, agent: Agent, labeller: str) 
     return hits, tries
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("labeller", ["ego_vehicle", "other_vehicle_behind", "infrastructure"])
 def test_box_centres_fall_on_their_actors_pixels(recorded: tuple[DeepAccident, Scenario], labeller: str) -> None:
     da, scenario = recorded

@@ -42,6 +42,7 @@ def labels(root: Path) -> list[Path]:
     return sorted(root.glob("*/*/label/*/*.txt"))
 
 
+@pytest.mark.slow
 def test_numbers_with_three_decimals(release: Path) -> None:
     for path in labels(release):
         first, rows = rows_of(path)

@@ -41,6 +41,7 @@ def test_good_files_are_no_finding(root: Path) -> None:
     assert of_splits(validate_release(root)) == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("content", [b"\xff\xfe\x00", b"one_word\n", b"three words here\n"])
 @pytest.mark.parametrize("split", [*SPLITS, *MINI_SPLITS])
 def test_a_file_of_garbage_leaves_the_others_known(root: Path, split: str, content: bytes) -> None:

@@ -20,6 +20,7 @@ def untracked(path: Path, *, keep: Callable[[list[str]], bool] = lambda _: False
     path.write_text("\n".join([first, *(" ".join(row) for row in words)]) + "\n")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("agent", tiny.AGENTS)
 @pytest.mark.parametrize("frames", [[2], [1, 2, 3, 4]])
 def test_labels_that_track_nobody(own_release: Path, agent: str, frames: list[int]) -> None:

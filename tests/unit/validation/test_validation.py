@@ -38,6 +38,7 @@ def rewrite_boxes(path: Path, change: Callable[[list[str]], list[str]]) -> None:
     path.write_text("\n".join([first, *(" ".join(change(line.split())) for line in lines)]) + "\n")
 
 
+@pytest.mark.slow
 def test_healthy_releases_are_clean(release_root: Path, release_root_b: Path) -> None:
     for root, deep in ((release_root, True), (release_root_b, False)):
         report = validate_release(root, deep=deep)
@@ -96,6 +97,7 @@ def write_velocities(root: Path, angle: Callable[[float, float], float]) -> dict
     return truth
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "angle"),
     [
@@ -182,6 +184,7 @@ def test_the_known_faults_of_the_release_are_told_apart(tmp_path: Path) -> None:
     assert {"sheer-curtain", "no-collision-in-accident", "meta-incomplete"} <= known
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("orientation", [name for name in ORIENTATIONS if name != "forward-up"])
 def test_a_turned_bev_camera_is_recognised(release_root: Path, tmp_path: Path, orientation: str) -> None:
     root = tmp_path / "release"

@@ -127,6 +127,7 @@ def samples(da_motion: DeepAccident, tokens: list[str]) -> Samples:
     return Samples(da_motion, tokens)
 
 
+@pytest.mark.slow
 @of_all
 def test_order_parts_and_pauses_change_no_bit(samples: Samples, tokens: list[str], name: str, tmp_path: Path) -> None:
     arguments = {token: samples.some(name, token) for token in tokens}
@@ -161,6 +162,7 @@ def test_pooled_counts_have_the_same_result(samples: Samples, tokens: list[str],
     assert bits(evaluator.result_of(by_scenario)) == bits(evaluator.compute())
 
 
+@pytest.mark.slow
 @of_all
 def test_two_runs_can_be_swapped(samples: Samples, tokens: list[str], name: str) -> None:
     """Where nothing is swapped they differ as observed; where all is, by the same with the other sign."""
@@ -195,6 +197,7 @@ def test_empty_predictions_score_0(samples: Samples, tokens: list[str], name: st
     ALL[name]().compute()
 
 
+@pytest.mark.slow
 @of_all
 def test_results_can_be_copied_and_written(samples: Samples, tokens: list[str], name: str) -> None:
     evaluator = evaluated(name, tokens, lambda token: samples.some(name, token))

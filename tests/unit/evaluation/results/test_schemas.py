@@ -89,6 +89,7 @@ def test_good_results_are_valid(task: str, tmp_path: Path) -> None:
     validator(task).validate(document(task, tmp_path / "m"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
 def test_what_the_schema_refuses_the_reader_refuses(task: str, tmp_path: Path) -> None:
     """Every value of good results in turn made another one; the reader may know better, never less."""

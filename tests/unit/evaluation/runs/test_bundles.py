@@ -33,6 +33,7 @@ def read(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
+@pytest.mark.slow
 def test_holds_all_and_reads_back(run: EvaluationRun, results: Results, tmp_path: Path) -> None:
     folder = save_run(run, tmp_path / "new" / "bundle")
     assert {path.name for path in folder.iterdir()} == FILES

@@ -139,6 +139,7 @@ class TestNumbers:
             assert each.difference in (0.0, None)
             assert each.decision in ("the difference is 0", "nothing to compare", "for exploration")
 
+    @pytest.mark.slow
     def test_twins_are_one_cluster(self, generated: Callable[..., Comparison]) -> None:
         better = [each + 3 + number % 3 for number, each in enumerate(HARD)]
         alone, both = (generated(HARD, better, twins=twins) for twins in (False, True))

@@ -59,6 +59,7 @@ class TestRun:
         run = evaluate_results(da_motion, tmp_path / "none.json", SETUP, "train", workers=1)
         assert (len(run.evaluator), run.result.apa) == (20, 0.0)
 
+    @pytest.mark.slow
     def test_two_workers_give_the_same_bits(
         self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_motion: Write
     ) -> None:

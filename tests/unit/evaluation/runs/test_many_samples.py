@@ -34,6 +34,7 @@ def done(folder: Path) -> int:
 
 
 class TestWorkers:
+    @pytest.mark.slow
     def test_two_workers_are_one(self, da_motion: DeepAccident) -> None:
         tokens = {token: token for token in da_motion.samples("train", "evaluate")}
         load = partial(labels_as_maps, da_motion)
@@ -92,12 +93,14 @@ class TestWorkers:
         assert lines[0] == "100.0"
         assert "something of the script or notebook that runs" in lines[1]
 
+    @pytest.mark.slow
     def test_a_killed_worker_is_our_error(self) -> None:
         with pytest.raises(EvaluationError, match=r"a worker process was killed .*; if memory ran out, give fewer"):
             evaluate_samples(Sums(), VALUES, evaluating.killed, workers=2)
 
 
 class TestFaults:
+    @pytest.mark.slow
     @pytest.mark.parametrize("workers", [1, 2])
     def test_the_sample_is_named(self, workers: int) -> None:
         with pytest.raises(EvaluationError, match=r"^x: cannot be evaluated: FileNotFoundError: predictions/7\.npz$"):
@@ -125,6 +128,7 @@ class TestCheckpoints:
         assert not again.repeated
         assert [each.name for each in path.parent.iterdir()] == ["state.json"]
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("workers", [1, 2])
     def test_a_killed_run_goes_on(self, tmp_path: Path, workers: int) -> None:
         path, folder = tmp_path / "state.json", tmp_path / "trace"

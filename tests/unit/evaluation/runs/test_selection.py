@@ -76,6 +76,7 @@ def test_a_horizon_between_samples(da_b: DeepAccident) -> None:
         SampleSelection(split="val", horizon=1.2).tokens(da_b)
 
 
+@pytest.mark.slow
 def test_nothing_to_evaluate(tmp_path: Path) -> None:
     short = make_release(tmp_path / "release", SynthConfig(scenarios=6, frames=4, layout="B", seed=4, sensors=False))
     with pytest.raises(NotAvailableError, match=r"val: this release has no labelled samples of ego_vehicle there"):

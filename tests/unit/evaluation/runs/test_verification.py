@@ -99,6 +99,7 @@ class TestNamed:
         assert found(verification) == [("file", "metrics_summary.json")]
         assert verification.notes[0].startswith("evaluated with numpy 1.0, verified with ")
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("kind", ["label", "meta", "calib"])
     def test_a_file_of_a_scenario(self, bundle: Path, own_release: Path, kind: str) -> None:
         opened = DeepAccident(dataroot=own_release, verbose=False)

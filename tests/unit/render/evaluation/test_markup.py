@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from report_page import Page
@@ -9,6 +10,7 @@ from report_page import Page
 from deepaccident_devkit.render.evaluation.markup import Markup, tag, tree
 
 
+@pytest.mark.slow
 @given(
     st.recursive(
         st.text() | st.floats() | st.none() | st.booleans(),

@@ -19,6 +19,8 @@ from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.render.evaluation import save_report
 from deepaccident_devkit.render.evaluation.figures import run_figures
 
+pytestmark = pytest.mark.slow
+
 SETUPS = (
     EvaluationSetup(task="motion"),
     EvaluationSetup(task="accident", protocol="boxes"),

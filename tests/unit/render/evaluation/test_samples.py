@@ -20,6 +20,8 @@ from deepaccident_devkit.render.evaluation import draw_motion_outcome, save_repo
 from deepaccident_devkit.render.evaluation.figures import run_figures
 from deepaccident_devkit.render.evaluation.samples import sample_figures
 
+pytestmark = pytest.mark.slow
+
 
 def test_outcomes_of_cells_are_coloured(da_motion: DeepAccident, tokens: list[str]) -> None:
     label = da_motion.motion_labels(tokens[0], MotionLabelConfig(protocol="clean"))

@@ -91,6 +91,7 @@ def test_a_wrong_estimate_does_not_break_the_limit(da: DeepAccident, monkeypatch
     assert 25_000 < sum(sizes) <= 50_000
 
 
+@pytest.mark.slow
 def test_forty_frames_of_real_size_go_by_mail(tmp_path: Path) -> None:
     """Pictures of 1600×900 with noise, which hardly compresses, at all cameras of all frames."""
     root = make_release(tmp_path / "release", SynthConfig(scenarios=1, frames=40, sensors=False, seed=1), workers=1)

@@ -9,6 +9,8 @@ from video_views import SIZE, decoded, grey, greys
 
 from deepaccident_devkit.errors import ChoiceError
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("suffix", [".mp4", ".gif", ".webp"])
 def test_a_video_has_all_frames_in_order_at_its_size(video: Callable[..., Path], suffix: str) -> None:

@@ -15,6 +15,7 @@ from deepaccident_devkit.render.video.views import Scene, names_at, views_of
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 
 
+@pytest.mark.slow
 def test_views_side_by_side_have_their_shares_of_the_width(da: DeepAccident, accident: str) -> None:
     frame = f"{accident}/004"
     views = views_of(["bev", "frame", grey], None)
@@ -26,6 +27,7 @@ def test_views_side_by_side_have_their_shares_of_the_width(da: DeepAccident, acc
     assert (picture[:, :100] != 255).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(set(VIEWS) - set(CAMERAS[1:])))
 def test_every_view_draws(da: DeepAccident, accident: str, name: str) -> None:
     scene = Scene(dataset=da, views=views_of(name, None), agents=None, width=320, height=180)
@@ -55,6 +57,7 @@ def test_each_view_draws_those_of_the_layers_that_it_has() -> None:
     assert [layers for _, layers in views_of(["Camera_Front", "bev"], None)] == [None, None]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", [("frame", "visibility", "bev"), ("frame", "sample", "labels")])
 def test_words_keep_their_room_beside_other_views(da: DeepAccident, accident: str, what: tuple[str, ...]) -> None:
     """Nothing is written over a view's left or right edge; matplotlib warns, which is an error here, if it gives up."""

@@ -98,6 +98,7 @@ def test_windows_hold_every_ray_that_meets_someone(request, crowd, rig_of, place
         assert windows.any(axis=0).mean() < 0.7
 
 
+@pytest.mark.slow
 def test_rays_through_a_box_are_those_with_a_point_in_it():
     size, place = (4.0, 2.0, 1.5), np.array([0.2, 0.0, 1.94])
     points = place + ray_directions()[:, None] * np.arange(0.01, 4, 0.01)[:, None]
@@ -108,6 +109,7 @@ def test_rays_through_a_box_are_those_with_a_point_in_it():
     assert len(through) > 0.7 * len(rows) > 1000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["world", "hilly_world"])
 @pytest.mark.parametrize("air", [DRY, RAIN, Air(drops=0.7)])
 def test_boxed_all_points_in_boxes_are_there(request, crowd, rig_of, place, air):

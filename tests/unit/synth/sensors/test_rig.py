@@ -31,6 +31,7 @@ def same(first, second):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["world", "hilly_world"])
 def test_labels_do_not_depend_on_images(request, rig_of, others, place):
     town = request.getfixturevalue(place)
@@ -164,6 +165,7 @@ def test_boxes_have_one_place_in_the_world(hilly_world, rig_of, others):
         np.testing.assert_allclose(centers, np.broadcast_to(centers[0], np.shape(centers)), atol=3e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["world", "hilly_world"])
 def test_images_show_road_users_where_their_boxes_project(request, rig_of, actor, place):
     """A red car ahead: where the middle of its box projects, the picture is red or glass, not road."""

@@ -39,6 +39,7 @@ def test_who_is_behind_the_camera_has_no_rectangle():
     np.testing.assert_array_equal(low, high)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["world", "hilly_world"])
 def test_movers_are_no_nearer_than_their_windows_say(request, actor, rig_of, place):
     others = [actor(10 + k, "truck", -60.0 + 17 * k, 1.75, np.pi) for k in range(8)]
@@ -66,6 +67,7 @@ def ego_sees(rig, actor_id, agent=0):
     return bool(camera_visible(scene, rig.agents[agent], rig.agents[agent].ground_from_lidar(scene), rows)[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("upper_edge", "width", "seen"),
     [(4.0, 6.0, False), (4.0, 1.9, True), (1.0, 6.0, True)],
@@ -86,6 +88,7 @@ def test_a_truck_hides_the_car_before_it(world, bare, actor, rig_of):
     assert not ego_sees(rig_of(bare(world), [car, actor(10, "truck", -8.0, -1.75)]), 1009)
 
 
+@pytest.mark.slow
 def test_a_rise_hides_a_pedestrian_behind_it(hilly_world, bare, actor, rig_of):
     """The crest lies 55 m from the middle; the ego waits 30 m from it, the pedestrian stands far behind."""
     pedestrian = actor(9, "pedestrian", -86.0, -1.75)

@@ -11,6 +11,8 @@ from deepaccident_devkit.synth.traffic.casting import WARM_UP
 from deepaccident_devkit.synth.traffic.drama import perform_accident, perform_twin, set_stage
 from deepaccident_devkit.synth.traffic.impact import least_gap, touching_pairs
 
+pytestmark = pytest.mark.slow
+
 SEEDS = range(4)
 ANGLES = {
     1: (80, 100), 2: (25, 130), 3: (95, 165), 4: (55, 110), 5: (55, 110), 6: (20, 70),

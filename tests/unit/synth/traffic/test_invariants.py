@@ -17,6 +17,8 @@ from deepaccident_devkit.synth.traffic.kinematics import HARDEST_BRAKING, MAX_ST
 from deepaccident_devkit.synth.traffic.signals import GREEN, RED
 from deepaccident_devkit.synth.traffic.unplanned import unplanned
 
+pytestmark = pytest.mark.slow
+
 CORNERS = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) / 2
 MAPPED = 143.0
 """Metres from the middle within which the ground is known under a whole truck."""

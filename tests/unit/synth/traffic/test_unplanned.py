@@ -1,6 +1,7 @@
 from collections import Counter
 
 import numpy as np
+import pytest
 
 from deepaccident_devkit.synth.roads import Junction
 from deepaccident_devkit.synth.spec import DESIGNS, draw
@@ -17,6 +18,7 @@ def played(seed, design=1):
     return spec, stage, perform_accident(stage)
 
 
+@pytest.mark.slow
 def test_a_stranger_meets_one_of_the_designed_pair_who_both_obey():
     kinds, met = Counter(), 0
     for seed in range(8):

@@ -124,6 +124,7 @@ def never(_crash: bool, ahead: np.ndarray) -> np.ndarray:
     return np.full(len(ahead), np.nan)
 
 
+@pytest.mark.slow
 def test_the_headline_ranks_skill_above_a_siren_silence_and_chance() -> None:
     honest = [evaluated(skilled(seed)) for seed in range(PREDICTORS)]
     lowest = min(headline(each) for each in honest)

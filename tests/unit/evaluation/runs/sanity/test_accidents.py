@@ -18,6 +18,8 @@ from deepaccident_devkit.evaluation.runs.sanity.accidents import (
 from deepaccident_devkit.evaluation.runs.sanity.probes import SCALES, SYMMETRIES, candidates_of
 from deepaccident_devkit.geometry import SE3
 
+pytestmark = pytest.mark.slow
+
 Change = Callable[[Accident], Accident]
 WORLD = SE3.from_yaw(0.7, (250.0, -80.0, 0.0))
 PRESENT = 3.4

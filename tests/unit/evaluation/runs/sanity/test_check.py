@@ -55,6 +55,7 @@ def sanity(
     return check_sanity(dataset, results, setup, tokens, samples=samples)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lies", ORIENTATIONS)
 @pytest.mark.parametrize("predict", [as_maps, as_heads])
 @pytest.mark.parametrize("task", ["motion", "accident"])
@@ -68,6 +69,7 @@ def test_labels_as_predictions_are_perfect_and_raise_no_alarm(
     assert report.samples == 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("meant", ORIENTATIONS)
 @pytest.mark.parametrize("stated", ORIENTATIONS)
 def test_the_orientation_that_would_be_right_is_named(

@@ -21,6 +21,8 @@ from deepaccident_devkit.evaluation.runs.sanity.probes import SCALES, SYMMETRIES
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.v2x import Link
 
+pytestmark = pytest.mark.slow
+
 Moments = dict[str, DetectionMoments]
 LAGS = {"0.5 s late": -5, "0.5 s early": 5}
 

@@ -16,6 +16,8 @@ from deepaccident_devkit.evaluation.runs.sanity.probes import SCALES, candidates
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import MotionHeads, MotionLabelConfig, MotionLabels
 
+pytestmark = pytest.mark.slow
+
 Labels = dict[str, MotionLabels]
 Change = Callable[[AnyArray], AnyArray]
 
