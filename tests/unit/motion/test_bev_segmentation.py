@@ -101,3 +101,12 @@ def test_results_are_read_only() -> None:
     assert targets.masks.shape == (len(BEV_CLASSES), 200, 200)
     with pytest.raises(ValueError, match="read-only"):
         targets.masks[0, 0, 0] = True
+
+
+def test_of_a_sample_the_ground_is_augmented_too(da: DeepAccident) -> None:
+    sample, augmentation = da.sample[3], Augmentation(rotation=math.radians(90), flip=True)
+    mine = bev_segmentation(da, sample, augmentation=augmentation)
+    np.testing.assert_array_equal(
+        mine.mask("road"), segmentation_of(da.load_bev(sample), BevGrid(), augmentation=augmentation).mask("road")
+    )
+    assert (mine.mask("road") != bev_segmentation(da, sample).mask("road")).any()

@@ -9,6 +9,7 @@ from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, PRESETS, Augmentation, MotionLabelConfig
 from deepaccident_devkit.motion.config import label_config
+from deepaccident_devkit.v2x import AgentConfig
 
 
 def test_the_default_is_the_released_labels_in_the_devkits_orientation() -> None:
@@ -174,3 +175,12 @@ def test_an_augmentation_turns_then_scales_then_mirrors() -> None:
         Augmentation(flip="no")
     with pytest.raises(ConfigError, match="augmentation: rotation: expected finite radians, found 'x'"):
         Augmentation(rotation="x")
+
+
+def test_the_narrowest_and_the_widest_centre() -> None:
+    assert [MotionLabelConfig(sigma=sigma).sigma for sigma in (0.01, 10_000)] == [0.01, 10_000]
+
+
+def test_agents_of_a_configuration_are_described_by_name_and_partners() -> None:
+    agents = AgentConfig("mine", ("behind", "infrastructure"))
+    assert MotionLabelConfig(agents=agents).as_dict()["agents"] == {"name": "mine", "partners": list(agents.partners)}

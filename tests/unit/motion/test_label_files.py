@@ -39,7 +39,7 @@ from deepaccident_devkit.motion import (
     motion_labels_from_boxes,
     write_label_files,
 )
-from deepaccident_devkit.motion.label_folder import FORMAT_VERSION, MANIFEST
+from deepaccident_devkit.motion.label_folder import FORMAT_VERSION, MANIFEST, writing_to
 from deepaccident_devkit.motion.stored_labels import NOBODY, NOWHERE, StoredLabels
 from deepaccident_devkit.taxonomy import AGENTS
 
@@ -709,3 +709,25 @@ def wait_for(condition: Callable[[], bool]) -> None:
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.001)
+
+
+def test_a_disk_that_fails_while_writing_is_our_error(tmp_path: Path) -> None:
+    with pytest.raises(LabelFilesError, match=r"labels cannot be written \(no room\); make room there"):  # noqa: SIM117
+        with writing_to(tmp_path / "labels"):
+            raise OSError("no room")
+
+
+def test_a_folder_below_a_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    entered = []
+    with pytest.raises(LabelFilesError, match="no labels can be written there"):  # noqa: SIM117
+        with writing_to(tmp_path / "file" / "labels"):
+            entered.append(True)
+    assert not entered
+
+
+def test_labels_can_be_pickled(small: DeepAccident) -> None:
+    label = small.motion_labels(small.sample[0]["token"])
+    again = pickle.loads(pickle.dumps(label))
+    np.testing.assert_array_equal(again.instance, label.instance)
+    assert (again.config, again.id_map) == (label.config, label.id_map)

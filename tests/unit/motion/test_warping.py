@@ -15,7 +15,7 @@ from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS, LabelProtocol
 from deepaccident_devkit.motion.warps import single_precision
 from deepaccident_devkit.motion.warps.chains import present_from_frames, present_from_past
 from deepaccident_devkit.motion.warps.feature_warps import agents_to_ego, past_to_present
-from deepaccident_devkit.motion.warps.warping import nearest_indices, sampling_matrix, warp
+from deepaccident_devkit.motion.warps.warping import nearest_indices, rounded_points, sampling_matrix, warp
 
 GRID = BevGrid((-4, 4, 1), (-4, 4, 1))
 RELEASED, CLEAN, FIERY = (LABEL_PROTOCOLS[name] for name in ("released", "clean", "fiery"))
@@ -228,3 +228,16 @@ def test_a_chain_of_frames_starts_at_the_identity() -> None:
     assert_array_equal(chain[0], np.eye(4))
     np.testing.assert_allclose(chain[1][:3, 3], [-1, 0, 0])
     np.testing.assert_allclose(chain[2][:2, :2], [[0, 1], [-1, 0]], atol=1e-7)
+
+
+def test_more_cells_than_a_warp_can_number_are_refused() -> None:
+    huge = BevGrid((-2100, 2100, 1), (-2100, 2100, 1))
+    points = (np.zeros((2, 2)), np.zeros((2, 2)))
+    with pytest.raises(GeometryError, match="cells are more than a warp can number"):
+        rounded_points(points, huge, LABEL_PROTOCOLS["clean"])
+
+
+@pytest.mark.parametrize("shape", [(0, 3, 4, 4), (4, 4)])
+def test_no_map_is_no_feature(shape: tuple[int, ...]) -> None:
+    with pytest.raises(GeometryError, match="features: expected at least one map"):
+        agents_to_ego(np.zeros(shape), np.zeros((shape[0], 6)))

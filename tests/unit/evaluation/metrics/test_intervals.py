@@ -14,6 +14,7 @@ from deepaccident_devkit.evaluation.metrics.intervals import (
     LEAST_CLUSTERS,
     Intervals,
     Resampling,
+    _notes,
     interval_ends,
     intervals_of,
     parts_of,
@@ -149,3 +150,9 @@ def test_each_number_for_itself() -> None:
         alone = interval_ends(values[at : at + 1], left_out[:, at : at + 1], ranges[at : at + 1], 0.95)
         assert_array_equal(np.ravel(alone), [together[0][at], together[1][at]])
     assert_allclose(interval_ends(values * 100, left_out * 100, ranges * [1, 100], 0.95)[0][0], 100 * together[0][0])
+
+
+def test_at_the_least_number_of_clusters_it_is_that_they_are_alike() -> None:
+    few, alike = _notes({"few": LEAST_CLUSTERS - 1, "alike": LEAST_CLUSTERS})
+    assert few.startswith("no interval of few: fewer than")
+    assert alike == f"no interval of alike: fewer than {LEAST_CLUSTERS} clusters change it"

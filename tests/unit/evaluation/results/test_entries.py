@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
+from deepaccident_devkit.evaluation.results.entries import detection_entries
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 FIRST, SECOND, THIRD = plain.TOKENS
@@ -123,3 +124,10 @@ class TestEntries:
         np.testing.assert_allclose(np.exp(1j * back.yaw), np.exp(1j * boxes.yaw), atol=1e-9)
         np.testing.assert_array_equal(back.size, boxes.size)
         np.testing.assert_array_equal(back.category, boxes.category)
+
+
+def test_a_velocity_that_is_known_in_part_is_unknown() -> None:
+    columns = {"center": np.zeros((2, 3)), "size": np.ones((2, 3)), "yaw": np.zeros(2), "frame": "world"}
+    velocity = np.array([[1.0, np.nan, 0.0], [1.0, 2.0, 0.0]])
+    detected = DetectedBoxes.from_arrays(scores=np.ones(2), velocity=velocity, **columns)
+    assert [each["velocity"] for each in detection_entries("s", detected)] == [None, [1.0, 2.0]]

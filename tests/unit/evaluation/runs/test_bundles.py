@@ -199,3 +199,12 @@ class TestDamaged:
     def test_no_folder(self, tmp_path: Path) -> None:
         with pytest.raises(ResultsError, match=r"nowhere: no such folder"):
             read_bundle(tmp_path / "nowhere")
+
+
+def test_scenarios_without_hashes_are_no_bundle_s(run: EvaluationRun, tmp_path: Path) -> None:
+    bundle = read_bundle(save_run(run, tmp_path / "run"))
+    path = bundle.folder / "scenarios.json"
+    stated = read(path)
+    path.write_text(json.dumps({**stated, "scenarios": ["s"]}), encoding="utf-8")
+    with pytest.raises(ResultsError, match="expected scenarios with their hashes"):
+        bundle.scenarios()

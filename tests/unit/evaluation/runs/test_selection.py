@@ -81,3 +81,8 @@ def test_nothing_to_evaluate(tmp_path: Path) -> None:
     short = make_release(tmp_path / "release", SynthConfig(scenarios=6, frames=4, layout="B", seed=4, sensors=False))
     with pytest.raises(NotAvailableError, match=r"val: this release has no labelled samples of ego_vehicle there"):
         SampleSelection(split="val", agents=("ego_vehicle",)).tokens(DeepAccident("v1", short, verbose=False))
+
+
+def test_a_horizon_may_be_rounded_a_little(da_motion: DeepAccident) -> None:
+    exact = SampleSelection(split="train", horizon=1.5).tokens(da_motion)
+    assert SampleSelection(split="train", horizon=1.5 - 1e-9).tokens(da_motion) == exact

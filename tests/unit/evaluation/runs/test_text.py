@@ -19,6 +19,7 @@ from deepaccident_devkit.evaluation.runs import (
     summary_text,
 )
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.runs.text import _notes
 
 Write = Callable[..., Results]
 
@@ -99,3 +100,8 @@ def test_what_a_results_file_holds(
     assert lines_of(results_text(motion))[-1].startswith(
         "form instances, up to 1 predictions of 5 frames, 0.5 s apart, cells x (-50.0, 50.0, 0.5), y (-50.0, 50.0, 0.5)"
     )
+
+
+def test_notes_of_results_that_stand_beside_say_of_which() -> None:
+    metrics = {"notes": ["both"], "beside": {"paper": {"notes": ["both", "its own"]}}}
+    assert list(_notes(metrics)) == ["both", "if paper: its own"]

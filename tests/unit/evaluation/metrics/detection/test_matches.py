@@ -10,8 +10,9 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation import DetectedBoxes, detection_truth
 from deepaccident_devkit.evaluation.metrics.detection import DETECTION_PROTOCOLS, detection_matches
-from deepaccident_devkit.evaluation.metrics.detection.boxes import columns_of
+from deepaccident_devkit.evaluation.metrics.detection.boxes import BoxColumns, columns_of
 from deepaccident_devkit.evaluation.metrics.detection.frame_counts import frame_counts
+from deepaccident_devkit.evaluation.metrics.detection.matching import match_errors
 from deepaccident_devkit.geometry import Boxes
 
 
@@ -61,3 +62,13 @@ def test_of_several_that_are_near_enough_the_nearest_is_matched(protocol: str, *
     found = detection_matches(detected, truth, rules, rules.thresholds[0])
     of_two = found.truth if rules.matching == "by_score" else found.detection
     assert of_two.tolist() == [0 if nearest_first else 1]
+
+
+def test_released_errors_of_places_have_three_axes() -> None:
+    def columns(center: tuple[float, float, float]) -> BoxColumns:
+        box = Boxes.from_arrays([center], size=[[4.0, 2.0, 1.5]], yaw=[0.0], frame="lidar")
+        return columns_of(box)
+
+    truth, found = columns((10.0, 5.0, 1.0)), columns((13.0, 9.0, 13.0))
+    assert match_errors(found, truth, DETECTION_PROTOCOLS["released"])[0, 0] == pytest.approx(13)
+    assert match_errors(found, truth, DETECTION_PROTOCOLS["paper"])[0, 0] == pytest.approx(5)

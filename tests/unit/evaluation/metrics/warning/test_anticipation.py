@@ -13,6 +13,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.evaluation import Accident
 from deepaccident_devkit.evaluation.metrics.accident import AccidentContext, BoxTruth, accident_context
+from deepaccident_devkit.evaluation.metrics.alarms import truth
 from deepaccident_devkit.evaluation.metrics.alarms.constant_velocity import constant_velocity_alarms
 from deepaccident_devkit.evaluation.metrics.headlines import headlines
 from deepaccident_devkit.evaluation.metrics.numbers import numbers_of
@@ -24,9 +25,12 @@ from deepaccident_devkit.evaluation.metrics.warning import (
     FieldWarnings,
     ScoreSeries,
     WarningEvaluator,
+    anticipation,
     field_figures,
 )
+from deepaccident_devkit.evaluation.metrics.warning.anticipation import _mean
 from deepaccident_devkit.evaluation.metrics.warning.drives import REFERENCES, TRIVIAL
+from deepaccident_devkit.evaluation.metrics.warning.recordings import surest
 
 PAIR = (11, 22)
 MEETING = np.array([[20.0, 10.0], [16.0, 10.0]])
@@ -326,6 +330,7 @@ def test_without_recordings_there_is_nothing() -> None:
     [
         ({"scores_of": "scene"}, ChoiceError, "scores_of: expected one of pair, recording"),
         ({"window": 0.0}, ConfigError, "window: expected seconds above 0"),
+        ({"window": math.inf}, ConfigError, "window: expected seconds above 0"),
         ({"threshold": math.inf}, ConfigError, "threshold: expected a number, or None"),
         ({"correct_by": "luck"}, ChoiceError, "correct_by: expected one of either, pair, place"),
     ],
@@ -335,7 +340,20 @@ def test_choices_are_checked(choices: dict, error: type[Exception], message: str
         CleanWarnings(**choices)
 
 
-def test_the_context_tells_involvement_twins_and_what_constant_velocities_lead_to(da_motion: DeepAccident) -> None:
+def test_field_knows_pairs_and_recordings_alone() -> None:
+    with pytest.raises(ChoiceError, match="scores_of: expected one of pair, recording, found 'scene'"):
+        FieldWarnings(scores_of="scene")
+
+
+def test_means_over_draws_leave_unknown_numbers_out_and_keep_counts_and_words() -> None:
+    parts = [{"a": {"x": value, "n": 3, "by": "f1"}} for value in (1.0, math.nan, 4.0)]
+    assert _mean(parts) == {"a": {"x": 2.5, "n": 3, "by": "f1"}}
+    assert math.isnan(_mean([math.nan, math.nan]))
+
+
+def test_the_context_tells_involvement_twins_and_what_constant_velocities_lead_to(
+    da_motion: DeepAccident, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Of a synthetic accident; just before the impact the colliding pair is foreseen."""
     crash = next(each for each in da_motion.scenario if each["collision"] is not None)
     pair = set(crash["collision"]["ids"])
@@ -356,6 +374,12 @@ def test_the_context_tells_involvement_twins_and_what_constant_velocities_lead_t
     twin = f"{crash['token'].replace('_accident/', '_normal/')}/{involved}/001"
     other = accident_context(da_motion, twin, 2.0)
     assert other.time_to_twin_impact == pytest.approx((last - 1) / 10)
+    asked = []
+    monkeypatch.setattr(truth, "constant_velocity_alarms", lambda _boxes, _names, own: asked.append(own) or ())
+    for agent in ("ego_vehicle", "ego_vehicle_behind", "infrastructure"):
+        there = accident_context(da_motion, f"{crash['token']}/{agent}/{last - 1:03d}", 2.0, references=True)
+        assert set(asked) == {there.own_actor_id if there.involvement == "ego_involved" else None}
+        asked.clear()
     assert other.involvement == "ego_involved"
 
 
@@ -380,3 +404,54 @@ def test_results_are_as_json_holds_them() -> None:
     result = evaluated(skilled(1), pairs=3).compute()
     assert isinstance(result, AnticipationResult)
     assert result.as_dict()["groups"]["ego_involved"]["recordings"] == {"accident": 3, "twins": 3, "others": 0}
+
+
+@pytest.mark.parametrize("protocol", ["clean", "field"])
+def test_settings_are_the_protocols(protocol: str) -> None:
+    evaluator = WarningEvaluator(protocol)
+    assert evaluator.settings == evaluator.protocol.settings()
+    assert evaluator.settings
+
+
+def test_random_rows_are_means_of_their_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    def row(draws: int) -> float:
+        monkeypatch.setattr(anticipation, "RANDOM_DRAWS", draws)
+        found = evaluated(skilled(0), pairs=4).compute()
+        return next(each for name, each in found.references.items() if name.startswith("random"))[
+            "ego_involved"
+        ].auc_ahead
+
+    one, two = row(1), row(2)
+    assert one != two
+    assert abs(two - 0.5) < 0.5
+
+
+def test_only_bystanders_and_the_pole_hand_their_alarm_on() -> None:
+    evaluator = WarningEvaluator("clean")
+    for involvement in ("ego_involved", "bystander", "infrastructure"):
+        for frame in range(1, 41, 5):
+            known = context("accident", frame, 41, 41, involvement)
+            alarms = [Accident(positions=MEETING, time=1.0, score=0.5, ids=PAIR)]
+            evaluator.update(f"type1_subtype1_accident/{involvement}/ego_vehicle/{frame:03d}", alarms, None, known)
+    groups = evaluator.compute().groups
+    assert {name: bool(each.tta0_after) for name, each in groups.items()} == {
+        "ego_involved": False,
+        "bystander": True,
+        "infrastructure": True,
+    }
+
+
+@pytest.mark.parametrize("references", [False, True])
+def test_the_published_metrics_of_reference_predictors_are_counted_where_they_are_asked_for(
+    *, references: bool
+) -> None:
+    evaluator = evaluated(skilled(0), "field", pairs=2)
+    counts = [evaluator.counts[token] for token in evaluator.counts]
+    made = evaluator.protocol.result(counts, references=references)
+    assert bool(made.references) is references
+
+
+def test_the_surest_right_alarm_is_the_surest() -> None:
+    alarms = [[0.2, True], [0.9, False], [0.6, True]]
+    assert surest(alarms, "accident") == [0.6, 0.9]
+    assert surest(alarms, "twins") == [0.9, 0.9]

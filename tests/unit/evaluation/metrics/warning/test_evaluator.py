@@ -495,3 +495,14 @@ def test_an_alarm_for_later_than_the_horizon_is_none() -> None:
     evaluator.update("t/s/ego_vehicle/031", [alarm(time=900.0, ids=PAIR)], None, bounded)
     made = evaluator.compute()
     assert (made.warned_share, made.alarms, made.beyond) == (0, 0, 1)
+
+
+def test_the_notes_say_what_was_not_evaluated() -> None:
+    def notes(kind: str) -> str:
+        evaluator = WarningEvaluator("boxes")
+        drive(evaluator, "t/s", every(2.0), kind)
+        return "\n".join(evaluator.compute().notes)
+
+    assert "no recording of an accident was evaluated" in notes("twins")
+    assert "no recording of an accident was evaluated" not in notes("accident")
+    assert "no recording without an accident was evaluated" in notes("accident")

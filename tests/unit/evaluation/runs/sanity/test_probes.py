@@ -2,7 +2,11 @@
 
 import numpy as np
 import pytest
+from memory_results import MemoryResults
 
+from deepaccident_devkit.evaluation import Accident
+from deepaccident_devkit.evaluation.runs.sanity.check import _says_something
+from deepaccident_devkit.evaluation.runs.sanity.pairs import _rank_tally
 from deepaccident_devkit.evaluation.runs.sanity.probes import IDENTITY, SYMMETRIES, Symmetry, orientation_mistaken
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
@@ -46,3 +50,15 @@ def test_each_mixed_up_orientation_is_one_symmetry(stated: Orientation, meant: O
 
 def test_no_orientation_explains_what_is_mirrored_along_x() -> None:
     assert orientation_mistaken(SYMMETRIES[0], "devkit") is None
+
+
+def test_equal_scores_rank_no_pair() -> None:
+    wrong_is_surer, pairs, right_is_surer, *_ = _rank_tally(np.array([0.5, 0.5]), np.array([True, False]))
+    assert (wrong_is_surer, pairs, right_is_surer) == (0, 1, 0)
+    assert _rank_tally(np.array([0.5, 0.9]), np.array([True, False]))[0] == 1
+
+
+def test_of_accident_lists_samples_with_an_alarm_say_something() -> None:
+    alarm = Accident(positions=[[12.0, 0.5], [13.0, -1.5]], time=1.5, score=0.8)
+    says = _says_something(MemoryResults("accident", {"with": [alarm], "without": []}))
+    assert (says("with"), says("without")) == (True, False)
