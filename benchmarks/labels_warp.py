@@ -1,4 +1,4 @@
-"""Bringing all maps of a sample to the present; the released code takes 15 ms for it (design.md 6)."""
+"""Bringing all maps of a sample to the present; the released code takes 15 ms for it."""
 
 import numpy as np
 

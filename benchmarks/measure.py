@@ -17,7 +17,7 @@ class Figure:
         unit: of value and bound.
         bound: what it should not be worse than, None for a figure that only informs.
         higher_is_better: whether the bound is a lower one.
-        reference: what the released code takes (design.md 6), in the same unit; None where it has no like.
+        reference: what the released code takes, in the same unit; None where it has no like.
     """
 
     name: str

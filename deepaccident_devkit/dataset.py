@@ -87,7 +87,8 @@ class Dataset(OpenTables):
             sample: token or record.
             frame: frame of the result: `world`, `ego`, `lidar` or a camera channel (then optical axes).
             visible: None for all; `camera` for those that a camera of this agent sees; `released` for those that any
-                agent at this moment sees by the released rule (evaluation.md f; the agent itself is not among them).
+                agent at this moment sees by the released rule (docs/released_code.md, Visibility and attributes; the
+                agent itself is not among them).
             velocity: the label's, `decoded` (the column `velocity`; see docs/conventions.md); `derived` from this
                 agent's world positions of the actor at 10 Hz, NaN where there are none; or the raw pair of the
                 `label`, as if it were in the LiDAR frame (the agent's own in world).

@@ -1,4 +1,7 @@
-"""Names and numbers of the dataset: agents, channels, categories, splits (format.md, evaluation.md 0)."""
+"""Names and numbers of the dataset: agents, channels, categories, splits.
+
+See docs/format.md, and docs/released_code.md, Conventions and samples.
+"""
 
 from typing import Final, Literal
 
@@ -49,10 +52,10 @@ CHANNEL_FORMAT: Final[dict[str, str]] = {**dict.fromkeys(CAMERAS, "jpg"), LIDAR:
 """Channel → ending of its files."""
 
 CATEGORIES: Final = ("car", "truck", "van", "cyclist", "motorcycle", "pedestrian")
-"""Class names; the position is the class index of the released evaluation (evaluation.md 0)."""
+"""Class names; the position is the class index of the released evaluation (docs/released_code.md, Conventions)."""
 
 SMALL_CATEGORIES: Final = ("cyclist", "motorcycle", "pedestrian")
-"""The classes for which fewer LiDAR points are asked (evaluation.md f)."""
+"""The classes for which fewer LiDAR points are asked (docs/released_code.md, Visibility and attributes)."""
 
 OWN_ACTOR_ID: Final = -100
 """Label id of the recording agent itself."""

@@ -27,7 +27,7 @@ def main() -> None:
 
 
 def golden_table() -> str:
-    """Golden d through each protocol of rasters, and `paper` with each choice made otherwise."""
+    """Golden accidents (d_accident) through each protocol of rasters, and `paper` with each choice made otherwise."""
     sys.path.insert(0, str(TESTS))
     from parity.conftest import GoldenCase
     from parity.test_accident import heads_of, label_of

@@ -53,7 +53,7 @@ def main() -> None:
 
 
 def golden_accidents() -> str:
-    """Golden d through the released protocol, and with each choice made otherwise."""
+    """The golden run (d_accident) through the released protocol, and with each choice made otherwise."""
     return released_accidents(golden_samples())
 
 
@@ -106,12 +106,12 @@ def _variants(
 
 
 def golden_motion() -> str:
-    """Golden d through the released protocol, and with each choice made otherwise."""
+    """The golden run (d_accident) through the released protocol, and with each choice made otherwise."""
     return motion_table({"": list(golden_samples())}, motion_variants())
 
 
 def golden_attribute() -> str:
-    """VPQ of golden d by weather: of the right frames, and of those that the released code takes."""
+    """VPQ of the golden run (d_accident) by weather: of the right frames, and of those that the released code takes."""
     from parity.conftest import GoldenCase
 
     counted = MotionEvaluator(trajectories=False)
@@ -132,7 +132,7 @@ def golden_attribute() -> str:
 
 
 def golden_samples() -> Iterator[Given]:
-    """The samples of golden d."""
+    """The samples of the golden run (d_accident)."""
     from parity.conftest import GoldenCase
     from parity.test_motion_end_to_end import Sample
 
@@ -227,7 +227,7 @@ def detection_variants() -> dict[str, dict[str, object]]:
 
 
 def golden_detection() -> str:
-    """Golden e through the released protocol, with each choice made otherwise, and through the others."""
+    """The golden detections (e_detection) through `released`, each choice made otherwise, and the other protocols."""
     from parity.test_detection import frames
 
     def evaluate(protocol: DetectionProtocol) -> DetectionResult:

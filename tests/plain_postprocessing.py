@@ -1,4 +1,7 @@
-"""Evaluation.md c as one reads it, a cell and an instance at a time: what the devkit's arrays must give as well."""
+"""Post-processing a cell and an instance at a time, as docs/released_code.md, Post-processing, reads.
+
+The devkit's arrays must give the same.
+"""
 
 import math
 

@@ -32,7 +32,7 @@ from deepaccident_devkit.evaluation.metrics.warning import (
     WarningProtocol,
 )
 from deepaccident_devkit.geometry import Box
-from deepaccident_devkit.motion import LabelProtocol, PostProcessing
+from deepaccident_devkit.motion import LabelProtocol, MotionLabelConfig, PostProcessing
 
 pytestmark = pytest.mark.slow
 
@@ -70,6 +70,19 @@ def test_every_switch_of_the_label_protocols_is_explained() -> None:
     page = (DOCS / "motion_labels.md").read_text(encoding="utf-8")
     missing = [field.name for field in fields(LabelProtocol) if f"`{field.name}`" not in page]
     assert missing == []
+
+
+@pytest.mark.parametrize("choices", [LabelProtocol, MotionProtocol, VpqRules, TrajectoryRules, ReleasedAccidents])
+def test_every_switch_is_on_the_page_of_the_released_code(choices: type[Any]) -> None:
+    page = (DOCS / "released_code.md").read_text(encoding="utf-8")
+    assert [field.name for field in fields(choices) if not re.search(rf"[`.]{field.name}\b", page)] == []
+
+
+@pytest.mark.parametrize("choices", [LabelProtocol, MotionLabelConfig, MotionProtocol, ReleasedAccidents, Scoring])
+def test_the_page_of_the_released_code_names_no_other_switch(choices: type[Any]) -> None:
+    page = (DOCS / "released_code.md").read_text(encoding="utf-8")
+    named = set(re.findall(rf"`{choices.__name__}\.(\w+)", page))
+    assert named - {field.name for field in fields(choices)} == set()
 
 
 def test_the_code_on_protocols_runs(da_motion: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

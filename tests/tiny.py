@@ -1,4 +1,4 @@
-"""A release written by hand, without the devkit's writers: raw text, pickles and CARLA's own signs (format.md)."""
+"""A release written by hand, without the devkit's writers: raw text, pickles and CARLA's own signs (docs/format.md)."""
 
 import pickle
 from collections.abc import Callable, Sequence
@@ -39,7 +39,7 @@ def calib(ego_to_world: np.ndarray, *, height: float) -> dict[str, np.ndarray]:
 
 
 def lidar_height(agent: str) -> float:
-    """The pole's LiDAR is its ego frame (format.md, calib)."""
+    """The pole's LiDAR is its ego frame (docs/format.md, Calib)."""
     return 0.0 if agent == "infrastructure" else 1.94
 
 

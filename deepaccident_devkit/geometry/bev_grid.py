@@ -74,7 +74,7 @@ class BevGrid:
         """The cells that points (N, 2) or (N, 3) lie in; x forward, y left, metres.
 
         A cell owns its lower edges in x and y, whatever the orientation. (Label rasters round polygon corners by a
-        rule of their own, evaluation.md a; this one is for points.)
+        rule of their own, docs/released_code.md, Motion labels; this one is for points.)
 
         Returns:
             (N, 2) int64 row and column in this orientation, −1 −1 for points beside the grid; and (N,) bool, which

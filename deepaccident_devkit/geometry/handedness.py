@@ -1,4 +1,4 @@
-"""CARLA's left-handed values ↔ the devkit's right-handed ones: the one place where signs change (design.md 2).
+"""CARLA's left-handed values ↔ the devkit's right-handed ones: the one place where signs change (docs/conventions.md).
 
 CARLA's frames have x forward, y **right**, z up, and yaw clockwise seen from above. The devkit's have x forward,
 y **left**, z up, yaw counter-clockwise. With S = diag(1, −1, 1) every conversion of a point, a pose or an angle is its
@@ -48,7 +48,7 @@ def flip_pose(pose: ArrayLike) -> FloatArray:
 
 
 def flip_six_vector(six: ArrayLike) -> FloatArray:
-    """Poses (…, 6) as (tx, ty, tz, rx, ry, rz), evaluation.md g, in the other handedness."""
+    """Poses (…, 6) as (tx, ty, tz, rx, ry, rz), docs/released_code.md, Poses, in the other handedness."""
     return as_floats(as_floats(six) * _SIX)
 
 

@@ -92,10 +92,10 @@ class SE3(FrozenArrays):
 
     @classmethod
     def from_six(cls, vector: ArrayLike) -> SE3:
-        """From (6,) tx, ty, tz, rx, ry, rz: metres and radians, R = Rx(rx) · Ry(ry) · Rz(rz) (evaluation.md g).
+        """From (6,) tx, ty, tz, rx, ry, rz: metres and radians, R = Rx(rx) · Ry(ry) · Rz(rz).
 
-        The vector is right-handed, as all of SE3; one of the released code goes through
-        `handedness.flip_six_vector` first. Raises GeometryError if a number is not finite.
+        See docs/released_code.md, Poses. The vector is right-handed, as all of SE3; one of the released code goes
+        through `handedness.flip_six_vector` first. Raises GeometryError if a number is not finite.
         """
         six = checked("vector", vector, (6,))
         if not np.isfinite(six).all():

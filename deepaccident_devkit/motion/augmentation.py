@@ -1,4 +1,7 @@
-"""A rotation, scale and flip of the bird's-eye view, applied to boxes, labels and poses alike (evaluation.md a)."""
+"""A rotation, scale and flip of the bird's-eye view, applied to boxes, labels and poses alike.
+
+See docs/released_code.md, Motion labels.
+"""
 
 from __future__ import annotations
 

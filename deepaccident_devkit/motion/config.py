@@ -39,7 +39,8 @@ class MotionLabelConfig:
         future_frames: frames after the present that labels show.
         step: recorded frames (0.1 s) from one label frame to the next; 5 is 2 Hz.
         only_vehicle: leave out pedestrians (two-wheelers are vehicles, as in all three codes).
-        filter_invisible: draw only what the cooperating agents see by the released rule (evaluation.md f).
+        filter_invisible: draw only what the cooperating agents see by the released rule (docs/released_code.md,
+            Visibility and attributes).
         agents: whose sight counts; None for all that are there, whoever cooperates: the released way. Names are kept
             as a tuple.
         draw_ego: draw the ego's own box (the roadside pole has none).

@@ -25,8 +25,8 @@ _CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
 class LabelProtocol:
     """How labels are drawn and warped; a flag is True where the released code's slip is kept.
 
-    Change one with `dataclasses.replace(LABEL_PROTOCOLS["released"], half_cell_shift=False)`. Sources: evaluation.md a
-    and h.
+    Change one with `dataclasses.replace(LABEL_PROTOCOLS["released"], half_cell_shift=False)`. Sources:
+    docs/released_code.md, Motion labels, Warps, and FIERY's own labels.
 
     Attributes:
         own_box_moved_twice: the ego's own row is taken to the ego frame twice, with the released box constructor

@@ -111,7 +111,10 @@ def _frames(
 
 
 def _seen(dataset: Dataset, sample: RowArgument, index: IntArray, config: MotionLabelConfig) -> IntArray:
-    """The `_pairs` of actors and frames at which an agent whose sight counts sees them (evaluation.md f)."""
+    """The `_pairs` of actors and frames at which an agent whose sight counts sees them.
+
+    See docs/released_code.md, Visibility and attributes.
+    """
     boxes, scenario = dataset.columns("annotation"), dataset.get("sample", sample)["scenario_token"]
     pairs = []
     for agent in cooperating_agents(dataset, sample, config.agents):

@@ -1,4 +1,4 @@
-"""Which samples models are trained on and evaluated at (evaluation.md 0)."""
+"""Which samples models are trained on and evaluated at (docs/released_code.md, Conventions and samples)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`BEV_instance_camera/*.npz`: the top-down instance segmentation camera (format.md, BEV_instance_camera)."""
+"""`BEV_instance_camera/*.npz`: the top-down instance segmentation camera (docs/format.md, BEV camera)."""
 
 from dataclasses import dataclass
 from pathlib import Path

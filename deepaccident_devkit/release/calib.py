@@ -1,4 +1,4 @@
-"""`calib/*.pkl`: the poses and cameras of one agent at one frame (format.md, calib)."""
+"""`calib/*.pkl`: the poses and cameras of one agent at one frame (docs/format.md, Calib)."""
 
 import pickle
 from collections.abc import Mapping, Sequence

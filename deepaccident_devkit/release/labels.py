@@ -1,4 +1,4 @@
-"""`label/*.txt`: the boxes that one agent annotated at one frame (format.md, label).
+"""`label/*.txt`: the boxes that one agent annotated at one frame (docs/format.md, Label).
 
 Files are parsed in bulk: the bodies of many files are joined and go through Arrow's CSV reader in one call. What that
 call does not take (CRLF, blanks at line ends, one-token lines, faults) is tidied or named file by file.

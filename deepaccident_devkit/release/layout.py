@@ -1,4 +1,4 @@
-"""Where the files of a release lie, in either layout (format.md, tree)."""
+"""Where the files of a release lie, in either layout (docs/format.md, Tree)."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""`lidar01/*.npz`: one point cloud a file (format.md, lidar01)."""
+"""`lidar01/*.npz`: one point cloud a file (docs/format.md, LiDAR)."""
 
 from pathlib import Path
 from typing import Literal, overload

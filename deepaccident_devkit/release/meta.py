@@ -1,4 +1,4 @@
-"""`meta/<scenario>.txt`: how a scenario was set up and how it ended (format.md, meta)."""
+"""`meta/<scenario>.txt`: how a scenario was set up and how it ended (docs/format.md, Meta)."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""`train.txt`, `val.txt`, …: which scenario belongs to which split (format.md, tree)."""
+"""`train.txt`, `val.txt`, …: which scenario belongs to which split (docs/format.md, Tree)."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -144,7 +144,8 @@ class Sightings(FrozenArrays):
         index: (T,) int64, frame numbers from 1, ascending.
         points: (T,) int64, points of the agent's LiDAR in the box.
         camera: (T,) bool, whether a camera of the agent sees it.
-        seen: (T,) bool, whether the agent counts as seeing it by the released rule (evaluation.md f).
+        seen: (T,) bool, whether the agent counts as seeing it by the released rule (docs/released_code.md, Visibility
+            and attributes).
     """
 
     agent: str

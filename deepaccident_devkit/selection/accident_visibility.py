@@ -1,4 +1,4 @@
-"""Whether an agent sees an accident coming: the released rule (evaluation.md f, `accident_visibility`)."""
+"""Whether an agent sees an accident coming: the released rule (docs/released_code.md, Visibility and attributes)."""
 
 from __future__ import annotations
 
@@ -81,9 +81,10 @@ def accident_visible(dataset: Dataset, sample: RowArgument) -> bool | None:
 
 
 def accident_visible_mask(in_view: ArrayLike, *, collision: ArrayLike = True, exempt: ArrayLike = False) -> BoolArray:
-    """The released rule by itself (evaluation.md f): which samples count as seeing the accident.
+    """The released rule by itself: which samples count as seeing the accident.
 
-    A sample does not if its agent does not have the accident in view now and at one or two of the two moments before.
+    See docs/released_code.md, Visibility and attributes. A sample does not if its agent does not have the accident in
+    view now and at one or two of the two moments before.
 
     Args:
         in_view: (…, 3) bool, whether the agent has all of the colliding pair but itself in view (`pair_in_view`) 1 s
@@ -106,7 +107,9 @@ def accident_visible_mask(in_view: ArrayLike, *, collision: ArrayLike = True, ex
 
 
 def pair_in_view(mask: ArrayLike, actor_ids: ArrayLike, pair: Collection[int], own_id: int | None = None) -> bool:
-    """Whether an agent sees everyone of a colliding pair but itself, at one moment (evaluation.md f).
+    """Whether an agent sees everyone of a colliding pair but itself, at one moment.
+
+    See docs/released_code.md, Visibility and attributes.
 
     Args:
         mask: (N,) which boxes of its label the agent sees (`tables.visible_mask`).

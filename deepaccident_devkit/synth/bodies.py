@@ -17,7 +17,7 @@ MEDIAN_SIZES: dict[str, Size] = {
     "cyclist": (1.64, 0.37, 1.77),
     "pedestrian": (0.38, 0.38, 1.86),
 }
-"""Of the real release: length, width, height, metres (format.md, label)."""
+"""Of the real release: length, width, height, metres (docs/format.md, Label)."""
 _SPREAD = (0.05, 0.05, 0.04)
 """Of length, width and height."""
 _FARTHEST_ORIGIN = 0.3

@@ -1,4 +1,4 @@
-"""Which of the paper's twelve designs an accident realises (format.md, accident types)."""
+"""Which of the paper's twelve designs an accident realises (docs/format.md, Accident types)."""
 
 from deepaccident_devkit.release import Meta
 

@@ -28,7 +28,7 @@ class OpenTables:
     Attributes:
         dataroot: the release's folder.
         version: `v1` or `v1-mini`.
-        layout: how the release lies on disk: `A`, `B` or `A+B` (format.md).
+        layout: how the release lies on disk: `A`, `B` or `A+B` (docs/format.md, Tree).
         problems: the broken scenarios that were left out (`on_error='skip'`).
     """
 

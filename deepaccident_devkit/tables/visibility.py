@@ -1,4 +1,4 @@
-"""Which annotated actors count as seen: the released rule (evaluation.md f)."""
+"""Which annotated actors count as seen: the released rule (docs/released_code.md, Visibility and attributes)."""
 
 from collections.abc import Sequence
 

@@ -40,7 +40,7 @@ _PARTNERS: Final[dict[AgentName, dict[Role, AgentName]]] = {
         "infrastructure": "infrastructure",
     },
 }
-"""Ego → role → agent: the released V2X dataset's renaming (evaluation.md g)."""
+"""Ego → role → agent: the released V2X dataset's renaming (docs/released_code.md, Poses)."""
 
 
 def _names(argument: str, expected: str, given: Iterable[str]) -> tuple[str, ...]:

@@ -47,8 +47,8 @@ def visible_instances(
 ) -> list[str]:
     """The instances that at least one of some agents sees at a sample's moment, by the released rule.
 
-    With all five agents and no link, these are the actors that the released labels count as visible (evaluation.md f).
-    Own rows and untracked ones never are.
+    With all five agents and no link, these are the actors that the released labels count as visible
+    (docs/released_code.md, Visibility and attributes). Own rows and untracked ones never are.
 
     Args:
         dataset: the release.
@@ -104,7 +104,8 @@ def cooperative_boxes(
         agents: names of agents, a configuration or its name as seen from the ego, or None for all that are there.
         frame: frame of the result, of the sample: `world`, `ego`, `lidar` or a camera channel (optical).
         visible: None for all that is annotated, own rows among it; `camera` for what a camera of the agent itself
-            sees; `released` for what the agent itself sees by the released rule (evaluation.md f).
+            sees; `released` for what the agent itself sees by the released rule (docs/released_code.md, Visibility and
+            attributes).
         link: what happens to the partners' data; None for nothing.
 
     Returns:

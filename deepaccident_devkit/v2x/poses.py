@@ -1,7 +1,8 @@
-"""Poses of agents relative to each other and to their own next moment (evaluation.md g), as functions of arrays.
+"""Poses of agents relative to each other and to their own next moment, as functions of arrays.
 
-Every function serves both handednesses: right-handed poses (the devkit's) give right-handed 6-vectors, CARLA's raw
-poses give the released code's; `geometry.handedness.flip_six_vector` leads from one to the other.
+See docs/released_code.md, Poses. Every function serves both handednesses: right-handed poses (the devkit's) give
+right-handed 6-vectors, CARLA's raw poses give the released code's; `geometry.handedness.flip_six_vector` leads from one
+to the other.
 """
 
 from collections.abc import Iterable, Sequence
@@ -20,7 +21,7 @@ Poses = Sequence[SE3] | ArrayLike
 
 
 def relative_pose_to_ego(world_from_agent: Poses) -> FloatArray:
-    """Where agents stand in the ego's frame: `ego_from_agent` of each as a 6-vector (evaluation.md g).
+    """Where agents stand in the ego's frame: `ego_from_agent` of each as a 6-vector (docs/released_code.md, Poses).
 
     Args:
         world_from_agent: (K, 4, 4), or K SE3: poses of one moment, the ego's first.
@@ -38,10 +39,10 @@ def relative_pose_to_ego(world_from_agent: Poses) -> FloatArray:
 
 
 def future_egomotion(world_from_ego: Poses, valid: ArrayLike | None = None) -> FloatArray:
-    """An agent's motion from each of its moments to the next: `next_from_this` as 6-vectors (evaluation.md g).
+    """An agent's motion from each of its moments to the next: `next_from_this` as 6-vectors.
 
-    A row maps points of a moment's ego frame into the next one's. For the released seven rows give eight poses: 1 s
-    before the present to 2.5 s after it, in steps of 0.5 s.
+    See docs/released_code.md, Poses. A row maps points of a moment's ego frame into the next one's. For the released
+    seven rows give eight poses: 1 s before the present to 2.5 s after it, in steps of 0.5 s.
 
     Args:
         world_from_ego: (T + 1, 4, 4), or T + 1 SE3: poses of one agent in the order of time.

@@ -1,4 +1,4 @@
-"""What one agent's labels say by themselves: ids, sizes, own rows, tracks (format.md, label)."""
+"""What one agent's labels say by themselves: ids, sizes, own rows, tracks (docs/format.md, Label)."""
 
 from collections.abc import Callable, Iterator
 

@@ -1,4 +1,4 @@
-"""Are the agents where vehicles can be, and their sensors where the format says (format.md, calib)."""
+"""Are the agents where vehicles can be, and their sensors where the format says (docs/format.md, Calib)."""
 
 from collections.abc import Callable, Iterator
 

@@ -1,4 +1,4 @@
-"""Does meta tell what was recorded: words, counts, ids, and an impact at the end (format.md, meta)."""
+"""Does meta tell what was recorded: words, counts, ids, and an impact at the end (docs/format.md, Meta)."""
 
 import re
 from collections.abc import Callable, Iterator

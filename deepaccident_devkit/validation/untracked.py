@@ -1,4 +1,4 @@
-"""Labels that track nobody: every id is −1, which format.md knows of far actors only."""
+"""Labels that track nobody: every id is −1, which docs/format.md, Label, knows of far actors only."""
 
 from collections.abc import Iterator
 

@@ -1,12 +1,12 @@
-"""Golden d and d2: accidents as the released code evaluates them. Equal counts, matches and cells.
+"""The golden accidents (tests/data/golden: d_accident, d2_eval_accidents). Equal counts, matches and cells.
 
-Made by the released functions, d by the whole evaluation loop over samples of six predictions, d2 by `eval_accidents`
-alone, under numpy 1.23.5, scikit-image 0.20.0, shapely 2.0.1, OpenCV 4.7.0 and torch 2.13 on the CPU (golden/README.md,
-d_accident and d2_eval_accidents); the rules are evaluation.md d. Errors and rates to 1e-6. Distances of outlines as far
-as a golden can pin them (design.md 7, trap 4): one in a hundred of them all moves with numpy's version and the
-processor, by half a cell at most, and none across a threshold. Ours are compared with what the released code gives
-with a stable sort. The golden's maps lie as the released code has them; d also runs turned to the devkit's orientation
-and to FIERY's.
+Accidents as the released code evaluates them. Made by the released functions, d_accident by the whole evaluation loop
+over samples of six predictions, d2_eval_accidents by `eval_accidents` alone, under numpy 1.23.5, scikit-image 0.20.0,
+shapely 2.0.1, OpenCV 4.7.0 and torch 2.13 on the CPU (tests/data/golden/README.md); the rules are
+docs/released_code.md, Accidents. Errors and rates to 1e-6. Distances of outlines as far as a golden can pin them: one
+in a hundred of them all moves with numpy's version and the processor, by half a cell at most, and none across a
+threshold. Ours are compared with what the released code gives with a stable sort. The golden's maps lie as the released
+code has them; d_accident also runs turned to the devkit's orientation and to FIERY's.
 """
 
 import functools
@@ -218,7 +218,7 @@ def test_distances_between_drawn_boxes(request: pytest.FixtureRequest) -> None:
 
 
 def distances_of_samples(folder: Path) -> list[tuple[float, float]]:
-    """Golden d: ours and theirs, of true pairs nearer than 30 cells in the last frame."""
+    """d_accident: ours and theirs, of true pairs nearer than 30 cells in the last frame."""
     result = []
     for index in range(len(whole(folder)["samples"])):
         golden = GoldenCase(folder, "d_accident", "samples", index)
@@ -232,7 +232,7 @@ def distances_of_samples(folder: Path) -> list[tuple[float, float]]:
 
 
 def distances_of_cases(folder: Path) -> list[tuple[float, float]]:
-    """Golden d2: ours and theirs, in the order of the golden's log."""
+    """d2_eval_accidents: ours and theirs, in the order of the golden's log."""
     cases = GoldenCase(folder, "d2_eval_accidents", "cases", None).whole.get("cases", [])
     assert cases, f"{folder / 'd2_eval_accidents'}.json: no cases; see pytest --golden DIR"
     result = []

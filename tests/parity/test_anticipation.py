@@ -1,7 +1,7 @@
-"""Golden safety/anticipation: accident anticipation as four published evaluations have it, and without their quirks.
+"""The golden anticipation (tests/data/golden/safety): four published evaluations, and without their quirks.
 
 UString, DSTA, DRIVE and DAD were run with their sorts made stable, `clean` is plain code with scikit-learn's AP and AUC
-(golden/safety/README.md). All numbers to 1e-9; where a published code raised an error the devkit says NaN.
+(tests/data/golden/safety/README.md). All numbers to 1e-9; where a published code raised an error the devkit says NaN.
 """
 
 import functools

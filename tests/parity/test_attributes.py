@@ -1,7 +1,7 @@
-"""Goldens a and d: the attributes that the released evaluation breaks its results down by (evaluation.md f, end).
+"""The golden attributes (tests/data/golden: a_labels, d_accident), by which the released evaluation sorts its results.
 
-Golden a has meta lines and what the released code read in them, golden d which samples of a run have which value.
-Equal words. `accident_visibility` itself is `test_visibility`'s.
+a_labels has meta lines and what the released code read in them, d_accident which samples of a run have which value
+(docs/released_code.md, Visibility and attributes). Equal words. `accident_visibility` itself is `test_visibility`'s.
 """
 
 from typing import Any

@@ -1,7 +1,8 @@
-"""Golden e: average precision and errors of detected boxes, in both modes of the released code.
+"""The golden detections (tests/data/golden, e_detection): average precision and errors of boxes, in both modes.
 
 Made by the released functions under numpy 1.23.5, numba 0.57.1 and shapely 2.0.1 in place of the CUDA kernel
-(golden/README.md, e_detection); the rules are evaluation.md e. Everything equal to 1e-9, but mASE to 1e-4.
+(tests/data/golden/README.md); the rules are docs/released_code.md, Detection. Everything equal to 1e-9, but mASE to
+1e-4.
 
 The golden's boxes are left-handed, with yaws beyond half a turn: they go in as columns, y and vy negated. Yaw stands
 as the converter writes it, which is ours.

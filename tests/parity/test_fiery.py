@@ -1,6 +1,6 @@
-"""Golden h: FIERY's own labels, for the preset `fiery`, in each frame's own ego frame.
+"""FIERY's golden labels (tests/data/golden, h_fiery), for the preset `fiery`, in each frame's own ego frame.
 
-Made by FIERY (golden/README.md, h_fiery). Every cell of instance, offset and flow is equal, and centerness after
+Made by FIERY (tests/data/golden/README.md). Every cell of instance, offset and flow is equal, and centerness after
 rounding to float16, as it is stored. The ids are the objects' numbers: FIERY counts them over its past frames too.
 """
 

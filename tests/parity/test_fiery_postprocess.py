@@ -1,7 +1,7 @@
-"""Golden h: FIERY's own ids and paths for noisy predictions, with the preset `fiery`. Every cell and number equal.
+"""FIERY's golden ids and paths (tests/data/golden, h_fiery), for noisy predictions, with the preset `fiery`.
 
-Made by wayveai/fiery @ fd03f16 under numpy 1.26.4 and torch 2.13 on the CPU (golden/README.md, h_fiery); rasters there
-are FIERY's, rows along x. Each case also runs turned to the devkit's orientation.
+Made by wayveai/fiery @ fd03f16 under numpy 1.26.4 and torch 2.13 on the CPU (tests/data/golden/README.md); rasters
+there are FIERY's, rows along x. Every cell and number equal. Each case also runs turned to the devkit's orientation.
 """
 
 import numpy as np

@@ -1,8 +1,8 @@
-"""Golden a: motion labels of whole samples, in each frame's own ego frame, augmented ones included.
+"""The golden labels (tests/data/golden, a_labels): whole samples, in each frame's own ego frame, augmented ones too.
 
-Made by the released transforms under numpy 1.23.5, OpenCV 4.7.0 and torch 2.13 on a processor (golden/README.md,
-a_labels). Every cell of segmentation, instance, offset and flow is equal, and centerness after rounding to float16,
-as it is stored (one cell in three million flips in rounding); boxes within 1e-5 m.
+Made by the released transforms under numpy 1.23.5, OpenCV 4.7.0 and torch 2.13 on a processor
+(tests/data/golden/README.md). Every cell of segmentation, instance, offset and flow is equal, and centerness after
+rounding to float16, as it is stored (one cell in three million flips in rounding); boxes within 1e-5 m.
 """
 
 import functools

@@ -1,7 +1,8 @@
-"""Golden a once more, from files: each scene is written as a release by hand and read back through the tables.
+"""The golden labels (tests/data/golden, a_labels) once more, from files.
 
-Poses, boxes and visibility then come from label, calib and meta files, egomotion from poses; every cell of the labels
-in each frame's own frame and at the present is equal, as in test_labels and test_warps.
+Each scene is written as a release by hand and read back through the tables. Poses, boxes and visibility then come from
+label, calib and meta files, egomotion from poses; every cell of the labels in each frame's own frame and at the present
+is equal, as in test_labels and test_warps.
 """
 
 import pickle

@@ -1,8 +1,9 @@
-"""Golden d: what the released evaluation loop printed of motion, over all samples and by attribute.
+"""The golden run (tests/data/golden, d_accident): what the released loop printed of motion, of all and by attribute.
 
-`MotionEvaluator` gets the stored labels and predictions; the other side is d_accident_stdout.txt (golden/README.md,
-d_accident; evaluation.md b and d), which has a block an attribute value, then one of everything. Counts equal, what is
-printed equal to its last digit. The VPQ of the blocks is the released mistake (`selected_as_released`).
+`MotionEvaluator` gets the stored labels and predictions; the other side is d_accident_stdout.txt
+(tests/data/golden/README.md; docs/released_code.md, IoU and VPQ, and Paths), which has a block an attribute value, then
+one of everything. Counts equal, what is printed equal to its last digit. The VPQ of the blocks is the released mistake
+(`selected_as_released`).
 """
 
 import functools
@@ -37,7 +38,7 @@ _PATHS = {
 
 
 class Sample:
-    """One sample of golden d: its labels, at the present already, and its six predictions."""
+    """One sample of d_accident: its labels, at the present already, and its six predictions."""
 
     def __init__(self, golden: GoldenCase) -> None:
         self.token, self.frames = str(golden.index), golden.entry["S"]

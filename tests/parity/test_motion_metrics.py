@@ -1,8 +1,9 @@
-"""Golden b: IoU and VPQ of linked instances, at both ranges, of each sequence and over all of them.
+"""The golden IoU and VPQ (tests/data/golden, b_vpq) of linked instances, at both ranges, of each sequence and of all.
 
 Made by the released functions (FIERY's panoptic metric, torchmetrics' IoU) under numpy 1.23.5 and torch 2.13 on the CPU
-(golden/README.md, b_vpq; evaluation.md b). Counts equal; rates and sums of intersections over unions to 2e-6, since the
-released code sums in float32. `test_trajectories` has the errors of the paths, `test_motion_end_to_end` the evaluator.
+(tests/data/golden/README.md; docs/released_code.md, IoU and VPQ). Counts equal; rates and sums of intersections over
+unions to 2e-6, since the released code sums in float32. `test_trajectories` has the errors of the paths,
+`test_motion_end_to_end` the evaluator.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,7 @@
-"""Golden f, and of golden a the accident's visibility: which actors the released code counts as seen. Exact.
+"""The golden visibility (tests/data/golden: f_visibility, and a_labels for the accident's): who counts as seen. Exact.
 
-Made by the released functions under numpy 1.23.5 (golden/README.md, f_visibility and a_labels); the rules are
-evaluation.md f.
+Made by the released functions under numpy 1.23.5 (tests/data/golden/README.md); the rules are
+docs/released_code.md, Visibility and attributes.
 """
 
 import numpy as np

@@ -1,8 +1,8 @@
-"""Golden a, g and h: labels warped to the present, maps of the past and of other agents warped to the ego.
+"""The golden warps (tests/data/golden: a_labels, g_poses, h_fiery): to the present, from the past and other agents.
 
-Made by the released functions and by FIERY's own under torch 2.13 (golden/README.md, a_labels, g_poses, h_fiery); the
-rules are evaluation.md a, g and h. No cell of a nearest warp of labels may differ; a dense field may in 10 cells of
-80,000, a bilinear warp in 1.5 % of the cells that are not zero, by one step of float16 or 3e-4.
+Made by the released functions and by FIERY's own under torch 2.13 (tests/data/golden/README.md); the rules are
+docs/released_code.md, Warps, and FIERY's own labels. No cell of a nearest warp of labels may differ; a dense field may
+in 10 cells of 80,000, a bilinear warp in 1.5 % of the cells that are not zero, by one step of float16 or 3e-4.
 """
 
 import json
@@ -115,7 +115,7 @@ def test_agents_maps_are_warped_as_by_the_released_code(golden_row, mode, orient
 
 
 def scene_of(golden) -> dict[str, np.ndarray]:
-    """The arrays of one scene of golden a: a file a scene."""
+    """The arrays of one scene of a_labels: a file a scene."""
     assert golden.index is not None, f"{golden.folder}: no scene in a_labels.json"
     with np.load(golden.folder / f"a_labels_{golden.index:02d}.npz") as archive:
         return dict(archive)
@@ -129,7 +129,7 @@ def whole(golden_row) -> dict[str, np.ndarray]:
 
 
 def chain_of(golden_row) -> np.ndarray:
-    """(7, 6) the raw egomotion that golden g's warps take."""
+    """(7, 6) the raw egomotion that the warps of g_poses take."""
     part = json.loads((golden_row.folder / "g_poses.json").read_text(encoding="utf-8"))
     return whole(golden_row)[f"egomotion_{part['chains'].index(part['warp_chain']):03d}"]
 
@@ -181,7 +181,7 @@ def released(labels: MotionLabels, name: str) -> np.ndarray:
 
 
 def centres_of(instance: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """(T, 1, H, W) float32 centerness as evaluation.md a makes it, from the instances' centres."""
+    """(T, 1, H, W) float32 centerness of the instances' centres, as docs/released_code.md, Motion labels, has it."""
     rows, columns = np.indices(instance.shape[1:])
     result = np.zeros((len(instance), 1, *instance.shape[1:]), dtype=np.float32)
     for frame, ids in enumerate(instance):

@@ -201,7 +201,7 @@ def test_opencoods_precision_is_vocs(drawn: list[Sample], everywhere: bool) -> N
 
 
 def plain_pass(sample: Sample, category: int, threshold: float, least: float | None) -> tuple[int, int, int, list]:
-    """TP, FP, FN and the scores of the TPs of one sample and class, as evaluation.md e says; no `least`: score pass."""
+    """TP, FP, FN, scores of TPs of a sample and class (docs/released_code.md, Detection); no `least`: score pass."""
     prediction, truth = sample
     center, true_center = (boxes.center.astype(np.float32) for boxes in (prediction.boxes, truth))
     beyond, true_beyond = (np.sqrt(2 * each[:, 0].astype(float) ** 2) >= 120 for each in (center, true_center))

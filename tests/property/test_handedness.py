@@ -104,7 +104,7 @@ def carla_matrix(location: np.ndarray, yaw: float, pitch: float, roll: float) ->
 
 
 def raw_calib(ego_to_world: np.ndarray, lidar_to_ego: np.ndarray) -> dict[str, np.ndarray]:
-    """A calib file's dict as format.md describes it."""
+    """A calib file's dict as docs/format.md, Calib, describes it."""
     raw = {"ego_to_world": ego_to_world, "lidar_to_ego": lidar_to_ego}
     for camera, degrees in CAMERA_YAWS.items():
         c, s, f = np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), FOCAL[camera]
@@ -145,7 +145,7 @@ def test_a_point_its_box_and_its_pixel_stay_together_on_the_way_to_another_agent
     x, y, z = center.tolist()
     (scratch / "label.txt").write_text(f"1 2\ncar {x} {y} {z} 4.2 1.9 1.5 {yaw} 3.0 -1.0 7 5 True\n")
 
-    # the left-handed way: format.md's formulas and nothing else
+    # the left-handed way: the formulas of docs/format.md, Calib, and nothing else
     c, s = np.cos(yaw), np.sin(yaw)
     half = np.array([4.2, 1.9, 1.5]) / 2
     spots = np.concatenate([[[0, 0, 0]], RAW_CORNERS, [[0.6, -0.8, 0.3]]]) * half  # centre, corners, a point inside

@@ -41,7 +41,7 @@ def paths(draw: st.DrawFn) -> dict[int, np.ndarray]:
 
 
 def plain_vpq(prediction: np.ndarray, label: np.ndarray, *, ids_must_stay: bool) -> list[list[float]]:
-    """[iou, tp, fp, fn] of the instances in each frame, as evaluation.md b tells it."""
+    """[iou, tp, fp, fn] of the instances in each frame, as docs/released_code.md, IoU and VPQ, tells it."""
     result, partner = [], {}
     for predicted, true in zip(prediction, label, strict=True):
         sums = [0.0, 0, 0, 0]

@@ -35,7 +35,9 @@ def cluster_of(scenario: str) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScenarioAttributes:
-    """What a scenario's name and meta file say, in the released evaluation's words (evaluation.md f); None unknown.
+    """What a scenario's name and meta file say, in the released evaluation's words; None unknown.
+
+    See docs/released_code.md, Visibility and attributes.
 
     Attributes:
         scenario_type: such as `type1_subtype1_accident`.

@@ -1,4 +1,7 @@
-"""The frames and cells that are evaluated: at the present, in the recording, within a range (evaluation.md a)."""
+"""The frames and cells that are evaluated: at the present, in the recording, within a range.
+
+See docs/released_code.md, Conventions and samples.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where instances go, which predicted path is which true one, and how far off it is (evaluation.md d).
+"""Where instances go, which predicted path is which true one, and how far off it is (docs/released_code.md, Paths).
 
 Paths are those of the instances of the first frame: id → (n, 2) positions, such as `motion.trajectories` gives in
 metres, or `LinkedInstances.centers` times the cells' size. An instance that a frame lacks has no point for it, so that

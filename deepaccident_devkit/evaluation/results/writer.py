@@ -70,9 +70,9 @@ class ResultsWriter:
             labels: of motion, the label protocol (`motion.LABEL_PROTOCOLS`) that the model learned from, which says
                 where in its cell a point is; None if it is not known.
             store: of motion, `instances` keeps instance maps and paths, some 30 KB a sample of five predictions; heads
-                are post-processed as the released evaluation of motion does (evaluation.md c). The released accident
-                evaluation does that otherwise, and from instance maps its numbers differ slightly. `heads` keeps the
-                maps of the model as they are: 34 MB a sample of six predictions.
+                are post-processed as the released evaluation of motion does (docs/released_code.md, Post-processing).
+                The released accident evaluation does that otherwise, and from instance maps its numbers differ
+                slightly. `heads` keeps the maps of the model as they are: 34 MB a sample of six predictions.
 
         Raises:
             ChoiceError: no such task.

@@ -1,7 +1,8 @@
 """Which boxes labels show at a frame, and where their corners lie on the ground of the agent's ego frame.
 
 The released code turns label rows into mmdet3d boxes and moves those, all in float32 and CARLA's left-handed frames;
-the cells depend on the rounding, so its steps are repeated here one by one (evaluation.md 0 and a).
+the cells depend on the rounding, so its steps are repeated here one by one (docs/released_code.md, Conventions and
+samples, Motion labels).
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ class FrameBoxes:
         yaw: (N,) float64, heading about z, radians.
         actor_id: (N,) int64; −100 is the agent's own row, −1 an untracked actor's.
         category: (N,) int, position in `taxonomy.CATEGORIES`.
-        visible: (N,) bool, whether anybody whose sight counts sees the actor (evaluation.md f).
+        visible: (N,) bool, whether anybody whose sight counts sees the actor (docs/released_code.md, Visibility and
+            attributes).
         ego_from_lidar: (4, 4) float64.
     """
 

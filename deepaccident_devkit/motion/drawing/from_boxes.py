@@ -1,6 +1,7 @@
 """Motion labels from boxes: who is drawn where, under which id, and where that is at the next frame.
 
-Every frame is drawn in its own ego frame (evaluation.md a and h); `MotionLabels.to_present` warps the maps.
+Every frame is drawn in its own ego frame (docs/released_code.md, Motion labels); `MotionLabels.to_present` warps the
+maps.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Instances of one frame from a model's maps: peaks of the centerness, and each foreground cell to its nearest one.
 
-The rules are the released ones (evaluation.md c), FIERY's: everything in float32, first come first served on ties, and
-cells in row-major order. Arrays here lie in the orientation that the rules count in; see `postprocessing`.
+The rules are the released ones (docs/released_code.md, Post-processing), FIERY's: everything in float32, first come
+first served on ties, and cells in row-major order. Arrays here lie in the orientation that the rules count in; see
+`postprocessing`.
 """
 
 from __future__ import annotations

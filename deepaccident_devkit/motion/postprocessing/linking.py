@@ -1,6 +1,6 @@
 """The same id for the same instance in all frames: each is matched with where the flow takes those of the frame before.
 
-The rules are the released ones (evaluation.md c), FIERY's with a distance of one's own.
+The rules are the released ones (docs/released_code.md, Post-processing), FIERY's with a distance of one's own.
 """
 
 from __future__ import annotations

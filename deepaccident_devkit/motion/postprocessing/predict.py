@@ -29,7 +29,9 @@ _MOST_CENTERS: Final = 2**24
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PostProcessing:
-    """How instances are read off a model's maps; the defaults are the released ones for VPQ (evaluation.md c).
+    """How instances are read off a model's maps; the defaults are the released ones for VPQ.
+
+    See docs/released_code.md, Post-processing.
 
     Attributes:
         foreground: which cells are actors: `argmax` of both logits (background where they are equal), or `sigmoid`:
@@ -142,7 +144,9 @@ class LinkedInstances:
 
 
 def predict_instances(heads: MotionHeads, settings: PostProcessing | str = "motion") -> LinkedInstances:
-    """Instances with the same id in all frames, as the released code finds them (evaluation.md c and h).
+    """Instances with the same id in all frames, as the released code finds them.
+
+    See docs/released_code.md, Post-processing and FIERY's own labels.
 
     Args:
         heads: a model's maps, or `MotionHeads.from_labels`.

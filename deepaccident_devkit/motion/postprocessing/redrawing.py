@@ -1,7 +1,8 @@
 """The accident variant's boxes: each instance of the first frame drawn as a rectangle along its path.
 
-The released accident evaluation looks at these and not at the instances themselves (evaluation.md c). All its quirks
-are kept; the masks' rectangles and the drawing are those of OpenCV 4.7, whatever version is installed.
+The released accident evaluation looks at these and not at the instances themselves (docs/released_code.md,
+Post-processing). All its quirks are kept; the masks' rectangles and the drawing are those of OpenCV 4.7, whatever
+version is installed.
 """
 
 from __future__ import annotations

@@ -33,8 +33,9 @@ def maps_to_present(
 
     Segmentation, instance, offset and flow take the nearest cell's values. The protocol says how (`warp`), what comes
     in from beside the grid (`outside_is_zero`) and whether offset and flow turn with the frame
-    (`vectors_not_rotated`). An augmentation of the configuration counts on both sides: A C A⁻¹ (evaluation.md a). A
-    missing frame that is all `ignore_index` (not `missing_frames_are_empty`) stays so: there is nothing to warp.
+    (`vectors_not_rotated`). An augmentation of the configuration counts on both sides: A C A⁻¹ (docs/released_code.md,
+    Warps). A missing frame that is all `ignore_index` (not `missing_frames_are_empty`) stays so: there is nothing to
+    warp.
 
     Args:
         maps: segmentation, instance, centerness, offset and flow, each frame in its own ego frame.

@@ -3,17 +3,17 @@
 Sampling is counted in a protocol's `native` orientation, with matrices of that orientation's handedness, by one of
 three rules (`WarpRule`):
 
-- `stretched`: the released `FeatureWarper` (evaluation.md a), which is BEVerse's. Sample points stand at
+- `stretched`: the released `FeatureWarper` (docs/released_code.md, Warps), which is BEVerse's. Sample points stand at
   linspace(−49.75, 50, 200) along either axis instead of at the cells' centres, and the outermost of them are taken for
   the grid's ends: without motion, cell i samples 0.4975 + 0.9975 i, which nearest sampling rounds to i, and which blurs
   bilinear sampling by up to half a cell. In float32, rounding for rounding, since the last bit decides for points that
   lie on the border between two cells. Grids that are not centred on the ego, where the released code has no meaning,
   are stretched about their own middle.
 - `exact`: cell centres, in float64; without motion every cell gets its own value, in either mode.
-- `fiery`: FIERY's (evaluation.md h), native in `fiery`. Cell centres, but of the motion only yaw and planar translation
-  as the 6-vector has them count, and they are put together as source = Rot(−yaw) · target + (−tx, +ty): the sideways
-  shift has the wrong sign, and neither shift is turned. FIERY knows square grids centred on the ego; on others we
-  measure in metres from the ego.
+- `fiery`: FIERY's (docs/released_code.md, FIERY's own labels), native in `fiery`. Cell centres, but of the motion only
+  yaw and planar translation as the 6-vector has them count, and they are put together as source = Rot(−yaw) · target +
+  (−tx, +ty): the sideways shift has the wrong sign, and neither shift is turned. FIERY knows square grids centred on
+  the ego; on others we measure in metres from the ego.
 
 The transform is rigid (or A · rigid · A⁻¹ with an augmentation A); points lie on the plane z = 0, of whose images x and
 y count. `source_from_target` maps points of the frame that the result is in to points of the frame that the raster is

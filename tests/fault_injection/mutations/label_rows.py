@@ -137,7 +137,7 @@ def id_odd(place: Place, rng: np.random.Generator) -> str:
     return f"{actor} is {new}"
 
 
-@GROUP.kind(harmless="tracking comes and goes in real labels too: format.md shows an untracked row at 22 m")
+@GROUP.kind(harmless="tracking comes and goes in real labels too: one has an untracked row at 22 m")
 def id_lost(place: Place, rng: np.random.Generator) -> str:
     """A near actor that others track has the id of an untracked one (−1) at one frame."""
     (agent, actor), frame = place.shared_actor(rng, within=NEAR), place.middle_frame(rng)

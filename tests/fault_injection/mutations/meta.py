@@ -48,7 +48,7 @@ def meta_cut(place: Place, rng: np.random.Generator) -> str:
     return f"ends in {shorter[-20:]!r}"
 
 
-@GROUP.kind(harmless="real meta files too can lack their last four lines (format.md)")
+@GROUP.kind(harmless="real meta files too can lack their last four lines (docs/format.md, Meta)")
 def meta_last_lines_removed(place: Place, rng: np.random.Generator) -> str:
     """The meta file ends after its third line."""
     _write(place, place.meta_lines()[:3])
@@ -125,7 +125,7 @@ def meta_impact_nan(place: Place, rng: np.random.Generator) -> str:
     return _set_word(place, 5, "nan")
 
 
-@GROUP.kind(only="accident", harmless="an accident folder can hold a scenario without a collision (format.md)")
+@GROUP.kind(only="accident", harmless="an accident folder can hold one without a collision (docs/format.md, Meta)")
 def meta_collision_dropped(place: Place, rng: np.random.Generator) -> str:
     """The meta file of an accident tells of no collision."""
     words = place.meta_lines()[0].split()

@@ -103,7 +103,7 @@ def agents_exchanged(place: Place, rng: np.random.Generator) -> str:
     return f"{one} and {other}"
 
 
-@GROUP.kind(harmless="a partial download: a scenario with an agent wholly absent is good (format.md)")
+@GROUP.kind(harmless="a partial download: a scenario with an agent wholly absent is good (docs/format.md, Tree)")
 def agent_removed(place: Place, rng: np.random.Generator) -> str:
     """An agent is wholly absent."""
     agent = place.any_agent(rng)
@@ -112,7 +112,7 @@ def agent_removed(place: Place, rng: np.random.Generator) -> str:
     return agent
 
 
-@GROUP.kind(harmless="a partial download: users unpack some sensors only (format.md)")
+@GROUP.kind(harmless="a partial download: users unpack some sensors only (docs/format.md, Tree)")
 def sensor_removed(place: Place, rng: np.random.Generator) -> str:
     """A sensor of all agents is wholly absent."""
     channel = str(rng.choice(CHANNELS))
@@ -121,7 +121,7 @@ def sensor_removed(place: Place, rng: np.random.Generator) -> str:
     return channel
 
 
-@GROUP.kind(harmless="a partial download: users unpack some sensors only (format.md)")
+@GROUP.kind(harmless="a partial download: users unpack some sensors only (docs/format.md, Tree)")
 def all_sensors_removed(place: Place, rng: np.random.Generator) -> str:
     """All sensors of all agents are absent: labels and calib alone."""
     for agent in place.agents:
@@ -130,7 +130,7 @@ def all_sensors_removed(place: Place, rng: np.random.Generator) -> str:
     return "labels and calib stay"
 
 
-@GROUP.kind(harmless="the real test split ships without labels, BEV arrays and sometimes meta (format.md)")
+@GROUP.kind(harmless="the real test split ships without labels, BEV arrays and sometimes meta (docs/format.md, Tree)")
 def test_labels_removed(place: Place, rng: np.random.Generator) -> str:
     """The scenario is of the test split, as its twin is, and has no labels, no BEV arrays and no meta."""
     line = _line(place)
@@ -145,7 +145,7 @@ def test_labels_removed(place: Place, rng: np.random.Generator) -> str:
     return "moved to test.txt"
 
 
-@GROUP.kind(harmless="split files can lie in their own folder (format.md)")
+@GROUP.kind(harmless="split files can lie in their own folder (docs/format.md, Tree)")
 def split_files_moved(place: Place, rng: np.random.Generator) -> str:
     """The split files lie under split_txt_files/."""
     for path in sorted(place.root.glob("*.txt")):

@@ -1,4 +1,4 @@
-"""On format.md's own numbers; the laws are in tests/property/test_handedness.py."""
+"""On numbers of real files (docs/format.md, Calib); the laws are in tests/property/test_handedness.py."""
 
 import numpy as np
 from numpy.testing import assert_array_equal

@@ -11,7 +11,7 @@ from strategies import mutations
 from deepaccident_devkit.errors import LabelError, MissingFileError
 from deepaccident_devkit.release import Labels, read_label, read_labels, write_label
 
-# format.md's real lines
+# lines of real labels; docs/format.md, Label, says what each value is
 HEADER = "0.0034441 -5.6166797"
 PARKED = "car -38.698 -19.789 -0.882 4.181 1.994 1.381 -0.000518 0.0 0.0 20001 0 True"
 OWN = "car -0.0026 -1.4e-05 -1.2216 4.674 1.812 1.442 0.0 0.00344 -5.6167 -100 1394 False"

@@ -9,7 +9,7 @@ from deepaccident_devkit.errors import MetaError, MissingFileError
 from deepaccident_devkit.release import Collision, Meta, read_meta, write_meta
 from deepaccident_devkit.taxonomy import META_AGENTS
 
-# format.md's real files
+# real files, as in docs/format.md, Meta
 ACCIDENT = """\
 HardRainNoon 1236 car 1237 car 6790.168605131015 same front_side 78
  colliding agents: ego_behind other_behind

@@ -36,7 +36,7 @@ def test_the_papers_seven_as_seen_from_the_ego_vehicle() -> None:
     ],
 )
 def test_partners_are_renamed_as_in_the_released_code(ego: str, side: str, expected: tuple[str, ...]) -> None:
-    """The released V2X dataset's name_mapping, written out (evaluation.md g)."""
+    """The released V2X dataset's name_mapping, written out (docs/released_code.md, Poses)."""
     everyone = AGENT_CONFIGS["all"].agents_for(ego, side=side)
     assert everyone == (ego, *expected)
     assert set(everyone) == set(AGENTS)

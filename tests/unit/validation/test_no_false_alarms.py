@@ -1,4 +1,4 @@
-"""What format.md calls normal is no finding, and what cannot be read ends no run."""
+"""What docs/format.md calls normal is no finding, and what cannot be read ends no run."""
 
 import shutil
 from pathlib import Path

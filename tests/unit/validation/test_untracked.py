@@ -58,7 +58,7 @@ def near_vehicles(path: Path) -> int:
 
 
 def test_far_actors_are_not_tracked(own_release: Path) -> None:
-    """−1 is normal where it begins at a distance, whoever else is nearer (format.md, label)."""
+    """−1 is normal where it begins at a distance, whoever else is nearer (docs/format.md, Label)."""
     for path in own_release.glob("*/*/*/label/*/*.txt"):
         untracked(path, keep=lambda row: float(row[1]) ** 2 + float(row[2]) ** 2 < 20**2)
     codes = {finding.code for finding in validate_release(own_release, workers=1).findings}

@@ -1,6 +1,6 @@
-"""Accidents as the released code evaluates them, slips included (protocol `released`; evaluation.md d).
+"""Accidents as the released code evaluates them, bugs included (protocol `released`; docs/released_code.md, Accidents).
 
-Each slip is a field of `ReleasedAccidents` that can be put right, or lies in the functions that it comes from:
+Each bug is a field of `ReleasedAccidents` that can be put right, or lies in the functions that it comes from:
 `motion.postprocessing.redrawing` (boxes of 5 m × 2 m at most, drawn into the wrong frame after a gap, and of the first
 frame's instances alone), `outlines.first_outline` (of an instance in several parts, one counts),
 `trajectories.padded` and `match_trajectories`.

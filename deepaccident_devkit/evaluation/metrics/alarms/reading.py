@@ -1,4 +1,7 @@
-"""`AccidentReading`: how an accident is read off instance maps, by the paper's words (evaluation.md, last tables)."""
+"""`AccidentReading`: how an accident is read off instance maps, by the paper's words.
+
+docs/released_code.md, Paper versus code, has where the released code differs.
+"""
 
 from __future__ import annotations
 

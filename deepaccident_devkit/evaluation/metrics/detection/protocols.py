@@ -39,8 +39,8 @@ def _check_classes(classes: tuple[tuple[str, tuple[str, ...]], ...]) -> None:
 class DetectionProtocol:
     """What counts as found, and how that becomes numbers.
 
-    Sources: evaluation.md e (released), the paper's text, the nuScenes devkit (eval/detection) and OpenCOOD
-    (opencood/utils/eval_utils.py, box_utils.py and data_utils/datasets).
+    Sources: docs/released_code.md, Detection (released), the paper's text, the nuScenes devkit (eval/detection) and
+    OpenCOOD (opencood/utils/eval_utils.py, box_utils.py and data_utils/datasets).
 
     Attributes:
         classes: what is counted apart: a name and the categories that it takes in.

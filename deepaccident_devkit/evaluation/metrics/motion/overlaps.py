@@ -1,8 +1,8 @@
-"""How far predicted and true maps overlap: IoU of cells, video panoptic quality (VPQ) of instances (evaluation.md b).
+"""How far predicted and true maps overlap: IoU of cells, video panoptic quality (VPQ) of instances.
 
 VPQ: instances found, in the right cells and under the same id all along. In each frame a true and a predicted instance
 match if the intersection of their cells is more than half of the union, so that nobody has two partners. FIERY's
-measure, of which the released code has a copy; counts are sums over frames.
+measure, of which the released code has a copy; counts are sums over frames (docs/released_code.md, IoU and VPQ).
 """
 
 from __future__ import annotations

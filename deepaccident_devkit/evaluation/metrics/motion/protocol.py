@@ -17,7 +17,9 @@ from deepaccident_devkit.motion import LABEL_PROTOCOLS, POST_PROCESSING, PostPro
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotionProtocol:
-    """What decides the motion metrics; the defaults are the released ones (evaluation.md b, c and d).
+    """What decides the motion metrics; the defaults are the released ones.
+
+    Sources: docs/released_code.md, Post-processing, IoU and VPQ, and Paths.
 
     Attributes:
         labels: protocol of the labels that are the truth, by name; others are refused. None for any labels.

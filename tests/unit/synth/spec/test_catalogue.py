@@ -1,4 +1,4 @@
-"""The twelve designs are the paper's: the accident that each means is of its type (format.md, accident types)."""
+"""The twelve designs are the paper's: the accident that each means is of its type (docs/format.md, Accident types)."""
 
 import dataclasses
 import importlib.util
