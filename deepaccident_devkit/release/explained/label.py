@@ -41,7 +41,7 @@ def label_text(path: Path, rows: int | None) -> tuple[str, LabelError | None]:
     """
     labels, fault = read_label_to_fault(path, raw=True)
     shown = slice(0, rows)
-    until = "" if fault is None else " before the line that cannot be read"
+    until = "" if fault is None else ", before the line that cannot be read"
     more = max(len(labels) - len(range(len(labels))[shown]), 0)
     parts = [
         f"A label: the boxes that one agent annotated at one frame. {_counts(labels)}{until}.",

@@ -107,7 +107,7 @@ def test_a_broken_label_is_told_up_to_its_fault(tmp_path: Path) -> None:
     first, own, van, _ = label_lines("ego_vehicle", 1)
     path = copied(tmp_path / "label.txt", "\n".join([first, own, "", van, "car 1 2 3", van]).encode())
     explanation = explain_file(path)
-    assert "2 boxes: 1 car, 1 van before the line that cannot be read." in explanation.text
+    assert "2 boxes: 1 car, 1 van, before the line that cannot be read." in explanation.text
     assert isinstance(explanation.fault, LabelError)
     assert str(explanation.fault).startswith(f"{path}:5: expected 13 fields, found 4: 'car 1 2 3'")
 
