@@ -7,14 +7,20 @@ _LISTED = 20
 """Words that a message lists at most."""
 
 
-def columns_text(rows: Sequence[Sequence[str]]) -> str:
-    """Lines of aligned columns: the first flush left, the others flush right; the first row is the heading."""
+def columns_text(rows: Sequence[Sequence[str]], *, left: int = 1) -> str:
+    """Lines of aligned columns: the first `left` flush left, the others flush right; the first row is the heading."""
     widths = [max(len(word) for word in column) for column in zip(*rows, strict=True)]
     lines = []
-    for first, *others in rows:
-        cells = [f"{first:<{widths[0]}}", *(f"{word:>{width}}" for word, width in zip(others, widths[1:], strict=True))]
+    for row in rows:
+        cells = [f"{word:<{width}}" for word, width in zip(row[:left], widths, strict=False)]
+        cells += [f"{word:>{width}}" for word, width in zip(row[left:], widths[left:], strict=True)]
         lines.append("  ".join(cells).rstrip())
     return "\n".join(lines)
+
+
+def fixed_text(value: float, digits: int) -> str:
+    """A number with so many decimals, and no sign on zero."""
+    return f"{round(float(value), digits) + 0.0:.{digits}f}"
 
 
 def possible_text(wrong: str, possible: Iterable[str]) -> str:

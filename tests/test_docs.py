@@ -159,6 +159,15 @@ def test_the_code_on_from_nuscenes_runs(da_motion: DeepAccident) -> None:
     assert isinstance(names["box"], Box)
 
 
+def test_the_code_on_the_format_runs(release_root: Path) -> None:
+    code = python_blocks(DOCS / "format.md")
+    demo = "deepaccident_demo/release"
+    assert demo in code
+    names: dict[str, Any] = {}
+    exec(compile(code.replace(demo, str(release_root)), "format.md", "exec"), names)  # noqa: S102
+    assert names["meta"].collision is not None
+
+
 def test_the_code_on_the_first_page_runs(da: DeepAccident) -> None:
     code, demo = python_blocks(DOCS / "index.md"), "deepaccident_demo/release"
     assert demo in code

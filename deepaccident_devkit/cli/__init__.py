@@ -20,6 +20,7 @@ _VERBS = (
     "synth",
     "index",
     "info",
+    "explain",
     "labels",
     "split",
     "stats",

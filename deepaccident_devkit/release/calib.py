@@ -109,7 +109,7 @@ def read_calibs(paths: Sequence[Path], *, raw: bool = False) -> Calibs | list[di
 
     Raises as `read_calib` does.
     """
-    files = [_read_raw(path) for path in paths]
+    files = [read_unchecked_calib(path) for path in paths]
     calibs = _converted(paths, files)
     return files if raw else calibs
 
@@ -138,7 +138,11 @@ def write_raw_calib(path: Path, raw: Mapping[str, AnyArray]) -> None:
     write_bytes(path, content.replace(b"cnumpy._core.multiarray\n", b"cnumpy.core.multiarray\n"))
 
 
-def _read_raw(path: Path) -> dict[str, AnyArray]:
+def read_unchecked_calib(path: Path) -> dict[str, AnyArray]:
+    """A file's own dict, as `read_calib(raw=True)` returns it, but whatever its numbers are: only keys and shapes hold.
+
+    Raises as `read_calib` does, but not for NaN and transforms that are not rigid.
+    """
     content = read_content(path, CalibError, _REMEDY)
     try:
         loaded = load_arrays(content)

@@ -121,13 +121,26 @@ def read_labels(paths: Sequence[Path], *, raw: bool = False) -> Labels:
     """
     parts = _parse_batches([paths[start : start + _FILES_A_CALL] for start in range(0, len(paths), _FILES_A_CALL)])
     parts = parts or [_columns_of(_parse_body(b""), _parse_header(b""), np.zeros(0, dtype=np.int64))]
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    if not raw:
-        columns["agent_velocity"] = handedness.flip_vectors2(columns["agent_velocity"])
-        columns["center"] = handedness.flip_points(columns["center"])
-        columns["velocity"] = handedness.flip_vectors2(columns["velocity"])
-        columns["yaw"] = handedness.flip_yaw(columns["yaw"])
-    return Labels(raw=raw, **columns)
+    return _labels({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, raw=raw)
+
+
+def read_label_to_fault(path: Path, *, raw: bool = False) -> tuple[Labels, LabelError | None]:
+    """One label file as far as its first wrong line, and the error that `read_label` raises for that; None if good.
+
+    Raises as `read_label` does, if not even the first line can be read.
+    """
+    try:
+        return read_label(path, raw=raw), None
+    except LabelError as error:
+        content = _content(path)
+        fault = _faulty_line(content)
+        if fault is None:
+            raise
+        before = b"".join(content.splitlines(keepends=True)[: fault[0] - 1])
+        columns = _parse_joined([_tidied(before)])
+        if columns is None:
+            raise
+        return _labels(columns, raw=raw), error
 
 
 def write_label(path: Path, labels: Labels) -> None:
@@ -153,6 +166,16 @@ def write_label(path: Path, labels: Labels) -> None:
     )
     lines += [f"{CATEGORIES[code]} {_words(row)} {actor} {points} {seen}" for code, row, actor, points, seen in rows]
     write_bytes(path, "\n".join(lines).encode("ascii"))
+
+
+def _labels(columns: dict[str, AnyArray], *, raw: bool) -> Labels:
+    """The columns as the files say them, or right-handed."""
+    if not raw:
+        columns["agent_velocity"] = handedness.flip_vectors2(columns["agent_velocity"])
+        columns["center"] = handedness.flip_points(columns["center"])
+        columns["velocity"] = handedness.flip_vectors2(columns["velocity"])
+        columns["yaw"] = handedness.flip_yaw(columns["yaw"])
+    return Labels(raw=raw, **columns)
 
 
 def _words(numbers: Iterable[float]) -> str:
@@ -283,23 +306,29 @@ def _tidied(content: bytes) -> bytes:
 
 
 def _first_fault(paths: Sequence[Path], contents: Sequence[bytes]) -> LabelError:
-    """Walk the lines to name the first one that is wrong."""
+    """Name the first line that is wrong."""
     for path, content in zip(paths, contents, strict=True):
-        header_seen = False
-        for number, line in enumerate(content.splitlines(), start=1):
-            if b"\0" in line:
-                return LabelError(f"{path}:{number}: holds zero bytes, as a full disk leaves them; {_REMEDY}")
-            words = [word.decode("utf-8", errors="replace") for word in line.split()]
-            if len(words) < 2:
-                continue
-            fault = _line_fault(words) if header_seen else _header_fault(words)
-            if fault:
-                return LabelError(f"{path}:{number}: {fault}; {_REMEDY}")
-            header_seen = True
-        if not header_seen:
-            return LabelError(f"{path}:1: expected '<speed_x> <speed_y>', found an empty file; {_REMEDY}")
+        if (fault := _faulty_line(content)) is not None:
+            number, what = fault
+            return LabelError(f"{path}:{number}: {what}; {_REMEDY}")
     odd = [path for path, content in zip(paths, contents, strict=True) if _parse_joined([_tidied(content)]) is None]
     return LabelError(f"{(odd or paths)[0]}: cannot be parsed, though each line looks right; {_REMEDY}")
+
+
+def _faulty_line(content: bytes) -> tuple[int, str] | None:
+    """Walk the lines: the number of the first one that is wrong, and what is."""
+    header_seen = False
+    for number, line in enumerate(content.splitlines(), start=1):
+        if b"\0" in line:
+            return number, "holds zero bytes, as a full disk leaves them"
+        words = [word.decode("utf-8", errors="replace") for word in line.split()]
+        if len(words) < 2:
+            continue
+        fault = _line_fault(words) if header_seen else _header_fault(words)
+        if fault:
+            return number, fault
+        header_seen = True
+    return None if header_seen else (1, "expected '<speed_x> <speed_y>', found an empty file")
 
 
 def _header_fault(words: Sequence[str]) -> str | None:
