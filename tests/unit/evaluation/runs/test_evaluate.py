@@ -10,6 +10,7 @@ import pytest
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, ResultsError
 from deepaccident_devkit.evaluation import AccidentEvaluator, Resampling, accident_context, sample_attributes
+from deepaccident_devkit.evaluation.metrics.attributes import WITHIN_RECORDINGS
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter
 from deepaccident_devkit.evaluation.runs import (
     BREAKDOWNS,
@@ -19,7 +20,9 @@ from deepaccident_devkit.evaluation.runs import (
     evaluate_results,
     scenario_hashes,
 )
-from deepaccident_devkit.evaluation.runs.evaluation_run import checkpoint_path, remove_checkpoints
+from deepaccident_devkit.evaluation.runs.coverage import Coverage
+from deepaccident_devkit.evaluation.runs.evaluate import _partial
+from deepaccident_devkit.evaluation.runs.evaluation_run import breakdowns_of, checkpoint_path, remove_checkpoints
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 
 SETUP = EvaluationSetup(task="accident", protocol="boxes")
@@ -248,3 +251,13 @@ class TestBrokenOff:
         (path.parent / "mine.txt").unlink()
         remove_checkpoints(tmp_path / "out")
         assert not path.parent.exists()
+
+
+def test_warnings_are_broken_down_by_whole_recordings_alone() -> None:
+    assert not {*breakdowns_of("warning")} & {*WITHIN_RECORDINGS}
+    assert {*breakdowns_of("accident")} & {*WITHIN_RECORDINGS}
+
+
+def test_extra_samples_are_those_of_other_lists_and_those_of_no_release() -> None:
+    found = _partial(Coverage(expected=5, missing=("a",), extra=("b", "c"), unknown=("d",)))
+    assert (found.missing, found.extra, found.expected, found.evaluated) == (1, 3, 5, 4)

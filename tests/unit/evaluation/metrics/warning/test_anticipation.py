@@ -455,3 +455,11 @@ def test_the_surest_right_alarm_is_the_surest() -> None:
     alarms = [[0.2, True], [0.9, False], [0.6, True]]
     assert surest(alarms, "accident") == [0.6, 0.9]
     assert surest(alarms, "twins") == [0.9, 0.9]
+
+
+def test_predictors_that_know_nothing_work_at_a_threshold_of_their_own() -> None:
+    result = evaluated(skilled(0), pairs=8).compute()
+    recall = {name: each["ego_involved"].operating.recall for name, each in result.references.items()}
+    assert (recall["always"], recall["never"]) == (1, 0)
+    assert 0.2 < recall["random per recording"] < 0.8
+    assert not [note for note in result.notes if "no recording" in note]

@@ -20,6 +20,7 @@ from deepaccident_devkit.evaluation.metrics.motion import MOTION_PROTOCOLS
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput, instances_of
 from deepaccident_devkit.evaluation.results import ResultsWriter, read_results
 from deepaccident_devkit.evaluation.runs.explanation import Explanation, explain
+from deepaccident_devkit.evaluation.runs.explanation.explain import ExplainedNumber, _change_text
 from deepaccident_devkit.evaluation.runs.explanation.variants import Refusal, SideBySide
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionHeads, MotionLabelConfig, MotionLabels
@@ -201,3 +202,16 @@ def test_the_first_evaluator_says_what_is_an_error() -> None:
 def test_no_samples_cannot_be_explained(da_motion: DeepAccident, tokens: list[str]) -> None:
     with pytest.raises(EvaluationError, match="there is no sample to explain the numbers of"):
         explain(da_motion, motion(da_motion, tokens[:1], still), EvaluationSetup(task="motion"), [])
+
+
+@pytest.mark.parametrize(
+    ("number", "text"),
+    [
+        (None, "="),
+        (ExplainedNumber(choice="a=1", headline="apa", value=0.5, change=0.0, changed=False), "="),
+        (ExplainedNumber(choice="a=1", headline="apa", value=0.5, change=0.25, changed=True), "+0.250"),
+        (ExplainedNumber(choice="a=1", headline="apa", value=0.5, change=None, changed=True), "now 0.500"),
+    ],
+)
+def test_a_change_is_told_with_its_sign(number: ExplainedNumber | None, text: str) -> None:
+    assert _change_text(number, "share") == text
