@@ -1,4 +1,4 @@
-"""Draw the README's pictures and its animation from a synthetic release: `python docs/make_pictures.py`."""
+"""Render the pictures of README.md and docs/pictures.md from a synthetic release: `python docs/make_pictures.py`."""
 
 import tempfile
 from pathlib import Path
@@ -13,7 +13,8 @@ from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.v2x import Link
 
 IMAGES = Path(__file__).parent / "images"
-RELEASE = SynthConfig(scenarios=1, frames=40, image_size=(640, 360), seed=19, view="hidden")
+RELEASE = SynthConfig(scenarios=1, frames=40, image_size=(640, 360), seed=33, view="hidden")
+"""By daylight: Clear, Noon."""
 FRAMES_BEFORE = 8
 HIDDEN_BEFORE = 10
 """When the house on the corner still hides the other car from the ego."""
@@ -24,7 +25,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         release = DeepAccident(dataroot=make_release(Path(folder) / "release", RELEASE, progress=True))
         scenario = release.scenario[0]
-        draw_pictures(release, scenario["token"])
+        render_pictures(release, scenario["token"])
         release.render_scenario_video(scenario, IMAGES / "accident.webp", what="accident", size=(1024, 576))
 
 
@@ -33,7 +34,7 @@ def save(drawn: Axes | Figure, name: str, *, dpi: float) -> None:
     save_picture(drawn, IMAGES / f"{name}.png", dpi=dpi)
 
 
-def draw_pictures(release: DeepAccident, scenario: str) -> None:
+def render_pictures(release: DeepAccident, scenario: str) -> None:
     frames = release.field2token("frame", "scenario_token", scenario)
     frame = frames[-1 - FRAMES_BEFORE]
     ego = release.samples_of(frame)[0]

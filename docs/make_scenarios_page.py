@@ -8,6 +8,9 @@ PAGE = Path(__file__).parent / "scenarios.md"
 
 _HEAD = """# Scenario files: your own accidents
 
+For everybody who writes their own synthetic scenarios: the fields of a scenario file, and the twelve designs as files.
+10 minutes.
+
 `deepaccident synth` makes the paper's twelve accidents. Each is a small YAML file; you can write your own:
 
 ```yaml

@@ -8,6 +8,9 @@ PAGE = Path(__file__).parent / "validation.md"
 
 _HEAD = """# What `deepaccident validate` looks for
 
+For everybody who has downloaded a release: what `deepaccident validate` tests, and what each of its findings means. 11
+minutes.
+
     deepaccident validate DATAROOT            # labels, calib, meta and the names of all files: a minute or two
     deepaccident validate DATAROOT --deep     # also decodes every image and array: hours for the whole release
     deepaccident validate DATAROOT --json     # one JSON document

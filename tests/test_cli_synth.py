@@ -77,7 +77,7 @@ def test_without_options_scenarios_have_their_natural_length(tmp_path, made):
 def test_labels_without_embree_are_said_to_take_long(tmp_path, made, monkeypatch):
     monkeypatch.setattr(sys.modules[synth.callback.__module__], "has_embree", lambda: False)
     result = CliRunner().invoke(synth, [str(tmp_path), "--no-sensors"])
-    assert "slow, without the package embreex: pip install 'deepaccident_devkit[synth]'" in result.stderr
+    assert "slow without the package embreex; in a checkout: pip install '.[synth]'" in result.stderr
     assert made == [SynthConfig(frames=None, sensors=False)]
 
 

@@ -4,6 +4,7 @@ import ast
 import importlib.util
 import inspect
 import re
+import shlex
 from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 
 import pytest
 from click import Context
+from click.testing import CliRunner
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
@@ -33,6 +35,7 @@ from deepaccident_devkit.evaluation.metrics.warning import (
 )
 from deepaccident_devkit.geometry import Box
 from deepaccident_devkit.motion import LabelProtocol, MotionLabelConfig, PostProcessing
+from deepaccident_devkit.synth import SynthConfig, make_release
 
 pytestmark = pytest.mark.slow
 
@@ -47,6 +50,7 @@ COUNTERPARTS = sorted(
     }
 )
 """The code in the right columns of that page's tables."""
+WORDS_A_MINUTE = 200
 NO_CALLS = ("<sample>/Camera_Front", ".intensity", '"paper"', "link=", "agents=")
 
 
@@ -56,14 +60,54 @@ def python_blocks(page: Path) -> str:
     return "\n".join(blocks)
 
 
-def test_the_code_on_motion_labels_runs(
-    da_motion: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    code = python_blocks(DOCS / "motion_labels.md")
-    demo = "deepaccident_demo/release"
-    assert demo in code
-    monkeypatch.chdir(tmp_path)
-    exec(compile(code.replace(demo, str(da_motion.dataroot)), "motion_labels.md", "exec"), {})  # noqa: S102
+def run_page(page: Path) -> dict[str, Any]:
+    """Run the page's Python and shell blocks, as they stand and in their order, in the working folder."""
+    names: dict[str, Any] = {}
+    blocks = re.findall(r"^```(python|bash)\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    assert blocks, f"{page}: no code"
+    for language, code in blocks:
+        if language == "python":
+            exec(compile(code, page.name, "exec"), names)  # noqa: S102
+            continue
+        for line in code.splitlines():
+            program, *words = shlex.split(line)
+            assert program == "deepaccident"
+            result = CliRunner().invoke(deepaccident, words, catch_exceptions=False)
+            assert result.exit_code == 0, f"{line}: {result.output}"
+    return names
+
+
+def folder_of_demo(root: Path, folder: Path) -> Path:
+    """Lay a release where `deepaccident demo` makes one."""
+    (folder / "deepaccident_demo").mkdir()
+    (folder / "deepaccident_demo" / "release").symlink_to(root, target_is_directory=True)
+    return folder
+
+
+@pytest.fixture
+def in_labels_demo(da_motion: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working folder in which `deepaccident_demo/release` is a small release, with labels alone."""
+    monkeypatch.chdir(folder_of_demo(da_motion.dataroot, tmp_path))
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def small_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An accident as the demo's, with all sensors: as many frames as the pages ask for, and small images."""
+    folder = tmp_path_factory.mktemp("demo")
+    config = SynthConfig(scenarios=1, frames=32, image_size=(64, 36), view="hidden")
+    return make_release(folder / "release", config, workers=2)
+
+
+@pytest.fixture
+def in_demo(small_demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working folder in which `deepaccident_demo/release` is the release of `small_demo`."""
+    monkeypatch.chdir(folder_of_demo(small_demo, tmp_path))
+    return tmp_path
+
+
+def test_the_code_on_motion_labels_runs(in_labels_demo: Path) -> None:
+    run_page(DOCS / "motion_labels.md")
 
 
 def test_every_switch_of_the_label_protocols_is_explained() -> None:
@@ -85,26 +129,17 @@ def test_the_page_of_the_released_code_names_no_other_switch(choices: type[Any])
     assert named - {field.name for field in fields(choices)} == set()
 
 
-def test_the_code_on_protocols_runs(da_motion: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The session's release has but a training split; the predictions there are the labels, so that they score 100."""
-    code = python_blocks(DOCS / "protocols.md").replace('"val"', '"train"')
-    demo = "deepaccident_demo/release"
-    assert demo in code
-    monkeypatch.chdir(tmp_path)
-    names: dict[str, Any] = {}
-    exec(compile(code.replace(demo, str(da_motion.dataroot)), "protocols.md", "exec"), names)  # noqa: S102
+def test_the_code_on_protocols_runs(in_labels_demo: Path) -> None:
+    """The predictions there are the labels, so that they score 100."""
+    names = run_page(DOCS / "protocols.md")
     result = names["halves"][0].compute()
     assert [value for each in result.ranges.values() for value in (each.iou, each.pq)] == [100] * 4
     assert names["group"].samples > 0
-    assert (tmp_path / "motion.json").is_file()
+    assert (in_labels_demo / "motion.json").is_file()
 
 
-def test_the_code_on_evaluating_runs(
-    da_motion: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code = python_blocks(DOCS / "evaluating.md").replace("deepaccident_demo/release", str(da_motion.dataroot))
-    monkeypatch.chdir(tmp_path)
-    exec(compile(code, "evaluating.md", "exec"), {})  # noqa: S102
+def test_the_code_on_evaluating_runs(in_labels_demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run_page(DOCS / "evaluating.md")
     assert "all numbers are equal" in capsys.readouterr().out
 
 
@@ -138,41 +173,49 @@ def test_every_protocol_of_the_metrics_is_explained(name: str) -> None:
     assert f"`{name}`" in (DOCS / "protocols.md").read_text(encoding="utf-8")
 
 
-def test_the_code_on_baselines_runs(da_motion: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_code_on_baselines_runs(in_labels_demo: Path) -> None:
     """On the demo's release five agents foresee nearly all; here, too."""
-    code = python_blocks(DOCS / "baselines.md")
-    demo = "deepaccident_demo/release"
-    assert demo in code
-    monkeypatch.chdir(tmp_path)
-    names: dict[str, Any] = {}
-    exec(compile(code.replace(demo, str(da_motion.dataroot)), "baselines.md", "exec"), names)  # noqa: S102
+    names = run_page(DOCS / "baselines.md")
     assert names["evaluator"].compute().ranges["100x100"].pq > 80
     assert names["boxes"].boxes.frame == "world"
 
 
-def test_the_code_on_from_nuscenes_runs(da_motion: DeepAccident) -> None:
-    code = python_blocks(DOCS / "from_nuscenes.md")
-    demo = "deepaccident_demo/release"
-    assert demo in code
-    names: dict[str, Any] = {}
-    exec(compile(code.replace(demo, str(da_motion.dataroot)), "from_nuscenes.md", "exec"), names)  # noqa: S102
+def test_the_code_on_from_nuscenes_runs(in_demo: Path) -> None:
+    """That of its tables, too, but for the pictures."""
+    names = run_page(DOCS / "from_nuscenes.md")
     assert isinstance(names["box"], Box)
+    calls = [code for code in COUNTERPARTS if re.match(r"(da|box)\.\w+\(", code) and not code.startswith("da.render_")]
+    assert len(calls) > 30
+    for code in calls:
+        eval(compile(code, "from_nuscenes.md", "eval"), names)  # noqa: S307
 
 
-def test_the_code_on_the_format_runs(release_root: Path) -> None:
-    code = python_blocks(DOCS / "format.md")
-    demo = "deepaccident_demo/release"
-    assert demo in code
-    names: dict[str, Any] = {}
-    exec(compile(code.replace(demo, str(release_root)), "format.md", "exec"), names)  # noqa: S102
-    assert names["meta"].collision is not None
+def test_the_code_on_the_format_runs(in_demo: Path) -> None:
+    assert run_page(DOCS / "format.md")["meta"].collision is not None
 
 
-def test_the_code_on_the_first_page_runs(da: DeepAccident) -> None:
-    code, demo = python_blocks(DOCS / "index.md"), "deepaccident_demo/release"
-    assert demo in code
-    code = code.replace(demo, str(da.dataroot)).replace("frame=30", "frame=3")
-    exec(compile(code, "index.md", "exec"), {})  # noqa: S102
+@pytest.mark.parametrize("page", [TOP / "README.md", DOCS / "index.md"])
+def test_the_code_on_the_first_pages_runs(page: Path, in_demo: Path) -> None:
+    run_page(page)
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        *sorted(DOCS.glob("*.md")),
+        *sorted((TOP / "schema").glob("**/*.md")),
+        TOP / "tutorials" / "README.md",
+        TOP / "benchmarks" / "README.md",
+    ],
+    ids=lambda page: page.relative_to(TOP).as_posix(),
+)
+def test_a_page_begins_with_whom_it_is_for_and_how_long_it_takes(page: Path) -> None:
+    """At 200 words a minute, a third more or less."""
+    text = page.read_text(encoding="utf-8")
+    told = re.match(r"# [^\n]+\n\n(?:[^\n]+\n){0,2}?[^\n]*?\b(\d+)\s+minutes?\b", text)
+    assert told, f"{page.name}: no reading time below the title"
+    words = len(text.split()) / WORDS_A_MINUTE
+    assert abs(int(told[1]) - words) <= max(1, words / 3)
 
 
 def named(expression: ast.expr) -> Any:

@@ -20,15 +20,28 @@ from deepaccident_devkit.v2x import AGENT_CONFIGS, Link
 
 _RELEASED_HORIZON = Baseline().horizon
 _FILES: dict[str, str] = {"motion": "motion", "accident": "accident.json", "detection": "detection.json"}
-_SPLIT = click.option("--split", default="val", show_default=True, help="val, …, or a split file (….txt).")
-_OUT = click.option("--out", required=True, type=click.Path(), metavar="DIR", help="Where the files go.")
-_MODEL = click.option("--model", type=click.Choice(list(MOTION_MODELS)), default="constant_velocity", show_default=True)
-_SEED = click.option("--seed", default=0, show_default=True, help="Of the pose noise.")
+_SPLIT = click.option("--split", default="val", show_default=True, help="Name of a split, or a split file (.txt).")
+_OUT = click.option("--out", required=True, type=click.Path(), metavar="DIR", help="Folder to write the files into.")
+_MODEL = click.option(
+    "--model",
+    type=click.Choice(list(MOTION_MODELS)),
+    default="constant_velocity",
+    show_default=True,
+    help="How the baseline moves each actor into the future.",
+)
+_SEED = click.option("--seed", default=0, show_default=True, help="Seed of the pose noise.")
+_SCOPE = click.option(
+    "--scope",
+    type=click.Choice(get_args(Scope)),
+    default="accident",
+    show_default=True,
+    help="Accident scenarios only, or all scenarios.",
+)
 
 
 @click.group()
 def baseline() -> None:
-    """Predict without a model: what some agents see by the labels goes on as it moves."""
+    """Make predictions without a trained model: actors that some agents see keep their motion."""
 
 
 @baseline.command()
@@ -41,26 +54,44 @@ def baseline() -> None:
     type=click.Choice([*get_args(ResultsTask), "all"]),
     default=("all",),
     show_default=True,
-    help="May be repeated.",
+    help="Task to write results for; you can repeat this option.",
 )
-@click.option("--agents", type=click.Choice(list(AGENT_CONFIGS)), default="single", show_default=True)
+@click.option(
+    "--agents",
+    type=click.Choice(list(AGENT_CONFIGS)),
+    default="single",
+    show_default=True,
+    help="Which agents share what they see.",
+)
 @_MODEL
-@click.option("--latency", default=0.0, show_default=True, help="Of the partners' data, seconds, steps of 0.1.")
-@click.option("--pose-noise", default=0.0, show_default=True, help="Of the partners' poses, metres.")
+@click.option(
+    "--latency", default=0.0, show_default=True, help="Delay of the partners' data, in seconds, in steps of 0.1."
+)
+@click.option(
+    "--pose-noise",
+    default=0.0,
+    show_default=True,
+    help="Mean position error of the partners' poses, in metres.",
+)
 @_SEED
-@click.option("--horizon", default=_RELEASED_HORIZON, show_default=True, help="Seconds ahead, steps of 0.5.")
+@click.option(
+    "--horizon", default=_RELEASED_HORIZON, show_default=True, help="How many seconds to predict, in steps of 0.5."
+)
 @click.option(
     "--samples",
     "purpose",
     type=click.Choice(["evaluate", "all"]),
     default="evaluate",
     show_default=True,
-    help="Those that are evaluated, within the horizon before the end; or two a second of every scenario.",
+    help="evaluate: samples within the horizon before the end. all: two samples per second of each scenario.",
 )
-@click.option("--scope", type=click.Choice(get_args(Scope)), default="accident", show_default=True)
+@_SCOPE
 @_OUT
 def predict(split: str, tasks: tuple[str, ...], purpose: Any, scope: Scope, out: str, **options: Any) -> None:
-    """Write a baseline's results for a split of the release under DATAROOT: motion/, accident.json, detection.json."""
+    """Write results files of a baseline for one split of the release in DATAROOT.
+
+    The files are motion/, accident.json and detection.json.
+    """
     noise, latency, seed = options.pop("pose_noise"), options.pop("latency"), options.pop("seed")
     link = Link(latency=latency, pose_noise=noise or None, seed=seed) if noise or latency else None
     chosen = Baseline(link=link, **{name: options.pop(name) for name in ("agents", "model", "horizon")})
@@ -80,24 +111,35 @@ def predict(split: str, tasks: tuple[str, ...], purpose: Any, scope: Scope, out:
 @_SPLIT
 @_MODEL
 @click.option(
-    "--ego", "egos", multiple=True, type=click.Choice(AGENTS), help="May be repeated.  [default: ego_vehicle]"
+    "--ego",
+    "egos",
+    multiple=True,
+    type=click.Choice(AGENTS),
+    help="Agent that predicts; you can repeat this option.  [default: ego_vehicle]",
 )
-@click.option("--scope", type=click.Choice(get_args(Scope)), default="accident", show_default=True)
+@_SCOPE
 @click.option(
     "--protocol",
     type=click.Choice(list(PROTOCOLS)),
     default="paper",
     show_default=True,
-    help="Of the accidents in maps; those named explicitly are always evaluated by boxes.",
+    help="Protocol for accidents in maps. Explicit accidents always use the protocol boxes.",
 )
 @click.option(
-    "--seed", "seeds", multiple=True, type=int, help="Of the pose noise; may be repeated.  [default: 0, 1, 2]"
+    "--seed",
+    "seeds",
+    multiple=True,
+    type=int,
+    help="Seed of the pose noise; you can repeat this option.  [default: 0, 1, 2]",
 )
 @resamples_parameter
-@click.option("--quick", is_flag=True, help="Fewer horizons and steps of noise and latency.")
+@click.option("--quick", is_flag=True, help="Try fewer horizons, and fewer values of noise and latency.")
 @_OUT
 def v2x(split: str, egos: tuple[str, ...], seeds: tuple[int, ...], resamples: int, out: str, **options: Any) -> None:
-    """Print what seven sets of agents foresee of the release under DATAROOT; write a CSV and a picture a table."""
+    """Compare how well seven sets of agents predict the accidents of the release in DATAROOT.
+
+    Print the tables, and write one CSV file and one picture per table.
+    """
     how = {name: options.pop(name) for name in ("model", "scope", "protocol", "quick")}
     usual = StudyConfig()
     how |= {"egos": egos or usual.egos, "seeds": seeds or usual.seeds, "resampling": Resampling(resamples=resamples)}

@@ -38,10 +38,10 @@ from deepaccident_devkit.evaluation.runs.text import SHOWN_BREAKDOWNS
 from deepaccident_devkit.render.evaluation import save_report
 
 _HELP = {
-    "motion": "Tell how well motion is foreseen: IoU, VPQ and errors of paths.",
-    "accident": "Tell how well accidents are foreseen: APA, and errors of who, where and when.",
-    "detection": "Tell how well boxes are detected: AP and errors.",
-    "warning": "Tell how early accidents are warned of, and how often an alarm is false.",
+    "motion": "Evaluate predicted motion: IoU, VPQ and path errors.",
+    "accident": "Evaluate predicted accidents: APA, and the errors in who, where and when.",
+    "detection": "Evaluate detected boxes: AP and errors.",
+    "warning": "Evaluate warnings: how early they come before accidents, and how often an alarm is false.",
 }
 _RELEASE = ("dataroot", "version", "index_dir", "workers", "on_error")
 
@@ -59,14 +59,14 @@ def _threshold_options(task: TaskName) -> Callable[[Callable[..., Any]], Callabl
         click.option(
             "--threshold-from",
             type=click.Path(path_type=Path),
-            help="Bundle of another split's evaluation, which chooses the operating point (protocol clean).",
+            help="Folder with an evaluation on another split; it sets the alarm threshold (protocol clean only).",
         ),
         click.option(
             "--threshold-by",
             type=click.Choice(get_args(Chooser)),
             default="best_f1",
             show_default=True,
-            help="Its threshold of the best F1, or of at most one second a minute in false alarm.",
+            help="best_f1: the threshold with the best F1. quiet: at most one second of false alarm per minute.",
         ),
     )
     return lambda verb: options[0](options[1](verb))
@@ -76,22 +76,55 @@ def _task_verb(task: TaskName) -> click.Command:
     """The verb of one task."""
     protocols = list(TASK_PROTOCOLS[task])
 
-    @click.command(task, help=f"{_HELP[task]}\n\nThe truth is of the release under DATAROOT.")
+    @click.command(
+        task, help=f"{_HELP[task]}\n\nThe predictions are compared with the labels of the release in DATAROOT."
+    )
     @release_parameters
-    @click.option("--results", required=True, type=click.Path(path_type=Path), help="What was predicted.")
+    @click.option(
+        "--results", required=True, type=click.Path(path_type=Path), help="Results file or folder with the predictions."
+    )
     @selection_parameters
-    @click.option("--protocol", type=click.Choice(protocols), default=protocols[0], show_default=True)
+    @click.option(
+        "--protocol",
+        type=click.Choice(protocols),
+        default=protocols[0],
+        show_default=True,
+        help="Rules of the metrics; docs/protocols.md describes them.",
+    )
     @_threshold_options(task)
-    @click.option("--switch", "switches", multiple=True, metavar="NAME=VALUE", help="Make a choice of it otherwise.")
-    @click.option("--allow-partial", is_flag=True, help="Evaluate the samples there are; all is marked as partial.")
-    @click.option("--by", multiple=True, type=click.Choice(ATTRIBUTES), help="Break down by this; may be repeated.")
+    @click.option(
+        "--switch",
+        "switches",
+        multiple=True,
+        metavar="NAME=VALUE",
+        help="Change one field of the protocol; you can repeat this option.",
+    )
+    @click.option(
+        "--allow-partial",
+        is_flag=True,
+        help="Accept results that lack some samples; every number is then marked as partial.",
+    )
+    @click.option(
+        "--by",
+        multiple=True,
+        type=click.Choice(ATTRIBUTES),
+        help="Also give the numbers for each value of this attribute; you can repeat this option.",
+    )
     @resamples_parameter
-    @click.option("--sanity", is_flag=True, help="Look whether predictions are mirrored, turned, shifted, scaled, …")
-    @click.option("--explain", "explained", is_flag=True, help="Tell what each choice of the protocol changes.")
-    @click.option("--out", type=click.Path(path_type=Path), help="Folder for all numbers, figures and a report.")
-    @click.option("--overwrite", is_flag=True, help="Replace the evaluation in --out.")
-    @click.option("--include-results", is_flag=True, help="Copy RESULTS into --out, to check it by itself.")
-    @click.option("--json", "as_json", is_flag=True, help="One JSON object, for programs.")
+    @click.option(
+        "--sanity", is_flag=True, help="Test whether the predictions are mirrored, rotated, shifted, scaled, …"
+    )
+    @click.option(
+        "--explain", "explained", is_flag=True, help="Show how much each field of the protocol changes the numbers."
+    )
+    @click.option(
+        "--out", type=click.Path(path_type=Path), help="Folder to write all numbers, figures and a report into."
+    )
+    @click.option("--overwrite", is_flag=True, help="Replace an evaluation that is already in --out.")
+    @click.option(
+        "--include-results", is_flag=True, help="Copy the results into --out, so that others can verify them."
+    )
+    @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
     def verb(results: Path, protocol: str, switches: tuple[str, ...], **options: Any) -> None:
         setup = EvaluationSetup(
             task=task, protocol=protocol, switches=switches_of(switches), horizon=options["horizon"]

@@ -18,20 +18,22 @@ from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.taxonomy import VERSIONS
 
 _FINDINGS_STATUS = 1
-_workers = click.option("--workers", type=click.IntRange(min=1), help="Processes to use.")
+_workers = click.option("--workers", type=click.IntRange(min=1), help="Number of processes to use.")
 
 
 @click.command()
 @click.argument("results", type=click.Path(path_type=Path))
-@click.option("--dataroot", type=click.Path(path_type=Path), help="A release, to see whether it has these samples.")
-@click.option("--version", type=click.Choice(VERSIONS), default="v1", show_default=True, help="Which release.")
+@click.option(
+    "--dataroot", type=click.Path(path_type=Path), help="Also compare the samples with those of this release."
+)
+@click.option("--version", type=click.Choice(VERSIONS), default="v1", show_default=True, help="Version of the release.")
 @selection_parameters
 @_workers
 @on_error_parameter
 def validate(results: Path, dataroot: Path | None, version: str, workers: int | None, **options: Any) -> None:
-    """Read the results file or folder RESULTS wholly and tell what it holds.
+    """Check every entry of the results file or folder RESULTS, and print a summary.
 
-    Exit status 1 if with --dataroot it has not just the samples of --split, 2 if an entry is wrong.
+    Exit status 1: with --dataroot, samples of --split are missing or there are others. 2: an entry is wrong.
     """
     opened = read_results(results)
     opened.check(workers=workers, progress=True)
@@ -48,11 +50,17 @@ def validate(results: Path, dataroot: Path | None, version: str, workers: int | 
 
 @click.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
-@click.option("--dataroot", type=click.Path(path_type=Path), help="The release.  [default: where it was]")
-@click.option("--results", type=click.Path(path_type=Path), help="The results.  [default: in DIR, or where they were]")
+@click.option(
+    "--dataroot", type=click.Path(path_type=Path), help="Folder of the release.  [default: as in the evaluation]"
+)
+@click.option(
+    "--results",
+    type=click.Path(path_type=Path),
+    help="Results file or folder.  [default: the copy in DIR, or as in the evaluation]",
+)
 @_workers
 @on_error_parameter
-@click.option("--json", "as_json", is_flag=True, help="One JSON object, for programs.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
 def verify(
     folder: Path,
     dataroot: Path | None,
@@ -61,9 +69,9 @@ def verify(
     on_error: Literal["raise", "skip"],
     as_json: bool,
 ) -> None:
-    """Evaluate again what the folder DIR is of, and list what differs from it.
+    """Repeat the evaluation in the folder DIR and list all differences.
 
-    Exit status 0 if nothing does, 1 if something does.
+    Exit status 0: there is no difference. 1: there are differences.
     """
     bundle = read_bundle(folder)
     dataset = DeepAccident(bundle.release_version, dataroot or bundle.dataroot, workers=workers, on_error=on_error)
@@ -76,12 +84,12 @@ def verify(
 @click.command()
 @click.argument("a", type=click.Path(path_type=Path))
 @click.argument("b", type=click.Path(path_type=Path))
-@click.option("--common", is_flag=True, help="Compare the samples that both have, where one has others, too.")
+@click.option("--common", is_flag=True, help="Compare only the samples that both evaluations have.")
 @resamples_parameter
-@click.option("--out", type=click.Path(path_type=Path), help="A file for all numbers: ….csv or ….json.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON object, for programs.")
+@click.option("--out", type=click.Path(path_type=Path), help="File to write all numbers into (.csv or .json).")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
 def compare(a: Path, b: Path, common: bool, resamples: int, out: Path | None, as_json: bool) -> None:
-    """Compare the evaluations in the folders A and B, and say which differences are real."""
+    """Compare the evaluations in the folders A and B, and test which differences are statistically significant."""
     if out is not None and out.suffix not in (".csv", ".json"):
         raise click.BadParameter(f"--out: expected a file ….csv or ….json, found {str(out)!r}")
     comparison = compare_bundles(a, b, Resampling(resamples=resamples), common=common)

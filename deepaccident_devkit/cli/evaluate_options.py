@@ -18,30 +18,28 @@ _SELECTION = (
         "--split",
         default="val",
         show_default=True,
-        help="train, val, test, train_mini, val_mini, or a split file (….txt).",
+        help="train, val, test, train_mini, val_mini, or a split file (.txt).",
     ),
     click.option(
         "--samples",
         type=click.Choice(get_args(SampleList)),
-        help="Those within the horizon before the end, or two a second of whole scenarios.  [default: evaluate; of "
-        "warnings all]",
+        help="evaluate: samples within the horizon before the end. all: two samples per second of each scenario.  "
+        "[default: evaluate; for warnings: all]",
     ),
     click.option(
         "--scope",
         type=click.Choice(get_args(ScopeName)),
-        help="Scenarios designed to end in an accident, or the normal ones, too.  [default: accident, or all with "
-        "--samples all]",
+        help="Accident scenarios only, or all scenarios.  [default: accident; with --samples all: all]",
     ),
     agents_parameter,
-    click.option("--horizon", default=2.0, show_default=True, help="Seconds that predictions look ahead."),
+    click.option("--horizon", default=2.0, show_default=True, help="How many seconds the predictions look ahead."),
 )
 resamples_parameter = click.option(
     "--resamples",
     type=click.IntRange(min=0),
     default=RESAMPLES,
     show_default=True,
-    help="How often, at most, numbers are computed of other counts, to see how sure they are; 0 for no intervals and "
-    "no tests.",
+    help="Number of resamples for intervals and tests, at most; 0 for no intervals and no tests.",
 )
 
 

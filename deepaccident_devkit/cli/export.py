@@ -16,7 +16,7 @@ from deepaccident_devkit.v2x.collisions import first_accident
 
 @click.group()
 def export() -> None:
-    """Write data in other tools' formats."""
+    """Write data in the formats of other tools."""
 
 
 def _points(context: click.Context, parameter: click.Parameter, value: str) -> str | int:
@@ -26,30 +26,46 @@ def _points(context: click.Context, parameter: click.Parameter, value: str) -> s
     return value if value == "all" else int(value)
 
 
-@export.command(short_help="A scenario as an interactive 3D scene.")
+@export.command(short_help="Write a scenario as an interactive 3D scene (MCAP).")
 @release_parameters
 @click.argument("scenario", required=False)
-@click.option("--out", required=True, type=click.Path(path_type=Path), metavar="FILE", help="Such as accident.mcap.")
+@click.option(
+    "--out",
+    required=True,
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="File to write, such as accident.mcap.",
+)
 @agents_parameter
-@click.option("--channels", multiple=True, metavar="NAME[,NAME…]", help="Cameras, lidar01; all if not given.")
-@click.option("--frames", callback=frame_range, metavar="FIRST..LAST", help="Frame numbers from 1; all if not given.")
+@click.option(
+    "--channels",
+    multiple=True,
+    metavar="NAME[,NAME…]",
+    help="Sensors, such as Camera_Front or lidar01.  [default: all]",
+)
+@click.option("--frames", callback=frame_range, metavar="FIRST..LAST", help="Frame numbers, from 1.  [default: all]")
 @click.option(
     "--points",
     callback=_points,
     metavar="all|N",
     default="all",
     show_default=True,
-    help="All, or every N-th of a cloud.",
+    help="all, or N for every N-th point of a cloud.",
 )
-@click.option("--labels/--no-labels", default=True, show_default=True, help="The boxes.")
-@click.option("--motion-labels", type=click.Choice(list(PRESETS)), help="Motion labels too.")
-@click.option("--results", type=click.Path(path_type=Path), metavar="FILE", help="Predictions too: a results file.")
+@click.option("--labels/--no-labels", default=True, show_default=True, help="Whether to write the boxes.")
+@click.option("--motion-labels", type=click.Choice(list(PRESETS)), help="Also write motion labels by this preset.")
+@click.option(
+    "--results",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Also write the predictions of this results file.",
+)
 @click.option(
     "--on-missing",
     type=click.Choice(get_args(OnError)),
     default="skip",
     show_default=True,
-    help="Leave out sensor files that are not there, or stop.",
+    help="skip: leave out missing sensor files. raise: stop at the first one.",
 )
 def mcap(
     scenario: str | None,
@@ -59,10 +75,10 @@ def mcap(
     results: Path | None,
     **options: Any,
 ) -> None:
-    """Write SCENARIO of the release under DATAROOT as an MCAP file, which Foxglove and rerun open.
+    """Write one scenario of the release in DATAROOT as an MCAP file for Foxglove or rerun.
 
-    SCENARIO is a token, such as type1_subtype1_accident/Town03_type001_subtype0001_scenario00024; the first one with
-    a collision if not given.
+    SCENARIO is a token, such as type1_subtype1_accident/Town03_type001_subtype0001_scenario00024. Without SCENARIO the
+    command takes the first scenario with a collision.
     """
     names = agent_names(agents)
     choices = {name: options.pop(name) for name in ("frames", "points", "labels", "motion_labels", "on_missing")}

@@ -13,11 +13,11 @@ from deepaccident_devkit.taxonomy import VERSIONS, OnError
 
 @click.group(cls=VerbGroup)
 @release_parameters
-@click.option("--check", is_flag=True, help="Compare every label, calib and meta file, not only folders' times.")
+@click.option("--check", is_flag=True, help="Compare each label, calib and meta file, not only the folders' times.")
 def index(
     dataroot: Path, version: str, index_dir: Path | None, workers: int | None, on_error: OnError, check: bool
 ) -> None:
-    """Make the index of the release under DATAROOT, or bring it up to date, and say where it lies."""
+    """Make or update the index of the release in DATAROOT, and print where it is."""
     made = open_index(
         find_release(dataroot, version),
         index_dir=index_dir,
@@ -31,23 +31,23 @@ def index(
     click.echo(f"{made.tables_folder}: {counts}")
 
 
-@index.command(short_help="Where it lies, what it holds, whether it is up to date.")
+@index.command(short_help="Print where the index is, what it holds, and whether it is up to date.")
 @click.argument("dataroot", type=click.Path(path_type=Path))
-@click.option("--version", type=click.Choice(VERSIONS), help="Of which release.  [default: of every one]")
-@click.option("--index-dir", type=click.Path(path_type=Path), help="Where to look instead.")
-@click.option("--check", is_flag=True, help="Compare every label, calib and meta file, not only folders' times.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON object, for programs.")
+@click.option("--version", type=click.Choice(VERSIONS), help="Version of the release.  [default: all]")
+@click.option("--index-dir", type=click.Path(path_type=Path), help="Folder to look in, in place of the usual ones.")
+@click.option("--check", is_flag=True, help="Compare each label, calib and meta file, not only the folders' times.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
 def info(dataroot: Path, version: str | None, index_dir: Path | None, check: bool, as_json: bool) -> None:
-    """Print where the indexes of DATAROOT lie, what they hold and whether they are up to date; change nothing."""
+    """Print where the indexes of DATAROOT are, what they hold, and whether they are up to date. Nothing is changed."""
     report = index_report(dataroot, version=version, index_dir=index_dir, check_files=check)
     click.echo(report.to_json() if as_json else report.to_text())
 
 
-@index.command(short_help="Remove it.")
+@index.command(short_help="Remove the index.")
 @click.argument("dataroot", type=click.Path(path_type=Path))
-@click.option("--version", type=click.Choice(VERSIONS), default="v1", show_default=True, help="Of which release.")
-@click.option("--index-dir", type=click.Path(path_type=Path), help="Where it lies, if not in the usual places.")
+@click.option("--version", type=click.Choice(VERSIONS), default="v1", show_default=True, help="Version of the release.")
+@click.option("--index-dir", type=click.Path(path_type=Path), help="Folder of the index, if it is not a usual one.")
 def clear(dataroot: Path, version: str, index_dir: Path | None) -> None:
-    """Remove the index of DATAROOT, in its own folder and in your cache; the release itself is not touched."""
+    """Remove the index of DATAROOT, from its own folder and from your cache. The release itself stays as it is."""
     cleared = clear_index(dataroot, version=version, index_dir=index_dir)
     click.echo("\n".join(removed.to_text() for removed in cleared) or f"{dataroot}: no index to remove")

@@ -20,8 +20,13 @@ _CONFIG_OPTIONS = ("preset", "protocol", "switches", "orientation", "seen_by", "
 
 @click.command()
 @release_parameters
-@click.option("--split", required=True, help="train, val, train_mini, val_mini, or a split file (….txt).")
-@click.option("--out", required=True, metavar="FOLDER", help="Where the labels go: new, or with such labels.")
+@click.option("--split", required=True, help="train, val, train_mini, val_mini, or a split file (.txt).")
+@click.option(
+    "--out",
+    required=True,
+    metavar="FOLDER",
+    help="Folder to write into: a new one, or one with labels of the same kind.",
+)
 @agents_parameter
 @click.option(
     "--samples",
@@ -29,18 +34,34 @@ _CONFIG_OPTIONS = ("preset", "protocol", "switches", "orientation", "seen_by", "
     type=click.Choice(get_args(Purpose)),
     default="every",
     show_default=True,
-    help="Which of their samples: every one (10 Hz), all key frames (2 Hz), those to train on or evaluate at.",
+    help="every: all samples (10 Hz). all: two samples per second. train, evaluate: those of training and evaluation.",
 )
-@click.option("--preset", type=click.Choice(list(PRESETS)), default="deepaccident", show_default=True)
-@click.option("--protocol", type=click.Choice(list(LABEL_PROTOCOLS)), help="The preset's own if not given.")
-@click.option("--switch", "switches", multiple=True, metavar="NAME=yes|no", help="Keep a slip of the protocol or not.")
-@click.option("--orientation", type=click.Choice(ORIENTATIONS), help="How cells lie; the preset's own if not given.")
-@click.option("--seen-by", type=click.Choice(list(AGENT_CONFIGS)), help="Draw what these agents see; all if not given.")
+@click.option(
+    "--preset",
+    type=click.Choice(list(PRESETS)),
+    default="deepaccident",
+    show_default=True,
+    help="Grid, orientation and protocol of the labels.",
+)
+@click.option(
+    "--protocol", type=click.Choice(list(LABEL_PROTOCOLS)), help="Rules of the labels.  [default: of the preset]"
+)
+@click.option(
+    "--switch", "switches", multiple=True, metavar="NAME=yes|no", help="Switch one quirk of the protocol on or off."
+)
+@click.option(
+    "--orientation", type=click.Choice(ORIENTATIONS), help="Order of rows and columns.  [default: of the preset]"
+)
+@click.option(
+    "--seen-by",
+    type=click.Choice(list(AGENT_CONFIGS)),
+    help="Only actors that these agents see.  [default: all actors]",
+)
 @click.option("--only-vehicle", is_flag=True, help="Leave out pedestrians.")
 def labels(split: str, out: str, agents: tuple[str, ...], purpose: Purpose, **options: Any) -> None:
-    """Write the motion labels of a split of the release under DATAROOT.
+    """Write the motion labels of one split of the release in DATAROOT.
 
-    One file a scenario and agent. A call that was broken off goes on where it stopped.
+    There is one file per scenario and agent. If a run is interrupted, the same command continues it.
     """
     config = _config(**{name: options.pop(name) for name in _CONFIG_OPTIONS})
     chosen = agent_names(agents)

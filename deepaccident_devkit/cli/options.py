@@ -17,13 +17,15 @@ on_error_parameter = click.option(
     type=click.Choice(["raise", "skip"]),
     default="raise",
     show_default=True,
-    help="List broken scenarios and stop, or leave them out.",
+    help="raise: list broken scenarios and stop. skip: leave them out.",
 )
 _PARAMETERS = (
     click.argument("dataroot", type=click.Path(path_type=Path)),
-    click.option("--version", type=click.Choice(VERSIONS), default="v1", show_default=True, help="Which release."),
-    click.option("--index-dir", type=click.Path(path_type=Path), help="Where the index lies or goes."),
-    click.option("--workers", type=click.IntRange(min=1), help="Processes to use."),
+    click.option(
+        "--version", type=click.Choice(VERSIONS), default="v1", show_default=True, help="Version of the release."
+    ),
+    click.option("--index-dir", type=click.Path(path_type=Path), help="Folder of the index."),
+    click.option("--workers", type=click.IntRange(min=1), help="Number of processes to use."),
     on_error_parameter,
 )
 
@@ -41,15 +43,17 @@ def where_parameter(verb: Verb) -> Verb:
         "--where",
         multiple=True,
         metavar="FILTER",
-        help="Only scenarios such as town=Town03,Town05, weather!=Clear, length=40..60 or collision=true; all of "
-        "several --where must hold.",
+        help="Only scenarios that match, such as town=Town03,Town05, weather!=Clear, length=40..60 or collision=true. "
+        "If you repeat this option, all filters must match.",
     )
     return option(verb)
 
 
 def agents_parameter(verb: Verb) -> Verb:
     """Give a verb `agents`, the texts of repeated --agents (`agent_names` reads them)."""
-    option = click.option("--agents", multiple=True, metavar="NAME[,NAME…]", help="Whose samples; all if not given.")
+    option = click.option(
+        "--agents", multiple=True, metavar="NAME[,NAME…]", help="Only samples of these agents.  [default: all]"
+    )
     return option(verb)
 
 

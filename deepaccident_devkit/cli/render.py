@@ -34,7 +34,7 @@ from deepaccident_devkit.v2x.collisions import first_accident
 
 _RELEASE = ("dataroot", "version", "index_dir", "workers", "on_error")
 _DPI = 100.0
-_OUT = f"A picture ({', '.join(PICTURE_SUFFIXES)}), or the folder of several."
+_OUT = f"File to write ({', '.join(PICTURE_SUFFIXES)}), or a folder for several pictures."
 
 
 def _linked(draw: Callable[..., Any]) -> Callable[..., Any]:
@@ -65,9 +65,14 @@ def _seconds(context: click.Context, parameter: click.Parameter, value: str) -> 
 
 def _link_options(latency: float, pose_noise: float) -> tuple[Any, ...]:
     return (
-        click.option("--latency", default=latency, show_default=True, help="Of the partners' data, seconds."),
-        click.option("--pose-noise", default=pose_noise, show_default=True, help="Of the partners' poses, metres."),
-        click.option("--seed", default=0, show_default=True, help="Of the noise."),
+        click.option("--latency", default=latency, show_default=True, help="Delay of the partners' data, in seconds."),
+        click.option(
+            "--pose-noise",
+            default=pose_noise,
+            show_default=True,
+            help="Mean position error of the partners' poses, in metres.",
+        ),
+        click.option("--seed", default=0, show_default=True, help="Seed of the noise."),
     )
 
 
@@ -75,43 +80,45 @@ _AGENTS = click.option(
     "--agents",
     multiple=True,
     metavar="NAME[,NAME…]",
-    help=f"Agents, or one of {', '.join(AGENT_CONFIGS)}.  [default: the view's own]",
+    help=f"Agents, or one of {', '.join(AGENT_CONFIGS)}.  [default: chosen by the view]",
 )
-_VIEW_RANGE = click.option("--view-range", type=float, metavar="M", help="Metres shown to each side.")
-_COORDINATES = click.option("--frame", type=click.Choice(get_args(Frame)), help="Of the axes.  [default: ego]")
+_VIEW_RANGE = click.option("--view-range", type=float, metavar="M", help="Metres to show on each side.")
+_COORDINATES = click.option("--frame", type=click.Choice(get_args(Frame)), help="Frame of the axes.  [default: ego]")
 _LAYERS = click.option(
     "--layers",
     multiple=True,
     metavar="NAME[,NAME…]",
-    help=f"What is drawn, of those of {', '.join(LAYERS)} that the view has.",
+    help=f"Only these layers. A view has some of {', '.join(LAYERS)}.",
 )
-_FRAMES = click.option("--frame-range", "frames", callback=frame_range, metavar="FIRST..LAST", help="Of a scenario.")
+_FRAMES = click.option(
+    "--frame-range", "frames", callback=frame_range, metavar="FIRST..LAST", help="Frames of a scenario."
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Picture:
-    """A view that is drawn into a picture.
+    """A view that is rendered into a picture.
 
     Attributes:
-        draw: the function of the render package, or one about it; its first line is the verb's help.
+        draw: the function of the render package, or one about it.
         of: the table whose rows it draws.
         canvas: `fig` if it draws on a figure, `ax` if on axes.
         options: of this verb.
-        help: where `draw` does not say it.
-        default: what is drawn without a token.
+        help: the first line of the verb's help.
+        default: what is rendered without a token.
     """
 
     draw: Callable[..., Any]
     of: str
+    help: str
     canvas: str = "fig"
     options: tuple[Any, ...] = (_LAYERS,)
-    help: str | None = None
     default: str = "the first accident"
 
     def drawn(
         self, dataset: Dataset, row: str, size: tuple[int, int] | None, dpi: float, choices: dict[str, Any]
     ) -> Any:
-        """Draw a row on a figure of a size in pixels, or on one as large as the view wants."""
+        """Render a row on a figure of a size in pixels, or on one as large as the view wants."""
         canvas = {}
         if size is not None:
             figure = figure_of_pixels(*size, dpi=dpi)
@@ -120,17 +127,46 @@ class _Picture:
 
 
 _PICTURES = {
-    "sample": _Picture(draw=render_sample, of="sample", options=(_AGENTS, _LAYERS)),
-    "sample-data": _Picture(draw=render_sample_data, of="sample_data", canvas="ax"),
-    "annotation": _Picture(draw=render_annotation, of="annotation"),
-    "instance": _Picture(draw=render_instance, of="instance", options=(_AGENTS, _LAYERS)),
+    "sample": _Picture(
+        draw=render_sample,
+        of="sample",
+        help="Render one sample: its six camera images, and its boxes and LiDAR points from above.",
+        options=(_AGENTS, _LAYERS),
+    ),
+    "sample-data": _Picture(
+        draw=render_sample_data,
+        of="sample_data",
+        help="Render what one sensor recorded: a camera image, or the LiDAR or the BEV camera from above.",
+        canvas="ax",
+    ),
+    "annotation": _Picture(
+        draw=render_annotation,
+        of="annotation",
+        help="Render one box: in the camera that shows it largest, from above, and described in words.",
+    ),
+    "instance": _Picture(
+        draw=render_instance,
+        of="instance",
+        help="Render one actor over time: its path, its camera images, its speed, and which agents see it.",
+        options=(_AGENTS, _LAYERS),
+    ),
     "pointcloud": _Picture(
         draw=render_pointcloud_in_image,
         of="sample_data",
+        help="Render the LiDAR points on a camera image, also those that are hidden behind objects.",
         canvas="ax",
-        options=(click.option("--color-by", type=click.Choice(get_args(ColorBy)), help="[default: depth]"),),
+        options=(
+            click.option(
+                "--color-by", type=click.Choice(get_args(ColorBy)), help="Colour of the points.  [default: depth]"
+            ),
+        ),
     ),
-    "frame": _Picture(draw=render_frame, of="frame", options=(_AGENTS, _LAYERS)),
+    "frame": _Picture(
+        draw=render_frame,
+        of="frame",
+        help="Render one moment of all agents side by side: front cameras, and boxes and LiDAR from above.",
+        options=(_AGENTS, _LAYERS),
+    ),
     "bev": _Picture(
         draw=_linked(render_bev),
         of="sample",
@@ -139,24 +175,43 @@ _PICTURES = {
             _AGENTS,
             _VIEW_RANGE,
             _COORDINATES,
-            click.option("--sweeps", type=click.IntRange(min=1), help="Frames of points.  [default: 1]"),
+            click.option(
+                "--sweeps", type=click.IntRange(min=1), help="Number of frames of LiDAR points.  [default: 1]"
+            ),
             *_link_options(0.0, 0.0),
             _LAYERS,
         ),
-        help="Draw a moment from above: boxes, LiDAR points and more, of one agent or of several.",
+        help="Render one moment from above: boxes, LiDAR points and other layers, of one or several agents.",
     ),
     "labels": _Picture(
         draw=render_motion_labels,
         of="sample",
-        options=(click.option("--style", type=click.Choice(get_args(MotionStyle)), help="[default: maps]"), _LAYERS),
+        help="Render the motion labels of one sample: one column per frame; instances, centerness, offset and flow.",
+        options=(
+            click.option(
+                "--style", type=click.Choice(get_args(MotionStyle)), help="Style of the picture.  [default: maps]"
+            ),
+            _LAYERS,
+        ),
     ),
     "visibility": _Picture(
-        draw=render_visibility, of="frame", canvas="ax", options=(_AGENTS, _COORDINATES, _VIEW_RANGE, _LAYERS)
+        draw=render_visibility,
+        of="frame",
+        help="Render who sees whom, from above: an actor has one dot for each agent that sees it.",
+        canvas="ax",
+        options=(_AGENTS, _COORDINATES, _VIEW_RANGE, _LAYERS),
     ),
-    "visibility-matrix": _Picture(draw=render_visibility_matrix, of="frame", canvas="ax", options=(_AGENTS,)),
+    "visibility-matrix": _Picture(
+        draw=render_visibility_matrix,
+        of="frame",
+        help="Render who sees whom as a table: one row per actor, one column per agent.",
+        canvas="ax",
+        options=(_AGENTS,),
+    ),
     "accident": _Picture(
         draw=render_accident,
         of="scenario",
+        help="Render the countdown to an accident: one column per moment, one row per agent.",
         options=(
             _AGENTS,
             click.option(
@@ -165,7 +220,7 @@ _PICTURES = {
                 default=",".join(f"{second:g}" for second in COUNTDOWN),
                 show_default=True,
                 metavar="S[,S…]",
-                help="Moments before the impact.",
+                help="Moments to show, in seconds before the impact.",
             ),
             _LAYERS,
         ),
@@ -174,47 +229,57 @@ _PICTURES = {
         draw=_evaluated,
         of="sample",
         options=(
-            click.option("--results", type=click.Path(path_type=Path), required=True, help="A model's results."),
-            click.option("--task", type=click.Choice(["motion", "accident"]), help="How motion is seen."),
-            click.option("--protocol", help="By name.  [default: released; of explicit accidents boxes]"),
+            click.option("--results", type=click.Path(path_type=Path), required=True, help="Results file of a model."),
+            click.option(
+                "--task", type=click.Choice(["motion", "accident"]), help="Verdict on motion, or on the accident in it."
+            ),
+            click.option(
+                "--protocol", help="Name of the protocol.  [default: released; for explicit accidents: boxes]"
+            ),
             _LAYERS,
         ),
-        help="Draw a sample's truth and beside it what a model says, with the verdict in numbers.",
+        help="Render the label of a sample beside a model's prediction, with the verdict in numbers.",
         default="the first of the results",
     ),
     "link": _Picture(
         draw=_linked(render_link),
         of="sample",
         options=(_AGENTS, _VIEW_RANGE, *_link_options(0.2, 0.3), _LAYERS),
-        help="Draw what latency and wrong poses do to what partners share with a sample's agent.",
+        help="Render how latency and pose noise change the data that partners share with the sample's agent.",
     ),
-    "calibration": _Picture(draw=render_calibration, of="frame", options=(_AGENTS, _LAYERS)),
+    "calibration": _Picture(
+        draw=render_calibration,
+        of="frame",
+        help="Render LiDAR points and boxes of all agents in camera images, to check the calibration.",
+        options=(_AGENTS, _LAYERS),
+    ),
 }
 
 
 @click.group()
 def render() -> None:
-    """Draw a release: each view is a verb, `video` puts them in motion."""
+    """Render pictures of a release, one command per view; `video` makes a video of them."""
     os.environ.setdefault("MPLBACKEND", "Agg")  # files alone: no window system is asked for anything
 
 
 def _verb(name: str, picture: _Picture) -> click.Command:
-    first_line = (picture.help or picture.draw.__doc__ or "").partition("\n")[0]
-    scenario = "" if picture.of == "scenario" else ", or a scenario for what it has a second before its end"
     table = picture.of.replace("_", " ")
-    text = f"{first_line}\n\nTOKEN names a row of the table {table}{scenario}; without any, it is {picture.default}."
+    text = f"{picture.help}\n\nTOKEN is a row of the table {table}."
+    if picture.of != "scenario":
+        text += " A scenario's token stands for the moment one second before its end."
+    text += f" Without TOKEN the command renders {picture.default}."
 
-    @click.command(name, help=text, short_help=first_line)
+    @click.command(name, help=text, short_help=picture.help)
     @release_parameters
     @click.argument("tokens", nargs=-1, metavar="[TOKEN…]")
     @click.option("--out", type=click.Path(path_type=Path), required=True, metavar="FILE|FOLDER", help=_OUT)
-    @click.option("--size", callback=pixel_size, metavar="WxH", help="Pixels.  [default: the view's own]")
+    @click.option("--size", callback=pixel_size, metavar="WxH", help="Size in pixels.  [default: chosen by the view]")
     @click.option(
         "--dpi",
         type=click.FloatRange(min=1),
         default=_DPI,
         show_default=True,
-        help="Pixels an inch: words grow with it.",
+        help="Pixels per inch; the text grows with it.",
     )
     @_FRAMES
     def verb(
@@ -235,7 +300,7 @@ def _verb(name: str, picture: _Picture) -> click.Command:
         rows = rows_to_draw(dataset, picture.of, tokens, frames)
         for row, path in zip(rows, picture_paths(out, name, rows), strict=True):
             save_picture(picture.drawn(dataset, row, size, dpi, choices), path, dpi=dpi)
-            click.echo(f"drawn: {row} in {path}")
+            click.echo(f"rendered: {row} in {path}")
 
     for option in picture.options:  # of a command they are appended, of a function they would come in front
         verb = option(verb)
@@ -246,21 +311,29 @@ for _name, _picture in _PICTURES.items():
     render.add_command(_verb(_name, _picture))
 
 
-@render.command(short_help="Write a scenario as a video: any of the views, side by side.")
+@render.command(short_help="Write a scenario as a video of one or several views.")
 @release_parameters
 @click.argument("scenario", required=False)
-@click.option("--out", type=click.Path(path_type=Path), required=True, metavar="FILE", help=f"{', '.join(SUFFIXES)}.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    required=True,
+    metavar="FILE",
+    help=f"File to write ({', '.join(SUFFIXES)}).",
+)
 @click.option(
     "--what",
     multiple=True,
     metavar="VIEW[,VIEW…]",
-    help=f"Side by side, of {', '.join(VIEWS)}.  [default: frame]",
+    help=f"Views to show side by side: {', '.join(VIEWS)}.  [default: frame]",
 )
 @_AGENTS
 @_LAYERS
 @_FRAMES
-@click.option("--size", callback=pixel_size, metavar="WxH", default="1280x720", show_default=True, help="Pixels.")
-@click.option("--fps", default=10.0, show_default=True, help="Frames a second; recorded are 10.")
+@click.option(
+    "--size", callback=pixel_size, metavar="WxH", default="1280x720", show_default=True, help="Size in pixels."
+)
+@click.option("--fps", default=10.0, show_default=True, help="Frames per second; the recordings have 10.")
 def video(
     scenario: str | None,
     out: Path,
@@ -269,9 +342,10 @@ def video(
     layers: tuple[str, ...],
     **options: Any,
 ) -> None:
-    """Write SCENARIO of the release under DATAROOT as a video; without one, the first accident.
+    """Write one scenario of the release in DATAROOT as a video.
 
-    MP4 plays in browsers if the extra is there: pip install 'deepaccident_devkit[video]'.
+    Without SCENARIO the command takes the first accident. An MP4 file plays in browsers if the extra `video` is
+    installed; in a checkout: pip install '.[video]'.
     """
     release = {option: options.pop(option) for option in _RELEASE}
     check_target(out, size=options["size"], fps=options["fps"])  # before the release is indexed

@@ -14,17 +14,20 @@ from deepaccident_devkit.v2x import AGENT_CONFIGS
 @click.command()
 @release_parameters
 @click.argument("scenario", required=False)
-@click.option("--out", required=True, type=click.Path(), help="The file to write, such as replay.html.")
-@click.option("--results", type=click.Path(), help="A model's results of motion or accidents: shows their verdicts.")
+@click.option("--out", required=True, type=click.Path(), help="File to write, such as replay.html.")
+@click.option("--results", type=click.Path(), help="Results file of motion or accidents, shown with its verdicts.")
 @click.option(
     "--agents",
     multiple=True,
     metavar="NAME[,NAME…]",
-    help=f"Whose cameras, views and results: agents, or one of {', '.join(AGENT_CONFIGS)} as seen from the ego.  "
-    "[default: all that are there]",
+    help=f"Agents to show, or one of {', '.join(AGENT_CONFIGS)} (from the ego vehicle).  [default: all]",
 )
-@click.option("--image-width", type=int, metavar="N", help="Pixels.  [default: what keeps the file within 15 MB]")
-@click.option("--quality", type=int, metavar="Q", help="Of JPEG, 1 to 95.  [default: what keeps the file within 15 MB]")
+@click.option(
+    "--image-width", type=int, metavar="N", help="Image width in pixels.  [default: so that the file has at most 15 MB]"
+)
+@click.option(
+    "--quality", type=int, metavar="Q", help="JPEG quality, 1 to 95.  [default: so that the file has at most 15 MB]"
+)
 def replay(
     scenario: str | None,
     out: str,
@@ -34,9 +37,9 @@ def replay(
     quality: int | None,
     **release: Any,
 ) -> None:
-    """Write SCENARIO of the release under DATAROOT as one HTML file that plays in any browser, without a network.
+    """Write one scenario of the release in DATAROOT as one HTML file that plays in any browser, without a network.
 
-    SCENARIO is a token, TYPE/NAME; without one it is the first that ends in an accident.
+    SCENARIO is a token of the form TYPE/NAME. Without SCENARIO the command takes the first accident.
     """
     prediction = None if results is None else read_results(results)  # before the release is indexed
     path = render_replay(

@@ -13,13 +13,17 @@ from deepaccident_devkit.splits import OFFICIAL_SEED, official_split, save_selec
 
 @click.command()
 @release_parameters
-@click.option("--seed", default=OFFICIAL_SEED, show_default=True, help="Of the official procedure's shuffles.")
-@click.option("--released-skip", is_flag=True, help="Pass over the twins that the released loop passes over.")
-@click.option("--out", type=click.Path(path_type=Path), help="Folder for train.txt, val.txt, test.txt and the minis.")
+@click.option("--seed", default=OFFICIAL_SEED, show_default=True, help="Seed of the official procedure.")
+@click.option("--released-skip", is_flag=True, help="Skip the normal twins that a quirk of the released code skips.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    help="Folder to write train.txt, val.txt, test.txt, train_mini.txt and val_mini.txt into.",
+)
 @where_parameter
-@click.option("--save", type=click.Path(path_type=Path), help="With --where: the split file to write.")
-@click.option("--overwrite", is_flag=True, help="Replace files that are there.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON object, for programs.")
+@click.option("--save", type=click.Path(path_type=Path), help="With --where: split file to write.")
+@click.option("--overwrite", is_flag=True, help="Replace files that already exist.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
 def split(
     seed: int,
     released_skip: bool,
@@ -30,9 +34,9 @@ def split(
     as_json: bool,
     **release: Any,
 ) -> None:
-    """Split the release under DATAROOT by the official procedure and print how it is distributed.
+    """Split the release in DATAROOT by the official procedure, and print how the scenarios are distributed.
 
-    With --where, report the scenarios that meet all filters instead, and --save them as a split file.
+    With --where, report only the scenarios that match all filters. --save writes them into a split file.
     """
     if where and out:
         raise click.UsageError("--out is for the official split; with --where give --save FILE")

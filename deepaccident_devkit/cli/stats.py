@@ -14,21 +14,23 @@ from deepaccident_devkit.statistics import dataset_statistics, writable_folder
 @click.command()
 @release_parameters
 @where_parameter
-@click.option("--out", type=click.Path(), help="Folder for statistics.json, a CSV a table, and figures.")
+@click.option(
+    "--out", type=click.Path(), help="Folder to write statistics.json, one CSV file per table, and figures into."
+)
 @click.option(
     "--format",
     "formats",
     type=click.Choice(get_args(PictureFormat)),
     multiple=True,
-    help="With --out: of the figures; may be repeated.  [default: both]",
+    help="With --out: format of the figures; you can repeat this option.  [default: both]",
 )
-@click.option("--json", "as_json", is_flag=True, help="One JSON object, for programs.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
 def stats(
     where: tuple[str, ...], out: str | None, formats: tuple[PictureFormat, ...], as_json: bool, **release: Any
 ) -> None:
-    """Print the paper's statistics of the release under DATAROOT: scenarios, actors, boxes, ends, by split.
+    """Print the paper's statistics of the release in DATAROOT by split: scenarios, actors, boxes, ends.
 
-    With --out, write them too; files of earlier statistics there are replaced.
+    With --out, also write them into files. Earlier statistics in that folder are replaced.
     """
     if formats and out is None:
         raise click.UsageError("--format is for figures; give --out FOLDER too")

@@ -14,9 +14,9 @@ from deepaccident_devkit.taxonomy import Layout
 _DEFAULTS = SynthConfig()
 _EXAMPLES = """\b
 Examples:
-  deepaccident synth OUT --scenarios 24 --no-sensors     labels of all twelve designs
-  deepaccident synth --show-design 3 > mine.yaml         a scenario file: edit it, then
-  deepaccident synth OUT --spec mine.yaml                accidents by it"""
+  deepaccident synth OUT --scenarios 24 --no-sensors     only labels, all twelve designs
+  deepaccident synth --show-design 3 > mine.yaml         print a scenario file to edit
+  deepaccident synth OUT --spec mine.yaml                make accidents from your file"""
 
 
 def _list_designs(context: click.Context, _parameter: click.Parameter, wanted: bool) -> None:
@@ -37,52 +37,63 @@ def _show_design(context: click.Context, _parameter: click.Parameter, number: in
     "--scenarios",
     default=_DEFAULTS.scenarios,
     show_default=True,
-    help="How many: accidents and their normal twins in turn.",
+    help="Number of scenarios: accidents and their normal twins in turn.",
 )
-@click.option("--frames", type=int, help="The last so many of each scenario, at 10 Hz.  [default: all, 40 to 100]")
+@click.option(
+    "--frames", type=int, help="Record only the last N frames of each scenario (10 Hz).  [default: all, 40 to 100]"
+)
 @click.option(
     "--image-size",
     callback=pixel_size,
     metavar="WxH",
     default="{}x{}".format(*_DEFAULTS.image_size),
     show_default=True,
-    help="Of the camera images, pixels; the real ones have 1600x900.",
+    help="Size of the camera images in pixels; the real ones have 1600x900.",
 )
 @click.option(
     "--layout",
     type=click.Choice(get_args(Layout)),
     default=_DEFAULTS.layout,
     show_default=True,
-    help="A: all splits in one folder; B: a folder a split.",
+    help="A: all splits in one folder. B: one folder per split.",
 )
 @click.option("--seed", default=_DEFAULTS.seed, show_default=True, help="The same seed gives the same bytes.")
-@click.option("--no-sensors", is_flag=True, help="Only labels, calib and meta: no images, point clouds, BEV arrays.")
-@click.option("--unlabelled-test", is_flag=True, help="Without labels in the test split, as in the real release.")
-@click.option("--exact", is_flag=True, help="Calib and numbers of points without the small errors of the real release.")
+@click.option(
+    "--no-sensors", is_flag=True, help="Write only labels, calib and meta: no images, point clouds, BEV arrays."
+)
+@click.option("--unlabelled-test", is_flag=True, help="Write no labels for the test split, as in the real release.")
+@click.option(
+    "--exact", is_flag=True, help="Leave out the small errors of calib and point counts that the real release has."
+)
 @click.option(
     "--design",
     "designs",
     type=click.IntRange(DESIGN_NUMBERS[0], DESIGN_NUMBERS[-1]),
     multiple=True,
-    help="Only accidents of this design; of several --design in turn.  [default: all twelve in turn]",
+    help="Only accidents of this design; you can repeat this option.  [default: all twelve in turn]",
 )
 @click.option(
     "--spec",
     type=click.Path(path_type=Path),
-    help="A scenario file of your own in place of the designs; docs/scenarios.md says what it can hold.",
+    help="Your own scenario file, in place of the designs; docs/scenarios.md describes its fields.",
 )
 @click.option(
     "--unplanned",
     default=_DEFAULTS.unplanned,
     show_default=True,
-    help="Share of accidents, 0 to 1, that are none of the designs: with a pedestrian, a third vehicle.",
+    help="Share of accidents (0 to 1) that follow no design, such as one with a pedestrian or a third vehicle.",
 )
 @click.option(
     "--view",
     type=click.Choice(get_args(View)),
-    help="hidden: a house on the street corner hides the two who will collide from each other.",
+    help="hidden: a house at the corner hides the two vehicles that will collide from each other.",
 )
-@click.option("--workers", type=click.IntRange(min=1), default=None, help="Processes to use.  [default: as it pays]")
+@click.option(
+    "--workers",
+    type=click.IntRange(min=1),
+    default=None,
+    help="Number of processes to use.  [default: chosen by the amount of work]",
+)
 @click.option(
     "--list-designs",
     is_flag=True,
@@ -97,16 +108,16 @@ def _show_design(context: click.Context, _parameter: click.Parameter, number: in
     is_eager=True,
     expose_value=False,
     callback=_show_design,
-    help="Print a design's scenario file, to begin one of your own with, and stop.",
+    help="Print the scenario file of a design, as a start for your own, and stop.",
 )
 def synth(out: Path, *, no_sensors: bool, workers: int | None, **options: Any) -> None:
     """Make a complete synthetic release in the new folder OUT.
 
-    After a break the same command goes on where it was.
+    If a run is interrupted, the same command continues it.
     """
     config = SynthConfig(sensors=not no_sensors, **options)
     if no_sensors and not has_embree():
-        click.echo("slow, without the package embreex: pip install 'deepaccident_devkit[synth]'", err=True)
+        click.echo("slow without the package embreex; in a checkout: pip install '.[synth]'", err=True)
     made = make_release(out, config, workers=workers, progress=True)
     scenarios = f"{config.scenarios} scenario{'s' if config.scenarios > 1 else ''}"
     frames = "" if config.frames is None else f" of {config.frames} frame{'s' if config.frames > 1 else ''}"

@@ -14,18 +14,20 @@ _FINDINGS_STATUS = 1
 
 @click.command()
 @release_parameters
-@click.option("--deep", is_flag=True, help="Decode every image and array, and hold them against the labels.")
-@click.option("--scenario", "scenarios", multiple=True, metavar="TOKEN", help="Only this scenario; may be repeated.")
-@click.option("--notes", is_flag=True, help="List also what is only worth knowing.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON document, for programs.")
+@click.option("--deep", is_flag=True, help="Also decode each image and array, and compare them with the labels.")
+@click.option(
+    "--scenario", "scenarios", multiple=True, metavar="TOKEN", help="Only this scenario; you can repeat this option."
+)
+@click.option("--notes", is_flag=True, help="Also list notes, which are no errors and no warnings.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON document, for programs.")
 def validate(
     dataroot: Path, version: str, deep: bool, scenarios: tuple[str, ...], notes: bool, as_json: bool, **release: Any
 ) -> None:
-    """Say what is wrong, odd or missing in the release under DATAROOT, worst scenario first.
+    """Print what is wrong, unusual or missing in the release in DATAROOT, worst scenario first.
 
-    It reads the files, not the index, and looks at every scenario: --index-dir and --on-error change nothing here.
-    Exit status: 0 if there are at most notes and what the real release is known for, 1 if there are errors or other
-    warnings, 2 if it cannot be looked at.
+    The command reads the files and each scenario, not the index: --index-dir and --on-error have no effect.
+    Exit status 0: there are only notes and known findings of the real release. 1: there are errors or other warnings.
+    2: the release cannot be read.
     """
     report = validate_release(
         dataroot,

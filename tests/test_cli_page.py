@@ -1,0 +1,30 @@
+"""docs/cli.md has the help of all commands as it is now."""
+
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("make_cli_page", DOCS / "make_cli_page.py")
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_page_is_up_to_date(script: ModuleType) -> None:
+    assert script.PAGE.read_text(encoding="utf-8") == script.page(), "run: python docs/make_cli_page.py"
+
+
+def test_every_command_and_option_has_a_help_text(script: ModuleType) -> None:
+    lines = script.page().splitlines()
+    assert [line for line in lines if line.startswith("|") and line.endswith("|  |")] == []
+    for command in ("info", "index clear", "evaluate motion", "evaluate compare", "render bev", "export mcap"):
+        assert sum(line.lstrip("# ") == f"deepaccident {command}" for line in lines) == 1
