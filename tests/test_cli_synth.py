@@ -7,6 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 from deepaccident_devkit.cli.synth import synth
+from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.synth import SynthConfig
 from deepaccident_devkit.synth.spec import design_text, parse_spec
@@ -68,6 +69,25 @@ def test_every_option_reaches_the_configuration(tmp_path, made):
     ]
 
 
+def test_a_release_for_the_released_code_is_asked_for_by_one_word(tmp_path, made):
+    CliRunner().invoke(synth, [str(tmp_path), "--for-released-code"])
+    CliRunner().invoke(synth, [str(tmp_path), "--for-released-code", "--image-size", "1600x900", "--layout", "A"])
+    assert made == [
+        SynthConfig(frames=None, for_released_code=True),
+        SynthConfig(frames=None, for_released_code=True, image_size=(1600, 900)),
+    ]
+
+
+@pytest.mark.parametrize(
+    "words", [("--image-size", "480x270"), ("--image-size", "1600x901"), ("--layout", "B"), ("--unlabelled-test",)]
+)
+def test_what_contradicts_the_released_code_is_refused(tmp_path, made, words):
+    result = CliRunner().invoke(synth, [str(tmp_path), "--for-released-code", *words])
+    assert isinstance(result.exception, ConfigError)
+    assert "leave one of the two out" in str(result.exception)
+    assert made == []
+
+
 def test_without_options_scenarios_have_their_natural_length(tmp_path, made):
     result = CliRunner().invoke(synth, [str(tmp_path)])
     assert made == [SynthConfig(frames=None)]
@@ -110,5 +130,5 @@ def test_a_design_is_shown_as_a_file_to_begin_with():
 def test_help_names_every_option():
     text = CliRunner().invoke(synth, ["--help"]).output
     named = {option for parameter in synth.params for option in parameter.opts if option.startswith("--")}
-    assert len(named) == 15
+    assert len(named) == 16
     assert all(option in text for option in named)

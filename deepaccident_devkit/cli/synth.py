@@ -7,6 +7,7 @@ import click
 
 from deepaccident_devkit.cli.options import pixel_size
 from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.synth.config import IMAGE_SIZE, RELEASED_IMAGE_SIZE
 from deepaccident_devkit.synth.sensors.caster import has_embree
 from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, View, design_text, designs_text
 from deepaccident_devkit.taxonomy import Layout
@@ -16,7 +17,8 @@ _EXAMPLES = """\b
 Examples:
   deepaccident synth OUT --scenarios 24 --no-sensors     only labels, all twelve designs
   deepaccident synth --show-design 3 > mine.yaml         print a scenario file to edit
-  deepaccident synth OUT --spec mine.yaml                make accidents from your file"""
+  deepaccident synth OUT --spec mine.yaml                make accidents from your file
+  deepaccident synth OUT --for-released-code             for the released DeepAccident code"""
 
 
 def _list_designs(context: click.Context, _parameter: click.Parameter, wanted: bool) -> None:
@@ -46,9 +48,9 @@ def _show_design(context: click.Context, _parameter: click.Parameter, number: in
     "--image-size",
     callback=pixel_size,
     metavar="WxH",
-    default="{}x{}".format(*_DEFAULTS.image_size),
-    show_default=True,
-    help="Size of the camera images in pixels; the real ones have 1600x900.",
+    help="Size of the camera images in pixels. The real ones have 1600x900, and the released DeepAccident code takes that for "
+    "granted: with another size it computes wrong camera geometry.  [default: {}x{}; {}x{} with "
+    "--for-released-code]".format(*IMAGE_SIZE, *RELEASED_IMAGE_SIZE),
 )
 @click.option(
     "--layout",
@@ -64,6 +66,12 @@ def _show_design(context: click.Context, _parameter: click.Parameter, number: in
 @click.option("--unlabelled-test", is_flag=True, help="Write no labels for the test split, as in the real release.")
 @click.option(
     "--exact", is_flag=True, help="Leave out the small errors of calib and point counts that the real release has."
+)
+@click.option(
+    "--for-released-code",
+    is_flag=True,
+    help="A release that the released DeepAccident code reads correctly: images of 1600x900, layout A, a labelled test "
+    "split, and the split files under split_txt_files/ too.",
 )
 @click.option(
     "--design",

@@ -81,7 +81,8 @@ class MotionLabels(FrozenArrays):
     def to_present(self, centerness: WarpMode = "nearest") -> MotionLabels:
         """The labels with every frame in the present ego frame, as models are trained on and evaluated against them.
 
-        `motion.warps.to_present` says how.
+        `motion.warps.to_present` says how. Labels that are not warped equal the released code's in every cell; warped
+        ones can differ in single cells, at ties of the sampling (docs/motion_labels.md, "How equal they are").
 
         Args:
             centerness: how to sample the centres' peaks: the released code trains with `nearest` and evaluates with

@@ -10,6 +10,10 @@ from deepaccident_devkit.taxonomy import Layout
 
 MAX_FRAMES = 999
 MIN_IMAGE_SIZE = (16, 9)
+IMAGE_SIZE: Final = (480, 270)
+"""Pixels, of images whose size nobody asks for; small, since larger ones take long."""
+RELEASED_IMAGE_SIZE: Final = (1600, 900)
+"""Pixels, of the real images. The released code does not look: it takes every image for one of this size."""
 DESIGN_ROUND: Final = (1, 7, 2, 8, 3, 9, 4, 10, 5, 11, 6, 12)
 """All designs in the order in which they take turns: with traffic lights and without, so that two pairs have both."""
 HIDDEN_DESIGN_ROUND: Final = (1, 7)
@@ -24,7 +28,9 @@ class SynthConfig:
         scenarios: how many; they alternate between an accident and its normal twin.
         frames: recorded frames of each scenario, at 10 Hz: the last ones before its end. None records it from when the
             cars set off until it ends, 40 to 100 frames; a normal one up to 200, if `end.time` of its file says so.
-        image_size: width and height of the camera images, pixels (the real ones have 1600×900).
+        image_size: width and height of the camera images, pixels; None for 480×270, or 1600×900 with
+            `for_released_code`. The real ones have 1600×900. The released code takes that for granted: with another
+            size it computes wrong camera geometry.
         layout: `A`, all splits in one folder, or `B`, a folder a split.
         seed: the same seed gives the same bytes (on the same machine with the same package versions).
         sensors: whether to write images, point clouds and BEV arrays besides labels, calib and meta.
@@ -39,11 +45,13 @@ class SynthConfig:
         unlabelled_test: whether the test split lacks labels, BEV arrays and meta, as the real one does.
         exact: whether calib files are the same at each frame, and `num_lidar_pts` what a recount gives. Else both are
             a little off, as in the real release.
+        for_released_code: whether the released code has to read the release: images of 1600×900, layout `A`, a
+            labelled test split, and the split files under `split_txt_files/` too. What contradicts it is refused.
     """
 
     scenarios: int = 4
     frames: int | None = 40
-    image_size: tuple[int, int] = (480, 270)
+    image_size: tuple[int, int] | None = None
     layout: Layout = "A"
     seed: int = 0
     sensors: bool = True
@@ -53,6 +61,7 @@ class SynthConfig:
     spec: Path | None = None
     unlabelled_test: bool = False
     exact: bool = False
+    for_released_code: bool = False
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -63,9 +72,9 @@ class SynthConfig:
         _check_word("layout", self.layout, get_args(Layout))
         if self.view is not None:
             _check_word("view", self.view, get_args(View))
-        if len(self.image_size) != 2:
+        if len(self.pixels) != 2:
             raise ConfigError(f"image_size: expected (width, height), found {self.image_size!r}")
-        for name, value, least in zip(("width", "height"), self.image_size, MIN_IMAGE_SIZE, strict=True):
+        for name, value, least in zip(("width", "height"), self.pixels, MIN_IMAGE_SIZE, strict=True):
             _check_range(f"image_size: {name}", value, least, 8192)
         for design in self.designs:
             _check_range("designs", design, DESIGN_NUMBERS[0], DESIGN_NUMBERS[-1])
@@ -75,11 +84,40 @@ class SynthConfig:
             raise ConfigError(
                 "spec, designs: a release is made of a scenario file or of designs; choose one of the two"
             )
+        if self.for_released_code:
+            self._check_for_released_code()
+
+    @property
+    def pixels(self) -> tuple[int, int]:
+        """Width and height of the camera images that are made."""
+        if self.image_size is not None:
+            return self.image_size
+        return RELEASED_IMAGE_SIZE if self.for_released_code else IMAGE_SIZE
 
     @property
     def design_round(self) -> tuple[int, ...]:
         """The designs that take turns."""
         return self.designs or (HIDDEN_DESIGN_ROUND if self.view == "hidden" else DESIGN_ROUND)
+
+    def _check_for_released_code(self) -> None:
+        """Refuse what the released code cannot read, or reads wrongly."""
+        remedy = "leave one of the two out"
+        if self.pixels != RELEASED_IMAGE_SIZE:
+            real, found = ("{}x{}".format(*size) for size in (RELEASED_IMAGE_SIZE, self.pixels))
+            raise ConfigError(
+                f"image_size, for_released_code: the released code takes every image for one of {real}, found {found}; "
+                f"{remedy}"
+            )
+        if self.layout != "A":
+            raise ConfigError(
+                "layout, for_released_code: the released code looks for all splits in one folder, layout A, found "
+                f"{self.layout}; {remedy}"
+            )
+        if self.unlabelled_test:
+            raise ConfigError(
+                "unlabelled_test, for_released_code: the released converter finds the frames of each split, test too, "
+                f"by their labels; {remedy}"
+            )
 
 
 def _check_word(name: str, value: str, words: tuple[str, ...]) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.files import is_writable_folder
 from deepaccident_devkit.parallel import run_unordered
+from deepaccident_devkit.release.layout import SPLIT_FILE_FOLDER
 from deepaccident_devkit.synth.config import SynthConfig
 from deepaccident_devkit.synth.plan import ScenarioPlan, plan_scenarios, plan_splits
 from deepaccident_devkit.synth.recording import RecordingJob, forget_scenario, parts_of, record_scenario
@@ -49,7 +50,10 @@ def make_release(
     with unfinished_release(out, wanted) as unfinished:
         jobs = [_jobs(unfinished, wanted, plan) for plan in plans]
         _record_all(unfinished, jobs, workers or _worker_count(wanted, len(plans)), progress=progress)
-        plan_splits(plans).save(unfinished.release, overwrite=True)
+        splits = plan_splits(plans)
+        splits.save(unfinished.release, overwrite=True)
+        if wanted.for_released_code:
+            splits.save(unfinished.release / SPLIT_FILE_FOLDER, overwrite=True)
     return out
 
 

@@ -1,7 +1,8 @@
 """Which scenarios a release has: accidents of each design and their normal twins, their names and their splits."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from typing import Final, cast
 
 import numpy as np
@@ -17,6 +18,8 @@ OFFICIAL_FROM_PAIRS: Final = 12
 """Pairs from which the official procedure splits a release; of fewer it would leave val and test empty."""
 _GOLDEN_RATIO: Final = 0.6180339887498949
 """Its multiples fill [0, 1) evenly, whatever their number."""
+_MINI_SHARE: Final = Fraction(1, 5)
+"""Of its split, what a mini split may hold at most."""
 _PLAN_STREAM: Final = 1
 """Sets the plan's random numbers apart from those of the pair's scene."""
 _HIDDEN_SPEEDS: Final = (12.0, 14.0)
@@ -132,18 +135,23 @@ def plan_splits(plans: Sequence[ScenarioPlan]) -> Splits:
 
     The official procedure deals the scenarios out, as `deepaccident split` does. Of fewer than `OFFICIAL_FROM_PAIRS`
     pairs, the first goes to train, the second to val, the third to test, and of those after them about 70, 15 and
-    15 %; each mini split is the first pair of its split.
+    15 %.
+
+    A mini split is what the procedure makes of its split (of fewer pairs: the first ones of the split), with two
+    differences. The procedure rounds a fifth of the split, up too, and leaves the mini split of a small one empty. Here
+    it holds at most a fifth, and where that is less than a pair, one pair: a loader of the mini splits finds something.
     """
     if len({plan.pair for plan in plans}) >= OFFICIAL_FROM_PAIRS:
-        return split_records([_record(plan) for plan in plans])
-    by_split = {split: [plan for plan in plans if _small_split(plan.pair) == split] for split in SPLITS}
-    tokens = {split: tuple(sorted(plan.token for plan in of_split)) for split, of_split in by_split.items()}
-    return Splits(
-        train=tokens["train"],
-        val=tokens["val"],
-        test=tokens["test"],
-        train_mini=_first_pair(by_split["train"]),
-        val_mini=_first_pair(by_split["val"]),
+        dealt = split_records([_record(plan) for plan in plans])
+    else:
+        train, val, test = (
+            tuple(sorted(plan.token for plan in plans if _small_split(plan.pair) == split)) for split in SPLITS
+        )
+        dealt = Splits(train=train, val=val, test=test, train_mini=train, val_mini=val)
+    return replace(
+        dealt,
+        train_mini=_mini(plans, dealt.train, dealt.train_mini),
+        val_mini=_mini(plans, dealt.val, dealt.val_mini),
     )
 
 
@@ -190,8 +198,20 @@ def _small_split(pair: int) -> str:
     return "train" if share < 0.7 else "val" if share < 0.85 else "test"
 
 
-def _first_pair(plans: Sequence[ScenarioPlan]) -> tuple[str, ...]:
-    return tuple(sorted(plan.token for plan in plans if plan.pair == plans[0].pair))
+def _mini(plans: Sequence[ScenarioPlan], split: Sequence[str], wanted: Collection[str]) -> tuple[str, ...]:
+    """Whole pairs of those wanted, as many as `_MINI_SHARE` of the split allows; if none, the split's smallest pair."""
+    members = set(split)
+    pairs: dict[int, list[str]] = {}
+    for plan in plans:
+        if plan.token in members:
+            pairs.setdefault(plan.pair, []).append(plan.token)
+    mini: list[str] = []
+    for pair in pairs.values():
+        if set(pair) <= set(wanted) and len(mini) + len(pair) <= _MINI_SHARE * len(split):
+            mini += pair
+    if not mini and pairs:
+        mini = min(pairs.values(), key=len)
+    return tuple(sorted(mini))
 
 
 def _record(plan: ScenarioPlan) -> ScenarioRecord:

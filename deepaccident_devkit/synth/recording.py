@@ -105,7 +105,7 @@ def _made_ready(task: _Task) -> tuple[Scenario, Rig]:
         scenario.actors,
         scenario.agents,
         sky=(scenario.weather, scenario.time_of_day),
-        image_size=config.image_size,
+        image_size=config.pixels,
         seed=(config.seed, plan.pair, int(plan.accident)),
         images=config.sensors,
         exact=config.exact,

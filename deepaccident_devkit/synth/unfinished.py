@@ -105,7 +105,7 @@ def _agree(path: Path, config: SynthConfig) -> None:
 def _as_json(config: SynthConfig) -> dict[str, Any]:
     """All that the bytes of a release depend on, as it comes back from JSON; the scenario file with what it says."""
     text = None if config.spec is None else config.spec.read_text(encoding="utf-8")
-    fields = {"version": __version__, **asdict(config), "spec": text}
+    fields = {"version": __version__, **asdict(config), "image_size": config.pixels, "spec": text}
     as_read: dict[str, Any] = json.loads(json.dumps(fields))
     return as_read
 

@@ -3,7 +3,8 @@
 A nearest warp decides by rounding which cell a sample point lies in, and points close to a border between cells fall
 to one side or the other by the last bit of the matrix. So the labels' warps repeat each rounding: products summed in
 order of the inner index, without fused multiply-add, the inverse by elimination as LAPACK's getrf and getrs do it, and
-sine and cosine by a polynomial. Checked against torch 2.13 on random poses: equal bits.
+sine and cosine by a polynomial. Checked against torch 2.13 on random poses: equal bits. Not so the angles of
+`six_vectors`.
 """
 
 from typing import Any, Final
@@ -74,7 +75,11 @@ def fused_product(first: Float32Array, second: Float32Array) -> Float32Array:
 
 
 def six_vectors(matrix: Float32Array) -> Float32Array:
-    """Matrices (…, 4, 4) → 6-vectors (…, 6), by way of float64: angles to the last bit or so."""
+    """Matrices (…, 4, 4) → 6-vectors (…, 6), by way of float64: translations as they are, angles rounded once.
+
+    torch's atan2 in float32 is not correctly rounded, so that its angles can differ in the last bit. At a tie, where a
+    sample point lies on a border between cells, that can change the cell: of about 330 warped dumps, three had one off.
+    """
     return geometry_six_vectors.from_matrices(matrix).astype(np.float32)
 
 

@@ -38,6 +38,31 @@ def test_a_scenario_file_and_designs_exclude_each_other():
         SynthConfig(spec=Path("own.yaml"), designs=(1,))
 
 
+def test_a_release_for_the_released_code_has_its_images_and_its_layout():
+    config = SynthConfig(for_released_code=True)
+    assert (config.pixels, config.layout) == ((1600, 900), "A")
+    assert SynthConfig(for_released_code=True, image_size=(1600, 900)).pixels == (1600, 900)
+    assert SynthConfig().pixels == (480, 270)
+    assert SynthConfig(image_size=(64, 36)).pixels == (64, 36)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "sentence"),
+    [
+        ("image_size", (480, 270), "takes every image for one of 1600x900, found 480x270; leave one of the two out"),
+        ("layout", "B", "looks for all splits in one folder, layout A, found B; leave one of the two out"),
+        (
+            "unlabelled_test",
+            True,
+            "finds the frames of each split, test too, by their labels; leave one of the two out",
+        ),
+    ],
+)
+def test_what_the_released_code_cannot_read_is_refused(field, value, sentence):
+    with pytest.raises(ConfigError, match=f"^{field}, for_released_code: the released .*{sentence}$"):
+        SynthConfig(**{field: value}, for_released_code=True)
+
+
 def test_the_round_of_designs():
     assert sorted(SynthConfig().design_round) == list(range(1, 13))
     assert SynthConfig(designs=(5, 5, 2)).design_round == (5, 5, 2)

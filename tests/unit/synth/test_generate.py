@@ -8,13 +8,14 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.release import find_release, read_calib, read_label, read_meta, read_split_file
+from deepaccident_devkit.release import find_release, read_calib, read_image, read_label, read_meta, read_split_file
 from deepaccident_devkit.synth import SynthConfig, generate, make_release, recording
 from deepaccident_devkit.synth.plan import plan_scenarios
 from deepaccident_devkit.synth.recording import RecordingJob, _Recorder, parts_of, record_scenario
 from deepaccident_devkit.synth.scenario import build_scenario
 from deepaccident_devkit.synth.unfinished import Unfinished, unfinished_release
-from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, MINI_SPLITS, SPLITS
+from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, CHANNELS, MINI_SPLITS, SPLITS
+from deepaccident_devkit.validation import validate_release
 
 TINY = {"scenarios": 2, "frames": 2, "image_size": (32, 18)}
 
@@ -59,6 +60,33 @@ def test_layout_b_has_a_folder_a_split(tmp_path):
         tokens = {s.token for s in release.scenarios if s.folder == split.removesuffix("_mini")}
         assert set(read_split_file(path)) == tokens
     assert len(read_label(release.scenarios[-1].label_path("infrastructure", 1))) > 5
+
+
+@pytest.mark.slow
+def test_a_release_for_the_released_code_has_its_split_files_twice(tmp_path):
+    """Calib files are those of 1600x900 images, whether images are there or not."""
+    config = SynthConfig(scenarios=4, frames=1, sensors=False, for_released_code=True)
+    root = make_release(tmp_path / "released", config, workers=1)
+    release = find_release(root)
+    assert release.layout == "A"
+    for split in (*SPLITS, *MINI_SPLITS):
+        assert release.split_files[split] == root / f"{split}.txt"
+        copy = root / "split_txt_files" / f"{split}.txt"
+        assert copy.read_bytes() == release.split_files[split].read_bytes()
+        assert bool(copy.read_bytes()) == (split != "test")
+    intrinsic = read_calib(release.scenarios[0].calib_path("ego_vehicle", 1)).intrinsic
+    for channel in CAMERAS:
+        assert intrinsic[channel][:2, 2] == pytest.approx((800, 450))
+    assert validate_release(root, workers=1).is_good
+
+
+@pytest.mark.slow
+def test_images_for_the_released_code_have_its_size(tmp_path):
+    config = SynthConfig(scenarios=1, frames=1, for_released_code=True)
+    (scenario,) = find_release(make_release(tmp_path / "released", config, workers=1)).scenarios
+    for agent in AGENTS:
+        for channel in CAMERAS:
+            assert read_image(scenario.channel_path(agent, channel, 1)).shape == (900, 1600, 3)
 
 
 @pytest.mark.slow

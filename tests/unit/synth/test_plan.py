@@ -6,7 +6,7 @@ import pytest
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.splits import split_records
 from deepaccident_devkit.synth import SynthConfig
-from deepaccident_devkit.synth.plan import plan_scenarios, plan_splits
+from deepaccident_devkit.synth.plan import _mini, plan_scenarios, plan_splits
 from deepaccident_devkit.synth.scenario import build_scenario
 from deepaccident_devkit.taxonomy import TOWNS
 
@@ -96,6 +96,35 @@ def test_a_large_release_is_split_by_the_official_procedure():
     assert all(len(names) == 1 for names in of_pair.values())
 
 
+@pytest.mark.parametrize("scenarios", [*range(1, 50), 60, 120, 240, 691])
+def test_minis_are_whole_pairs_a_fifth_at_most_and_never_empty(scenarios):
+    plans = plans_of(scenarios=scenarios)
+    splits = plan_splits(plans)
+    pair_of = {plan.token: plan.pair for plan in plans}
+    for whole, mini in ((splits.train, splits.train_mini), (splits.val, splits.val_mini)):
+        assert set(mini) <= set(whole)
+        pairs = {pair_of[token] for token in mini}
+        assert set(mini) == {token for token in whole if pair_of[token] in pairs}
+        assert len(pairs) == 1 or 5 * len(mini) <= len(whole)
+        assert bool(mini) == bool(whole)
+
+
+def test_minis_of_single_scenarios_are_a_fifth_too(tmp_path):
+    path = tmp_path / "own.yaml"
+    path.write_text(OWN)
+    for scenarios, train_minis in ((3, 1), (11, 1), (60, 8)):
+        splits = plan_splits(plans_of(spec=path, scenarios=scenarios))
+        assert len(splits.train_mini) == train_minis <= max(1, len(splits.train) // 5)
+        assert 1 <= len(splits.val_mini) <= max(1, len(splits.val) // 5)
+
+
+def test_a_lone_accident_is_the_smallest_unit():
+    """Of a pair and a lone accident in train."""
+    plans = plans_of(scenarios=3)
+    tokens = [plan.token for plan in plans]
+    assert _mini(plans, tokens, tokens) == (tokens[2],)
+
+
 @pytest.mark.parametrize("scenarios", [22, 24, 25, 40])
 def test_no_split_is_empty_from_six_scenarios_on(scenarios):
     assert {plan.split for plan in plans_of(scenarios=scenarios)} == {"train", "val", "test"}
@@ -181,4 +210,7 @@ def test_the_lists_are_what_the_official_procedure_makes_of_what_is_built():
                 "spawn_side": meta and meta.spawn_side,
             }
         )
-    assert split_records(records) == plan_splits(plans)
+    official, made = split_records(records), plan_splits(plans)
+    assert (made.train, made.val, made.test) == (official.train, official.val, official.test)
+    assert set(official.train_mini) >= set(made.train_mini)
+    assert (len(official.val_mini), len(made.val_mini)) == (0, 2), "the procedure leaves a small mini split empty"
