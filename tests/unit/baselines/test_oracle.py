@@ -24,6 +24,7 @@ def test_it_knows_whom_the_released_rule_calls_seen_and_the_ego(da_hidden: DeepA
     assert seen.own_actor_id == own
     ids = seen.boxes.actor_id.tolist()
     assert ids[0] == OWN_ACTOR_ID
+    assert seen.has_own
     assert ids[1:] == sorted(set(visible_actors(da_hidden, token, agents=agents).tolist()) - {own})
     assert UNTRACKED_ID not in ids
 

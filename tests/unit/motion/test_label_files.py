@@ -35,11 +35,12 @@ from deepaccident_devkit.motion import (
     MotionLabelConfig,
     MotionLabels,
     label_files,
+    label_folder,
     motion_labels,
     motion_labels_from_boxes,
     write_label_files,
 )
-from deepaccident_devkit.motion.label_folder import FORMAT_VERSION, MANIFEST, writing_to
+from deepaccident_devkit.motion.label_folder import FORMAT_VERSION, MANIFEST
 from deepaccident_devkit.motion.stored_labels import NOBODY, NOWHERE, StoredLabels
 from deepaccident_devkit.taxonomy import AGENTS
 
@@ -713,7 +714,7 @@ def wait_for(condition: Callable[[], bool]) -> None:
 
 def test_a_disk_that_fails_while_writing_is_our_error(tmp_path: Path) -> None:
     with pytest.raises(LabelFilesError, match=r"labels cannot be written \(no room\); make room there"):  # noqa: SIM117
-        with writing_to(tmp_path / "labels"):
+        with label_folder.writing_to(tmp_path / "labels"):
             raise OSError("no room")
 
 
@@ -721,7 +722,7 @@ def test_a_folder_below_a_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("", encoding="utf-8")
     entered = []
     with pytest.raises(LabelFilesError, match="no labels can be written there"):  # noqa: SIM117
-        with writing_to(tmp_path / "file" / "labels"):
+        with label_folder.writing_to(tmp_path / "file" / "labels"):
             entered.append(True)
     assert not entered
 

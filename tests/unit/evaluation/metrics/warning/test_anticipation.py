@@ -423,7 +423,8 @@ def test_random_rows_are_means_of_their_draws(monkeypatch: pytest.MonkeyPatch) -
 
     one, two = row(1), row(2)
     assert one != two
-    assert abs(two - 0.5) < 0.5
+    monkeypatch.setattr(anticipation, "_mean", None)  # which one draw has no need of
+    assert row(1) == one
 
 
 def test_only_bystanders_and_the_pole_hand_their_alarm_on() -> None:
