@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from click import Context
+from click import Context, Group
 from click.testing import CliRunner
 
 from deepaccident_devkit import DeepAccident
@@ -51,6 +51,29 @@ COUNTERPARTS = sorted(
 )
 """The code in the right columns of that page's tables."""
 WORDS_A_MINUTE = 200
+PAGES = [TOP / "README.md", *sorted(DOCS.glob("*.md")), *sorted((TOP / "schema").glob("**/*.md"))]
+RUN_ELSEWHERE = {
+    "docs/interactive_3d.md": "tests/unit/export/test_mcap_choices.py",
+    "docs/scenarios.md": "tests/unit/synth/spec/test_catalogue.py",
+    "docs/synth.md": "tests/unit/synth/test_synth_page.py",
+    "docs/testing.md": "tests/unit/testing/test_page.py",
+    "docs/training.md": "tests/torch_extra/test_batches.py",
+    "schema/motion_labels.md": "tests/unit/motion/test_label_files.py",
+    "schema/results/README.md": "tests/unit/evaluation/results/test_schemas.py",
+}
+"""Pages whose Python needs more than the demo's release, and the tests that run it."""
+STAND_FOR = {
+    "DATAROOT": "deepaccident_demo/release",
+    "FILE": "deepaccident_demo/release/type1_subtype1_accident/meta/Town10HD_type001_subtype0001_scenario00001.txt",
+    "OUT": "out",
+}
+"""What the words in capitals of a command line may be."""
+NOT_RUN = {
+    "synth ": "tests/test_cli_synth.py has them; some take minutes",
+    "baseline v2x": "tests/test_cli_baseline.py has it, on smaller releases",
+    "export mcap": "tests/unit/export has it, which has the extra",
+}
+"""Command lines of pages that begin so are parsed alone, and why."""
 NO_CALLS = ("<sample>/Camera_Front", ".intensity", '"paper"', "link=", "agents=")
 
 
@@ -194,9 +217,47 @@ def test_the_code_on_the_format_runs(in_demo: Path) -> None:
     assert run_page(DOCS / "format.md")["meta"].collision is not None
 
 
-@pytest.mark.parametrize("page", [TOP / "README.md", DOCS / "index.md"])
-def test_the_code_on_the_first_pages_runs(page: Path, in_demo: Path) -> None:
+@pytest.mark.parametrize(
+    "page", [TOP / "README.md", *(DOCS / f"{name}.md" for name in ("index", "queries", "validation"))]
+)
+def test_the_code_on_other_pages_runs(page: Path, in_demo: Path) -> None:
     run_page(page)
+
+
+def test_no_page_has_code_that_no_test_runs() -> None:
+    here = Path(__file__).read_text(encoding="utf-8")
+    for page in PAGES:
+        name = page.relative_to(TOP).as_posix()
+        if "```python" not in page.read_text(encoding="utf-8"):
+            assert name not in RUN_ELSEWHERE
+        elif name in RUN_ELSEWHERE:
+            assert page.name in (TOP / RUN_ELSEWHERE[name]).read_text(encoding="utf-8")
+        else:
+            assert f'"{page.name}"' in here or f'"{name}"' in here, name
+
+
+COMMANDS = [
+    pytest.param(line, id=f"{page.stem}: {line[12:]}")
+    for page in PAGES
+    if page.name != "cli.md"  # which is made from the commands themselves
+    for line in re.findall(r"^    (deepaccident \S[^#\n]*[^#\s])", page.read_text(encoding="utf-8"), re.MULTILINE)
+]
+"""The command lines of the pages' indented blocks."""
+
+
+@pytest.mark.parametrize("line", COMMANDS)
+def test_the_command_lines_of_the_pages_run(line: str, in_demo: Path) -> None:
+    _, *words = shlex.split(line.split(" > ", maxsplit=1)[0])
+    words = [STAND_FOR.get(word, word) for word in words]
+    if any(line[len("deepaccident ") :].startswith(begin) for begin in NOT_RUN):
+        command, context = deepaccident, Context(deepaccident)
+        while isinstance(command, Group):
+            name, found, words = command.resolve_command(context, words)
+            command, context = found, Context(found, info_name=name, parent=context)
+        command.make_parser(context).parse_args(words)  # raises where there is no such option
+        return
+    result = CliRunner().invoke(deepaccident, words, catch_exceptions=False)
+    assert result.exit_code in {0, 1} if words[0] == "validate" else result.exit_code == 0, result.output
 
 
 @pytest.mark.parametrize(

@@ -93,7 +93,7 @@ def test_the_code_on_the_page_runs(da: DeepAccident, tmp_path: Path, monkeypatch
     code = "\n".join(re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE))
     assert "data/DeepAccident" in code
     monkeypatch.chdir(tmp_path)
-    exec(compile(code.replace("data/DeepAccident", str(da.dataroot)), "interactive_3d.md", "exec"), {})  # noqa: S102
+    exec(compile(code.replace("deepaccident_demo/release", str(da.dataroot)), "interactive_3d.md", "exec"), {})  # noqa: S102
     assert len(read_mcap(tmp_path / "accident.mcap").only("/actors")) == 6
 
 
