@@ -43,7 +43,7 @@ def test_notebook_is_stored_without_outputs(name: str) -> None:
 def test_notebook_begins_with_what_installs_the_devkit(name: str) -> None:
     first = next(cell.source for cell in read(name).cells if cell.cell_type == "code")
     assert "except ModuleNotFoundError:" in first
-    assert "\n    %pip install --quiet 'deepaccident_devkit[synth]'" in first
+    assert "\n    %pip install --quiet '..[synth]'" in first
 
 
 @pytest.mark.parametrize("name", LAST_WORDS)

@@ -33,7 +33,7 @@ try:
     from hypothesis import strategies as st
     from hypothesis.extra import numpy as hnp
 except ModuleNotFoundError as error:
-    raise MissingExtraError("the strategies need hypothesis: pip install 'deepaccident_devkit[testing]'") from error
+    raise MissingExtraError("the strategies need hypothesis: in a checkout, pip install '.[testing]'") from error
 
 T = TypeVar("T")
 

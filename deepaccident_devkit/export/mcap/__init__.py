@@ -66,7 +66,5 @@ def export_mcap(
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] not in ("mcap", "mcap_protobuf", "foxglove_schemas_protobuf", "google"):
             raise
-        raise MissingExtraError(
-            f"the MCAP export needs {error.name}: pip install 'deepaccident_devkit[mcap]'"
-        ) from error
+        raise MissingExtraError(f"the MCAP export needs {error.name}: in a checkout, pip install '.[mcap]'") from error
     return write_scenario(dataset, scenario, target, config, prediction=prediction, progress=progress)

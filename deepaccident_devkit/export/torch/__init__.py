@@ -19,7 +19,7 @@ try:
     import torch  # noqa: F401 - nothing here is of use without it
 except ModuleNotFoundError as error:
     raise MissingExtraError(
-        "the torch adapter needs PyTorch: pip install 'deepaccident_devkit[torch]' "
+        "the torch adapter needs PyTorch: in a checkout, pip install '.[torch]' "
         "(for its CPU build alone: pip install torch --index-url https://download.pytorch.org/whl/cpu)"
     ) from error
 

@@ -16,7 +16,7 @@ from deepaccident_devkit.files import replacing
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-_INSTALL: Final = "pip install 'deepaccident_devkit[video]'"
+_INSTALL: Final = "in a checkout, pip install '.[video]'"
 _CRF: Final = "20"
 """Of H.264: 0 loses nothing, 51 is the worst."""
 _WEBP_QUALITY: Final = 70

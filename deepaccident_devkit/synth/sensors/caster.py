@@ -61,7 +61,7 @@ def require_embree() -> None:
     """Raise MissingExtraError if images and point clouds cannot be made."""
     if not has_embree():
         raise MissingExtraError(
-            "images and point clouds need the package embreex: pip install 'deepaccident_devkit[synth]', "
+            "images and point clouds need the package embreex (in a checkout, pip install '.[synth]'), "
             "or make a release without them (--no-sensors; SynthConfig(sensors=False))"
         )
 

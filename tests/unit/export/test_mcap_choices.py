@@ -248,7 +248,7 @@ def test_without_the_extra_the_error_names_it(
         if name.startswith(("deepaccident_devkit.export.mcap.", f"{package}.")) and not name.endswith(".config"):
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'deepaccident_devkit\[mcap\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install '\.\[mcap\]'"):
         export_mcap(da, scenario, tmp_path / "a.mcap")
 
 

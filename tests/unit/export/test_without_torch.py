@@ -12,7 +12,7 @@ def test_without_torch_the_adapter_names_the_extra(monkeypatch: pytest.MonkeyPat
     for name in [name for name in sys.modules if name.startswith("deepaccident_devkit.export.torch")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'deepaccident_devkit\[torch\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install '\.\[torch\]'"):
         from deepaccident_devkit.export.torch import V2XDataset  # noqa: F401
 
 

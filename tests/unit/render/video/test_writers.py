@@ -67,7 +67,7 @@ def test_without_av_opencv_writes_mp4_and_says_who_does_not_play_it(
     monkeypatch.setitem(sys.modules, "av", None)
     with caplog.at_level(logging.WARNING):
         path = video("v.mp4", what=colors)
-    assert "browsers do not play; for H.264: pip install 'deepaccident_devkit[video]'" in caplog.text
+    assert "browsers do not play; for H.264: in a checkout, pip install '.[video]'" in caplog.text
     assert [each.name for each in path.parent.iterdir()] == ["v.mp4"]
     capture = cv2.VideoCapture(str(path))
     pictures = []
