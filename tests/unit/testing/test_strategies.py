@@ -65,4 +65,4 @@ def test_partial_releases_are_drawn() -> None:
 def test_without_hypothesis_they_say_what_to_install() -> None:
     code = "import sys; sys.modules['hypothesis'] = None; import deepaccident_devkit.testing.strategies"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert "MissingExtraError: the strategies need hypothesis: pip install" in ran.stderr
+    assert "MissingExtraError: the strategies need hypothesis: in a checkout, pip install" in ran.stderr
