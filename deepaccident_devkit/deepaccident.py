@@ -19,7 +19,8 @@ from deepaccident_devkit.taxonomy import OnError
 class _Later:
     """A function of a package that takes its time to import: fetched when somebody asks for it, and then in its place.
 
-    `DeepAccident` binds functions of all layers, and who only reads tables should not wait for those that draw.
+    `DeepAccident` binds functions of all layers, and reading tables should not wait for the import of those that
+    render.
     """
 
     def __init__(self, package: str, function: str) -> None:

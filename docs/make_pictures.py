@@ -1,4 +1,4 @@
-"""Draw the README's pictures and its animation from a synthetic release: `python docs/make_pictures.py`."""
+"""Render the README's pictures and its animation from a synthetic release: `python docs/make_pictures.py`."""
 
 import tempfile
 from pathlib import Path

@@ -48,7 +48,7 @@ def test_every_view_draws_the_first_accident_when_no_token_is_given(
     out = tmp_path / "picture.png"
     in_short_recordings = ["--latency", 0] if verb == "link" else []
     text = run(verb, da.dataroot, "--out", out, "--size", "{}x{}".format(*SIZE), "--dpi", 40, *in_short_recordings)
-    assert re.fullmatch(rf"drawn: {re.escape(accident)}\S* in {re.escape(str(out))}\n", text)
+    assert re.fullmatch(rf"rendered: {re.escape(accident)}\S* in {re.escape(str(out))}\n", text)
     with Image.open(out) as image:
         assert image.size == SIZE
     assert len(np.unique(pixels(out).reshape(-1, 3), axis=0)) > 20

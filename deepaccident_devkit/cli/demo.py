@@ -29,7 +29,7 @@ speed (a baseline, docs/baselines.md; warning: from when on every moment has the
 @click.argument("out", type=click.Path(path_type=Path), default="deepaccident_demo")
 @click.option("--workers", type=click.IntRange(min=1), help="Processes to use.")
 def demo(out: Path, workers: int | None) -> None:
-    """Make a small synthetic release in OUT, index it, print its tables, draw its accident, foresee it."""
+    """Make a small synthetic release in OUT, index it, print its tables, render its accident, foresee it."""
     root = out / "release"
     if root.is_dir():
         click.echo(f"using the release that is in {root}")
@@ -39,13 +39,13 @@ def demo(out: Path, workers: int | None) -> None:
     release = DeepAccident("v1", root, workers=workers)
     click.echo(f"\n{overview(release).to_text()}\n")
     for path in draw_accident(release, out):
-        click.echo(f"drawn: {path}")
+        click.echo(f"rendered: {path}")
     click.echo(_what_next(out, root))
     click.echo(f"\n{_HIDDEN}\n{demo_table(release)[1]}")
 
 
 def draw_accident(release: DeepAccident, out: Path) -> list[Path]:
-    """Draw the first accident: the five agents a second before the impact and at it, the ego's cameras and labels.
+    """Render the first accident: the five agents a second before the impact and at it, the ego's cameras and labels.
 
     Returns:
         The pictures written.

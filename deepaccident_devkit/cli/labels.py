@@ -33,9 +33,9 @@ _CONFIG_OPTIONS = ("preset", "protocol", "switches", "orientation", "seen_by", "
 )
 @click.option("--preset", type=click.Choice(list(PRESETS)), default="deepaccident", show_default=True)
 @click.option("--protocol", type=click.Choice(list(LABEL_PROTOCOLS)), help="The preset's own if not given.")
-@click.option("--switch", "switches", multiple=True, metavar="NAME=yes|no", help="Keep a slip of the protocol or not.")
+@click.option("--switch", "switches", multiple=True, metavar="NAME=yes|no", help="Keep a quirk of the protocol or not.")
 @click.option("--orientation", type=click.Choice(ORIENTATIONS), help="How cells lie; the preset's own if not given.")
-@click.option("--seen-by", type=click.Choice(list(AGENT_CONFIGS)), help="Draw what these agents see; all if not given.")
+@click.option("--seen-by", type=click.Choice(list(AGENT_CONFIGS)), help="Show what these agents see; all if not given.")
 @click.option("--only-vehicle", is_flag=True, help="Leave out pedestrians.")
 def labels(split: str, out: str, agents: tuple[str, ...], purpose: Purpose, **options: Any) -> None:
     """Write the motion labels of a split of the release under DATAROOT.

@@ -83,22 +83,22 @@ _LAYERS = click.option(
     "--layers",
     multiple=True,
     metavar="NAME[,NAME…]",
-    help=f"What is drawn, of those of {', '.join(LAYERS)} that the view has.",
+    help=f"What is rendered, of those of {', '.join(LAYERS)} that the view has.",
 )
 _FRAMES = click.option("--frame-range", "frames", callback=frame_range, metavar="FIRST..LAST", help="Of a scenario.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Picture:
-    """A view that is drawn into a picture.
+    """A view that is rendered into a picture.
 
     Attributes:
-        draw: the function of the render package, or one about it; its first line is the verb's help.
-        of: the table whose rows it draws.
-        canvas: `fig` if it draws on a figure, `ax` if on axes.
+        render: the function of the render package, or one about it; its first line is the verb's help.
+        of: the table whose rows it renders.
+        canvas: `fig` if it renders on a figure, `ax` if on axes.
         options: of this verb.
         help: where `draw` does not say it.
-        default: what is drawn without a token.
+        default: what is rendered without a token.
     """
 
     draw: Callable[..., Any]
@@ -111,7 +111,7 @@ class _Picture:
     def drawn(
         self, dataset: Dataset, row: str, size: tuple[int, int] | None, dpi: float, choices: dict[str, Any]
     ) -> Any:
-        """Draw a row on a figure of a size in pixels, or on one as large as the view wants."""
+        """Render a row on a figure of a size in pixels, or on one as large as the view wants."""
         canvas = {}
         if size is not None:
             figure = figure_of_pixels(*size, dpi=dpi)
@@ -143,7 +143,7 @@ _PICTURES = {
             *_link_options(0.0, 0.0),
             _LAYERS,
         ),
-        help="Draw a moment from above: boxes, LiDAR points and more, of one agent or of several.",
+        help="Render a moment from above: boxes, LiDAR points and more, of one agent or of several.",
     ),
     "labels": _Picture(
         draw=render_motion_labels,
@@ -179,14 +179,14 @@ _PICTURES = {
             click.option("--protocol", help="By name.  [default: released; of explicit accidents boxes]"),
             _LAYERS,
         ),
-        help="Draw a sample's truth and beside it what a model says, with the verdict in numbers.",
+        help="Render a sample's truth and beside it what a model says, with the verdict in numbers.",
         default="the first of the results",
     ),
     "link": _Picture(
         draw=_linked(render_link),
         of="sample",
         options=(_AGENTS, _VIEW_RANGE, *_link_options(0.2, 0.3), _LAYERS),
-        help="Draw what latency and wrong poses do to what partners share with a sample's agent.",
+        help="Render what latency and wrong poses do to what partners share with a sample's agent.",
     ),
     "calibration": _Picture(draw=render_calibration, of="frame", options=(_AGENTS, _LAYERS)),
 }
@@ -194,7 +194,7 @@ _PICTURES = {
 
 @click.group()
 def render() -> None:
-    """Draw a release: each view is a verb, `video` puts them in motion."""
+    """Render a release: each view is a verb, `video` puts them in motion."""
     os.environ.setdefault("MPLBACKEND", "Agg")  # files alone: no window system is asked for anything
 
 
@@ -235,7 +235,7 @@ def _verb(name: str, picture: _Picture) -> click.Command:
         rows = rows_to_draw(dataset, picture.of, tokens, frames)
         for row, path in zip(rows, picture_paths(out, name, rows), strict=True):
             save_picture(picture.drawn(dataset, row, size, dpi, choices), path, dpi=dpi)
-            click.echo(f"drawn: {row} in {path}")
+            click.echo(f"rendered: {row} in {path}")
 
     for option in picture.options:  # of a command they are appended, of a function they would come in front
         verb = option(verb)

@@ -230,7 +230,7 @@ def _source(task: _Task) -> str:
 
 
 def _scenario_arrays(dataset: Dataset, scenario: str) -> Iterator[AnyArray]:
-    """What the tables hold of a scenario that labels are drawn from, of all agents."""
+    """What the tables hold of a scenario that labels are made from, of all agents."""
     row, samples = dataset.getind("scenario", scenario), dataset.columns("sample")
     first, last = samples["scenario_row"].searchsorted((row, row + 1))
     yield dataset.columns("ego_pose")["matrix"][first:last]
@@ -264,7 +264,7 @@ def _by_recording(dataset: Dataset, tokens: Iterable[RowArgument]) -> dict[str, 
         row = dataset.getind("sample", given)
         token = given if isinstance(given, str) else given["token"]
         if not labelled[row]:
-            raise NotAvailableError(f"{token} has no label to draw (the test split ships without them)")
+            raise NotAvailableError(f"{token} has no label (the test split ships without them)")
         recording, number = _parts(token)
         found.setdefault(recording, set()).add(number)
     if not found:

@@ -60,7 +60,7 @@ def padded(paths: Paths, length: int, *, accelerating: bool = True) -> dict[int,
     Args:
         paths: of at least one point each.
         length: points wanted.
-        accelerating: the released slip: a path whose last step is d goes on by d, 2 d, 3 d, … a frame; else by d each
+        accelerating: the released quirk: a path whose last step is d goes on by d, 2 d, 3 d, … a frame; else by d each
             time. A path of one point stands still.
     """
     return {name: _continued(path, length, accelerating=accelerating) for name, path in paths.items()}
@@ -168,8 +168,8 @@ class TrajectoryRules:
         ade_limit: metres; a larger mean error counts as this.
         fde_limit: metres; a larger final error counts as this.
         miss_distance: metres; a larger final error is a miss.
-        first_prediction_empty_ends: the released slip: where the first prediction has no path at all, the sample
-            counts for nothing, whatever the others have.
+        first_prediction_empty_ends: the released quirk: where the first prediction has no path at all, the sample
+            does not count, even if other predictions have paths.
     """
 
     ade_limit: float = 8.0
@@ -207,7 +207,7 @@ def trajectory_errors(
         predictions: K times id → (≥ T, 2) metres.
         truth: id → (T, 2) metres.
         matches: of each prediction with the truth.
-        rules: limits and slips.
+        rules: limits and quirks.
     """
     ade, fde, missed, count = 0.0, 0.0, 0, 0
     frames = longest(truth)

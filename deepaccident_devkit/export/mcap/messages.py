@@ -23,7 +23,7 @@ from deepaccident_devkit.taxonomy import LIDAR
 COLORED_POINT: Final = np.dtype(
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("alpha", "u1")]
 )
-"""A point of a drawing; viewers take the colour from the last four fields."""
+"""A point of a rendering; viewers take the colour from the last four fields."""
 _NUMERIC_TYPES: Final = {
     np.dtype("u1"): PackedElementField.UINT8,
     np.dtype("<i4"): PackedElementField.INT32,

@@ -1,4 +1,4 @@
-"""How near instances of one frame are, as the released code measures it: between outlines, as scikit-image draws them.
+"""How near instances of one frame are, as the released code measures it: between outlines, as scikit-image finds them.
 
 The released code takes `find_contours(mask * id, 0.1)[0]` and then `approximate_polygon(…, tolerance=0.5)`. Both are
 written out here (scikit-image 0.20, BSD), the first to the last bit. The second decides ties at exactly its tolerance

@@ -1,8 +1,8 @@
 """Accidents as the released code evaluates them, bugs included (protocol `released`; docs/released_code.md, Accidents).
 
 Each bug is a field of `ReleasedAccidents` that can be put right, or lies in the functions that it comes from:
-`motion.postprocessing.redrawing` (boxes of 5 m × 2 m at most, drawn into the wrong frame after a gap, and of the first
-frame's instances alone), `outlines.first_outline` (of an instance in several parts, one counts),
+`motion.postprocessing.redrawing` (boxes of 5 m × 2 m at most, rasterised into the wrong frame after a gap, and of the
+first frame's instances alone), `outlines.first_outline` (of an instance in several parts, one counts),
 `trajectories.padded` and `match_trajectories`.
 """
 
@@ -52,7 +52,7 @@ _NOTHING_FOUND: Final = {"id": 1.0, "position": 20.0, "time": 1.0}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReleasedAccidents:
-    """The released rules; the defaults are as they are, slips included.
+    """The released rules; the defaults keep all quirks.
 
     Attributes:
         labels: protocol of the labels that are the truth, others are refused; None for any.
@@ -60,7 +60,7 @@ class ReleasedAccidents:
         prediction_gap: cells; the predicted ones that are nearer do: 2.5 m. The paper has 1 m for both.
         level: where the outlines run, see `outlines.LEVEL`: 0.1 makes instances almost a cell larger all around.
         truth_through_heads: truth is what the post-processing finds in the labels; else the labels' own instances.
-        redraw: distances are those of the boxes drawn along the paths; else of the instances themselves.
+        redraw: distances are those of the boxes rasterised along the paths; else of the instances themselves.
         last_frame_only: only the last frame counts, as the lists of accidents are made anew for each. So accidents
             have no time, and its error is always 0. Else the frame with the smallest distance counts, and truth and
             prediction have each its own.

@@ -276,7 +276,7 @@ def _cases_within(sample: Counts, alarms: Sequence[Alarm], distance: float, scor
 
 
 def actor_of(cells: BoolArray, frame: int, label: MotionLabels, context: AccidentContext) -> int | None:
-    """The actor that most of an instance's labelled cells belong to; of as many, the one that was drawn first.
+    """The actor to which most of an instance's labelled cells belong; of equal ones the one rasterised first.
 
     Args:
         cells: (H, W) where the instance is, as the label lies.

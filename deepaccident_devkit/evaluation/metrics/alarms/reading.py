@@ -37,7 +37,7 @@ class AccidentReading:
         foreground: of heads: which cells are actors, as `PostProcessing` has it. The released accident evaluation has
             `sigmoid`; the paper is silent, and `argmax` is what the same paper's motion metrics use.
         link_distance: of heads: cells, as `PostProcessing` has it. The released accident evaluation has 8.
-        redraw: of heads: take the boxes that the released code draws along the paths instead of the instances.
+        redraw: of heads: take the boxes that the released code rasterises along the paths instead of the instances.
         outline: what the distance of two instances is between: the convex hulls of their cells' `centers` (points and
             straight lines allowed), or of their whole `cells`, which are nearer by about a cell.
         danger_distance: metres; what comes nearer to each other collides.
@@ -303,5 +303,5 @@ def _candidates(shapes: _Shapes, size: FloatArray, reading: AccidentReading) -> 
 
 
 def _within_cell(rules: LabelProtocol | None) -> FloatArray:
-    """The point of a cell, in cells along x and y from its low corner, that its drawn place stands for."""
+    """The point of a cell, in cells along x and y from its low corner, that its rasterised place stands for."""
     return np.array([0.5, 0.5] if rules is None else rules.place_in_cell)

@@ -56,7 +56,7 @@ class DetectionProtocol:
         ranges: the rings from and to (metres, the end excluded) that are counted apart. With matching `by_truth`, a box
             beyond the ring is there to be matched, a detection by truth of any class, and what it matches does not
             count; with `by_score` it is not there.
-        range_from_x_alone: the distance that rings are of is sqrt(x² + x²), a slip for sqrt(x² + y²).
+        range_from_x_alone: rings are of the distance sqrt(x² + x²), a bug: sqrt(x² + y²) is meant.
         measure: how near a detection is to the truth: distance of the centres of their lower faces, distance of
             centres on the ground, overlap of volumes or of footprints (intersection over union).
         bottom_taken_as_top: in the overlap of volumes, boxes reach from their lower face downwards.

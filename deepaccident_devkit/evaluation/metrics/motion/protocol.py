@@ -28,9 +28,9 @@ class MotionProtocol:
         paths: how they are read off heads, and off labels, for minADE, minFDE and miss rate. The released code has
             these errors from the accident evaluation, which links and cuts out instances by other rules.
         vpq: which matches count.
-        accelerating_paths: the released slip of `trajectories.padded`.
+        accelerating_paths: the released quirk of `trajectories.padded`.
         gate: metres, as of `match_trajectories`.
-        trajectories: limits of the errors, and a slip.
+        trajectories: limits of the errors, and a quirk.
         nothing_is_zero: IoU and VPQ of samples with nothing to count are 0; else NaN.
     """
 

@@ -75,7 +75,7 @@ def _result(name: str, evaluator: Evaluator[Any], counts: Collection[Counts]) ->
 CHOSEN: Final = "chosen"
 """Name of the rules that are explained."""
 _WITHOUT_EFFECT: Final = ("own_box_not_augmented", "ids_kept_between_samples")
-"""Slips that show only in training: nothing is augmented here, and no ids come from another sample."""
+"""Quirks that show only in training: nothing is augmented here, and no ids come from another sample."""
 _LABEL_CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
     "drawn_when": get_args(DrawnWhen),
     "warp": ("stretched", "exact"),
@@ -218,7 +218,7 @@ def _kept(memory: dict[Any, Found], key: Any, make: Callable[[], Found]) -> Foun
 
 
 def _label_variants(chosen: Variant) -> dict[str, Variant]:
-    """The chosen rules with truths that are drawn otherwise, by `labels.name=value`; of rules that take labels."""
+    """The chosen rules with truths of changed label protocols, by `labels.name=value`; of rules that take labels."""
     if chosen.labels is None or not hasattr(chosen.rules, "labels"):
         return {}
     rules = replace(chosen.rules, labels=None)
