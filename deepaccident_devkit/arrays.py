@@ -64,7 +64,7 @@ def checked(
 def as_numbers(
     name: str, values: ArrayLike, expected: str = "numbers", dtype: DTypeLike | None = np.float64
 ) -> AnyArray:
-    """`checked` for any shape: the one way in for a caller's arrays, of whatever framework.
+    """`checked` for any shape: the one way in for a caller's arrays, of any framework.
 
     What numpy can read without being asked to copy from another device is taken: its own arrays, sequences, and what
     offers `__array__` or DLPack, such as torch tensors on the processor. Nothing is detached, fetched from an
@@ -116,7 +116,7 @@ def checked_whole(
 ) -> int:
     """A single whole number, numpy's integers among them, as Python's int; or raise `error`."""
     try:
-        return operator.index(value)  # type: ignore[arg-type]  # what is none is refused
+        return operator.index(value)  # type: ignore[arg-type]  # everything else is refused
     except TypeError:
         raise error(f"{name}: expected {expected}, found {value!r}") from None
 
@@ -142,7 +142,7 @@ def readonly(array: AnyArray) -> AnyArray:
 
 
 def _read(name: str, values: Any, expected: str) -> AnyArray:
-    """`values` as an array of whatever type, or GeometryError with the remedy."""
+    """`values` as an array of any type, or GeometryError with the remedy."""
     if type(values) is np.ndarray:
         return values
     prefix = f"{name}: " if name else ""

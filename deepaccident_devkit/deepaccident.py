@@ -38,7 +38,7 @@ class _Later:
 
 
 class _Package:
-    """Stands for such a package at run time, so that each function is named once: whatever it is asked for comes later.
+    """Stands for such a package at run time, so that each function is named once: its attributes are resolved later.
 
     Type checkers see the package itself, and with it every signature.
     """

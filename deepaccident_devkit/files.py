@@ -81,7 +81,7 @@ def file_checksum(path: Path) -> str:
 def irregular_text(mode: int) -> str | None:
     """What stands in a file's place, by the mode that `stat` gives: `not a regular file (a named pipe)`; else None.
 
-    Opening a pipe waits for whoever writes to it, and a device may have no end.
+    Opening a pipe waits for its writer, and a device may have no end.
     """
     if stat.S_ISREG(mode):
         return None

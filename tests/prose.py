@@ -4,10 +4,8 @@ Each function keeps the number of lines, so that a finding has its line, and lea
 so that words left and right of code are no phrase.
 """
 
-import io
 import json
 import re
-import tokenize
 from collections.abc import Iterable, Iterator
 
 from spellchecker import SpellChecker
@@ -19,6 +17,11 @@ _CODE = re.compile(r"(`+)(?!`).+?(?<!`)\1(?!`)|\]\([^)\s]*\)|</?[a-z][^>]*>|http
 _DOCTEST = re.compile(r"^ *>>> .*\n(?:.*\S.*\n)*", re.MULTILINE)
 _FIELD = re.compile(r"\{[^{}]*\}|%\(?\w*\)?[sd]")
 _ARGUMENT = re.compile(r"^ +\**\w+: ", re.MULTILINE)
+_ANY = re.compile(r".+", re.DOTALL)
+_TEXT = re.compile(
+    r"""\#(?P<comment>[^\n]*)|(?P<quote>\"{3}|'{3}|\"|')(?P<inside>(?:[^\\]|\\.)*?)(?P=quote)""", re.DOTALL
+)
+"""A comment, or a string."""
 _TOKEN = re.compile(r"[^\W\d][\w'’]*(?:\.\w[\w.]*)?|\d[\w.]*")
 
 
@@ -48,27 +51,22 @@ def notebook(text: str) -> str:
 
 
 def python(source: str, *, literals: bool) -> str:
-    """The comments and docstrings of a module; with `literals` also its other strings, but for single words."""
-    tokens = list(tokenize.generate_tokens(io.StringIO(source).readline))
-    lines: list[list[str]] = [[] for _ in range(source.count("\n") + 2)]
-    apart = {tokenize.NEWLINE, tokenize.NL, tokenize.INDENT, tokenize.DEDENT, tokenize.COMMENT, tokenize.ENCODING}
-    before = tokenize.NEWLINE
-    for number, token in enumerate(tokens):
-        words = ""
-        if token.type == tokenize.COMMENT:
-            words = markdown(token.string.lstrip("#"))
-        elif token.type == tokenize.STRING and before == tokenize.NEWLINE and tokens[number + 1].type in apart:
-            words = docstring(_inside(token.string))
-        elif literals and (token.type == tokenize.STRING or tokenize.tok_name[token.type] == "FSTRING_MIDDLE"):
-            inside = _inside(token.string) if token.type == tokenize.STRING else token.string
-            words = _taken_out(_FIELD, inside) if " " in inside.strip() else _GAP
-        elif token.type not in apart and tokenize.tok_name[token.type] not in ("FSTRING_START", "FSTRING_END"):
-            words = _GAP
-        if token.type not in apart or token.type == tokenize.NEWLINE:
-            before = token.type
-        for row, line in enumerate(words.split("\n"), token.start[0] - 1):
-            lines[row].append(line)
-    return "\n".join(" ".join(line) for line in lines)
+    """The comments and docstrings of a module; with `literals` also its other strings, except single words."""
+    pieces = []
+    end = 0
+    for found in _TEXT.finditer(source):
+        code = source[end : found.start()]
+        pieces.append(_taken_out(_ANY, code) if code.strip() else code)
+        inside = found["comment"] or found["inside"]
+        if found["comment"]:
+            text = _taken_out(_CODE, inside)
+        elif found["quote"] == '"""' and not source[source.rfind("\n", 0, found.start()) + 1 : found.start()].strip():
+            text = docstring(inside)
+        else:
+            text = _taken_out(_FIELD, inside) if literals and " " in inside.strip() else _taken_out(_ANY, inside)
+        pieces.append(text)
+        end = found.end()
+    return "".join(pieces)
 
 
 def docstring(text: str) -> str:
@@ -79,26 +77,24 @@ def docstring(text: str) -> str:
     return text
 
 
-def _inside(literal: str) -> str:
-    """What a string literal has between its quotes."""
-    return re.sub(r"^[a-zA-Z]*('''|\"\"\"|'|\")(.*)\1$", r"\2", literal, flags=re.DOTALL)
-
-
-def phrases(text: str, phrase: str) -> Iterator[int]:
-    """The lines of a text in which a phrase begins: its words in their order, in small or capital letters."""
-    words = r"\s+".join(re.escape(word) for word in phrase.split())
-    start = r"\b" if phrase[0].isalnum() else ""
-    end = r"\b" if phrase[-1].isalnum() else ""
-    for found in re.finditer(start + words + end, text, re.IGNORECASE):
-        yield text.count("\n", 0, found.start()) + 1
+def phrases(text: str, wanted: Iterable[str]) -> Iterator[tuple[int, str]]:
+    """The line at which a phrase begins, and the phrase: its words in their order, in small or capital letters."""
+    small = text.lower()
+    for phrase in wanted:
+        first, *more = phrase.lower().split()
+        if first in small:
+            pattern = r"\s+".join(re.escape(word) for word in (first, *more))
+            start, end = (r"\b" if phrase[at].isalnum() else "" for at in (0, -1))
+            for found in re.finditer(start + pattern + end, small):
+                yield text.count("\n", 0, found.start()) + 1, phrase
 
 
 def words(text: str) -> Iterator[tuple[int, str]]:
-    """The line and the small letters of each word that can be misspelt: no names of code, no abbreviations."""
+    """The line and the small letters of each word that can be misspelt: no code, abbreviations or units."""
     for number, line in enumerate(text.split("\n"), 1):
         for found in _TOKEN.finditer(line):
             word = re.sub(r"['’]s?$", "", found.group().rstrip("."))
-            if word[1:].islower() and not re.search(r"[\d_.]", word):
+            if len(word) > 2 and word.isalpha() and word[1:].islower():
                 yield number, word.lower()
 
 

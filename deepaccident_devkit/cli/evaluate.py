@@ -82,7 +82,7 @@ def _task_verb(task: TaskName) -> click.Command:
     @selection_parameters
     @click.option("--protocol", type=click.Choice(protocols), default=protocols[0], show_default=True)
     @_threshold_options(task)
-    @click.option("--switch", "switches", multiple=True, metavar="NAME=VALUE", help="Make a choice of it otherwise.")
+    @click.option("--switch", "switches", multiple=True, metavar="NAME=VALUE", help="Change a choice of it.")
     @click.option("--allow-partial", is_flag=True, help="Evaluate the samples there are; all is marked as partial.")
     @click.option("--by", multiple=True, type=click.Choice(ATTRIBUTES), help="Break down by this; may be repeated.")
     @resamples_parameter

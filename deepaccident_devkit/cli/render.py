@@ -93,7 +93,7 @@ class _Picture:
     """A view that is rendered into a picture.
 
     Attributes:
-        render: the function of the render package, or one about it; its first line is the verb's help.
+        draw: the function of the render package, or one about it; its first line is the verb's help.
         of: the table whose rows it renders.
         canvas: `fig` if it renders on a figure, `ax` if on axes.
         options: of this verb.

@@ -41,7 +41,7 @@ class MotionLabelConfig:
         only_vehicle: leave out pedestrians (two-wheelers are vehicles, as in all three codes).
         filter_invisible: rasterise only what the cooperating agents see by the released rule (docs/released_code.md,
             Visibility and attributes).
-        agents: whose sight counts; None for all that are there, whoever cooperates: the released way. Names are kept
+        agents: whose sight counts; None for all that are there, which is the released way. Names are kept
             as a tuple.
         draw_ego: rasterise the ego's own box (the infrastructure has none).
         ignore_index: what stands in offset and flow beside instances, and in missing frames where they are ignored:

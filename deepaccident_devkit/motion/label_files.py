@@ -67,7 +67,7 @@ def write_label_files(
     """Write the motion labels of samples into a folder, one file a scenario and agent.
 
     Files are whole or absent. A call that was broken off goes on where it stopped; samples may be added later; what
-    the release changed in the meantime is written anew.
+    the release changed in the meantime is written again.
 
     Args:
         dataset: the release.
@@ -108,7 +108,7 @@ class LabelFiles(Mapping[str, MotionLabels]):
     """Motion labels in a folder, by sample token; a read takes some milliseconds.
 
     Cheap to pickle, and safe in threads and in forked workers: each process opens its own files, a few at a time. What
-    is added to the folder later is seen by who opens it anew.
+    is added to the folder later is seen when it is opened again.
     """
 
     def __init__(self, folder: str | os.PathLike[str], config: MotionLabelConfig | str | None = None) -> None:

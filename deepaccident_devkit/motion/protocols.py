@@ -131,7 +131,7 @@ LABEL_PROTOCOLS: Final[Mapping[str, LabelProtocol]] = MappingProxyType(
         "fiery": _FIERY,
     }
 )
-"""By name: the released code, that without its slips, and the two codes that it comes from."""
+"""By name: the released code, the same without its quirks, and the two codes that it comes from."""
 
 
 def label_protocol(protocol: str | LabelProtocol) -> LabelProtocol:

@@ -25,7 +25,7 @@ for a value that is not known; no other value or range matches those. All filter
 around the sign and the commas do not count.
 
 A field that does not exist is a FieldError, a value that the field cannot have a ChoiceError; both name what is
-possible. A value that the whole release knows, but not the part of it that is here, is none: it matches nothing.
+possible. A value that the whole release knows, but not the part that is here, is not an error: it matches nothing.
 """
 
 from deepaccident_devkit.selection.accident_visibility import (

@@ -77,7 +77,7 @@ def clear_index(dataroot: Path, *, version: str = "v1", index_dir: Path | None =
 
 
 def holds_index(folder: Path) -> bool:
-    """Whether there is anything of an index, be it half made."""
+    """Whether there is an index, or part of one."""
     return any(_is_own(path) and path.name != LOCK_FILE for path in _entries(folder))
 
 
@@ -125,7 +125,7 @@ def _is_own(path: Path) -> bool:
 
 
 def _remove(folder: Path) -> Cleared:
-    """Remove an index folder whose lock is held: the manifest first, so that half an index is none."""
+    """Remove an index folder whose lock is held: the manifest first, so that half an index is not taken for one."""
     sizes = [size for path, size in sizes_in(folder).items() if path.name != LOCK_FILE]
     try:
         (folder / MANIFEST_FILE).unlink(missing_ok=True)

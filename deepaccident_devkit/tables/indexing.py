@@ -62,7 +62,7 @@ def make_index(
 
     Raises:
         IndexStoreError: something cannot be written; the index that was there stays as it was.
-        SplitFileError: a split file is none.
+        SplitFileError: a split file cannot be read.
     """
     splits = assign_splits(layout)
     candidates = [scenario for scenario in layout.scenarios if scenario.token not in splits.problems]
@@ -129,7 +129,7 @@ def edited_scenarios(layout: ReleaseLayout, folder: Path, manifest: Manifest) ->
         whether the tables are made from what the other scenarios' shards hold.
 
     Raises:
-        SplitFileError: a split file is none.
+        SplitFileError: a split file cannot be read.
     """
     splits = assign_splits(layout)
     broken = {problem.scenario: problem.digest for problem in manifest.problems}

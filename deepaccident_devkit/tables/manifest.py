@@ -58,7 +58,7 @@ def read_manifest(folder: Path) -> Manifest | None:
 
 
 def stored_schema_version(folder: Path) -> int | None:
-    """The schema version that an index folder's manifest states, be it known here or not; None if it states none."""
+    """The schema version that an index folder's manifest states, known here or not; None if it states none."""
     version = _content(folder).get("schema_version")
     return version if isinstance(version, int) and not isinstance(version, bool) else None
 

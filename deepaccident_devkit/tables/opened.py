@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from deepaccident_devkit.tables import records
 
 RowArgument = str | Mapping[str, Any]
-"""How a row is named wherever the API takes one: by its token, or by its record."""
+"""How a caller names a row: by its token, or by its record."""
 
 
 class OpenTables:
@@ -191,7 +191,7 @@ class OpenTables:
             NotAvailableError: nothing says which scenario belongs where: no split file, and no split folders; or
                 scenarios of your file are not in this release.
             MissingFileError: there is no such file.
-            SplitFileError: your file is none: a line has not two words, or a scenario stands twice.
+            SplitFileError: your file is no split file: a line has not two words, or a scenario stands twice.
         """
         if missing not in get_args(OnError):
             raise ChoiceError(f"missing: expected one of {', '.join(get_args(OnError))}, found {missing!r}")

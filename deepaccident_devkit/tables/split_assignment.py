@@ -28,7 +28,7 @@ class SplitAssignment:
 
 
 def assign_splits(layout: ReleaseLayout) -> SplitAssignment:
-    """Read the split files and compare them with the folders; raises SplitFileError for a file that is none."""
+    """Read the split files and compare them with the folders; raises SplitFileError for any other file."""
     listed = {split: set(read_split_file(path)) for split, path in layout.split_files.items()}
     tokens = {scenario.token for scenario in layout.scenarios}
     problems: dict[str, list[str]] = {}

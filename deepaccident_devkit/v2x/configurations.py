@@ -112,7 +112,7 @@ AGENT_CONFIGS: Final[dict[str, AgentConfig]] = {
 """The paper's seven, by name."""
 
 Agents = AgentConfig | str | Sequence[str] | None
-"""Who cooperates, wherever a call takes `agents=`: agents' names, a configuration or the name of one as seen from the
+"""Who cooperates, as calls take it for `agents=`: agents' names, a configuration or the name of one as seen from the
 sample's agent, or None for all that are there."""
 
 

@@ -1,7 +1,7 @@
 """`seen_actors`: who is known to a set of agents at a moment, if detection were perfect.
 
-Every actor that the released rule calls seen (docs/released_code.md, Visibility and attributes) is known exactly, but
-for what the link between the agents does. Velocities are the labels', decoded.
+Every actor that the released rule calls seen (docs/released_code.md, Visibility and attributes) is known exactly, apart
+from the effects of the link. Velocities are the labels', decoded.
 """
 
 from __future__ import annotations

@@ -123,7 +123,7 @@ def _own_boxes(subject: Subject) -> Iterator[Finding]:
     differs = np.zeros(len(subject.own), dtype=bool)
     difference = np.abs(subject.boxes.labels.velocity[rows] - first_line[subject.boxes.sample[rows]]).max(axis=1)
     differs[rows] = difference > OWN_VELOCITY
-    yield from subject.label_findings("own-velocity", differs, "the own velocity is not that of the first line")
+    yield from subject.label_findings("own-velocity", differs, "the agent's own velocity differs from the first line")
 
 
 def _tracks(subject: Subject) -> Iterator[Finding]:

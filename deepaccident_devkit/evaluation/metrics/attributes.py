@@ -1,4 +1,4 @@
-"""What samples are told apart by when results are broken down: place, weather, story, and how near the accident is."""
+"""The attributes by which results are broken down: place, weather, story, and how near the accident is."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The choices of a protocol by their names, such as `reading.outline`, and protocols with some made otherwise."""
+"""The choices of a protocol by their names, such as `reading.outline`, and protocols with some of them changed."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def switch_names(rules: DataclassInstance) -> list[str]:
 
 
 def switched(rules: Rules, switches: Mapping[str, Any]) -> Rules:
-    """A protocol with some choices made otherwise.
+    """A protocol with some choices changed.
 
     Args:
         rules: the protocol, a frozen dataclass; parts of it may be others.

@@ -207,11 +207,11 @@ class Evaluator(ABC, Generic[Result]):
             maker, settings, repeated = state["made_by"], state["settings"], set(state["repeated"])
             counts = {token: dict(each) for token, each in state["counts"].items()}
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise EvaluationError(f"{source}: no saved evaluation ({error}); begin anew") from error
+            raise EvaluationError(f"{source}: no saved evaluation ({error}); begin again") from error
         if maker != self._maker:
-            raise EvaluationError(f"{source}: was saved by {maker}, this is {self._maker}; begin anew")
+            raise EvaluationError(f"{source}: was saved by {maker}, this is {self._maker}; begin again")
         if settings != self.settings:
-            raise EvaluationError(f"{source}: was saved with other settings ({settings}); begin anew, or use those")
+            raise EvaluationError(f"{source}: was saved with other settings ({settings}); begin again, or use those")
         for token, each in counts.items():
             self.add(token, each)
         self.repeated |= repeated
@@ -258,5 +258,5 @@ def ratio(part: float, whole: float) -> float:
 
 
 def total(counts: Iterable[Counts], name: str) -> float:
-    """The exact sum of a number over samples, whatever their order."""
+    """The exact sum of a number over samples, the same in any order."""
     return math.fsum(each[name] for each in counts)

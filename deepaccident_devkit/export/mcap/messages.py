@@ -77,7 +77,7 @@ def rgb(color: str) -> ByteArray:
 
 
 def color_message(color: str, alpha: float = 1.0) -> Any:
-    """A Color of a colour of `render.colors`."""
+    """A `Color` of a colour of `render.colors`."""
     red, green, blue = (rgb(color) / 255).tolist()
     return Color(r=red, g=green, b=blue, a=alpha)
 

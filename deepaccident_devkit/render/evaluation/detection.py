@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _DASHES: Final = ("-", "--", "-.", ":")
-"""Lines that colours alone would tell apart are told apart in print, too."""
+"""Styles that distinguish lines also in print without colours."""
 
 
 def render_precision_recall(result: DetectionResult, name: str, *, ring: int = 0, ax: Axes | None = None) -> Axes:

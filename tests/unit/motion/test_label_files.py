@@ -497,7 +497,9 @@ class TestDamage:
         (folder / MANIFEST).write_text(text, encoding="latin-1")
         before = contents(folder)
         for use in (lambda: LabelFiles(folder), lambda: write(small, folder, tokens_of(small, 3))):
-            with pytest.raises(LabelFilesError, match=r"manifest\.json: cannot be read .*; make the labels anew in an"):
+            with pytest.raises(
+                LabelFilesError, match=r"manifest\.json: cannot be read .*; make the labels again in an"
+            ):
                 use()
         assert contents(folder) == before
 

@@ -57,7 +57,7 @@ class BoxAccidentResult(AccidentResult):
         lateness: seconds, mean over the true positives by which the predicted moment is later than the true one,
             negative if it is earlier; None without any.
         unjudged: alarms that nothing can refute: no accident is known, and they are for later than the recording shows.
-        beyond: alarms for later than the horizon, which are none.
+        beyond: alarms for later than the horizon, which do not count.
         at_impact: samples at the impact itself, where nothing is foreseen any more; they are left out of all else.
     """
 
@@ -83,8 +83,8 @@ class BoxAccidents:
 
     Attributes:
         reading: how an accident is read off maps. By the paper's 1 m, the default, traffic side by side is one, since
-            neighbouring cells are 0.5 m apart; at 0.5 m a square contact is none.
-        min_score: alarms less sure than this are none.
+            neighbouring cells are 0.5 m apart; at 0.5 m a square contact is missed.
+        min_score: alarms with a lower score do not count.
         match_distance: metres: gate of the match of instances with actors, which decides whether a prediction in maps
             names the right ones; also how far off the `nearest` of `naming` may be.
         naming: whom an explicit accident without `ids` (actor ids) names: the two actors whose boxes' centres are
@@ -116,7 +116,7 @@ class BoxAccidents:
         return asdict(self)
 
     def variants(self) -> dict[str, BoxAccidents]:
-        """These metrics with one choice made otherwise, by `name=value`; for explanations."""
+        """These metrics with one choice changed, by `name=value`; for explanations."""
         own: Mapping[str, tuple[Any, ...]] = {
             "min_score": (0.5,),
             "match_distance": (2.0, 4.0, 8.0),
@@ -173,7 +173,8 @@ class BoxAccidents:
             nothing = {distance: replace(each, accuracy=math.nan) for distance, each in base.within.items()}
             base = replace(base, apa=math.nan, within=nothing)
         at = base.within[self.scoring.errors_at]
-        beyond = [f"{given['beyond']} alarms are for later than the horizon and are none"] if given["beyond"] else []
+        late = given["beyond"]
+        beyond = [f"{late} alarms are for later than the horizon and do not count"] if late else []
         return BoxAccidentResult(
             **{each.name: getattr(base, each.name) for each in fields(AccidentResult) if each.name != "notes"},
             notes=(*base.notes, *beyond),

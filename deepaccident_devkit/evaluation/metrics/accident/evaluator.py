@@ -38,7 +38,7 @@ class AccidentProtocol(Protocol):
         """Fewer counts with the same result, to the last bit."""
 
     def variants(self) -> Mapping[str, AccidentProtocol]:
-        """The same protocol with one choice made otherwise, by the choice's name: what `explain` compares with."""
+        """The same protocol with one choice changed, by the choice's name: what `explain` compares with."""
 
 
 PROTOCOLS: Final[Mapping[str, AccidentProtocol]] = MappingProxyType(
@@ -61,11 +61,11 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
 
         Args:
             protocol: of `PROTOCOLS` by name, or your own.
-            explain: count each sample also with each choice of the protocol made otherwise, for `explained`; takes
+            explain: count each sample also with each choice of the protocol changed, for `explained`; takes
                 that many times longer.
 
         Raises:
-            ChoiceError: no protocol has that name, or it is none.
+            ChoiceError: no protocol has that name, or it is of another type.
         """
         super().__init__()
         self.protocol = _protocol(protocol)
@@ -120,7 +120,7 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
         return self.protocol.pooled(counts)
 
     def explained(self) -> dict[str, AccidentResult]:
-        """For each choice of the protocol the result if it were made otherwise, all else equal.
+        """For each choice of the protocol the result if that choice alone is changed.
 
         Raises:
             EvaluationError: the evaluator was not made with `explain`.

@@ -113,7 +113,7 @@ class PaperAccidents:
         return asdict(self)
 
     def variants(self) -> dict[str, PaperAccidents]:
-        """These metrics with one choice made otherwise, by `name=value`; for explanations."""
+        """These metrics with one choice changed, by `name=value`; for explanations."""
         own: Mapping[str, tuple[Any, ...]] = {
             "predicted_by": get_args(PredictedBy),
             "sample_choice": get_args(SampleChoice),

@@ -61,7 +61,7 @@ class ReleasedAccidents:
         level: where the outlines run, see `outlines.LEVEL`: 0.1 makes instances almost a cell larger all around.
         truth_through_heads: truth is what the post-processing finds in the labels; else the labels' own instances.
         redraw: distances are those of the boxes rasterised along the paths; else of the instances themselves.
-        last_frame_only: only the last frame counts, as the lists of accidents are made anew for each. So accidents
+        last_frame_only: only the last frame counts, as the lists of accidents begin empty at each. So accidents
             have no time, and its error is always 0. Else the frame with the smallest distance counts, and truth and
             prediction have each its own.
         accelerating: paths that end early go on faster and faster; see `trajectories.padded`.
@@ -105,7 +105,7 @@ class ReleasedAccidents:
         return asdict(self)
 
     def variants(self) -> Mapping[str, ReleasedAccidents]:
-        """These rules with one choice made otherwise, by `name=value`."""
+        """These rules with one choice changed, by `name=value`."""
         switches = {name: (False, True) for name, value in asdict(self).items() if isinstance(value, bool)}
         return with_others(
             self, {"truth_gap": (2.0,), "prediction_gap": (2.0,), "level": (0.5,), "errors_at": (10.0,), **switches}

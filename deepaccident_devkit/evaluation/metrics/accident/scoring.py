@@ -207,7 +207,7 @@ class Scoring:
             raise ConfigError(f"time_tolerance: expected seconds from 0, or None, found {self.time_tolerance!r}")
 
     def variants(self) -> dict[str, Scoring]:
-        """This scoring with one choice made otherwise, by `name=value`; for explanations."""
+        """This scoring with one choice changed, by `name=value`; for explanations."""
         return with_others(
             self,
             {

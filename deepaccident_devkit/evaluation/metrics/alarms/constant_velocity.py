@@ -1,4 +1,4 @@
-"""Alarms of the simplest predictor there is: all go on as they do now, and whoever touches within 3 s collides."""
+"""Alarms of the simplest predictor: all keep their velocity, and two that touch within 3 s collide."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ class AlarmRules(Protocol):
 
     @property
     def min_score(self) -> float:
-        """Alarms less sure than this are none."""
+        """Alarms with a lower score do not count."""
 
     @property
     def match_distance(self) -> float:
@@ -75,7 +75,7 @@ def named_alarms(
 
 
 def within_horizon(alarms: list[NamedAlarm], truth: BoxTruth) -> list[NamedAlarm]:
-    """The alarms for no later than predictions look ahead, within half a recorded frame; others are none."""
+    """The alarms within the horizon of the predictions and half a recorded frame; others do not count."""
     return [each for each in alarms if each[0].time <= truth.horizon + SLACK]
 
 
@@ -91,7 +91,7 @@ def nearest_two(positions: FloatArray, identity: IntArray, center: FloatArray, g
         positions: (2, 2) x forward, y left, metres.
         identity: (I,) int64, ascending: of those who can be named.
         center: (I, 2) where they are, in the same frame; NaN where they are not.
-        gate: metres: whoever is farther away is not named.
+        gate: metres: an actor that is farther away is not named.
     """
     places = InstanceTracks(identity=np.arange(2), center=positions[None])
     match = match_tracks(places, InstanceTracks(identity=identity, center=center[None]), gate)

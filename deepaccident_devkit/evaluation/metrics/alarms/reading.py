@@ -74,7 +74,7 @@ class AccidentReading:
         return linked.instance if linked.redrawn is None else linked.redrawn
 
     def variants(self) -> dict[str, AccidentReading]:
-        """This reading with one choice made otherwise, by `name=value`; for explanations."""
+        """This reading with one choice changed, by `name=value`; for explanations."""
         return with_others(
             self,
             {

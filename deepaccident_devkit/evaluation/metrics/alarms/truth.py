@@ -44,7 +44,7 @@ class BoxTruth(FrozenArrays):
             NaN where nobody annotated the actor.
         accident: what meta says will happen within the horizon: the pair at the impact; None if nothing does.
         impact: the same however far ahead; None also if it is beyond the horizon and no label shows one of the pair.
-        horizon: seconds that predictions look ahead: an alarm for later is none. Infinite if nothing bounds it.
+        horizon: seconds that predictions look ahead: a later alarm does not count. Infinite without a limit.
     """
 
     time: FloatArray
@@ -65,7 +65,7 @@ class BoxTruth(FrozenArrays):
     def nearest_pair(self, danger_distance: float) -> tuple[int, int] | None:
         """The two whose boxes come nearest to each other, nearer than a distance; the earliest of several, by id.
 
-        Two that both stand all the time, such as parked cars, are none.
+        Two that both stand all the time, such as parked cars, do not count.
         """
         found = []
         x_and_y = self.footprint[..., :2]
@@ -174,7 +174,7 @@ def box_truth(dataset: Dataset, sample: RowArgument, horizon: float = RELEASED_H
     """What happens after a sample, from the labels of all agents of the release.
 
     The pair is meta's, and the moment the recording's last frame, which in an accident scenario is the impact. Each of
-    the two is where it was last annotated up to then: at that frame, but for partial labels.
+    the two is where it was last annotated up to then: at that frame, except in partial labels.
 
     Args:
         dataset: the release.

@@ -55,7 +55,7 @@ def nearest_by_truth(reach: Reach, counts: Mapping[int, bool], truth_counts: Seq
     """Each true box in turn takes the candidate of the lowest rank that is left, for every score at once.
 
     A candidate that arrives is offered to the true boxes in their order. The first that has none or ranks it lower
-    takes it and hands what it had on to those behind it: that is just what matching anew with one candidate more gives,
+    takes it and hands what it had on to those behind it: that is the same as to match again with one candidate more,
     since those before it would not have taken what it hands on.
 
     Args:

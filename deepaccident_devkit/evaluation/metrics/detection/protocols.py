@@ -76,7 +76,7 @@ class DetectionProtocol:
             their tokens (OpenCOOD's default). Only for `voc`.
         error_threshold: which threshold's matches the errors are of; None for no errors.
         error_of_bottoms: the position error is that of the lower faces' centres in 3D; else on the ground.
-        scale_by_overlap: the scale error is 1 − overlap of volumes as the boxes stand; else as though centre and
+        scale_by_overlap: the scale error is 1 − overlap of volumes as the boxes stand; else as if centre and
             heading were equal.
         orientation_unwrapped: the heading error is |a mod 6.2831852 − b mod 6.2831852|, up to a full turn; else the
             smaller angle between the two.
@@ -146,7 +146,7 @@ class DetectionProtocol:
         return result
 
     def variants(self) -> dict[str, DetectionProtocol]:
-        """These metrics with one choice made otherwise, by `name=value`; for explanations.
+        """These metrics with one choice changed, by `name=value`; for explanations.
 
         A choice that others stand in the way of is changed together with them: errors need thresholds in metres, a
         single range and another curve than `voc`; a footprint in the area needs one; velocities of the label are those

@@ -42,7 +42,7 @@ _PATH_COUNTS: Final = ("true_positive", "false_positive", "false_negative")
 _PATHS: Final = ("ade", "fde", "missed", "count", *_PATH_COUNTS)
 _INSTANCE_MAPS: Final = (
     "given as instance maps, and so compared with the labels' own instances, of paths too; those given as heads have "
-    "their paths compared with what is read off the labels as though a model had predicted them"
+    "their paths compared with what is read off the labels as if a model had predicted them"
 )
 
 

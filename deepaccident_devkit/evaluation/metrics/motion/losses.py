@@ -28,7 +28,7 @@ class LostInstance:
         reason: `missing`: most of its cells are nobody's; `merged`: they are another one's, of which it is the smaller
             part; `cut`: they are its own, but are not more than half of both together (IoU ≤ 0.5); `renamed`: they are,
             but under another id than when it was last found.
-        other: the id in the labels of whom it was merged with; None otherwise.
+        other: the id in the labels with which it was merged, or None.
     """
 
     frame: int

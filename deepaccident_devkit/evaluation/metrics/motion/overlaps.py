@@ -72,9 +72,9 @@ def iou(counts: Iterable[SegmentationCounts], *, absent: float = 0.0) -> float:
 
 
 CLASSES: Final = ("background", "instances")
-"""What is counted: cells without any instance, as though they were one, and the instances."""
+"""What is counted: cells without any instance, as if they were one, and the instances."""
 _MOST_PAIRS: Final = 4_000_000
-"""Entries of a histogram of pairs of ids; ids that would need more are numbered anew."""
+"""Entries of a histogram of pairs of ids; ids that would need more are renumbered."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -230,7 +230,7 @@ def _frame(counts: VpqCounts, index: int) -> VpqCounts:
 
 
 def _shared_cells(predicted: AnyArray, true: AnyArray) -> IntArray:
-    """(T, G + 1, P + 1) cells by true and predicted id, 0 the background; ids are numbered anew if they are large."""
+    """(T, G + 1, P + 1) cells by true and predicted id, 0 the background; ids are renumbered if they are large."""
     frames, cells = len(true), true[0].size if len(true) else 0
     here = np.flatnonzero((predicted > 0) | (true > 0))
     true_id, predicted_id = (np.maximum(maps.reshape(-1)[here], 0).astype(np.int64) for maps in (true, predicted))

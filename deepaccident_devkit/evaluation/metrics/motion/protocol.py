@@ -57,7 +57,7 @@ class MotionProtocol:
         return tuple(f"{extent:g}x{extent:g}" for extent in self.ranges)
 
     def variants(self) -> dict[str, MotionProtocol]:
-        """These metrics with one choice made otherwise, by `name=value`; for explanations.
+        """These metrics with one choice changed, by `name=value`; for explanations.
 
         Those of a part have its name before theirs: `paths.link_distance=10.0`. Labels are no choice of the metrics:
         where those of other protocols are the truth, the truth is another one.

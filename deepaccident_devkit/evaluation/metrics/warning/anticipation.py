@@ -87,7 +87,7 @@ class AnticipationResult(FrozenMappings):
         operating_by: `given` threshold, or `recall`.
         groups: involvement of the agent → figures; agents of one scenario are never pooled.
         references: predictor (of `PREDICTORS` but the given one) → the same; empty for resamples.
-        beyond: alarms for later than the horizon, which are none.
+        beyond: alarms for later than the horizon, which do not count.
         notes: sentences that a reader of the numbers should know.
     """
 
@@ -250,6 +250,6 @@ def _notes(counts: Collection[Counts], drives: Sequence[Drive], rules: CleanWarn
         )
     beyond = sum(each["beyond"] for each in counts)
     if beyond:
-        yield f"{beyond} alarms are for later than the horizon and are none"
+        yield f"{beyond} alarms are for later than the horizon and do not count"
     if drives and not any(each["references"] for each in counts):
         yield "the rows 'TTC < 3 s' need what constant velocities lead to: accident_context(…, references=True)"

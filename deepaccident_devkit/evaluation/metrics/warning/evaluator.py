@@ -48,7 +48,7 @@ class WarningEvaluator(Evaluator[Any]):
             protocol: of `WARNING_PROTOCOLS` by name, or your own.
 
         Raises:
-            ChoiceError: no protocol has that name, or it is none.
+            ChoiceError: no protocol has that name, or it is of another type.
         """
         super().__init__()
         self.protocol = _protocol(protocol)
@@ -73,7 +73,7 @@ class WarningEvaluator(Evaluator[Any]):
             label: says how far apart in time the maps of a prediction are, and how they lie in their cells; None for
                 the released way. Alarms need none.
             context: what happens, from `accident_context(dataset, sample, horizon, references=True)`; the horizon says
-                up to when actors can be named, and that an alarm for later is none.
+                up to when actors can be named, and after which alarms do not count.
 
         Raises:
             EvaluationError: the token is no sample's, the context or something in it is missing, the prediction is

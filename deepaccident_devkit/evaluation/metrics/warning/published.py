@@ -31,7 +31,7 @@ class FieldResult(FrozenMappings):
         samples: how many.
         figures: code and involvement of the agent, such as `ustring ego_involved` → what that code prints.
         references: predictor (of `PREDICTORS` but the given one) → the same.
-        beyond: alarms for later than the horizon, which are none.
+        beyond: alarms for later than the horizon, which do not count.
         notes: sentences that a reader of the numbers should know: why numbers are NaN.
     """
 
@@ -64,7 +64,7 @@ class FieldWarnings(WarningRules):
         return {"scores_of": get_args(ScoresOf)}
 
     def variants(self) -> Mapping[str, WarningRules]:
-        """These metrics with one choice made otherwise; each quirk among them."""
+        """These metrics with one choice changed; each quirk among them."""
         quirks = with_others(self.quirks, {each.name: (False, True) for each in fields(FieldQuirks)})
         return {**WarningRules.variants(self), **with_parts(self, "quirks", quirks)}
 

@@ -43,7 +43,7 @@ class ScoreSeries(FrozenArrays):
         return highest
 
     def before(self, seconds: float) -> FloatArray:
-        """(N, M) scores at the M moments of the last seconds before `toa`, the latest first; NaN where is none."""
+        """(N, M) scores at the M moments of the last seconds before `toa`, the latest first; NaN without a score."""
         moments = np.arange(1, round(seconds * self.fps) + 1)
         column = np.ceil(self.toa[:, None] - moments - _SLACK).astype(np.int64)
         there = (column >= 0) & (column < self.scores.shape[1])

@@ -1,4 +1,4 @@
-"""What is counted side by side: the chosen rules, the task's other protocols, and each choice made otherwise."""
+"""What is counted side by side: the chosen rules, the task's other protocols, and each choice changed."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class Variants:
     Attributes:
         chosen: the rules that are explained.
         protocols: the task's by name.
-        choices: the chosen ones with one choice made otherwise, by `name=value`.
+        choices: the chosen ones with one choice changed, by `name=value`.
         refused: protocol → why it does not take such results.
     """
 
@@ -227,7 +227,7 @@ def _label_variants(chosen: Variant) -> dict[str, Variant]:
 
 
 def _other_labels(rules: LabelProtocol) -> dict[str, LabelProtocol]:
-    """A label protocol with one choice made otherwise, by `name=value`."""
+    """A label protocol with one choice changed, by `name=value`."""
     switches: Mapping[str, tuple[Any, ...]] = {
         **{name: (False, True) for name in slip_names() if name not in _WITHOUT_EFFECT},
         **({} if rules.warp == "fiery" else _LABEL_CHOICES),
