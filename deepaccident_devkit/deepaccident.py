@@ -17,7 +17,7 @@ from deepaccident_devkit.taxonomy import OnError
 
 
 class _Later:
-    """A function of a package that takes its time to import: fetched when somebody asks for it, and then in its place.
+    """A function of a package that is slow to import: imported at its first use, and then kept in this one's place.
 
     `DeepAccident` binds functions of all layers, and reading tables should not wait for the import of those that
     render.
@@ -86,7 +86,7 @@ class DeepAccident(Dataset):
             dataroot: the folder that the release was unpacked into.
             index_dir: where to keep the index, of this release alone; by default `<dataroot>/.deepaccident`, or the
                 user's cache folder where that cannot be written.
-            workers: processes to index with; None takes what the work is worth.
+            workers: processes to index with; None chooses by the amount of work.
             on_error: `raise` lists every broken scenario and raises; `skip` leaves them out and says so.
             verbose: whether to show a progress bar while indexing.
 
@@ -157,7 +157,7 @@ class DeepAccident(Dataset):
         _print(overview.scenario_lines(self))
 
     def list_agents(self) -> None:
-        """Print in how many scenarios each agent is there."""
+        """Print the number of scenarios of each agent."""
         _print(overview.agent_lines(self))
 
     def list_categories(self) -> None:

@@ -81,7 +81,7 @@ def test_the_known_words_are_sorted_and_used(prose: dict[str, str], known: list[
 
 
 def test_a_misspelling_is_found() -> None:
-    text = "# A heading\n\nTwo vehicles colide at the `juncton`, and\n[a link](junctoin.md) has 2.5e-3 IoU.\n"
+    text = "# A heading\n\nTwo vehicles colide at the `juncton`, and\n[a link](#junctoin) has 2.5e-3 IoU.\n"
     assert misspelt(markdown(text), []) == [(3, "colide")]
     assert misspelt(markdown(text), ["colide"]) == []
     assert misspelt(markdown("```\ncolide\n```\n<!-- colide -->\n\n    colide\n\nA colide.\n"), []) == [(8, "colide")]

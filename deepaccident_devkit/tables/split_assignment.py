@@ -16,8 +16,8 @@ class SplitAssignment:
         split_of: scenario token → split; absent where it is unknown.
         problems: scenario token → why it has no single place, a sentence each.
         unlisted: scenarios that no split file lists, though there is one of every split.
-        contradictions: scenario token → what files and folders say against each other; the files win.
-        notices: what is odd but does not hinder, a sentence each.
+        contradictions: scenario token → how files and folders contradict each other; the files win.
+        notices: what is odd but harmless, a sentence each.
     """
 
     split_of: Mapping[str, str]

@@ -43,7 +43,7 @@ def project_to_image(
 ) -> ImagePoints:
     """Points of one agent in an image of any agent at any moment of the same scenario.
 
-    The points are taken to stand still: those of another moment are off where something moved.
+    The points are taken to stand still: those of another moment are wrong where something moved.
 
     Args:
         dataset: the release.

@@ -1,4 +1,4 @@
-"""Every kind of finding: how bad it is, what it means, what to do. docs/validation.md is made from this table."""
+"""Every kind of finding: its severity, its meaning and the remedy. docs/validation.md is made from this table."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ class Code:
         severity: how bad it is.
         meaning: one sentence for the docs.
         remedy: what to do.
-        known: why the real release itself is so, empty if it is not.
+        known: why the real release itself has it, empty if it does not.
         deep: whether only `--deep` finds it.
     """
 

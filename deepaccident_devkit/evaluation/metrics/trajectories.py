@@ -2,7 +2,7 @@
 
 Paths are those of the instances of the first frame: id → (n, 2) positions, such as `motion.trajectories` gives in
 metres, or `LinkedInstances.centers` times the cells' size. An instance that a frame lacks has no point for it, so that
-point k of a path is not always frame k; the released code takes it so, and so do these functions.
+point k of a path is not always of frame k. The released code ignores this, and so do these functions.
 
 They are paired as the released code does (`traj_mapping`). It adds a row and a column of zeros to its costs (ids begin
 at 1) and then drops the first match, `matches[1:]`, as the one of those two. With a stable sort it always is; an
@@ -162,7 +162,7 @@ def instance_paths(instance: AnyArray, grid: BevGrid) -> dict[int, FloatArray]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrajectoryRules:
-    """What decides the errors; the defaults are the released ones.
+    """The choices of the errors; the defaults are the released ones.
 
     Attributes:
         ade_limit: metres; a larger mean error counts as this.
@@ -180,7 +180,7 @@ class TrajectoryRules:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrajectoryErrors:
-    """Sums over the true paths of a sample that some prediction has a partner for.
+    """Sums over the true paths of a sample that have a partner in some prediction.
 
     Attributes:
         ade: of the mean distances over the frames, metres.

@@ -1,4 +1,4 @@
-"""`DrawnPaths`: what the released accident evaluation looks at: the first frame's instances, their paths and boxes."""
+"""`DrawnPaths`: what the released accident evaluation compares: the first frame's instances, their paths, boxes."""
 
 from __future__ import annotations
 

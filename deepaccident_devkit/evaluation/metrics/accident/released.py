@@ -1,6 +1,6 @@
 """Accidents as the released code evaluates them, bugs included (protocol `released`; docs/released_code.md, Accidents).
 
-Each bug is a field of `ReleasedAccidents` that can be put right, or lies in the functions that it comes from:
+Each bug is a field of `ReleasedAccidents` that can be corrected, or lies in the functions that have it:
 `motion.postprocessing.redrawing` (boxes of 5 m × 2 m at most, rasterised into the wrong frame after a gap, and of the
 first frame's instances alone), `outlines.first_outline` (of an instance in several parts, one counts),
 `trajectories.padded` and `match_trajectories`.
@@ -56,8 +56,8 @@ class ReleasedAccidents:
 
     Attributes:
         labels: protocol of the labels that are the truth, others are refused; None for any.
-        truth_gap: cells; the true instances that are nearer collide. 0.001 asks them to overlap.
-        prediction_gap: cells; the predicted ones that are nearer do: 2.5 m. The paper has 1 m for both.
+        truth_gap: cells; the true instances that are nearer collide. With 0.001 they must overlap.
+        prediction_gap: cells; the predicted instances that are nearer collide: 2.5 m. The paper has 1 m for both.
         level: where the outlines run, see `outlines.LEVEL`: 0.1 makes instances almost a cell larger all around.
         truth_through_heads: truth is what the post-processing finds in the labels; else the labels' own instances.
         redraw: distances are those of the boxes rasterised along the paths; else of the instances themselves.
@@ -115,7 +115,7 @@ class ReleasedAccidents:
         """What one sample adds.
 
         Raises:
-            EvaluationError: there is no label, or the prediction is none of motion, or of something else.
+            EvaluationError: there is no label, or the prediction is no motion.
         """
         if not isinstance(prediction, MotionOutput) or label is None:
             raise EvaluationError(
@@ -200,7 +200,7 @@ def accident_counts(
     Args:
         predictions: K of them, the mean last.
         truth: what is true.
-        matches: of each prediction: its ids and the true ones that are the same.
+        matches: of each prediction: its ids and the matched true ids.
         rules: the rules.
         step: seconds from one frame to the next.
 
@@ -255,7 +255,7 @@ def collision(given: DrawnPaths, frames: Sequence[int], gap: float, level: float
 
 
 def _apart(predicted: DrawnPaths, alarm: Collision, truth: DrawnPaths, true: Collision) -> float:
-    """Metres: the sum of how far the two predicted ones are from the two true ones, whichever way is nearer."""
+    """Metres: the sum of the distances of the predicted from the true two, in the order with the smaller sum."""
     here, there = (
         np.array([each.paths[name][one.frame] for name in one.pair])
         for each, one in ((predicted, alarm), (truth, true))
@@ -264,7 +264,7 @@ def _apart(predicted: DrawnPaths, alarm: Collision, truth: DrawnPaths, true: Col
 
 
 def _others_named(alarm: Collision, true: Collision, same: Collection[Pair]) -> int:
-    """0 if both that are foreseen are the true ones, by the matches of their paths; else 1."""
+    """0 if the two predicted ones are the true ones, by the matches of their paths; else 1."""
     return int(not all(any((name, other) in same for other in true.pair) for name in alarm.pair))
 
 

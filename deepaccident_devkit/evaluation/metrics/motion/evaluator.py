@@ -1,4 +1,4 @@
-"""`MotionEvaluator`: the motion metrics of any number of samples, and what each of them adds."""
+"""`MotionEvaluator`: the motion metrics of any number of samples, and the counts of each sample."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class RangeResult:
         sq: segmentation quality of the instances found, percent.
         rq: recognition quality, percent.
         true_positive: instances found, frame by frame.
-        false_positive: instances predicted that are nobody.
+        false_positive: instances predicted without a true one.
         false_negative: instances missed.
     """
 
@@ -163,7 +163,7 @@ class MotionEvaluator(Evaluator[MotionResult]):
     def selected_as_released(self, order: Sequence[str], selected: Collection[str]) -> MotionResult:
         """The result of some samples as the released code has it "by attribute": with the VPQ of other frames.
 
-        See `overlaps.separate_selected_as_released`, whose mistake this is; `compute(selected)` is the correct result.
+        See `overlaps.separate_selected_as_released` for the mistake; `compute(selected)` is the correct result.
 
         Args:
             order: all samples in the order evaluated.

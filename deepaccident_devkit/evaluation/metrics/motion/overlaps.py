@@ -1,8 +1,9 @@
 """How far predicted and true maps overlap: IoU of cells, video panoptic quality (VPQ) of instances.
 
-VPQ: instances found, in the right cells and under the same id all along. In each frame a true and a predicted instance
-match if the intersection of their cells is more than half of the union, so that nobody has two partners. FIERY's
-measure, of which the released code has a copy; counts are sums over frames (docs/released_code.md, IoU and VPQ).
+VPQ: instances found, in the right cells and under the same id in all frames. In each frame a true and a predicted
+instance match if the intersection of their cells is more than half of the union, so that each has at most one partner.
+FIERY's measure, of which the released code has a copy; counts are sums over frames (docs/released_code.md, IoU and
+VPQ).
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ def segmentation_counts(prediction: AnyArray, label: AnyArray, classes: int = 2)
     Args:
         prediction: any shape, integers: the class of each cell, from 0.
         label: the same shape.
-        classes: how many are counted; cells of others are of none of them.
+        classes: how many are counted; cells of other classes are ignored.
 
     Returns:
         The counts of each class.
@@ -79,7 +80,7 @@ _MOST_PAIRS: Final = 4_000_000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VpqRules:
-    """What decides VPQ; the defaults are the released ones.
+    """The choices of VPQ; the defaults are the released ones.
 
     Attributes:
         ids_must_stay: a true instance that was matched with another predicted id when it last had a match is no true
@@ -155,7 +156,7 @@ def vpq_counts(prediction: AnyArray, label: AnyArray, rules: VpqRules = VpqRules
 
 
 def vpq_matches(prediction: AnyArray, label: AnyArray, rules: VpqRules = VpqRules()) -> IntArray:
-    """Who is whom: the true positives of `vpq_counts`; arguments and errors as there.
+    """The matched instances: the true positives of `vpq_counts`; arguments and errors as there.
 
     Returns:
         (N, 3) int64: frame from 0, predicted id, true id; by frame.

@@ -1,4 +1,4 @@
-"""`MotionProtocol`: what decides the motion metrics."""
+"""`MotionProtocol`: the choices of the motion metrics."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from deepaccident_devkit.motion import LABEL_PROTOCOLS, POST_PROCESSING, PostPro
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotionProtocol:
-    """What decides the motion metrics; the defaults are the released ones.
+    """The choices of the motion metrics; the defaults are the released ones.
 
     Sources: docs/released_code.md, Post-processing, IoU and VPQ, and Paths.
 
@@ -96,7 +96,7 @@ MOTION_PROTOCOLS: Final[Mapping[str, MotionProtocol]] = MappingProxyType(
     {"released": MotionProtocol(), "paper": MotionProtocol(nothing_is_zero=False)}
 )
 """What the released code computes. The paper's text says no more of these metrics than their names, FIERY's and the
-ranges: so `paper` is the released code, but that it makes no 0 of nothing."""
+ranges: so `paper` is the released code, except that a number with nothing to count is NaN and not 0."""
 
 
 def motion_protocol(protocol: str | MotionProtocol) -> MotionProtocol:

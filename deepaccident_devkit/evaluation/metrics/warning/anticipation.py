@@ -1,4 +1,4 @@
-"""`CleanWarnings`: anticipation metrics over recordings that no siren, silence or chance can win (protocol `clean`)."""
+"""`CleanWarnings`: anticipation metrics in which a siren, silence or chance cannot win (protocol `clean`)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from deepaccident_devkit.evaluation.metrics.warning.recordings import KINDS
 
 RANDOM_DRAWS: Final = 20
 LATENCIES: Final = (0.0, 0.1, 0.3)
-"""Seconds that a warning may take from who sees to who collides."""
+"""Seconds that a warning may need from an agent that sees the danger to the two that collide."""
 _ANY: Final = float(np.nextafter(0.0, 1.0))
 _FIXED: Final[Mapping[str, float]] = {"always": 1.0, "never": 1.0, "random per frame": 0.5, "random per recording": 0.5}
 """Operating points of the predictors that know nothing; of the other references any alarm is one."""
@@ -57,8 +57,8 @@ class AnticipationFigures(FrozenMappings):
         at_p80: at the threshold of the highest recall with a precision of 0.8.
         best_f1: threshold: of the best F1 over these recordings; to be given when another split is evaluated.
         quiet: threshold: the lowest with at most one second a minute in alarm without an accident to come; likewise.
-        tta0_after: for who sees an accident of others: latency → seconds of `operating.tta0` that are left when the two
-            who collide are told, a lead below 0 as 0; empty for `ego_involved`.
+        tta0_after: for agents that see an accident of others: latency → seconds of `operating.tta0` that are left when
+            the two that collide receive the warning, at least 0; empty for `ego_involved`.
         recordings: by kind: `accident`, `twins`, `others`.
         twins: pairs of an accident recording and its twin.
     """
@@ -80,7 +80,7 @@ class AnticipationFigures(FrozenMappings):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AnticipationResult(FrozenMappings):
-    """What the protocol `clean` says.
+    """The result of the protocol `clean`.
 
     Attributes:
         samples: how many.

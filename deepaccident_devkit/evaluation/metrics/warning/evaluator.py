@@ -29,10 +29,9 @@ print. All compare with the labels' boxes, as the accident protocol `boxes`; the
 
 
 class WarningEvaluator(Evaluator[Any]):
-    """What those ask who would rely on the alarm: seconds of warning, detection in time, false alarms a minute.
+    """Numbers for users of an alarm: seconds of warning, detection in time, false alarms a minute.
 
-    Give it whole recordings, normal scenarios among them: samples of a recording that are not given are as if nobody
-    had driven then.
+    Give it whole recordings, normal scenarios among them: the metrics ignore the times of samples that are not given.
 
     `compute` gives an `AnticipationResult`, a `WarningResult` or a `FieldResult`, by the protocol.
 
@@ -72,7 +71,7 @@ class WarningEvaluator(Evaluator[Any]):
             prediction: what a model says: motion in maps, which is at most one alarm, or a list of alarms.
             label: says how far apart in time the maps of a prediction are, and how they lie in their cells; None for
                 the released way. Alarms need none.
-            context: what happens, from `accident_context(dataset, sample, horizon, references=True)`; the horizon says
+            context: the truth, from `accident_context(dataset, sample, horizon, references=True)`; the horizon says
                 up to when actors can be named, and after which alarms do not count.
 
         Raises:
@@ -120,7 +119,7 @@ class WarningEvaluator(Evaluator[Any]):
 
     @property
     def has_intervals(self) -> bool:
-        """Of the protocol `field` there are none: its numbers take long, and are for a look beside published ones."""
+        """The protocol `field` has none: its numbers take long, and are only for comparison with published ones."""
         return not isinstance(self.protocol, FieldWarnings)
 
 

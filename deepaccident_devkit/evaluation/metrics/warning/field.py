@@ -22,7 +22,7 @@ FieldCode = Literal["ustring", "dsta", "drive", "dad"]
 FIELD_CODES: Final[tuple[FieldCode, ...]] = get_args(FieldCode)
 _DAD_SECONDS: Final = 5.0
 _NUDGE: Final = 1e-6
-"""By which DRIVE moves its thresholds 0 and 1 inwards."""
+"""DRIVE moves its thresholds 0 and 1 inwards by this."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -31,9 +31,9 @@ class WarningRules:
         naming: whom an explicit accident without `ids` names, as `BoxAccidents` has it.
         correct_by: what makes an alarm right: that it names the `pair` that collides, in either order; the `place`,
             as its positions differ from where the two meet by less than `distance`; or `either` of these.
-        distance: metres: what the differences of the two positions may add up to, whichever way round fits better; as
-            strict as, and by default the distance of, the errors of the accident protocol `paper`.
-        time_tolerance: seconds: how far off the time of a right alarm may be from the impact; None for any.
+        distance: metres: the largest sum of the differences of the two positions, in the order that fits better; by
+            default the distance of the errors of the accident protocol `paper`.
+        time_tolerance: seconds: the largest time error of a right alarm; None for any.
     """
 
     reading: AccidentReading = field(default_factory=AccidentReading)
@@ -80,7 +80,7 @@ class WarningRules:
         }
 
     def _own_others(self) -> Mapping[str, tuple[Any, ...]]:
-        """Other values of the choices that a protocol has beside these."""
+        """Other values of the further choices of a protocol."""
         return {}
 
 
@@ -91,7 +91,7 @@ class WarningProtocol(WarningRules):
     Attributes:
         unjudged_are_false: where nobody collides, alarms for later than the recording goes on are false ones; else they
             are left out and counted aside, since nothing refutes them.
-        leads: seconds before the impact by which a detection rate is asked for.
+        leads: seconds before the impact at which detection rates are given.
         curve_lead: seconds before the impact: of the curve's detection rate.
         curve_rows: how many thresholds the curve has at most.
     """

@@ -1,4 +1,4 @@
-"""`FieldWarnings`: the numbers of four published anticipation codes, quirks and all (protocol `field`)."""
+"""`FieldWarnings`: the numbers of four published anticipation codes with their quirks (protocol `field`)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from deepaccident_devkit.evaluation.metrics.warning.protocol import WarningRules
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FieldResult(FrozenMappings):
-    """What the protocol `field` says: not comparable from code to code, and won by predictors that know nothing.
+    """The result of the protocol `field`: not comparable between codes, and predictors that know nothing can win.
 
     Attributes:
         samples: how many.

@@ -1,4 +1,4 @@
-"""`WarningResult`: what `WarningEvaluator.compute` returns, and how it comes of the tallies of recordings."""
+"""`WarningResult`: what `WarningEvaluator.compute` returns, made of the tallies of recordings."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _PER_MINUTE: Final = 60 * _PER_SECOND
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class WarningCurve(FrozenArrays):
-    """What would be if only alarms of at least a score were raised, the surest first; arrays are read-only.
+    """The numbers if only alarms of at least a score are raised, the highest score first; arrays are read-only.
 
     R scores: all that change something, or if there are more than `WarningProtocol.curve_rows` as many of them, evenly
     by rank. Arrays and not rows of numbers, since row n of a bootstrap's resample is of another score.
