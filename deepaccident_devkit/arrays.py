@@ -1,4 +1,4 @@
-"""Array aliases, and the checks that turn what a caller passes into what a record holds."""
+"""Array aliases, and the checks of the arrays and numbers that a caller passes."""
 
 from __future__ import annotations
 
@@ -64,10 +64,10 @@ def checked(
 def as_numbers(
     name: str, values: ArrayLike, expected: str = "numbers", dtype: DTypeLike | None = np.float64
 ) -> AnyArray:
-    """`checked` for any shape: the one way in for a caller's arrays, of whatever framework.
+    """`checked` for any shape: the one way in for a caller's arrays, of any framework.
 
-    What numpy can read without being asked to copy from another device is taken: its own arrays, sequences, and what
-    offers `__array__` or DLPack, such as torch tensors on the processor. Nothing is detached, fetched from an
+    Everything is taken that numpy can read without a copy from another device: its own arrays, sequences, and objects
+    with `__array__` or DLPack, such as torch tensors on the processor. Nothing is detached, fetched from an
     accelerator or unmasked silently; the error says how.
 
     Args:
@@ -116,7 +116,7 @@ def checked_whole(
 ) -> int:
     """A single whole number, numpy's integers among them, as Python's int; or raise `error`."""
     try:
-        return operator.index(value)  # type: ignore[arg-type]  # what is none is refused
+        return operator.index(value)  # type: ignore[arg-type]  # everything else is refused
     except TypeError:
         raise error(f"{name}: expected {expected}, found {value!r}") from None
 
@@ -142,7 +142,7 @@ def readonly(array: AnyArray) -> AnyArray:
 
 
 def _read(name: str, values: Any, expected: str) -> AnyArray:
-    """`values` as an array of whatever type, or GeometryError with the remedy."""
+    """`values` as an array of any type, or GeometryError with the remedy."""
     if type(values) is np.ndarray:
         return values
     prefix = f"{name}: " if name else ""
@@ -162,7 +162,7 @@ def _read(name: str, values: Any, expected: str) -> AnyArray:
 
 
 def _remedy(values: object) -> str:
-    """What to do with another framework's array that numpy does not read; nothing for what is no array."""
+    """The remedy for another framework's array that numpy does not read; empty for all other objects."""
     if isinstance(values, np.ndarray) or not (hasattr(values, "__array__") or hasattr(values, "__dlpack__")):
         return ""
     return "; pass a torch tensor as tensor.detach().cpu().float(), another framework's as a float32 numpy array"

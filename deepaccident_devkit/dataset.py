@@ -1,4 +1,4 @@
-"""What the layers above see of a release: its opened tables and the sensor files they name."""
+"""What the upper layers see of a release: its opened tables and the sensor files that they name."""
 
 from __future__ import annotations
 
@@ -49,9 +49,9 @@ class Dataset(OpenTables):
         return self._world_from(self._sample_row(sample), self.frame_name(frame))
 
     def ego_from(self, sample: RowArgument, channel: str) -> SE3:
-        """The transform to a sample's ego frame from a sensor's, with the very numbers of the sample's calib file.
+        """The transform to a sample's ego frame from a sensor's, with the exact numbers of the sample's calib file.
 
-        The one row of `calibrated_sensor` is what was meant; the files of a scenario differ from it by rounding.
+        The row of `calibrated_sensor` is the intended value; the files of a scenario differ from it by rounding.
 
         Raises:
             TokenError: no such sample or sensor.
@@ -129,7 +129,7 @@ class Dataset(OpenTables):
         return result
 
     def actor_ids(self, sample: RowArgument) -> IntArray:
-        """Which actors the boxes of a sample are, (N,) CARLA ids, in the order of its label.
+        """The CARLA ids (N,) of the actors of a sample's boxes, in the order of its label.
 
         Unlike `Boxes.actor_id`, the agent's own row has the agent's id. Untracked rows are −1, and so is an own row
         where meta does not say who the agent is.
@@ -151,7 +151,7 @@ class Dataset(OpenTables):
     # sensor data
 
     def get_sample_data_path(self, sample_data: RowArgument) -> Path:
-        """The path of a sensor file, whether it is there or not; raises TokenError."""
+        """The path of a sensor file, which need not exist; raises TokenError."""
         return self.dataroot / self._tables.resolver.filename(self.sample_data.row(token_of(sample_data)))
 
     def get_sample_data(self, sample_data: RowArgument) -> tuple[Path, list[Box], FloatArray | None]:

@@ -17,9 +17,10 @@ from deepaccident_devkit.taxonomy import OnError
 
 
 class _Later:
-    """A function of a package that takes its time to import: fetched when somebody asks for it, and then in its place.
+    """A function of a package that is slow to import: imported at its first use, and then kept in this one's place.
 
-    `DeepAccident` binds functions of all layers, and who only reads tables should not wait for those that draw.
+    `DeepAccident` binds functions of all layers, and reading tables should not wait for the import of those that
+    render.
     """
 
     def __init__(self, package: str, function: str) -> None:
@@ -37,7 +38,7 @@ class _Later:
 
 
 class _Package:
-    """Stands for such a package at run time, so that each function is named once: whatever it is asked for comes later.
+    """Stands for such a package at run time, so that each function is named once: its attributes are resolved later.
 
     Type checkers see the package itself, and with it every signature.
     """
@@ -85,7 +86,7 @@ class DeepAccident(Dataset):
             dataroot: the folder that the release was unpacked into.
             index_dir: where to keep the index, of this release alone; by default `<dataroot>/.deepaccident`, or the
                 user's cache folder where that cannot be written.
-            workers: processes to index with; None takes what the work is worth.
+            workers: processes to index with; None chooses by the amount of work.
             on_error: `raise` lists every broken scenario and raises; `skip` leaves them out and says so.
             verbose: whether to show a progress bar while indexing.
 
@@ -156,7 +157,7 @@ class DeepAccident(Dataset):
         _print(overview.scenario_lines(self))
 
     def list_agents(self) -> None:
-        """Print in how many scenarios each agent is there."""
+        """Print the number of scenarios of each agent."""
         _print(overview.agent_lines(self))
 
     def list_categories(self) -> None:

@@ -1,4 +1,4 @@
-"""The devkit's own exceptions: every error a caller can mend derives from `DeepAccidentError`.
+"""The devkit's own exceptions: every error that a caller can mend derives from `DeepAccidentError`.
 
 Each kind is also the built-in kind that a caller would expect (`ValueError`, `KeyError`, …) and is built from one
 sentence that names the file, the line and the remedy. One argument only: an exception with more does not survive
@@ -15,7 +15,7 @@ class DeepAccidentError(Exception):
 
 
 class ReleaseError(DeepAccidentError, ValueError):
-    """Something in the release on disk is not as its format says."""
+    """Something in the release on disk does not keep to its format."""
 
 
 class DatarootError(ReleaseError, FileNotFoundError):
@@ -39,7 +39,7 @@ class MetaError(ReleaseError):
 
 
 class CalibError(ReleaseError):
-    """A calibration file cannot be read, or holds something else than calibration."""
+    """A calibration file cannot be read, or holds something else."""
 
 
 class SensorFileError(ReleaseError):
@@ -55,7 +55,7 @@ class BrokenReleaseError(ReleaseError):
 
 
 class IndexStoreError(DeepAccidentError, OSError):
-    """The index cannot be written or read where it should lie."""
+    """The index cannot be written or read at its place."""
 
 
 class LabelFilesError(DeepAccidentError, OSError):

@@ -1,4 +1,4 @@
-"""Files: written so that a reader sees the old one or the whole new one, never half; opened if they are files."""
+"""Files: written so that a reader sees either the old or the whole new one; opened only if they are regular files."""
 
 import hashlib
 import os
@@ -49,7 +49,7 @@ def replacing(path: Path) -> Iterator[Path]:
 def replacing_folder(path: Path) -> Iterator[Path]:
     """Yield a new empty folder beside `path`; it takes the place of `path` if the block succeeds, else is removed.
 
-    `path` itself must not exist or be empty, so that nothing is ever deleted for it.
+    `path` itself must be missing or empty, so that nothing is ever deleted for it.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
@@ -79,9 +79,9 @@ def file_checksum(path: Path) -> str:
 
 
 def irregular_text(mode: int) -> str | None:
-    """What stands in a file's place, by the mode that `stat` gives: `not a regular file (a named pipe)`; else None.
+    """What is in a file's place, by the mode that `stat` gives: `not a regular file (a named pipe)`; else None.
 
-    Opening a pipe waits for whoever writes to it, and a device may have no end.
+    Opening a pipe waits for its writer, and a device may have no end.
     """
     if stat.S_ISREG(mode):
         return None
@@ -90,7 +90,7 @@ def irregular_text(mode: int) -> str | None:
 
 
 def is_writable_folder(path: Path) -> bool:
-    """Tell whether files can be made in `path`, by making the folder and one file in it."""
+    """Whether files can be made in `path`: makes the folder and one file in it."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):

@@ -153,7 +153,7 @@ def scenario_lines(dataset: Dataset) -> list[str]:
 
 
 def agent_lines(dataset: Dataset) -> list[str]:
-    """A line an agent name: in how many scenarios it is there."""
+    """A line for each agent name, with the number of its scenarios."""
     counts = Counter(agent["name"] for agent in dataset.agent)
     return [f"{name}  {counts[name]} scenarios" for name in AGENTS]
 
@@ -193,7 +193,7 @@ def _counts(values: Iterable[object]) -> dict[str, int]:
 
 
 def _table_rows(dataset: Dataset, scenarios: set[str]) -> dict[str, int]:
-    """Rows of every table that belong to some scenarios, counted on the columns: no record is made."""
+    """Rows of every table that belong to some scenarios, counted in the columns, without records."""
     rows = {name: len(dataset.arrow(name)) for name in dataset.table_names}
     chosen = [dataset.getind("scenario", token) for token in scenarios]
     if len(chosen) == rows["scenario"]:

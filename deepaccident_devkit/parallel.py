@@ -31,8 +31,8 @@ def run_batch(
     Args:
         work: an importable function of the devkit (workers import it by name).
         items: what it is applied to, one call an item.
-        workers: processes to use; 1 runs in this one; None takes as many as there are cores, and this process
-            alone where there is too little work to pay for a pool, or where a worker already calls.
+        workers: processes to use; 1 runs in this one; None takes as many as there are cores, or this process
+            alone if the work is too little for a pool or the caller is a worker itself.
         executor: any `concurrent.futures.Executor` to run on instead (a dask client's, a thread pool).
         label: text of the progress bar.
         progress: whether to show one.
@@ -54,7 +54,7 @@ def run_unordered(
     progress: bool = False,
     sizes: Sequence[int] | None = None,
 ) -> Generator[tuple[int, Result], None, None]:
-    """Apply `work` to every item; yields each one's position and result as soon as it is there.
+    """Apply `work` to every item; yields each one's position and result as soon as it is ready.
 
     Closing the generator cancels what has not begun. Arguments and errors are those of `run_batch`, and `sizes`: how
     far each item moves the progress bar; None for one step each.
@@ -105,7 +105,7 @@ def _on(
 
 
 def _end_with_parent() -> None:
-    """Watch the parent from a thread: a pool's worker whose parent was killed would wait for work for ever."""
+    """Watch the parent from a thread: without it a worker whose parent was killed would wait for ever."""
     import multiprocessing
     import threading
 

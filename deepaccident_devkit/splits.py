@@ -1,4 +1,4 @@
-"""Which scenario belongs where: the official procedure, made reproducible, and selections as split files."""
+"""Which scenario is in which split: the official procedure, made reproducible, and selections as split files."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 OFFICIAL_SEED: Final = 17
 _FEWEST_LABELS: Final = 6
 _SHARE: Final = 0.15
-"""Of all scenarios, what val and test may hold at most; also their share of twins not designed and of single ones."""
+"""The largest share of all scenarios in val and in test; also their share of twins not designed and of single ones."""
 _DESIGNED_SHARE: Final = 0.4
 _MINI_SHARE: Final = 0.2
 _EGOS, _OTHERS = frozenset(VEHICLE_AGENTS[:2]), frozenset(VEHICLE_AGENTS[2:])
@@ -64,8 +64,8 @@ class Splits:
         """Write `train.txt`, `val.txt`, `test.txt`, `train_mini.txt`, `val_mini.txt` into a folder, all or none.
 
         Args:
-            folder: where; it is made if it is not there. In a dataroot the files decide the release's splits.
-            overwrite: replace files that are there.
+            folder: where; it is made if missing. In a dataroot the files decide the release's splits.
+            overwrite: replace existing files.
 
         Returns:
             The files' paths.
@@ -83,11 +83,12 @@ def official_split(dataset: Dataset, seed: int = OFFICIAL_SEED, *, released_skip
     The official lists ship with the release and cannot be made again: their procedure starts from the order in which
     a file system happened to list folders. This one sorts first, so that it depends on the scenarios and `seed` alone.
 
-    1. Scenarios count whose `ego_vehicle` has more than five labels (so none of an unlabelled test split). Twins are a
+    1. Only scenarios whose `ego_vehicle` has more than five labels count (so none of an unlabelled test split). Twins
+    are a
        normal and an accident scenario of one name and subtype; they stay together. With T scenarios, val and test hold
        at most round(0.15 T) each.
-    2. Twins are *designed* if meta lets one of ego and the car behind it collide with one of other and the car behind
-       it in the accident, and names no collision in the normal scenario.
+    2. Twins are *designed* if by meta, in the accident, ego or the car behind it collides with other or the car behind
+       it, and names no collision in the normal scenario.
     3. Twins fall into three strata by the accident's meta: three-way; four-way with the other vehicle from opposite;
        the rest. Each stratum is shuffled; the first share goes to val, the next to test, the rest to train: 0.4 and
        0.4 of designed twins, then 0.15 and 0.15 of the other twins, then 0.15 and 0.15 of the scenarios without a twin
@@ -98,8 +99,8 @@ def official_split(dataset: Dataset, seed: int = OFFICIAL_SEED, *, released_skip
     Args:
         dataset: the release.
         seed: of the shuffles; 17 is the official one.
-        released_skip: do as the released loop does, which removes each designed pair from the list that it walks, and
-            so passes over the pair after it: that one is dealt with as not designed.
+        released_skip: do as the released loop does, which removes each designed pair from the list over which it loops.
+            So it skips the pair after it, which then counts as not designed.
     """
     scenarios = dataset.scenario[:]
     counted = [scenario for scenario in scenarios if _ego_labels(dataset, scenario) >= _FEWEST_LABELS]
@@ -115,7 +116,7 @@ def split_records(
     released_skip: bool = False,
     left_out: tuple[str, ...] = (),
 ) -> Splits:
-    """The steps 2 to 4 of `official_split` on records of scenarios, in whatever order they come."""
+    """The steps 2 to 4 of `official_split` on records of scenarios, in any order."""
     of_token = {scenario["token"]: scenario for scenario in scenarios}
     most = round(_SHARE * len(of_token))
     strata = _strata(of_token.values(), released_skip=released_skip)
@@ -134,7 +135,7 @@ def save_selection(scenarios: Iterable[RowArgument], path: str | os.PathLike[str
     Args:
         scenarios: tokens or records; their order is kept, each is written once.
         path: the file, whose name has to end in `.txt`.
-        overwrite: replace a file that is there.
+        overwrite: replace an existing file.
 
     Returns:
         The path.

@@ -27,7 +27,7 @@ def main() -> None:
 
 
 def golden_table() -> str:
-    """Golden accidents (d_accident) through each protocol of rasters, and `paper` with each choice made otherwise."""
+    """Golden accidents (d_accident) through each protocol of rasters, and `paper` with each choice changed."""
     sys.path.insert(0, str(TESTS))
     from parity.conftest import GoldenCase
     from parity.test_accident import heads_of, label_of
@@ -42,7 +42,7 @@ def golden_table() -> str:
             evaluator.update(f"sample {index}", output, label)
     rows = {"`released`": released.compute(), "**`paper`**": paper.compute()}
     rows |= {f"`{name}`": result for name, result in paper.explained().items()}
-    return table(rows, "protocol, or the choice of `paper` that is made otherwise")
+    return table(rows, "protocol, or the choice of `paper` that is changed")
 
 
 def perfect_table() -> str:

@@ -1,4 +1,4 @@
-"""Draw docs/images/layers.svg from the layers of pyproject.toml: `python docs/make_architecture.py`."""
+"""Render docs/images/layers.svg from the layers of pyproject.toml: `python docs/make_architecture.py`."""
 
 import ast
 import sys
@@ -17,7 +17,7 @@ WIDTH, MARGIN, GAP = 1080, 16, 8
 TOP_OF_TEXT, LINE, LETTER = 18, 16, 5.9
 """Pixels."""
 _COLORS = {"data": "#dbe9f6", "work": "#e5f2df", "use": "#fbeed5"}
-_KINDS = {"data": "the release and its tables", "work": "what is computed and drawn", "use": "what people call"}
+_KINDS = {"data": "the release and its tables", "work": "what is computed and rendered", "use": "what people call"}
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Draw a contact sheet of the paper's twelve designs from synthetic accidents: `python docs/make_design_sheet.py`."""
+"""Render a contact sheet of the paper's twelve designs from synthetic accidents: `python docs/make_design_sheet.py`."""
 
 import tempfile
 from pathlib import Path

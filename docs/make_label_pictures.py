@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/motion_labels.md and measure its tables: `python docs/make_label_pictures.py`."""
+"""Render the pictures of docs/motion_labels.md and measure its tables: `python docs/make_label_pictures.py`."""
 
 import re
 import tempfile
@@ -146,7 +146,7 @@ CIRCUMSTANCES = {
         "an augmentation: turned by 0.3 rad", config={"augmentation": Augmentation(rotation=0.3)}
     ),
     "untracked_share_an_id": Circumstance(
-        "`filter_invisible=False`, so that untracked actors are drawn", config={"filter_invisible": False}
+        "`filter_invisible=False`, so that untracked actors are rasterised", config={"filter_invisible": False}
     ),
     "missing_frames_are_empty": Circumstance("the recording ends 1 s after the present", moment={"frames": 3}),
     "ids_kept_between_samples": Circumstance(

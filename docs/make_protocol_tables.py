@@ -53,7 +53,7 @@ def main() -> None:
 
 
 def golden_accidents() -> str:
-    """The golden run (d_accident) through the released protocol, and with each choice made otherwise."""
+    """The golden run (d_accident) through the released protocol, and with each choice changed."""
     return released_accidents(golden_samples())
 
 
@@ -66,13 +66,13 @@ def released_accidents(samples: Iterable[Given]) -> str:
         halfway.update(*each)
     results = {"**`released`**": evaluator.compute(), "`level=0.5`": halfway.compute()}
     results |= {f"`{name}`": result for name, result in evaluator.explained().items()}
-    head, _, *lines = table(results, "protocol, or the choice that is made otherwise").splitlines()
+    head, _, *lines = table(results, "protocol, or the choice that is changed").splitlines()
     rows = {name: cells for name, *cells in (line.strip("| ").split(" | ") for line in lines)}
     return "\n".join(["| " + head.strip("| ") + " |", "|---" * head.count(" | ") + "|---|", *folded(rows)])
 
 
 def motion_variants() -> dict[str, MotionProtocol]:
-    """The released protocol, and with one choice made otherwise at a time."""
+    """The released protocol, and with one choice changed at a time."""
     released = MOTION_PROTOCOLS["released"]
     reading = {"center_threshold": (0.3,), "max_centers": (20,), "scan": ("fiery",)}
     instances = {"link_distance": (3.0, 8.0), "foreground": ("sigmoid",), **reading}
@@ -106,7 +106,7 @@ def _variants(
 
 
 def golden_motion() -> str:
-    """The golden run (d_accident) through the released protocol, and with each choice made otherwise."""
+    """The golden run (d_accident) through the released protocol, and with each choice changed."""
     return motion_table({"": list(golden_samples())}, motion_variants())
 
 
@@ -166,7 +166,7 @@ def motion_table(
     """A line a protocol, of each set of samples; of those in `once` the first protocol alone."""
     kinds = ["prediction"] if len(samples) > 1 else []
     metrics = ["IoU 30x30", "VPQ 30x30", "VPQ 100x100", "minADE (m)", "minFDE (m)", "miss rate", "paths", "accuracy"]
-    head = [*kinds, "protocol, or the choice that is made otherwise", *metrics]
+    head = [*kinds, "protocol, or the choice that is changed", *metrics]
     lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     for kind, given in samples.items():
         every = list(given)
@@ -201,7 +201,7 @@ def _motion_cells(result: MotionResult) -> list[str]:
 
 
 def detection_variants() -> dict[str, dict[str, object]]:
-    """Choices of the released protocol made otherwise, one at a time; those of the truth are in `release_detection`."""
+    """Choices of the released protocol, changed one at a time; those of the truth are in `release_detection`."""
     return {
         "single_precision": {"single_precision": False},
         "unknown_velocity_is_zero": {"unknown_velocity_is_zero": False},
@@ -227,7 +227,7 @@ def detection_variants() -> dict[str, dict[str, object]]:
 
 
 def golden_detection() -> str:
-    """The golden detections (e_detection) through `released`, each choice made otherwise, and the other protocols."""
+    """The golden detections (e_detection) through `released`, each choice changed, and the other protocols."""
     from parity.test_detection import frames
 
     def evaluate(protocol: DetectionProtocol) -> DetectionResult:

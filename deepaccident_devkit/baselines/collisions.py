@@ -33,7 +33,7 @@ def accidents_ahead(outlook: Outlook, horizon: float, danger_distance: float = D
     distance. Who stands beside somebody who stands, or is as near already and comes no nearer, is in no danger; nor are
     two pedestrians, and who drives up to somebody straight ahead brakes: at constant velocity every queue would be an
     accident. The score is (1 − least gap / danger distance) / (1 + seconds to that moment): 1 for two that touch now.
-    Whoever comes later to the place of an accident finds other conditions, so of alarms within 10 m the surest is kept.
+    Later the place of an accident is no longer the same, so of alarms within 10 m the surest is kept.
 
     Args:
         outlook: who is known, and how they go on.

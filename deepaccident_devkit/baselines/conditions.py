@@ -22,7 +22,7 @@ _QUICK_STEPS: Final = (0.0, 0.2, 0.5)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Condition:
-    """What is told apart in the study's tables.
+    """What the study's tables distinguish.
 
     Attributes:
         agents: name of the configuration, of `v2x.AGENT_CONFIGS`.
@@ -62,7 +62,7 @@ class TablePlan:
         name: also of its files.
         title: for people.
         varied: which fields of the conditions differ beside the agents.
-        by: the attributes that its samples are told apart by, one after the other; `all` for all of them together.
+        by: the attributes by which its samples are split, one after the other; `all` for all of them together.
         conditions: in the order of its rows.
     """
 

@@ -30,7 +30,7 @@ from deepaccident_devkit.taxonomy import LIDAR
 _BATCH: Final = 4
 """Samples that a worker counts before it reports."""
 _DETECTION: Final = "paper"
-"""The protocol of detections: what any agent sees is to be found, whoever cooperates, so that rows compare."""
+"""The protocol of detections: all that any agent sees must be found in every row, so that rows compare."""
 
 
 def drawn(token: str, seed: int) -> str:

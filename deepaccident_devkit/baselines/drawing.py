@@ -1,7 +1,7 @@
-"""Instance maps of an outlook, drawn as labels are, so that who foresees everything scores 100.
+"""Instance maps of an outlook, rasterised as labels are, so that a perfect outlook scores 100.
 
-Labels are drawn at every moment in the ego frame of that moment and warped to the present. So the expected boxes are
-put into the ego frames that the ego expects for itself, and go through the labels' own drawing and warps.
+Labels are rasterised at every moment in the ego frame of that moment and warped to the present. So the expected boxes
+are put into the ego frames that the ego expects for itself, and go through the labels' own rasteriser and warps.
 """
 
 from __future__ import annotations

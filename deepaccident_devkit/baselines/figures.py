@@ -1,4 +1,4 @@
-"""The study's figures, drawn into files."""
+"""The study's figures, rendered into files."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _EVERYONE: Final = "all samples"
 
 
 def save_study(study: V2XStudy, folder: str | os.PathLike[str]) -> list[Path]:
-    """Draw each table of a study into `<name>.png`, over those that are there; returns their paths. Raises OSError."""
+    """Render each table of a study into `<name>.png`, over those that exist. Returns their paths."""
     paths = []
     for table in study.tables.values():
         paths.append(Path(folder) / f"{table.name}.png")
@@ -25,7 +25,7 @@ def save_study(study: V2XStudy, folder: str | os.PathLike[str]) -> list[Path]:
 
 
 def study_panels(table: StudyTable) -> list[list[Panel]]:
-    """What is drawn of a table: a panel a metric; of several horizons, a row of panels each."""
+    """What is rendered of a table: a panel a metric; of several horizons, a row of panels each."""
     swept = next((name for name in table.by if name in _XLABELS), None)
     horizons = sorted({row.horizon for row in table.rows})
     result = []

@@ -31,7 +31,7 @@ def predict_motion(
     link: Link | None = None,
     config: MotionLabelConfig | None = None,
 ) -> MotionOutput:
-    """The instance maps that some agents expect, one prediction, drawn as the labels that `config` describes.
+    """The instance maps that some agents expect, one prediction, rasterised as the labels that `config` describes.
 
     Args:
         dataset: the release.

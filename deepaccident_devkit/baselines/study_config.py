@@ -20,8 +20,8 @@ class StudyConfig:
     """How a study is made.
 
     Attributes:
-        egos: agents whose samples are taken, kept as a tuple. The released evaluation takes all five agents'; but to
-            the pole a single vehicle is none, and the vehicles of both sides show an accident twice: so it is one here.
+        egos: agents whose samples are taken, kept as a tuple. The released evaluation takes all five agents. But
+            the infrastructure is no vehicle, and the vehicles of both sides show an accident twice: so it is one here.
         scope: `accident` for scenarios that were designed to end in one, `all` for normal ones too.
         model: how actors go on.
         protocol: of the accidents that are read off maps: `released`, `paper` or `boxes`. Those named explicitly are

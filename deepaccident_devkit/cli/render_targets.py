@@ -1,4 +1,4 @@
-"""Which rows `deepaccident render` draws, and into which files."""
+"""Which rows `deepaccident render` renders, and into which files."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,11 +20,11 @@ _CAMERA = "Camera_Front"
 
 
 def rows_to_draw(dataset: Dataset, table: str, tokens: Sequence[str], frames: range | None) -> list[str]:
-    """The tokens of a table's rows that a verb draws.
+    """The tokens of a table's rows that a verb renders.
 
     Args:
         dataset: the release.
-        table: what the verb draws.
+        table: what the verb renders.
         tokens: of rows of this table, or of scenarios: their first agent at some of their frames, and there the actor
             that it collides with. None at all stands for the first accident.
         frames: numbers of scenarios' frames; None for one second before their end.
@@ -36,7 +36,7 @@ def rows_to_draw(dataset: Dataset, table: str, tokens: Sequence[str], frames: ra
         click.UsageError: `frames` are given for what is no moment of a scenario.
     """
     if frames is not None and table in ("scenario", "instance"):
-        raise click.UsageError(f"--frame-range is for moments; a whole {table} is drawn, leave it out")
+        raise click.UsageError(f"--frame-range is for moments; a whole {table} is rendered, leave it out")
     rows: list[str] = []
     for token in tokens or [first_accident(dataset)]:
         if token.count("/") == 1:

@@ -65,7 +65,7 @@ class BevGrid:
         return math.prod(self._counts)
 
     def with_orientation(self, orientation: Orientation) -> BevGrid:
-        """The same cells, lying otherwise in an array. Raises ChoiceError."""
+        """The same cells, in another order in an array. Raises ChoiceError."""
         if orientation in ORIENTATIONS:
             return _with_orientation(self, orientation)
         return replace(self, orientation=orientation)  # which refuses it

@@ -37,7 +37,7 @@ class Box:
 
     @property
     def frame(self) -> str:
-        """The frame that center, orientation and velocity are in."""
+        """The frame that centre, orientation and velocity are in."""
         return self._boxes.frame
 
     @property
@@ -111,7 +111,7 @@ class Box:
         return self.transform(moved, self.frame)
 
     def rotate(self, quaternion: Quaternion) -> Box:
-        """A new box turned about its frame's origin: center, orientation and velocity."""
+        """A new box turned about its frame's origin: centre, orientation and velocity."""
         return self.transform(SE3.from_quaternion(quaternion), self.frame)
 
     def transform(self, target_from_source: SE3, frame: str) -> Box:

@@ -102,7 +102,7 @@ class Boxes(FrozenArrays):
         category: ArrayLike | None = None,
         **columns: ArrayLike,
     ) -> Boxes:
-        """Boxes that stand upright in `frame`: centers (N, 3), sizes (N, 3), yaw (N,) radians.
+        """Boxes that stand upright in `frame`: centres (N, 3), sizes (N, 3), yaw (N,) radians.
 
         `category` holds indices or names; the other columns default to what is not known (velocity NaN, id −1,
         no points, not visible).
@@ -159,7 +159,7 @@ class Boxes(FrozenArrays):
         return trusted_boxes(self.frame, columns)
 
     def transform(self, target_from_source: SE3, frame: str) -> Boxes:
-        """The same boxes in another frame: centers, rotations and velocities move, sizes stay. Raises GeometryError."""
+        """The same boxes in another frame: sizes stay. Raises GeometryError."""
         checked_transform("target_from_source", target_from_source)
         checked_frame("frame", frame)
         turn = target_from_source.rotation
@@ -338,7 +338,7 @@ def _check_numbers(columns: dict[str, AnyArray]) -> None:
 
 
 def _unit(rotation: FloatArray) -> FloatArray:
-    """The quaternions (N, 4), which must be unit ones but for rounding."""
+    """The quaternions (N, 4), which must be unit ones, apart from rounding."""
     norm = np.linalg.norm(rotation, axis=1)
     off = np.abs(norm - 1)
     if (off > _UNIT_TOLERANCE).any():

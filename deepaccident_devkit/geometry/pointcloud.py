@@ -36,7 +36,7 @@ _FAULTS = (*DAMAGED_ARCHIVE, TypeError, AttributeError)  # the last two: a bare 
 class LidarPointCloud(FrozenArrays):
     """N points in one right-handed frame; arrays are read-only views.
 
-    Clouds are large, so arrays of the right type are not copied: whoever changes their own array changes the cloud.
+    Clouds are large, so arrays of the right type are not copied: a change of the caller's array changes the cloud.
 
     Attributes:
         xyz: (N, 3) float64, metres.

@@ -17,7 +17,7 @@ def points_in_boxes(
 ) -> tuple[IntArray, IntArray]:
     """Every pair of a box and a point in it, faces included: rows of boxes (K,) and rows of points (K,).
 
-    A point p is in a box if |(p − center) · a| ≤ half for each of its three axes a, the products summed as
+    A point p is in a box if |(p − centre) · a| ≤ half for each of its three axes a, the products summed as
     (x + y) + z. Grid and windows only leave out points that cannot be inside, so the answer is that rule's to the bit.
     NaN lies in no box. Pairs ascend by box, then by point.
 

@@ -237,7 +237,7 @@ def inverses(matrix: AnyArray) -> AnyArray:
     try:
         result[..., :3, :3] = turned_back = np.linalg.inv(matrix[..., :3, :3])
     except np.linalg.LinAlgError:
-        raise GeometryError("a transform has no inverse: its rotation is none") from None
+        raise GeometryError("a transform has no inverse: its rotation is no rotation") from None
     result[..., :3, 3] = -(turned_back @ matrix[..., :3, 3, None])[..., 0]
     result[..., 3, 3] = 1
     return result

@@ -5,7 +5,7 @@ The way of a label, from a release to a model, and of a model's outputs to insta
 | step | from → to | where |
 |---|---|---|
 | what a sample shows | tables → `FrameBoxes`, ego motion | `sample_labels` (and `sample_lists`: which samples) |
-| who is drawn, and where | boxes → `FramePolygons` | `drawing.box_polygons` |
+| who is rasterised, and where | boxes → `FramePolygons` | `drawing.box_polygons` |
 | which cells those are | polygons → cells | `drawing.polygon_fill` |
 | ids, centres, flow | cells → centres here and at the next frame | `drawing.from_boxes` |
 | maps | cells and centres → `MotionLabels` | `drawing.label_maps`, `labels` |
@@ -16,7 +16,7 @@ The way of a label, from a release to a model, and of a model's outputs to insta
 | the same id in all frames | instances → `LinkedInstances` | `postprocessing.linking`, `postprocessing.predict` |
 | boxes along the paths | linked instances → their redrawn maps | `postprocessing.redrawing` |
 
-What is drawn is said by a `MotionLabelConfig` (`config`), how by a `LabelProtocol` (`protocols`: every slip of the
+A `MotionLabelConfig` (`config`) says what is rasterised, a `LabelProtocol` how (`protocols`: every quirk of the
 released code a switch), how cells lie by a grid's orientation (`orientations`). `warps.feature_warps` moves a model's
 own maps as labels are moved.
 """

@@ -79,7 +79,7 @@ def bev_segmentation(
 
     Raises:
         TokenError: no such sample.
-        ConfigError: a class in `coverage` does not exist, or its share is none.
+        ConfigError: a class in `coverage` does not exist, or its share is not in [0, 1].
         MissingFileError: the BEV camera's file was not downloaded (the test split has none).
         SensorFileError: it cannot be read.
     """

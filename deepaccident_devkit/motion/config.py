@@ -1,4 +1,4 @@
-"""`MotionLabelConfig`: what labels are drawn of, how far and how, with the presets that papers name."""
+"""`MotionLabelConfig`: what labels show, how far and how, with the presets that papers name."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ class MotionLabelConfig:
         future_frames: frames after the present that labels show.
         step: recorded frames (0.1 s) from one label frame to the next; 5 is 2 Hz.
         only_vehicle: leave out pedestrians (two-wheelers are vehicles, as in all three codes).
-        filter_invisible: draw only what the cooperating agents see by the released rule (docs/released_code.md,
+        filter_invisible: rasterise only what the cooperating agents see by the released rule (docs/released_code.md,
             Visibility and attributes).
-        agents: whose sight counts; None for all that are there, whoever cooperates: the released way. Names are kept
+        agents: whose sight counts; None for all that are there, which is the released way. Names are kept
             as a tuple.
-        draw_ego: draw the ego's own box (the roadside pole has none).
+        draw_ego: rasterise the ego's own box (the infrastructure has none).
         ignore_index: what stands in offset and flow beside instances, and in missing frames where they are ignored:
             255, or any number from the grid's longer side on, in cells, which no vector can have.
         orientation: a word to the constructor: the orientation that `grid` is laid out in, None for its own. The grid

@@ -67,7 +67,7 @@ def write_label_files(
     """Write the motion labels of samples into a folder, one file a scenario and agent.
 
     Files are whole or absent. A call that was broken off goes on where it stopped; samples may be added later; what
-    the release changed in the meantime is written anew.
+    the release changed in the meantime is written again.
 
     Args:
         dataset: the release.
@@ -108,7 +108,7 @@ class LabelFiles(Mapping[str, MotionLabels]):
     """Motion labels in a folder, by sample token; a read takes some milliseconds.
 
     Cheap to pickle, and safe in threads and in forked workers: each process opens its own files, a few at a time. What
-    is added to the folder later is seen by who opens it anew.
+    is added to the folder later is seen when it is opened again.
     """
 
     def __init__(self, folder: str | os.PathLike[str], config: MotionLabelConfig | str | None = None) -> None:
@@ -230,7 +230,7 @@ def _source(task: _Task) -> str:
 
 
 def _scenario_arrays(dataset: Dataset, scenario: str) -> Iterator[AnyArray]:
-    """What the tables hold of a scenario that labels are drawn from, of all agents."""
+    """What the tables hold of a scenario that labels are made from, of all agents."""
     row, samples = dataset.getind("scenario", scenario), dataset.columns("sample")
     first, last = samples["scenario_row"].searchsorted((row, row + 1))
     yield dataset.columns("ego_pose")["matrix"][first:last]
@@ -264,7 +264,7 @@ def _by_recording(dataset: Dataset, tokens: Iterable[RowArgument]) -> dict[str, 
         row = dataset.getind("sample", given)
         token = given if isinstance(given, str) else given["token"]
         if not labelled[row]:
-            raise NotAvailableError(f"{token} has no label to draw (the test split ships without them)")
+            raise NotAvailableError(f"{token} has no label (the test split ships without them)")
         recording, number = _parts(token)
         found.setdefault(recording, set()).add(number)
     if not found:

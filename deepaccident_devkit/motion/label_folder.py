@@ -82,7 +82,7 @@ class Manifest:
             if isinstance(error, LabelFilesError):
                 raise
             raise LabelFilesError(
-                f"{path}: cannot be read ({error}); make the labels anew in an empty folder"
+                f"{path}: cannot be read ({error}); make the labels again in an empty folder"
             ) from error
         return cls(config, samples)
 
@@ -186,7 +186,7 @@ def _check_version(path: Path, form: object, version: object) -> None:
         )
         raise LabelFilesError(
             f"{path}: {kind} devkit's labels (format version {version}, this devkit's is {FORMAT_VERSION}); {remedy} "
-            "make the labels anew in an empty folder"
+            "make the labels again in an empty folder"
         )
 
 

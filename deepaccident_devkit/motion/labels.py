@@ -29,8 +29,8 @@ class MotionLabels(FrozenArrays):
     Attributes:
         config: how they were made.
         segmentation: (T, H, W) uint8: 1 where an actor is, 0 elsewhere.
-        instance: (T, H, W) int32: ids from 1 in the order drawn, 0 elsewhere. Missing frames that a protocol ignores
-            are all `ignore_index`, which is also an id where so many are drawn: `label_valid` tells which it is.
+        instance: (T, H, W) int32: ids from 1 in the order rasterised, 0 elsewhere. Missing frames that a protocol
+            ignores are all `ignore_index`, which can also be an id: `label_valid` tells which it is.
         centerness: (T, 1, H, W) float32 in [0, 1].
         offset: (T, 2, H, W) float32, cells (down the rows, along the columns) from a cell to its instance's centre;
             `ignore_index` elsewhere.

@@ -1,4 +1,4 @@
-"""The same maps lying otherwise: cells change places, and what offset and flow say along rows and columns with them.
+"""The same maps in another orientation: cells change places, and the channels of offset and flow with them.
 
 The devkit's orientation is the hub: `released` has its rows in reverse order, so that what points down the rows
 changes its sign; `fiery` is its transpose, so that rows and columns, and the two channels, change places.

@@ -1,4 +1,4 @@
-"""What the released label code does otherwise than one would, each slip by its name."""
+"""The quirks of the released label code, each by its name."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LabelProtocol:
-    """How labels are drawn and warped; a flag is True where the released code's slip is kept.
+    """How labels are rasterised and warped; a flag is True where the released code's quirk is kept.
 
     Change one with `dataclasses.replace(LABEL_PROTOCOLS["released"], half_cell_shift=False)`. Sources:
     docs/released_code.md, Motion labels, Warps, and FIERY's own labels.
@@ -31,17 +31,17 @@ class LabelProtocol:
     Attributes:
         own_box_moved_twice: the ego's own row is taken to the ego frame twice, with the released box constructor
             between; else once.
-        own_box_default: where not exactly one row is the ego's own, a box of 3.99 m x 1.85 m at the LiDAR is drawn in
-            its place; else the first own row is drawn, and none if there is none.
+        own_box_default: where not exactly one row is the ego's own, a box of 3.99 m x 1.85 m at the LiDAR is rasterised
+            in its place; else the first own row is rasterised, if there is one.
         own_box_not_augmented: an augmentation moves all boxes but the ego's own.
         half_cell_shift: the corners of boxes are rounded to the nearest *edge* between cells, so that boxes lie half a
             cell too far along both axes; else to the cell that they lie in.
-        drawn_when: which of the actors that somebody sees are drawn at a frame: those seen at the `present` frame and
-            no others (released: who appears later never is), those seen at that frame or `since` the present at an
+        drawn_when: which of the actors that somebody sees are rasterised at a frame: those seen at the `present` frame
+            and no others (released: who appears later never is), those seen at that frame or `since` the present at an
             earlier one, or those seen `now`, at that frame (FIERY and BEVerse).
-        untracked_share_an_id: all untracked rows (−1), where they are drawn at all, are one instance; else each row
-            of each frame is one of its own.
-        missing_frames_are_empty: a frame beyond the recording is all zeros, as though nobody were there (offset and
+        untracked_share_an_id: all untracked rows (−1), where they are rasterised at all, are one instance; else each
+            row of each frame is one of its own.
+        missing_frames_are_empty: a frame beyond the recording is all zeros, as if nobody were there (offset and
             flow 255); else it is all `ignore_index`.
         outside_is_zero: what a warp brings in from outside the grid is 0 in every map; else 0 in segmentation,
             instance and centerness, and `ignore_index` in offset and flow.
@@ -86,7 +86,7 @@ class LabelProtocol:
 
     @property
     def place_in_cell(self) -> tuple[float, float]:
-        """The point that the middle of what is drawn at a cell stands for, in cells along x and y from its low corner.
+        """The point for which a rasterised cell stands, in cells along x and y from its low corner.
 
         With `half_cell_shift` it is the corner that the native orientation counts the cell from.
         """
@@ -131,7 +131,7 @@ LABEL_PROTOCOLS: Final[Mapping[str, LabelProtocol]] = MappingProxyType(
         "fiery": _FIERY,
     }
 )
-"""By name: the released code, that without its slips, and the two codes that it comes from."""
+"""By name: the released code, the same without its quirks, and the two codes that it comes from."""
 
 
 def label_protocol(protocol: str | LabelProtocol) -> LabelProtocol:

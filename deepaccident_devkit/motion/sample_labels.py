@@ -1,6 +1,6 @@
 """Motion labels of a sample of a release: what the tables hold, gathered for `motion_labels_from_boxes`.
 
-The columns are read as they are, all frames at once: records and `Boxes` would cost as much as the drawing.
+The columns are read as they are, all frames at once: records and `Boxes` would cost as much as rasterising.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def motion_labels(
     """The motion labels of a sample, each frame in its own ego frame; `MotionLabels.to_present` warps them.
 
     The agent's own row (−100) shows only as the ego's own box, and not at all with `draw_ego=False`. So it is in the
-    released code too, where nobody ever sees that row; but with `filter_invisible=False` that code would draw it
+    released code too, where nobody ever sees that row; but with `filter_invisible=False` that code would rasterise it
     again, over the ego's box and under an id of its own. Here it does not.
 
     Args:
@@ -57,7 +57,7 @@ def motion_labels(
     row, samples = dataset.getind("sample", sample), dataset.columns("sample")
     if not samples["labelled"][row]:
         token = dataset.sample[row]["token"]
-        raise NotAvailableError(f"{token} has no label to draw (the test split ships without them)")
+        raise NotAvailableError(f"{token} has no label (the test split ships without them)")
     length = dataset.columns("scenario")["num_frames"].item(samples["scenario_row"].item(row))
     first_row = dataset.columns("agent")["first_sample_row"].item(samples["agent_row"].item(row))
     present = row - first_row

@@ -1,4 +1,4 @@
-"""The bytes and lines of the release's small files, with our errors where they cannot be had."""
+"""The bytes and lines of the release's small files, with the devkit's errors if they cannot be read."""
 
 import os
 from pathlib import Path
@@ -35,7 +35,7 @@ def read_content(path: Path, fault: type[ReleaseError], remedy: str) -> bytes:
 
 
 def check_regular(path: Path, fault: type[ReleaseError], remedy: str) -> None:
-    """Refuse what is no regular file, for readers that open by themselves; what is not there is left to them."""
+    """Refuse what is no regular file, for readers that open files themselves; they report a missing file."""
     try:
         irregular = irregular_text(path.stat().st_mode)
     except OSError:

@@ -1,8 +1,8 @@
 """A restricted unpickler: dicts of numeric numpy arrays, and nothing that a pickle could run.
 
 A pickle is a program. This one may name only what numpy's own array pickles name (numpy 1 and 2, protocols 0 to 5),
-and what it gets under those names are stand-ins of ours: they take down what the array is made of, import nothing,
-and keep no attribute that a pickle tries to give them. The arrays are made from those notes afterwards.
+and under those names it gets the devkit's stand-ins: they note what the array is made of, import nothing, and keep
+no attribute that a pickle tries to set. The arrays are made from those notes afterwards.
 """
 
 import io
@@ -16,7 +16,7 @@ import numpy as np
 from deepaccident_devkit.arrays import AnyArray
 
 _PLAIN_NUMBER = re.compile(r"[<>=|]?[fiub][1-9][0-9]?", re.ASCII)
-"""The only dtypes there are: numpy itself would evaluate what else a string may say."""
+"""The only dtypes allowed: numpy itself would evaluate other strings."""
 UNPICKLE_FAULTS = (
     pickle.UnpicklingError,
     AttributeError,
@@ -30,7 +30,7 @@ UNPICKLE_FAULTS = (
     TypeError,
     ValueError,
 )
-"""What unpickling damaged or hostile bytes can raise."""
+"""The errors that damaged or hostile bytes can raise."""
 
 
 def load_arrays(content: bytes) -> Any:
@@ -68,7 +68,7 @@ class _DtypeNotes:
         self.dtype: np.dtype[Any] = np.dtype(text)
 
     def __setstate__(self, state: Sequence[Any]) -> None:
-        """Of the state numpy writes, take the byte order."""
+        """Take the byte order from the state that numpy writes."""
         self.dtype = self.dtype.newbyteorder(state[1])
 
 

@@ -127,7 +127,7 @@ def write_calib(path: Path, calib: Calib) -> None:
 
 
 def write_raw_calib(path: Path, raw: Mapping[str, AnyArray]) -> None:
-    """Write a file's own dict, as `read_calib(raw=True)` returns it; whether it is one that can be read is not checked.
+    """Write a file's own dict, as `read_calib(raw=True)` returns it; it is not checked that this can be read again.
 
     Old numpy versions can read it too.
     """
@@ -190,7 +190,7 @@ def _converted(paths: Sequence[Path], files: Sequence[Mapping[str, AnyArray]]) -
 
 
 def _surely_rigid(poses: FloatArray) -> BoolArray:
-    """Which transforms (…, 4, 4) are beyond doubt; the others get a closer look, and a sentence."""
+    """Which transforms (…, 4, 4) are certainly rigid; the others are checked one by one."""
     turns = poses[..., :3, :3]
     with np.errstate(invalid="ignore", over="ignore"):
         off = np.abs(turns @ np.swapaxes(turns, -1, -2) - np.eye(3)).max(axis=(-1, -2))

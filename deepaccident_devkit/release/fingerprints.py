@@ -1,4 +1,4 @@
-"""Hashes of what truth is made of: the bytes of a scenario's label, meta and calib files, as the release has them."""
+"""Hashes of the truth: the bytes of a scenario's label, meta and calib files, as they are in the release."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class ScenarioHashes:
 
 
 class Located(Protocol):
-    """What says where a release is, such as a `Dataset`."""
+    """An object that knows where a release is, such as a `Dataset`."""
 
     @property
     def dataroot(self) -> Path:
@@ -53,7 +53,7 @@ class Located(Protocol):
 def scenario_hashes(
     dataset: Located, scenarios: Collection[str], *, workers: int | None = None
 ) -> dict[str, ScenarioHashes]:
-    """The hashes of some scenarios' files, by token in order; those that the release has not are left out.
+    """The hashes of some scenarios' files, by token in order; those that are not in the release are left out.
 
     Reads the files themselves and not the index, which does not notice a file that was edited in place.
 
@@ -77,7 +77,7 @@ def fingerprint(hashes: Mapping[str, ScenarioHashes]) -> str:
 
 
 def digest_of(value: Any) -> str:
-    """A hash of what JSON can hold, whatever the order of its names."""
+    """A hash of a JSON value; the order of names does not matter."""
     text = json.dumps(value, sort_keys=True, separators=(",", ":"))
     return hashlib.blake2b(text.encode(), digest_size=_DIGEST_BYTES).hexdigest()
 

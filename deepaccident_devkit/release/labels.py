@@ -1,7 +1,7 @@
 """`label/*.txt`: the boxes that one agent annotated at one frame (docs/format.md, Label).
 
-Files are parsed in bulk: the bodies of many files are joined and go through Arrow's CSV reader in one call. What that
-call does not take (CRLF, blanks at line ends, one-token lines, faults) is tidied or named file by file.
+Files are parsed in bulk: the bodies of many files are joined and go through Arrow's CSV reader in one call. Files that
+this call cannot read (CRLF, blanks at line ends, one-token lines, faults) are tidied, or their fault is named.
 """
 
 import codecs
@@ -183,7 +183,7 @@ def _words(numbers: Iterable[float]) -> str:
 
 
 def _parse_batches(batches: Sequence[Sequence[Path]]) -> list[dict[str, AnyArray]]:
-    """Parse every batch: where there are several, this thread reads files while others parse what it has read."""
+    """Parse every batch: of several, this thread reads files while other threads parse."""
     if len(batches) < 2:
         return [_parse_files(batch, [_content(path) for path in batch]) for batch in batches]
     from concurrent.futures import ThreadPoolExecutor

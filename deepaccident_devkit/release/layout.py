@@ -75,7 +75,7 @@ class ScenarioFolder:
 
 @dataclass(frozen=True, slots=True)
 class ReleaseLayout:
-    """What lies under a dataroot, as far as folder names tell.
+    """What lies under a dataroot, by the names of folders.
 
     Attributes:
         root: the dataroot.
@@ -132,7 +132,7 @@ def _is_unicode(path: Path) -> bool:
 
 
 def frame_numbers(folder: Path, ending: str) -> tuple[list[int], list[str]]:
-    """The frame numbers of a folder's files, ascending, and the names that end so but carry no frame number.
+    """The frame numbers of a folder's files, ascending, and the names with that ending but without a frame number.
 
     A folder that is not there has none.
 
@@ -193,7 +193,7 @@ def _scenarios_in(root: Path, folder: str) -> Iterator[ScenarioFolder]:
         for agent in AGENTS:
             try:
                 names = _subfolders(root / folder / scenario_type / agent / "calib")
-            except DatarootError as error:  # the scenarios that other agents name tell it each, when they are read
+            except DatarootError as error:  # scenarios that other agents name report this themselves when they are read
                 closed, names = error, []
             for name in names:
                 agents_of.setdefault(name, []).append(agent)
@@ -204,7 +204,7 @@ def _scenarios_in(root: Path, folder: str) -> Iterator[ScenarioFolder]:
 
 
 def _subfolders(folder: Path) -> list[str]:
-    """The folders in a folder; none where a file stands in the way, which `frame_numbers` tells of each scenario."""
+    """The folders in a folder; none where a file is in the way, which `frame_numbers` reports for each scenario."""
     try:
         entries = _entries(folder)
     except DatarootError as error:

@@ -51,8 +51,8 @@ class Meta:
         spawn_side: where the other vehicle comes from: `left`, `right` or `opposite…`.
         ego_direction: `straight`, `left` or `right`.
         other_direction: likewise.
-        planned_agents: of a scenario that ended without a collision, the pair that `colliding agents:` names all the
-            same: those who were to collide. None if it names nobody, or if there was a collision.
+        planned_agents: of a scenario without a collision, the pair that `colliding agents:` names nevertheless: the
+            two that should have collided. None if it names nobody, or if there was a collision.
     """
 
     weather: str

@@ -21,7 +21,7 @@ _REMEDY = "restore the file from its archive"
 
 
 def read_npz(path: Path) -> AnyArray:
-    """The array under `data`, or the only one there is.
+    """The array under `data`, or the only one in the file.
 
     Raises:
         MissingFileError: there is no such file.

@@ -21,7 +21,7 @@ def read_split_file(path: Path, *, raw: bool = False, unique: bool = False) -> l
     Args:
         path: the file.
         raw: return the words of every non-blank line instead, repeated lines included.
-        unique: take a scenario that stands in two lines as a fault, not once.
+        unique: a scenario in two lines is an error; if not set, it counts once.
 
     Raises:
         MissingFileError: there is no such file.

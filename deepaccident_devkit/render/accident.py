@@ -53,7 +53,7 @@ def render_accident(
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Draw the countdown to an accident: a column a moment, a row an agent, and the pair from above at the bottom.
+    """Render the countdown to an accident: a column a moment, a row an agent, and the pair from above at the bottom.
 
     Each agent has the image of its camera that sees the colliding pair best (the front one where none does). From above
     there is the place of contact (a cross), the pair's speeds, and where they came from and go to until they meet.
@@ -65,10 +65,10 @@ def render_accident(
         agents: whose images; None for all that are there, and an empty list for none.
         layers: `image`, `boxes`, `trajectories` and `grid` are the default; also `points` (of the LiDAR, in images),
             `ids` and `velocities`. Without `image` no image file is read.
-        fig: an empty figure to draw on; a new one if None.
+        fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure drawn on; its title says who hits whom, how fast and at which angle.
+        The figure; its title says who hits whom, how fast and at which angle.
 
     Raises:
         TokenError: no such scenario.
@@ -106,7 +106,7 @@ def render_accident(
 def draw_countdown(
     dataset: Dataset, frame: str, agents: Sequence[str], layers: Collection[Layer] | None, fig: Figure
 ) -> None:
-    """Draw a moment of an accident: five cameras, the place of contact from above, the speeds of the pair.
+    """Render a moment of an accident: five cameras, the place of contact from above, the speeds of the pair.
 
     Each agent's camera is the one that shows the pair best shortly before the impact, in all moments.
 
@@ -115,7 +115,7 @@ def draw_countdown(
         frame: token.
         agents: whose cameras are shown.
         layers: of `render_accident`; None for its default.
-        fig: an empty figure to draw on, about 16 to 9.
+        fig: an empty figure to render on, about 16 to 9.
 
     Raises:
         NotAvailableError: nobody collides in the scenario, or it has no meta.
@@ -216,7 +216,7 @@ def _draw_contact(
     *,
     near: float = _NEAR,
 ) -> None:
-    """Draw the moment of a sample (a token) around the place of contact, in world: of the layers `shown` its own."""
+    """Render the moment of a sample (a token) around the place of contact, in world: of the layers `shown` its own."""
     record, index = dataset.get("sample", sample), int(sample.rsplit("/", 1)[1])
     x, y = contact.point[:2].tolist()
     ax.set(xlim=(x - near, x + near), ylim=(y - near, y + near), aspect="equal")
@@ -259,7 +259,7 @@ def _draw_camera(dataset: Dataset, camera: str, shown: Collection[Layer], ax: Ax
 
 
 def _draw_speeds(dataset: Dataset, contact: Contact, tracks: ScenarioTracks, index: int, ax: Axes) -> None:
-    """Draw how fast the pair is over the seconds before the impact, up to the present full, then pale."""
+    """Render how fast the pair is over the seconds before the impact, up to the present full, then pale."""
     impact, fastest = int(tracks.index.max()), 1.0
     for actor, instance, dashes in zip(contact.actor_ids, contact.instances, _DASHES, strict=True):
         rows = np.flatnonzero(tracks.actor_id == actor)

@@ -34,18 +34,19 @@ def render_annotation(
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Draw a box in the camera of its agent that shows it largest, from above, and in words.
+    """Render a box in the camera of its agent that shows it largest, from above, and in words.
 
     Args:
         dataset: the release.
         annotation: token or record.
         margin: metres shown from above to each side of the box's centre.
         layers: `image`, `boxes` (this box in the camera, all boxes from above) and, from above, the others of
-            `render_bev`; by default image, bev, points, boxes and grid. Without `boxes` the box itself is drawn alone.
-        fig: an empty figure to draw on; a new one if None.
+            `render_bev`; by default image, bev, points, boxes and grid. Without `boxes` the box itself is rendered
+            alone.
+        fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure drawn on: the camera cut to the box, then the box from above in the agent's ego frame, then words.
+        The figure: the camera cut to the box, then the box from above in the agent's ego frame, then words.
 
     Raises:
         TokenError: no such annotation.
@@ -91,7 +92,7 @@ def _draw_in_camera(
 def draw_view(
     dataset: Dataset, view: BestView, boxes: Boxes, colors: list[str], ax: Axes, *, image: bool = True
 ) -> None:
-    """Draw the part of a best view's image about boxes, in world, and their edges; the title is the camera."""
+    """Render the part of a best view's image about boxes, in world, and their edges; the title is the camera."""
     camera = dataset.get("sample_data", view.camera)
     lens = camera_of(dataset, camera)
     draw_image(dataset, camera, ax, image=image)

@@ -1,4 +1,4 @@
-"""Where panels are drawn: on the caller's axes, or on new ones that a notebook shows."""
+"""Where panels are rendered: on the caller's axes, or on new ones that a notebook shows."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def detached_figure(size: tuple[float, float]) -> Figure:
 
 
 def with_light_grid(ax: Axes, grid: Literal["x", "y", "both"]) -> Axes:
-    """The axes, with a light grid behind what is drawn, and without a frame at the top and right."""
+    """The axes, with a light grid behind what is rendered, and without a frame at the top and right."""
     ax.grid(axis=grid, color=GRID_COLOR, linewidth=0.5)
     ax.set_axisbelow(True)
     ax.spines[["top", "right"]].set_visible(False)
@@ -68,7 +68,7 @@ def settled(fig: Figure) -> Figure:
     """The figure, laid out once.
 
     matplotlib measures the room for titles and legends on panels as they are before it makes their scales equal, so
-    that it takes too little of it; laid out again at drawing, it starts from panels that are nearly right.
+    that it takes too little of it; laid out again at rendering, it starts from panels that are nearly right.
     """
     engine = fig.get_layout_engine() if fig.figure is fig else None  # a part of a figure is laid out with it
     if engine is not None:

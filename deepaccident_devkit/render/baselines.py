@@ -47,7 +47,7 @@ class Panel:
         ylabel: what the results are.
         top: the largest result that there can be.
         xlabel: what is varied: then there are lines; None for bars in groups.
-        intervals: configuration → group, or number varied → (low, high); drawn where there is one.
+        intervals: configuration → group, or number varied → (low, high); rendered where there is one.
     """
 
     values: Mapping[str, Mapping[str | float, float | None]]
@@ -59,14 +59,14 @@ class Panel:
 
 
 def render_panel(panel: Panel, *, ax: Axes | None = None) -> Axes:
-    """Draw a panel.
+    """Render a panel.
 
     Args:
         panel: its numbers.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on.
+        The axes.
     """
     ax = axes_or_new(ax, _PANEL)
     if panel.xlabel is None:
@@ -79,15 +79,15 @@ def render_panel(panel: Panel, *, ax: Axes | None = None) -> Axes:
 
 
 def render_panels(panels: Sequence[Sequence[Panel]], title: str, *, fig: Figure | None = None) -> Figure:
-    """Draw rows of panels under one title, with one legend.
+    """Render rows of panels under one title, with one legend.
 
     Args:
         panels: rows of equal length.
         title: of the figure.
-        fig: an empty figure to draw on; a new one if None.
+        fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure drawn on.
+        The figure.
     """
     fig = figure_or_new(fig, _size(panels))
     axes = fig.subplots(len(panels), len(panels[0]), squeeze=False)
@@ -101,7 +101,7 @@ def render_panels(panels: Sequence[Sequence[Panel]], title: str, *, fig: Figure 
 
 
 def save_panels(panels: Sequence[Sequence[Panel]], title: str, path: Path) -> None:
-    """Draw `render_panels` into a PNG file, over the one that is there. Raises OSError."""
+    """Render `render_panels` into a PNG file, over the one that is there. Raises OSError."""
     write_figure(render_panels(panels, title, fig=detached_figure(_size(panels))), path, dpi=_DPI)
 
 

@@ -49,7 +49,7 @@ _MOST_PIXELS: Final = 400
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BevView:
-    """Which part of a moment is drawn from above, and from whose data.
+    """Which part of a moment is rendered from above, and from whose data.
 
     Attributes:
         view_range: metres shown to each side of the agent.
@@ -89,10 +89,10 @@ def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a 
     seconds: tuple[float, float] = (1.0, 3.0),
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw a moment from above: boxes, LiDAR points and more, in one frame, metres.
+    """Render a moment from above: boxes, LiDAR points and more, in one frame, metres.
 
     The colliding pair is red, their companions green, the others coloured by category. The sample's own agent has a
-    dark mark, other agents one in their colour with their name; where several agents' points are drawn, they have
+    dark mark, other agents one in their colour with their name; where several agents' points are rendered, they have
     their agents' colours.
 
     Args:
@@ -100,7 +100,7 @@ def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a 
         sample: token or record: its agent is in the middle, its frame the present.
         view_range: metres shown to each side of the agent.
         agents: whose points and boxes: names of agents, a configuration or its name, or None for all that are there;
-            by default the sample's own agent alone. Several agents' boxes are drawn once an actor.
+            by default the sample's own agent alone. Several agents' boxes are rendered once an actor.
         frame: of the axes: `ego` or `lidar` (forward to the right, left up), or `world`.
         layers: of `bev` (what the agent's BEV camera saw, muted), `points`, `boxes`, `ids`, `velocities` (arrows of a
             second), `trajectories` (past thin, future thick, fading) and `grid`; by default bev, points, boxes, grid.
@@ -108,10 +108,10 @@ def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a 
         link: what happens to the partners' data; None for nothing.
         sweeps: how many frames of points, the present included.
         seconds: how far trajectories reach back and ahead.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on, in metres of `frame`.
+        The axes, in metres of `frame`.
 
     Raises:
         TokenError: no such sample.
@@ -135,7 +135,7 @@ def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a 
 def draw_bev(
     dataset: Dataset, sample: RowArgument, view: BevView, layers: frozenset[Layer], ax: Axes
 ) -> frozenset[str]:
-    """Draw a panel of `render_bev`, which says what and when it raises; returns the colours of the boxes drawn."""
+    """Render a panel of `render_bev`, which says what and when it raises; returns the colours of the boxes rendered."""
     record = dataset.sample[dataset.getind("sample", sample)]
     names = cooperating_agents(dataset, record, view.agents)
     target_from_world = dataset.world_from(record, view.frame).inverse()
@@ -224,17 +224,17 @@ def _finish(record: SampleRecord, frame: str, *, grid: bool, ax: Axes) -> None:
 def draw_points_from_above(
     xyz: FloatArray, ax: Axes, *, center: FloatArray, view_range: float, color: str = POINT_COLOR
 ) -> None:
-    """Draw the points (P, 3) within a square of ±`view_range` metres about `center` (2,), all in one colour."""
+    """Render the points (P, 3) within a square of ±`view_range` metres about `center` (2,), all in one colour."""
     near = (np.abs(xyz[:, :2] - center) < view_range).all(axis=1)
     ax.scatter(xyz[near, 0], xyz[near, 1], s=0.6, c=color, linewidths=0, rasterized=True, zorder=1)
 
 
 def draw_underlay(image: BevImage, ax: Axes, *, target_from_ego: SE3, view_range: float) -> None:
-    """Draw a BEV camera's tags at their places in the frame of the axes, metres, up to `view_range` to each side.
+    """Render a BEV camera's tags at their places in the frame of the axes, metres, up to `view_range` to each side.
 
     Args:
         image: of an agent.
-        ax: axes to draw on; its limits stay as they are.
+        ax: axes to render on; its limits stay as they are.
         target_from_ego: from the agent's ego frame into the frame of the axes; its tilt is left out.
         view_range: metres about the agent; a turned picture is cut to a square that the corners reach.
     """

@@ -25,18 +25,18 @@ SMALLEST_TEXT: Final = 7
 
 
 def draw_box(box: Box, ax: Axes, color: str | None = None) -> Axes:
-    """Draw one box from above, in its own frame's x and y, metres, with a line towards its front."""
+    """Render one box from above, in its own frame's x and y, metres, with a line towards its front."""
     chosen = color or CATEGORY_COLORS[box.category]
     _draw_footprints(box.center[None, :2], box.bottom_corners().T[None, :, :2], ax, [chosen], 0.25, {})
     return ax
 
 
 def draw_boxes_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str], *, fill: float = 0.25, **how: Any) -> None:
-    """Draw boxes in their frame's x and y, metres, each with a line towards its front.
+    """Render boxes in their frame's x and y, metres, each with a line towards its front.
 
     Args:
         boxes: in any frame that stands on the ground.
-        ax: axes to draw on.
+        ax: axes to render on.
         colors: a colour a box.
         fill: how opaque the inside is, from 0 to 1.
         how: of the outlines, such as `linestyle` or `linewidths`.
@@ -51,7 +51,7 @@ def draw_ids_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str]) -> None:
 
 
 def draw_velocities_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str]) -> None:
-    """Draw an arrow to where each box with a known velocity would be in a second."""
+    """Render an arrow to where each box with a known velocity would be in a second."""
     moving = _moving(boxes)
     if moving.any():
         center, velocity = boxes.center[moving], boxes.velocity[moving]
@@ -61,7 +61,7 @@ def draw_velocities_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str]) ->
 
 
 def draw_actors_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str], layers: Collection[Layer]) -> None:
-    """Draw those of the layers `boxes`, `velocities` and `ids` that are asked for, as the functions above do."""
+    """Render those of the layers `boxes`, `velocities` and `ids` that are asked for, as the functions above do."""
     if "boxes" in layers:
         draw_boxes_from_above(boxes, ax, colors)
     if "velocities" in layers:
@@ -71,7 +71,7 @@ def draw_actors_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str], layers
 
 
 def draw_boxes_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Sequence[str]) -> None:
-    """Draw the edges of boxes given in the camera's optical frame, as far as they lie before the camera.
+    """Render the edges of boxes given in the camera's optical frame, as far as they lie before the camera.
 
     The front of a box is filled where all of it is before the camera.
     """
@@ -99,7 +99,7 @@ def draw_ids_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Seq
 
 
 def draw_velocities_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Sequence[str]) -> None:
-    """Draw a line to where the centre of each moving box of the camera's optical frame would be in a second."""
+    """Render a line to where the centre of each moving box of the camera's optical frame would be in a second."""
     from matplotlib.collections import LineCollection
     from matplotlib.colors import to_rgba_array
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 CALIBRATION_LAYERS: Final[tuple[Layer, ...]] = ("image", "points", "boxes", "ids")
 _DEFAULT: Final[tuple[Layer, ...]] = ("image", "points", "boxes")
 _FARTHEST: Final = 60.0
-"""Metres from the camera up to which boxes are drawn: far ones are as small as the error that one looks for."""
+"""Metres from the camera up to which boxes are rendered: far ones are as small as the error that one looks for."""
 _COLUMNS: Final = 3
 
 
@@ -38,21 +38,21 @@ def render_calibration(
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Draw the LiDAR points of all agents and all agents' boxes in camera images, to prove the calibration.
+    """Render the LiDAR points of all agents and all agents' boxes in camera images, to prove the calibration.
 
     Where the transforms are right, the points of each agent, which have its colour, lie on the same kerbs, walls and
     cars as the image's; where an agent's pose or a sensor's place is wrong, its colour is off everywhere. Points and
-    boxes are drawn whatever may stand before them.
+    boxes are rendered whatever may stand before them.
 
     Args:
         dataset: the release.
         frame_or_sample: token or record: of a sample its six cameras, of a frame the front cameras of the agents.
         agents: whose points and boxes (and, of a frame, whose cameras); None for all that are there.
         layers: of `image`, `points`, `boxes` (up to 60 m) and `ids`; by default all but ids.
-        fig: an empty figure to draw on; a new one if None.
+        fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure drawn on, three panels a row.
+        The figure, three panels a row.
 
     Raises:
         TokenError: no such sample or frame.

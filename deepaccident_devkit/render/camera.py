@@ -40,7 +40,7 @@ _HEIGHTS: Final = (-1.0, 6.0)
 def render_sample_data(
     dataset: Dataset, sample_data: RowArgument, *, layers: Iterable[Layer] | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Draw what a sensor recorded: a camera's image, or the LiDAR or the BEV camera from above.
+    """Render what a sensor recorded: a camera's image, or the LiDAR or the BEV camera from above.
 
     Colours of boxes are those of `render_bev`.
 
@@ -51,10 +51,10 @@ def render_sample_data(
             any of the agent's cameras sees, without its own), `ids` and `velocities` (a line of a second); by default
             image and boxes. From above those of `render_bev`; by default points and boxes of the LiDAR, in its frame,
             and the picture and boxes of the BEV camera, in the ego frame.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on: pixels of a camera, else metres.
+        The axes: pixels of a camera, else metres.
 
     Raises:
         TokenError: no such sensor file.
@@ -82,13 +82,13 @@ def render_sample_data(
 
 
 def draw_image(dataset: Dataset, camera: Any, ax: Axes, *, image: bool = True) -> None:
-    """Draw a camera's image in pixels of its calib, without ticks, or leave its place empty.
+    """Render a camera's image in pixels of its calib, without ticks, or leave its place empty.
 
     Args:
         dataset: the release.
         camera: record of its sensor file.
-        ax: axes to draw on.
-        image: whether to draw it.
+        ax: axes to render on.
+        image: whether to render it.
 
     Raises:
         MissingFileError: the image was not downloaded.
@@ -102,22 +102,22 @@ def draw_image(dataset: Dataset, camera: Any, ax: Axes, *, image: bool = True) -
 
 
 def draw_points_in_image(pixels: FloatArray, ax: Axes, *, size: float = 2.0, **colors: Any) -> PathCollection:
-    """Draw points at pixels (P, 2) of an image.
+    """Render points at pixels (P, 2) of an image.
 
     Args:
         pixels: as (u, v), those in the image alone.
-        ax: axes to draw on, in pixels.
+        ax: axes to render on, in pixels.
         size: of a point, in points².
         colors: `color`, one for all; or `c`, a number a point, with `cmap`, `vmin` and `vmax`.
 
     Returns:
-        What was drawn, for a colour bar.
+        What was rendered, for a colour bar.
     """
     return ax.scatter(pixels[:, 0], pixels[:, 1], s=size, linewidths=0, rasterized=True, **colors)
 
 
 def draw_camera_boxes(dataset: Dataset, camera: Any, boxes: Boxes, layers: Collection[Layer], ax: Axes) -> None:
-    """Draw the layers of boxes, given in the optical frame of a camera (a record), in its image."""
+    """Render the layers of boxes, given in the optical frame of a camera (a record), in its image."""
     lens = camera_of(dataset, camera)
     colors = role_colors(dataset, camera["sample_token"], boxes)
     if "boxes" in layers:
@@ -136,7 +136,7 @@ def render_pointcloud_in_image(
     color_by: ColorBy = "depth",
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw a camera's image and LiDAR points upon it, whatever may stand before them.
+    """Render a camera's image and LiDAR points upon it, whatever may stand before them.
 
     Args:
         dataset: the release.
@@ -145,10 +145,10 @@ def render_pointcloud_in_image(
             sample's, and of `color_by="agent"` those of all agents at its moment.
         color_by: `depth` along the camera's axis, up to 50 m; `height` above the ground that the camera's agent is on;
             or `agent`, a colour for each.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on, in pixels.
+        The axes, in pixels.
 
     Raises:
         TokenError: no such sample or sensor file.

@@ -36,12 +36,12 @@ BEV_COLORS: Mapping[str, str] = {
     "vehicle": "#cdd6e6",
     "pedestrian": "#ecd2e4",
 }
-"""CARLA's tags in the BEV camera, muted: boxes are drawn upon it."""
+"""CARLA's tags in the BEV camera, muted: boxes are rendered upon it."""
 GRID_COLOR = "#d0d0d0"
 MUTED_COLOR = "#666666"
 """Words of less weight."""
 TRUE_PLACE_COLOR = "#8a8a8a"
-"""Where something truly is that is drawn elsewhere, too."""
+"""Where something truly is that is rendered elsewhere, too."""
 OUTCOME_COLORS: Mapping[str, str] = {"right": "#1a9850", "false": "#e08a1e", "missed": "#9a9a9a"}
 """What was predicted and is true, what is not true, and what was not predicted."""
 SERIES_COLORS = ("#08306b", "#2f6fde", "#7fb2e5", "#9a9a9a")

@@ -35,7 +35,7 @@ _CROPS: Final = ("first", "second", "third", "fourth")
 _MOSAIC: Final[list[Any]] = [["path", "first", "second"], ["path", "third", "fourth"], ["speed", "points", "seen"]]
 _FRAMES_A_SECOND: Final = round(1 / FRAME_PERIOD)
 _AROUND: Final = 10.0
-"""Metres drawn beyond the path to each side, at least."""
+"""Metres rendered beyond the path to each side, at least."""
 
 
 def render_instance(
@@ -46,7 +46,7 @@ def render_instance(
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Draw an actor over time: its path, how it looks, how fast it is, and who sees it.
+    """Render an actor over time: its path, how it looks, how fast it is, and who sees it.
 
     Args:
         dataset: the release.
@@ -54,10 +54,10 @@ def render_instance(
         agents: whose views are shown, or None for all that are there; a configuration is as seen from the first agent.
         layers: of the path `bev` (what a BEV camera saw, muted), `trajectories` (the path), `boxes` (each second) and
             `grid`; of the camera pictures `image` and `boxes`. By default all.
-        fig: an empty figure to draw on; a new one if None.
+        fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure drawn on: the path in world from above with its seconds and the impact; the largest views of it at
+        The figure: the path in world from above with its seconds and the impact; the largest views of it at
         four moments; below them speed, LiDAR points in its box and who sees it (by the released rule; pale where an
         agent annotated it only), over the time of the recording.
 

@@ -16,12 +16,12 @@ LAYERS: tuple[Layer, ...] = get_args(Layer)
 def layers_of(
     given: Iterable[Layer] | None, default: Iterable[Layer], possible: Collection[Layer] = LAYERS
 ) -> frozenset[Layer]:
-    """The layers to draw.
+    """The layers to render.
 
     Args:
         given: what the caller asked for; one alone may stand without a list. None stands for the default, and nothing
             at all for an empty picture.
-        default: the layers drawn when the caller does not choose.
+        default: the layers rendered when the caller does not choose.
         possible: the layers that the picture has.
 
     Returns:

@@ -40,7 +40,7 @@ def agent_handles(agents: Collection[str]) -> list[Artist]:
 
 
 def draw_legend(where: Any, handles: Sequence[Artist], *, columns: int, **how: Any) -> None:
-    """Draw a small legend below axes or a figure; nothing if it would be empty."""
+    """Render a small legend below axes or a figure; nothing if it would be empty."""
     if handles:
         style = {"fontsize": 7.5, "frameon": False, "handlelength": 1.2, "columnspacing": 1.0, **how}
         where.legend(handles=list(handles), ncols=columns, **style)

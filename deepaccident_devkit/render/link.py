@@ -63,7 +63,7 @@ def render_link(
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Draw what latency, wrong poses and losses do to what partners share with a sample's agent.
+    """Render what latency, wrong poses and losses do to what partners share with a sample's agent.
 
     The first panel has the partners' boxes: dashed where they truly are, in the partner's colour where they arrive,
     with an arrow from one to the other and the metres in the legend. Beside it are the agents' clouds, without the link
@@ -76,10 +76,10 @@ def render_link(
         agents: who cooperates: names, a configuration or its name as seen from the ego; None for all that are there.
         view_range: metres shown to each side of the ego.
         layers: `points`, `boxes` and `grid` are the default; also `ids`. Without `points` there are no clouds.
-        fig: an empty figure to draw on; a new one if None.
+        fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure drawn on, in metres of the sample's ego frame.
+        The figure, in metres of the sample's ego frame.
 
     Raises:
         TokenError: no such sample.
@@ -144,7 +144,7 @@ def _tracked(boxes: Boxes) -> Boxes:
 
 
 def _draw_shared(shared: list[SharedBoxes], shown: frozenset[Layer], ax: Axes) -> list[Artist]:
-    """Draw the partners' boxes on axes; returns what the legend says."""
+    """Render the partners' boxes on axes; returns what the legend says."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

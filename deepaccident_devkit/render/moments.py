@@ -50,19 +50,19 @@ def render_sample(
     link: Link | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Draw a sample: its six cameras as they look, and boxes and LiDAR from above.
+    """Render a sample: its six cameras as they look, and boxes and LiDAR from above.
 
     Args:
         dataset: the release.
         sample: token or record.
-        agents: whose points and boxes are drawn from above (`render_bev`); by default the sample's own agent's.
-        layers: each panel draws those of them that it has: cameras those of `render_sample_data`, the panel from above
-            those of `render_bev`; by default each its own default.
+        agents: whose points and boxes are rendered from above (`render_bev`); by default the sample's own agent's.
+        layers: each panel renders those of them that it has: cameras those of `render_sample_data`, the panel from
+            above those of `render_bev`; by default each its own default.
         link: what happens to the partners' data; None for nothing.
-        fig: an empty figure to draw on; a new one if None.
+        fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure drawn on.
+        The figure.
 
     Raises:
         TokenError: no such sample.
@@ -98,7 +98,7 @@ def render_frame(
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Draw what the agents of a moment see to the front, and each one's boxes and LiDAR from above, side by side.
+    """Render what the agents of a moment see to the front, and each one's boxes and LiDAR from above, side by side.
 
     The colliding pair is red and their companions green, as in the paper.
 
@@ -107,13 +107,13 @@ def render_frame(
         frame: token or record.
         agents: which, or None for all that are there; a configuration is as seen from the first that is there. Their
             order is always that of `taxonomy.AGENTS`.
-        layers: each panel draws those of them that it has: cameras those of `render_sample_data`, panels from above
+        layers: each panel renders those of them that it has: cameras those of `render_sample_data`, panels from above
             those of `render_bev`; by default each its own default.
-        fig: an empty figure to draw on; a new one if None. In a tall one, panels from above reach farther to the left
+        fig: an empty figure to render on; a new one if None. In a tall one, panels from above reach farther to the left
             and right of the agent than the 50 m before and behind it.
 
     Returns:
-        The figure drawn on, a column an agent.
+        The figure, a column an agent.
 
     Raises:
         TokenError: no such frame.
@@ -146,7 +146,7 @@ def render_frame(
 
 
 def panel_layers(layers: Iterable[Layer] | None) -> tuple[frozenset[Layer], frozenset[Layer]]:
-    """What cameras and what panels from above draw of the layers asked for; raises ChoiceError."""
+    """What cameras and what panels from above render of the layers asked for; raises ChoiceError."""
     if layers is None:
         return frozenset(CAMERA_DEFAULT), frozenset(BEV_DEFAULT)
     chosen = layers_of(layers, (), MOMENT_LAYERS)

@@ -42,7 +42,7 @@ def render_motion_labels(
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Draw a sample's motion labels: a column a frame; instances, centerness, offset and flow below each other.
+    """Render a sample's motion labels: a column a frame; instances, centerness, offset and flow below each other.
 
     Args:
         dataset: the release.
@@ -52,10 +52,10 @@ def render_motion_labels(
         style: `maps`, or `trail` for one panel with all frames, the later the paler, and the actors' paths.
         layers: of maps `labels` (the cells), `velocities` (the arrows of the flow), both of which are the default,
             `ids` and `grid`; of a trail `trajectories` in place of `velocities`.
-        fig: an empty figure to draw on; a new one if None.
+        fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure drawn on; `draw_motion_map` and `draw_motion_trail` say what is what.
+        The figure; `draw_motion_map` and `draw_motion_trail` say what is what.
 
     Raises:
         TokenError: no such sample.
@@ -78,17 +78,17 @@ def draw_motion_labels(
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Draw labels as `render_motion_labels` does; actors whose label ids are `marked` are red (the ego itself: −100).
+    """Render labels as `render_motion_labels` does; actors whose label ids are `marked` are red (the ego itself: −100).
 
     Args:
         labels: at the present or each frame in its own ego frame, as they are.
         marked: label ids.
         style: `maps` or `trail`.
         layers: as of `render_motion_labels`.
-        fig: an empty figure to draw on; a new one if None.
+        fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure drawn on.
+        The figure.
 
     Raises:
         ChoiceError: no such style or layer, or a trail of frames that are not at the present.
@@ -107,7 +107,7 @@ def draw_motion_output(
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Draw what a model predicts, as `draw_motion_labels` draws labels; of instance maps only the instances.
+    """Render what a model predicts, as `draw_motion_labels` renders labels; of instance maps only the instances.
 
     Args:
         output: in the present ego frame, in any orientation.
@@ -117,10 +117,10 @@ def draw_motion_output(
         marked: ids of instances that are red.
         style: `maps` or `trail`.
         layers: as of `render_motion_labels`.
-        fig: an empty figure to draw on; a new one if None.
+        fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure drawn on.
+        The figure.
 
     Raises:
         ChoiceError: no such prediction, post-processing, style or layer.
@@ -138,7 +138,7 @@ def draw_motion_map(
     layers: Iterable[Layer] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw one map of one label frame, in metres of the ego frame that it is in: forward to the right, left up.
+    """Render one map of one label frame, in metres of the ego frame that it is in: forward to the right, left up.
 
     Instances have a colour each, which they keep over the frames; `marked` ones are red. The ego's own box has a dark
     edge, and is dark where it is not marked. Colours of offset and flow are directions, paler for shorter vectors, on
@@ -146,15 +146,15 @@ def draw_motion_map(
     frame beyond the recording is grey.
 
     Args:
-        labels: at the present or not; or a prediction, of which the last one is drawn.
+        labels: at the present or not; or a prediction, of which the last one is rendered.
         name: of the map.
         frame: 0 is the present.
         marked: label ids of actors, the ego's own is −100; of a prediction, ids of instances.
         layers: `labels` and `velocities`, which are the default, `ids` and `grid`.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on.
+        The axes.
 
     Raises:
         ChoiceError: no such map, frame or layer.
@@ -174,16 +174,16 @@ def draw_motion_trail(
     layers: Iterable[Layer] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw all frames over each other, the present opaque and on top, later ones the paler; and the actors' paths.
+    """Render all frames over each other, the present opaque and on top, later ones the paler; and the actors' paths.
 
     Args:
-        labels: at the present; or a prediction, of which the last one is drawn.
+        labels: at the present; or a prediction, of which the last one is rendered.
         marked: as of `draw_motion_map`.
         layers: `labels` (the cells) and `trajectories` (from centre to centre), which are the default, `ids`, `grid`.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on, in metres of the present ego frame.
+        The axes, in metres of the present ego frame.
 
     Raises:
         ChoiceError: no such layer, or the frames are not at the present.

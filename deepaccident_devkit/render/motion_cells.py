@@ -1,4 +1,4 @@
-"""How the cells of motion maps are drawn: one map of one frame, all frames as a trail, and what colours mean."""
+"""How the cells of motion maps are rendered: one map of one frame, all frames as a trail, and what colours mean."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PALEST: Final = 0.22
 
 
 def draw_map_of(maps: MotionMaps, name: DrawnMap, frame: int, shown: frozenset[Layer], ax: Axes) -> Axes:
-    """Draw one map of one frame as `draw_motion_map` says; `shown` are its layers."""
+    """Render one map of one frame as `draw_motion_map` says; `shown` are its layers."""
     ax.set(xlim=maps.grid.x[:2], ylim=maps.grid.y[:2], aspect="equal")
     if not maps.valid[frame]:
         ax.set_facecolor(BEYOND_COLOR)
@@ -34,7 +34,7 @@ def draw_map_of(maps: MotionMaps, name: DrawnMap, frame: int, shown: frozenset[L
 
 
 def draw_trail_of(maps: MotionMaps, shown: frozenset[Layer], ax: Axes) -> Axes:
-    """Draw all frames as `draw_motion_trail` says; `shown` are its layers."""
+    """Render all frames as `draw_motion_trail` says; `shown` are its layers."""
     ax.set(xlim=maps.grid.x[:2], ylim=maps.grid.y[:2], aspect="equal", xlabel="x forward (m)", ylabel="y left (m)")
     if "labels" in shown:
         _draw_cells(ax, trail_picture(maps), maps)

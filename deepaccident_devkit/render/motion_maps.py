@@ -32,7 +32,7 @@ _PALETTE: Final = (0, 1, 2, 3, 8, 9, 10, 11, 12, 13, 16, 17, 18, 19)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MotionMaps(FrozenArrays):
-    """Motion of T frames as it is drawn: rows of cells along y left, columns along x forward; arrays are read-only.
+    """Motion of T frames as it is rendered: rows of cells along y left, columns along x forward; arrays are read-only.
 
     Attributes:
         grid: the cells, in the devkit's orientation.
@@ -84,7 +84,7 @@ class MotionMaps(FrozenArrays):
 
 
 def maps_of_labels(labels: MotionLabels, marked: Collection[int] = ()) -> MotionMaps:
-    """Labels as they are drawn; actors whose label ids are `marked` (the ego itself: −100) are red."""
+    """Labels as they are rendered; actors whose label ids are `marked` (the ego itself: −100) are red."""
     source, ignore = labels.config.grid.orientation, labels.config.ignore_index
     valid = labels.label_valid
 
@@ -119,7 +119,7 @@ def maps_of_output(
     marked: Collection[int] = (),
     post_processing: PostProcessing | str = "motion",
 ) -> MotionMaps:
-    """One prediction as it is drawn.
+    """One prediction as it is rendered.
 
     Args:
         output: what a model says.

@@ -68,7 +68,7 @@ class Sights(FrozenArrays):
         return np.isin(self.boxes.actor_id, self.actor[self.actor >= 0])
 
     def hidden_from(self, agent: str) -> BoolArray:
-        """(N,) which of the accident's actors, the pair and the agents, an agent does not see; itself is none.
+        """(N,) which of the accident's actors, the pair and the agents, an agent does not see, without itself.
 
         None at all if the agent is not one of those that look, or if nobody collides.
         """

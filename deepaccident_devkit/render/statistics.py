@@ -102,19 +102,19 @@ _FIGURES: Mapping[str, tuple[tuple[float, float], _Draw]] = {
     "collisions": ((15, 6.5), _collisions),
 }
 STATISTICS_FIGURES: Final = tuple(_FIGURES)
-"""The groups that `render_statistics` draws."""
+"""The groups that `render_statistics` renders."""
 
 
 def render_statistics(statistics: DatasetStatistics, group: str, *, fig: Figure | None = None) -> Figure:
-    """Draw one group of statistics, coloured by split.
+    """Render one group of statistics, coloured by split.
 
     Args:
         statistics: of `dataset_statistics`.
         group: one of `STATISTICS_FIGURES`.
-        fig: an empty figure to draw on; a new one if None.
+        fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure drawn on.
+        The figure.
 
     Raises:
         ChoiceError: no such group.
@@ -144,7 +144,7 @@ def save_statistics(
     folder: str | os.PathLike[str],
     formats: Sequence[PictureFormat] = ("png", "pdf"),
 ) -> list[Path]:
-    """Draw all groups of statistics into files `<group>.<format>`, each atomically, over those that are there.
+    """Render all groups of statistics into files `<group>.<format>`, each atomically, over those that are there.
 
     Args:
         statistics: of `dataset_statistics`.

@@ -29,14 +29,14 @@ _PANEL = (7.0, 4.5)
 
 
 def render_counts(table: CountTable, *, ax: Axes | None = None) -> Axes:
-    """Draw a table of counts as horizontal bars, the splits one after the other, each with its sum and share.
+    """Render a table of counts as horizontal bars, the splits one after the other, each with its sum and share.
 
     Args:
         table: of `DatasetStatistics.counts`.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on.
+        The axes.
     """
     ax = axes_or_new(ax, _PANEL)
     values, whole = list(table.counts), table.total()
@@ -58,14 +58,14 @@ def render_counts(table: CountTable, *, ax: Axes | None = None) -> Axes:
 
 
 def render_histogram(histogram: Histogram, *, ax: Axes | None = None) -> Axes:
-    """Draw a histogram as bars, the splits on top of each other.
+    """Render a histogram as bars, the splits on top of each other.
 
     Args:
         histogram: of `DatasetStatistics.histograms`.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on; its title says how many values lie outside of the bins.
+        The axes; its title says how many values lie outside of the bins.
     """
     ax = axes_or_new(ax, _PANEL)
     widths = [high - low for low, high in pairwise(histogram.edges)]
@@ -79,15 +79,15 @@ def render_histogram(histogram: Histogram, *, ax: Axes | None = None) -> Axes:
 
 
 def render_quantiles(table: QuantileTable, field: str, *, ax: Axes | None = None) -> Axes:
-    """Draw a number's quantiles by category: box from 25 to 75 %, line at the median, whiskers at 5 and 95 %.
+    """Render a number's quantiles by category: box from 25 to 75 %, line at the median, whiskers at 5 and 95 %.
 
     Args:
         table: of `DatasetStatistics.quantiles`.
         field: which of its numbers.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on.
+        The axes.
     """
     ax = axes_or_new(ax, _PANEL)
     rows = [row for row in table.quantiles if row.field == field and row.group == GROUPS[0] and row.values]
@@ -98,14 +98,14 @@ def render_quantiles(table: QuantileTable, field: str, *, ax: Axes | None = None
 
 
 def render_angles(histogram: Histogram, *, ax: Axes | None = None) -> Axes:
-    """Draw a histogram of angles around a circle: 0° up, counter-clockwise.
+    """Render a histogram of angles around a circle: 0° up, counter-clockwise.
 
     Args:
         histogram: in degrees.
-        ax: polar axes to draw on; new ones if None.
+        ax: polar axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on.
+        The axes.
 
     Raises:
         ChoiceError: the axes are not polar.
@@ -133,14 +133,14 @@ def render_angles(histogram: Histogram, *, ax: Axes | None = None) -> Axes:
 
 
 def render_relative_positions(pairs: Sequence[CollisionPair], *, ax: Axes | None = None) -> Axes:
-    """Draw where the other of each colliding pair was at the last frame, seen by the first, forward up.
+    """Render where the other of each colliding pair was at the last frame, seen by the first, forward up.
 
     Args:
         pairs: `DatasetStatistics.collisions`.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on, in metres from the centre of the first: its forward up, its left to the left.
+        The axes, in metres from the centre of the first: its forward up, its left to the left.
     """
     from matplotlib.patches import Rectangle
 

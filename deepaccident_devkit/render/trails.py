@@ -24,11 +24,11 @@ _STANDING: Final = 0.5
 
 
 def draw_trail(path: FloatArray, ax: Axes, color: str, **how: Any) -> LineCollection:
-    """Draw a path (T, 2), metres, opaque at its first point and fading towards its last.
+    """Render a path (T, 2), metres, opaque at its first point and fading towards its last.
 
     Args:
         path: from the present on, or back.
-        ax: axes to draw on.
+        ax: axes to render on.
         color: of the line.
         how: of the line, such as `linewidths` or `linestyles`.
     """
@@ -45,7 +45,7 @@ def draw_trails(
     seconds: tuple[float, float],
     ax: Axes,
 ) -> None:
-    """Draw where the actors of boxes were (thin) and will be (thick), by all agents' labels.
+    """Render where the actors of boxes were (thin) and will be (thick), by all agents' labels.
 
     Args:
         dataset: the release.
@@ -54,7 +54,7 @@ def draw_trails(
         colors: a colour a box.
         target_from_world: into the frame of the axes.
         seconds: how far back and how far ahead.
-        ax: axes to draw on.
+        ax: axes to render on.
     """
     tracks = scenario_tracks(dataset, sample["scenario_token"])
     own = dataset.get("agent", sample["agent_token"])["actor_id"]

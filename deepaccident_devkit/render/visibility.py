@@ -55,7 +55,7 @@ def render_visibility(
     layers: Iterable[Layer] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw who sees whom, from above: each actor has a dot for each agent that sees it by the released rule.
+    """Render who sees whom, from above: each actor has a dot for each agent that sees it by the released rule.
 
     A dot has its agent's colour and its own place in the row, and lines lead from the agents to those of the colliding
     pair that they see. The accident's actors that the sample's agent does not see are dashed, and the pair says so.
@@ -68,10 +68,10 @@ def render_visibility(
         view_range: metres to each side of the ego; None shows all agents and the colliding pair.
         layers: `boxes`, `visibility` (dots, lines, words) and `grid` are the default; also `points` (the LiDAR of those
             who look), `ids` and `velocities`.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on, in metres of the frame.
+        The axes, in metres of the frame.
 
     Raises:
         TokenError: no such sample or frame.
@@ -115,7 +115,7 @@ def render_visibility(
 def render_visibility_matrix(
     dataset: Dataset, moment: RowArgument, *, agents: Agents = None, ax: Axes | None = None
 ) -> Axes:
-    """Draw who sees whom as a table: a row an actor, a column an agent; a full cell is seen, a hollow one is not.
+    """Render who sees whom as a table: a row an actor, a column an agent; a full cell is seen, a hollow one is not.
 
     The number in a cell is the agent's LiDAR points in the box; where its label lacks the actor there is no cell. The
     colliding pair comes first, then the agents, then who is seen by more.
@@ -124,10 +124,10 @@ def render_visibility_matrix(
         dataset: the release.
         moment: token or record of a sample, or of a frame.
         agents: who looks, as of `render_visibility`.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on, with rows counted from 0 downwards.
+        The axes, with rows counted from 0 downwards.
 
     Raises:
         TokenError: no such sample or frame.

@@ -1,4 +1,4 @@
-"""Finding scenarios by what they are: `da.find(...)`, the texts of `--where`, and whether an accident can be seen.
+"""Finding scenarios by their attributes: `da.find(...)`, the texts of `--where`, and whether an accident can be seen.
 
 **Fields.** A filter names a field of the scenario table, or one that is derived from it:
 
@@ -15,7 +15,7 @@
 | `num_frames` (short: `length`) | recorded frames |
 | `visibility` | `visible`, `partial`, `invisible`: whether ego sees the accident coming (see `accident_visibility`) |
 
-**Values.** One value, or a list, tuple or set of values, any of which will do; numpy's scalars count as Python's, an
+**Values.** One value, or a list, tuple or set of values, one of which must match; numpy's scalars count as Python's, an
 array is given as a list (`array.tolist()`). Numbers also as texts: `"40..60"` (both
 ends count; one may be left out), `">=50"`, `">50"`, `"<=50"`, `"<50"`. None, or the text `unknown` or `none`, stands
 for a value that is not known; no other value or range matches those. All filters of a call must hold.
@@ -25,7 +25,7 @@ for a value that is not known; no other value or range matches those. All filter
 around the sign and the commas do not count.
 
 A field that does not exist is a FieldError, a value that the field cannot have a ChoiceError; both name what is
-possible. A value that the whole release knows, but not the part of it that is here, is none: it matches nothing.
+possible. A value that the whole release knows, but not the part that is here, is not an error: it matches nothing.
 """
 
 from deepaccident_devkit.selection.accident_visibility import (

@@ -63,8 +63,8 @@ def accident_visibility(dataset: Dataset, scenario: RowArgument) -> str | None:
 def accident_visible(dataset: Dataset, sample: RowArgument) -> bool | None:
     """The released attribute `accident_visibility` of a sample: whether its agent has the accident in view.
 
-    The agent has it in view at a moment if it sees by itself (the released rule without the other agents) everyone of
-    the colliding pair but itself. The sample counts as unseen if that fails now and at one or two of the moments
+    The agent has it in view at a moment if it sees by itself (the released rule without the other agents) the colliding
+    pair, itself excepted. The sample counts as unseen if that fails now and at one or two of the moments
     0.5 s and 1 s ago, where a moment before the recording counts as failed. Scenarios without a collision and the two
     of `SHEER_CURTAINS` always count as seen.
 
@@ -107,7 +107,7 @@ def accident_visible_mask(in_view: ArrayLike, *, collision: ArrayLike = True, ex
 
 
 def pair_in_view(mask: ArrayLike, actor_ids: ArrayLike, pair: Collection[int], own_id: int | None = None) -> bool:
-    """Whether an agent sees everyone of a colliding pair but itself, at one moment.
+    """Whether an agent sees the others of a colliding pair at one moment.
 
     See docs/released_code.md, Visibility and attributes.
 

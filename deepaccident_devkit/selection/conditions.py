@@ -15,7 +15,7 @@ from deepaccident_devkit.selection.fields import Field, Value
 from deepaccident_devkit.text import possible_text
 
 FilterValue = Value | Collection[Value]
-"""What a keyword of `find` takes: a value, or several of which any will do."""
+"""What a keyword of `find` takes: a value, or several values, one of which must match."""
 
 _TEXT = re.compile(r"\s*(\w+)\s*(!=|>=|<=|=|>|<)(.*)", re.DOTALL)
 _RANGE = re.compile(r"(-?\d+)?\s*\.\.\s*(-?\d+)?")
@@ -23,7 +23,7 @@ _BOUND = re.compile(r"(>=|<=|>|<)\s*(-?\d+)")
 _UNKNOWN = ("unknown", "none")
 _FLAGS = {"true": True, "yes": True, "false": False, "no": False}
 _SINGLE = (str, bytes, bytearray, Mapping, np.ndarray)
-"""What Python counts among the collections and a filter does not; of these only a str can be a value."""
+"""Types that Python takes for collections and a filter does not; of these only a str can be a value."""
 _MOST_DIGITS = 18
 _LONGEST = 60
 """Characters of a wrong value that a message shows."""
@@ -35,8 +35,8 @@ class Filter:
 
     Attributes:
         name: the field's name or its short form.
-        values: any of them will do.
-        negated: whether those scenarios are wanted instead that have none of the values.
+        values: one of them must match.
+        negated: whether the scenarios with none of the values are wanted instead.
     """
 
     name: str
@@ -105,7 +105,7 @@ def condition_of(wanted: Filter, field: Field, here: Iterable[Value]) -> Conditi
     Args:
         wanted: the filter.
         field: the field that it names.
-        here: the values that the field has in this release, which are possible whatever else is known of it.
+        here: the values that the field has in this release, which are always possible.
 
     Raises:
         ChoiceError: a value that the field cannot have.

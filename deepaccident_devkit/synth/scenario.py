@@ -45,7 +45,7 @@ MAX_DRAWS = 100
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scenario:
-    """All that is there to be recorded; time 0 is that of the first recorded frame.
+    """All that is there to be recorded; time 0 is the time of the first recorded frame.
 
     Attributes:
         plan: which scenario it is.

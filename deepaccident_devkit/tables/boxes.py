@@ -1,4 +1,4 @@
-"""What labels alone do not say: world poses, chains, instances, tracks.
+"""What is derived from labels: world poses, chains, instances, tracks.
 
 All of it is arrays over the N boxes of one scenario, in the order agent, frame, row.
 """
@@ -97,8 +97,8 @@ def instances(boxes: ScenarioBoxes) -> tuple[Mapping[str, AnyArray], AnyArray]:
 def tracks(boxes: ScenarioBoxes, instance_row: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Which box stands for each actor at each frame, ordered by frame and instance, and who annotated it.
 
-    The first agent in order that saw the actor from outside; its own row only where nobody else annotated it, since
-    that lies up to 0.3 m from where the others see it.
+    The box of the first agent in order that saw the actor from outside. An agent's own row counts only if nobody else
+    annotated it, since it lies up to 0.3 m from where the others see it.
 
     Returns:
         (M,) rows of the chosen boxes; (M,) uint8 bit masks over `taxonomy.AGENTS`.

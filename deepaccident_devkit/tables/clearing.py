@@ -51,10 +51,10 @@ def clear_index(dataroot: Path, *, version: str = "v1", index_dir: Path | None =
         index_dir: the only place to look in, where given.
 
     Returns:
-        What was removed; nothing if there was no index.
+        What was removed; empty if there was no index.
 
     Raises:
-        IndexStoreError: something there is no part of an index, then nothing is removed; or removing failed.
+        IndexStoreError: something there is no part of an index, and then nothing is removed; or the removal failed.
         VersionError: the version is unknown.
     """
     if version not in VERSIONS:
@@ -77,7 +77,7 @@ def clear_index(dataroot: Path, *, version: str = "v1", index_dir: Path | None =
 
 
 def holds_index(folder: Path) -> bool:
-    """Whether there is anything of an index, be it half made."""
+    """Whether there is an index, or part of one."""
     return any(_is_own(path) and path.name != LOCK_FILE for path in _entries(folder))
 
 
@@ -109,7 +109,7 @@ def _refuse_foreign(folder: Path) -> None:
             foreign.append(folder / MANIFEST_FILE)
     if foreign:
         names = ", ".join(str(path.relative_to(folder)) for path in sorted(foreign)[:_NAMED])
-        raise IndexStoreError(f"{folder}: not removed, for it holds what is no part of an index: {names}; look at it")
+        raise IndexStoreError(f"{folder}: not removed: it holds what is no part of an index: {names}; look at it")
 
 
 def _is_own(path: Path) -> bool:
@@ -125,7 +125,7 @@ def _is_own(path: Path) -> bool:
 
 
 def _remove(folder: Path) -> Cleared:
-    """Remove an index folder whose lock is held: the manifest first, so that half an index is none."""
+    """Remove an index folder whose lock is held: the manifest first, so that half an index is not taken for one."""
     sizes = [size for path, size in sizes_in(folder).items() if path.name != LOCK_FILE]
     try:
         (folder / MANIFEST_FILE).unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""`Finding`: one thing that is wrong, odd or missing in a release; what indexing and `validate` both speak in."""
+"""`Finding`: one thing that is wrong, odd or missing in a release; used by indexing and by `validate`."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -21,7 +21,7 @@ class Finding:
         where: the file (with the line), the folder, or the agents and actors.
         what: what is wrong there.
         remedy: what to do.
-        known: whether the real release is known to be so; then it is no fault of this copy.
+        known: whether the real release has it too; then it is no fault of this copy.
     """
 
     code: str

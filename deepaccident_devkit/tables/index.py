@@ -5,7 +5,7 @@
       tables-<digest>/     one Arrow file a table
       shards/              one file a scenario, from which the tables are joined
       .lock                held by the process that makes the index
-      .unfinished          there while it is made; what a stopped process left is finished by the next one
+      .unfinished          there while it is made; the next process finishes the work of a stopped one
 
 Opening compares the times of folders, meta and split files and the sizes of the tables with the manifest; making it
 compares every label and calib file, reads only the scenarios that changed, and compares the checksums of shards and
@@ -145,7 +145,7 @@ def _found_or_made(
 
 
 def _finished(index: Index, make: Callable[[Path], Index]) -> Index:
-    """Finish what a stopped process left; an index that is good is used as it is where that cannot be done."""
+    """Finish what a stopped process left; if that cannot be done, a good index is used as it is."""
     if not is_writable_folder(index.folder):
         return index
     try:
@@ -176,7 +176,7 @@ def _writable_folder(layout: ReleaseLayout, index_dir: Path | None) -> Path:
 
 
 def is_current(layout: ReleaseLayout, index: Index, fingerprint: str) -> bool:
-    """Whether nothing was added or removed, and what was broken still is as it was.
+    """Whether nothing was added or removed, and no broken scenario was changed.
 
     Broken scenarios are looked at file by file: a file mended in place leaves its folder's time alone.
     """

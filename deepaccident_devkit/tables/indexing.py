@@ -35,7 +35,7 @@ MARK_FILE = ".unfinished"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
-    """What became of one scenario.
+    """The outcome of indexing one scenario.
 
     Attributes:
         token: the scenario's.
@@ -62,7 +62,7 @@ def make_index(
 
     Raises:
         IndexStoreError: something cannot be written; the index that was there stays as it was.
-        SplitFileError: a split file is none.
+        SplitFileError: a split file cannot be read.
     """
     splits = assign_splits(layout)
     candidates = [scenario for scenario in layout.scenarios if scenario.token not in splits.problems]
@@ -89,7 +89,7 @@ def make_index(
 
 
 def is_unfinished(folder: Path) -> bool:
-    """Whether an index is being made in this folder, or a process was stopped that made one."""
+    """Whether an index is being made in this folder, or the process that made one was stopped."""
     return (folder / MARK_FILE).exists()
 
 
@@ -129,7 +129,7 @@ def edited_scenarios(layout: ReleaseLayout, folder: Path, manifest: Manifest) ->
         whether the tables are made from what the other scenarios' shards hold.
 
     Raises:
-        SplitFileError: a split file is none.
+        SplitFileError: a split file cannot be read.
     """
     splits = assign_splits(layout)
     broken = {problem.scenario: problem.digest for problem in manifest.problems}
@@ -193,7 +193,7 @@ def table_file_states(folder: Path) -> dict[str, tuple[int, str]]:
 
 
 def _remove_stale_shards(folder: Path, indexed: set[str]) -> None:
-    """Remove the shards of scenarios that are gone or broken; what resists is left to the next time."""
+    """Remove the shards of scenarios that are gone or broken; what cannot be removed is left to the next time."""
     shards = folder / SHARDS_FOLDER
     kept = {shard_path(shards, token) for token in indexed}
     for shard in shards.glob("*/*.arrow"):
@@ -206,7 +206,7 @@ def _remove_stale_shards(folder: Path, indexed: set[str]) -> None:
 
 
 def _remove_leftovers(folder: Path) -> None:
-    """Remove temporary files and the tables that the manifest does not name; what resists is left to the next time."""
+    """Remove temporary files and the tables that the manifest does not name; failures are left to the next time."""
     with suppress(OSError):
         named = stored_tables(folder)
         stale = [tables for tables in folder.glob(f"{TABLES_PREFIX}*") if tables.name != named]
@@ -226,7 +226,7 @@ def _marked_unfinished(folder: Path) -> Iterator[None]:
     _remove_leftovers(folder)
     try:
         yield
-    finally:  # the mark last: what is not tidied up is seen
+    finally:  # the mark is removed last, so that unfinished tidying is noticed
         _remove_leftovers(folder)
         with suppress(OSError):
             mark.unlink(missing_ok=True)
@@ -234,7 +234,7 @@ def _marked_unfinished(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def _store_errors(folder: Path) -> Iterator[None]:
-    """Turn what can happen to files and workers into errors that name the folder and the remedy."""
+    """Turn errors of files and workers into errors that name the folder and the remedy."""
     import pyarrow as pa
 
     try:

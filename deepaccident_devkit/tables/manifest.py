@@ -1,4 +1,4 @@
-"""What an index says of itself: what it was made from, and what is broken."""
+"""The manifest of an index: what it was made from, and what is broken."""
 
 import json
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ class Problem:
     Attributes:
         scenario: its token.
         messages: a sentence each, naming file, line and remedy.
-        digest: of its files as they were when this was found; empty where they are not the cause.
+        digest: of its files as they were when this was found; empty if they are not the cause.
     """
 
     scenario: str
@@ -58,7 +58,7 @@ def read_manifest(folder: Path) -> Manifest | None:
 
 
 def stored_schema_version(folder: Path) -> int | None:
-    """The schema version that an index folder's manifest states, be it known here or not; None if it states none."""
+    """The schema version that an index folder's manifest states, known here or not; None if it states none."""
     version = _content(folder).get("schema_version")
     return version if isinstance(version, int) and not isinstance(version, bool) else None
 
@@ -69,7 +69,7 @@ def stored_tables(folder: Path) -> str:
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Write the manifest, which makes what it names the index."""
+    """Write the manifest: from then on the tables that it names are the index."""
     write_bytes(folder / MANIFEST_FILE, json.dumps(asdict(manifest), indent=1).encode())
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from deepaccident_devkit.tables import records
 
 RowArgument = str | Mapping[str, Any]
-"""How a row is named wherever the API takes one: by its token, or by its record."""
+"""How a caller names a row: by its token, or by its record."""
 
 
 class OpenTables:
@@ -187,11 +187,11 @@ class OpenTables:
             missing: a file's scenarios that are not in this release: `raise`, or `skip` them.
 
         Raises:
-            ChoiceError: no such split, or no such way with the missing.
-            NotAvailableError: nothing says which scenario belongs where: no split file, and no split folders; or
+            ChoiceError: no such split, or `missing` is neither `raise` nor `skip`.
+            NotAvailableError: the splits are unknown: there are no split files and no split folders; or
                 scenarios of your file are not in this release.
             MissingFileError: there is no such file.
-            SplitFileError: your file is none: a line has not two words, or a scenario stands twice.
+            SplitFileError: your file is no split file: a line has not two words, or a scenario stands twice.
         """
         if missing not in get_args(OnError):
             raise ChoiceError(f"missing: expected one of {', '.join(get_args(OnError))}, found {missing!r}")
@@ -233,7 +233,7 @@ def _reopened(kind: type[OpenTables], arguments: dict[str, Any]) -> OpenTables:
 
 
 def token_of(row: RowArgument) -> str:
-    """The token of a row named by token or record: said once for the whole API; raises TokenError."""
+    """The token of a row given by token or record, as the whole API takes it; raises TokenError."""
     token = row.get("token") if isinstance(row, Mapping) else row
     if not isinstance(token, str):
         raise TokenError(f"expected a token or a record with one, found {row!r}")

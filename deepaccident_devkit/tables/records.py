@@ -159,7 +159,7 @@ class SampleDataRecord(TypedDict):
         Vector(
             shape=(3, 4),
             doc="Upper three rows of `ego_from_sensor` as this sample's calib file gives it; `calibrated_sensor` holds "
-            "the same but for rounding.",
+            "the same apart from rounding.",
         ),
     ]
     prev: Annotated[str | None, Key(table="sample_data", doc="The same sensor's file before.")]
@@ -194,7 +194,7 @@ class CalibratedSensorRecord(TypedDict):
         Vector(shape=(4,), doc="Quaternion w, x, y, z; cameras with optical axes (x right, y down, z forward)."),
     ]
     camera_intrinsic: Annotated[
-        list[list[float]] | None, Vector(shape=(3, 3), doc="K of a camera; null otherwise.", unit="px")
+        list[list[float]] | None, Vector(shape=(3, 3), doc="K of a camera, else null.", unit="px")
     ]
     matrix: Annotated[
         list[list[float]],

@@ -125,7 +125,7 @@ def index_report(
     Raises:
         DatarootError: the folder is missing, or holds neither a release nor an index.
         VersionError: the version is unknown.
-        SplitFileError: a split file is none; with `check_files` alone.
+        SplitFileError: a split file cannot be read; with `check_files` alone.
     """
     infos, looked_in, missing = [], [], []
     versions = VERSIONS if version is None else (version,)

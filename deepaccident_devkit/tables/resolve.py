@@ -1,4 +1,4 @@
-"""Tokens ↔ rows, by arithmetic on how rows are ordered: no dictionary but one entry a scenario.
+"""Tokens ↔ rows, by arithmetic on how rows are ordered: without a dictionary except of scenarios.
 
 Rows are ordered by scenario; within it samples by agent, then frame; sensor files by sample, then channel; boxes by
 sample, then label row; instances by actor id; tracks by frame, then instance.

@@ -1,4 +1,4 @@
-"""What the file names of a scenario tell: its frames, what is missing, and a digest that changes with any file."""
+"""What file names say of a scenario: its frames, missing files, and a digest that changes with any file."""
 
 import hashlib
 import os

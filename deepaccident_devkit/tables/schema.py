@@ -1,4 +1,4 @@
-"""JSON Schemas of the records, and the page's table of columns: both derived from the records' declaration."""
+"""JSON Schemas of the records, and the page's table of columns, both derived from the declared records."""
 
 from typing import Any
 

@@ -90,7 +90,7 @@ def _sample_data_rows(calibs: Calibs, calibrated_sensor_of: IntArray, agents: in
 
 
 def _calibrated_sensor_rows(values: FloatArray, agents: int, frames: int) -> tuple[Rows, IntArray]:
-    """What every agent's sensors were meant to be, by agent, channel, first occurrence; and each file's row.
+    """The distinct values of every agent's sensors, by agent, channel, first occurrence; and each file's row.
 
     Args:
         values: as of `_sensor_values`.

@@ -16,8 +16,8 @@ class SplitAssignment:
         split_of: scenario token → split; absent where it is unknown.
         problems: scenario token → why it has no single place, a sentence each.
         unlisted: scenarios that no split file lists, though there is one of every split.
-        contradictions: scenario token → what files and folders say against each other; the files win.
-        notices: what is odd but does not hinder, a sentence each.
+        contradictions: scenario token → how files and folders contradict each other; the files win.
+        notices: what is odd but harmless, a sentence each.
     """
 
     split_of: Mapping[str, str]
@@ -28,7 +28,7 @@ class SplitAssignment:
 
 
 def assign_splits(layout: ReleaseLayout) -> SplitAssignment:
-    """Read the split files and compare them with the folders; raises SplitFileError for a file that is none."""
+    """Read the split files and compare them with the folders; raises SplitFileError for any other file."""
     listed = {split: set(read_split_file(path)) for split, path in layout.split_files.items()}
     tokens = {scenario.token for scenario in layout.scenarios}
     problems: dict[str, list[str]] = {}

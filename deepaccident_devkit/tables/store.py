@@ -122,7 +122,7 @@ class StoredTable:
             reader = pa.ipc.open_file(pa.memory_map(str(path)))
             batch = reader.get_batch(0)
         except FileNotFoundError:
-            raise IndexStoreError(f"{path}: no such file: the index was made anew; open the release again") from None
+            raise IndexStoreError(f"{path}: no such file: the index was made again; open the release again") from None
         except (OSError, pa.ArrowException, IndexError, ValueError) as error:
             remedy = "mend it with: deepaccident index DATAROOT --check"
             raise IndexStoreError(f"{path}: cannot be read ({error}); {remedy}") from error

@@ -1,4 +1,4 @@
-"""The opened tables: rows as fresh dict records, as Arrow tables, and as views for whoever computes on columns."""
+"""The opened tables: rows as fresh dict records, as Arrow tables, and as views for computations on columns."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path

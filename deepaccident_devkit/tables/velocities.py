@@ -1,4 +1,4 @@
-"""Velocities of boxes: decoded from the labels, derived from displacements, and which convention the labels keep.
+"""Velocities of boxes: decoded from the labels, derived from displacements, and which convention the labels follow.
 
 A velocity is over the ground, three numbers in world. Arrays are over the N boxes of one scenario, right-handed.
 """
@@ -23,9 +23,9 @@ from deepaccident_devkit.taxonomy import (
 )
 
 LEAST_BOXES: Final = 20
-"""Moving boxes below which a scenario does not tell how its velocities are written."""
+"""With fewer moving boxes it is not known how a scenario's velocities are written."""
 _LEAST_SPEED = 1.0
-"""m/s; slower actors tell nothing."""
+"""m/s; slower actors are not used."""
 _FITS = (0.5, 0.15)
 """m/s, and as a share of the speed, within which a velocity fits."""
 _LEAST_SHARE = 0.5
@@ -99,7 +99,7 @@ def fit_velocities(boxes: ScenarioBoxes, displacement: FloatArray) -> VelocityFi
 
 
 def velocities_that_fit(boxes: ScenarioBoxes, displacement: FloatArray) -> tuple[IntArray, dict[str, BoolArray]]:
-    """The rows (M,) of boxes that tell something, and which of them fit each frame."""
+    """The rows (M,) of boxes that are used, and which of them fit each frame."""
     label_id, said = boxes.labels.actor_id, boxes.labels.velocity
     speed = np.linalg.norm(displacement[:, :2], axis=1)
     telling = (label_id != OWN_ACTOR_ID) & (label_id != UNTRACKED_ID) & (label_id < STATIC_ACTOR_ID)
@@ -115,7 +115,7 @@ def velocities_that_fit(boxes: ScenarioBoxes, displacement: FloatArray) -> tuple
 def decoded_velocities(boxes: ScenarioBoxes, displacement: FloatArray, frame: str | None) -> FloatArray:
     """(N, 3) m/s in world: the labels' own velocities where they have any, the displacements (N, 3) elsewhere.
 
-    A label says nothing of the vertical: that is the displacement's, and 0 where there is none.
+    A label has no vertical velocity: it is taken from the displacement, and is 0 without one.
 
     Args:
         boxes: the boxes.

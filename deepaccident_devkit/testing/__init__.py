@@ -1,7 +1,7 @@
 """Test kit: releases of under 1 MB in both layouts, healthy or broken in a named way, for tests of loaders.
 
 A pytest plugin (`plugin`, loaded by pytest where the devkit is installed) has fixtures, and `strategies` draws contents
-with hypothesis; the functions here need neither. See docs/testing.md.
+with hypothesis; the functions here need neither of them. See docs/testing.md.
 """
 
 from importlib import import_module

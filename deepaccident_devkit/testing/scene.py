@@ -15,7 +15,7 @@ FAR_ACTOR_ID = 1399
 PAIR: tuple[AgentName, AgentName] = ("ego_vehicle", "other_vehicle")
 """The two that collide."""
 _DELAY = 15.0
-"""Metres by which the other vehicle and its follower are late where nothing happens."""
+"""Metres by which the other vehicle and its follower are late in a normal scenario."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,7 +1,7 @@
 """Hypothesis strategies for what a release is made of: poses, points, boxes, the files' contents, small releases.
 
-Contents (`labels`, `metas`, `calibs`, `clouds`) are all that the files can hold, however odd; `label_texts` are what
-the real ones look like. Raises MissingExtraError on import if hypothesis is not installed.
+Contents (`labels`, `metas`, `calibs`, `clouds`) are all that the files can hold, also odd values; `label_texts` look
+like real files. Raises MissingExtraError on import if hypothesis is not installed.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Agents and what connects them: who cooperates, what they see together, over which link, and where everything is."""
+"""Agents and their links: who cooperates, what they see together, and where everything is."""
 
 from deepaccident_devkit.selection import (
     accident_visibility,

@@ -35,8 +35,8 @@ def aggregate_point_cloud(
         frame: frame of the result, of the sample at the present: `world`, `ego`, `lidar` or a camera channel.
         compensate: move the points in the box of an actor from where it was to where it is at the present, by the
             track table (all agents' labels); points of actors that are not annotated at both moments stay.
-        link: what happens to the partners' data; None for nothing. Each sweep is a message of its own: lost, wrong and
-            late by itself. Compensation makes up for latency, not for wrong poses.
+        link: what happens to the partners' data; None for nothing. Each sweep is a message of its own, with its own
+            loss, pose error and delay. `compensate` corrects latency, not wrong poses.
 
     Returns:
         The points by frame from the present back, then by agent, the ego first; no points if all were lost.
@@ -73,7 +73,7 @@ def moved_points(points: FloatArray, then: Boxes, now: Boxes) -> FloatArray:
     Args:
         points: in the frame of the boxes, metres.
         then: the actors when the points were taken.
-        now: actors at another moment, each id once; those that are not among `then` do not matter.
+        now: actors at another moment, each id once; actors that are not among `then` are ignored.
 
     Returns:
         (P, 3): a point in a box of `then` has the same place in that actor's box of `now`; in several, the last

@@ -24,7 +24,7 @@ ContactSide = Literal["front", "rear", "left", "right"]
 CONTACT_GAP: Final = 1.5
 """Metres between the pair at the last frame up to which they can have collided within the next tenth of a second."""
 _TOUCHING: Final = 0.02
-"""Metres of gap from which on the direction of the shortest line between two outlines is trusted."""
+"""Metres; with a gap of at least this the direction of the shortest line between two outlines is used."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -40,13 +40,14 @@ class Contact(FrozenArrays):
             middle of the overlap where they overlap already; at the mean height of their centres. Read-only.
         gap: metres between the outlines from above, 0 where they overlap.
         speeds: m/s over the ground, by the displacements of the last 0.1 s; NaN where unknown.
-        closing_speed: m/s at which they near each other along the shortest line between their outlines (along the
+        closing_speed: m/s at which they approach each other along the shortest line between their outlines (along the
             normal of the sides that meet where they touch or overlap); negative if they part; NaN where unknown.
         impact_angle: between their headings, in [0, π]: 0 the same way, π head-on.
         sides: the side of each that faces the other across the widest gap along any side's normal (the least overlap).
         agrees: whether meta agrees with the recording: `disagreements` is empty.
-        disagreements: what does not, in words: nothing but a gap of more than 1.5 m, another class than meta's, other
-            agents than meta's, an end before the last frame, or a contact side of meta's that is neither's.
+        disagreements: each contradiction in words: a gap of more than 1.5 m, another class than meta's, other
+            agents than meta's, an end before the last frame, or a contact side in meta that is neither of the two
+            sides.
     """
 
     instances: tuple[str, str]
@@ -151,10 +152,10 @@ def _last_moment(tracks: ScenarioTracks, scenario: str, first: int, second: int)
 def _contact(pair: Boxes, facing: FloatArray) -> tuple[FloatArray, float, FloatArray]:
     """The point of contact (3,), the gap from above, and the horizontal unit vector (2,) from first to second.
 
-    That vector leads along the shortest line between the outlines; where they touch there is none, and `facing` is it.
+    That vector leads along the shortest line between the outlines; where they touch it is `facing`.
 
     The second outline is pushed against the first, a little into it, and the middle of what they then share is taken:
-    of two faces in parallel, nearest along a whole stretch, that is the middle of the stretch.
+    for two parallel faces that is the middle of the stretch where they face each other.
     """
     from shapely import Polygon, get_coordinates, shortest_line
     from shapely.affinity import translate
@@ -203,7 +204,7 @@ def _disagreements(
     sides: tuple[ContactSide, ContactSide],
 ) -> list[str]:
     told = record["collision"]
-    if told is None:  # only for the type: the caller has one
+    if told is None:  # only for the type checker
         return []
     found = []
     if index != record["num_frames"]:
@@ -226,7 +227,7 @@ def _agent_ids(dataset: Dataset, scenario: str) -> dict[str, int | None]:
 
 
 def _other_agents(ids: Mapping[str, int | None], pair: Sequence[int], told: Sequence[str | None] | None) -> list[str]:
-    """Where the agents that meta says collided are not those whose ids the pair has, in words.
+    """How the agents that collided by meta differ from those that have the pair's ids, in words.
 
     Args:
         ids: the vehicles that are agents here → their actor ids; None where meta does not say.

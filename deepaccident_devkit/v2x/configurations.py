@@ -11,7 +11,7 @@ from deepaccident_devkit.errors import ChoiceError, NotAvailableError
 from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE, AgentName
 
 Role = Literal["behind", "other", "other_behind", "infrastructure"]
-"""What a partner is to the ego: the vehicle behind it, the other side's two, the roadside pole."""
+"""The role of a partner: the vehicle behind the ego, the other side's two, the infrastructure."""
 Side = Literal["ego_vehicle", "other_vehicle"]
 
 _PARTNERS: Final[dict[AgentName, dict[Role, AgentName]]] = {
@@ -52,7 +52,7 @@ def _names(argument: str, expected: str, given: Iterable[str]) -> tuple[str, ...
 
 @dataclass(frozen=True, slots=True)
 class AgentConfig:
-    """Who cooperates with an ego agent, named by what they are to it.
+    """Who cooperates with an ego agent, named by their roles.
 
     Attributes:
         name: as in `AGENT_CONFIGS`.
@@ -73,7 +73,8 @@ class AgentConfig:
         """The agents of this configuration by their own names, the ego first.
 
         Seen from a vehicle, `behind` is the other vehicle of its side (for a vehicle behind: the one in front), and
-        `other` the first of the other side. Seen from the pole, `infrastructure` is the first vehicle of `side`,
+        `other` the first of the other side. Seen from the infrastructure, `infrastructure` is the first vehicle of
+        `side`,
         `behind` the one behind that, `other` and `other_behind` those of the other side. So `vehicles` always is four
         agents, three of them partners.
 
@@ -82,7 +83,7 @@ class AgentConfig:
 
         Args:
             ego: the agent that the others serve.
-            side: whose side the pole takes; without effect for a vehicle.
+            side: the side that the infrastructure takes; not used for a vehicle.
 
         Raises:
             ChoiceError: no such agent or side.
@@ -112,7 +113,7 @@ AGENT_CONFIGS: Final[dict[str, AgentConfig]] = {
 """The paper's seven, by name."""
 
 Agents = AgentConfig | str | Sequence[str] | None
-"""Who cooperates, wherever a call takes `agents=`: agents' names, a configuration or the name of one as seen from the
+"""Who cooperates, as calls take it for `agents=`: agents' names, a configuration or the name of one as seen from the
 sample's agent, or None for all that are there."""
 
 

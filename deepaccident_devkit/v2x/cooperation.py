@@ -34,7 +34,7 @@ class CooperativeView(FrozenArrays):
             in the label of `source`.
         source: (N,) int8, index into `taxonomy.AGENTS`: whose box it is.
         seen_by: (N,) uint8, bit mask over `taxonomy.AGENTS`: who contributed a box of it; of an untracked actor only
-            the source, since nothing but the place says that others' rows are of the same.
+            the source, since its rows in other labels are known by their place alone.
     """
 
     boxes: Boxes
@@ -93,9 +93,9 @@ def cooperative_boxes(
 ) -> Boxes:
     """The union of what some agents annotated at a sample's moment, one box an actor, in one frame.
 
-    Of an actor that several have, the box of the ego counts, else of the first agent that saw it from outside; an
-    agent's own row (which becomes the agent's actor) only where no other has it, since it lies up to 0.3 m off.
-    Untracked rows (−1) are kept, but once: one within 0.5 m of another agent's of the same class, or of a tracked
+    If several agents have an actor, the ego's box counts, else the box of the first other agent. An agent's own
+    row (which becomes the agent's actor) counts only if no other agent has the actor, since it lies up to 0.3 m off.
+    Untracked rows (−1) are kept once: a row within 0.5 m of another agent's row of the same class, or of a tracked
     actor's chosen box, is left out. `cooperative_view` also says who saw what.
 
     Args:
@@ -181,7 +181,7 @@ def _one_an_actor(boxes: Boxes, actor: IntArray, agent: AnyArray) -> Cooperative
 
 
 def _first_of_each(actor: IntArray, agent: AnyArray) -> IntArray:
-    """The rows, ascending, at which a pair of an actor and an agent stands first: a label may repeat an actor."""
+    """The first row of each pair of an actor and an agent, ascending: a label may repeat an actor."""
     first: IntArray = np.unique(actor * len(AGENTS) + agent, return_index=True)[1]
     first.sort()
     return first

@@ -1,4 +1,4 @@
-"""What a real link between agents does to what they share: wrong poses, delay, loss (the paper's robustness study)."""
+"""The effects of a real link on shared data: wrong poses, delay, loss (the paper's robustness study)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from deepaccident_devkit.taxonomy import FRAME_PERIOD
 NoiseLaw = Literal["paper", "zero-mean"]
 _NORMAL: Final = NormalDist()
 _FRAME_TOLERANCE: Final = 1e-6
-"""How far, in frames, a latency may be from a whole number of them."""
+"""The largest distance of a latency from a whole number of frames, in frames."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,7 +73,7 @@ class Link:
 
     Attributes:
         latency: seconds, a multiple of 0.1 (the paper: 0.1 to 0.5): a partner's data are those of an earlier frame,
-            placed by the pose it had then, so that what stands still stays and what moves lags behind.
+            placed by its pose at that time: standing actors stay in place, moving ones lag behind.
         pose_noise: None for exact poses; a number is `PoseNoise(mean=…)`.
         packet_loss: probability in [0, 1] that nothing of a partner arrives at a frame.
         seed: of all draws.
@@ -113,7 +113,7 @@ class Link:
         if sent < 1:
             raise ConfigError(
                 f"latency: {self.latency} s reaches back before the first frame of {scenario} from frame {index:03d}; "
-                f"the most there is {(index - 1) / 10} s, and this latency works from frame "
+                f"the longest possible is {(index - 1) / 10} s, and this latency works from frame "
                 f"{self.latency_frames + 1:03d} on"
             )
         return sent
@@ -123,7 +123,7 @@ class Link:
         return self.packet_loss > 0 and uniforms(f"{self._key(scenario, partner, index)}/loss")[0] < self.packet_loss
 
     def pose_error(self, scenario: str, partner: str, index: int, position: FloatArray) -> SE3 | None:
-        """Where the ego places what the partner has at its true place: `claimed_from_world`; None without noise.
+        """From true places to where the ego puts the partner's data: `claimed_from_world`; None without noise.
 
         Args:
             scenario: token.

@@ -33,7 +33,7 @@ class MessageSize:
     Attributes:
         images: the six cameras' pixels, 3 bytes each, in the size that calib gives.
         cloud: the LiDAR's points, 16 bytes each; None if points were not counted.
-        boxes: the boxes it annotated but its own, 45 bytes each, and its own.
+        boxes: the boxes that it annotated, its own included, 45 bytes each.
         bev: a BEV feature map of the shape and type asked for.
     """
 
@@ -67,7 +67,7 @@ def message_sizes(
 
     Returns:
         Agent → sizes of what arrives, the sample's own agent (who sends nothing to itself) first, if it is among them.
-        A partner whose message is lost is left out; what it sent in vain, a call without `link` says.
+        A partner whose message is lost is left out; a call without `link` gives the size of the lost message.
 
     Raises:
         TokenError: no such sample.

@@ -46,8 +46,8 @@ def future_egomotion(world_from_ego: Poses, valid: ArrayLike | None = None) -> F
 
     Args:
         world_from_ego: (T + 1, 4, 4), or T + 1 SE3: poses of one agent in the order of time.
-        valid: (T + 1,) whether each moment is in the recording; what stands in `world_from_ego` where it is not does
-            not matter. All are, if None.
+        valid: (T + 1,) whether each moment is in the recording; the poses of other moments do not matter. None: all
+            are.
 
     Returns:
         (T, 6) metres and radians, in the poses' handedness; a row is zero (no motion) if its moment or the next is

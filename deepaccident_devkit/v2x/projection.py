@@ -23,7 +23,7 @@ class ImagePoints(FrozenArrays):
         pixels: (N, 2) float64 as (u, v); pixel centres are at halves; NaN behind the camera.
         depth: (N,) float64, metres along the optical axis.
         color: (N, 3) uint8 RGB of the pixel, black outside the image; None if no colours were asked for.
-        mask: (N,) bool, in front of the camera and in the image (whatever may stand before the point).
+        mask: (N,) bool, in front of the camera and in the image (also behind other things).
     """
 
     pixels: FloatArray
@@ -43,7 +43,7 @@ def project_to_image(
 ) -> ImagePoints:
     """Points of one agent in an image of any agent at any moment of the same scenario.
 
-    The points are taken to stand still: those of another moment are off where something moved.
+    The points are taken to stand still: those of another moment are wrong where something moved.
 
     Args:
         dataset: the release.

@@ -1,7 +1,7 @@
-"""`seen_actors`: who is known to a set of agents at a moment, if detection were perfect.
+"""`seen_actors`: which actors a set of agents knows at a moment, with perfect detection.
 
-Every actor that the released rule calls seen (docs/released_code.md, Visibility and attributes) is known exactly, but
-for what the link between the agents does. Velocities are the labels', decoded.
+Every actor that the released rule calls seen (docs/released_code.md, Visibility and attributes) is known exactly, apart
+from the effects of the link. Velocities are the labels', decoded.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class SeenActors(FrozenArrays):
     Attributes:
         boxes: N boxes, one an actor; the ego's own comes first and has the id −100, as in its label.
         seen_by: (N,) uint8, bit mask over `taxonomy.AGENTS`: who sees it; of the ego, the ego.
-        own_actor_id: the ego's id among the actors; None for the pole, or where meta does not say.
+        own_actor_id: the ego's id among the actors; None for the infrastructure, or if meta does not say it.
     """
 
     boxes: Boxes
@@ -37,7 +37,7 @@ class SeenActors(FrozenArrays):
 
     @property
     def has_own(self) -> bool:
-        """Whether the ego has a box of its own: the pole has none."""
+        """Whether the ego has a box of its own; the infrastructure has none."""
         return bool((self.boxes.actor_id == OWN_ACTOR_ID).any())
 
 
@@ -51,14 +51,14 @@ def seen_actors(
 ) -> SeenActors:
     """The actors that at least one of some agents sees at a sample's moment, and the ego itself.
 
-    A partner's box of itself does not count, as nowhere in the released rule: it is known if another of the agents
-    sees it. Untracked actors (−1) are never seen.
+    A partner's box of itself does not count, as in the released rule: another of the agents has to see
+    it. Untracked actors (−1) are never seen.
 
     Args:
         dataset: the release.
         sample: token or record: its agent is the ego, its frame the present.
         agents: who cooperates, as of `v2x.cooperating_agents`.
-        link: what happens to the partners' data; None for nothing. Nothing makes up for a delay: what moves lags.
+        link: what happens to the partners' data; None for nothing. A delay is not compensated: moving actors lag.
         frame: of the boxes: `ego`, `world`, `lidar` or a camera channel of the sample.
 
     Raises:

@@ -77,12 +77,12 @@ class Trajectory(FrozenArrays):
 def trajectory(
     dataset: Dataset, instance: RowArgument, sample: RowArgument | None = None, frame: str = "world"
 ) -> Trajectory:
-    """An actor's past and future from all agents' labels: the track table's rows, which it chooses among agents.
+    """An actor's past and future from all agents' labels: the rows of the track table.
 
     Args:
         dataset: the release.
         instance: token or record.
-        sample: token or record of the present: it parts past from future, and `frame` is its.
+        sample: token or record of the present: it divides past from future, and `frame` is one of its frames.
         frame: `world`, or `ego`, `lidar` or a channel of `sample`, which stays where it is at that moment.
 
     Raises:

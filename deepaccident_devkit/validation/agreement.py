@@ -1,4 +1,4 @@
-"""Do the agents' recordings agree: the same actor at the same moment, seen by several (centimetres, degrees)."""
+"""Whether the agents' recordings agree on an actor that several see at one moment (centimetres, degrees)."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -132,7 +132,7 @@ def _own_rows(subject: Subject, views: Views) -> Iterator[Finding]:
 
 
 def _missing_actors(subject: Subject, views: Views) -> Iterator[Finding]:
-    """Near actors that others annotate and one agent does not, though its labels leave nobody out (`Subject.reach`)."""
+    """Near actors that others annotate and one agent lacks, although its labels are complete (`Subject.reach`)."""
     there = np.isfinite(views.center[..., 0])
     place = np.nanmean(views.center, axis=1)
     for agent, reach in enumerate(subject.reach.tolist()):

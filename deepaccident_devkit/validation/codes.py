@@ -1,4 +1,4 @@
-"""Every kind of finding: how bad it is, what it means, what to do. docs/validation.md is made from this table."""
+"""Every kind of finding: its severity, its meaning and the remedy. docs/validation.md is made from this table."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ class Code:
         severity: how bad it is.
         meaning: one sentence for the docs.
         remedy: what to do.
-        known: why the real release itself is so, empty if it is not.
+        known: why the real release itself has it, empty if it does not.
         deep: whether only `--deep` finds it.
     """
 
@@ -101,7 +101,7 @@ CODES: dict[str, Code] = {
     "speed-off": Code("warning", "A label's first line does not fit the agent's displacement.", _RESTORE_ONE),
     "duplicate-id": Code("warning", "An id occurs twice in one label.", _RESTORE_ONE),
     "duplicate-box": Code("warning", "Two boxes of a label stand in the same place.", _RESTORE_ONE),
-    "odd-id": Code("warning", "An id is none that the format knows.", _RESTORE_ONE),
+    "odd-id": Code("warning", "An id is not one that the format knows.", _RESTORE_ONE),
     "ids-untracked": Code(
         "warning",
         "All ids of a label, or of an agent's labels, are −1, though its actors can be tracked.",
@@ -149,7 +149,7 @@ CODES: dict[str, Code] = {
     ),
     # meta
     "name-and-folder": Code("warning", "A scenario lies in another type's folder than its name says.", "move it"),
-    "meta-word": Code("warning", "Meta says a word that is none of the format's.", _RESTORE_ONE),
+    "meta-word": Code("warning", "Meta says a word that the format does not have.", _RESTORE_ONE),
     "meta-frames": Code("warning", "Meta counts other frames than were recorded (and 10).", _RESTORE),
     "meta-incomplete": Code(
         "note", "Meta lacks some of its lines 2 to 7.", _NOTHING, known="real files lack them now and then"

@@ -50,7 +50,7 @@ def take_inventory(scenario: ScenarioFolder, scan: ScenarioScan) -> tuple[Invent
 
 
 def absences(scenario: ScenarioFolder, scan: ScenarioScan) -> Iterator[Finding]:
-    """What a partial download lacks as a whole: agents, labels, meta."""
+    """Whole parts that a partial download lacks: agents, labels, meta."""
     token = scenario.token
     missing = [agent for agent in AGENTS if agent not in scan.agents]
     with_labels = [agent for agent in missing if scenario.kind_folder(agent, "label").is_dir()]

@@ -17,12 +17,12 @@ _END_OF_BLOCK = 0x00
 
 
 def zero_stretch(content: bytes) -> tuple[int, int] | None:
-    """Where a JPEG's picture data hold a stretch of zero bytes that no encoder writes, and how long it is.
+    """The place and length of a stretch of zero bytes in a JPEG's picture data that no encoder writes.
 
     Zero bits always stand for the first symbol of each Huffman table, followed by the lowest of its values. If that of
     a table for AC coefficients is not the end of a block, as in the standard table of the grey channel, then zero bits
     are blocks whose coefficients are negative one after the other up to the last. `ZEROS` bytes hold several of them,
-    and no picture has such. Where a scan's tables begin with the end of a block (those made to fit a flat picture;
+    which no picture has. Where a scan's tables begin with the end of a block (those made to fit a flat picture;
     chroma alone), zero bytes are an even surface, and nothing is said; nor of progressive and arithmetic coding.
 
     Returns:

@@ -1,4 +1,4 @@
-"""What one agent's labels say by themselves: ids, sizes, own rows, tracks (docs/format.md, Label)."""
+"""Checks of one agent's labels without the others: ids, sizes, own rows, tracks (docs/format.md, Label)."""
 
 from collections.abc import Callable, Iterator
 
@@ -21,7 +21,7 @@ LENGTHS: dict[str, tuple[float, float]] = {
 }
 """Metres, shortest and longest of each class."""
 LARGEST_SIZE = 5.0
-"""Metres that no road user is wide or high."""
+"""Metres; no road user is wider or higher."""
 FURTHEST = 1000.0
 """Metres from the LiDAR in which labels annotate."""
 OWN_OFFSET = 0.6
@@ -36,16 +36,16 @@ SIZE_CHANGE = 0.02
 WALKER_SIZE_CHANGE = 1.0
 """Metres by which a pedestrian's box may change from frame to frame: real ones stretch by 0.62."""
 JUMP = 0.6
-"""Metres that an actor may be off the middle of its neighbours in time: 120 m/s²."""
+"""The largest distance of an actor from the middle of its neighbours in time, metres: 120 m/s²."""
 TURN = np.radians(40.0)
-"""Heading that a car may be off the middle of its neighbours in time."""
+"""The largest turn of a car from the middle of its neighbours in time."""
 LAST_FRAMES = 2
 """Frames at the end in which a collision may throw its pair about."""
 _FOUR_WHEELS = [CATEGORIES.index(name) for name in ("car", "truck", "van")]
 
 
 def check_labels(subject: Subject) -> Iterator[Finding]:
-    """Everything that one label, or one agent's labels, show without the others."""
+    """All findings in one label, or in one agent's labels, without the others."""
     for check in _CHECKS:
         yield from check(subject)
 
@@ -123,7 +123,7 @@ def _own_boxes(subject: Subject) -> Iterator[Finding]:
     differs = np.zeros(len(subject.own), dtype=bool)
     difference = np.abs(subject.boxes.labels.velocity[rows] - first_line[subject.boxes.sample[rows]]).max(axis=1)
     differs[rows] = difference > OWN_VELOCITY
-    yield from subject.label_findings("own-velocity", differs, "the own velocity is not that of the first line")
+    yield from subject.label_findings("own-velocity", differs, "the agent's own velocity differs from the first line")
 
 
 def _tracks(subject: Subject) -> Iterator[Finding]:

@@ -1,4 +1,4 @@
-"""Are the agents where vehicles can be, and their sensors where the format says (docs/format.md, Calib)."""
+"""Whether agents are where vehicles can be, and their sensors where the format says (docs/format.md, Calib)."""
 
 from collections.abc import Callable, Iterator
 
@@ -32,7 +32,7 @@ _SPEED_DIFFERENCE = (1.0, 0.2)
 
 
 def check_poses(subject: Subject) -> Iterator[Finding]:
-    """Everything that the calib files of a scenario show, and the labels' first lines beside them."""
+    """All findings in the calib files of a scenario and the labels' first lines."""
     for agent in range(len(subject.agents)):
         for check in _CHECKS:
             yield from check(subject, agent)

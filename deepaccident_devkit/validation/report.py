@@ -18,7 +18,7 @@ _LINES_A_SCENARIO = 8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Coverage:
-    """How much of a whole release is here.
+    """Which part of a whole release is here.
 
     Attributes:
         scenarios: split → scenarios here; `unknown` for those of no known split.
@@ -31,7 +31,7 @@ class Coverage:
     recordings: Mapping[str, Mapping[str, Mapping[str, int]]]
 
     def to_download(self) -> Iterator[str]:
-        """What a whole release has besides, a sentence each."""
+        """What is missing for a whole release, a sentence each."""
         here, whole = sum(self.scenarios.values()), sum(self.expected.values())
         if set(self.scenarios) <= set(self.expected):
             for split, total in self.expected.items():
@@ -93,7 +93,7 @@ class ValidationReport:
 
     @property
     def is_good(self) -> bool:
-        """Whether there is nothing but notes, and what the real release is known for."""
+        """Whether all findings are notes, or known of the real release."""
         return all(finding.severity == "note" or finding.known for finding in self.findings)
 
     def to_json(self) -> str:

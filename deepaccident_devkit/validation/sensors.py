@@ -1,4 +1,4 @@
-"""What only the sensor files show (`--deep`): every image and array is decoded."""
+"""Findings that only the sensor files show (`--deep`): every image and array is decoded."""
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -40,7 +40,7 @@ _VEHICLES = tuple(CATEGORIES.index(name) for name in ("car", "truck", "van"))
 _BEV_LEAST_SHARE = 0.5
 _THUMBNAIL = (32, 18)
 _OUT_OF_SEQUENCE = 3.0
-"""How many times further an image may be from its neighbours in time than these are from each other."""
+"""The largest ratio of an image's distance from its neighbours in time to their distance from each other."""
 _LEAST_DIFFERENCE = 6.0
 """Grey levels; below it images are the same to the eye."""
 _BLANK = 40.0
@@ -71,7 +71,7 @@ class _BevHits:
 
 
 def check_sensors(subject: Subject, inventory: Inventory) -> Iterator[Finding]:
-    """Decode all sensor files of a scenario and hold them against its labels and calib files."""
+    """Decode all sensor files of a scenario and compare them with its labels and calib files."""
     checksums: dict[str, list[tuple[str, str, int]]] = defaultdict(list)
     for (agent, channel), frames in inventory.frames.items():
         usable = [frame for frame in frames if frame <= subject.num_frames]

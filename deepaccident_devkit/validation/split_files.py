@@ -1,4 +1,4 @@
-"""Do the split files, and the folders of layout B, give every scenario one place, and twins the same."""
+"""Whether split files, and folders of layout B, give every scenario one split, and twins the same one."""
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator

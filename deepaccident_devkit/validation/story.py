@@ -1,4 +1,4 @@
-"""Does meta tell what was recorded: words, counts, ids, and an impact at the end (docs/format.md, Meta)."""
+"""Whether meta fits the recording: words, counts, ids, and an impact at the end (docs/format.md, Meta)."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -26,7 +26,7 @@ SHEER_CURTAINS = ("Town05_type001_subtype0002_scenario00035", "Town05_type001_su
 
 
 def check_story(subject: Subject) -> Iterator[Finding]:
-    """Everything that meta says, against the format and the recordings."""
+    """All that meta says, compared with the format and the recordings."""
     if subject.files.scenario.name in SHEER_CURTAINS:
         what = "vehicles behind sheer curtains are marked invisible"
         yield subject.finding("sheer-curtain", subject.token, what)

@@ -1,4 +1,4 @@
-"""`Subject`: one scenario's small files in memory, with what every check on their meaning starts from."""
+"""`Subject`: one scenario's small files in memory, with the data that every check of their meaning needs."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class Subject:
         """(A,) metres around each agent within which its labels leave nobody out; 0 where nothing shows that.
 
         Labels that hold what neither its agent's LiDAR nor its cameras saw leave nobody out for being hidden, and all
-        labels of a scenario are written by one rule; how far that goes is told by the boxes that each agent has.
+        labels of a scenario are written by one rule; the boxes of each agent show how far that reaches.
         """
         labels, agent = self.boxes.labels, self.boxes.agent
         distance = np.linalg.norm(labels.center[:, :2], axis=1)

@@ -1,4 +1,4 @@
-"""Labels that track nobody: every id is −1, which docs/format.md, Label, knows of far actors only."""
+"""Labels that track nobody: every id is −1, which is normal for far actors only (docs/format.md, Label)."""
 
 from collections.abc import Iterator
 
@@ -13,7 +13,7 @@ from deepaccident_devkit.validation.subject import Subject, frames_text, place_t
 NEAR = 15.0
 """Metres within which a vehicle that the agent saw is not too far away to be tracked."""
 _LEAST_BOXES = 2
-"""Boxes that must show it: tracking of one alone comes and goes."""
+"""The number of boxes that must show it: the tracking of a single one comes and goes."""
 _VEHICLES = tuple(CATEGORIES.index(name) for name in ("car", "truck", "van"))
 
 

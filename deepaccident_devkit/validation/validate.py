@@ -121,10 +121,10 @@ def findings(dataset: Dataset, scenario: RowArgument, *, deep: bool = False) -> 
 
 
 def check_scenario(scenario: ScenarioFolder, *, deep: bool = False) -> ScenarioCheck:
-    """Everything that one scenario's files show.
+    """All findings in one scenario's files.
 
-    What keeps a scenario from being indexed comes from the same functions that index it; only if there is nothing of
-    that kind are the files' meanings looked at.
+    The functions that index a scenario find what keeps it from being indexed. The meaning of its files is checked only
+    if they find nothing.
     """
     scan = scan_scenario(scenario)
     inventory, of_files = take_inventory(scenario, scan)

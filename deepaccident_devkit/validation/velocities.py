@@ -1,4 +1,4 @@
-"""How are the labels' velocities written, and whose do not fit? (docs/conventions.md, velocity)."""
+"""How the labels' velocities are written, and which actors' do not fit (docs/conventions.md, velocity)."""
 
 from collections.abc import Iterator
 
@@ -10,7 +10,7 @@ from deepaccident_devkit.taxonomy import RELEASED_VELOCITY_FRAME, VELOCITY_FRAME
 from deepaccident_devkit.validation.subject import Subject
 
 _ACTOR_OFF = (3, 0.8)
-"""Boxes of an actor, and the share of them, that must not fit before its velocities are said to be off."""
+"""How many boxes of an actor, and which share of them, must not fit for a finding."""
 
 
 def check_velocities(subject: Subject, fit: VelocityFit) -> Iterator[Finding]:

@@ -1,1 +1,1 @@
-"""What is measured: a package a task, and beneath them what the tasks share."""
+"""The metrics: a package for each task, and below them what the tasks share."""

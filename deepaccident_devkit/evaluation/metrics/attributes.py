@@ -1,4 +1,4 @@
-"""What samples are told apart by when results are broken down: place, weather, story, and how near the accident is."""
+"""The attributes by which results are broken down: place, weather, story, and how near the accident is."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ STRAIGHT: Final = "straight_straight"
 TURNING: Final = "one_of_the_agents_turning"
 NO_IMPACT: Final = "no impact"
 WITHIN_RECORDINGS: Final = ("time_to_impact", "impact_step", "time_to_end", "accident_visibility")
-"""Attributes that cut recordings apart: of no use to a task that is about whole ones."""
+"""Attributes that differ within a recording: of no use to a task on whole recordings."""
 
 
 def cluster_of(scenario: str) -> str:
-    """What an accident and its twin share, which show the same junction, traffic and weather: `type1_subtype1/Town03…`.
+    """The cluster of an accident and its twin, of the same junction, traffic and weather: `type1_subtype1/Town03…`.
 
     Args:
         scenario: its token, `type1_subtype1_accident/Town03…`.
@@ -65,7 +65,7 @@ class ScenarioAttributes:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SampleAttributes:
-    """What a sample can be told from others by.
+    """The attributes of a sample.
 
     Attributes:
         scenario: token of its scenario.

@@ -70,7 +70,7 @@ def breakdown(
 
     Args:
         evaluator: with all samples counted.
-        attributes: of its samples, from `sample_attributes`; those of others do not matter.
+        attributes: of its samples, from `sample_attributes`; those of other samples are ignored.
         by: one of `sample_attributes.ATTRIBUTES`; `all` for one group.
         resampling: how to make intervals; None for the defaults.
 
@@ -124,7 +124,7 @@ def _group(
 
 
 def _rank(value: str | None) -> tuple[bool, float, str]:
-    """Texts by their alphabet, times by their length, what is not known last."""
+    """Texts in alphabetical order, times by their length, unknown values last."""
     text = value or ""
     try:
         return value is None, float(text.split(" ")[0]), text

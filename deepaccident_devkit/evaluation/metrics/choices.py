@@ -1,4 +1,4 @@
-"""The choices of a protocol by their names, such as `reading.outline`, and protocols with some made otherwise."""
+"""The choices of a protocol by their names, such as `reading.outline`, and protocols with some of them changed."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def switch_names(rules: DataclassInstance) -> list[str]:
 
 
 def switched(rules: Rules, switches: Mapping[str, Any]) -> Rules:
-    """A protocol with some choices made otherwise.
+    """A protocol with some choices changed.
 
     Args:
         rules: the protocol, a frozen dataclass; parts of it may be others.
@@ -58,7 +58,7 @@ def switched(rules: Rules, switches: Mapping[str, Any]) -> Rules:
 
 
 def _of_kind(name: str, rules: DataclassInstance, field: str, value: Any) -> Any:
-    """A value that can stand for a field's own; raises ChoiceError. None says nothing of what may be in its place."""
+    """A value of the kind of a field's own; raises ChoiceError. A field that is None takes any value."""
     before = getattr(rules, field)
     kind = next((kind for kind in (bool, float, str, tuple) if isinstance(before, _LIKE[kind])), None)
     fits = kind is None or (isinstance(value, _LIKE[kind]) and (kind is bool or not isinstance(value, bool)))

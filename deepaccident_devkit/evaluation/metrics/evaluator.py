@@ -1,4 +1,4 @@
-"""`Evaluator`: what all evaluators share. They keep small counts by sample and sum them when asked.
+"""`Evaluator`: the base of all evaluators, which keep small counts by sample and sum them when asked.
 
 So results do not depend on the order of samples or on how many workers counted them, memory grows with the counts
 alone, and any selection of the samples can be summed (see `breakdown`).
@@ -42,14 +42,14 @@ class Evaluator(ABC, Generic[Result]):
     @property
     @abstractmethod
     def settings(self) -> dict[str, Any]:
-        """All that decides the numbers, as JSON can hold it: evaluators of other settings cannot be merged."""
+        """All choices that affect the numbers, as JSON can hold them: evaluators of other settings cannot be merged."""
 
     @abstractmethod
     def result_of(self, counts: Collection[Counts]) -> Result:
         """The metrics of some samples' counts, in any order."""
 
     def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
-        """Fewer counts with the same result, for results of these samples that are asked for again and again.
+        """Fewer counts with the same result, for many results of these samples.
 
         A subclass whose counts are sums adds them up; others keep them apart, as here.
         """
@@ -57,7 +57,7 @@ class Evaluator(ABC, Generic[Result]):
 
     @property
     def has_intervals(self) -> bool:
-        """Whether its numbers may be asked for again and again; else there are no intervals and no tests of them."""
+        """Whether its numbers can be computed many times; if not, they have no intervals and no tests."""
         return True
 
     def resampled(self, parts: Sequence[Sequence[Counts]], times: IntArray) -> Iterator[Result]:
@@ -74,7 +74,7 @@ class Evaluator(ABC, Generic[Result]):
 
     @abstractmethod
     def update(self, token: str, *arguments: Any) -> None:
-        """Count one sample: its token, then prediction, truth and what else the evaluator takes."""
+        """Count one sample: its token, then prediction, truth and other arguments of the evaluator."""
 
     def update_batch(self, tokens: Sequence[str], *columns: Sequence[Any]) -> None:
         """Count several samples, such as those of a data loader's batch, one after another.
@@ -137,7 +137,7 @@ class Evaluator(ABC, Generic[Result]):
 
     @property
     def counts(self) -> Mapping[str, Counts]:
-        """Each sample's counts by token, copied when they are asked for: nobody can change what is summed."""
+        """Each sample's counts by token, copied, so that callers cannot change the sums."""
         return _Copies(self._counts)
 
     @property
@@ -175,7 +175,7 @@ class Evaluator(ABC, Generic[Result]):
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write all counts to a JSON file, from which a broken-off run goes on; returns its path.
 
-        The file is the old one or the new one at any moment, never half of it.
+        At any moment the file is either the old or the whole new one.
 
         Raises:
             EvaluationError: it cannot be written.
@@ -207,11 +207,11 @@ class Evaluator(ABC, Generic[Result]):
             maker, settings, repeated = state["made_by"], state["settings"], set(state["repeated"])
             counts = {token: dict(each) for token, each in state["counts"].items()}
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise EvaluationError(f"{source}: no saved evaluation ({error}); begin anew") from error
+            raise EvaluationError(f"{source}: no saved evaluation ({error}); begin again") from error
         if maker != self._maker:
-            raise EvaluationError(f"{source}: was saved by {maker}, this is {self._maker}; begin anew")
+            raise EvaluationError(f"{source}: was saved by {maker}, this is {self._maker}; begin again")
         if settings != self.settings:
-            raise EvaluationError(f"{source}: was saved with other settings ({settings}); begin anew, or use those")
+            raise EvaluationError(f"{source}: was saved with other settings ({settings}); begin again, or use those")
         for token, each in counts.items():
             self.add(token, each)
         self.repeated |= repeated
@@ -219,7 +219,7 @@ class Evaluator(ABC, Generic[Result]):
 
     @property
     def _maker(self) -> str:
-        """Whose counts these are: another version may count differently."""
+        """The class and version that made the counts: another version may count differently."""
         return f"{type(self).__name__} of devkit {__version__}"
 
 
@@ -244,7 +244,7 @@ class _Copies(Mapping[str, Counts]):
 
 
 def _copied(value: Any) -> Any:
-    """A copy of what JSON can hold; much faster than `copy.deepcopy`."""
+    """A copy of JSON values; much faster than `copy.deepcopy`."""
     if isinstance(value, Mapping):
         return {name: _copied(each) for name, each in value.items()}
     if isinstance(value, (list, tuple)):
@@ -258,5 +258,5 @@ def ratio(part: float, whole: float) -> float:
 
 
 def total(counts: Iterable[Counts], name: str) -> float:
-    """The exact sum of a number over samples, whatever their order."""
+    """The exact sum of a number over samples, the same in any order."""
     return math.fsum(each[name] for each in counts)

@@ -17,7 +17,7 @@ from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionHeads, MotionLabels
 
 _TINY: Final = 1e-6
-"""Cells: edges of a range fall on edges of cells but for rounding."""
+"""Cells: edges of a range fall on edges of cells, apart from rounding."""
 
 
 def labels_at_present(label: MotionLabels) -> MotionLabels:

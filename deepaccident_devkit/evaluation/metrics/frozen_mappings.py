@@ -1,4 +1,4 @@
-"""Results that hold mappings: nobody can change them, and they can be copied, pickled and written as JSON."""
+"""Results with read-only mappings, which can be copied, pickled and written as JSON."""
 
 from __future__ import annotations
 

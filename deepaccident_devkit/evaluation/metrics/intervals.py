@@ -1,7 +1,7 @@
 """Intervals of any evaluator's numbers, from how much each changes when one cluster is left out (the jackknife).
 
 A cluster is an accident with its twin (`attributes.cluster_of`): its samples show the same junction and traffic, so
-that the number of clusters, not of samples, says how much is known of others. docs/statistics.md has the formulas and
+the number of clusters, not of samples, says how sure a number is. docs/statistics.md has the formulas and
 their measured coverage.
 """
 
@@ -34,13 +34,13 @@ Clusters = Sequence[Sequence[Counts]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Resampling:
-    """How it is measured how sure numbers are: for intervals, and for the test of two runs' difference.
+    """The settings of intervals, and of the test of two runs' difference.
 
     Attributes:
-        resamples: how often, at most, numbers are computed of other counts: with a cluster left out for intervals (at
+        resamples: how often, at most, numbers are computed again: with a cluster left out for intervals (at
             most 100 times), with clusters swapped between two runs for a test; 0 for no intervals and no tests.
         confidence: share of such intervals that should hold the true number; tests are at 1 − confidence.
-        seed: equal ones draw equally, where there are more clusters or swaps than are taken.
+        seed: of the random choice of clusters or swaps, if there are more than are taken.
     """
 
     resamples: int = RESAMPLES
@@ -61,7 +61,7 @@ class Intervals:
 
     Attributes:
         ends: number, by its path → (low, high); those without an interval are not there.
-        notes: sentences that say which have none, and why.
+        notes: sentences that say which numbers have none, and why.
     """
 
     ends: Mapping[str, tuple[float, float]]
@@ -109,7 +109,7 @@ def difference_intervals(
     """Intervals of how two sets of counts of the same clusters differ, the same clusters left out of both.
 
     Args:
-        evaluator: that knows the counts.
+        evaluator: of these counts.
         pair: of each set the counts of the same clusters, in the same order.
         differences: number, by its path → second − first, of all clusters together.
         resampling: how.
@@ -227,7 +227,7 @@ def _wilson(
 
 
 def _notes(having: Mapping[str, int]) -> Iterator[str]:
-    """Why numbers have no interval; they by how many parts have them."""
+    """Why numbers have no interval; the numbers by how many parts have them."""
     few = [name for name, count in having.items() if count < LEAST_CLUSTERS]
     alike = [name for name, count in having.items() if count >= LEAST_CLUSTERS]
     if few:

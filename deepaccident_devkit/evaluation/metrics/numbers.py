@@ -1,4 +1,4 @@
-"""The numbers that a result holds, by their paths, and between which ends each can lie."""
+"""The numbers that a result holds, by their paths, and the limits of each."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def has_interval(path: str) -> bool:
 def range_of(path: str, alone: FloatArray) -> tuple[float, float]:
     """The least and the most that a number can be; infinite for no limit.
 
-    Its unit tells: shares are in [0, 1], percents in [0, 100], lengths and times from 0. A number that is not of the
+    By its unit: shares are in [0, 1], percents in [0, 100], lengths and times from 0. A number that is not of the
     devkit's own has no unit: it is taken for a share if no cluster is outside [0, 1], and else for one that is never
     below 0 if none is.
 

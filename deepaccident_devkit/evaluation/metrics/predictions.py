@@ -1,4 +1,4 @@
-"""What a model says about a sample, from any framework."""
+"""The predictions of a model for a sample, from any framework."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ class MotionOutput(FrozenArrays):
         heads: K times a model's maps of T frames, the present first (a single one may stand alone); None if
             `instances` are given.
         instances: (K, T, H, W) int32, ids from 1 that stay the same over the frames, 0 elsewhere; None with heads.
-        orientation: a word to the constructor: how the maps lie, None for as the grid says. The grid keeps it: what is
-            read here is None always.
+        orientation: an argument of the constructor: how the maps lie, None for the grid's. The grid keeps it: this
+            field is always None.
     """
 
     grid: BevGrid
@@ -120,7 +120,7 @@ class MotionOutput(FrozenArrays):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Accident(FrozenArrays):
-    """An accident that is said to come.
+    """A predicted accident.
 
     Attributes:
         positions: (2, 2) x forward, y left of the two that collide, metres in the present ego frame.

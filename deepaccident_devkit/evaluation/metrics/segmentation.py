@@ -1,4 +1,4 @@
-"""`BevSegmentationEvaluator`: intersection over union of what covers the ground, by class."""
+"""`BevSegmentationEvaluator`: intersection over union of the classes on the ground."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class BevSegmentationResult(FrozenMappings):
         mean_iou: the mean over the classes that there are, in %; NaN if there is none.
         iou: class of `motion.BEV_CLASSES` → intersection over union in %, of the cells of all samples together; NaN
             where neither side has any.
-        cells: class → how many cells are hit, predicted in vain and missed.
+        cells: class → how many cells are hit, predicted wrongly and missed.
         samples: number of samples.
     """
 

@@ -2,7 +2,7 @@
 
 Paths are those of the instances of the first frame: id → (n, 2) positions, such as `motion.trajectories` gives in
 metres, or `LinkedInstances.centers` times the cells' size. An instance that a frame lacks has no point for it, so that
-point k of a path is not always frame k; the released code takes it so, and so do these functions.
+point k of a path is not always of frame k. The released code ignores this, and so do these functions.
 
 They are paired as the released code does (`traj_mapping`). It adds a row and a column of zeros to its costs (ids begin
 at 1) and then drops the first match, `matches[1:]`, as the one of those two. With a stable sort it always is; an
@@ -60,7 +60,7 @@ def padded(paths: Paths, length: int, *, accelerating: bool = True) -> dict[int,
     Args:
         paths: of at least one point each.
         length: points wanted.
-        accelerating: the released slip: a path whose last step is d goes on by d, 2 d, 3 d, … a frame; else by d each
+        accelerating: the released quirk: a path whose last step is d goes on by d, 2 d, 3 d, … a frame; else by d each
             time. A path of one point stands still.
     """
     return {name: _continued(path, length, accelerating=accelerating) for name, path in paths.items()}
@@ -162,14 +162,14 @@ def instance_paths(instance: AnyArray, grid: BevGrid) -> dict[int, FloatArray]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrajectoryRules:
-    """What decides the errors; the defaults are the released ones.
+    """The choices of the errors; the defaults are the released ones.
 
     Attributes:
         ade_limit: metres; a larger mean error counts as this.
         fde_limit: metres; a larger final error counts as this.
         miss_distance: metres; a larger final error is a miss.
-        first_prediction_empty_ends: the released slip: where the first prediction has no path at all, the sample
-            counts for nothing, whatever the others have.
+        first_prediction_empty_ends: the released quirk: where the first prediction has no path at all, the sample
+            does not count, even if other predictions have paths.
     """
 
     ade_limit: float = 8.0
@@ -180,7 +180,7 @@ class TrajectoryRules:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrajectoryErrors:
-    """Sums over the true paths of a sample that some prediction has a partner for.
+    """Sums over the true paths of a sample that have a partner in some prediction.
 
     Attributes:
         ade: of the mean distances over the frames, metres.
@@ -207,7 +207,7 @@ def trajectory_errors(
         predictions: K times id → (≥ T, 2) metres.
         truth: id → (T, 2) metres.
         matches: of each prediction with the truth.
-        rules: limits and slips.
+        rules: limits and quirks.
     """
     ade, fde, missed, count = 0.0, 0.0, 0, 0
     frames = longest(truth)

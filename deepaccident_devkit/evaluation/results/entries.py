@@ -112,7 +112,7 @@ def detection_columns(entries: Sequence[Entry], owners: Sequence[str]) -> Column
         owners: tokens of the samples that they stand under.
 
     Returns:
-        center (N, 3) metres and rotation (N, 4) unit quaternions w, x, y, z in the world, size (N, 3) length, width,
+        `center` (N, 3) metres and rotation (N, 4) unit quaternions w, x, y, z in the world, size (N, 3) length, width,
         height, velocity (N, 3) m/s, NaN where unknown, category (N,), score (N,).
     """
     check_entries(entries, _BOX_REQUIRED, _BOX_OPTIONAL)

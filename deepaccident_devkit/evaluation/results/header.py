@@ -231,7 +231,7 @@ def _check_version(version: object, path: Path) -> None:
     if type(version) is not int:
         raise ContentError(f"version: expected {FORMAT_VERSION}, found {shown(version)}")
     if version != FORMAT_VERSION:
-        kind, remedy = ("a newer", "update the devkit") if version > FORMAT_VERSION else ("an older", "write it anew")
+        kind, remedy = ("a newer", "update the devkit") if version > FORMAT_VERSION else ("an older", "write it again")
         raise ResultsError(
             f"{path}: version: {kind} results format ({shown(version)}, this devkit's is {FORMAT_VERSION}); {remedy}"
         )

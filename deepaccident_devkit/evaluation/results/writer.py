@@ -71,7 +71,7 @@ class ResultsWriter:
                 where in its cell a point is; None if it is not known.
             store: of motion, `instances` keeps instance maps and paths, some 30 KB a sample of five predictions; heads
                 are post-processed as the released evaluation of motion does (docs/released_code.md, Post-processing).
-                The released accident evaluation does that otherwise, and from instance maps its numbers differ
+                The released accident evaluation does that in its own way, and from instance maps its numbers differ
                 slightly. `heads` keeps the maps of the model as they are: 34 MB a sample of six predictions.
 
         Raises:
@@ -116,7 +116,7 @@ class ResultsWriter:
             return
         with _told(self.path), self._stack:
             if body is None:
-                raise ResultsError("a prediction could not be written, so that none is kept; write all of them anew")
+                raise ResultsError("a prediction could not be written, so that none is kept; write all of them again")
             body.finish()
 
     def add(self, token: str, prediction: MotionOutput | Iterable[Accident] | DetectedBoxes) -> None:

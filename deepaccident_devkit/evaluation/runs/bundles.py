@@ -104,7 +104,7 @@ class Bundle:
         return stored
 
     def checksums(self) -> dict[str, str]:
-        """File → checksum of all that was written, but for the list itself; raises ResultsError."""
+        """File → checksum of all that was written, except the list itself; raises ResultsError."""
         path = self.folder / FILES_FILE
         stored = read_json(path, FILES_FORMAT).get("files")
         if not isinstance(stored, dict):

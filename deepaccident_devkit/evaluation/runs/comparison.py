@@ -33,7 +33,7 @@ class ComparedNumber:
         low: where the interval of the true difference begins; None for no interval.
         high: where it ends.
         family: `main` for the task's first headline, which is tested by itself; `headlines` for the others, which are
-            tested together; `other` for numbers that are not tested, but for exploration.
+            tested together; `other` for numbers that are for exploration and are not tested.
         p: of the paired permutation test of this number for itself; None without difference or resamples.
         adjusted_p: the same by Holm's rule over the headlines; of others like p.
         real: whether the adjusted p is at most 1 − confidence; False of numbers that are not tested.
@@ -76,7 +76,7 @@ class Comparison:
         partial: marks of those that are partial themselves.
         resampling: how differences were tested.
         swaps: how many swaps of the two runs' counts, cluster by cluster, p is of.
-        all_swaps: whether these are all there are (but for the sign); else they are random.
+        all_swaps: whether these are all there are (apart from the sign); else they are random.
         numbers: headlines first.
     """
 

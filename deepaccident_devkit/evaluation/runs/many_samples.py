@@ -119,7 +119,7 @@ def _resume(evaluator: Evaluator[Any], path: Path, samples: Mapping[str, Any]) -
 
 
 def _workers_that_can(batch: _Batch[Any], workers: int | None) -> int | None:
-    """The number asked for if other processes can do a batch's work, which they import by name; raises otherwise."""
+    """The number asked for if other processes can do a batch's work, which they import by name; if not, raises."""
     from multiprocessing.reduction import ForkingPickler
 
     try:

@@ -26,7 +26,7 @@ from deepaccident_devkit.evaluation.metrics.intervals import (
 from deepaccident_devkit.evaluation.metrics.numbers import has_interval
 
 _ROUNDING: Final = 1e-9
-"""Differences that are equal but for so small a share of them count as equal."""
+"""Differences that differ by at most this share of them count as equal."""
 _POWER: Final = 0.8
 """Chance that so many scenarios as are said to decide a difference do."""
 

@@ -91,7 +91,7 @@ def scenario_of(token: str) -> str:
 
 
 def agent_of(token: str) -> str:
-    """The agent's name in a sample's token; empty if it is none."""
+    """The agent's name in a sample's token; empty if it is no sample's token."""
     return token.rsplit("/", 2)[1] if token.count("/") > 1 else ""
 
 

@@ -42,7 +42,7 @@ _NOT_COMPARED: Final = (
     "results/path",
     "results/fingerprint",
 )
-"""Of a summary: what is told apart, is not made again, or says where things were."""
+"""Of a summary: what is distinguished, is not made again, or says where things were."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

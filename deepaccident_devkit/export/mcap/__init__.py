@@ -41,7 +41,7 @@ def export_mcap(
         dataset: the release.
         scenario: token or record.
         path: of the file; one that is there is replaced.
-        prediction: results, or a mapping from sample token to what is predicted; drawn beside the labels.
+        prediction: results, or a mapping from sample token to what is predicted; rendered beside the labels.
         progress: whether to show a bar.
         **choices: the fields of `McapConfig`: `agents`, `channels`, `frames`, `points`, `labels`, `motion_labels`,
             `on_missing`.

@@ -40,7 +40,7 @@ _PATH_ALPHA: Final = 0.5
 
 
 class Actors:
-    """Draws the boxes of moments."""
+    """Renders the boxes of moments."""
 
     def __init__(self, dataset: Dataset, scenario: str) -> None:
         """Boxes of a scenario."""

@@ -22,14 +22,14 @@ CELL_POINT: Final = np.dtype(
 )
 """A point of a map: `instance` is the map's id, `frame` counts from 0, the present."""
 FRAME_HEIGHT: Final = 0.2
-"""Metres that each future frame is drawn above the one before, so that none hides another."""
+"""Metres that each future frame is rendered above the one before, so that none hides another."""
 _PALETTE: Final = tuple(CATEGORY_COLORS.values())
 _FADING: Final = 0.6
 """Share of its opacity that an instance loses until the last frame."""
 
 
 class MotionMaps:
-    """Draws the motion labels of moments in the agents' ego frames."""
+    """Renders the motion labels of moments in the agents' ego frames."""
 
     def __init__(self, dataset: Dataset, scenario: str, config: MotionLabelConfig) -> None:
         """Labels of a scenario."""

@@ -1,6 +1,6 @@
-"""Boxes as Foxglove draws them (cubes and lines of scene entities), and as coloured points for viewers that do not.
+"""Boxes as Foxglove renders them (cubes and lines of scene entities), and as coloured points for viewers that do not.
 
-rerun shows point clouds but no SceneUpdate, so every drawing has a twin of points on a topic that ends in `/points`.
+rerun shows point clouds but no SceneUpdate, so every rendering has a twin of points on a topic that ends in `/points`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _TEXT_PIXELS: Final = 14.0
 _TEXT_ABOVE: Final = 0.6
 """Metres from a box's top to its text."""
 POINT_SPACING: Final = 0.25
-"""Metres between the points of a drawn line."""
+"""Metres between the points of a rendered line."""
 
 
 def scene_update(entities: Sequence[Any], index: int) -> Any:
@@ -126,7 +126,7 @@ def colored_points(xyz: FloatArray, color: str, alpha: float = 1.0) -> AnyArray:
 
 
 def joined(parts: Sequence[AnyArray]) -> AnyArray:
-    """Points of several drawings in one array."""
+    """Points of several renderings in one array."""
     return np.concatenate([np.zeros(0, dtype=COLORED_POINT), *parts])
 
 

@@ -23,7 +23,7 @@ from deepaccident_devkit.taxonomy import LIDAR
 COLORED_POINT: Final = np.dtype(
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("alpha", "u1")]
 )
-"""A point of a drawing; viewers take the colour from the last four fields."""
+"""A point of a rendering; viewers take the colour from the last four fields."""
 _NUMERIC_TYPES: Final = {
     np.dtype("u1"): PackedElementField.UINT8,
     np.dtype("<i4"): PackedElementField.INT32,
@@ -77,7 +77,7 @@ def rgb(color: str) -> ByteArray:
 
 
 def color_message(color: str, alpha: float = 1.0) -> Any:
-    """A Color of a colour of `render.colors`."""
+    """A `Color` of a colour of `render.colors`."""
     red, green, blue = (rgb(color) / 255).tolist()
     return Color(r=red, g=green, b=blue, a=alpha)
 

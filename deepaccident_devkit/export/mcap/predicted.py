@@ -38,7 +38,7 @@ _MARK_HEIGHT: Final = 1.0
 
 
 class PredictedScenes:
-    """Draws predictions of moments, on topics below `/<agent>/prediction`."""
+    """Renders predictions of moments, on topics below `/<agent>/prediction`."""
 
     def __init__(self, prediction: Predictions) -> None:
         """Predictions by sample token; raises ConfigError if they are no such thing."""

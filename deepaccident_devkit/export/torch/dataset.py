@@ -201,7 +201,7 @@ class V2XDataset(TorchDataset):
         }
 
     def _check_agents(self) -> None:
-        """What `agents` names is the same for all samples: a slip shows at the first."""
+        """What `agents` names is the same for all samples: a mistake shows at the first."""
         if len(self):
             first = self._dataset.sample[int(self._rows[0])]["token"]
             sensor_data.participants(self._dataset, first, self.config.agents)

@@ -23,7 +23,7 @@ from deepaccident_devkit.motion.warps import single_precision
 from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID, UNTRACKED_ID
 
 _DEFAULT_SIZE: Final = (3.99, 1.85, 1.62)
-"""The box that the released code draws where it finds no own row: a Lincoln's, by the looks of it."""
+"""The box that the released code rasterises where it finds no own row; it has the size of a Lincoln."""
 _CORNERS: Final = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]], dtype=np.float32) / 2
 """mmdet3d's corners 0, 3, 7, 4 from above, in lengths and widths."""
 _UP: Final = np.array([0, 0, 1, 0, 0, 0, 0], dtype=np.float32)
@@ -76,7 +76,7 @@ class FrameBoxes:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FramePolygons:
-    """What is drawn at one moment, in the order drawn; arrays are read-only.
+    """The polygons of one moment, in the order in which they are rasterised; arrays are read-only.
 
     Attributes:
         corners: (n, 4, 2) float32, x and y of the footprints' corners in the moment's ego frame, metres,
@@ -101,8 +101,8 @@ def box_polygons(
 
     Args:
         frames: the boxes of each label frame; None where there is no recording.
-        config: what is drawn.
-        is_vehicle: whether the agent is one and has a box of its own to draw (the roadside pole has none).
+        config: what is rasterised.
+        is_vehicle: whether the agent is a vehicle, with a box of its own (the infrastructure has none).
 
     Returns:
         A frame's polygons, the ego's own first and the others in the order of their rows; None for None.
@@ -176,7 +176,7 @@ class _Joined:
 
 
 def _drawn(boxes: _Joined, first: int, config: MotionLabelConfig) -> BoolArray:
-    """Which rows are drawn, where frame 0 is number `first`; own rows are not: the ego has a box of its own."""
+    """Which rows are rasterised, where frame 0 is number `first`; own rows are not: the ego has a box of its own."""
     rows: BoolArray = boxes.actor_id != OWN_ACTOR_ID
     if config.only_vehicle:
         rows &= boxes.category != _PEDESTRIAN

@@ -1,7 +1,7 @@
-"""Motion labels from boxes: who is drawn where, under which id, and where that is at the next frame.
+"""Motion labels from boxes: which cells an actor takes, under which id, and where it is at the next frame.
 
-Every frame is drawn in its own ego frame (docs/released_code.md, Motion labels); `MotionLabels.to_present` warps the
-maps.
+Every frame is rasterised in its own ego frame (docs/released_code.md, Motion labels); `MotionLabels.to_present` warps
+the maps.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from deepaccident_devkit.taxonomy import UNTRACKED_ID
 
 __all__ = ["FrameBoxes", "FramePolygons", "labels_from_polygons", "motion_labels_from_boxes"]
 _FAR: Final = 2**24
-"""Cells: corners beyond are drawn from there; the grid is far from both."""
+"""Cells: corners farther off are moved to here; the grid is far from both."""
 _MOST_IDS: Final = 2**24
 """float32 counts no further."""
 
@@ -53,13 +53,13 @@ def motion_labels_from_boxes(
             as `v2x.future_egomotion` gives them; taken as float32.
         config: what labels show, or the name of a preset; None for the released ones in the devkit's orientation.
         valid: (R,) bool, which frames are in the recording; all but those that are None in `frames`, if None.
-        is_vehicle: whether the agent is one and has a box of its own to draw (the roadside pole has none).
+        is_vehicle: whether the agent is a vehicle, with a box of its own (the infrastructure has none).
         id_map: actor id → id that a sample before this one had: the released code keeps them for a scenario and agent
             as long as a worker meets no other. None starts at 1.
 
     Raises:
         GeometryError: another number of frames or rows, or a motion that is not finite.
-        ConfigError: an id that is none, or any where the protocol does not keep ids between samples.
+        ConfigError: a wrong id, or any id where the protocol does not keep ids between samples.
         ChoiceError: no such preset.
     """
     chosen = label_config(config)
@@ -128,7 +128,7 @@ def _checked_ids(id_map: Mapping[int, int] | None, config: MotionLabelConfig) ->
 def _numbered(
     polygons: Sequence[FramePolygons | None], config: MotionLabelConfig, id_map: dict[int, int]
 ) -> tuple[IntArray, dict[int, int]]:
-    """The id of each polygon of all frames, and the map continued: ids from 1 in the order drawn."""
+    """The id of each polygon of all frames, and the map continued: ids from 1 in the order rasterised."""
     highest, ids = max(id_map.values(), default=0), []
     nobody = None if config.rules.untracked_share_an_id else UNTRACKED_ID
     for key in (key for frame in polygons if frame is not None for key in frame.key.tolist()):
@@ -160,7 +160,7 @@ def _covered(polygons: Sequence[FramePolygons | None], ids: IntArray, config: Mo
 
 
 def _vertices(corners: AnyArray, native: BevGrid, rules: LabelProtocol) -> IntArray:
-    """Native column and row that corners (n, 4, 2), x and y (left), metres, are drawn at."""
+    """Native column and row at which corners (n, 4, 2), x and y (left), metres, are rasterised."""
     x, y = corners[..., 0], corners[..., 1] if rules.right_handed else -corners[..., 1]
     columns_and_rows = (y, x) if native.orientation == "fiery" else (x, y)
     axes = reversed(axes_of(native))

@@ -69,7 +69,7 @@ class LabelMaps:
         """Maps of frames in which nobody is.
 
         All in one piece of memory: five pieces of a megabyte each would go back to the system with every sample, and
-        fetching them again takes as long as all the drawing.
+        fetching them again takes as long as all the rasterising.
         """
         frames, (height, width) = config.label_frames, config.grid.shape
         count = frames * height * width
@@ -92,7 +92,7 @@ def label_maps(
     """What instances and their centres look like as maps.
 
     Args:
-        covered: what is drawn, native.
+        covered: what is rasterised, native.
         centers: (T, 1 + ids, 2) each instance's centre, row and column, native; NaN where there is none.
         following: (T, 1 + ids, 2) where it is at the next frame, seen from this one; NaN where that is not known.
         missing: (T,) which frames are not in the recording.
@@ -132,7 +132,7 @@ def label_maps(
 
 
 def _draw_peaks(centerness: AnyArray, frame: IntArray, center: IntArray, sigma: float) -> None:
-    """Draw peaks around centres (n, 2), row and column, of frames (n,) into (T, 1, H, W); the higher one counts."""
+    """Put peaks around centres (n, 2), row and column, of frames (n,) into (T, 1, H, W); the higher one counts."""
     shape = centerness.shape[-2:]
     peak = _peak(sigma, max(shape))
     reach = len(peak) // 2

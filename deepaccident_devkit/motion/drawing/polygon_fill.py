@@ -1,9 +1,9 @@
 """Filling polygons on cells as OpenCV 4.7's fillPoly does, whatever OpenCV is installed, and many at a time.
 
-Labels are drawn by `cv2.fillPoly` (8-connected, whole-cell corners), and what it draws changed with OpenCV 4.8 (the
-interior of small polygons) and 4.11 (at the image's border). The released labels are those of 4.7; so its rule is
-written out here: the outline as clipped Bresenham lines, and between the edges the cells of each row from the first at
-or right of the left edge to the last at or left of the right one, in fixed point with 16 binary digits. Source:
+Labels are rasterised by `cv2.fillPoly` (8-connected, whole-cell corners), and what it rasterises changed with OpenCV
+4.8 (the interior of small polygons) and 4.11 (at the image's border). The released labels are those of 4.7; so its rule
+is written out here: the outline as clipped Bresenham lines, and between the edges the cells of each row from the first
+at or right of the left edge to the last at or left of the right one, in fixed point with 16 binary digits. Source:
 OpenCV 4.7.0, imgproc, drawing.cpp: clipLine, LineIterator, CollectPolyEdges and FillEdgeCollection.
 
 In each row of a convex polygon inside the image, what lies between the edges fills the gap between their outlines and
@@ -35,7 +35,7 @@ def filled_cells(
         polygons: (N, V, 2) whole numbers, column and row of V ≥ 3 corners in either direction; they may lie beside the
             image, coincide or cross.
         shape: rows and columns of one image.
-        image: (N,) which of the images each polygon is drawn into; the first if None.
+        image: (N,) which of the images each polygon is rasterised into; the first if None.
         images: how many images there are.
 
     Returns:

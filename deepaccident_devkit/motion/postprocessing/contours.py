@@ -99,8 +99,8 @@ def _follow(mask: bytes, width: int, start: int) -> list[int]:
 def convex_hull(contour: list[Point]) -> list[Point]:
     """The corners of the convex hull, turning from the x axis towards the y axis, as OpenCV lists them.
 
-    That list starts at the rightmost corner, unless the corners' places in the contour fall (or rise) along it but for
-    one jump: then where they jump.
+    That list starts at the rightmost corner, unless the corners' places in the contour fall (or rise) along it with one
+    jump: then it starts at the jump.
     """
     first = {point: place for place, point in reversed(list(enumerate(contour)))}
     last = {point: place for place, point in enumerate(contour)}

@@ -1,8 +1,8 @@
 """The smallest rectangle around each of many convex hulls, to the last bit as OpenCV 4.5.5 to 4.7 finds it.
 
 `cv2.minAreaRect` changed its angles with OpenCV 4.13, and one cannot be turned into the other without moving a few of
-the cells drawn from it. Source: OpenCV 4.7.0, imgproc, rotcalipers.cpp: which side is tried next is decided in whole
-numbers, lengths and areas are float32.
+the cells rasterised from it. Source: OpenCV 4.7.0, imgproc, rotcalipers.cpp: which side is tried next is decided in
+whole numbers, lengths and areas are float32.
 """
 
 from __future__ import annotations

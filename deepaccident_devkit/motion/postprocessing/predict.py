@@ -47,7 +47,7 @@ class PostProcessing:
             chosen; heads in another one are turned there and the result back.
         link_distance: cells; how near an instance must be to where the flow takes one of the frame before to share its
             id.
-        redraw: draw boxes along the paths of the first frame's instances, for the accident evaluation.
+        redraw: rasterise boxes along the paths of the first frame's instances, for the accident evaluation.
     """
 
     foreground: Foreground = "argmax"
@@ -116,7 +116,8 @@ class LinkedInstances:
         orientation: how the cells lie; that of the heads.
         instance: (T, H, W) int32: ids that are the same in all frames, 0 elsewhere.
         frame_instance: (T, H, W) int32: each frame's own ids before linking, 1 to I without gaps, 0 elsewhere.
-        redrawn: (T, H, W) int32: the ids of boxes drawn along the paths, 0 elsewhere; None unless the settings ask.
+        redrawn: (T, H, W) int32: the ids of boxes rasterised along the paths, 0 elsewhere; None unless the settings
+            ask.
         frame_centers: T times (K, 2) int64: rows and columns of the centres that cells were grouped around.
         paths: by id, ascending, the instances of the first frame.
     """
@@ -222,7 +223,7 @@ def trajectories(
         grid: what the cells cover, in any orientation.
         protocol: of the labels, or of those that the model learned. Where it has the `half_cell_shift`, that is undone:
             a cell stands for the corner that the protocol's native orientation counts it from.
-        half_cell_shift: in place of the protocol's own; with False a cell stands for its middle, whoever drew it.
+        half_cell_shift: in place of the protocol's own; with False a cell always stands for its middle.
 
     Returns:
         Id → (n, 2) x forward, y left, metres in the ego frame that the maps are in, at `linked.paths[id].frames`.

@@ -1,7 +1,7 @@
-"""The accident variant's boxes: each instance of the first frame drawn as a rectangle along its path.
+"""The accident variant's boxes: each instance of the first frame rasterised as a rectangle along its path.
 
 The released accident evaluation looks at these and not at the instances themselves (docs/released_code.md,
-Post-processing). All its quirks are kept; the masks' rectangles and the drawing are those of OpenCV 4.7, whatever
+Post-processing). All its quirks are kept; the masks' rectangles and the rasterising are those of OpenCV 4.7, whatever
 version is installed.
 """
 
@@ -20,7 +20,7 @@ from deepaccident_devkit.motion.postprocessing.contours import Point, are_one_pa
 from deepaccident_devkit.motion.postprocessing.min_area_rect import min_area_rects
 
 LONGEST: Final = (10, 4)
-"""Cells, length and width that a box is cut down to: a truck is drawn as 5 m × 2 m."""
+"""Cells, length and width that a box is cut down to: a truck is rasterised as 5 m × 2 m."""
 TURNING_MOVE: Final = 4
 """Cells that an instance must move in a step for its box to turn that way."""
 _PI: Final = 3.1415926
@@ -35,7 +35,7 @@ def redrawn_cells(
     """Boxes of the first frame's instances in all frames.
 
     An instance's first box has the length, width and angle of the smallest rectangle around its (last) part in the
-    first frame; the later ones turn to where it moved if that was far enough. Boxes are drawn one a frame from the
+    first frame; the later ones turn to where it moved if that was far enough. Boxes are rasterised one a frame from the
     first on, for as many frames as the instance is in: after a gap they are in the wrong ones. Later ids overwrite.
 
     Args:
@@ -45,7 +45,7 @@ def redrawn_cells(
         shape: rows and columns.
 
     Returns:
-        For each frame (2, P) rows and columns of the cells drawn, and (P,) their ids.
+        For each frame (2, P) rows and columns of the cells rasterised, and (P,) their ids.
     """
     instances, frames = exists.shape
     if not instances:

@@ -86,7 +86,7 @@ def present_from_frames(
 
 
 def frames_from_next(egomotion: ArrayLike, rules: LabelProtocol, augmentation: Augmentation | None = None) -> AnyArray:
-    """Transforms of each frame's next one to it; the released code inverts these motions otherwise than the chains'.
+    """Transforms from each frame's next one to it; the released code inverts these in a way of their own.
 
     Args:
         egomotion: (T, 6) right-handed, `next_from_this`.

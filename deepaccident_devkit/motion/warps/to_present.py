@@ -76,7 +76,7 @@ def maps_to_present(
 def _empty_like(maps: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
     """Arrays of these shapes in one block, which the allocator keeps for the next sample.
 
-    One by one they go back to the system each time, and their pages, taken anew, cost more than the warps.
+    One by one they go back to the system each time, and their pages, taken again, cost more than the warps.
     """
     block = np.empty(sum(given.nbytes for given in maps.values()), dtype=np.uint8)
     result, start = {}, 0

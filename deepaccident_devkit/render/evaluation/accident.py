@@ -27,15 +27,15 @@ _TIME_EDGES: Final = np.arange(-2.25, 2.3, 0.5)
 
 
 def render_accuracy(evaluator: AccidentEvaluator, *, ax: Axes | None = None) -> Axes:
-    """Draw the accident accuracy over the distance that a prediction may be off, with the three official distances.
+    """Render the accident accuracy over the distance that a prediction may be off, with the three official distances.
 
     Args:
         evaluator: with samples counted. Where its counts hold how far off each alarm is there is a curve from 0 to
             20 m; the released protocol's hold the outcomes at the official distances alone.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on; the title says the mean of the three, the accident prediction accuracy (APA).
+        The axes; the title says the mean of the three, the accident prediction accuracy (APA).
     """
     ax, result = axes_or_new(ax, PANEL), evaluator.compute()
     allowed = np.linspace(0, _FARTHEST, 201)
@@ -55,14 +55,14 @@ def render_accuracy(evaluator: AccidentEvaluator, *, ax: Axes | None = None) -> 
 
 
 def render_outcomes(result: AccidentResult, *, ax: Axes | None = None) -> Axes:
-    """Draw how many accidents are foreseen, predicted falsely and missed, at each distance allowed.
+    """Render how many accidents are foreseen, predicted falsely and missed, at each distance allowed.
 
     Args:
         result: of `AccidentEvaluator.compute`.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on.
+        The axes.
     """
     from matplotlib.ticker import MaxNLocator
 
@@ -84,15 +84,15 @@ def render_outcomes(result: AccidentResult, *, ax: Axes | None = None) -> Axes:
 
 
 def render_errors(evaluator: AccidentEvaluator, error: Literal["position", "time"], *, ax: Axes | None = None) -> Axes:
-    """Draw a histogram of how far off the predicted accidents are, of the samples that have one to come.
+    """Render a histogram of how far off the predicted accidents are, of the samples that have one to come.
 
     Args:
         evaluator: with samples counted, of a protocol whose counts hold it (not the released one's).
         error: of `position`, metres; or of `time`, seconds by which the prediction is late.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on; what lies beyond the bins is in the outermost.
+        The axes; what lies beyond the bins is in the outermost.
     """
     from matplotlib.ticker import MaxNLocator
 
@@ -115,14 +115,14 @@ def render_errors(evaluator: AccidentEvaluator, error: Literal["position", "time
 
 
 def render_alarms(evaluator: AccidentEvaluator, *, ax: Axes | None = None) -> Axes:
-    """Draw precision over recall of alarms, from the surest on.
+    """Render precision over recall of alarms, from the surest on.
 
     Args:
         evaluator: with samples counted, of a protocol whose alarms have scores (`boxes`).
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on: each point is all alarms of at least some score.
+        The axes: each point is all alarms of at least some score.
     """
     ax = axes_or_new(ax, PANEL)
     ax.set_title("Alarms from the surest on", fontsize=10)

@@ -18,16 +18,16 @@ UNKNOWN: Final = "not known"
 
 
 def render_breakdown(task: str, broken: Breakdown[Any], number: str, *, ax: Axes | None = None) -> Axes:
-    """Draw one headline number of each group as a bar, with its interval as a whisker.
+    """Render one headline number of each group as a bar, with its interval as a whisker.
 
     Args:
         task: whose headline numbers there are.
         broken: of `breakdown`.
         number: path of the number, as of `Headline`: `apa`, `ranges/30x30/iou`.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on; each bar has its value, and of how many samples and scenarios it is.
+        The axes; each bar has its value, and of how many samples and scenarios it is.
     """
     ax, bars, shown = axes_or_new(ax, PANEL), [], None
     for group in broken.groups:

@@ -18,20 +18,20 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _DASHES: Final = ("-", "--", "-.", ":")
-"""Lines that colours alone would tell apart are told apart in print, too."""
+"""Styles that distinguish lines also in print without colours."""
 
 
 def render_precision_recall(result: DetectionResult, name: str, *, ring: int = 0, ax: Axes | None = None) -> Axes:
-    """Draw precision over recall of one class, a line a threshold.
+    """Render precision over recall of one class, a line a threshold.
 
     Args:
         result: of `DetectionEvaluator.compute`.
         name: one of its classes.
         ring: which of its ranges.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on; a line ends where the recall does, and its label says the average precision.
+        The axes; a line ends where the recall does, and its label says the average precision.
 
     Raises:
         ChoiceError: no such class, or no such range.
@@ -60,14 +60,14 @@ def render_precision_recall(result: DetectionResult, name: str, *, ring: int = 0
 
 
 def render_average_precisions(result: DetectionResult, *, ax: Axes | None = None) -> Axes:
-    """Draw each class's average precision as a bar, the mean over thresholds and ranges.
+    """Render each class's average precision as a bar, the mean over thresholds and ranges.
 
     Args:
         result: of `DetectionEvaluator.compute`.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on, in percent; each bar has its value, and how many true boxes there are.
+        The axes, in percent; each bar has its value, and how many true boxes there are.
     """
     bars = [
         Bar(

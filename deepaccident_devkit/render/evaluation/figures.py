@@ -45,7 +45,7 @@ _BY_TIME: Final = "time_to_impact"
 
 
 class Draw(Protocol):
-    """Draws on axes, and returns them."""
+    """Renders on axes, and returns them."""
 
     def __call__(self, *, ax: Axes) -> Axes:
         """Draw."""
@@ -59,7 +59,7 @@ class RunFigure:
         name: of its file, without the ending.
         caption: what is to be seen, for the reader of the report.
         alt: the same in words and numbers, for who does not see it.
-        draw: draws it on axes.
+        draw: renders it on axes.
         rows: how many bars are below each other; the figure is higher for many.
     """
 
@@ -71,7 +71,7 @@ class RunFigure:
 
 
 def save_figure(run: EvaluationRun, drawn: RunFigure, folder: Path) -> Path:
-    """Draw a figure of a run into a PNG file, atomically, over one that is there.
+    """Render a figure of a run into a PNG file, atomically, over one that is there.
 
     Args:
         run: of `evaluate_results`.

@@ -19,14 +19,14 @@ _PARTS: Final = {"iou": "IoU", "pq": "PQ", "sq": "SQ", "rq": "RQ"}
 
 
 def render_ranges(result: MotionResult, *, ax: Axes | None = None) -> Axes:
-    """Draw IoU and the panoptic quality with its two factors, within each range.
+    """Render IoU and the panoptic quality with its two factors, within each range.
 
     Args:
         result: of `MotionEvaluator.compute`.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on, in percent; what has nothing to count has no bar.
+        The axes, in percent; what has nothing to count has no bar.
     """
     ax, count = axes_or_new(ax, PANEL), len(result.ranges)
     for offset, ((name, within), color) in enumerate(
@@ -46,15 +46,15 @@ def render_ranges(result: MotionResult, *, ax: Axes | None = None) -> Axes:
 
 
 def render_quality_by_time(evaluator: MotionEvaluator, step: float = 0.5, *, ax: Axes | None = None) -> Axes:
-    """Draw the panoptic quality of each frame ahead, a line a range.
+    """Render the panoptic quality of each frame ahead, a line a range.
 
     Args:
         evaluator: with samples counted.
         step: seconds from frame to frame.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on, in percent over seconds from the present. The result's quality is that of the sums over all
+        The axes, in percent over seconds from the present. The result's quality is that of the sums over all
         frames.
     """
     ax, counts = axes_or_new(ax, PANEL), evaluator.counts.values()

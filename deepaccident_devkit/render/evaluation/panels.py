@@ -41,15 +41,15 @@ class Bar:
 
 
 def draw_bars(bars: Sequence[Bar], ax: Axes, limit: float | None = None) -> Axes:
-    """Draw horizontal bars, the first on top, with their intervals as whiskers and their texts to the right.
+    """Render horizontal bars, the first on top, with their intervals as whiskers and their texts to the right.
 
     Args:
         bars: what is not known has a dash in a bar's place.
-        ax: the axes to draw on.
+        ax: the axes to render on.
         limit: where the values end; None for as far as they go.
 
     Returns:
-        The axes drawn on.
+        The axes.
     """
     if not bars:
         return draw_nothing(ax)

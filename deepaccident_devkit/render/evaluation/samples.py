@@ -63,15 +63,15 @@ def sample_figures(run: EvaluationRun, dataset: Dataset, results: Results) -> tu
 
 
 def draw_motion_outcome(prediction: MotionOutput, label: MotionLabels, *, ax: Axes | None = None) -> Axes:
-    """Draw the last frame's cells: actors that are predicted rightly, falsely, and missed.
+    """Render the last frame's cells: actors that are predicted rightly, falsely, and missed.
 
     Args:
-        prediction: what a model says; the last of several predictions is drawn.
+        prediction: what a model says; the last of several predictions is rendered.
         label: the truth, on the same ground; frames in their own ego frames are warped to the present.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on, in metres of the present ego frame: forward to the right, left up.
+        The axes, in metres of the present ego frame: forward to the right, left up.
 
     Raises:
         EvaluationError: the present is not recorded.

@@ -70,7 +70,7 @@ def headline_table(run: EvaluationRun) -> Markup:
 
 
 def predictors(run: EvaluationRun) -> Markup:
-    """The predictions beside predictors that know nothing or the present alone; empty but for warnings."""
+    """The predictions beside predictors that know nothing or the present alone; empty except for warnings."""
     return joined(
         joined(
             [table(list(each.rows[0]), [list(row) for row in each.rows[1:]]), *(tag("p", note) for note in each.notes)]
@@ -134,7 +134,7 @@ def sanity(report: Mapping[str, Any]) -> Markup:
 
 
 def explanation(report: Mapping[str, Any]) -> Markup:
-    """What the other protocols, and each choice made otherwise, do to the headline numbers.
+    """What the other protocols, and a change of each choice, do to the headline numbers.
 
     Args:
         report: as `Explanation.as_dict` has it.
@@ -157,7 +157,7 @@ def explanation(report: Mapping[str, Any]) -> Markup:
     return joined(
         [
             table(["number", *protocols], rows, f"by protocol, of {report['samples']:,} samples"),
-            table(["choice", *shown], otherwise, "one choice made otherwise, all else as chosen") if otherwise else "",
+            table(["choice", *shown], otherwise, "one choice changed, all else as chosen") if otherwise else "",
             tag("p", f"No number changes with: {', '.join(same)}.") if same else "",
             tag("details", tag("summary", "What these results cannot be evaluated by"), tag("ul", *refused))
             if refused
@@ -185,7 +185,7 @@ def checking() -> Markup:
         [
             tag(
                 "p",
-                "This report is one file of a bundle. Whoever has the bundle, the results and the release can "
+                "This report is one file of a bundle. Anyone who has the bundle, the results and the release can "
                 "recompute all numbers, and is told each that differs:",
             ),
             tag("p", tag("code", "deepaccident evaluate verify DIR")),

@@ -20,14 +20,14 @@ _BIN: Final = 0.5
 
 
 def render_warning_times(result: WarningResult, *, ax: Axes | None = None) -> Axes:
-    """Draw a histogram of the seconds of warning, over the recordings of accidents that are warned of.
+    """Render a histogram of the seconds of warning, over the recordings of accidents that are warned of.
 
     Args:
         result: of `WarningEvaluator.compute`.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on; a line is at the mean, the title says how many recordings have no right alarm.
+        The axes; a line is at the mean, the title says how many recordings have no right alarm.
     """
     from matplotlib.ticker import MaxNLocator
 
@@ -48,14 +48,14 @@ def render_warning_times(result: WarningResult, *, ax: Axes | None = None) -> Ax
 
 
 def render_predictors(result: AnticipationResult, *, ax: Axes | None = None) -> Axes:
-    """Draw how well accidents are told from other recordings before they happen, beside the reference predictors.
+    """Render how well accidents are told from other recordings before they happen, beside the reference predictors.
 
     Args:
         result: of `WarningEvaluator("clean").compute`.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on; of the first group of recordings, a bar a predictor; a line is at 0.5, which chance has.
+        The axes; of the first group of recordings, a bar a predictor; a line is at 0.5, which chance has.
     """
     ax, group = axes_or_new(ax, PANEL), next(iter(result.groups), None)
     if group is None:
@@ -78,14 +78,14 @@ def render_predictors(result: AnticipationResult, *, ax: Axes | None = None) -> 
 
 
 def render_detection_rates(result: WarningResult, *, ax: Axes | None = None) -> Axes:
-    """Draw which share of accidents has a right alarm so many seconds before the impact, or earlier.
+    """Render which share of accidents has a right alarm so many seconds before the impact, or earlier.
 
     Args:
         result: of `WarningEvaluator.compute`.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on; each bar has its value, and of how many recordings it is.
+        The axes; each bar has its value, and of how many recordings it is.
     """
     bars = [
         Bar(
@@ -103,14 +103,14 @@ def render_detection_rates(result: WarningResult, *, ax: Axes | None = None) -> 
 
 
 def render_false_alarms(result: WarningResult, *, ax: Axes | None = None) -> Axes:
-    """Draw the false alarms a minute of each kind of recording.
+    """Render the false alarms a minute of each kind of recording.
 
     Args:
         result: of `WarningEvaluator.compute`.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on; each bar has its value, and the alarms and minutes that it is of.
+        The axes; each bar has its value, and the alarms and minutes that it is of.
     """
     bars = [
         Bar(
@@ -129,14 +129,14 @@ def render_false_alarms(result: WarningResult, *, ax: Axes | None = None) -> Axe
 
 
 def render_warning_curve(result: WarningResult, *, ax: Axes | None = None) -> Axes:
-    """Draw the detection rate over the false alarms a minute, a point a score from which alarms are raised.
+    """Render the detection rate over the false alarms a minute, a point a score from which alarms are raised.
 
     Args:
         result: of `WarningEvaluator.compute`.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on; some points have their score beside them.
+        The axes; some points have their score beside them.
     """
     ax, curve = axes_or_new(ax, PANEL), result.curve
     ax.set_title("If only alarms of at least a score were raised", fontsize=10)

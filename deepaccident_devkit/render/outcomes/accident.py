@@ -39,16 +39,16 @@ def draw_accident_outcome(
     layers: Iterable[Layer] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw where two collide in truth and where they are foreseen to, with the metres between the places.
+    """Render where two collide in truth and where they are foreseen to, with the metres between the places.
 
     Args:
         compared: what a protocol compares, of `compared_accidents`.
-        truth: the actors around, as they are now, and where the pair goes; None draws the accidents alone.
+        truth: the actors around, as they are now, and where the pair goes; None renders the accidents alone.
         layers: `boxes` (the actors now), `trajectories` (of the pair) and `grid` are the default; also `ids`.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on, in metres of the present ego frame.
+        The axes, in metres of the present ego frame.
 
     Raises:
         ChoiceError: no such layer.

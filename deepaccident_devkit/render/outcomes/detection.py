@@ -41,7 +41,7 @@ def draw_detection_outcome(
     layers: Iterable[Layer] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw detections over true boxes: matched ones with a line to their true box, false ones, and who is missed.
+    """Render detections over true boxes: matched ones with a line to their true box, false ones, and who is missed.
 
     Args:
         prediction: in the protocol's frame.
@@ -49,11 +49,11 @@ def draw_detection_outcome(
         protocol: name, or a protocol: its matching decides.
         threshold: one of the protocol's; None for that of its errors, or else the middle one.
         layers: `boxes` and `grid` are the default; also `ids`, those of the true boxes.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on, in metres of that frame; the title counts. What does not count, such as boxes beyond the
-        protocol's area, is not drawn.
+        The axes, in metres of that frame; the title counts. What does not count, such as boxes beyond the
+        protocol's area, is not rendered.
 
     Raises:
         ChoiceError: no such protocol, threshold or layer.
@@ -76,7 +76,7 @@ def draw_detection_outcome(
 
 
 def draw_true(truth: Boxes, matches: DetectionMatches, ax: Axes) -> None:
-    """Draw the true boxes that count, those that are missed dashed."""
+    """Render the true boxes that count, those that are missed dashed."""
     found, missed = truth.select(matches.truth), truth.select(matches.missed)
     draw_boxes_from_above(found, ax, ["black"] * len(found), fill=0, linewidths=0.7)
     colors = [OUTCOME_COLORS["missed"]] * len(missed)

@@ -53,7 +53,7 @@ def render_evaluation(
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Draw a sample's truth and beside it what a model says, with a protocol's verdict on it in numbers.
+    """Render a sample's truth and beside it what a model says, with a protocol's verdict on it in numbers.
 
     Motion has true instances as found or missed and predicted ones as right or false, frame by frame; accidents have
     the places where two collide, with the metres between foreseen and true ones; detections have matched, false and
@@ -69,10 +69,10 @@ def render_evaluation(
             prediction's cells and half a second apart.
         layers: of motion `labels`, `trajectories`, `ids`, `grid`; of accidents `boxes`, `trajectories`, `ids`, `grid`;
             of detections `boxes`, `ids`, `grid`. All but `ids` are the default.
-        fig: an empty figure to draw on; a new one if None.
+        fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure drawn on: truth to the left, prediction to the right, the verdict above.
+        The figure: truth to the left, prediction to the right, the verdict above.
 
     Raises:
         TokenError: no such sample.

@@ -88,16 +88,16 @@ def motion_outcome(
 def draw_motion_side(
     outcome: MotionOutcome, side: Side, *, layers: Iterable[Layer] | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Draw the `true` instances as found or missed, or the `predicted` ones as right or false; later frames are paler.
+    """Render `true` instances as found or missed, or `predicted` ones as right or false; later frames are paler.
 
     Args:
         outcome: of `motion_outcome`.
         side: which.
         layers: `labels` (the cells), `trajectories` and `grid` are the default; also `ids`.
-        ax: axes to draw on; new ones if None.
+        ax: axes to render on; new ones if None.
 
     Returns:
-        The axes drawn on, in metres of the present ego frame; the title counts instances over all frames.
+        The axes, in metres of the present ego frame; the title counts instances over all frames.
 
     Raises:
         ChoiceError: no such layer.

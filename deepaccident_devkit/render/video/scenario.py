@@ -1,4 +1,4 @@
-"""`render_scenario_video`: the frames of a scenario, drawn in parallel, into one file."""
+"""`render_scenario_video`: the frames of a scenario, rendered in parallel, into one file."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
         scenario: token or record.
         path: the file to write, by its suffix: `.mp4` (which browsers play if the extra `video` is installed), `.gif`
             or `.webp`. One that is there is replaced, once the new one is whole.
-        what: a view by name, a function (dataset, frame record, figure) that draws one, or several side by side.
+        what: a view by name, a function (dataset, frame record, figure) that renders one, or several side by side.
         agents: who is shown, or None for all that are there. Views of one agent (`sample`, `bev`, cameras, …) show the
             first one named, else the first one there; their boxes and points from above are of all of `agents`.
-        layers: each view draws those of them that it has; None for each one's default.
+        layers: each view renders those of them that it has; None for each one's default.
         frames: numbers of frames, from 1, in the order given; or a slice of all of them, as of a list; None for all.
         size: width and height, pixels; even numbers for MP4.
         fps: frames a second; recorded are 10.
-        workers: processes that draw. None takes what the work is worth, and this one alone for functions of your own;
+        workers: processes that render. None takes what the work is worth, and this one alone for functions of your own;
             with more, these must be importable from a module.
         progress: whether to show a bar.
 
@@ -95,7 +95,7 @@ def _numbers(frames: Collection[int] | slice | None, last: int) -> list[int]:
 
 
 def _workers(own: Sequence[OwnView], workers: int | None) -> int | None:
-    """How many processes draw; raises ChoiceError if a function cannot be sent to them."""
+    """How many processes render; raises ChoiceError if a function cannot be sent to them."""
     if not own or workers == 1:
         return workers
     if workers is None:

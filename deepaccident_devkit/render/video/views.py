@@ -1,4 +1,4 @@
-"""The views that a video can show, each drawn on a figure of its own, and a frame of them side by side."""
+"""The views that a video can show, each rendered on a figure of its own, and a frame of them side by side."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import FrameRecord
 
 OwnView = Callable[[Dataset, "FrameRecord", "Figure"], object]
-"""Draws a moment, given by its record, on an empty figure; what it returns does not matter."""
+"""Renders a moment, given by its record, on an empty figure; what it returns does not matter."""
 _DPI: Final = 100.0
 _DPI_AT: Final = 1280 * 720
 """Pixels of the picture whose inch has `_DPI` pixels; that of larger ones has more, so that words stay as large."""
@@ -39,7 +39,7 @@ _DPI_AT: Final = 1280 * 720
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Moment:
-    """What a view draws.
+    """What a view renders.
 
     Attributes:
         dataset: the release.
@@ -64,7 +64,7 @@ class Moment:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class View:
-    """One way to draw a moment.
+    """One way to render a moment.
 
     Attributes:
         draw: on an empty figure.
@@ -150,11 +150,11 @@ VIEWS: Final[Mapping[str, View]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scene:
-    """How every frame of a video is drawn.
+    """How every frame of a video is rendered.
 
     Attributes:
         dataset: the release.
-        views: side by side, each with the layers that it draws.
+        views: side by side, each with the layers that it renders.
         agents: as of `cooperating_agents`.
         width: pixels.
         height: pixels.
@@ -167,7 +167,7 @@ class Scene:
     height: int
 
     def picture(self, frame: str) -> ByteArray:
-        """Draw the moment of a frame's token; (height, width, 3) uint8, RGB."""
+        """Render the moment of a frame's token; (height, width, 3) uint8, RGB."""
         names = names_at(self.dataset, frame, self.agents)
         total, left, parts = sum(view.share for view, _ in self.views), 0, []
         for number, (view, layers) in enumerate(self.views):

@@ -28,7 +28,7 @@ _log = logging.getLogger(__name__)
 
 
 def check_target(path: Path, *, size: tuple[int, int], fps: float) -> None:
-    """Tell before anything is drawn whether it can be written; raises ChoiceError."""
+    """Tell before anything is rendered whether it can be written; raises ChoiceError."""
     if path.suffix.lower() not in SUFFIXES:
         raise ChoiceError(f"path: expected a file that ends in {', '.join(SUFFIXES)}, found {str(path)!r}")
     if path.is_dir():

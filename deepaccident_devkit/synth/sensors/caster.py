@@ -1,4 +1,4 @@
-"""Casting rays against solids and the ground: Embree where it is installed, numpy otherwise."""
+"""Casting rays against solids and the ground: Embree where it is installed, else numpy."""
 
 import importlib.util
 from functools import lru_cache

@@ -276,7 +276,7 @@ def _cast_boxed(scene: Scene, lidar: Lidar, ground_from_lidar: SE3) -> tuple[Int
 def _random_numbers() -> tuple[Float32Array, Float32Array]:
     """Numbers of the standard normal distribution, and even ones from 0 to 1, (2 ** 18,) each.
 
-    Each turn takes them from places of its own: drawing them anew would take as long as casting the rays to the boxes.
+    Each turn takes them from places of its own: drawing them again would take as long as casting the rays to the boxes.
     """
     rng = np.random.default_rng(0)
     normal, even = rng.standard_normal(_NUMBERS, dtype=np.float32), rng.random(_NUMBERS, dtype=np.float32)

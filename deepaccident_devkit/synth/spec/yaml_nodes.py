@@ -57,7 +57,7 @@ def parse_yaml(text: str, source: str) -> Node:
     except yaml.MarkedYAMLError as error:
         raise ConfigError(f"{source}:{_fault(error)}") from error
     except (yaml.YAMLError, RecursionError) as error:
-        raise ConfigError(f"{source}: no YAML: {str(error).splitlines()[0]}; write it anew as plain text") from error
+        raise ConfigError(f"{source}: no YAML: {str(error).splitlines()[0]}; write it again as plain text") from error
 
 
 def _fault(error: yaml.MarkedYAMLError) -> str:

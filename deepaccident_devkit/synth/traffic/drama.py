@@ -27,7 +27,7 @@ _GREEN_SHARE = (0.35, 0.75)
 _LATEST = 1.5
 """Seconds after the time at which the pair should meet, when a simulation of their accident ends."""
 _ROUNDS = 5
-"""How often a simulation is made anew without those of the background who touch someone."""
+"""How often a simulation is made again without those of the background who touch someone."""
 _LONGEST_DRIVE = 11.0
 """Seconds before a meeting for which the background drives; in a longer scenario it stands until then."""
 _MARGIN = 0.1

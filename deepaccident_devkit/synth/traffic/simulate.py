@@ -29,7 +29,7 @@ class Simulation(FrozenArrays):
     Attributes:
         time: (S,) seconds, `kinematics.PERIOD` apart.
         states: (S, A, 5) x, y (metres), yaw (radians), speed (m/s) and steering angle (radians); x and y are of the
-            box's centre, speed and yaw of the rear axle, which does not slip.
+            box's centre, speed and yaw of the rear axle, which does not slide.
         velocities: (S, A, 2) of the box's centre, m/s.
         contact: row of the first step at which the watched pair touches, None if it never does.
     """

@@ -41,7 +41,7 @@ def break_release(root: Path, name: str, *, scenario: str | None = None) -> Brok
 
     Raises:
         ChoiceError: there is no such breakage.
-        ConfigError: the release has no such scenario, or not what this breaks.
+        ConfigError: the release has no such scenario, or lacks what this breaks.
     """
     breakage = checked_breakage(name)
     editor = _Watched(root, _chosen(root, scenario))
@@ -81,7 +81,7 @@ def broken_release(out: Path, name: str, config: SmallRelease | None = None) -> 
 
     Raises:
         ChoiceError: there is no such breakage.
-        ConfigError: `out` is a file or holds something, or the release wanted has not what this breaks.
+        ConfigError: `out` is a file or holds something, or the wanted release lacks what this breaks.
     """
     checked_breakage(name)
     return break_release(write_small_release(out, config), name)
@@ -95,7 +95,7 @@ def checked_breakage(name: str) -> Breakage:
 
 
 class _Watched(ScenarioEditor):
-    """Knows whether anything is now another than it was."""
+    """Knows whether any file has changed."""
 
     def __init__(self, root: Path, scenario: ScenarioFolder) -> None:
         super().__init__(root, scenario)
@@ -107,7 +107,7 @@ class _Watched(ScenarioEditor):
             self._before[path] = _digest(path)
 
     def has_changed(self) -> bool:
-        """Whether a file holds something else, was made or is gone."""
+        """Whether a file was changed, made or removed."""
         return any(_digest(path) != before for path, before in self._before.items())
 
 

@@ -1,4 +1,4 @@
-"""What a breakage is, and what is done to a release by one."""
+"""What a breakage is, and how it changes a release."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -64,7 +64,7 @@ class BrokenRelease:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Victim:
-    """What a breakage breaks.
+    """The scenario that a breakage breaks.
 
     Attributes:
         editor: the scenario.

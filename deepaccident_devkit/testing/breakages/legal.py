@@ -1,4 +1,4 @@
-"""What is odd and no fault: the format allows it, real releases have it, and a loader must take it."""
+"""Odd files without a fault: the format allows them, real releases have them, and a loader must read them."""
 
 from pathlib import Path
 

@@ -59,7 +59,7 @@ CONFIGS = {
     "oblong, as fiery": MotionLabelConfig(grid=OBLONG, orientation="fiery", protocol="clean"),
     "large": MotionLabelConfig(grid=BevGrid((-100.0, 100.0, 0.5), (-100.0, 100.0, 0.5)), future_frames=1),
     "augmented": MotionLabelConfig(augmentation=Augmentation(rotation=0.3, scale=1.04, flip=True)),
-    "slips of one's own": MotionLabelConfig(protocol=replace(LABEL_PROTOCOLS["clean"], untracked_share_an_id=True)),
+    "quirks of one's own": MotionLabelConfig(protocol=replace(LABEL_PROTOCOLS["clean"], untracked_share_an_id=True)),
     "one agent's sight": MotionLabelConfig(agents=("ego_vehicle",)),
 }
 
@@ -137,7 +137,7 @@ class TestRoundTrip:
             assert_same(files[token], motion_labels(da_motion, token, CONFIGS[name]))
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("name", ["clean, everybody, untracked too", "everybody", "slips of one's own"])
+    @pytest.mark.parametrize("name", ["clean, everybody, untracked too", "everybody", "quirks of one's own"])
     def test_untracked_actors(self, small: DeepAccident, tmp_path: Path, name: str) -> None:
         """Each row is an instance without an actor, or all are actor −1."""
         config = replace(CONFIGS[name], filter_invisible=False)
@@ -316,7 +316,7 @@ class TestRefusing:
     def test_what_cannot_be_drawn_is_said_before_anything_is_written(self, root: Path, tmp_path: Path) -> None:
         small, out = opened(root), tmp_path / "labels"
         unlabelled = opened(tiny.write_tiny_release(tmp_path / "test", labelled=False))
-        with pytest.raises(NotAvailableError, match="ego_vehicle/003 has no label to draw"):
+        with pytest.raises(NotAvailableError, match="ego_vehicle/003 has no label"):
             write(unlabelled, out, tokens_of(unlabelled, 3))
         with pytest.raises(TokenError, match="no token 'nothing'"):
             write(small, out, [*tokens_of(small, 3), "nothing"])
@@ -498,7 +498,9 @@ class TestDamage:
         (folder / MANIFEST).write_text(text, encoding="latin-1")
         before = contents(folder)
         for use in (lambda: LabelFiles(folder), lambda: write(small, folder, tokens_of(small, 3))):
-            with pytest.raises(LabelFilesError, match=r"manifest\.json: cannot be read .*; make the labels anew in an"):
+            with pytest.raises(
+                LabelFilesError, match=r"manifest\.json: cannot be read .*; make the labels again in an"
+            ):
                 use()
         assert contents(folder) == before
 

@@ -129,7 +129,7 @@ def test_an_open_release_outlives_a_new_index(root: Path) -> None:
     assert len(opened(root).scenario) == 3
     assert len(release.scenario) == 2
     assert len(release.track[:]) == len(release.track) > 0
-    with pytest.raises(IndexStoreError, match="the index was made anew; open the release again"):
+    with pytest.raises(IndexStoreError, match="the index was made again; open the release again"):
         pickle.loads(pickled)
 
 

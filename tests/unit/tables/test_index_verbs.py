@@ -211,7 +211,7 @@ def test_clear_refuses_what_is_no_index(root: Path, tmp_path: Path, name: str, b
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("{}")
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    with pytest.raises(IndexStoreError, match=r"v1: not removed, for it holds what is no part of an index: .*;"):
+    with pytest.raises(IndexStoreError, match=r"v1: not removed: it holds what is no part of an index: .*;"):
         clear_index(root, index_dir=folder)
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 

@@ -177,7 +177,7 @@ def test_message_sizes_are_of_what_arrives(da: DeepAccident, sample: str) -> Non
     arrived = [message.agent for message in messages(da, sample, None, lossy)]
     assert 1 < len(arrived) < len(AGENTS)
     assert da.message_sizes(sample, link=lossy) == {agent: now[agent] for agent in arrived}
-    with pytest.raises(ConfigError, match=r"from frame 004; the most there is 0\.3 s"):
+    with pytest.raises(ConfigError, match=r"from frame 004; the longest possible is 0\.3 s"):
         da.message_sizes(sample, link=Link(latency=0.4))
 
 

@@ -37,7 +37,7 @@ def test_a_latency_longer_than_the_past_names_what_there_is(da_b: DeepAccident, 
     assert len(da_b.cooperative_boxes(sample, link=Link(latency=0.3))) > 0
     for call in (da_b.cooperative_boxes, da_b.visible_instances, da_b.aggregate_point_cloud, da_b.message_sizes):
         with pytest.raises(
-            ConfigError, match=r"from frame 004; the most there is 0\.3 s, and .* works from frame 006 on"
+            ConfigError, match=r"from frame 004; the longest possible is 0\.3 s, and .* works from frame 006 on"
         ):
             call(sample, agents=["infrastructure"], link=Link(latency=0.5))
 

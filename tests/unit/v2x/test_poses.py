@@ -34,5 +34,5 @@ def test_what_is_no_poses_is_refused(poses: object) -> None:
 
 
 def test_a_pose_without_an_inverse_is_refused() -> None:
-    with pytest.raises(GeometryError, match="a transform has no inverse: its rotation is none"):
+    with pytest.raises(GeometryError, match="a transform has no inverse: its rotation is no rotation"):
         relative_pose_to_ego(np.zeros((2, 4, 4)))

@@ -1,7 +1,7 @@
-"""Accident metrics for those who would rely on the alarm: against what happens, not against rasters (protocol `boxes`).
+"""Accident metrics for users of alarms: compared with what happens, not with rasters (protocol `boxes`).
 
 The truth is the pair and the moment that the scenario's meta file names, at the places where the labels have them.
-Every alarm counts, nothing of the truth helps to choose one, and what a recording cannot refute is not judged.
+Every alarm counts, the truth does not help to choose one, and an alarm that a recording cannot refute is not judged.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ _LEFT_OUT = ("unjudged", "beyond", "at_impact")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoxAccidentResult(AccidentResult):
-    """Accident metrics, and what one would ask of an alarm; the latter at the distance of `Scoring.errors_at`.
+    """Accident metrics, and numbers on alarms; these at the distance of `Scoring.errors_at`.
 
-    Where no accident comes at all nothing can be foreseen: then APA and the accuracies are NaN, and the false alarm
-    rate says how good predictions are.
+    Without any accident to foresee APA and the accuracies are NaN, and the false alarm rate says how good predictions
+    are.
 
     Attributes:
         precision: share of the alarms that foresee a true accident; None without alarms.
@@ -56,8 +56,8 @@ class BoxAccidentResult(AccidentResult):
         false_alarm_rate: share of the samples without an accident to come that raise an alarm; None without any.
         lateness: seconds, mean over the true positives by which the predicted moment is later than the true one,
             negative if it is earlier; None without any.
-        unjudged: alarms that nothing can refute: no accident is known, and they are for later than the recording shows.
-        beyond: alarms for later than the horizon, which are none.
+        unjudged: alarms that nothing can refute: no accident is known, and they are for a time after the recording.
+        beyond: alarms for later than the horizon, which do not count.
         at_impact: samples at the impact itself, where nothing is foreseen any more; they are left out of all else.
     """
 
@@ -76,20 +76,20 @@ class BoxAccidents:
     """Accident metrics against the labels' boxes.
 
     A list of `Accident`s is a list of alarms: each is true or false, and the surest one that is near enough to the true
-    accident (the earliest of equally sure ones) is the true positive. K motion predictions are one alarm, as sure as
-    the share of them that have an accident; where and when is said by the mean sample (the last) or else by the first
-    that has one. They are not cut at the recording's end, which a model cannot know. An alarm for later than the
-    horizon is none, and at the impact itself there is nothing to foresee.
+    accident (the earliest of equally sure ones) is the true positive. K motion predictions are one alarm, whose score
+    is the share of them that have an accident. The mean sample (the last) says where and when, or if it has no
+    accident, the first sample that has one. They are not cut at the recording's end, which a model cannot know. An
+    alarm for later than the horizon does not count, and at the impact itself there is nothing to foresee.
 
     Attributes:
-        reading: how an accident is read off maps. By the paper's 1 m, the default, traffic side by side is one, since
-            neighbouring cells are 0.5 m apart; at 0.5 m a square contact is none.
-        min_score: alarms less sure than this are none.
+        reading: how an accident is read off maps. By the paper's 1 m, the default, traffic side by side collides, since
+            neighbouring cells are 0.5 m apart; at 0.5 m a square contact is missed.
+        min_score: alarms with a lower score do not count.
         match_distance: metres: gate of the match of instances with actors, which decides whether a prediction in maps
-            names the right ones; also how far off the `nearest` of `naming` may be.
+            names the right ones; also the largest distance of the `nearest` of `naming`.
         naming: whom an explicit accident without `ids` (actor ids) names: the two actors whose boxes' centres are
             `nearest` to its positions at its time (at the last moment of the truth, if it is for later), or, with
-            `given`, nobody. Where nobody is near enough, the accident names others than those who collide.
+            `given`, nobody. If nobody is near enough, the accident names the wrong actors.
         unjudged_are_false: alarms that the recording cannot refute are false ones; else they are left out and counted
             aside.
         scoring: when an accident counts as foreseen.
@@ -116,7 +116,7 @@ class BoxAccidents:
         return asdict(self)
 
     def variants(self) -> dict[str, BoxAccidents]:
-        """These metrics with one choice made otherwise, by `name=value`; for explanations."""
+        """These metrics with one choice changed, by `name=value`; for explanations."""
         own: Mapping[str, tuple[Any, ...]] = {
             "min_score": (0.5,),
             "match_distance": (2.0, 4.0, 8.0),
@@ -141,10 +141,10 @@ class BoxAccidents:
         Returns:
             `positive`: whether an accident comes; `named`: whom the boxes bring nearer to each other than the danger
             distance (of `NAMED`); `alarms`: the surest first; `unjudged` and `beyond`: how many were left out, and how
-            many are none; `at_impact`: whether the impact is now, so that nothing else of the sample counts.
+            many do not count; `at_impact`: whether the impact is now, so that nothing else of the sample counts.
 
         Raises:
-            EvaluationError: the context has no truth, or the prediction is neither.
+            EvaluationError: the context has no truth, or the prediction is neither maps nor accidents.
         """
         truth = context.truth
         if not isinstance(truth, BoxTruth):
@@ -173,7 +173,8 @@ class BoxAccidents:
             nothing = {distance: replace(each, accuracy=math.nan) for distance, each in base.within.items()}
             base = replace(base, apa=math.nan, within=nothing)
         at = base.within[self.scoring.errors_at]
-        beyond = [f"{given['beyond']} alarms are for later than the horizon and are none"] if given["beyond"] else []
+        late = given["beyond"]
+        beyond = [f"{late} alarms are for later than the horizon and do not count"] if late else []
         return BoxAccidentResult(
             **{each.name: getattr(base, each.name) for each in fields(AccidentResult) if each.name != "notes"},
             notes=(*base.notes, *beyond),
@@ -186,7 +187,7 @@ class BoxAccidents:
         )
 
     def pooled(self, counts: Collection[Counts]) -> list[Counts]:
-        """The sums of all counts, which have the same result; alarms stay one by one."""
+        """The sums of all counts, which have the same result; alarms are kept one by one."""
         return [self._united(counts)]
 
     def _united(self, counts: Collection[Counts]) -> dict[str, Any]:
@@ -247,7 +248,7 @@ def _alarm(accident: Accident, ids: Pair | None, truth: BoxTruth) -> dict[str, A
 
 
 def _average_precision(alarms: Sequence[Sequence[float]], positives: int) -> float | None:
-    """The area under the steps of precision over recall; equally sure alarms are one step, so that no order counts."""
+    """The area under the steps of precision over recall; alarms of equal score are one step."""
     if not positives:
         return None
     if not alarms:

@@ -1,4 +1,4 @@
-"""`ComparedAccidents`: which accidents a protocol compares in a sample, for who wants to look at them."""
+"""`ComparedAccidents`: the accidents that a protocol compares in a sample, to look at them."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class ComparedAccidents:
     """The accidents of one sample, in the present ego frame; those read off maps have no `ids`.
 
     Attributes:
-        true: what comes, as the protocol has it; None if nothing does.
-        predicted: what is foreseen, one an alarm or a prediction that has one.
+        true: the accident to come, by the protocol; None without one.
+        predicted: the accidents foreseen, one for each alarm, or for each prediction with one.
     """
 
     true: Accident | None
@@ -44,11 +44,11 @@ def compared_accidents(
     Args:
         prediction: what a model says; of one that `protocol.counts` takes.
         label: the sample's motion labels, where the protocol compares with those.
-        context: what else is known of the sample.
+        context: other facts on the sample.
         protocol: one of the devkit's; of another one, explicit accidents are as given, and the truth is the context's.
 
     Raises:
-        EvaluationError: the prediction is neither motion nor accidents, or the protocol has not what it compares with.
+        EvaluationError: the prediction is neither motion nor accidents, or the protocol lacks its truth.
     """
     given = checked_prediction(prediction)
     if isinstance(protocol, ReleasedAccidents):

@@ -1,4 +1,4 @@
-"""`DrawnPaths`: what the released accident evaluation looks at: the first frame's instances, their paths and boxes."""
+"""`DrawnPaths`: what the released accident evaluation compares: the first frame's instances, their paths, boxes."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class DrawnPaths:
     Attributes:
         paths: by id, ascending, the first frame's instances: (n, 2) positions in metres, one for each frame that the
             instance is in.
-        drawn: (T, H, W) the ids as they are drawn, 0 elsewhere; in the orientation `released`, since outlines depend on
-            where they begin.
+        drawn: (T, H, W) the ids as they are rasterised, 0 elsewhere; in the orientation `released`, since outlines
+            depend on where they begin.
     """
 
     paths: Paths
@@ -44,7 +44,7 @@ def paths_of_instances(instance: AnyArray, grid: BevGrid, *, redraw: bool) -> Dr
     Args:
         instance: (T, H, W) ids from 1 that stay the same over the frames, 0 elsewhere.
         grid: its cells and orientation.
-        redraw: draw boxes along the paths, as the released post-processing does; else keep the instances.
+        redraw: rasterise boxes along the paths, as the released post-processing does; else keep the instances.
     """
     paths = instance_paths(instance, grid)
     lying = to_orientation(instance, vectors=False, source=grid.orientation, target="released")

@@ -1,4 +1,4 @@
-"""`AccidentEvaluator`: how well accidents are foreseen, and what a protocol for that has to offer."""
+"""`AccidentEvaluator`: how well accidents are foreseen, and the interface of a protocol for it."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from deepaccident_devkit.evaluation.metrics.predictions import Prediction, check
 from deepaccident_devkit.motion import MotionLabels
 
 Truth = MotionLabels | BoxTruth | AccidentContext
-"""What an evaluator takes as label: motion labels, or for a protocol without rasters what it compares with."""
+"""What an evaluator takes as label: motion labels, or for a protocol without rasters its own truth."""
 
 
 @runtime_checkable
 class AccidentProtocol(Protocol):
-    """A frozen dataclass with one field a choice; `PROTOCOLS` has those with names."""
+    """A frozen dataclass with one field for each choice; `PROTOCOLS` has those with names."""
 
     def settings(self) -> dict[str, Any]:
-        """All that decides the numbers, as JSON can hold it."""
+        """All choices that affect the numbers, as JSON can hold them."""
 
     def counts(self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext) -> Counts:
-        """What one sample adds; raises EvaluationError if it cannot be evaluated so."""
+        """What one sample adds; raises EvaluationError if it cannot be evaluated by this protocol."""
 
     def result(self, counts: Collection[Counts]) -> AccidentResult:
         """The metrics of some samples' counts, in any order; of those that `pooled` gives, too."""
@@ -38,7 +38,7 @@ class AccidentProtocol(Protocol):
         """Fewer counts with the same result, to the last bit."""
 
     def variants(self) -> Mapping[str, AccidentProtocol]:
-        """The same protocol with one choice made otherwise, by the choice's name: what `explain` compares with."""
+        """The same protocol with one choice changed, by the choice's name: what `explain` compares with."""
 
 
 PROTOCOLS: Final[Mapping[str, AccidentProtocol]] = MappingProxyType(
@@ -61,11 +61,11 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
 
         Args:
             protocol: of `PROTOCOLS` by name, or your own.
-            explain: count each sample also with each choice of the protocol made otherwise, for `explained`; takes
+            explain: count each sample also with each choice of the protocol changed, for `explained`; takes
                 that many times longer.
 
         Raises:
-            ChoiceError: no protocol has that name, or it is none.
+            ChoiceError: no protocol has that name, or it is of another type.
         """
         super().__init__()
         self.protocol = _protocol(protocol)
@@ -96,7 +96,7 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
                 frames are warped to the present with bilinear centres, as the released evaluation does. A protocol that
                 compares with boxes needs none; it takes their truth here (`box_truth` or `accident_context`), or in the
                 context.
-            context: what else is known of it; None for nothing.
+            context: other facts on the sample; None for nothing.
 
         Raises:
             EvaluationError: the protocol cannot evaluate such a prediction or label, or the sample came before with
@@ -120,7 +120,7 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
         return self.protocol.pooled(counts)
 
     def explained(self) -> dict[str, AccidentResult]:
-        """For each choice of the protocol the result if it were made otherwise, all else equal.
+        """For each choice of the protocol the result if that choice alone is changed.
 
         Raises:
             EvaluationError: the evaluator was not made with `explain`.
@@ -134,7 +134,7 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
 
 
 def _known(label: Truth | None, context: AccidentContext | None) -> tuple[MotionLabels | None, AccidentContext]:
-    """Motion labels, and all else that is known; raises EvaluationError."""
+    """Motion labels, and the other facts; raises EvaluationError."""
     if context is not None and not isinstance(context, AccidentContext):
         raise EvaluationError(
             f"context: expected an AccidentContext, found {type(context).__name__}; make it with "

@@ -1,4 +1,4 @@
-"""How near instances of one frame are, as the released code measures it: between outlines, as scikit-image draws them.
+"""How near instances of one frame are, as the released code measures it: between outlines, as scikit-image finds them.
 
 The released code takes `find_contours(mask * id, 0.1)[0]` and then `approximate_polygon(…, tolerance=0.5)`. Both are
 written out here (scikit-image 0.20, BSD), the first to the last bit. The second decides ties at exactly its tolerance
@@ -18,13 +18,15 @@ import numpy as np
 from deepaccident_devkit.arrays import AnyArray, FloatArray, IntArray
 
 LEVEL: Final = 0.1
-"""Where between 0 beside the instance and its id in it the outline runs: the higher the id, the farther out."""
+"""The level, between 0 outside the instance and its id inside, at which the outline runs: the higher the id, the
+farther out.
+"""
 TOLERANCE: Final = 0.5
-"""Cells that a simplified outline may be off."""
+"""The largest error of a simplified outline, cells."""
 TIE: Final = 1e-9
-"""Cells that two lengths must differ by to be different."""
+"""Lengths that differ by less, in cells, are equal."""
 NO_OUTLINE: Final = 1e11
-"""Cells: the released code's distance to an instance that is not in the picture, or too small there for an outline."""
+"""Cells: the released code's distance to an instance that is not in the map, or too small there for an outline."""
 Place = tuple[slice, slice]
 """Rows and columns."""
 _TOP, _LEFT, _BOTTOM, _RIGHT = range(4)
@@ -133,7 +135,7 @@ def simplified(outlines: list[FloatArray]) -> list[FloatArray]:
 
 
 def _places(image: AnyArray, ids: IntArray) -> list[Place | None]:
-    """Where instances are; None for those that are not in the picture. Renumbered, since ids may be of any size."""
+    """Where instances are; None for those that are not in the map. Renumbered, since ids may be of any size."""
     from scipy.ndimage import find_objects
 
     cells = np.flatnonzero(image > 0)
@@ -147,7 +149,7 @@ def _places(image: AnyArray, ids: IntArray) -> list[Place | None]:
 
 
 def _box_gaps(places: Sequence[Place | None]) -> FloatArray:
-    """(N, N) cells that the outlines of instances are apart at least: their boxes, each a cell wider all around."""
+    """(N, N) the least distances of the outlines of instances, cells: of their boxes, each a cell wider all around."""
     lowest, highest = np.full((2, len(places), 2), np.nan)
     for index, place in enumerate(places):
         if place is not None:

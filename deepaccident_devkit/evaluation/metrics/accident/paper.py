@@ -1,4 +1,4 @@
-"""Accident metrics as the paper describes them; where it is silent, as the released code has them (protocol `paper`).
+"""Accident metrics as the paper describes them, or where it is silent, as in the released code (protocol `paper`).
 
 Each choice is a field of `PaperAccidents`, `AccidentReading` or `Scoring`; docs/protocols.md lists them.
 """
@@ -66,23 +66,24 @@ class PaperAccidents:
     """The accident metrics of the paper's text.
 
     Attributes:
-        labels: protocol of the labels that are the truth; others are refused. None for any labels.
+        labels: label protocol of the truth; labels of others are refused. None for any labels.
         reading: how an accident is read off maps, the truth's and the prediction's alike.
         predicted_by: whose accident counts as predicted: that of `any` of the K predictions, or the `mean` sample's
             (the last of the K) alone.
         sample_choice: which of several predictions that have an accident is compared: the `best`, whose positions are
-            nearest to the truth (as the released code; the first of equal ones), or `mean_first`: the mean sample's or
-            else the first, without a look at the truth. Both are counted; this one is the result, the other is beside.
+            nearest to the truth (as the released code; the first of equal ones), or `mean_first`: the mean sample's, or
+            else the first, which does not use the truth. Both are counted; this one is the result, the other is in
+            `beside`.
         position_time: the moment of the predicted positions: its `own` accident's, or that of the `truth`, where both
             predicted agents are there then. Explicit accidents have only their own.
         alarm_choice: which of a sample's explicit accidents are predicted: the `surest` (the earliest of equally sure
-            ones), as a prediction in maps shows one at most; or `any`, as if each were one of K predictions, the surest
-            in the mean's place.
+            ones), as a prediction in maps shows at most one; or `any`: each counts as one of K predictions, and the
+            surest as the mean.
         alarms_cut: explicit accidents for later than the labels' last frame in the recording, by more than half a step,
             are left out, as the frames of maps are.
         naming: whom an explicit accident without `ids` names: the two true instances that are `nearest` to its
-            positions at its time, or, with `given`, nobody. (`ids` are actor ids, and are compared with the actors that
-            the true instances are.)
+            positions at its time, or, with `given`, nobody. (`ids` are actor ids, and are compared with those of the
+            true instances.)
         match_distance: metres: gate of the match of instances that decides whether a prediction names the right ones;
             also how far off the `nearest` of `naming` may be.
         scoring: when an accident counts as foreseen.
@@ -113,7 +114,7 @@ class PaperAccidents:
         return asdict(self)
 
     def variants(self) -> dict[str, PaperAccidents]:
-        """These metrics with one choice made otherwise, by `name=value`; for explanations."""
+        """These metrics with one choice changed, by `name=value`; for explanations."""
         own: Mapping[str, tuple[Any, ...]] = {
             "predicted_by": get_args(PredictedBy),
             "sample_choice": get_args(SampleChoice),
@@ -255,7 +256,7 @@ def _nearest(alarms: Sequence[Alarm | None]) -> Alarm | None:
 
 
 def _notes(given: Mapping[str, Any], samples: int) -> tuple[str, ...]:
-    """Sentences on predictions whose truth is not that of heads."""
+    """Sentences on predictions whose truth is not made of heads."""
     return tuple(
         f"{given[form]} of {samples} predictions were given as {words}: their truth is the labels' instance map, not "
         "the released grouping and linking of the labels"
@@ -278,7 +279,7 @@ def explicit_alarm(
     Args:
         predicted: in the present ego frame, as the truth.
         truth: read off the labels' maps.
-        actors: who the two true instances are, None for one that is not known; None without a true accident.
+        actors: actor ids of the two true instances, None for one that is not known; None without a true accident.
         seconds: from frame to frame of the maps.
         naming: whom the predicted one names if it has no `ids`.
         gate: metres: how far off the nearest instances may be.
@@ -300,7 +301,7 @@ def _id_error(
     naming: Naming,
     gate: float,
 ) -> int | None:
-    """1 if others are named than the two true instances; None if nobody is named, or it is not known who those are."""
+    """1 if other actors than the two true ones are named; None if nobody is named, or their ids are not known."""
     if truth.contact is None or actors is None:
         return None
     if predicted.ids is not None:

@@ -1,8 +1,8 @@
 """Accidents as the released code evaluates them, bugs included (protocol `released`; docs/released_code.md, Accidents).
 
-Each bug is a field of `ReleasedAccidents` that can be put right, or lies in the functions that it comes from:
-`motion.postprocessing.redrawing` (boxes of 5 m × 2 m at most, drawn into the wrong frame after a gap, and of the first
-frame's instances alone), `outlines.first_outline` (of an instance in several parts, one counts),
+Each bug is a field of `ReleasedAccidents` that can be corrected, or lies in the functions that have it:
+`motion.postprocessing.redrawing` (boxes of 5 m × 2 m at most, rasterised into the wrong frame after a gap, and of the
+first frame's instances alone), `outlines.first_outline` (of an instance in several parts, one counts),
 `trajectories.padded` and `match_trajectories`.
 """
 
@@ -52,16 +52,16 @@ _NOTHING_FOUND: Final = {"id": 1.0, "position": 20.0, "time": 1.0}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReleasedAccidents:
-    """The released rules; the defaults are as they are, slips included.
+    """The released rules; the defaults keep all quirks.
 
     Attributes:
         labels: protocol of the labels that are the truth, others are refused; None for any.
-        truth_gap: cells; the true instances that are nearer collide. 0.001 asks them to overlap.
-        prediction_gap: cells; the predicted ones that are nearer do: 2.5 m. The paper has 1 m for both.
+        truth_gap: cells; the true instances that are nearer collide. With 0.001 they must overlap.
+        prediction_gap: cells; the predicted instances that are nearer collide: 2.5 m. The paper has 1 m for both.
         level: where the outlines run, see `outlines.LEVEL`: 0.1 makes instances almost a cell larger all around.
         truth_through_heads: truth is what the post-processing finds in the labels; else the labels' own instances.
-        redraw: distances are those of the boxes drawn along the paths; else of the instances themselves.
-        last_frame_only: only the last frame counts, as the lists of accidents are made anew for each. So accidents
+        redraw: distances are those of the boxes rasterised along the paths; else of the instances themselves.
+        last_frame_only: only the last frame counts, as the lists of accidents begin empty at each. So accidents
             have no time, and its error is always 0. Else the frame with the smallest distance counts, and truth and
             prediction have each its own.
         accelerating: paths that end early go on faster and faster; see `trajectories.padded`.
@@ -105,7 +105,7 @@ class ReleasedAccidents:
         return asdict(self)
 
     def variants(self) -> Mapping[str, ReleasedAccidents]:
-        """These rules with one choice made otherwise, by `name=value`."""
+        """These rules with one choice changed, by `name=value`."""
         switches = {name: (False, True) for name, value in asdict(self).items() if isinstance(value, bool)}
         return with_others(
             self, {"truth_gap": (2.0,), "prediction_gap": (2.0,), "level": (0.5,), "errors_at": (10.0,), **switches}
@@ -115,7 +115,7 @@ class ReleasedAccidents:
         """What one sample adds.
 
         Raises:
-            EvaluationError: there is no label, or the prediction is none of motion, or of something else.
+            EvaluationError: there is no label, or the prediction is no motion.
         """
         if not isinstance(prediction, MotionOutput) or label is None:
             raise EvaluationError(
@@ -200,7 +200,7 @@ def accident_counts(
     Args:
         predictions: K of them, the mean last.
         truth: what is true.
-        matches: of each prediction: its ids and the true ones that are the same.
+        matches: of each prediction: its ids and the matched true ids.
         rules: the rules.
         step: seconds from one frame to the next.
 
@@ -255,7 +255,7 @@ def collision(given: DrawnPaths, frames: Sequence[int], gap: float, level: float
 
 
 def _apart(predicted: DrawnPaths, alarm: Collision, truth: DrawnPaths, true: Collision) -> float:
-    """Metres: the sum of how far the two predicted ones are from the two true ones, whichever way is nearer."""
+    """Metres: the sum of the distances of the predicted from the true two, in the order with the smaller sum."""
     here, there = (
         np.array([each.paths[name][one.frame] for name in one.pair])
         for each, one in ((predicted, alarm), (truth, true))
@@ -264,7 +264,7 @@ def _apart(predicted: DrawnPaths, alarm: Collision, truth: DrawnPaths, true: Col
 
 
 def _others_named(alarm: Collision, true: Collision, same: Collection[Pair]) -> int:
-    """0 if both that are foreseen are the true ones, by the matches of their paths; else 1."""
+    """0 if the two predicted ones are the true ones, by the matches of their paths; else 1."""
     return int(not all(any((name, other) in same for other in true.pair) for name in alarm.pair))
 
 

@@ -20,9 +20,11 @@ from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMapping
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabels
 
 DISTANCES: Final = (5.0, 10.0, 15.0)
-"""Metres: how far off a predicted accident may be."""
+"""The largest position differences of a predicted accident, metres."""
 NAMED: Final = ("meta", "another", "none", "unknown")
-"""Whom the truth of a sample names: the pair of the meta file, another one, nobody; or the pair was not told."""
+"""The actors that the truth of a sample names: the pair of the meta file, another pair, nobody; or the pair is
+unknown.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,7 +37,7 @@ class AccidentsWithin:
         fp: predicted, but elsewhere or without any.
         fn: missed.
         accuracy: tp / (tp + fp / 2 + fn / 2); NaN where nothing is counted.
-        id_error: share of the true positives that name others; None if the protocol says nothing of it.
+        id_error: share of the true positives that name others; None if the protocol has no value.
         position_error: metres, mean over the true positives; likewise.
         time_error: seconds, mean over the true positives; likewise.
     """
@@ -65,7 +67,7 @@ class AccidentResult(FrozenMappings):
         negatives: those without.
         truths: whom the samples' truths name, counts by `NAMED`.
         notes: sentences that a reader of the numbers should know.
-        beside: results of other choices that are always printed along, by `name=value`.
+        beside: results of other choices that are always printed too, by `name=value`.
     """
 
     within: Mapping[float, AccidentsWithin]
@@ -119,7 +121,7 @@ def united(tallies: Iterable[Tally]) -> Tally:
 
 
 def exact_parts(numbers: Iterable[Iterable[float]]) -> list[float]:
-    """A few floats with the exact sum of many: it as a float, then what that lacks."""
+    """A few floats with the exact sum of many: the rounded sum, then the remainders."""
     rest, parts = [*chain.from_iterable(numbers)], []
     while part := math.fsum(rest):
         parts.append(part)
@@ -178,7 +180,7 @@ Alarm = Mapping[str, Any]
 positive) and `id` (0 the same two, 1 others) differences from the truth; None where there is none or it is not known.
 """
 _TIME_SLACK: Final = 1e-6
-"""Seconds: moments are decimal numbers, which binary ones only come near."""
+"""Seconds: moments are decimal numbers, which binary numbers only approximate."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -190,7 +192,7 @@ class Scoring:
         limit_counts: a difference of exactly the distance allowed is within it, as in the released code.
         far_is_missed: an accident foreseen elsewhere is a false positive and leaves the true one missed; else it is
             only the former, as in the released code.
-        time_tolerance: seconds: how far off in time an accident foreseen may be; None for any. The paper looks at
+        time_tolerance: seconds: the largest time error of an accident foreseen; None for any. The paper looks at
             positions alone.
     """
 
@@ -207,7 +209,7 @@ class Scoring:
             raise ConfigError(f"time_tolerance: expected seconds from 0, or None, found {self.time_tolerance!r}")
 
     def variants(self) -> dict[str, Scoring]:
-        """This scoring with one choice made otherwise, by `name=value`; for explanations."""
+        """This scoring with one choice changed, by `name=value`; for explanations."""
         return with_others(
             self,
             {
@@ -276,7 +278,7 @@ def _cases_within(sample: Counts, alarms: Sequence[Alarm], distance: float, scor
 
 
 def actor_of(cells: BoolArray, frame: int, label: MotionLabels, context: AccidentContext) -> int | None:
-    """The actor that most of an instance's labelled cells belong to; of as many, the one that was drawn first.
+    """The actor to which most of an instance's labelled cells belong; of equal ones the one rasterised first.
 
     Args:
         cells: (H, W) where the instance is, as the label lies.
@@ -285,7 +287,7 @@ def actor_of(cells: BoolArray, frame: int, label: MotionLabels, context: Acciden
         context: who the label's own box is.
 
     Returns:
-        Its id; None if no cell is labelled, or if it is not known whose the label is.
+        Its id; None if no cell is labelled, or if the agent of the label is not known.
     """
     drawn = label.instance[frame][cells]
     names, counts = np.unique(drawn[drawn > 0], return_counts=True)

@@ -1,1 +1,1 @@
-"""Alarms of accidents and what really happens: what the metrics of accidents and of warnings share."""
+"""Alarms of accidents and what really happens, for the metrics of accidents and of warnings."""

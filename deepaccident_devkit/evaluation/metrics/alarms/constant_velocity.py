@@ -1,4 +1,4 @@
-"""Alarms of the simplest predictor there is: all go on as they do now, and whoever touches within 3 s collides."""
+"""Alarms of the simplest predictor: all keep their velocity, and two that touch within 3 s collide."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from deepaccident_devkit.geometry.conflicts import time_to_collision
 ALARM_TIME: Final = 3.0
 """Seconds of time to collision below which there is an alarm."""
 _MOVES: Final = 0.1
-"""Metres a second of two relative to each other below which they are no danger, such as parked cars."""
+"""Relative speeds below this, in m/s, are no danger, such as those of parked cars."""
 
 
 def constant_velocity_alarms(boxes: Boxes, names: Mapping[int, int | None], own: int | None) -> tuple[Accident, ...]:
@@ -23,7 +23,7 @@ def constant_velocity_alarms(boxes: Boxes, names: Mapping[int, int | None], own:
     Args:
         boxes: N actors at the present, in its ego frame, with velocities over the ground; unknown ones stand.
         names: actor ids that stand for others: a label's own row, −100; None if it is not known which.
-        own: the actor that one of a pair has to be; None for any pair.
+        own: the actor that must be in the pair; None for any pair.
 
     Returns:
         Positions are those at the contact; the score falls from 1 at the contact to 0 at 3 s.

@@ -10,7 +10,7 @@ import numpy as np
 from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
 
 _PAIRS_AT_ONCE = 1 << 18
-"""Pairs of corner and side that are looked at together: bounds the memory."""
+"""The number of pairs of corner and side in one batch: bounds the memory."""
 
 
 def convex_hulls(points: IntArray, group: IntArray) -> FloatArray:
@@ -73,8 +73,8 @@ def _both_sides(points: IntArray, group: IntArray) -> tuple[IntArray, IntArray, 
 def _lower_envelope(chain: IntArray, along: IntArray, aside: IntArray) -> IntArray:
     """Which points of each chain, ascending in `along`, are corners of its convex lower side; its ends always are.
 
-    A point on or above the line between any two others is no corner, so all that are so between their neighbours go at
-    once, until none is.
+    A point on or above the line between any two others is no corner. So all points above the line between their
+    neighbours are removed at once, again and again, until there are none.
     """
     kept = np.arange(len(chain))
     while True:
@@ -127,7 +127,7 @@ def _parts(way: FloatArray, first: FloatArray, second: FloatArray) -> BoolArray:
     """Whether a line across `way`, from second to first, has each hull on a side of its own.
 
     Of hulls that are apart the shortest way between corners and sides is the shortest of all, and such a line crosses
-    it; hulls that overlap cannot be parted.
+    it; hulls that overlap cannot be separated.
     """
     near = np.einsum("pvk,pk->pv", first, way).min(axis=1)
     far = np.einsum("pvk,pk->pv", second, way).max(axis=1)

@@ -1,4 +1,4 @@
-"""The alarms that predictions raise, the surest first, where, and whom each of them names."""
+"""The alarms that predictions raise, the surest first, with their places and the actors that they name."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from deepaccident_devkit.taxonomy import FRAME_PERIOD
 LABEL_STEP: Final = 0.5
 """Seconds from one frame of the released labels to the next."""
 Naming = Literal["nearest", "given"]
-"""Whom an explicit accident without `ids` names: who is `nearest` to its positions then, or nobody."""
+"""The actors that an explicit accident without `ids` names: those `nearest` to its positions then, or nobody."""
 Pair = tuple[int | None, int | None]
-"""Ids of those who are named; None for one who is nobody that is known."""
+"""Ids of the actors named; None for an unknown one."""
 NamedAlarm = tuple[Accident, Pair | None]
 """An alarm and whom it names; None if it names nobody."""
 _RELEASED_LABELS: Final = MotionLabelConfig()
@@ -42,7 +42,7 @@ class AlarmRules(Protocol):
 
     @property
     def min_score(self) -> float:
-        """Alarms less sure than this are none."""
+        """Alarms with a lower score do not count."""
 
     @property
     def match_distance(self) -> float:
@@ -58,8 +58,8 @@ def named_alarms(
 ) -> list[NamedAlarm]:
     """The alarms of one sample, the surest first, of equally sure ones the earliest.
 
-    K motion predictions are at most one alarm, as sure as the share of them that have an accident; where and when is
-    said by the mean sample (the last) or else by the first that has one.
+    K motion predictions are at most one alarm, whose score is the share of them that have an accident. The mean sample
+    (the last) says where and when, or if it has no accident, the first that has one.
 
     Args:
         prediction: motion in maps, or explicit accidents.
@@ -75,23 +75,23 @@ def named_alarms(
 
 
 def within_horizon(alarms: list[NamedAlarm], truth: BoxTruth) -> list[NamedAlarm]:
-    """The alarms for no later than predictions look ahead, within half a recorded frame; others are none."""
+    """The alarms within the horizon of the predictions and half a recorded frame; others do not count."""
     return [each for each in alarms if each[0].time <= truth.horizon + SLACK]
 
 
 def by_sureness(alarm: Accident) -> tuple[Any, ...]:
-    """The surest first, of equally sure ones the earliest; the rest is so that no order of a list counts."""
+    """The surest first, of equally sure ones the earliest; other keys make it independent of the list's order."""
     return -alarm.score, alarm.time, alarm.positions.tolist(), alarm.ids or ()
 
 
 def nearest_two(positions: FloatArray, identity: IntArray, center: FloatArray, gate: float) -> Pair:
-    """Who is nearest to two positions, a different one each, by the least sum of distances.
+    """The two actors nearest to two positions, by the least sum of distances.
 
     Args:
         positions: (2, 2) x forward, y left, metres.
-        identity: (I,) int64, ascending: of those who can be named.
+        identity: (I,) int64, ascending: of actors that can be named.
         center: (I, 2) where they are, in the same frame; NaN where they are not.
-        gate: metres: whoever is farther away is not named.
+        gate: metres: an actor that is farther away is not named.
     """
     places = InstanceTracks(identity=np.arange(2), center=positions[None])
     match = match_tracks(places, InstanceTracks(identity=identity, center=center[None]), gate)
@@ -99,7 +99,7 @@ def nearest_two(positions: FloatArray, identity: IntArray, center: FloatArray, g
 
 
 def position_difference(first: FloatArray, second: FloatArray) -> float:
-    """The differences of two pairs of positions (2, 2), metres: the sum over the two, whichever way they fit better."""
+    """The differences of two pairs of positions (2, 2), metres: the sum over the two, in the order that fits better."""
     apart = np.linalg.norm(first[:, None] - second, axis=-1)
     return float(min(apart[0, 0] + apart[1, 1], apart[0, 1] + apart[1, 0]))
 

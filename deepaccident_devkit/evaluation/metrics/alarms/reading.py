@@ -24,23 +24,23 @@ from deepaccident_devkit.motion.postprocessing.predict import Foreground
 Outline = Literal["centers", "cells"]
 Moment = Literal["closest", "first", "last"]
 TIE: Final = 1e-9
-"""Metres that two lengths must differ by to be different: means of cells are off by the last bits."""
+"""Lengths that differ by less, in metres, are equal: means of cells are inexact in the last bits."""
 _TIE_DECIMALS: Final = 9
 _CHOICES: Final[Mapping[str, tuple[str, ...]]] = {"outline": get_args(Outline), "moment": get_args(Moment)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AccidentReading:
-    """Which instances are said to collide, and when; the defaults are the protocol `paper`'s.
+    """Which instances collide, and when; the defaults are those of the protocol `paper`.
 
     Attributes:
         foreground: of heads: which cells are actors, as `PostProcessing` has it. The released accident evaluation has
             `sigmoid`; the paper is silent, and `argmax` is what the same paper's motion metrics use.
         link_distance: of heads: cells, as `PostProcessing` has it. The released accident evaluation has 8.
-        redraw: of heads: take the boxes that the released code draws along the paths instead of the instances.
+        redraw: of heads: take the boxes that the released code rasterises along the paths instead of the instances.
         outline: what the distance of two instances is between: the convex hulls of their cells' `centers` (points and
             straight lines allowed), or of their whole `cells`, which are nearer by about a cell.
-        danger_distance: metres; what comes nearer to each other collides.
+        danger_distance: metres; instances that come nearer to each other collide.
         present: whether the present frame counts.
         moment: the frame of a pair's accident: where it is `closest` (the earliest if there are several), the `first`
             with less than the danger distance, or the `last` frame alone, as in the released code.
@@ -65,7 +65,7 @@ class AccidentReading:
 
     @property
     def post_processing(self) -> PostProcessing:
-        """What heads go through."""
+        """The post-processing of heads."""
         return PostProcessing(foreground=self.foreground, link_distance=self.link_distance, redraw=self.redraw)
 
     def instances(self, heads: MotionHeads) -> AnyArray:
@@ -74,7 +74,7 @@ class AccidentReading:
         return linked.instance if linked.redrawn is None else linked.redrawn
 
     def variants(self) -> dict[str, AccidentReading]:
-        """This reading with one choice made otherwise, by `name=value`; for explanations."""
+        """This reading with one choice changed, by `name=value`; for explanations."""
         return with_others(
             self,
             {
@@ -128,7 +128,7 @@ class InstanceAccident:
 
     Attributes:
         tracks: of all instances.
-        contact: None if nothing comes near enough.
+        contact: None if no pair comes near enough.
     """
 
     tracks: InstanceTracks
@@ -172,7 +172,7 @@ def accident_of(
 
 
 def match_tracks(predicted: InstanceTracks, truth: InstanceTracks, gate: float) -> dict[int, int]:
-    """Instances that go the same way, one to one: predicted id → true id.
+    """Instances with the same path, one to one: predicted id → true id.
 
     The distance of two is the mean of that of their centres over the moments at which both are there. Of all ways to
     match, as many pairs as possible within `gate`, and of those with as many the least sum of distances. (So a distant
@@ -190,7 +190,7 @@ def match_tracks(predicted: InstanceTracks, truth: InstanceTracks, gate: float) 
     sums = np.where(common, apart, 0).sum(axis=0)
     distance = np.where(common.any(axis=0), even(sums / np.maximum(common.sum(axis=0), 1)), np.inf)
     allowed = distance <= gate + TIE
-    # a pair more within the gate outweighs all that distances can add up to
+    # one more pair within the gate outweighs any sum of distances
     refused = (gate + 1) * (min(distance.shape) + 1)
     rows, columns = linear_sum_assignment(np.where(allowed, distance, refused))
     return {
@@ -303,5 +303,5 @@ def _candidates(shapes: _Shapes, size: FloatArray, reading: AccidentReading) -> 
 
 
 def _within_cell(rules: LabelProtocol | None) -> FloatArray:
-    """The point of a cell, in cells along x and y from its low corner, that its drawn place stands for."""
+    """The point of a cell, in cells along x and y from its low corner, that its rasterised place stands for."""
     return np.array([0.5, 0.5] if rules is None else rules.place_in_cell)

@@ -26,7 +26,7 @@ RELEASED_HORIZON: Final = 2.0
 SLACK: Final = FRAME_PERIOD / 2
 """Seconds: half a recorded frame, so that decimal moments compare as they are meant."""
 _MOVES: Final = 0.5
-"""Metres that an actor covers in the window if it does more than stand."""
+"""Metres that an actor must cover in the window to count as moving."""
 Involvement = Literal["ego_involved", "bystander", "infrastructure"]
 """Of the agent whose recording it is: one of the pair that collides, a vehicle that is not, or the roadside pole.
 Where nobody collides, of the pair of the twin; without a known twin `ego_vehicle` and `other_vehicle`, whom all designs
@@ -42,9 +42,9 @@ class BoxTruth(FrozenArrays):
         actor_id: (A,) int64, ascending.
         footprint: (F, A, 5) float64 x forward, y left, length, width, yaw in the present ego frame, metres and radians;
             NaN where nobody annotated the actor.
-        accident: what meta says will happen within the horizon: the pair at the impact; None if nothing does.
-        impact: the same however far ahead; None also if it is beyond the horizon and no label shows one of the pair.
-        horizon: seconds that predictions look ahead: an alarm for later is none. Infinite if nothing bounds it.
+        accident: the accident within the horizon, by meta: the pair at the impact; None without one.
+        impact: the same at any time ahead; None also if it is beyond the horizon and no label shows one of the pair.
+        horizon: seconds that predictions look ahead: a later alarm does not count. Infinite without a limit.
     """
 
     time: FloatArray
@@ -65,7 +65,7 @@ class BoxTruth(FrozenArrays):
     def nearest_pair(self, danger_distance: float) -> tuple[int, int] | None:
         """The two whose boxes come nearest to each other, nearer than a distance; the earliest of several, by id.
 
-        Two that both stand all the time, such as parked cars, are none.
+        Two that both stand all the time, such as parked cars, do not count.
         """
         found = []
         x_and_y = self.footprint[..., :2]
@@ -101,15 +101,15 @@ _OTHER_ENDING: Final[Mapping[str, str]] = MappingProxyType({"normal": "accident"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AccidentContext:
-    """What is known of a sample beside its motion labels; a protocol may need some of it.
+    """Facts on a sample that its motion labels do not have; a protocol may need some of them.
 
     Attributes:
         pair: actor ids of the two that collide, from the scenario's meta file; None if nobody does, or if it is not
             `known`.
-        known: whether `pair` says anything.
+        known: whether the pair is known; if not, `pair` None does not mean that nobody collides.
         own_actor_id: the actor id of the agent whose sample it is; None for the roadside, or if not known.
         truth: what a protocol without rasters compares with (see `boxes`); None for the others.
-        time_to_impact: seconds to the recorded impact, however far ahead; None if nobody collides, or not known.
+        time_to_impact: seconds to the recorded impact, at any time ahead; None if nobody collides, or not known.
         time_to_end: seconds to the recording's last frame; None if not known.
         twin: whether nobody collides here, but somebody does in the scenario's twin; None if that is not known, such
             as where the release has no twin of it.
@@ -134,12 +134,12 @@ class AccidentContext:
 def accident_context(
     dataset: Dataset, sample: RowArgument, horizon: float | None = None, *, references: bool = False
 ) -> AccidentContext:
-    """What a release knows of a sample beside its motion labels, for the accident metrics.
+    """The facts on a sample that its motion labels do not have, for the accident metrics.
 
     Args:
         dataset: the release.
         sample: token or record.
-        horizon: seconds that the protocol `boxes` looks ahead; None leaves out what it alone needs.
+        horizon: seconds that the protocol `boxes` looks ahead; None leaves out what only that protocol needs.
         references: whether to foresee what the reference predictors do (`REFERENCES`), which takes some milliseconds.
 
     Raises:
@@ -174,7 +174,7 @@ def box_truth(dataset: Dataset, sample: RowArgument, horizon: float = RELEASED_H
     """What happens after a sample, from the labels of all agents of the release.
 
     The pair is meta's, and the moment the recording's last frame, which in an accident scenario is the impact. Each of
-    the two is where it was last annotated up to then: at that frame, but for partial labels.
+    the two is where it was last annotated up to then: at that frame, except in partial labels.
 
     Args:
         dataset: the release.
@@ -241,7 +241,7 @@ def _last_position(tracks: ScenarioTracks, footprints: FloatArray, actor: int, s
 
 
 def _twin_of(dataset: Dataset, scenario: Mapping[str, Any]) -> Any:
-    """The scenario of the same family and name with the other ending; None if there is none, or nobody knows of it."""
+    """The scenario of the same family and name with the other ending; None if there is none, or it is not known."""
     family, _, ending = scenario["scenario_type"].rpartition("_")
     try:
         twin = dataset.scenario.get(f"{family}_{_OTHER_ENDING.get(ending, ending)}/{scenario['name']}")

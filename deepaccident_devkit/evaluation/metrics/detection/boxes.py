@@ -147,13 +147,13 @@ def detection_truth(
 ) -> Boxes:
     """What a detector should have found at a sample, by a protocol: its `truth`, `label_velocity` and `own_box`.
 
-    Area and ranges are not applied: `DetectionEvaluator.update` does that to both sides.
+    Area and ranges are not applied: `DetectionEvaluator.update` does that for truth and detections.
 
     Args:
         dataset: the release.
-        sample: token or record: its agent is the one around whom is evaluated.
+        sample: token or record; the evaluation is around its agent.
         protocol: name, or a protocol.
-        agents: for `cooperative` truth, whose labels are united (as `v2x.cooperative_boxes`); None for all.
+        agents: for `cooperative` truth: the agents whose labels are united (as `v2x.cooperative_boxes`); None for all.
 
     Returns:
         Boxes in the protocol's frame.

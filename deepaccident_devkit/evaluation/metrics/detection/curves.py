@@ -1,6 +1,6 @@
 """From the counts of many samples to precision, recall and average precision, by three rules.
 
-Each sample may be taken several times, or not at all: resamples share all that does not depend on how often.
+Each sample may be taken several times, or not at all: resamples share all that does not depend on these numbers.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def curves(cell: Cell, protocol: DetectionProtocol, times: IntArray) -> Points:
 
 
 def recall_matches(truths: IntArray, points: int) -> IntArray:
-    """Which matches, counted from 1 by falling score, the released code reads its curve at.
+    """The matches, counted from 1 by falling score, at which the released code reads its curve.
 
     For each level it takes the first of which number/truths exceeds it; levels are sums of 1/points in double
     precision, whose rounding decides ties.
@@ -225,7 +225,7 @@ def _nuscenes(cell: Cell, protocol: DetectionProtocol) -> _Curve:
 def _interpolated_errors(cell: Cell, scores: FloatArray, first: int, last: int) -> FloatArray:
     """The mean of the running means of errors at the points from `first` to `last`; 1 where there are none.
 
-    NaN where nothing is known of any match, and for cells that have no errors.
+    NaN if no match has a known error, and for cells that have no errors.
     """
     if last < first or not len(cell.errors):
         return np.ones(4)

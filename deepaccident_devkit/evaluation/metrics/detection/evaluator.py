@@ -43,12 +43,12 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
         """Start without samples.
 
         Args:
-            protocol: `released` (its distance_mAP), `released_iou` (its iou_mAP), `paper`, `opencood`, or one made.
+            protocol: `released` (its distance_mAP), `released_iou` (its iou_mAP), `paper`, `opencood`, or your own.
             **switches: fields of `DetectionProtocol` to change.
 
         Raises:
             ChoiceError: no such protocol, switch or choice.
-            ConfigError: choices that cannot be.
+            ConfigError: choices that exclude each other.
         """
         super().__init__()
         self.protocol = detection_protocol(protocol, **switches)
@@ -68,8 +68,8 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
                 ranges are applied here.
 
         Raises:
-            GeometryError: the truth is no boxes, or boxes are in another frame.
-            EvaluationError: the prediction is none of boxes, or the sample came before, with another result.
+            GeometryError: the truth is not of boxes, or boxes are in another frame.
+            EvaluationError: the prediction is not of boxes, or the sample came before, with another result.
         """
         if not isinstance(prediction, DetectedBoxes):
             raise EvaluationError(
@@ -154,7 +154,7 @@ def _by_draw(points: Sequence[Points], name: str, shape: tuple[int, int, int]) -
 
 
 class Ledger:
-    """The columns of many samples behind one another, by token, and the cells that they make.
+    """The columns of many samples, one after the other, by token, and the cells that they make.
 
     Attributes:
         order: (S,) which of the given counts each sample is of.

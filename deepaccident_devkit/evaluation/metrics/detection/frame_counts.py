@@ -38,8 +38,8 @@ class FrameCounts:
         truths: how many true boxes of each group count.
         scores: of each detection.
         detections: (groups, detections) that count.
-        tp: (cells, detections) on whose arrival, by falling score, one more true box is found.
-        spent: (cells, detections) on whose arrival one more detection goes to a true box that does not count.
+        tp: (cells, detections) that find one more true box when they are added by falling score.
+        spent: (cells, detections) with which one more detection goes to a true box that does not count.
         excused: (cells, detections, changes): true boxes neither found nor missed; see `matching.Steps`.
         matches: (cells, detections) whose scores decide the curve's points; empty when matched by score (then `tp`).
         errors: (classes, detections, ATE, ASE, AOE, AVE) of the matches at the protocol's error threshold; None where
@@ -56,7 +56,7 @@ class FrameCounts:
     errors: list[list[Any]] = field(default_factory=lambda: [[], [], [], [], [], []])
 
     def as_dict(self) -> dict[str, Any]:
-        """Names → lists, equal after a way through JSON."""
+        """Names → lists, the same after writing and reading JSON."""
         return {
             "truths": self.truths,
             "scores": self.scores,
@@ -69,7 +69,7 @@ class FrameCounts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ring:
-    """One range of one sample: who counts in it, and the pairs near enough at the widest threshold.
+    """One range of one sample: the boxes that count in it, and the pairs near enough at the widest threshold.
 
     Attributes:
         counts: (D,) whether each detection counts.

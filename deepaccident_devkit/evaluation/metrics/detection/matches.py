@@ -1,4 +1,4 @@
-"""`DetectionMatches`: which detection is which true box, for who wants to look at them; metrics count by themselves."""
+"""`DetectionMatches`: which detection is which true box, to look at; the metrics do not use it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class DetectionMatches(FrozenArrays):
         threshold: metres or a share, of the protocol's.
         detection: (M,) int64 detections that are true positives.
         truth: (M,) int64 the true box of each.
-        false: (F,) int64 detections that are nobody.
+        false: (F,) int64 detections without a true box.
         missed: (G,) int64 true boxes without a detection.
     """
 

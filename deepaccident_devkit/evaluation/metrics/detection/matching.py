@@ -1,4 +1,4 @@
-"""How near boxes are to one another, who is matched with whom, and how far off a match is.
+"""How near boxes are to one another, which are matched, and the errors of a match.
 
 A *candidate* is a detection within the problem of one class; `Reach` has those that are near enough to any true box,
 in descending order of their scores (equal ones in the order given), each with the true boxes that it reaches, in the
@@ -25,14 +25,14 @@ _NOBODY: Final = -1
 
 @dataclass(slots=True)
 class Steps:
-    """How matches come about while the score that is asked for falls: whose arrival changes which count.
+    """How matches change while the score threshold falls: which candidate changes which count.
 
     Attributes:
-        tp: candidates on whose arrival one more true box has a detection, both of which count.
-        spent: those on whose arrival one more detection that counts goes to a true box that does not.
-        excused: those on whose arrival a true box that counts gets a detection that does not (+1) or gets rid of it
+        tp: candidates with which one more true box has a detection, both of which count.
+        spent: those with which one more detection that counts goes to a true box that does not.
+        excused: those with which a true box that counts gets a detection that does not (+1) or gets rid of it
             (−1): it is neither found nor missed.
-        holder: true box → the candidate that it has once all have arrived.
+        holder: true box → the candidate that it has in the end.
     """
 
     tp: list[int] = field(default_factory=list)
@@ -41,7 +41,7 @@ class Steps:
     holder: dict[int, int] = field(default_factory=dict)
 
     def note(self, arriving: int, changes: Sequence[int]) -> None:
-        """Take what an arrival changed: found, spent, excused (and pairs of which neither counts)."""
+        """Note what a candidate changed: found, spent, excused (and pairs of which neither counts)."""
         found, spent, excused, _ = changes
         if found:
             self.tp.append(arriving)
@@ -54,9 +54,9 @@ class Steps:
 def nearest_by_truth(reach: Reach, counts: Mapping[int, bool], truth_counts: Sequence[bool]) -> Steps:
     """Each true box in turn takes the candidate of the lowest rank that is left, for every score at once.
 
-    A candidate that arrives is offered to the true boxes in their order. The first that has none or ranks it lower
-    takes it and hands what it had on to those behind it: that is just what matching anew with one candidate more gives,
-    since those before it would not have taken what it hands on.
+    Each new candidate is offered to the true boxes in their order. The first that has none or ranks it lower
+    takes it and passes its former one on to the boxes after it: that is the same as to match again with one candidate
+    more, since the boxes before it would not have taken the one passed on.
 
     Args:
         reach: the pairs.

@@ -37,7 +37,7 @@ def _check_classes(classes: tuple[tuple[str, tuple[str, ...]], ...]) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DetectionProtocol:
-    """What counts as found, and how that becomes numbers.
+    """Which boxes count as found, and how numbers are made of them.
 
     Sources: docs/released_code.md, Detection (released), the paper's text, the nuScenes devkit (eval/detection) and
     OpenCOOD (opencood/utils/eval_utils.py, box_utils.py and data_utils/datasets).
@@ -56,7 +56,7 @@ class DetectionProtocol:
         ranges: the rings from and to (metres, the end excluded) that are counted apart. With matching `by_truth`, a box
             beyond the ring is there to be matched, a detection by truth of any class, and what it matches does not
             count; with `by_score` it is not there.
-        range_from_x_alone: the distance that rings are of is sqrt(x² + x²), a slip for sqrt(x² + y²).
+        range_from_x_alone: rings are of the distance sqrt(x² + x²), a bug: sqrt(x² + y²) is meant.
         measure: how near a detection is to the truth: distance of the centres of their lower faces, distance of
             centres on the ground, overlap of volumes or of footprints (intersection over union).
         bottom_taken_as_top: in the overlap of volumes, boxes reach from their lower face downwards.
@@ -76,7 +76,7 @@ class DetectionProtocol:
             their tokens (OpenCOOD's default). Only for `voc`.
         error_threshold: which threshold's matches the errors are of; None for no errors.
         error_of_bottoms: the position error is that of the lower faces' centres in 3D; else on the ground.
-        scale_by_overlap: the scale error is 1 − overlap of volumes as the boxes stand; else as though centre and
+        scale_by_overlap: the scale error is 1 − overlap of volumes as the boxes stand; else as if centre and
             heading were equal.
         orientation_unwrapped: the heading error is |a mod 6.2831852 − b mod 6.2831852|, up to a full turn; else the
             smaller angle between the two.
@@ -113,7 +113,7 @@ class DetectionProtocol:
     absent_class_is_zero: bool = False
 
     def __post_init__(self) -> None:
-        """Check the choices; raises ChoiceError for an unknown word and ConfigError for what cannot be."""
+        """Check the choices; raises ChoiceError for an unknown word and ConfigError for impossible values."""
         for name in ("classes", "area", "ranges", "thresholds", "small_thresholds"):
             object.__setattr__(self, name, as_tuples(getattr(self, name)))
         for name, allowed in _CHOICES.items():
@@ -146,9 +146,9 @@ class DetectionProtocol:
         return result
 
     def variants(self) -> dict[str, DetectionProtocol]:
-        """These metrics with one choice made otherwise, by `name=value`; for explanations.
+        """These metrics with one choice changed, by `name=value`; for explanations.
 
-        A choice that others stand in the way of is changed together with them: errors need thresholds in metres, a
+        A choice that contradicts others is changed together with them: errors need thresholds in metres, a
         single range and another curve than `voc`; a footprint in the area needs one; velocities of the label are those
         of one agent in its LiDAR frame.
         """
@@ -159,7 +159,7 @@ class DetectionProtocol:
         return made
 
     def _free_choices(self) -> dict[str, tuple[Any, ...]]:
-        """Choices that nothing else stands in the way of."""
+        """Choices that contradict no others."""
         flags: dict[str, tuple[Any, ...]] = {
             name: (False, True)
             for name, value in asdict(self).items()
@@ -178,7 +178,7 @@ class DetectionProtocol:
         }
 
     def _bound_choices(self) -> list[tuple[str, Any, dict[str, Any]]]:
-        """Choices with a value, and what has to change with it."""
+        """Choices with a value, and the choices that must change with it."""
         in_metres = self.measure.startswith("distance")
         one_agent = self.frame == "lidar" and self.truth != "cooperative"
         kept = None if self.error_threshold not in _PAPER_THRESHOLDS else self.error_threshold
@@ -211,7 +211,7 @@ class DetectionProtocol:
 
 
 def _curve_needs(curve: Curve) -> dict[str, Any]:
-    """What else a curve asks for: another than `nuscenes` has no least precision, `voc` neither errors nor a recall."""
+    """What a curve excludes: only `nuscenes` has a least precision; `voc` has neither errors nor a least recall."""
     if curve == "voc":
         return {"min_precision": 0.0, "min_recall": 0.0, "error_threshold": None}
     return {"global_sort": True} if curve == "nuscenes" else {"global_sort": True, "min_precision": 0.0}

@@ -59,7 +59,7 @@ class DetectionResult(FrozenArrays, FrozenMappings):
         FrozenMappings.__post_init__(self)
 
     def as_dict(self) -> dict[str, Any]:
-        """All but the curves, as JSON holds it; None for what there is nothing to count of."""
+        """All except the curves, as JSON holds it; None where there is nothing to count."""
         by_class = {
             name: {
                 "thresholds": self.thresholds[position].tolist(),
@@ -81,7 +81,7 @@ class DetectionResult(FrozenArrays, FrozenMappings):
 
 
 def mean_of(values: AnyArray) -> float:
-    """The exact mean of what is not NaN; NaN if there is nothing."""
+    """The exact mean of the numbers that are not NaN; NaN if there are none."""
     known = [value for value in np.asarray(values, dtype=np.float64).reshape(-1).tolist() if not isnan(value)]
     return fsum(known) / len(known) if known else nan
 
@@ -94,14 +94,14 @@ AP_WEIGHT: Final = 5
 class NuScenesSummary(FrozenMappings):
     """mAP, mean errors and one score of all, in nuScenes' manner.
 
-    The score is like nuScenes' NDS and is not it: this dataset has no attributes, so that there is no AAE, and the
+    The score is like nuScenes' NDS, but not the same: this dataset has no attributes, so that there is no AAE, and the
     weights are 5 for mAP and 1 for each of four errors, of 9 (nuScenes: of 10).
 
     Attributes:
         mean_average_precision: in %.
         errors: mATE (m), mASE (1 − IoU), mAOE (rad), mAVE (m/s) → mean over the classes.
         score_without_attributes: in %, the weighted mean of mAP and of 1 − error (0 for errors above 1, and for an
-            error that is not known, such as that of velocities which a detector does not give).
+            unknown error, such as that of velocities which a detector does not give).
         table: class → AP (%) and errors.
     """
 

@@ -1,4 +1,4 @@
-"""How well a model foresees where everybody is: IoU, VPQ, minADE, minFDE, miss rate."""
+"""How well a model foresees where all actors are: IoU, VPQ, minADE, minFDE, miss rate."""
 
 from deepaccident_devkit.evaluation.metrics.motion.evaluator import (
     MotionEvaluator,

@@ -1,4 +1,4 @@
-"""`MotionEvaluator`: the motion metrics of any number of samples, and what each of them adds."""
+"""`MotionEvaluator`: the motion metrics of any number of samples, and the counts of each sample."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _PATH_COUNTS: Final = ("true_positive", "false_positive", "false_negative")
 _PATHS: Final = ("ade", "fde", "missed", "count", *_PATH_COUNTS)
 _INSTANCE_MAPS: Final = (
     "given as instance maps, and so compared with the labels' own instances, of paths too; those given as heads have "
-    "their paths compared with what is read off the labels as though a model had predicted them"
+    "their paths compared with what is read off the labels as if a model had predicted them"
 )
 
 
@@ -56,7 +56,7 @@ class RangeResult:
         sq: segmentation quality of the instances found, percent.
         rq: recognition quality, percent.
         true_positive: instances found, frame by frame.
-        false_positive: instances predicted that are nobody.
+        false_positive: instances predicted without a true one.
         false_negative: instances missed.
     """
 
@@ -163,7 +163,7 @@ class MotionEvaluator(Evaluator[MotionResult]):
     def selected_as_released(self, order: Sequence[str], selected: Collection[str]) -> MotionResult:
         """The result of some samples as the released code has it "by attribute": with the VPQ of other frames.
 
-        See `overlaps.separate_selected_as_released`, whose mistake this is; `compute(selected)` is the correct result.
+        See `overlaps.separate_selected_as_released` for the mistake; `compute(selected)` is the correct result.
 
         Args:
             order: all samples in the order evaluated.

@@ -1,4 +1,4 @@
-"""Why perfect maps given as heads are not perfect: what grouping and linking make of the labels' instances.
+"""Why perfect maps given as heads do not score 100: how grouping and linking change the labels' instances.
 
 The released evaluation reads instances off heads: cells go to the nearest peak of centerness, and instances of
 consecutive frames are linked by where the flow takes them. Labels that go through this do not all come back as they
@@ -25,10 +25,10 @@ class LostInstance:
     Attributes:
         frame: from 0.
         identity: its id in the labels.
-        reason: `missing`: most of its cells are nobody's; `merged`: they are another one's, of which it is the smaller
-            part; `cut`: they are its own, but are not more than half of both together (IoU ≤ 0.5); `renamed`: they are,
-            but under another id than when it was last found.
-        other: the id in the labels of whom it was merged with; None otherwise.
+        reason: `missing`: most of its cells have no id; `merged`: they have another instance's id, of which it is the
+            smaller part; `cut`: they have its own id, but IoU ≤ 0.5; `renamed`: IoU > 0.5, but under another id than
+            when it was last found.
+        other: the id in the labels with which it was merged, or None.
     """
 
     frame: int

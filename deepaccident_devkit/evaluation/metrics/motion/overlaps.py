@@ -1,8 +1,9 @@
 """How far predicted and true maps overlap: IoU of cells, video panoptic quality (VPQ) of instances.
 
-VPQ: instances found, in the right cells and under the same id all along. In each frame a true and a predicted instance
-match if the intersection of their cells is more than half of the union, so that nobody has two partners. FIERY's
-measure, of which the released code has a copy; counts are sums over frames (docs/released_code.md, IoU and VPQ).
+VPQ: instances found, in the right cells and under the same id in all frames. In each frame a true and a predicted
+instance match if the intersection of their cells is more than half of the union, so that each has at most one partner.
+FIERY's measure, of which the released code has a copy; counts are sums over frames (docs/released_code.md, IoU and
+VPQ).
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ def segmentation_counts(prediction: AnyArray, label: AnyArray, classes: int = 2)
     Args:
         prediction: any shape, integers: the class of each cell, from 0.
         label: the same shape.
-        classes: how many are counted; cells of others are of none of them.
+        classes: how many are counted; cells of other classes are ignored.
 
     Returns:
         The counts of each class.
@@ -72,14 +73,14 @@ def iou(counts: Iterable[SegmentationCounts], *, absent: float = 0.0) -> float:
 
 
 CLASSES: Final = ("background", "instances")
-"""What is counted: cells without any instance, as though they were one, and the instances."""
+"""What is counted: cells without any instance, as if they were one, and the instances."""
 _MOST_PAIRS: Final = 4_000_000
-"""Entries of a histogram of pairs of ids; ids that would need more are numbered anew."""
+"""Entries of a histogram of pairs of ids; ids that would need more are renumbered."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VpqRules:
-    """What decides VPQ; the defaults are the released ones.
+    """The choices of VPQ; the defaults are the released ones.
 
     Attributes:
         ids_must_stay: a true instance that was matched with another predicted id when it last had a match is no true
@@ -155,7 +156,7 @@ def vpq_counts(prediction: AnyArray, label: AnyArray, rules: VpqRules = VpqRules
 
 
 def vpq_matches(prediction: AnyArray, label: AnyArray, rules: VpqRules = VpqRules()) -> IntArray:
-    """Who is whom: the true positives of `vpq_counts`; arguments and errors as there.
+    """The matched instances: the true positives of `vpq_counts`; arguments and errors as there.
 
     Returns:
         (N, 3) int64: frame from 0, predicted id, true id; by frame.
@@ -230,7 +231,7 @@ def _frame(counts: VpqCounts, index: int) -> VpqCounts:
 
 
 def _shared_cells(predicted: AnyArray, true: AnyArray) -> IntArray:
-    """(T, G + 1, P + 1) cells by true and predicted id, 0 the background; ids are numbered anew if they are large."""
+    """(T, G + 1, P + 1) cells by true and predicted id, 0 the background; ids are renumbered if they are large."""
     frames, cells = len(true), true[0].size if len(true) else 0
     here = np.flatnonzero((predicted > 0) | (true > 0))
     true_id, predicted_id = (np.maximum(maps.reshape(-1)[here], 0).astype(np.int64) for maps in (true, predicted))

@@ -1,4 +1,4 @@
-"""`MotionProtocol`: what decides the motion metrics."""
+"""`MotionProtocol`: the choices of the motion metrics."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from deepaccident_devkit.motion import LABEL_PROTOCOLS, POST_PROCESSING, PostPro
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotionProtocol:
-    """What decides the motion metrics; the defaults are the released ones.
+    """The choices of the motion metrics; the defaults are the released ones.
 
     Sources: docs/released_code.md, Post-processing, IoU and VPQ, and Paths.
 
@@ -28,9 +28,9 @@ class MotionProtocol:
         paths: how they are read off heads, and off labels, for minADE, minFDE and miss rate. The released code has
             these errors from the accident evaluation, which links and cuts out instances by other rules.
         vpq: which matches count.
-        accelerating_paths: the released slip of `trajectories.padded`.
+        accelerating_paths: the released quirk of `trajectories.padded`.
         gate: metres, as of `match_trajectories`.
-        trajectories: limits of the errors, and a slip.
+        trajectories: limits of the errors, and a quirk.
         nothing_is_zero: IoU and VPQ of samples with nothing to count are 0; else NaN.
     """
 
@@ -57,7 +57,7 @@ class MotionProtocol:
         return tuple(f"{extent:g}x{extent:g}" for extent in self.ranges)
 
     def variants(self) -> dict[str, MotionProtocol]:
-        """These metrics with one choice made otherwise, by `name=value`; for explanations.
+        """These metrics with one choice changed, by `name=value`; for explanations.
 
         Those of a part have its name before theirs: `paths.link_distance=10.0`. Labels are no choice of the metrics:
         where those of other protocols are the truth, the truth is another one.
@@ -96,7 +96,7 @@ MOTION_PROTOCOLS: Final[Mapping[str, MotionProtocol]] = MappingProxyType(
     {"released": MotionProtocol(), "paper": MotionProtocol(nothing_is_zero=False)}
 )
 """What the released code computes. The paper's text says no more of these metrics than their names, FIERY's and the
-ranges: so `paper` is the released code, but that it makes no 0 of nothing."""
+ranges: so `paper` is the released code, except that a number with nothing to count is NaN and not 0."""
 
 
 def motion_protocol(protocol: str | MotionProtocol) -> MotionProtocol:

@@ -1,4 +1,4 @@
-"""`CleanWarnings`: anticipation metrics over recordings that no siren, silence or chance can win (protocol `clean`)."""
+"""`CleanWarnings`: anticipation metrics in which a siren, silence or chance cannot win (protocol `clean`)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from deepaccident_devkit.evaluation.metrics.warning.recordings import KINDS
 
 RANDOM_DRAWS: Final = 20
 LATENCIES: Final = (0.0, 0.1, 0.3)
-"""Seconds that a warning may take from who sees to who collides."""
+"""Seconds that a warning may need from an agent that sees the danger to the two that collide."""
 _ANY: Final = float(np.nextafter(0.0, 1.0))
 _FIXED: Final[Mapping[str, float]] = {"always": 1.0, "never": 1.0, "random per frame": 0.5, "random per recording": 0.5}
 """Operating points of the predictors that know nothing; of the other references any alarm is one."""
@@ -57,8 +57,8 @@ class AnticipationFigures(FrozenMappings):
         at_p80: at the threshold of the highest recall with a precision of 0.8.
         best_f1: threshold: of the best F1 over these recordings; to be given when another split is evaluated.
         quiet: threshold: the lowest with at most one second a minute in alarm without an accident to come; likewise.
-        tta0_after: for who sees an accident of others: latency → seconds of `operating.tta0` that are left when the two
-            who collide are told, a lead below 0 as 0; empty for `ego_involved`.
+        tta0_after: for agents that see an accident of others: latency → seconds of `operating.tta0` that are left when
+            the two that collide receive the warning, at least 0; empty for `ego_involved`.
         recordings: by kind: `accident`, `twins`, `others`.
         twins: pairs of an accident recording and its twin.
     """
@@ -80,14 +80,14 @@ class AnticipationFigures(FrozenMappings):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AnticipationResult(FrozenMappings):
-    """What the protocol `clean` says.
+    """The result of the protocol `clean`.
 
     Attributes:
         samples: how many.
         operating_by: `given` threshold, or `recall`.
         groups: involvement of the agent → figures; agents of one scenario are never pooled.
         references: predictor (of `PREDICTORS` but the given one) → the same; empty for resamples.
-        beyond: alarms for later than the horizon, which are none.
+        beyond: alarms for later than the horizon, which do not count.
         notes: sentences that a reader of the numbers should know.
     """
 
@@ -250,6 +250,6 @@ def _notes(counts: Collection[Counts], drives: Sequence[Drive], rules: CleanWarn
         )
     beyond = sum(each["beyond"] for each in counts)
     if beyond:
-        yield f"{beyond} alarms are for later than the horizon and are none"
+        yield f"{beyond} alarms are for later than the horizon and do not count"
     if drives and not any(each["references"] for each in counts):
         yield "the rows 'TTC < 3 s' need what constant velocities lead to: accident_context(…, references=True)"

@@ -1,7 +1,7 @@
 """Anticipation metrics without the quirks of the published ones: over recordings, misses included (`clean`).
 
-Every figure that can be raised by alarming more stands beside what that costs: recall and lead beside precision and the
-time in alarm. Recordings have weights, so that a resample of them costs no second look at the scores.
+Every figure that grows with more alarms stands beside their cost: recall and lead beside precision and time in
+alarm. Recordings have weights, so that a resample does not read the scores again.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _MINUTE: Final = 60.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OperatingPoint:
-    """What is reached, and at what cost, if every score of at least a threshold is an alarm. NaN: nothing to count.
+    """The gain and the cost if every score of at least a threshold is an alarm. NaN: nothing to count.
 
     Attributes:
         threshold: the lowest score that is an alarm; NaN where no threshold has what is asked for.

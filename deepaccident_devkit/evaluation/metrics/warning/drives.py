@@ -44,8 +44,8 @@ class Drive(FrozenArrays):
         part: which of several groups of samples it is of.
         frame: (S,) int64 frame numbers of the samples, ascending.
         end: frame of the impact; of a twin, that of the accident's impact; else the one after the last sample.
-        scores: predictor, but for those of `TRIVIAL` → (S, 2) of its surest right alarm and of its surest one, −inf for
-            none; equal where nobody collides.
+        scores: predictor, except those of `TRIVIAL` → (S, 2) of its surest right alarm and of its surest one, −inf
+            without one; equal where nobody collides.
     """
 
     name: str
@@ -79,8 +79,8 @@ def drives_of(parts: Sequence[Collection[Counts]]) -> list[Drive]:
 def series_of(drives: Sequence[Drive], predictor: str, scores_of: ScoresOf, draw: int = 0) -> ScoreSeries:
     """The scores of some recordings, a column a step: the smallest from a sample to the next of any of them.
 
-    Lest length tell which end in an accident, twins end where theirs does, and others at the latest after the median
-    length of the accidents.
+    Lengths must not tell which recordings end in an accident. So twins end where their accident does, and others at
+    the latest after the median length of the accidents.
 
     Args:
         drives: the recordings.

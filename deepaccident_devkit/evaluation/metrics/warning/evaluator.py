@@ -29,10 +29,9 @@ print. All compare with the labels' boxes, as the accident protocol `boxes`; the
 
 
 class WarningEvaluator(Evaluator[Any]):
-    """What those ask who would rely on the alarm: seconds of warning, detection in time, false alarms a minute.
+    """Numbers for users of an alarm: seconds of warning, detection in time, false alarms a minute.
 
-    Give it whole recordings, normal scenarios among them: samples of a recording that are not given are as if nobody
-    had driven then.
+    Give it whole recordings, normal scenarios among them: the metrics ignore the times of samples that are not given.
 
     `compute` gives an `AnticipationResult`, a `WarningResult` or a `FieldResult`, by the protocol.
 
@@ -48,7 +47,7 @@ class WarningEvaluator(Evaluator[Any]):
             protocol: of `WARNING_PROTOCOLS` by name, or your own.
 
         Raises:
-            ChoiceError: no protocol has that name, or it is none.
+            ChoiceError: no protocol has that name, or it is of another type.
         """
         super().__init__()
         self.protocol = _protocol(protocol)
@@ -72,8 +71,8 @@ class WarningEvaluator(Evaluator[Any]):
             prediction: what a model says: motion in maps, which is at most one alarm, or a list of alarms.
             label: says how far apart in time the maps of a prediction are, and how they lie in their cells; None for
                 the released way. Alarms need none.
-            context: what happens, from `accident_context(dataset, sample, horizon, references=True)`; the horizon says
-                up to when actors can be named, and that an alarm for later is none.
+            context: the truth, from `accident_context(dataset, sample, horizon, references=True)`; the horizon says
+                up to when actors can be named, and after which alarms do not count.
 
         Raises:
             EvaluationError: the token is no sample's, the context or something in it is missing, the prediction is
@@ -120,7 +119,7 @@ class WarningEvaluator(Evaluator[Any]):
 
     @property
     def has_intervals(self) -> bool:
-        """Of the protocol `field` there are none: its numbers take long, and are for a look beside published ones."""
+        """The protocol `field` has none: its numbers take long, and are only for comparison with published ones."""
         return not isinstance(self.protocol, FieldWarnings)
 
 

@@ -22,12 +22,12 @@ FieldCode = Literal["ustring", "dsta", "drive", "dad"]
 FIELD_CODES: Final[tuple[FieldCode, ...]] = get_args(FieldCode)
 _DAD_SECONDS: Final = 5.0
 _NUDGE: Final = 1e-6
-"""By which DRIVE moves its thresholds 0 and 1 inwards."""
+"""DRIVE moves its thresholds 0 and 1 inwards by this."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FieldQuirks:
-    """What the published evaluations do; each switch made otherwise is what one would expect in its place.
+    """What the published evaluations do; each switch turned over is what a reader would expect.
 
     Attributes:
         zero_alarms_negatives: at the threshold 0 a recording without an accident is a true positive, since its scores
@@ -40,7 +40,7 @@ class FieldQuirks:
         missed_left_out: recordings without a warning do not count in times; else as 0 s (all four).
         time_by_length: times are shares of `toa`, made seconds by the length of the array of scores; else by `toa`
             (UString, DSTA).
-        five_seconds: shares are made seconds by 5 s, whatever the recordings' length; else by the array's length (DAD).
+        five_seconds: shares are multiplied by 5 s, for recordings of any length; else by the array's length (DAD).
         nonsense_kept: numbers that can be no recall or precision are given as they come; else NaN, with a note.
     """
 
@@ -62,8 +62,8 @@ class FieldFigures:
         average_precision: area under precision over recall; of recordings, of DRIVE of frames.
         mean_time: mTTA, seconds: mean over the recalls.
         time_at_r80: TTA@R80, seconds: at the recall nearest to 0.8.
-        precision_at_r80: at the first recall of at least 0.8; None but for DSTA.
-        precision_at_half: at the threshold 0.5, of frames; None but for DRIVE.
+        precision_at_r80: at the first recall of at least 0.8; None except for DSTA.
+        precision_at_half: at the threshold 0.5, of frames; None except for DRIVE.
         recall_at_half: likewise.
         time_at_half: likewise, seconds.
         note: why numbers are NaN; empty if none is.

@@ -20,20 +20,20 @@ _CHOICES: Final[Mapping[str, tuple[str, ...]]] = {"naming": get_args(Naming), "c
 class WarningRules:
     """Which alarms are right, against the labels' boxes and the pair and the moment of the meta file.
 
-    An alarm for later than the horizon is none. Unlike an accident that counts for APA, the impact may be later than
-    the model looks ahead: whoever is told early of the right pair or the right place is warned.
+    An alarm for later than the horizon does not count. Unlike an accident that counts for APA, the impact may be later
+    than the model looks ahead: an early alarm with the right pair or the right place is a warning.
 
     Attributes:
         reading: how an accident is read off maps, as `BoxAccidents` has it. Their cells are coarse, so that they raise
             more false alarms than explicit accidents.
-        min_score: alarms less sure than this are none.
+        min_score: alarms with a lower score do not count.
         match_distance: metres: gate of the matches that decide which actors an alarm without actor ids names.
         naming: whom an explicit accident without `ids` names, as `BoxAccidents` has it.
-        correct_by: what makes an alarm right: that it names the `pair` that collides, whichever way round; the `place`,
+        correct_by: what makes an alarm right: that it names the `pair` that collides, in either order; the `place`,
             as its positions differ from where the two meet by less than `distance`; or `either` of these.
-        distance: metres: what the differences of the two positions may add up to, whichever way round fits better; as
-            strict as, and by default the distance of, the errors of the accident protocol `paper`.
-        time_tolerance: seconds: how far off the time of a right alarm may be from the impact; None for any.
+        distance: metres: the largest sum of the differences of the two positions, in the order that fits better; by
+            default the distance of the errors of the accident protocol `paper`.
+        time_tolerance: seconds: the largest time error of a right alarm; None for any.
     """
 
     reading: AccidentReading = field(default_factory=AccidentReading)
@@ -62,7 +62,7 @@ class WarningRules:
         return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
 
     def variants(self) -> Mapping[str, WarningRules]:
-        """These metrics with one choice made otherwise, by `name=value`; for explanations."""
+        """These metrics with one choice changed, by `name=value`; for explanations."""
         return {
             **with_parts(self, "reading", self.reading.variants()),
             **with_others(
@@ -80,7 +80,7 @@ class WarningRules:
         }
 
     def _own_others(self) -> Mapping[str, tuple[Any, ...]]:
-        """Other values of the choices that a protocol has beside these."""
+        """Other values of the further choices of a protocol."""
         return {}
 
 
@@ -91,7 +91,7 @@ class WarningProtocol(WarningRules):
     Attributes:
         unjudged_are_false: where nobody collides, alarms for later than the recording goes on are false ones; else they
             are left out and counted aside, since nothing refutes them.
-        leads: seconds before the impact by which a detection rate is asked for.
+        leads: seconds before the impact at which detection rates are given.
         curve_lead: seconds before the impact: of the curve's detection rate.
         curve_rows: how many thresholds the curve has at most.
     """

@@ -1,4 +1,4 @@
-"""`FieldWarnings`: the numbers of four published anticipation codes, quirks and all (protocol `field`)."""
+"""`FieldWarnings`: the numbers of four published anticipation codes with their quirks (protocol `field`)."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from deepaccident_devkit.evaluation.metrics.warning.protocol import WarningRules
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FieldResult(FrozenMappings):
-    """What the protocol `field` says: not comparable from code to code, and won by predictors that know nothing.
+    """The result of the protocol `field`: not comparable between codes, and predictors that know nothing can win.
 
     Attributes:
         samples: how many.
         figures: code and involvement of the agent, such as `ustring ego_involved` → what that code prints.
         references: predictor (of `PREDICTORS` but the given one) → the same.
-        beyond: alarms for later than the horizon, which are none.
+        beyond: alarms for later than the horizon, which do not count.
         notes: sentences that a reader of the numbers should know: why numbers are NaN.
     """
 
@@ -64,7 +64,7 @@ class FieldWarnings(WarningRules):
         return {"scores_of": get_args(ScoresOf)}
 
     def variants(self) -> Mapping[str, WarningRules]:
-        """These metrics with one choice made otherwise; each quirk among them."""
+        """These metrics with one choice changed; each quirk among them."""
         quirks = with_others(self.quirks, {each.name: (False, True) for each in fields(FieldQuirks)})
         return {**WarningRules.variants(self), **with_parts(self, "quirks", quirks)}
 

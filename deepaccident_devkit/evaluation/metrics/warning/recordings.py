@@ -1,4 +1,4 @@
-"""What samples say of warnings, and tallies: what their recordings, each one drive of one agent, add to the metrics.
+"""The counts of samples, and tallies: the sums over their recordings, each one drive of one agent.
 
 All times in a tally are recorded frames, whole numbers, so that no order of the samples and no parts change a bit.
 """

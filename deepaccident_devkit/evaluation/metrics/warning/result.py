@@ -1,4 +1,4 @@
-"""`WarningResult`: what `WarningEvaluator.compute` returns, and how it comes of the tallies of recordings."""
+"""`WarningResult`: what `WarningEvaluator.compute` returns, made of the tallies of recordings."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _PER_MINUTE: Final = 60 * _PER_SECOND
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class WarningCurve(FrozenArrays):
-    """What would be if only alarms of at least a score were raised, the surest first; arrays are read-only.
+    """The numbers if only alarms of at least a score are raised, the highest score first; arrays are read-only.
 
     R scores: all that change something, or if there are more than `WarningProtocol.curve_rows` as many of them, evenly
     by rank. Arrays and not rows of numbers, since row n of a bootstrap's resample is of another score.
@@ -79,7 +79,7 @@ class WarningResult(FrozenArrays, FrozenMappings):
         alarms: how many alarms are judged.
         precision: share of them that are right.
         unjudged: alarms that nothing can refute: nobody collides, and they are for later than the recording goes on.
-        beyond: alarms for later than the horizon, which are none.
+        beyond: alarms for later than the horizon, which do not count.
         curve: the same over the score.
         notes: sentences that a reader of the numbers should know.
     """
@@ -228,7 +228,7 @@ def _notes(tally: Tally, protocol: WarningProtocol) -> Iterator[str]:
     if tally["unjudged"]:
         yield f"{tally['unjudged']} alarms are for later than their recording goes on and were left out"
     if tally["beyond"]:
-        yield f"{tally['beyond']} alarms are for later than the horizon and are none"
+        yield f"{tally['beyond']} alarms are for later than the horizon and do not count"
     lone = sum(tally[kind]["lone"] for kind in KINDS)
     if lone:
         yield f"{lone} recordings have a single sample, which says nothing of how far apart samples are"

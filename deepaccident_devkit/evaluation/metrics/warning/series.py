@@ -1,4 +1,4 @@
-"""`ScoreSeries`: the scores of recordings, frame by frame, which anticipation metrics are made of."""
+"""`ScoreSeries`: the scores of recordings, frame by frame, for anticipation metrics."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays
 
 _SLACK: Final = 1e-6
-"""Columns: times are decimal numbers, which binary ones only come near."""
+"""Columns: times are decimal numbers, which binary numbers only approximate."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -43,7 +43,7 @@ class ScoreSeries(FrozenArrays):
         return highest
 
     def before(self, seconds: float) -> FloatArray:
-        """(N, M) scores at the M moments of the last seconds before `toa`, the latest first; NaN where is none."""
+        """(N, M) scores at the M moments of the last seconds before `toa`, the latest first; NaN without a score."""
         moments = np.arange(1, round(seconds * self.fps) + 1)
         column = np.ceil(self.toa[:, None] - moments - _SLACK).astype(np.int64)
         there = (column >= 0) & (column < self.scores.shape[1])

@@ -31,7 +31,7 @@ _SHOWN: Final = 8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExplainedNumber:
-    """A headline number if one choice were made otherwise.
+    """A headline number if one choice is changed.
 
     Attributes:
         choice: `name=value`.
@@ -60,7 +60,7 @@ class Explanation(FrozenMappings):
         units: headline → unit.
         protocols: name → headline → value, of the task's protocols that take such predictions. A headline is missing
             where the protocol has none of that name.
-        numbers: of each choice that is made otherwise, one at a time, each headline; the largest changes first.
+        numbers: of each choice, changed one at a time, each headline; the largest changes first.
         refused: protocol or choice → why the results cannot be evaluated so.
     """
 
@@ -87,7 +87,7 @@ class Explanation(FrozenMappings):
         if moving:
             rows = [[name, *self._changes(each, shown)] for name, each in moving.items()]
             lines += [
-                "What one choice made otherwise changes (percents in percentage points):",
+                "What a change of one choice changes (percents in percentage points):",
                 columns_text([["", *shown], *rows]),
             ]
         if still:
@@ -103,7 +103,7 @@ class Explanation(FrozenMappings):
 
 
 def explained(choice: str, before: Sequence[Headline], after: Sequence[Headline]) -> list[ExplainedNumber]:
-    """The numbers of one choice made otherwise, in the order of those before."""
+    """The numbers with one choice changed, in the order of those before."""
     then = {each.name: each.value for each in after}
     numbers = []
     for each in before:
@@ -159,7 +159,7 @@ def explain(
     progress: bool = False,
     checkpoint: str | os.PathLike[str] | None = None,
 ) -> Explanation:
-    """The headline numbers by every protocol of the task, and with each choice of the chosen one made otherwise.
+    """The headline numbers by every protocol of the task, and with each choice of the chosen one changed.
 
     Labels are a choice too (`labels.half_cell_shift=False`) where the rules can be compared with others than their own.
     All is counted in one pass; of motion results that takes some thirty times as long as the evaluation alone.

@@ -1,4 +1,4 @@
-"""What is counted side by side: the chosen rules, the task's other protocols, and each choice made otherwise."""
+"""What is counted side by side: the chosen rules, the task's other protocols, and each choice changed."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def _result(name: str, evaluator: Evaluator[Any], counts: Collection[Counts]) ->
 CHOSEN: Final = "chosen"
 """Name of the rules that are explained."""
 _WITHOUT_EFFECT: Final = ("own_box_not_augmented", "ids_kept_between_samples")
-"""Slips that show only in training: nothing is augmented here, and no ids come from another sample."""
+"""Quirks that show only in training: nothing is augmented here, and no ids come from another sample."""
 _LABEL_CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
     "drawn_when": get_args(DrawnWhen),
     "warp": ("stretched", "exact"),
@@ -104,7 +104,7 @@ class Variants:
     Attributes:
         chosen: the rules that are explained.
         protocols: the task's by name.
-        choices: the chosen ones with one choice made otherwise, by `name=value`.
+        choices: the chosen ones with one choice changed, by `name=value`.
         refused: protocol → why it does not take such results.
     """
 
@@ -218,7 +218,7 @@ def _kept(memory: dict[Any, Found], key: Any, make: Callable[[], Found]) -> Foun
 
 
 def _label_variants(chosen: Variant) -> dict[str, Variant]:
-    """The chosen rules with truths that are drawn otherwise, by `labels.name=value`; of rules that take labels."""
+    """The chosen rules with truths of changed label protocols, by `labels.name=value`; of rules that take labels."""
     if chosen.labels is None or not hasattr(chosen.rules, "labels"):
         return {}
     rules = replace(chosen.rules, labels=None)
@@ -227,7 +227,7 @@ def _label_variants(chosen: Variant) -> dict[str, Variant]:
 
 
 def _other_labels(rules: LabelProtocol) -> dict[str, LabelProtocol]:
-    """A label protocol with one choice made otherwise, by `name=value`."""
+    """A label protocol with one choice changed, by `name=value`."""
     switches: Mapping[str, tuple[Any, ...]] = {
         **{name: (False, True) for name in slip_names() if name not in _WITHOUT_EFFECT},
         **({} if rules.warp == "fiery" else _LABEL_CHOICES),

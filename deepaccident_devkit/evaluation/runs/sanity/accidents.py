@@ -56,7 +56,7 @@ _TIME_OFF: Final = 0.4
 """Seconds by which a time may be off, and still fit; where little changes, less than half of that."""
 _LAGS: Final = {"0.5 s late": LABEL_STEP, "0.5 s early": -LABEL_STEP}
 _LAG_WINDOW: Final = (0.37, 0.8)
-"""Seconds: who is later than this and less than that is a step late; a slight delay is none."""
+"""Seconds: who is later than this and less than that is a step late; a slight delay does not count."""
 _UNITS: Final = {
     "times in milliseconds": (1000.0, "milliseconds"),
     "times in recorded frames": (1 / FRAME_PERIOD, "recorded frames of 0.1 s"),

@@ -1,4 +1,4 @@
-"""`check_sanity`: is 0 the score of a bad model, or of good predictions that lie otherwise than they say?"""
+"""`check_sanity`: is 0 the score of a bad model, or of good predictions whose files do not keep the format?"""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ def check_sanity(
 ) -> SanityReport:
     """What perfect and empty predictions score, and whether the given ones look mirrored, turned, shifted and so on.
 
-    Each suspicion is tried on samples spread over all: the predictions are set right as though it were true, and
-    compared with the truth. It is told if they fit twice as well then. Correct predictions, and bad ones, raise none.
+    Each suspicion is tried on samples spread over all: the predictions are corrected as if it were true, and
+    compared with the truth. It is told if they then fit twice as well. Correct predictions, and bad ones, raise none.
 
     Args:
         dataset: the release.

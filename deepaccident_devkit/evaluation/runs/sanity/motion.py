@@ -1,4 +1,4 @@
-"""Whether predicted maps look mirrored, turned, scaled, inverted, or as though their frames were others.
+"""Whether predicted maps look mirrored, turned, scaled, inverted, or as if their frames were others.
 
 Of heads also what `vectors` looks for.
 """
@@ -112,7 +112,7 @@ def _place(name: str, group: Group, says: str, remedy: str) -> Suspicion:
 
 
 def _unscaled(predicted: BoolArray, grid: BevGrid, scale: float) -> tuple[BoolArray, BoolArray]:
-    """Maps (T, rows, columns) in the devkit's orientation as though all were `scale` times too far; and what is known.
+    """Maps (T, rows, columns) in the devkit's orientation as if all were `scale` times too far; and what is known.
 
     The ego, at x = y = 0, stays.
     """

@@ -1,7 +1,7 @@
 """What a sample says for and against the ways in which predictions may be wrong as a whole.
 
-A suspicion is tried by setting the predictions right as though it were true. Where it is, they fit the truth then, and
-not as they were given. Each tells of its own: a share of cells or of actors, of both readings.
+A suspicion is tried by correcting the predictions as if it were true. If it is, they then fit the truth, and not as
+they were given. Each tells of its own: a share of cells or of actors, of both readings.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ def scale_says(scale: float) -> str:
 def warning_of(suspicion: Suspicion, candidate: Candidate) -> str:
     """A sentence for a candidate that is suspected."""
     return (
-        f"{suspicion.name}: it looks as though {candidate.description} ({suspicion.measure} "
+        f"{suspicion.name}: it looks as if {candidate.description} ({suspicion.measure} "
         f"{candidate.score or 0.0:.2f} if so, {candidate.given or 0.0:.2f} as given)"
     )
 

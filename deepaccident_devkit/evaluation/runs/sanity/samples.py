@@ -27,8 +27,8 @@ def telling_samples(
     """At most `count` samples, one of each of as many parts of equal length of all tokens, sorted.
 
     Of a part that is taken which shows most: an accident to come within the horizon, then the longest future within
-    it, then the most boxes; or, with `varied`, one as long before the accident and the next as short. Nothing is drawn
-    by chance.
+    it, then the most boxes; or, with `varied`, one as long before the accident and the next as short. Nothing is
+    random.
 
     Args:
         dataset: the release.

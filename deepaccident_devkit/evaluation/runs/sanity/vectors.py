@@ -1,4 +1,4 @@
-"""Whether the vectors of heads, offset and flow, look as though their channels or signs were others, or swapped."""
+"""Whether the vectors of heads, offset and flow, look as if their channels or signs were others, or swapped."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ class Facades:
     """Where the façades among F faces are; they are parallel to an axis, and x + y runs along them.
 
     Attributes:
-        start: (F,) float32, x + y where each begins, metres; 0 for faces that are none.
+        start: (F,) float32, x + y where each begins, metres; 0 for other faces.
         length: (F,) float32, metres.
         foot: (F,) float32, height of the lower edge above the ground frame's origin, metres.
     """

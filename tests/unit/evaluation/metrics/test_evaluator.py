@@ -100,7 +100,7 @@ def test_a_run_of_another_evaluator_or_version_does_not_go_on(tmp_path: Path, mo
         """Same settings, other counts."""
 
     path = filled("a").save(tmp_path / "state.json")
-    with pytest.raises(EvaluationError, match=r"was saved by Sums of devkit .*, this is Others of .*; begin anew"):
+    with pytest.raises(EvaluationError, match=r"was saved by Sums of devkit .*, this is Others of .*; begin again"):
         Others().resume(path)
     monkeypatch.setattr("deepaccident_devkit.evaluation.metrics.evaluator.__version__", "99")
     with pytest.raises(EvaluationError, match=r"was saved by .*, this is Sums of devkit 99"):
@@ -120,7 +120,7 @@ def test_a_run_of_another_evaluator_or_version_does_not_go_on(tmp_path: Path, mo
 def test_a_damaged_state_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "state.json"
     path.write_text(text, encoding="utf-8")
-    with pytest.raises(EvaluationError, match=r"state\.json: no saved evaluation .*begin anew"):
+    with pytest.raises(EvaluationError, match=r"state\.json: no saved evaluation .*begin again"):
         Sums().resume(path)
     path.write_bytes(filled("abcd").save(path).read_bytes()[:-9])
     with pytest.raises(EvaluationError, match="no saved evaluation"):

@@ -43,7 +43,7 @@ HEADERS: dict[str, tuple[Any, ...]] = {
     "no format": ({"format": ...}, 'has no "format" (a nuScenes results file?); put "format"'),
     "no version": ({"version": ...}, "version: is missing"),
     "a newer version": ({"version": 2}, "version: a newer results format (2, this devkit's is 1); update the devkit"),
-    "an older version": ({"version": 0}, "version: an older results format (0, this devkit's is 1); write it anew"),
+    "an older version": ({"version": 0}, "version: an older results format (0, this devkit's is 1); write it again"),
     "a version that is a text": ({"version": "1"}, 'version: expected 1, found "1"'),
     "a version that is true": ({"version": True}, "version: expected 1, found true"),
     "no task": ({"task": ...}, "task: is missing"),

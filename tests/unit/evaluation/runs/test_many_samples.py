@@ -184,7 +184,7 @@ class TestCheckpoints:
     def test_a_damaged_one(self, tmp_path: Path) -> None:
         path = tmp_path / "state.json"
         path.write_text('{"settings": {"scale"')
-        with pytest.raises(EvaluationError, match=r"state\.json: no saved evaluation .*; begin anew"):
+        with pytest.raises(EvaluationError, match=r"state\.json: no saved evaluation .*; begin again"):
             evaluate_samples(Sums(), VALUES, number, checkpoint=path)
 
     def test_where_none_can_be_written_is_told_at_once(self, tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ def test_every_value_knows_the_line_of_its_key_or_item():
         ("a: 2020-13-40", r"f.yaml:1: a: no value: '2020-13-40' \(.*\); put it in quotes if it is a word"),
         ("? [a]\n: 1", "f.yaml:1: expected a key that is a word"),
         ("a: 1\na: 2", "f.yaml:2: a: stands twice; keep one of them"),
-        ("\x00", "f.yaml: no YAML: unacceptable character #x0000: special characters are not allowed; write it anew"),
+        ("\x00", "f.yaml: no YAML: unacceptable character #x0000: special characters are not allowed; write it again"),
         ("- " * 5000, "f.yaml: no YAML: maximum recursion depth exceeded"),
     ],
 )

@@ -319,7 +319,7 @@ def test_an_alarm_for_later_than_the_horizon_is_none() -> None:
     assert result([alarm(time=2.04)], crash).apa == 1
     assert result([alarm(time=2.06)], crash).beyond == 1
     assert result([alarm(time=900.0, score=0.9), alarm(score=0.5)], crash).apa == 1
-    assert "1 alarms are for later than the horizon and are none" in made.notes
+    assert "1 alarms are for later than the horizon and do not count" in made.notes
 
 
 def test_at_the_impact_itself_nothing_is_foreseen() -> None:

@@ -1,4 +1,4 @@
-"""The protocol `released`: each slip, on a scene where it decides; tests/parity/test_accident.py has the golden."""
+"""The protocol `released`: each quirk on a scene that shows it; tests/parity/test_accident.py has the golden file."""
 
 import json
 import math

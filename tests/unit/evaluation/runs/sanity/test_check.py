@@ -121,9 +121,7 @@ def test_a_mistake_of_detections_is_told_with_its_remedy(da_motion: DeepAccident
         )
     report = sanity(da_motion, MemoryResults("detection", found), EvaluationSetup(task="detection"), tokens)
     (warning,) = report.warnings
-    assert warning.startswith(
-        "ego frame: it looks as though boxes are given in the agent's ego frame; translations are"
-    )
+    assert warning.startswith("ego frame: it looks as if boxes are given in the agent's ego frame; translations are")
     assert report.to_text().endswith(f"WARNING: {warning}")
 
 
@@ -158,7 +156,7 @@ def test_explicit_accidents(da_motion: DeepAccident, tokens: list[str], task: An
     assert (report.perfect[name], report.empty[name]) == (1.0, 0.0)
     late = {token: [delayed(each) for each in alarms] for token, alarms in right.items()}
     (warning,) = sanity(da_motion, MemoryResults("accident", late), setup, tokens, samples=10).warnings
-    assert warning.startswith("0.5 s late: it looks as though accidents are foretold for 0.5 s later than they come")
+    assert warning.startswith("0.5 s late: it looks as if accidents are foretold for 0.5 s later than they come")
 
 
 @pytest.mark.parametrize(("protocol", "told"), [("boxes", 1), ("paper", 0)])
