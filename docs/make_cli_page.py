@@ -93,7 +93,7 @@ def _on_release(command: click.Command) -> bool:
 
 
 def _alike(group: click.Group) -> dict[str, click.Command]:
-    """The commands of a group that have the options of a release, but for those that differ from the others."""
+    """The commands of a group that have the options of a release, except for those that differ from the others."""
     context = click.Context(group)
     commands = {name: group.get_command(context, name) for name in group.list_commands(context)}
     return {name: each for name, each in commands.items() if each and _on_release(each) and name not in _UNLIKE}

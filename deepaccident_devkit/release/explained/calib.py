@@ -93,7 +93,7 @@ def _off_text(matrix: FloatArray) -> str:
 def _transform_notes(raw: Mapping[str, AnyArray]) -> list[str]:
     faults = {key: rigid_fault(raw[key].astype(np.float64)) for key, shape in KEYS.items() if shape == (4, 4)}
     wrong = [f"Not rigid: {key}: {fault}" for key, fault in faults.items() if fault]
-    return wrong or ["All of them are rigid, but for rounding."]
+    return wrong or ["All of them are rigid, except for rounding."]
 
 
 def _devkit_text(raw: Mapping[str, AnyArray]) -> str:
