@@ -7,8 +7,8 @@ three rules (`WarpRule`):
   linspace(−49.75, 50, 200) along either axis instead of at the cells' centres, and the outermost of them are taken for
   the grid's ends: without motion, cell i samples 0.4975 + 0.9975 i, which nearest sampling rounds to i, and which blurs
   bilinear sampling by up to half a cell. In float32, rounding for rounding, since the last bit decides for points that
-  lie on the border between two cells (except for the angles of the egomotion: `single_precision.six_vectors`). Grids that
-  are not centred on the ego, where the released code has no meaning, are stretched about their own middle.
+  lie on the border between two cells (except for the angles of the egomotion: `single_precision.six_vectors`). Grids
+  that are not centred on the ego, where the released code has no meaning, are stretched about their own middle.
 - `exact`: cell centres, in float64; without motion every cell gets its own value, in either mode.
 - `fiery`: FIERY's (docs/released_code.md, FIERY's own labels), native in `fiery`. Cell centres, but of the motion only
   yaw and planar translation as the 6-vector has them count, and they are put together as source = Rot(−yaw) · target +
