@@ -84,9 +84,8 @@ def official_split(dataset: Dataset, seed: int = OFFICIAL_SEED, *, released_skip
     a file system happened to list folders. This one sorts first, so that it depends on the scenarios and `seed` alone.
 
     1. Only scenarios whose `ego_vehicle` has more than five labels count (so none of an unlabelled test split). Twins
-    are a
-       normal and an accident scenario of one name and subtype; they stay together. With T scenarios, val and test hold
-       at most round(0.15 T) each.
+       are a normal and an accident scenario of one name and subtype; they stay together. With T scenarios, val and test
+       hold at most round(0.15 T) each.
     2. Twins are *designed* if by meta, in the accident, ego or the car behind it collides with other or the car behind
        it, and names no collision in the normal scenario.
     3. Twins fall into three strata by the accident's meta: three-way; four-way with the other vehicle from opposite;
