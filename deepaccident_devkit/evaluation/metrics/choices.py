@@ -58,7 +58,7 @@ def switched(rules: Rules, switches: Mapping[str, Any]) -> Rules:
 
 
 def _of_kind(name: str, rules: DataclassInstance, field: str, value: Any) -> Any:
-    """A value of the kind of a field's own; raises ChoiceError. A field that is None takes any value."""
+    """A value of the kind of a field's own; raises ChoiceError. A field with None takes any value."""
     before = getattr(rules, field)
     kind = next((kind for kind in (bool, float, str, tuple) if isinstance(before, _LIKE[kind])), None)
     fits = kind is None or (isinstance(value, _LIKE[kind]) and (kind is bool or not isinstance(value, bool)))

@@ -167,7 +167,7 @@ class OpenShards:
         self._process = os.getpid()
 
     def archive(self, shard: Shard) -> zipfile.ZipFile:
-        """The archive, open; raises ContentError. Threads may share it, so the garbage collector closes dropped ones."""
+        """The open archive; raises ContentError. Threads may share it, so the garbage collector closes it."""
         if self._process != os.getpid():  # a fork shares positions in open files with its parent
             self._open, self._process = OrderedDict(), os.getpid()
         archive = self._open.get(shard.file)
