@@ -47,7 +47,7 @@ _COLUMNS: dict[str, tuple[tuple[int | None, ...], type]] = {
 }
 _FINITE = ("center", "size", "rotation")
 _UNIT_TOLERANCE = 1e-3
-"""The largest distance of a quaternion's norm from 1; it is then normalised."""
+"""The largest distance of a quaternion's norm from 1; it is then scaled to 1."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
