@@ -165,7 +165,7 @@ def test_video_takes_the_first_accident(da: DeepAccident, tmp_path: Path) -> Non
     [
         (["frame", "--frame-range", "3..1"], "expected frame numbers such as 20..40, found '3..1'"),
         (["frame", "--size", "big"], "expected width x height such as 480x270, found 'big'"),
-        (["accident", "--frame-range", "1..3"], "--frame-range is for moments; a whole scenario is drawn"),
+        (["accident", "--frame-range", "1..3"], "--frame-range is for moments; a whole scenario is rendered"),
         (["frame", "a/b/003", "--frame-range", "1..3"], "--frame-range is for scenarios; a/b/003 is a frame"),
         (["accident", "--seconds", "soon"], "expected seconds such as 2,1,0, found 'soon'"),
         (["frame", "a/b/003", "a/b/004"], "2 pictures need a folder, found the file"),

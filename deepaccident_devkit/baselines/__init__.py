@@ -1,4 +1,4 @@
-"""Predictions without a model, and what cooperation is worth to them.
+"""Predictions without a model, and how much cooperation improves them.
 
 What a set of agents sees by the labels (`oracle`) goes on at a constant velocity or turn rate (`motion_models`,
 `outlook`); `predict` makes motion maps (`drawing`), accidents (`collisions`) and detections of that, `predict_results`

@@ -13,12 +13,12 @@ from deepaccident_devkit.geometry.footprints import gaps_of_pairs
 from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD, OWN_ACTOR_ID
 
 DANGER_DISTANCE: Final = 0.25
-"""Metres: who comes nearer collides. The evaluation's 1 m, which allows for cells, would be an alarm for every car that
-passes a cyclist."""
+"""Metres: actors that come nearer to each other collide. The evaluation's 1 m, which allows for cells, would be an
+alarm for every car that passes a cyclist."""
 _SITE: Final = 10.0
 """Metres within which two alarms are of one accident: the surer one is kept."""
 _MOVES: Final = 0.5
-"""Metres that an actor covers if it does more than stand."""
+"""Metres that an actor must cover to count as moving."""
 _SAME_WAY: Final = np.radians(20)
 """Between the headings of two that drive one behind the other."""
 _SAME_LANE: Final = 1.0
@@ -30,13 +30,13 @@ def accidents_ahead(outlook: Outlook, horizon: float, danger_distance: float = D
     """The accidents of an outlook, the surest first.
 
     A pair is named at the first moment, in steps of 0.1 s, at which the gap between its boxes is below the danger
-    distance. Who stands beside somebody who stands, or is as near already and comes no nearer, is in no danger; nor are
-    two pedestrians, and who drives up to somebody straight ahead brakes: at constant velocity every queue would be an
-    accident. The score is (1 − least gap / danger distance) / (1 + seconds to that moment): 1 for two that touch now.
-    Later the place of an accident is no longer the same, so of alarms within 10 m the surest is kept.
+    distance. There is no danger for two that stand, for two that are already near and come no nearer, and for two
+    pedestrians. A driver behind somebody straight ahead brakes: at constant velocity every queue would be an accident.
+    The score is (1 − least gap / danger distance) / (1 + seconds to that moment): 1 for two that touch now. Later the
+    place of an accident is no longer the same, so of alarms within 10 m the surest is kept.
 
     Args:
-        outlook: who is known, and how they go on.
+        outlook: the known actors, and how they go on.
         horizon: seconds to look ahead.
         danger_distance: metres.
 

@@ -34,7 +34,7 @@ _DETECTION: Final = "paper"
 
 
 def drawn(token: str, seed: int) -> str:
-    """What a sample is called in the evaluators, where each seed's draw of it has its own counts."""
+    """The name of a sample in the evaluators, where each seed's draw of it has its own counts."""
     return f"{token}#{seed}"
 
 
@@ -70,7 +70,7 @@ class Evaluators:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Counting:
-    """What is counted how; cheap to pickle.
+    """The settings of the counts; cheap to pickle.
 
     Attributes:
         dataset: the release.

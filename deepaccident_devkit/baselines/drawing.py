@@ -53,7 +53,7 @@ def _ego_poses(poses: FloatArray, *, has_own: bool) -> list[SE3]:
 
 
 def _frame_boxes(seen: SeenActors, pose: FloatArray, lidar_from_present: SE3, ego_from_lidar: SE3) -> FrameBoxes:
-    """What would be annotated at a moment, all of it seen."""
+    """The boxes that would be annotated at a moment, all of them seen."""
     boxes = seen.boxes
     center = np.column_stack([pose[:, :2], boxes.center[:, 2]])
     return FrameBoxes(

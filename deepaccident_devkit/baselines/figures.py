@@ -25,7 +25,7 @@ def save_study(study: V2XStudy, folder: str | os.PathLike[str]) -> list[Path]:
 
 
 def study_panels(table: StudyTable) -> list[list[Panel]]:
-    """What is rendered of a table: a panel a metric; of several horizons, a row of panels each."""
+    """The panels of a table: one for each metric; with several horizons, a row of panels for each."""
     swept = next((name for name in table.by if name in _XLABELS), None)
     horizons = sorted({row.horizon for row in table.rows})
     result = []

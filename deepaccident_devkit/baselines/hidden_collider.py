@@ -29,7 +29,7 @@ _AGENTS: Final = {"single": "single vehicle", "all": "five agents"}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HiddenCollider:
-    """What the ego vehicle foresees of one accident, with some agents.
+    """How well the ego vehicle foresees one accident with some agents.
 
     Attributes:
         agents: name of the configuration.

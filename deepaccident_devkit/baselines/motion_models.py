@@ -18,7 +18,7 @@ def constant_velocity(pose: FloatArray, velocity: FloatArray, times: FloatArray)
 
     Args:
         pose: (N, 3) x, y (metres), yaw (radians) at time 0, in any right-handed frame.
-        velocity: (N, 2) m/s over the ground, in the same frame; who has NaN stands.
+        velocity: (N, 2) m/s over the ground, in the same frame; NaN counts as standing.
         times: (T,) seconds.
 
     Returns:

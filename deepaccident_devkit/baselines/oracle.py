@@ -1,4 +1,4 @@
-"""How fast the actors turn that a set of agents sees, by the labels; who these are says `v2x.seen`."""
+"""Turn rates, by the labels, of the actors that a set of agents sees (`v2x.seen`)."""
 
 from __future__ import annotations
 
@@ -22,12 +22,13 @@ HISTORY: Final = 5
 def turn_rates(
     dataset: Dataset, sample: RowArgument, *, agents: Agents = "single", link: Link | None = None
 ) -> FloatArray:
-    """How fast the actors of `seen_actors` turn, by their headings at the present and up to 0.5 s before it.
+    """The turn rates of the actors of `seen_actors`, by their headings at the present and up to 0.5 s before it.
 
-    Of each the earliest of these moments counts at which the agents saw it. Arguments and errors as of `seen_actors`.
+    For each actor the earliest of these moments counts at which the agents saw it. Arguments and errors as of
+    `seen_actors`.
 
     Returns:
-        (N,) radians a second, counter-clockwise; 0 for who was not seen before.
+        (N,) radians a second, counter-clockwise; 0 for actors not seen before.
     """
     scenario, agent, number = dataset.get("sample", sample)["token"].rsplit("/", 2)
     present = seen_actors(dataset, sample, agents=agents, link=link, frame="world").boxes

@@ -1,4 +1,4 @@
-"""`Outlook`: what an agent and its partners expect, from what they see now."""
+"""`Outlook`: where an agent and its partners expect the actors that they see now."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def outlook(
     model: MotionModel = "constant_velocity",
     link: Link | None = None,
 ) -> Outlook:
-    """What some agents expect at a sample.
+    """The outlook of some agents at a sample.
 
     Args:
         dataset: the release.
@@ -76,4 +76,4 @@ MOTION_MODELS: Final[Mapping[MotionModel, _Rates]] = {
     "constant_velocity": _straight,
     "constant_turn_rate": _turning,
 }
-"""How fast actors turn, by model."""
+"""Turn rates, by model."""

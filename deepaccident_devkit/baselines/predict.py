@@ -1,4 +1,4 @@
-"""What the baselines say of one sample, for each task."""
+"""The baselines' predictions of one sample, for each task."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from deepaccident_devkit.taxonomy import AGENTS, LIDAR, OWN_ACTOR_ID
 from deepaccident_devkit.v2x import Agents, Link
 
 _ENOUGH_POINTS = 10.0
-"""LiDAR points with which an actor is half as sure as with any number."""
+"""LiDAR points that add to a score half of what any number of them can add."""
 
 
 def predict_motion(
@@ -71,7 +71,7 @@ def predict_accidents(
         danger_distance: metres; whose boxes come nearer to each other collide.
 
     Raises:
-        ConfigError: a horizon or distance that cannot be.
+        ConfigError: an impossible horizon or distance.
         DeepAccidentError: as of `predict_motion`.
     """
     for name, value in (("horizon", horizon), ("danger_distance", danger_distance)):

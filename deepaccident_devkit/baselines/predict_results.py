@@ -1,4 +1,4 @@
-"""Results files of the baselines: predictions of many samples, written as a model's would be."""
+"""Results files of the baselines: predictions of many samples, written like those of a model."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _BATCH: Final = 8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Baseline:
-    """Who sees, and how what is seen goes on.
+    """Which agents see, and how seen actors go on.
 
     Attributes:
         agents: who cooperates, as of `v2x.cooperating_agents`.
@@ -51,7 +51,7 @@ class Baseline:
         return MotionLabelConfig(future_frames=round(frames))
 
     def predict(self, dataset: Dataset, task: ResultsTask, token: str) -> Prediction:
-        """What it says of a sample; raises DeepAccidentError as the functions of `predict`."""
+        """Its prediction of a sample; raises DeepAccidentError as the functions of `predict`."""
         seeing: dict[str, Any] = {"agents": self.agents, "link": self.link}
         if task == "motion":
             return predict_motion(dataset, token, model=self.model, config=self.config, **seeing)
@@ -60,7 +60,7 @@ class Baseline:
         return predict_detections(dataset, token, **seeing)
 
     def meta(self) -> dict[str, Any]:
-        """What a results file says of it, as JSON holds it."""
+        """Its notes in a results file, as JSON holds them."""
         agents = self.agents.name if isinstance(self.agents, AgentConfig) else self.agents
         return {
             "method": f"baseline: what the agents see by the labels, {self.model.replace('_', ' ')}",
@@ -126,7 +126,7 @@ def _predict(job: _Job) -> list[Prediction]:
 
 
 def _predicted(jobs: Sequence[_Job], workers: int | None, *, progress: bool) -> Iterator[tuple[str, Prediction]]:
-    """Tokens and predictions in the jobs' order, whichever is done first."""
+    """Tokens and predictions in the order of the jobs."""
     waiting: dict[int, list[Prediction]] = {}
     following = 0
     sizes = [len(job.tokens) for job in jobs]

@@ -1,4 +1,4 @@
-"""`v2x_study`: the paper's tables on what cooperation is worth, of a baseline, on any release."""
+"""`v2x_study`: the paper's tables on the gain of cooperation, with a baseline, on any release."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def v2x_study(
     Args:
         dataset: the release.
         split: `val`, … or a split file.
-        config: how; None for the paper's way.
+        config: the settings; None for the paper's.
         workers: processes; None takes what the work is worth. The numbers do not depend on it.
         progress: whether to show a bar.
 

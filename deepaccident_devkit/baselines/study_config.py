@@ -40,7 +40,7 @@ class StudyConfig:
     resampling: Resampling = field(default_factory=Resampling)
 
     def __post_init__(self) -> None:
-        """Check the choices; raises ChoiceError, and ConfigError for seeds that cannot be."""
+        """Check the choices; raises ChoiceError, and ConfigError for impossible seeds."""
         if isinstance(self.egos, str):
             raise ChoiceError(f"egos: expected several agents, found {self.egos!r}; give [{self.egos!r}] for one")
         object.__setattr__(self, "egos", tuple(self.egos))

@@ -92,7 +92,7 @@ class StudyTable:
     Attributes:
         name: also of its files.
         title: for people.
-        by: the fields of its rows that tell them apart, the agents first.
+        by: the fields that distinguish its rows, the agents first.
         rows: in their order.
     """
 
@@ -135,13 +135,13 @@ class StudyTable:
         return text.getvalue()
 
     def _names(self, row: StudyRow) -> list[str]:
-        """What tells a row apart."""
+        """The values that distinguish a row."""
         return [_cell(getattr(row, name)) for name in self.by]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class V2XStudy(FrozenMappings):
-    """What cooperation is worth on a release, to the baseline.
+    """The gain of cooperation on a release, for the baseline.
 
     Attributes:
         dataroot: the release's folder.
@@ -186,7 +186,7 @@ class V2XStudy(FrozenMappings):
 
 
 def _intervals_text(resampling: Resampling) -> list[str]:
-    """What stands in brackets, and why elsewhere nothing does."""
+    """The meaning of the brackets, and why some numbers have none."""
     if not resampling.resamples:
         return []
     what = f"[low, high]: intervals of {100 * resampling.confidence:g} %; a number has none where fewer than"

@@ -17,14 +17,14 @@ Orientation = Literal["devkit", "released", "fiery"]
 Axis = tuple[float, float, float]
 ORIENTATIONS: tuple[Orientation, ...] = get_args(Orientation)
 _WHOLE = 1e-6
-"""How far from a whole number of cells a range may be: decimal resolutions are not exact in binary."""
+"""The largest distance of a range from a whole number of cells: decimal resolutions are not exact in binary."""
 
 
 @dataclass(frozen=True, slots=True)
 class BevGrid:
     """Square or oblong cells over a piece of ground; equal ones are equal and hash alike.
 
-    Ranges are always right-handed metres, x forward and y **left**, whatever the orientation; that only says how the
+    Ranges are always right-handed metres, x forward and y **left**, in every orientation; that only says how the
     cells lie in an array (for the default ranges, 200 × 200):
 
     - `"devkit"`: row = y index, column = x index, both rising: row 0 is the far right (y = −50), column 0 the far
@@ -73,7 +73,7 @@ class BevGrid:
     def index_of(self, points: ArrayLike) -> tuple[IntArray, BoolArray]:
         """The cells that points (N, 2) or (N, 3) lie in; x forward, y left, metres.
 
-        A cell owns its lower edges in x and y, whatever the orientation. (Label rasters round polygon corners by a
+        A cell owns its lower edges in x and y, in every orientation. (Label rasters round polygon corners by a
         rule of their own, docs/released_code.md, Motion labels; this one is for points.)
 
         Returns:
@@ -108,8 +108,8 @@ class BevGrid:
     def reorient(self, raster: AnyArray, orientation: Orientation) -> AnyArray:
         """A raster (…, rows, columns) of this grid as a view that lies as `orientation` says.
 
-        Only cells change places: the values of offset and flow channels point along rows and columns, and are the
-        caller's to negate or swap.
+        Only cells change places: the values of offset and flow channels point along rows and columns, and the caller
+        has to negate or swap them.
 
         Raises:
             GeometryError: the raster has another shape than the grid.
@@ -129,7 +129,7 @@ class BevGrid:
 
 
 def turned(raster: AnyArray, orientation: Orientation) -> AnyArray:
-    """A raster (…, rows, columns) of the devkit's orientation in another, or back: each is its own way back."""
+    """A raster (…, rows, columns) of the devkit's orientation in another, or back: each is its own inverse."""
     if orientation == "fiery":
         return raster.swapaxes(-1, -2)
     return raster if orientation == "devkit" else raster[..., ::-1, :]

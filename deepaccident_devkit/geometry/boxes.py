@@ -47,7 +47,7 @@ _COLUMNS: dict[str, tuple[tuple[int | None, ...], type]] = {
 }
 _FINITE = ("center", "size", "rotation")
 _UNIT_TOLERANCE = 1e-3
-"""How far a quaternion's norm may be from 1; it is brought there."""
+"""The largest distance of a quaternion's norm from 1; it is then scaled to 1."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -104,8 +104,8 @@ class Boxes(FrozenArrays):
     ) -> Boxes:
         """Boxes that stand upright in `frame`: centres (N, 3), sizes (N, 3), yaw (N,) radians.
 
-        `category` holds indices or names; the other columns default to what is not known (velocity NaN, id −1,
-        no points, not visible).
+        `category` holds indices or names; the other columns default to unknown values (velocity NaN, id −1, no
+        points, not visible).
         """
         heading = checked("Boxes.yaw", yaw, (None,))
         count = len(heading)
@@ -283,7 +283,7 @@ class Boxes(FrozenArrays):
 
 
 def trusted_boxes(frame: str, columns: dict[str, AnyArray]) -> Boxes:
-    """Boxes over columns that are right by construction: the hot path, which checks nothing.
+    """Boxes over columns that are correct by construction: the hot path, without checks.
 
     `columns` holds every column of `Boxes`; the arrays must be fresh or read-only, and become read-only.
     """

@@ -24,7 +24,7 @@ from deepaccident_devkit.geometry.boxes import Boxes, checked_boxes
 from deepaccident_devkit.taxonomy import BEV_CAMERA, LIDAR, Frame
 
 VISIBLE_DEPTH = 1.0
-"""Metres in front of the camera from which on a corner in the image counts as seen (the nuScenes devkit's)."""
+"""A corner in the image counts as seen at this distance, metres, or farther (as in the nuScenes devkit)."""
 IN_FRONT_DEPTH = 0.1
 """Metres in front of the camera that all corners of a visible box must be (the nuScenes devkit's)."""
 _NO_PINHOLE: Final = (*get_args(Frame), LIDAR, BEV_CAMERA)
@@ -139,7 +139,7 @@ class PinholeCamera(FrozenArrays):
             boxes: in this camera's optical frame.
 
         Raises:
-            GeometryError: they are no boxes, or in another frame than a camera's: world, ego, LiDAR, the BEV camera's.
+            GeometryError: they are not boxes, or not in a camera's frame but in world, ego, LiDAR or the BEV camera's.
         """
         if checked_boxes("boxes", boxes).frame in _NO_PINHOLE:
             raise GeometryError(

@@ -1,4 +1,4 @@
-"""Conflicts of two road users, seen from above: when boxes touch that go on as they do now."""
+"""Conflicts of two road users, seen from above: when boxes touch if they keep their velocities."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def time_to_collision(
 ) -> FloatArray:
     """Seconds until P pairs of boxes touch, seen from above, each moving on at its velocity without turning.
 
-    Two boxes touch while none of the four directions of their sides parts them; along each direction that is an
+    Two boxes touch while none of the four directions of their sides separates them; along each direction that is an
     interval of time, so that the boxes touch from the latest begin to the earliest end.
 
     Args:

@@ -1,7 +1,7 @@
 """Rectangles on the ground, over arrays: areas in common and gaps.
 
 A footprint is a row (x, y, length, width, yaw): metres and radians in any right-handed frame whose z points up.
-Positions enter as differences only, so that world coordinates cost no digits.
+Only differences of positions are used, so that world coordinates lose no digits.
 """
 
 import numpy as np
@@ -50,8 +50,8 @@ def _areas_of_pairs(first: FloatArray, second: FloatArray) -> FloatArray:
     """Area in common of `first[i]` and `second[i]`, (P,) m².
 
     In the second's own axes, where it is |x| ≤ h, |y| ≤ k, the area is −∮ clamp(y, ±k) d clamp(x, ±h) around the
-    first: every edge adds a sum of trapezoids. No vertex is looked for, so that identical and touching rectangles are
-    no special cases: all of it depends continuously on the input.
+    first: every edge adds a sum of trapezoids. No vertices are computed, so identical and touching rectangles are no
+    special cases: the result depends continuously on the input.
     """
     x, y = _corners_in(first, second)
     half = second[:, 2:4, None] / 2

@@ -3,7 +3,7 @@
 CARLA's frames have x forward, y **right**, z up, and yaw clockwise seen from above. The devkit's have x forward,
 y **left**, z up, yaw counter-clockwise. With S = diag(1, −1, 1) every conversion of a point, a pose or an angle is its
 own inverse, so `flip_*` serves both directions. Cameras also change from CARLA's axes (x depth, y right, z up) to
-optical ones (x right, y down, z forward), which is no involution: those two have a `*_to_raw` beside them.
+optical ones (x right, y down, z forward), which is not its own inverse: those two have a `*_to_raw` each.
 
 All functions take arrays with any leading axes, return new float64 arrays and change nothing they are given.
 """

@@ -29,7 +29,7 @@ from deepaccident_devkit.geometry.se3 import SE3, checked_transform
 Range = tuple[float, float]
 _FIELDS = ("xyz", "intensity", "frame")
 _FAULTS = (*DAMAGED_ARCHIVE, TypeError, AttributeError)  # the last two: a bare array, which is no archive
-"""What reading a damaged or foreign file can raise."""
+"""The errors of reading a damaged or foreign file."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,7 +86,7 @@ class LidarPointCloud(FrozenArrays):
 
         Args:
             grid: x forward and y left of the cloud's own frame; its orientation does not matter.
-            x: metres, the start in, the end out, as a grid's cells; likewise `y` and `z`. None: any.
+            x: metres, with the start and without the end, as a grid's cells; likewise `y` and `z`. None: any.
             y: see `x`.
             z: see `x`.
         """
@@ -101,7 +101,7 @@ class LidarPointCloud(FrozenArrays):
     def remove_close(self, radius: float, sensor: ArrayLike | None = None) -> LidarPointCloud:
         """The points that are `radius` or more from the sensor, measured on the ground (x and y), in their order.
 
-        Where the nuScenes devkit cuts a square of that half side out, this cuts a circle.
+        The nuScenes devkit removes a square of that half side, this a circle.
 
         Args:
             radius: metres.

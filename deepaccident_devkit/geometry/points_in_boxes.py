@@ -1,4 +1,4 @@
-"""Which points lie in which oriented box, over arrays: most points are put aside by one look at a coarse grid."""
+"""Which points lie in which oriented box, over arrays: a coarse grid excludes most points at once."""
 
 import numpy as np
 
@@ -18,8 +18,8 @@ def points_in_boxes(
     """Every pair of a box and a point in it, faces included: rows of boxes (K,) and rows of points (K,).
 
     A point p is in a box if |(p − centre) · a| ≤ half for each of its three axes a, the products summed as
-    (x + y) + z. Grid and windows only leave out points that cannot be inside, so the answer is that rule's to the bit.
-    NaN lies in no box. Pairs ascend by box, then by point.
+    (x + y) + z. Grid and windows only leave out points that cannot be inside, so the answer equals that rule's to the
+    bit. NaN lies in no box. Pairs ascend by box, then by point.
 
     Args:
         points: (P, 3), metres.

@@ -101,7 +101,7 @@ def slerp(first: ArrayLike, second: ArrayLike, share: ArrayLike) -> FloatArray:
     a, b = as_floats(first), as_floats(second)
     cosine = np.sum(a * b, axis=-1, keepdims=True)
     a, cosine = np.where(cosine < 0, -a, a), np.abs(cosine)
-    square = b - cosine * a  # what of b is at right angles to a: as long as the angle's sine
+    square = b - cosine * a  # the part of b at right angles to a: its length is the angle's sine
     sine = np.linalg.norm(square, axis=-1, keepdims=True)
     angle = as_floats(share)[..., None] * np.arctan2(sine, cosine)
     direction = np.divide(square, sine, out=np.zeros_like(square), where=sine > 0)

@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from pyquaternion import Quaternion
 
 RIGID_TOLERANCE = 1e-3
-"""How far a rotation may be from orthonormal; files carry poses of single precision, or rounded ones."""
+"""The largest distance of a rotation from an orthonormal one; files have poses of single precision, or rounded ones."""
 LAST_ROW = (0.0, 0.0, 0.0, 1.0)
 
 
 @runtime_checkable
 class Movable(Protocol):
-    """What a transform carries from frame to frame: boxes, a box, a point cloud."""
+    """What a transform moves from frame to frame: boxes, a box, a point cloud."""
 
     @property
     def frame(self) -> str:
@@ -43,7 +43,7 @@ class SE3(FrozenArrays):
     """A rigid transform, right-handed: `target_from_source.apply(p_source)` is `p_target`.
 
     A rotation that is a little off an orthonormal one, as files have them, is kept as it is, to the bit. `inverse` is
-    the true inverse all the same, so that ways there and back end where they began.
+    the true inverse nevertheless, so that there and back gives the same point.
 
     Attributes:
         matrix: (4, 4) float64, column-vector convention, read-only.
@@ -161,11 +161,11 @@ class SE3(FrozenArrays):
     @overload
     def apply(self, points: ArrayLike) -> FloatArray: ...
     def apply(self, points: Any, frame: str | None = None) -> Any:
-        """What is in the source frame in the target frame.
+        """Points or objects of the source frame in the target frame.
 
         Args:
             points: (N, 3) or one point (3,), metres; or `Boxes`, a `Box` or a `LidarPointCloud`. NaN stays NaN, and
-                infinity has no place after a turn.
+                infinity becomes NaN in a rotation.
             frame: of boxes and clouds: the target frame's name, since a transform does not know between which frames
                 it leads. Without it they keep the name that they have, as after a motion within one frame.
 
@@ -207,7 +207,7 @@ class SE3(FrozenArrays):
         return self.apply(other)
 
     def __repr__(self) -> str:
-        """Translation and yaw, which is what one looks for."""
+        """Translation and yaw."""
         x, y, z = self.translation.tolist()
         return f"SE3(translation=[{x:.3f}, {y:.3f}, {z:.3f}], yaw={self.yaw:.4f})"
 

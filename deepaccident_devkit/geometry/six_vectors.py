@@ -1,8 +1,9 @@
 """The released code's 6-vectors (tx, ty, tz, rx, ry, rz) of rigid transforms, over arrays.
 
 See docs/released_code.md, Poses. R = Rx(rx) · Ry(ry) · Rz(rz): about z first, then y, then x, each about the target
-frame's own, fixed axes; angles in radians, ry in [−π/2, π/2]. Nothing here knows a handedness: a raw matrix gives the
-raw vector, a right-handed one the right-handed vector, and `handedness.flip_six_vector` leads from one to the other.
+frame's own, fixed axes; angles in radians, ry in [−π/2, π/2]. The functions do not depend on the handedness: a raw
+matrix gives the raw vector, a right-handed one the right-handed vector, and `handedness.flip_six_vector` leads from one
+to the other.
 
 At ry = ±π/2 (the gimbal) only rx ± rz is determined, and the formula reads both off the last bits.
 """

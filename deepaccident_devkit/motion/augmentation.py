@@ -17,7 +17,7 @@ from deepaccident_devkit.motion.settings import flag, number
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Augmentation:
-    """What training does to the ground plane: first turn, then scale, then mirror; right-handed.
+    """A change of the ground plane in training: first turn, then scale, then mirror; right-handed.
 
     Attributes:
         rotation: radians about z, counter-clockwise.

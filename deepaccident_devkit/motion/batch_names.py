@@ -49,7 +49,7 @@ HEADS: Final[Mapping[str, str]] = MappingProxyType(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Batch:
-    """How one code has its labels: our name → its name, and what is peculiar."""
+    """The labels of one code: our name → its name, and its peculiarities."""
 
     names: Mapping[str, str]
     orientation: Orientation
@@ -161,12 +161,12 @@ def config_from_names(settings: Mapping[str, Any], names: BatchNames) -> MotionL
     FIERY's are its `cfg` as nested dictionaries (TIME_RECEPTIVE_FIELD, N_FUTURE_FRAMES, LIFT.X_BOUND, LIFT.Y_BOUND,
     DATASET.IGNORE_INDEX, DATASET.FILTER_INVISIBLE_VEHICLES); BEVerse's and DeepAccident's `receptive_field`,
     `future_frames`, and the arguments of ConvertMotionLabels: `grid_conf` (xbound, ybound), `ignore_index`,
-    `only_vehicle`, `filter_invisible`. What is not given stays as in the preset; what says nothing about labels is
+    `only_vehicle`, `filter_invisible`. What is not given stays as in the preset; keys that do not concern labels are
     passed over.
 
     Raises:
         ChoiceError: no such code.
-        ConfigError: a value that cannot be.
+        ConfigError: an impossible value.
     """
     found = {ours: _setting(settings, path) for ours, path in _SETTINGS[_checked(names)].items()}
     changes: dict[str, Any] = {ours: value for ours, value in found.items() if value is not None}

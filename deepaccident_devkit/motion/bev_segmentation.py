@@ -1,4 +1,4 @@
-"""Targets of BEV semantic segmentation, from what the camera above the agent saw."""
+"""Targets of BEV semantic segmentation, from the camera above the agent."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ COVERAGE: Final[Mapping[str, float]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BevSegmentation:
-    """What covers each cell around an agent, by class; arrays are read-only.
+    """The classes that cover each cell around an agent; arrays are read-only.
 
     Attributes:
         grid: the cells and how they lie.
-        masks: (5, H, W) bool, a layer a class of `BEV_CLASSES`. Only what is seen from above: no road beneath a car,
+        masks: (5, H, W) bool, a layer a class of `BEV_CLASSES`. Only the upper surface counts: no road beneath a car,
             nothing beneath a bridge or a tree.
         known: (H, W) bool, whether the cell is within the camera's ±60 m; beside it all masks are False.
     """

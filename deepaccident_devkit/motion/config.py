@@ -46,8 +46,8 @@ class MotionLabelConfig:
         draw_ego: rasterise the ego's own box (the infrastructure has none).
         ignore_index: what stands in offset and flow beside instances, and in missing frames where they are ignored:
             255, or any number from the grid's longer side on, in cells, which no vector can have.
-        orientation: a word to the constructor: the orientation that `grid` is laid out in, None for its own. The grid
-            keeps it: what is read here is None always.
+        orientation: an argument of the constructor: the orientation of `grid`, None for its own. The grid keeps it:
+            this field is always None.
         sigma: radius of the centres' peaks, cells: exp(−d² / σ²), as FIERY.
         protocol: `released`, `clean`, `beverse`, `fiery`, or a `LabelProtocol` of your own; one that has a name is kept
             by its name.
@@ -94,7 +94,7 @@ class MotionLabelConfig:
 
         Raises:
             ChoiceError: no such preset.
-            ConfigError: no such field, or a value that cannot be.
+            ConfigError: no such field, or an impossible value.
         """
         preset = PRESETS[choice("preset", name, PRESETS)]
         unknown = sorted(set(changes) - set(cls.__dataclass_fields__))
@@ -128,7 +128,7 @@ class MotionLabelConfig:
         return range(-(self.receptive_field - 1) * self.step, self.future_frames * self.step + 1, self.step)
 
     def as_dict(self) -> dict[str, Any]:
-        """All that decides the labels' values, as JSON can hold it; protocols as their switches."""
+        """All that affects the labels' values, as JSON can hold it; protocols as their switches."""
         described = asdict(self)
         described["grid"] = {"x": list(self.grid.x), "y": list(self.grid.y)}
         described["orientation"] = self.grid.orientation
@@ -194,9 +194,9 @@ def _checked_grid(grid: object, orientation: Orientation | None) -> BevGrid:
 def _checked_mark(ignore_index: object, grid: BevGrid) -> int:
     """The mark beside the maps' values: a byte, and no vector between two cells of the grid may have it twice.
 
-    Both of a vector's components are less than the longer side, so that from there on none is the mark, turned or not.
-    On grids of more than 255 cells 255 alone is left: there it is the vector over 360 cells, at 45 degrees to the
-    axes, further than an actor reaches from its centre or gets in a step.
+    Both components of a vector are less than the longer side, so that a larger number is never one of them, turned or
+    not. On grids of more than 255 cells only 255 is possible: there it is the vector over 360 cells, at 45 degrees to
+    the axes, further than an actor reaches from its centre or gets in a step.
     """
     mark = count("ignore_index", ignore_index, "a mark beside the maps' values, such as 255", _BYTE)
     least = min(max(grid.shape), _BYTE)

@@ -116,7 +116,7 @@ class LabelFiles(Mapping[str, MotionLabels]):
 
         Args:
             folder: where.
-            config: what the labels must show, or the name of a preset; None for whatever they do.
+            config: what the labels must show, or the name of a preset; None for any.
 
         Raises:
             LabelFilesError: there is no such folder, its making was broken off, or its manifest cannot be read.
@@ -137,7 +137,7 @@ class LabelFiles(Mapping[str, MotionLabels]):
         self._process = os.getpid()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Everything but open files."""
+        """Everything except open files."""
         return {**self.__dict__, "_open": OrderedDict()}
 
     __eq__, __hash__ = object.__eq__, object.__hash__  # a mapping's would read all files
@@ -178,7 +178,7 @@ class LabelFiles(Mapping[str, MotionLabels]):
             raise LabelFilesError(f"{path}: {error}; remove it and run `deepaccident labels` again") from error
 
     def _archive(self, recording: str) -> zipfile.ZipFile:
-        """The open file of a scenario and agent; threads may ask at once, so what leaves is left to the collector."""
+        """The open file of a scenario and agent; threads may share it, so the garbage collector closes dropped ones."""
         if self._process != os.getpid():  # a fork shares positions in open files with its parent
             self._open, self._process = OrderedDict(), os.getpid()
         archive = self._open.get(recording)
@@ -273,7 +273,7 @@ def _by_recording(dataset: Dataset, tokens: Iterable[RowArgument]) -> dict[str, 
 
 
 def _check_agents(dataset: Dataset, wanted: Mapping[str, list[int]], config: MotionLabelConfig) -> None:
-    """Raise NotAvailableError or ChoiceError now where a worker would later, in the midst of the work."""
+    """Raise NotAvailableError or ChoiceError now, and not later in a worker."""
     if config.filter_invisible and config.agents is not None:
         for recording, frames in wanted.items():
             cooperating_agents(dataset, f"{recording}/{frames[0]:03d}", config.agents)
@@ -300,6 +300,6 @@ def _order(recording: str) -> tuple[str, int]:
 
 
 def _parts(token: object) -> tuple[str, int]:
-    """A sample token's scenario and agent, and its frame number; 0 for what is none."""
+    """A sample token's scenario and agent, and its frame number; 0 for other texts."""
     recording, _, number = str(token).rpartition("/")
     return recording, parse_number(number, 3) or 0

@@ -95,7 +95,7 @@ class Manifest:
             raise ConfigError(f"{root}: holds labels of another configuration ({told}); choose another folder")
 
     def write(self, root: Path) -> None:
-        """Put the manifest into its folder."""
+        """Write the manifest into its folder."""
         told = {
             "format": FORMAT,
             "version": FORMAT_VERSION,
@@ -165,7 +165,7 @@ def _acquire(lock: Any, root: Path) -> None:
 
 
 def _remove_half_written(root: Path) -> None:
-    """Remove the temporary files of stopped processes; what resists is left to the next time."""
+    """Remove the temporary files of stopped processes; failures are left to the next time."""
     with suppress(OSError):
         for path in [*root.glob(".*.tmp"), *root.glob("*/*/.*.tmp")]:
             if _HALF_WRITTEN.fullmatch(path.name):

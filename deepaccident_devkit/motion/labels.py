@@ -56,7 +56,7 @@ class MotionLabels(FrozenArrays):
     at_present: bool = False
 
     def __post_init__(self) -> None:
-        """Freeze arrays and map; the small arrays are copied, since callers go on with theirs."""
+        """Freeze arrays and map; the small arrays are copied, since callers may change theirs."""
         for name in ("future_egomotion", "valid"):
             object.__setattr__(self, name, np.array(getattr(self, name)))
         FrozenArrays.__post_init__(self)

@@ -33,7 +33,7 @@ class LabelProtocol:
             between; else once.
         own_box_default: where not exactly one row is the ego's own, a box of 3.99 m x 1.85 m at the LiDAR is rasterised
             in its place; else the first own row is rasterised, if there is one.
-        own_box_not_augmented: an augmentation moves all boxes but the ego's own.
+        own_box_not_augmented: an augmentation moves all boxes except the ego's own.
         half_cell_shift: the corners of boxes are rounded to the nearest *edge* between cells, so that boxes lie half a
             cell too far along both axes; else to the cell that they lie in.
         drawn_when: which of the actors that somebody sees are rasterised at a frame: those seen at the `present` frame
@@ -53,8 +53,8 @@ class LabelProtocol:
         warp: the sampling rule: `stretched` (released and BEVerse: sample points 0.50125 m apart), `exact` (cell
             centres, whole transforms) or `fiery` (cell centres; yaw and planar translation of the 6-vector alone).
         native: the orientation that corners are rounded, centres are counted and rasters are sampled in, and whose
-            handedness the boxes and motions have meanwhile; `fiery` for the warp of that name. It says which way halves
-            of a cell go; in which orientation the labels lie is `MotionLabelConfig.grid`'s matter.
+            handedness the boxes and motions have meanwhile; `fiery` for the warp of that name. It decides how halves of
+            a cell are rounded; `MotionLabelConfig.grid` has the orientation of the labels.
     """
 
     own_box_moved_twice: bool

@@ -1,4 +1,4 @@
-"""Motion labels of a sample of a release: what the tables hold, gathered for `motion_labels_from_boxes`.
+"""Motion labels of a sample of a release: the input of `motion_labels_from_boxes`, read from the tables.
 
 The columns are read as they are, all frames at once: records and `Boxes` would cost as much as rasterising.
 """
@@ -34,8 +34,8 @@ def motion_labels(
 ) -> MotionLabels:
     """The motion labels of a sample, each frame in its own ego frame; `MotionLabels.to_present` warps them.
 
-    The agent's own row (−100) shows only as the ego's own box, and not at all with `draw_ego=False`. So it is in the
-    released code too, where nobody ever sees that row; but with `filter_invisible=False` that code would rasterise it
+    The agent's own row (−100) shows only as the ego's own box, and not at all with `draw_ego=False`. The released code
+    does the same, since no agent ever sees that row; but with `filter_invisible=False` that code would rasterise it
     again, over the ego's box and under an id of its own. Here it does not.
 
     Args:

@@ -35,12 +35,12 @@ def samples(
     Frames are counted back from a scenario's last one, which in an accident scenario is the collision:
 
     - `train`: one a second, of normal and accident scenarios;
-    - `evaluate`: two a second within the last `horizon` seconds but the very last frame. Of scenarios designed to end
+    - `evaluate`: two a second within the last `horizon` seconds except the last frame. Of scenarios designed to end
       in an accident (`_accident` in their folder); `scope="all"` adds the normal ones;
     - `all`: two a second, the whole of every scenario;
     - `every`: all there are, ten a second.
 
-    The released V2X class stops after 50 samples of a list made in an order that nobody knows; nothing here does.
+    The released V2X class stops after 50 samples of a list in an unknown order; this function does not.
 
     Args:
         dataset: the release.
@@ -55,7 +55,7 @@ def samples(
 
     Raises:
         ChoiceError: no such split, purpose, protocol or scope.
-        ConfigError: a horizon that no frames fit, or one that the released protocol does not have.
+        ConfigError: a horizon that is no number of steps, or one that the released protocol does not have.
         NotAvailableError: the split is unknown, this release has no scenario of it, or none of its samples has labels
             (the test split ships without).
     """

@@ -1,4 +1,4 @@
-"""One box: how it looks, where it is, and what is known of it."""
+"""One box: its picture, its place, and its facts."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def draw_view(
 
 
 def _facts(dataset: Dataset, record: dict[str, Any], own: Boxes) -> list[list[str]]:
-    """What is known of a box (its only row in the ego frame), in columns of lines."""
+    """The facts on a box (its only row in the ego frame), in columns of lines."""
     length, width, height = record["size"]
     speed = float(np.linalg.norm(record["velocity"]))
     countdown = "none" if record["time_to_impact"] is None else f"in {record['time_to_impact']:.1f} s"

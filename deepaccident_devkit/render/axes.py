@@ -32,7 +32,7 @@ def figure_or_new(fig: Figure | None, size: tuple[float, float]) -> Figure:
 
 
 def axis_words(frame: str) -> tuple[str, str]:
-    """What the axes of a view from above say, in metres of `ego`, `lidar` or `world`."""
+    """The labels of the axes of a view from above, in metres of `ego`, `lidar` or `world`."""
     return ("x, world (m)", "y, world (m)") if frame == "world" else ("x forward (m)", "y left (m)")
 
 

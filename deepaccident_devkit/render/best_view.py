@@ -14,7 +14,7 @@ from deepaccident_devkit.v2x.projection import camera_of
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BestView:
-    """The image in which some boxes are largest; nothing is said about what stands before them.
+    """The image in which some boxes are largest, also if other things hide them.
 
     Attributes:
         camera: token of the image (sample data).

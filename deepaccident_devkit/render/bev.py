@@ -135,7 +135,7 @@ def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a 
 def draw_bev(
     dataset: Dataset, sample: RowArgument, view: BevView, layers: frozenset[Layer], ax: Axes
 ) -> frozenset[str]:
-    """Render a panel of `render_bev`, which says what and when it raises; returns the colours of the boxes rendered."""
+    """Render a panel of `render_bev`, with its arguments and errors; returns the colours of the boxes rendered."""
     record = dataset.sample[dataset.getind("sample", sample)]
     names = cooperating_agents(dataset, record, view.agents)
     target_from_world = dataset.world_from(record, view.frame).inverse()

@@ -113,7 +113,7 @@ def draw_velocities_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colo
 def segments_in_image(segments: FloatArray, camera: PinholeCamera) -> tuple[FloatArray, BoolArray]:
     """Line segments (S, 2, 3) of the optical frame as pixels (V, 2, 2), and which (S,) of them are before the camera.
 
-    What is nearer than `NEAREST_DRAWN` is cut off.
+    Parts nearer than `NEAREST_DRAWN` are cut off.
     """
     depth = segments[..., 2]
     drawn = np.asarray((depth >= NEAREST_DRAWN).any(axis=1))
@@ -143,7 +143,7 @@ def _draw_footprints(
 
 
 def _moving(boxes: Boxes) -> BoolArray:
-    moving: BoolArray = np.linalg.norm(boxes.velocity, axis=1) > 0  # NaN, what is not known, is not
+    moving: BoolArray = np.linalg.norm(boxes.velocity, axis=1) > 0  # NaN, an unknown speed, is not
     return moving
 
 

@@ -42,7 +42,7 @@ def render_calibration(
 
     Where the transforms are right, the points of each agent, which have its colour, lie on the same kerbs, walls and
     cars as the image's; where an agent's pose or a sensor's place is wrong, its colour is off everywhere. Points and
-    boxes are rendered whatever may stand before them.
+    boxes are rendered also if other things hide them.
 
     Args:
         dataset: the release.

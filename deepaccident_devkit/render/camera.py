@@ -1,4 +1,4 @@
-"""A camera's image with what it may see and any LiDAR points; of other sensors, the matching view from above."""
+"""A camera's image with boxes and LiDAR points; of other sensors, the matching view from above."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def render_pointcloud_in_image(
     color_by: ColorBy = "depth",
     ax: Axes | None = None,
 ) -> Axes:
-    """Render a camera's image and LiDAR points upon it, whatever may stand before them.
+    """Render a camera's image and LiDAR points upon it, also hidden ones.
 
     Args:
         dataset: the release.

@@ -1,4 +1,4 @@
-"""What a picture shows: the layers that a caller can switch on and off."""
+"""The layers of a picture, which a caller can switch on and off."""
 
 from __future__ import annotations
 

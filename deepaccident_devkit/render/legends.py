@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 BESIDE: Final[Mapping[str, Any]] = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0), "borderaxespad": 0.0}
-"""Where a legend covers nothing."""
+"""A place where a legend hides nothing."""
 
 
 def box_handles(colors: Collection[str]) -> list[Artist]:
@@ -47,7 +47,7 @@ def draw_legend(where: Any, handles: Sequence[Artist], *, columns: int, **how: A
 
 
 def draw_legend_of_fills(ax: Axes, colors: Mapping[str, str]) -> None:
-    """Say beside the axes what the colours of filled shapes mean."""
+    """Put a legend of filled shapes beside the axes."""
     from matplotlib.patches import Patch
 
     handles = [Patch(label=name, facecolor=(color, 0.4), edgecolor=color) for name, color in colors.items()]

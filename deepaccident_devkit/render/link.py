@@ -1,4 +1,4 @@
-"""What a link does to what partners share: where their boxes arrive, and the clouds with and without it."""
+"""The effects of a link on shared data: where partners' boxes arrive, and the clouds with and without it."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def render_link(
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Render what latency, wrong poses and losses do to what partners share with a sample's agent.
+    """Render the effects of latency, wrong poses and losses on the data that partners share with a sample's agent.
 
     The first panel has the partners' boxes: dashed where they truly are, in the partner's colour where they arrive,
     with an arrow from one to the other and the metres in the legend. Beside it are the agents' clouds, without the link
@@ -111,7 +111,7 @@ def render_link(
 
 
 def shared_boxes(dataset: Dataset, sample: RowArgument, link: Link, agents: Agents = None) -> list[SharedBoxes]:
-    """What each partner's tracked boxes become on their way; arguments and errors as of `render_link`."""
+    """Each partner's tracked boxes as they arrive; arguments and errors as of `render_link`."""
     record = dataset.get("sample", sample)
     partners = [agent for agent in cooperating_agents(dataset, sample, agents) if agent != record["agent"]]
     if not partners:

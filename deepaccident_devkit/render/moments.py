@@ -98,7 +98,7 @@ def render_frame(
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Render what the agents of a moment see to the front, and each one's boxes and LiDAR from above, side by side.
+    """Render the front views of a moment's agents, and each one's boxes and LiDAR from above, side by side.
 
     The colliding pair is red and their companions green, as in the paper.
 
@@ -146,7 +146,7 @@ def render_frame(
 
 
 def panel_layers(layers: Iterable[Layer] | None) -> tuple[frozenset[Layer], frozenset[Layer]]:
-    """What cameras and what panels from above render of the layers asked for; raises ChoiceError."""
+    """The layers of the cameras and of the panels from above, of those asked for; raises ChoiceError."""
     if layers is None:
         return frozenset(CAMERA_DEFAULT), frozenset(BEV_DEFAULT)
     chosen = layers_of(layers, (), MOMENT_LAYERS)

@@ -55,7 +55,7 @@ def render_motion_labels(
         fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure; `draw_motion_map` and `draw_motion_trail` say what is what.
+        The figure; `draw_motion_map` and `draw_motion_trail` explain it.
 
     Raises:
         TokenError: no such sample.

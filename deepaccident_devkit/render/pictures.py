@@ -66,7 +66,7 @@ def write_figure(figure: Figure, path: Path, *, dpi: float, words: dict[str, Any
         figure: as `detached_figure` makes it; pyplot does not forget others.
         path: a file that is there is replaced.
         dpi: pixels an inch.
-        words: what a PNG file says of itself.
+        words: the text entries of a PNG file.
 
     Returns:
         The path.

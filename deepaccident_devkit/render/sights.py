@@ -80,7 +80,7 @@ class Sights(FrozenArrays):
 
 
 def sights(dataset: Dataset, moment: RowArgument, agents: Agents = None, frame: str = "ego") -> Sights:
-    """Who of some agents sees whom of all actors that any agent annotated.
+    """Which of some agents see which of the actors that any agent annotated.
 
     Args:
         dataset: the release.

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _FAINTEST: Final = 0.1
 """How opaque the far end of a trail is."""
 _STANDING: Final = 0.5
-"""Metres: what moves less has no trail."""
+"""Metres: an actor that moves less has no trail."""
 
 
 def draw_trail(path: FloatArray, ax: Axes, color: str, **how: Any) -> LineCollection:

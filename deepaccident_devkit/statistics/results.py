@@ -1,4 +1,4 @@
-"""What statistics are made of: counts by a word, histograms, quantiles, colliding pairs; each also as rows of CSV."""
+"""The parts of statistics: counts by a word, histograms, quantiles, colliding pairs; each also as rows of CSV."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from deepaccident_devkit.taxonomy import SPLITS
 TOTAL: Final = "total"
 UNKNOWN: Final = "unknown"
 GROUPS: Final = (TOTAL, *SPLITS, UNKNOWN)
-"""What everything is counted for: all scenarios, those of each split, those whose split is unknown."""
+"""The groups of counts: all scenarios, those of each split, those whose split is unknown."""
 
 NO_ACCIDENT: Final = "no accident"
 WITH_PEDESTRIAN: Final = "collide with pedestrians"
@@ -36,7 +36,7 @@ Row = tuple[Cell, ...]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LeftOut:
-    """What a table does not count, since it has no value.
+    """Items that a table does not count, since they have no value.
 
     Attributes:
         what: what they are and why.

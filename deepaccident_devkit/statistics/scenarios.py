@@ -1,4 +1,4 @@
-"""Statistics of scenarios: what meta and the tables say of each as a whole."""
+"""Statistics of whole scenarios, by meta and the tables."""
 
 from __future__ import annotations
 

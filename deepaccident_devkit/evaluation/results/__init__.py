@@ -1,4 +1,4 @@
-"""Results files: what a model says of many samples, in formats that others can write and check.
+"""Results files: a model's predictions of many samples, in formats that others can write and check.
 
 schema/results/README.md describes them; `ResultsWriter` writes, `read_results` reads.
 """

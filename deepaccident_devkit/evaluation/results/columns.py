@@ -1,6 +1,6 @@
 """Lists of entries by sample, which accident and detection results consist of, as columns over all entries.
 
-A check says of many entries whether all are good. Of one entry it says what is wrong: `read_entries` finds it.
+A check of many entries says whether all are good; of one entry it says what is wrong. `read_entries` finds that one.
 """
 
 from __future__ import annotations
@@ -20,11 +20,13 @@ from deepaccident_devkit.evaluation.results.header import check_fields, check_to
 Entry = Mapping[str, Any]
 Columns = Mapping[str, AnyArray]
 ReadColumns = Callable[[Sequence[Entry], Sequence[str]], Columns]
-"""Columns of N entries, of these and their samples' tokens; raises ContentError, of a single entry what is wrong."""
+"""Makes columns of N entries, from these and their samples' tokens; its ContentError says what is wrong with a single
+one.
+"""
 _NUMBERS: Final = {int, float}
 """Python's types of JSON numbers; `bool` is another."""
 LARGEST: Final = 1e6
-"""Metres, seconds, metres a second: more is a mistake, and squares of the largest floats overflow."""
+"""Metres, seconds, metres a second: larger numbers are mistakes, and squares of the largest floats overflow."""
 FROM_ZERO: Final = (0.0, LARGEST)
 ANY_NUMBER: Final = (-np.inf, np.inf)
 
@@ -84,7 +86,7 @@ def check_entries(entries: Sequence[object], required: Sequence[str], optional: 
     """Whether all entries are objects that have the required fields, and others only if they are optional.
 
     Raises:
-        ContentError: of the first entry, what is wrong.
+        ContentError: says what is wrong with the first entry.
     """
     if set(map(type, entries)) - {dict}:
         raise ContentError(f"expected an object, found {shown(entries[0])}")
@@ -110,7 +112,7 @@ def numbers(
         limits: the least and the most that a number may be.
 
     Raises:
-        ContentError: of the first entry, what it has and what was expected.
+        ContentError: says what the first entry has and what was expected.
     """
     flat = _flat([entry[name] for entry in entries], shape)
     if flat is not None and not set(map(type, flat)) - _NUMBERS:
@@ -150,7 +152,7 @@ def with_value(entries: Sequence[Entry], name: str) -> tuple[IntArray, list[Entr
 
 
 def _tell_first_wrong(entries: Sequence[Any], owners: Sequence[str], read: ReadColumns) -> None:
-    """Find the first entry that is not as it should be, by halves; raises ContentError that names it."""
+    """Find the first wrong entry by bisection; raises ContentError that names it."""
     low, high = 0, len(entries)
     while high - low > 1:
         middle = (low + high) // 2
@@ -164,7 +166,7 @@ def _tell_first_wrong(entries: Sequence[Any], owners: Sequence[str], read: ReadC
 
 
 def _flat(values: list[Any], shape: tuple[int, ...]) -> list[Any] | None:
-    """What the innermost lists hold, in order; None where something is no list of the length."""
+    """The contents of the innermost lists, in order; None if something is no list of that length."""
     for length in shape:
         if set(map(type, values)) - {list} or set(map(len, values)) - {length}:
             return None

@@ -96,7 +96,7 @@ def accident_entries(accidents: Iterable[Accident]) -> list[dict[str, Any]]:
 
 _BOX_REQUIRED: Final = ("sample_token", "translation", "size", "rotation", "detection_name", "detection_score")
 IGNORED: Final = ("attribute_name", "ego_translation", "num_pts")
-"""What the nuScenes devkit writes beside; this dataset has no attributes."""
+"""A further field of the nuScenes devkit; this dataset has no attributes."""
 _BOX_OPTIONAL: Final = ("velocity", *IGNORED)
 _LENGTH_FIRST: Final = [1, 0, 2]
 """From width, length, height to length, width, height, and back."""
@@ -245,4 +245,4 @@ _ENTRIES: Final[Mapping[str, tuple[Callable[[str, object], list[dict[str, Any]]]
     "accident": (_accidents, accident_columns),
     "detection": (_boxes, detection_columns),
 }
-"""Task → what makes entries of a prediction, and what would refuse them when they are read."""
+"""Task → the functions that make entries of a prediction, and that check them when they are read."""

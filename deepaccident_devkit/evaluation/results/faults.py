@@ -1,6 +1,6 @@
-"""What a results file may not hold: `ContentError`, and JSON without what its readers quietly swallow.
+"""Faults of results files: `ContentError`, and strict JSON.
 
-Places are put before an error on its way out. Swallowed are a name that stands twice in an object, NaN, and half a
+Each caller puts its place before an error. JSON readers silently accept a repeated name in an object, NaN, and half a
 character.
 """
 
@@ -21,12 +21,12 @@ _SHOWN: Final = 80
 
 
 class ContentError(ValueError):
-    """What is wrong, in half a sentence; `told_of` makes a ResultsError of it."""
+    """What is wrong, as half a sentence; `told_of` makes a ResultsError of it."""
 
 
 @contextmanager
 def at(place: str) -> Iterator[None]:
-    """Put the place before what is found wrong there."""
+    """Put the place before the message of an error."""
     try:
         yield
     except ContentError as error:
@@ -67,7 +67,7 @@ class _Constant(float):
 
 
 def parsed_json(content: bytes) -> Any:
-    """What JSON text says; raises ContentError that names the place of what JSON does not allow."""
+    """The value of JSON text; raises ContentError that names the place of a fault."""
     faults: list[object] = []
 
     def made(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What results files say of themselves: format, version, task, meta, the form of motion maps; and sample tokens."""
+"""The header of results files: format, version, task, meta, the form of motion maps; and sample tokens."""
 
 from __future__ import annotations
 
@@ -129,18 +129,18 @@ BODY_FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
 }
 """Task → the fields after the header's."""
 _MOST_LEVELS: Final = 30
-"""Of objects and lists in one another, in `meta`: people and reports read it."""
+"""The largest depth of nested objects and lists in `meta`, which people and reports read."""
 WORDS: Final = r"^[^/\\]+(/[^/\\]+)*$"
 """A regular expression of tokens: words with `/` between."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Header:
-    """What a results file says of itself.
+    """The header of a results file.
 
     Attributes:
         task: what its predictions are of.
-        meta: whatever its author says: the method, its training, who made it.
+        meta: notes of its author: the method, its training, who made it.
     """
 
     task: ResultsTask
@@ -155,7 +155,7 @@ def read_header(document: object, path: Path) -> Header:
     """The header of a results file; all fields of the document are there, and no others.
 
     Raises:
-        ContentError: something else than the header of a results file.
+        ContentError: it is not the header of a results file.
         ResultsError: it is of another version.
     """
     if not isinstance(document, dict):
@@ -193,7 +193,7 @@ def json_meta(meta: object) -> dict[str, Any]:
 
 
 def check_fields(entry: Mapping[str, object], required: Sequence[str], optional: Sequence[str] = ()) -> None:
-    """Whether an object has the fields it must have, and others only if it may; raises ContentError that names one."""
+    """Check that an object has the required fields, and else only optional ones; raises ContentError that names one."""
     check_required(entry, required)
     known = (*required, *optional)
     unknown = [name for name in entry if name not in known]
@@ -202,7 +202,7 @@ def check_fields(entry: Mapping[str, object], required: Sequence[str], optional:
 
 
 def check_required(entry: Mapping[str, object], required: Sequence[str]) -> None:
-    """Whether an object has the fields it must have; raises ContentError that names the first that is missing."""
+    """Check that an object has the required fields; raises ContentError that names the first missing one."""
     missing = [name for name in required if name not in entry]
     if missing:
         raise ContentError(f"{missing[0]}: is missing (expected {', '.join(required)})")

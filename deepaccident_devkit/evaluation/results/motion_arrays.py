@@ -1,6 +1,6 @@
 """A motion prediction as the arrays that a shard holds, the members `<token>/<name>.npy` of a zip archive, and back.
 
-Arrays are never unpickled, nor larger than expected.
+Arrays are never unpickled, and never larger than expected.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ _FIRST_DATE: Final = (1980, 1, 1, 0, 0, 0)
 
 
 def member_name(token: str, name: str) -> str:
-    """What a sample's array is called in the archive."""
+    """The name of a sample's array in the archive."""
     return f"{token}/{name}.npy"
 
 
 def put_array(archive: zipfile.ZipFile, token: str, name: str, array: AnyArray) -> None:
-    """Add an array to an archive; the same bytes whenever that is."""
+    """Add an array to an archive; the bytes do not depend on the time."""
     buffer = io.BytesIO()
     np.lib.format.write_array(buffer, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
     entry = zipfile.ZipInfo(member_name(token, name), _FIRST_DATE)
@@ -51,7 +51,7 @@ def take_array(archive: zipfile.ZipFile, token: str, name: str, shape: Sequence[
         archive: open.
         token: of the sample.
         name: of the array.
-        shape: what it must have; checked before anything but the header is decompressed.
+        shape: its shape, which is checked before anything except the header is decompressed.
         kinds: numpy's letters of the kinds of element types that it may have.
 
     Raises:
@@ -227,7 +227,7 @@ def stored_paths(archive: zipfile.ZipFile, token: str, form: MotionForm) -> dict
 
 
 def check_sample(archive: zipfile.ZipFile, token: str, form: MotionForm) -> None:
-    """Whether all arrays of a sample are as they should be; raises ContentError that begins with the array's name."""
+    """Check all arrays of a sample; raises ContentError that begins with the array's name."""
     output, paths = stored_output(archive, token, form), stored_paths(archive, token, form)
     if output.instances is not None and paths:
         others = sorted(paths.keys() - set(np.unique(output.instances[-1]).tolist()))

@@ -1,4 +1,4 @@
-"""`Results`: what a model says of many samples, as a results file has it."""
+"""`Results`: a model's predictions of many samples, read from a results file."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class EntryContents:
         return self._at(self._entries, token)
 
     def check(self, *, workers: int | None, progress: bool) -> None:
-        """All was checked when it was read."""
+        """Nothing to do: all was checked when it was read."""
 
 
 class MotionContents:
@@ -92,7 +92,7 @@ class MotionContents:
 
 
 Contents = EntryContents | MotionContents
-"""What is in a file; those who ask for a token know that it is there."""
+"""The content of a file; callers ask only for tokens that it has."""
 
 
 @functools.lru_cache(maxsize=4)
@@ -176,7 +176,7 @@ class Results:
 
     @property
     def meta(self) -> dict[str, Any]:
-        """What the file's author says of it; a copy."""
+        """The notes of the file's author; a copy."""
         return copy.deepcopy(dict(self._contents.header.meta))
 
     @property
@@ -185,7 +185,7 @@ class Results:
         return self._contents.form
 
     def prediction(self, token: str) -> Prediction:
-        """What is predicted of a sample.
+        """The prediction of a sample.
 
         Returns:
             For motion a MotionOutput; of accidents a list, empty if none is foreseen; of detection the boxes, in the
@@ -214,7 +214,7 @@ class Results:
         return contents.trajectories(token)
 
     def check(self, *, workers: int | None = 1, progress: bool = False) -> None:
-        """Read everything, as one should before long work and before publishing.
+        """Read and check everything: do so before long work and before publishing.
 
         Args:
             workers: processes for the shards of motion; None takes what the work is worth.
@@ -245,13 +245,13 @@ class Results:
 
 
 def read_results(path: str | os.PathLike[str]) -> Results:
-    """Open results (schema/results/README.md); accidents and boxes are checked wholly, of motion the manifest is.
+    """Open results (schema/results/README.md); all accidents and boxes are checked, and of motion the manifest.
 
     Args:
         path: a JSON file, or a folder that holds a results.json, as motion results do.
 
     Raises:
-        ResultsError: there is none, it is of another version, or not as its format says; the message names the first
+        ResultsError: there is none, it is of another version, or against its format; the message names the first
             wrong entry by its token and field.
     """
     file = _file_of(Path(path).expanduser().absolute())

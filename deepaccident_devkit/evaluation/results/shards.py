@@ -78,7 +78,7 @@ class Manifest:
 
 
 def read_manifest(document: Mapping[str, Any], root: Path) -> Manifest:
-    """The manifest of the results in a folder, whose shards are there and as long as it says.
+    """The manifest of the results in a folder, with a check that its shards exist and have their sizes.
 
     Raises:
         ContentError: names the field, or the shard.
@@ -167,7 +167,7 @@ class OpenShards:
         self._process = os.getpid()
 
     def archive(self, shard: Shard) -> zipfile.ZipFile:
-        """The archive, open; raises ContentError. Threads may ask at once: what leaves is left to the collector."""
+        """The open archive; raises ContentError. Threads may share it, so the garbage collector closes it."""
         if self._process != os.getpid():  # a fork shares positions in open files with its parent
             self._open, self._process = OrderedDict(), os.getpid()
         archive = self._open.get(shard.file)
@@ -183,12 +183,12 @@ class OpenShards:
 
 @dataclass(frozen=True, slots=True)
 class ShardCheck:
-    """A shard to look through.
+    """A shard to check.
 
     Attributes:
         root: the folder of the results.
         shard: which.
-        form: of what is stored.
+        form: how predictions are stored.
     """
 
     root: Path

@@ -1,4 +1,4 @@
-"""`ResultsWriter`: predictions of many samples into a results file, whole or not at all."""
+"""`ResultsWriter`: writes predictions of many samples into a results file, completely or not at all."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from deepaccident_devkit.geometry import BevGrid
 
 
 class _Body(Protocol):
-    """What writes the samples of a task."""
+    """The writer of a task's samples."""
 
     def add(self, token: str, prediction: object) -> None: ...
 
@@ -154,7 +154,7 @@ class ResultsWriter:
 
 @contextmanager
 def _told(path: Path) -> Iterator[None]:
-    """Raise ResultsError that names the results for what the system says."""
+    """Raise ResultsError that names the results for an error of the system."""
     try:
         yield
     except ResultsError as error:

@@ -35,7 +35,7 @@ _REMEDY: Final = "give a folder that `deepaccident evaluate … --out` wrote, or
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bundle:
-    """What `deepaccident evaluate … --out DIR` wrote, as its summary tells; the other files are read when asked for.
+    """What `deepaccident evaluate … --out DIR` wrote, by its summary; the other files are read when needed.
 
     Attributes:
         folder: where.
@@ -175,7 +175,7 @@ def save_run(
     overwrite: bool = False,
     extras: Sequence[Callable[[Path], object]] = (),
 ) -> Path:
-    """Write a bundle: the folder is there with all of it, or as it was before; returns its path.
+    """Write a bundle: the folder then has all of it, or stays as it was; returns its path.
 
     It holds `metrics_summary.json` (`EvaluationRun.summary`), `counts.json` (the evaluator's, by sample),
     `samples.parquet` (`sample_rows`), `scenarios.json` (hashes of the truth), `files.json` (checksums of all these) and

@@ -57,7 +57,7 @@ def comparable_pair(first: Path, second: Path, *, common: bool = False) -> Compa
     Args:
         first: folder of one.
         second: of the other.
-        common: whether to compare the samples that both have where they have others, too.
+        common: whether to compare only the samples that both have, if they differ.
 
     Raises:
         ResultsError: one of them is no bundle.

@@ -1,6 +1,6 @@
 """`compare_bundles`: two evaluations side by side, and which of their differences are real.
 
-What is tested is fixed beforehand: the task's first headline by itself, the other headlines together by Holm's rule.
+The tests are fixed beforehand: of the task's first headline by itself, the other headlines together by Holm's rule.
 All else is for exploration.
 """
 
@@ -35,7 +35,7 @@ def compare_bundles(
         a: folder of the first, as `save_run` writes it.
         b: folder of the second.
         resampling: how they are tested; None for the defaults.
-        common: whether to compare the samples that both have where one has others, too.
+        common: whether to compare only the samples that both have, if they differ.
 
     Raises:
         ResultsError: one of them is no bundle.

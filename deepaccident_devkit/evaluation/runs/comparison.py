@@ -36,8 +36,8 @@ class ComparedNumber:
             tested together; `other` for numbers that are for exploration and are not tested.
         p: of the paired permutation test of this number for itself; None without difference or resamples.
         adjusted_p: the same by Holm's rule over the headlines; of others like p.
-        real: whether the adjusted p is at most 1 − confidence; False of numbers that are not tested.
-        better: `a` or `b`, where a difference is real and one knows which way is better; else None.
+        real: whether the adjusted p is at most 1 − confidence; False for numbers that are not tested.
+        better: `a` or `b`, if a difference is real and it is known whether more is better; else None.
         decision: for people: `b is better`, or why nothing is decided, and how many scenarios would.
     """
 
@@ -112,7 +112,7 @@ class Comparison:
         return "\n".join([*head, "", columns_text(rows), "", *self.notes()])
 
     def notes(self) -> list[str]:
-        """What a reader of the table has to know."""
+        """Notes for readers of the table."""
         if not self.resampling.resamples:
             return ["no intervals and no tests: no resamples were asked for"]
         level = 1 - self.resampling.confidence

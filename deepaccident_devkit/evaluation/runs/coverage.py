@@ -1,4 +1,4 @@
-"""`coverage`: whether results have just the samples that are evaluated, and which list they were probably made for."""
+"""`coverage`: whether results have exactly the evaluated samples, and the list for which they were probably made."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LISTS: Final[tuple[tuple[SampleList, ScopeName, float], ...]] = (
     ("all", "all", 2.0),
     ("all", "accident", 2.0),
 )
-"""What a user could mean by a list of a split's samples."""
+"""The lists of a split's samples that a user could mean."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,7 +51,7 @@ class Coverage:
         return not (self.missing or self.extra or self.unknown)
 
     def to_text(self) -> str:
-        """What differs: how many, three of each, and what was probably meant; or that all are there."""
+        """The differences: how many, three of each, and the list that was probably meant; or that all are there."""
         if self.is_complete:
             return f"all {self.expected} samples have a prediction, and nothing else has"
         parts = [

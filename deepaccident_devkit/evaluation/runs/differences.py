@@ -1,4 +1,4 @@
-"""`Difference`: one thing that is not as a bundle says, and how two JSON values differ."""
+"""`Difference`: one difference from a bundle, and how two JSON values differ."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from typing import Any, Final, Literal
 
 DifferenceKind = Literal["version", "file", "scenario", "results", "number", "sample", "evaluation"]
 ABSENT: Final = "absent"
-"""Stands for what is not there at all."""
+"""Stands for a missing value."""
 _LONGEST: Final = 60
 """Characters of a value that a line shows."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Difference:
-    """What a bundle says, and what is so.
+    """What a bundle says, and what was found.
 
     Attributes:
         kind: `version` of the devkit; `file` of the bundle; `scenario`, whose label, meta or calib files changed or are
             gone; `results`, the predictions; `number` of the summary; `sample`, its counts or its row; `evaluation`,
             which could not be made again.
-        where: what it is of, such as `metrics/apa` or `<scenario>: label`.
+        where: its place, such as `metrics/apa` or `<scenario>: label`.
         stored: what the bundle says.
-        found: what is so.
+        found: what was found.
     """
 
     kind: DifferenceKind
@@ -43,7 +43,7 @@ class Difference:
 
 
 def differing(stored: Any, found: Any, *, without: Collection[str] = ()) -> Iterator[tuple[str, Any, Any]]:
-    """The paths at which two values differ that JSON can hold, and what is there; equal numbers must be so exactly.
+    """The paths at which two values differ that JSON can hold, and what is there; numbers must be exactly equal.
 
     Args:
         stored: one of them.

@@ -76,7 +76,7 @@ def evaluate_results(
         setup: task and rules.
         selection: which samples; the name of a split for what `default_selection` has of it.
         allow_partial: whether to evaluate the samples that are in both where the results lack some, or have others;
-            then all that comes of it is marked as partial.
+            then all output is marked as partial.
         workers: processes; None takes what the work is worth.
         out: the folder that the run will be saved to (`save_run`): counts are kept beside it every half minute, and a
             run that broke off goes on with them if nothing that they depend on has changed. None for no such file.
@@ -119,7 +119,7 @@ def evaluate_results(
 
 
 def results_info(results: Results) -> ResultsInfo:
-    """What a run keeps of its results."""
+    """The facts on its results that a run keeps."""
     return ResultsInfo(
         path=os.fspath(Path(results.path).absolute()),
         task=results.task,

@@ -54,7 +54,7 @@ _LIBRARIES: Final = ("numpy", "scipy")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Partial:
-    """How much of what should be evaluated was not.
+    """How many of the expected samples were not evaluated.
 
     Attributes:
         missing: samples without a prediction.
@@ -157,7 +157,7 @@ class EvaluationRun:
 
     @property
     def stamp(self) -> dict[str, Any]:
-        """What every file written says: devkit, task, protocol, and whether it is partial."""
+        """The stamp of every file: devkit, task, protocol, and whether it is partial."""
         return {
             "devkit_version": __version__,
             "task": self.setup.task,
@@ -183,7 +183,7 @@ class EvaluationRun:
         return replace(self, breakdowns=tuple(run_batch(work, list(dict.fromkeys(chosen)), workers=workers)))
 
     def summary(self) -> dict[str, Any]:
-        """All numbers but those of single samples, and what they depend on, as JSON holds it."""
+        """All numbers except those of single samples, and what they depend on, as JSON holds it."""
         from importlib.metadata import version as installed_version
 
         made = {
@@ -256,7 +256,7 @@ def checkpoint_path(
 ) -> Path:
     """The file beside `out` that such a run saves its counts to.
 
-    Its name is a digest of all that decides the counts: another setup, other samples, other predictions, other labels
+    Its name is a digest of all that affects the counts: another setup, other samples, other predictions, other labels
     and another devkit have another file, and so never go on with these counts.
 
     Args:
@@ -285,7 +285,7 @@ def explanation_checkpoint(run: EvaluationRun, out: str | os.PathLike[str]) -> P
 
 
 def drop_if_damaged(path: Path, evaluator: Evaluator[Any]) -> None:
-    """Remove a file that no counts can be taken from: it costs time, and nothing else."""
+    """Remove a file from which no counts can be taken: only time is lost."""
     if path.exists():
         try:
             evaluator.fresh().resume(path)

@@ -22,7 +22,7 @@ EvaluatorT = TypeVar("EvaluatorT", bound=Evaluator[Any])
 _BATCH: Final = 8
 """Samples that a worker evaluates before it reports."""
 _SAVE_SECONDS: Final = 30.0
-"""From one save to the next: what a kill can lose."""
+"""Seconds from one save to the next, which a killed run can lose."""
 
 
 def evaluate_samples(
@@ -60,7 +60,7 @@ def evaluate_samples(
     if saved is not None:
         if saved.exists():
             _resume(evaluator, saved, samples)
-        evaluator.save(saved)  # now, and not after an hour, it shows whether it can be written
+        evaluator.save(saved)  # shows at once, and not after an hour, whether it can be written
     counted = evaluator.tokens
     left = [(token, task) for token, task in samples.items() if token not in counted]
     batches = [
@@ -138,7 +138,7 @@ def _workers_that_can(batch: _Batch[Any], workers: int | None) -> int | None:
 
 @contextmanager
 def _saved_now_and_then(evaluator: Evaluator[Any], path: Path | None) -> Iterator[Callable[[], None]]:
-    """Give a function that saves if the last time is long ago; save at the end, however it comes."""
+    """Give a function that saves if the last time is long ago; save at the end, also after an error."""
     if path is None:
         yield lambda: None
         return

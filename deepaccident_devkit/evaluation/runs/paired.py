@@ -2,8 +2,8 @@
 
 If both are equally good, it is chance which counts of a cluster are whose: swapped ones give differences as probable as
 the observed one. That holds for any evaluator's numbers and for any number of clusters. Swapped are whole clusters (an
-accident and its twin), since samples of one show the same few seconds, and what makes a cluster hard for both must not
-blur their difference.
+accident and its twin), since samples of one show the same few seconds, and clusters that are hard for both must not
+hide their difference.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from deepaccident_devkit.evaluation.metrics.numbers import has_interval
 _ROUNDING: Final = 1e-9
 """Differences that differ by at most this share of them count as equal."""
 _POWER: Final = 0.8
-"""Chance that so many scenarios as are said to decide a difference do."""
+"""The chance that the stated number of scenarios decides a difference."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -69,7 +69,7 @@ class PairedTest:
         high: (M,) where it ends.
         errors: (M,) standard errors; NaN where unknown.
         p: (M,) two-sided, of each number for itself; NaN without a difference, or without resamples.
-        swaps: that p is of.
+        swaps: the swaps of which p is a share.
         clusters: how many there are.
         resampling: how it was tested.
     """

@@ -1,4 +1,4 @@
-"""Predictions beside predictors that know nothing, and an operating point that another split chose: task `warning`."""
+"""Predictions beside predictors that know nothing, and an operating point from another split: task `warning`."""
 
 from __future__ import annotations
 

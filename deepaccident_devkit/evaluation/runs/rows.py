@@ -1,4 +1,4 @@
-"""`sample_rows`: what the samples of a run add, one flat row each, and such rows as a Parquet file."""
+"""`sample_rows`: the counts of a run's samples, one flat row each, and such rows as a Parquet file."""
 
 from __future__ import annotations
 

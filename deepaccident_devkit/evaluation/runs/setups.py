@@ -1,4 +1,4 @@
-"""`EvaluationSetup`: a task, its protocol and how far ahead, and what an evaluator of them takes of a sample."""
+"""`EvaluationSetup`: a task, its protocol and its horizon, and the arguments of its evaluator for a sample."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class EvaluationSetup:
         if not 0 < self.horizon < math.inf:
             raise ConfigError(f"horizon: expected seconds above 0, found {self.horizon!r}")
         object.__setattr__(self, "switches", MappingProxyType(dict(self.switches)))
-        switched(TASK_PROTOCOLS[self.task][self.protocol], self.switches)  # refuses what cannot be
+        switched(TASK_PROTOCOLS[self.task][self.protocol], self.switches)  # refuses impossible choices
 
     @property
     def rules(self) -> Any:
@@ -115,7 +115,7 @@ _EVALUATORS: Final[Mapping[str, Callable[[Any], Evaluator[Any]]]] = {
 
 @dataclass(frozen=True, slots=True)
 class SampleLoader:
-    """Gives what a setup's evaluator takes of a sample after its token; cheap to pickle.
+    """Makes the arguments of a setup's evaluator for a sample, except the token; cheap to pickle.
 
     Attributes:
         dataset: where the truth is.
@@ -149,7 +149,7 @@ class SampleLoader:
             )
 
     def __call__(self, token: str) -> tuple[Any, ...]:
-        """Prediction, truth and what else the evaluator takes."""
+        """Prediction, truth and other arguments of the evaluator."""
         prediction, rules = self.results.prediction(token), self.setup.rules
         if isinstance(prediction, DetectedBoxes):
             return self.detected(token, prediction, rules.frame), detection_truth(self.dataset, token, rules)

@@ -1,4 +1,4 @@
-"""What runs, bundles and results files hold, for people; every block of a partial run says so."""
+"""Texts of runs, bundles and results files; every block of a partial run says that it is partial."""
 
 from __future__ import annotations
 

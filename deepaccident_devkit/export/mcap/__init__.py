@@ -35,12 +35,12 @@ def export_mcap(
     """Write a scenario into an MCAP file: poses, images, point clouds, boxes and labels of all agents on one timeline.
 
     Messages are Foxglove's, as protobuf. Images are the files' own bytes. The same release and choices give the same
-    bytes, with the same versions of the libraries. The file is there whole or not at all.
+    bytes, with the same versions of the libraries. The file is written completely or not at all.
 
     Args:
         dataset: the release.
         scenario: token or record.
-        path: of the file; one that is there is replaced.
+        path: of the file; an existing one is replaced.
         prediction: results, or a mapping from sample token to what is predicted; rendered beside the labels.
         progress: whether to show a bar.
         **choices: the fields of `McapConfig`: `agents`, `channels`, `frames`, `points`, `labels`, `motion_labels`,

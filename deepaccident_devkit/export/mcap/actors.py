@@ -1,4 +1,4 @@
-"""The actors of a moment: the union of what the agents annotated, and what each of them annotated itself."""
+"""The actors of a moment: the union of all agents' boxes, and each agent's own boxes."""
 
 from __future__ import annotations
 

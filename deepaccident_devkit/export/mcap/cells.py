@@ -1,4 +1,4 @@
-"""Instance maps, of motion labels and of predictions, as coloured points: a point a cell that an actor is in."""
+"""Instance maps, of motion labels and of predictions, as coloured points: a point for each cell of an actor."""
 
 from __future__ import annotations
 

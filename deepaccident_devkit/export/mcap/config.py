@@ -1,4 +1,4 @@
-"""`McapConfig`: what of a scenario goes into an MCAP file."""
+"""`McapConfig`: which parts of a scenario go into an MCAP file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from deepaccident_devkit.text import possible_text
 from deepaccident_devkit.v2x import Agents
 
 EPOCH: Final = 1_704_067_200
-"""Unix seconds of every scenario's first frame: recordings have no date, and the viewers want one (2024-01-01 UTC)."""
+"""Unix seconds of every scenario's first frame: recordings have no date, and the viewers need one (2024-01-01 UTC)."""
 EXPORTED_CHANNELS: Final = (*CAMERAS, LIDAR)
 Predictions = Results | Mapping[str, Prediction]
 """What is predicted, by sample token."""
@@ -24,7 +24,7 @@ Predictions = Results | Mapping[str, Prediction]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class McapConfig:
-    """What of a scenario goes into the file; checked when made.
+    """Which parts of a scenario go into the file; checked when made.
 
     Attributes:
         agents: whose data: names of agents, a configuration as seen from the ego vehicle, or None for all that are

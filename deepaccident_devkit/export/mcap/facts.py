@@ -1,4 +1,4 @@
-"""What a scenario is, in words: the file's metadata, a log, and the countdown to the impact."""
+"""A scenario in words: the file's metadata, a log, and the countdown to the impact."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SHOWN: Final = ("town", "weather", "time_of_day", "road_type", "split", "accide
 
 
 def scenario_metadata(dataset: Dataset, scenario: str) -> dict[str, str]:
-    """What the file says of itself: the devkit's version, the scenario, a hash of its label, meta and calib files."""
+    """The file's metadata: the devkit's version, the scenario, a hash of its label, meta and calib files."""
     record = dataset.get("scenario", scenario)
     return {
         "devkit_version": __version__,

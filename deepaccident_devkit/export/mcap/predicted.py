@@ -1,4 +1,4 @@
-"""What a model says of a scenario's samples, beside the labels."""
+"""A model's predictions of a scenario's samples, beside the labels."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class PredictedScenes:
     """Renders predictions of moments, on topics below `/<agent>/prediction`."""
 
     def __init__(self, prediction: Predictions) -> None:
-        """Predictions by sample token; raises ConfigError if they are no such thing."""
+        """Predictions by sample token; raises ConfigError for other objects."""
         if not isinstance(prediction, Results | Mapping):
             raise ConfigError(
                 "prediction: expected Results, or a mapping from sample token to what is predicted, "

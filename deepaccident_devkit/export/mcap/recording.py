@@ -28,7 +28,7 @@ def frame_timestamp(index: int) -> Any:
 
 
 class Recording:
-    """Writes messages frame by frame; a topic, and the schema of its messages, is there from its first message on.
+    """Writes messages frame by frame; a topic, with the schema of its messages, begins with its first message.
 
     Chunks are compressed (zstd), and chunks, messages and metadata are indexed, so that viewers can seek.
     """

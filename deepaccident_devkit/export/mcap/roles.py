@@ -1,4 +1,4 @@
-"""Who is who in a scenario, by word; `render.roles` has the colours."""
+"""The roles of actors in a scenario, in words; `render.roles` has the colours."""
 
 from __future__ import annotations
 
@@ -18,6 +18,6 @@ class Roles:
         self._agents: Mapping[int, str] = {actor: agent for agent, actor in agent_actors(dataset, scenario).items()}
 
     def role(self, actor: int) -> str:
-        """What an actor is beside its category, such as `ego_vehicle, collides`; empty for most."""
+        """The role of an actor, such as `ego_vehicle, collides`; empty for most."""
         words = [self._agents[actor]] if actor in self._agents else []
         return ", ".join([*words, "collides"] if actor in self.pair else words)

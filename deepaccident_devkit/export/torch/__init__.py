@@ -16,7 +16,7 @@ loop. Only this package imports torch; importing it without torch raises Missing
 from deepaccident_devkit.errors import MissingExtraError
 
 try:
-    import torch  # noqa: F401 - nothing here is of use without it
+    import torch  # noqa: F401 - nothing here works without it
 except ModuleNotFoundError as error:
     raise MissingExtraError(
         "the torch adapter needs PyTorch: in a checkout, pip install '.[torch]' "

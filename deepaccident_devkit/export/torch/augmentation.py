@@ -1,7 +1,7 @@
 """The bird's-eye-view transform A (rotation, scale, flip) on boxes, points and poses, and random ones for training.
 
-Every agent's ego frame is transformed alike: points become A p, a pose W between two ego frames A W A⁻¹, and what leads
-from an ego frame to a sensor loses A again, so that points hit the pixels that they hit before. Images stay.
+Every agent's ego frame is transformed alike: points become A p, a pose W between two ego frames A W A⁻¹, and transforms
+from an ego frame to a sensor undo A first, so that points hit the same pixels as before. Images stay.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def augmented_pose(pose: ArrayLike, augmentation: Augmentation) -> FloatArray:
 
 
 def augmented_six_vectors(six: ArrayLike, augmentation: Augmentation) -> FloatArray:
-    """The same of 6-vectors (…, 6): shifts scale, and a mirror leaves a rotation a rotation."""
+    """The same of 6-vectors (…, 6): translations are scaled; a rotation stays a rotation, also with a mirror."""
     return six_vectors.from_matrices(augmented_pose(six_vectors.to_matrices(six), augmentation))
 
 

@@ -16,7 +16,7 @@ _OF_AGENTS: Final = ("agent_valid", "ego_from_agent", "images", "intrinsics", "e
 _MATRICES: Final = ("ego_from_agent", "intrinsics", "ego_from_camera", "image_from_ego")
 _OF_BOXES: Final = ("boxes", "velocity_known", "categories", "actor_ids")
 _LISTS: Final = ("token", "agents", "points", *_OF_BOXES)
-"""What stays a list with an entry an item: texts, and tensors of different lengths."""
+"""What stays a list with one entry for each item: texts, and tensors of different lengths."""
 
 
 def collate(items: Sequence[dict[str, Any]]) -> dict[str, Any]:

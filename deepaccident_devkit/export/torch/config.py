@@ -31,7 +31,7 @@ class V2XConfig:
     Attributes:
         agents: who cooperates with the sample's own agent, which is always there and first: a configuration, its name,
             agents' names, or None for all that are there (`v2x.Agents`).
-        link: what happens to the partners' sensor data and poses; boxes and labels are the truth and stay it.
+        link: what happens to the partners' sensor data and poses; boxes and labels stay the truth.
         past: frames of sensor data, the present included.
         step: recorded frames (0.1 s) between them; None for the labels' own step, else 5 (2 Hz).
         images: None for no images and cameras.

@@ -149,7 +149,7 @@ class V2XDataset(TorchDataset):
         return item
 
     def _received_item(self, sample: str, augmentation: Augmentation) -> dict[str, Any]:
-        """What holds of a sample itself, and what arrived of sensor data."""
+        """The sample's own tensors, and the sensor data that arrived."""
         dataset, config = self._dataset, self.config
         names = sensor_data.participants(dataset, sample, config.agents)
         arrived = sensor_data.received(dataset, sample, names, config)
@@ -218,7 +218,7 @@ class V2XDataset(TorchDataset):
             )
 
     def _check_latency(self) -> None:
-        """Partners' data from before a recording are an error at any sample: better now than within an epoch."""
+        """Raise now, and not within an epoch, for samples whose partners' data would be from before the recording."""
         frames = 0 if self.config.link is None else self.config.link.latency_frames
         samples, scenarios = self._dataset.columns("sample"), self._dataset.columns("scenario")
         first = scenarios["first_frame_row"][samples["scenario_row"][self._rows]]

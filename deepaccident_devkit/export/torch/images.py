@@ -1,4 +1,4 @@
-"""Camera images as a model takes them: resized, cropped, scaled; with intrinsics that keep pace."""
+"""Camera images as a model takes them: resized, cropped, scaled; with intrinsics to match."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ _PEDESTRIAN: Final = CATEGORIES.index("pedestrian")
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FrameBoxes:
-    """What an agent annotated at one moment, in its LiDAR frame, right-handed; arrays are read-only.
+    """The boxes that an agent annotated at one moment, in its LiDAR frame, right-handed; arrays are read-only.
 
     Attributes:
         center: (N, 3) float64, metres.
@@ -97,7 +97,7 @@ class FramePolygons:
 def box_polygons(
     frames: Sequence[FrameBoxes | None], config: MotionLabelConfig, *, is_vehicle: bool = True
 ) -> list[FramePolygons | None]:
-    """What labels show of boxes, frame by frame from the present on.
+    """The polygons of boxes that labels show, frame by frame from the present on.
 
     Args:
         frames: the boxes of each label frame; None where there is no recording.

@@ -55,7 +55,7 @@ def motion_labels_from_boxes(
         valid: (R,) bool, which frames are in the recording; all but those that are None in `frames`, if None.
         is_vehicle: whether the agent is a vehicle, with a box of its own (the infrastructure has none).
         id_map: actor id → id that a sample before this one had: the released code keeps them for a scenario and agent
-            as long as a worker meets no other. None starts at 1.
+            until a worker meets another one. None starts at 1.
 
     Raises:
         GeometryError: another number of frames or rows, or a motion that is not finite.
@@ -75,7 +75,7 @@ def labels_from_polygons(
     valid: ArrayLike | None = None,
     id_map: Mapping[int, int] | None = None,
 ) -> MotionLabels:
-    """The motion labels of footprints, each frame in its own ego frame; as `motion_labels_from_boxes` otherwise."""
+    """The motion labels of footprints, each frame in its own ego frame; all else as in `motion_labels_from_boxes`."""
     config = label_config(config)
     if len(polygons) != config.label_frames:
         raise GeometryError(

@@ -31,7 +31,7 @@ class CoveredCells:
         column: (P,) int64.
         identity: (P,) int64, ids from 1.
         frames: number of frames.
-        ids: highest id, of whatever frame.
+        ids: highest id of all frames.
     """
 
     frame: IntArray
@@ -66,7 +66,7 @@ class LabelMaps:
 
     @classmethod
     def empty(cls, config: MotionLabelConfig) -> LabelMaps:
-        """Maps of frames in which nobody is.
+        """Maps of frames without any actor.
 
         All in one piece of memory: five pieces of a megabyte each would go back to the system with every sample, and
         fetching them again takes as long as all the rasterising.
@@ -89,7 +89,7 @@ class LabelMaps:
 def label_maps(
     covered: CoveredCells, centers: Float32Array, following: Float32Array, missing: BoolArray, config: MotionLabelConfig
 ) -> LabelMaps:
-    """What instances and their centres look like as maps.
+    """The maps of instances and their centres.
 
     Args:
         covered: what is rasterised, native.

@@ -1,4 +1,4 @@
-"""Filling polygons on cells as OpenCV 4.7's fillPoly does, whatever OpenCV is installed, and many at a time.
+"""Filling many polygons at a time on cells as OpenCV 4.7's fillPoly does, with any installed OpenCV.
 
 Labels are rasterised by `cv2.fillPoly` (8-connected, whole-cell corners), and what it rasterises changed with OpenCV
 4.8 (the interior of small polygons) and 4.11 (at the image's border). The released labels are those of 4.7; so its rule
@@ -43,7 +43,7 @@ def filled_cells(
         polygon is on top there.
 
     Raises:
-        GeometryError: `polygons` or `image` has another shape, or an image is meant that there is not.
+        GeometryError: `polygons` or `image` has another shape, or an image does not exist.
     """
     corners = checked("polygons", polygons, (None, None, 2), np.int64)
     where = checked("image", np.zeros(len(corners)) if image is None else image, (len(corners),), np.int64)

@@ -1,4 +1,4 @@
-"""The outline of a mask that OpenCV would name first, and its convex hull in OpenCV's order; no OpenCV needed.
+"""The outline of a mask that OpenCV lists first, and its convex hull in OpenCV's order, without OpenCV.
 
 The released code takes `cv2.findContours(mask, …)[0][0]` and hands it to `cv2.minAreaRect`, whose result hangs on which
 part of a broken mask that is and on which corner of the hull comes first. Both are written out here (OpenCV 4.7.0,

@@ -20,7 +20,7 @@ class FrameGroups:
     """The instances of one frame; ids run from 1 to I without gaps, (row, column) are cells.
 
     Attributes:
-        ids: (P,) int64 the instance of each cell of the foreground; 0 for what counts as background all the same.
+        ids: (P,) int64 the instance of each cell of the foreground; 0 for cells that count as background nevertheless.
         count: (I + 1,) cells of each id.
         position_sum: (2, I + 1) float64 sums of their rows and columns.
         moved_sum: (2, I + 1) float64 sums of where the flow takes them.

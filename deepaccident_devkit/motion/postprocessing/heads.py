@@ -1,4 +1,4 @@
-"""`MotionHeads`: what a motion model says of one sample, as plain arrays of any framework."""
+"""`MotionHeads`: the outputs of a motion model for one sample, as plain arrays of any framework."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""The same id for the same instance in all frames: each is matched with where the flow takes those of the frame before.
+"""The same id for the same instance in all frames: the flow takes those of a frame to the next, where they are matched.
 
-The rules are the released ones (docs/released_code.md, Post-processing), FIERY's with a distance of one's own.
+The rules are the released ones (docs/released_code.md, Post-processing), FIERY's with another distance.
 """
 
 from __future__ import annotations

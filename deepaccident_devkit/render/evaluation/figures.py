@@ -57,8 +57,8 @@ class RunFigure:
 
     Attributes:
         name: of its file, without the ending.
-        caption: what is to be seen, for the reader of the report.
-        alt: the same in words and numbers, for who does not see it.
+        caption: what the figure shows, for the reader of the report.
+        alt: the same in words and numbers, for readers who cannot see it.
         draw: renders it on axes.
         rows: how many bars are below each other; the figure is higher for many.
     """

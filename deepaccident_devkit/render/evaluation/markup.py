@@ -1,4 +1,4 @@
-"""HTML out of plain values: whatever is not `Markup` already is escaped, so that no name can smuggle in tags."""
+"""HTML out of plain values: all text that is not `Markup` is escaped, so that no name can bring in tags."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from deepaccident_devkit.render.colors import GRID_COLOR, WARNING_COLOR
 _VOID: Final = ("img", "meta")
 _MOST_DIGITS: Final = 6
 _LONG: Final = 40
-"""Letters of what is no more a name."""
+"""A text of more letters is no name."""
 
 
 class Markup(str):
@@ -56,7 +56,7 @@ def facts(values: Mapping[str, str]) -> Markup:
 
 
 def tree(value: Any) -> Markup:
-    """Whatever JSON holds: mappings as tables of names, lists of mappings as tables of columns, the rest as text."""
+    """Any JSON value: mappings as tables of names, lists of mappings as tables of columns, the rest as text."""
     if isinstance(value, Mapping):
         if not value:
             return joined(["none"])
@@ -98,7 +98,7 @@ def _list(values: Sequence[Any]) -> Markup:
 
 
 _POLICY: Final = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-"""Whatever a name in it should try, a browser loads nothing and runs nothing."""
+"""A browser loads nothing and runs nothing, also if a name tries to."""
 _STYLE: Final = f"""
 :root {{ color-scheme: light; }}
 * {{ box-sizing: border-box; }}

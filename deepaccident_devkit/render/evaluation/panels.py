@@ -1,4 +1,4 @@
-"""What the panels of an evaluation share: their size, labelled bars with intervals, and words where nothing is."""
+"""Shared parts of an evaluation's panels: their size, labelled bars with intervals, and words in empty ones."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def draw_bars(bars: Sequence[Bar], ax: Axes, limit: float | None = None) -> Axes
     """Render horizontal bars, the first on top, with their intervals as whiskers and their texts to the right.
 
     Args:
-        bars: what is not known has a dash in a bar's place.
+        bars: an unknown value has a dash in place of a bar.
         ax: the axes to render on.
         limit: where the values end; None for as far as they go.
 

@@ -1,4 +1,4 @@
-"""`save_report`: one HTML file that tells all of an evaluation, and its figures as PNG files."""
+"""`save_report`: one HTML file with all of an evaluation, and its figures as PNG files."""
 
 from __future__ import annotations
 

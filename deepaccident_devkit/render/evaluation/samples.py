@@ -1,4 +1,4 @@
-"""The worst and the best samples of a run, as pictures: what was predicted over what is true, seen from above."""
+"""The worst and the best samples of a run, as pictures: the prediction over the truth, seen from above."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def draw_motion_outcome(prediction: MotionOutput, label: MotionLabels, *, ax: Ax
     """Render the last frame's cells: actors that are predicted rightly, falsely, and missed.
 
     Args:
-        prediction: what a model says; the last of several predictions is rendered.
+        prediction: of a model; the last of several predictions is rendered.
         label: the truth, on the same ground; frames in their own ego frames are warped to the present.
         ax: axes to render on; new ones if None.
 

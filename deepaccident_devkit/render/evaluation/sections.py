@@ -167,7 +167,7 @@ def explanation(report: Mapping[str, Any]) -> Markup:
 
 
 def choices(run: EvaluationRun) -> Markup:
-    """Every switch of the protocol, and what else decides the numbers; folded up."""
+    """Every switch of the protocol, and all other settings; folded up."""
     given = run.setup.as_dict()
     said = [("Every choice of the protocol", given["settings"]), ("Selection of samples", run.selection.as_dict())]
     if run.results.form is not None:

@@ -76,7 +76,7 @@ def draw_accident_outcome(
 
 
 def difference_words(compared: ComparedAccidents) -> str:
-    """What comes, and how far off the surest alarm is, in places together and in time."""
+    """The true accident, and the errors of the surest alarm, in both places together and in time."""
     true = compared.true
     comes = "no accident comes" if true is None else f"an accident comes in {true.time:.1f} s"
     if not compared.predicted:

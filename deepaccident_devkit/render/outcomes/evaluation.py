@@ -1,4 +1,4 @@
-"""`render_evaluation`: a sample's label, what a model says of it, and the verdict of a protocol."""
+"""`render_evaluation`: a sample's label, a model's prediction, and the verdict of a protocol."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def render_evaluation(
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Render a sample's truth and beside it what a model says, with a protocol's verdict on it in numbers.
+    """Render a sample's truth and beside it a model's prediction, with a protocol's verdict in numbers.
 
     Motion has true instances as found or missed and predicted ones as right or false, frame by frame; accidents have
     the places where two collide, with the metres between foreseen and true ones; detections have matched, false and

@@ -1,4 +1,4 @@
-"""What a scenario is, in words, and what its page does not show."""
+"""The facts on a scenario in words, and what its page does not show."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD
 
 
 def facts(recording: Recording) -> list[list[str]]:
-    """Names and values that say what a scenario is and how it ends; what is not known is left out."""
+    """Names and values of a scenario's facts and its end; unknown ones are left out."""
     return [[name, value] for name, value in (*_setting(recording), *_ending(recording)) if value]
 
 
@@ -21,7 +21,7 @@ def notes(recording: Recording, pictures: CameraPictures, *, points: bool) -> li
 
     Args:
         recording: the scenario and the agents.
-        pictures: what there is of the cameras.
+        pictures: those of the cameras.
         points: whether there are LiDAR points.
     """
     return [*_labels(recording), *_pictures(recording, pictures), *_points(recording, points=points)]

@@ -143,8 +143,8 @@ def _cameras(recording: Recording, pictures: CameraPictures) -> list[list[dict[s
 def replay_page(title: str, data: Mapping[str, Any]) -> str:
     """A whole page in HTML.
 
-    Its policy lets a browser run this script and use this style alone, and load nothing. All text of the data is shown
-    as text by the script, never as HTML.
+    By its policy a browser runs only this script, uses only this style, and loads nothing. All text of the data is
+    shown as text by the script, never as HTML.
 
     Args:
         title: of the window.

@@ -35,7 +35,7 @@ _CELL: Final = 0.4
 """Metres: of the points in such a square one is kept."""
 _MOST: Final = 1500
 _LEAST_HEIGHT: Final = 0.3
-"""Metres above the ground: the road itself says nothing from above."""
+"""Metres above the ground: lower points are of the road."""
 _GROUND: Final = 5.0
 """Percentile of the points' heights that is the ground: the ego frame of the pole is not on it."""
 

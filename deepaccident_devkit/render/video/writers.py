@@ -21,7 +21,7 @@ _CRF: Final = "20"
 """Of H.264: 0 loses nothing, 51 is the worst."""
 _WEBP_QUALITY: Final = 70
 _COLORS: Final = 255
-"""Of a GIF; one more is kept for what stays as it was."""
+"""Of a GIF; one more is kept for pixels that do not change."""
 _LOOKED_AT: Final = 2_000_000
 """Pixels of all pictures, about, by which the palette is chosen."""
 _log = logging.getLogger(__name__)
@@ -70,7 +70,7 @@ def _write_mp4(path: Path, pictures: Iterable[ByteArray], fps: float) -> None:
 
 
 def _write_h264(path: Path, pictures: Iterable[ByteArray], fps: float) -> None:
-    """H.264 in yuv420p with its index in front: what browsers play, and begin to before all of it is there."""
+    """H.264 in yuv420p with its index in front: browsers play it, and begin before it is complete."""
     import av
 
     with av.open(os.fspath(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
@@ -141,4 +141,4 @@ SUFFIXES: Final[Mapping[str, Callable[[Path, Iterable[ByteArray], float], None]]
     ".gif": _write_gif,
     ".webp": _write_webp,
 }
-"""Suffix → what writes such a file."""
+"""Suffix → the writer of such files."""

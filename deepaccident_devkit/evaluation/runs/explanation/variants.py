@@ -20,7 +20,7 @@ from deepaccident_devkit.motion.protocols import DrawnWhen, slip_names
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Why an evaluator cannot take a sample; stands in place of a result, or of what `update` takes."""
+    """Why an evaluator cannot take a sample, in place of a result or of the arguments of `update`."""
 
     reason: str
 
@@ -120,7 +120,7 @@ class Variants:
 
 
 def variants_of(loader: SampleLoader) -> Variants:
-    """What there is to count of results and a setup."""
+    """The variants of a setup that can be counted for results."""
     setup = loader.setup
     chosen = Variant(setup.rules, loader.label_config())
     protocols, refused = {}, {}
@@ -139,7 +139,7 @@ def variants_of(loader: SampleLoader) -> Variants:
 
 @dataclass(frozen=True, slots=True)
 class VariantsLoader:
-    """Gives what `SideBySide.update` takes of a sample; what variants share is made once. Cheap to pickle.
+    """Makes the arguments of `SideBySide.update` for a sample; shared parts are made once. Cheap to pickle.
 
     Attributes:
         loader: of the chosen rules.

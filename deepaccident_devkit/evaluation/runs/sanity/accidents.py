@@ -1,4 +1,4 @@
-"""Whether explicit accidents look mirrored, turned, scaled, given in cells or in another frame, and their times so."""
+"""Whether explicit accidents look mirrored, turned, scaled, in cells or in another frame, or with wrong times."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ _LEAST_TIMES: Final = 0.75
 _SAMPLES: Final = 4
 _DEVIATIONS: Final = 2.2
 _DECIDED: Final = {"place": 0.4, "time": 0.4}
-"""Share of the telling samples that have to fit a mistake or the truth; who fits neither says nothing of both."""
+"""The share of the useful samples that have to fit a mistake or the truth."""
 _TELLING: Final = 2.0
 """Metres by which both true positions together have to change for their sample to tell."""
 _TINY: Final = 1e-6
 """What those who are close by count for a mistake if there are none."""
 _WEIGHTIEST: Final = 4.0
-"""Metres: a sample whose positions change more tells no more."""
+"""Metres: a larger change of positions counts as this one."""
 _OFF: Final = 6.0
 """Metres by which both positions together may always be off, and still fit; where much changes, half of that."""
 _OFF_SCALED: Final = 4.0
@@ -75,7 +75,7 @@ _FRAMES: Final = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class AccidentMoment:
-    """What accidents of a sample may be given in by mistake.
+    """The wrong frames and times in which accidents of a sample may be given.
 
     Attributes:
         horizon: seconds that predictions look ahead.
@@ -143,7 +143,7 @@ def accident_suspicions() -> list[Suspicion]:
 def accident_tallies(
     alarms: Sequence[Accident], truth: BoxTruth, moment: AccidentMoment | None = None
 ) -> dict[str, list[float]]:
-    """What a sample says of each suspicion, by its surest alarm; nothing without an alarm and a true accident."""
+    """The tallies of a sample for each suspicion, by its surest alarm; none without an alarm and a true accident."""
     if truth.accident is None or not alarms:
         return {}
     alarm = min(alarms, key=by_sureness)

@@ -56,7 +56,7 @@ def check_sanity(
     samples: int | None = None,
     workers: int | None = 1,
 ) -> SanityReport:
-    """What perfect and empty predictions score, and whether the given ones look mirrored, turned, shifted and so on.
+    """The scores of perfect and empty predictions, and whether the given ones look mirrored, turned, shifted and so on.
 
     Each suspicion is tried on samples spread over all: the predictions are corrected as if it were true, and
     compared with the truth. It is told if they then fit twice as well. Correct predictions, and bad ones, raise none.
@@ -181,7 +181,7 @@ class _SanityEvaluator(Evaluator[SanityReport]):
 def _says_something(results: Results) -> Callable[[str], bool]:
     """Whether a sample has a prediction that can be compared: of accidents, of which a model may foresee few, an alarm.
 
-    Maps and boxes nearly always show somebody, and maps take long to read.
+    Maps and boxes nearly always show an actor, and maps take long to read.
     """
     return lambda token: results.task != "accident" or bool(results.prediction(token))
 

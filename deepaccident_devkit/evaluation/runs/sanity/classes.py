@@ -21,7 +21,7 @@ _LEAST: Final = 0.5
 _MOST: Final = 0.5
 """Share of all boxes that a single class has to be, if it alone has another name."""
 _OWN: Final = 1e-3
-"""What a class's own name counts more, so that a class nobody knows keeps it."""
+"""The bonus of a class's own name, so that a class that is never detected keeps it."""
 
 
 def class_names(found: DetectedBoxes, truth: Boxes) -> IntArray:

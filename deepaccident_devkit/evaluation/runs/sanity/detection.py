@@ -20,9 +20,9 @@ _NEAR_IN_3D: Final = 1.0
 """Metres: nearer, since frames of one agent differ by the height of its LiDAR alone."""
 _FAR: Final = 10.0
 _MOVED: Final = 2.0
-"""Metres that an actor has to move within the step for its box to tell of the time."""
+"""Metres that an actor has to move within the step for its box to show the time."""
 _THEN: Final = 0.8
-"""Share of that way from which on a detection is where the actor is then: a slight delay is none of a step."""
+"""Share of that way from which on a detection is where the actor is then: a slight delay is less than a step."""
 _STEP_FRAMES: Final = 5
 _LEAST: Final = 0.25
 _MARGIN_OF_EDGES: Final = 1.5

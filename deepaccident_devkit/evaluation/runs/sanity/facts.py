@@ -1,4 +1,4 @@
-"""What shows of predictions without a suspicion: that all are empty, ids that are not linked, scores all the same."""
+"""Facts that show without a suspicion: empty predictions, ids that are not linked, equal scores."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def ids_kept(prediction: MotionOutput, label: MotionLabels) -> list[int]:
 
 
 def is_empty(prediction: MotionOutput, frames: int) -> bool:
-    """Whether nobody is in the last prediction."""
+    """Whether the last prediction is empty."""
     return not actor_cells(prediction, frames).any()
 
 

@@ -93,7 +93,7 @@ def _suspicion(
 def _lag_tallies(name: str, lag: int, predicted: BoolArray, true: BoolArray) -> dict[str, list[float]]:
     """Whether frames show the true ones a step off.
 
-    Who predicts that nobody moves, or slowly, is later from frame to frame, and who overestimates speeds earlier: so a
+    A model that predicts no or slow motion is later from frame to frame, one that overestimates speeds is earlier: so a
     prediction that is off by one step as a whole is not off by two, least of all in the last frame, and not right in
     the first one.
     """

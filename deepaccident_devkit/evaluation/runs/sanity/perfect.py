@@ -1,4 +1,4 @@
-"""The predictions that nothing is better than, and those that nothing is in, in the form of given ones."""
+"""Perfect predictions, and empty ones, in the form of given ones."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What a sample says for and against the ways in which predictions may be wrong as a whole.
+"""The evidence of a sample for and against ways in which predictions may be wrong as a whole.
 
 A suspicion is tried by correcting the predictions as if it were true. If it is, they then fit the truth, and not as
-they were given. Each tells of its own: a share of cells or of actors, of both readings.
+they were given. Each has its own measure: a share of cells or of actors, for both readings.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ Group = Literal[
     "flow",
 ]
 MARGIN: Final = 2.0
-"""By how much most suspicions have to beat the predictions as they were given."""
+"""The least advantage of most suspicions over the predictions as given."""
 _AFTER_PLACES: Final[frozenset[Group]] = frozenset(get_args(Group)) - {"channels", "place"}
 _HIDES: Final[Mapping[Group, frozenset[Group]]] = {
     "channels": _AFTER_PLACES | {"place"},
     "place": _AFTER_PLACES,
     "exchange": frozenset({"offset", "flow"}),
 }
-"""Group → those that tell nothing where one of it is suspected."""
+"""Group → the groups that are not checked if one of its suspicions is raised."""
 SCALES: Final[Mapping[str, float]] = {f"scaled by {scale:g}": scale for scale in (0.5, 0.8, 1.25, 2.0)}
 """Name → how many times too far from the ego all is; cell sizes of 0.25, 0.4, 0.625 and 1 m for 0.5 m."""
 

@@ -1,4 +1,4 @@
-"""`SanityReport`: what a few samples say of predictions as a whole, and how that is put into words."""
+"""`SanityReport`: the findings of a few samples on predictions as a whole, and their texts."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from deepaccident_devkit.evaluation.runs.sanity.probes import Candidate
 from deepaccident_devkit.text import columns_text
 
 NEAR_NOTHING: Final = 0.05
-"""Share of the way from what nothing scores to what the truth scores; who is below it has next to nothing."""
+"""A score below this share of the way from the empty prediction's to the truth's is near nothing."""
 NOTHING_WRONG: Final = "Nothing looks wrong with the predictions."
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SanityReport(FrozenMappings):
-    """What a few samples say of predictions as a whole.
+    """The findings of a few samples on predictions as a whole.
 
     Attributes:
         samples: how many were looked at.
@@ -28,7 +28,7 @@ class SanityReport(FrozenMappings):
         units: headline → unit.
         candidates: all that was looked for, suspected or not.
         warnings: sentences; none if nothing looks wrong.
-        unchecked: sentences: what such results do not hold, so that nobody could look at it.
+        unchecked: sentences: what such results do not hold, and could not be checked.
         verdict: what there is to say beside the warnings, a sentence: that nothing looks wrong, or that the score is
             near nothing and no check explains it; empty if a warning does.
     """

@@ -1,4 +1,4 @@
-"""Which few samples a sanity check looks at: those that show most, spread over all."""
+"""The few samples of a sanity check: those that show most, spread over all."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 _GOLDEN: Final = 0.618
 _LOOKED_AT: Final = 25
-"""Neighbours among which the most telling one is taken."""
+"""Neighbours among which the most useful one is taken."""
 
 
 def telling_samples(
