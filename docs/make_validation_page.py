@@ -16,7 +16,10 @@ minutes.
     deepaccident validate DATAROOT --json     # one JSON document
 
 ```python
-da.findings("type1_subtype1_accident/Town03_type001_subtype0001_scenario00024")  # one scenario's, worst first
+from deepaccident_devkit import DeepAccident
+
+da = DeepAccident(dataroot="deepaccident_demo/release")
+da.findings(da.scenario[0]["token"])  # one scenario's, worst first
 ```
 
 It reads the files and needs no index. Each finding says what is wrong, where, how bad it is and what to do:

@@ -91,7 +91,7 @@ def test_a_normal_scenario_has_no_countdown(da: DeepAccident, tmp_path: Path) ->
 def test_the_code_on_the_page_runs(da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = (DOCS / "interactive_3d.md").read_text(encoding="utf-8")
     code = "\n".join(re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE))
-    assert "data/DeepAccident" in code
+    assert "deepaccident_demo/release" in code
     monkeypatch.chdir(tmp_path)
     exec(compile(code.replace("deepaccident_demo/release", str(da.dataroot)), "interactive_3d.md", "exec"), {})  # noqa: S102
     assert len(read_mcap(tmp_path / "accident.mcap").only("/actors")) == 6
