@@ -53,7 +53,7 @@ def _table(mutants: list[Mutant], outcomes: dict[str, str]) -> str:
         )
         rows.append(f"{area or 'all':<11}{cells}{share:>10}")
     left = [mutant for mutant in mutants if outcomes.get(mutant.key) in _PLANTED[2:]]
-    lines = (Path(__file__).parent / "equivalent.txt").read_text(encoding="utf-8").splitlines()
+    lines = (Path(__file__).parent / "survivors.txt").read_text(encoding="utf-8").splitlines()
     reasons = dict(line.rsplit(" | ", 1) for line in lines)
     for mutant in sorted(left, key=lambda mutant: (mutant.path, mutant.line)):
         reason = reasons.get(f"{mutant.path}: {mutant.change}", outcomes[mutant.key])
