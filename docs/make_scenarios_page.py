@@ -49,8 +49,9 @@ print(scenario.weather, scenario.actor("ego").max_speed)
   keeps right. At lights the phases take turns. Without lights who comes from the right goes first, at a three-way
   junction who stays on the road that goes on.
 - The actors of `meet` are timed so that both come to where their ways cross, the second `offset` seconds later. In the
-  accident they see each other too late and keep neither lights nor priority, and everyone else lets them go first. A
-  draw in which they miss each other is drawn again. Lights are green for that one of them who does not ignore `signal`.
+  accident they see each other too late and keep neither lights nor priority, and everyone else lets them go first. If
+  the two miss each other, all values are drawn once more. Lights are green for the one of them who does not ignore
+  `signal`.
 - All others keep the rules that they do not ignore: `signal` drives at red, `priority` gives way to nobody, `crosswalk`
   does not wait for pedestrians.
 - The recording ends with the collision, or else when ego arrives or at `end.time`; `--frames N` keeps the last N.
