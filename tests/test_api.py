@@ -39,6 +39,7 @@ def test_dataroots_that_are_none(tmp_path: Path, release_root: Path) -> None:
         DeepAccident(dataroot=release_root, on_error="ignore")  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_the_mini_release_is_a_version_of_its_own(own_release: Path) -> None:
     (own_release / "train").rename(own_release / "DeepAccident_mini")
     (own_release / "train.txt").unlink()

@@ -18,6 +18,8 @@ from deepaccident_devkit.evaluation.results import ResultsWriter
 from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results, read_bundle, save_run
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 
+pytestmark = pytest.mark.slow
+
 AGENTS = ("ego_vehicle", "infrastructure")
 LIST = ("--split", "train", "--agents", ",".join(AGENTS), "--resamples", "0")
 
@@ -93,7 +95,6 @@ def bundle(da_motion: DeepAccident, folder: Path, accidents: Path) -> Path:
     return out
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("task", "results", "protocol", "headline"),
     [
@@ -124,7 +125,6 @@ def test_every_task_and_protocol(
     assert "PARTIAL" not in text
 
 
-@pytest.mark.slow
 def test_a_bundle_with_all_there_is(bundle: Path, accidents: Path, da_motion: DeepAccident) -> None:
     names = {path.name for path in bundle.iterdir()}
     assert names == {
@@ -139,7 +139,6 @@ def test_a_bundle_with_all_there_is(bundle: Path, accidents: Path, da_motion: De
     assert not bundle.with_name("bundle.unfinished").exists()
 
 
-@pytest.mark.slow
 def test_json_is_the_summary(da_motion: DeepAccident, accidents: Path, tmp_path: Path) -> None:
     words = ("accident", da_motion.dataroot, "--results", accidents, *LIST, "--protocol", "boxes")
     done = evaluate(*words, "--by", "town", "--switch", "scoring.limit_counts=true", "--json", "--out", tmp_path / "b")
@@ -151,7 +150,6 @@ def test_json_is_the_summary(da_motion: DeepAccident, accidents: Path, tmp_path:
 
 
 class TestPartial:
-    @pytest.mark.slow
     def test_refused_unless_allowed_and_marked_everywhere(
         self, da_motion: DeepAccident, tokens: list[str], tmp_path: Path
     ) -> None:

@@ -15,6 +15,8 @@ from deepaccident_devkit.render import detached_figure, render_frame, render_sam
 from deepaccident_devkit.render.colors import COLLIDER_COLOR, COMPANION_COLOR
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 
+pytestmark = pytest.mark.slow
+
 
 def images(axes: Any) -> list[Any]:
     return [np.asarray(ax.images[0].get_array()) for ax in axes]
@@ -63,7 +65,6 @@ def test_the_columns_stand_side_by_side_with_camera_above_view_from_above(da: De
     assert (np.diff([box.x0 for box in boxes[:5]]) > boxes[0].width).all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("size", [(18, 6.9), (16, 9), (12.8, 7.2)])
 def test_panels_from_above_fill_a_tall_figure(da: DeepAccident, frame: str, size: tuple[float, float]) -> None:
     fig = render_frame(da, frame, fig=detached_figure(size))

@@ -17,10 +17,11 @@ from deepaccident_devkit.synth.unfinished import Unfinished, unfinished_release
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, CHANNELS, MINI_SPLITS, SPLITS
 from deepaccident_devkit.validation import validate_release
 
+pytestmark = pytest.mark.slow
+
 TINY = {"scenarios": 2, "frames": 2, "image_size": (32, 18)}
 
 
-@pytest.mark.slow
 def test_every_file_is_there_and_nothing_else(release_root, scenarios, config, digests):
     frames = range(1, config.frames + 1)
     expected = {s.meta_path for s in scenarios} | {release_root / f"{name}.txt" for name in (*SPLITS, *MINI_SPLITS)}
@@ -48,7 +49,6 @@ def test_accident_and_twin_share_name_and_scene(scenarios):
     assert accident.road_type == "four-way junction"
 
 
-@pytest.mark.slow
 def test_layout_b_has_a_folder_a_split(tmp_path):
     config = SynthConfig(scenarios=5, frames=1, layout="B", sensors=False)
     release = find_release(make_release(tmp_path / "b", config, workers=1))
@@ -62,7 +62,6 @@ def test_layout_b_has_a_folder_a_split(tmp_path):
     assert len(read_label(release.scenarios[-1].label_path("infrastructure", 1))) > 5
 
 
-@pytest.mark.slow
 def test_a_release_for_the_released_code_has_its_split_files_twice(tmp_path):
     """Calib files are those of 1600x900 images, whether images are there or not."""
     config = SynthConfig(scenarios=4, frames=1, sensors=False, for_released_code=True)
@@ -80,7 +79,6 @@ def test_a_release_for_the_released_code_has_its_split_files_twice(tmp_path):
     assert validate_release(root, workers=1).is_good
 
 
-@pytest.mark.slow
 def test_images_for_the_released_code_have_its_size(tmp_path):
     config = SynthConfig(scenarios=1, frames=1, for_released_code=True)
     (scenario,) = find_release(make_release(tmp_path / "released", config, workers=1)).scenarios
@@ -89,7 +87,6 @@ def test_images_for_the_released_code_have_its_size(tmp_path):
             assert read_image(scenario.channel_path(agent, channel, 1)).shape == (900, 1600, 3)
 
 
-@pytest.mark.slow
 def test_same_seed_same_bytes_with_any_number_of_workers(tmp_path, digests):
     """Two and three processes share one scenario."""
     config = SynthConfig(scenarios=1, frames=4, image_size=(32, 18), seed=7)
@@ -97,7 +94,6 @@ def test_same_seed_same_bytes_with_any_number_of_workers(tmp_path, digests):
     assert one == two == three
 
 
-@pytest.mark.slow
 def test_parts_of_any_number_make_the_same_scenario(tmp_path, digests):
     config = SynthConfig(scenarios=1, frames=5, image_size=(32, 18), seed=7)
     plan = plan_scenarios(config)[0]
@@ -135,7 +131,6 @@ def break_off(monkeypatch):
     return make
 
 
-@pytest.mark.slow
 def test_a_broken_off_release_is_gone_on_with(tmp_path, break_off, digests, monkeypatch):
     """The parts that are whole are not made again, and no byte tells."""
     config = SynthConfig(scenarios=2, frames=3, image_size=(32, 18), seed=7)
@@ -169,7 +164,6 @@ def unwritable(tmp_path):
     return tmp_path / "out", config, unfinished.part(name.replace("1of", "3of"))
 
 
-@pytest.mark.slow
 def test_a_worker_that_fails_leaves_no_half_written_scenario(unwritable, digests, monkeypatch, tmp_path):
     """In another process; once the fault is gone, the release is finished, and no byte tells."""
     out, config, place = unwritable
@@ -258,7 +252,6 @@ def test_a_line_that_a_break_cut_off_is_no_scenario(tmp_path):
     assert unfinished.made() == {"a/b"}
 
 
-@pytest.mark.slow
 def test_an_unlabelled_test_split_has_calib_images_and_points_alone(tmp_path):
     """As the real one has; the other splits lack nothing."""
     config = SynthConfig(scenarios=5, frames=1, image_size=(32, 18), layout="B", unlabelled_test=True)
@@ -272,7 +265,6 @@ def test_an_unlabelled_test_split_has_calib_images_and_points_alone(tmp_path):
     assert len(DeepAccident("v1", root, verbose=False).split_scenarios("test")) == 1
 
 
-@pytest.mark.slow
 def test_exact_releases_differ_in_calib_and_counts_alone(tmp_path):
     usual, exact = (
         find_release(
@@ -325,7 +317,6 @@ def test_an_empty_folder_is_filled(tmp_path):
     assert find_release(out).scenarios
 
 
-@pytest.mark.slow
 def test_a_long_recording_waits_before_it_starts():
     config = SynthConfig(scenarios=1, frames=999)
     scenario = build_scenario(config, plan_scenarios(config)[0])

@@ -13,6 +13,8 @@ from deepaccident_devkit.synth.spec import DESIGNS
 from deepaccident_devkit.tables.accidents import accident_type
 from deepaccident_devkit.taxonomy import VEHICLE_AGENTS
 
+pytestmark = pytest.mark.slow
+
 CONFIG = SynthConfig(scenarios=24, frames=None, seed=2, unplanned=0.0)
 
 
@@ -31,7 +33,6 @@ def gaps(scenario, first, second, times):
     return separation(poses[0], size[rows[0]], poses[1], size[rows[1]])
 
 
-@pytest.mark.slow
 def test_each_design_is_told_by_its_meta(built):
     types = [
         accident_type(scenario.meta, signalized=scenario.plan.subtype == 1)
@@ -83,7 +84,6 @@ def test_every_category_moves_about_over_a_few_scenes(built):
     assert set(moving) == {"car", "van", "truck", "motorcycle", "cyclist", "pedestrian"}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("frames", [1, 4, 60, 130])
 def test_so_many_frames_are_recorded(frames):
     config = replace(CONFIG, scenarios=2, frames=frames)
@@ -103,7 +103,6 @@ def test_the_same_numbers_make_the_same_scenario():
     assert build_scenario(other, plan_scenarios(other)[4]).spec != one.spec
 
 
-@pytest.mark.slow
 def test_unplanned_accidents_are_with_someone_who_records_nothing():
     config = replace(CONFIG, scenarios=8, unplanned=1.0)
     for plan in plan_scenarios(config)[::2]:

@@ -11,6 +11,8 @@ from deepaccident_devkit.synth.sensors.images.shadows import wall_shadows
 from deepaccident_devkit.synth.solids import FACES_A_SOLID, FRONT, REAR, Block
 from deepaccident_devkit.taxonomy import TIMES_OF_DAY, WEATHERS
 
+pytestmark = pytest.mark.slow
+
 
 def picture(rig, signals=None, channel="Camera_Front", agent=0):
     scene = rig.scene(0.0)
@@ -27,7 +29,6 @@ def test_every_sky_has_a_light(weather, time_of_day):
     assert (light.rain > 0) == ("Rain" in weather)
 
 
-@pytest.mark.slow
 def test_noon_is_brighter_than_sunset_and_sunset_than_night(world, rig_of):
     noon, sunset, night = (picture(rig_of(world, sky=("Cloudy", time))).mean() for time in ("Noon", "Sunset", "Night"))
     assert noon > 1.15 * sunset > 1.15 * 2 * night
@@ -48,7 +49,6 @@ def test_haze_hides_what_is_far(world, bare, rig_of):
     assert 0 < contrast["HardRain"] < 0.4 * contrast["Clear"]
 
 
-@pytest.mark.slow
 def test_red_lights_are_red_and_green_ones_green(world, rig_of):
     """The light for those who come from the west, seen from the ego that waits for it."""
     rig = rig_of(world, image_size=(640, 360), places={"ego_vehicle": (-22.0, -1.75, 0.0)})
@@ -69,7 +69,6 @@ def test_headlamps_light_the_road_ahead_at_night_alone(world, bare, rig_of):
     assert by_time["Night"] > 1.2 * by_time["Noon"]
 
 
-@pytest.mark.slow
 def test_cars_throw_shadows_in_the_sun(world, bare, actor, rig_of):
     car = actor(9, "car", -16.0, -1.75)
     with_car, without = (picture(rig_of(bare(world), others)).astype(int) for others in ([car], []))
@@ -146,7 +145,6 @@ def test_depths_are_those_of_single_rays(world, actor, rig_of):
         np.testing.assert_allclose(buffers.all.depth[sure], depth[sure], rtol=2e-3)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("ground", ["world", "hilly_world"])
 def test_wet_ground_mirrors_what_stands_on_it(ground, request, bare, rig_of):
     """The road before a red wall is redder than before a green one, with a hump elsewhere as well as without."""
@@ -159,7 +157,6 @@ def test_wet_ground_mirrors_what_stands_on_it(ground, request, bare, rig_of):
     assert (before[20] - before[220])[1] > 10
 
 
-@pytest.mark.slow
 def test_a_wet_slope_mirrors_the_sky_without_a_seam(hilly_world, bare, rig_of):
     """Up the hump from its foot the road's colour goes on as it is, above the horizon of level ground as below."""
     toward = {"ego_vehicle": (-8.0, 1.75, np.pi)}
@@ -174,14 +171,12 @@ def test_a_wet_slope_mirrors_the_sky_without_a_seam(hilly_world, bare, rig_of):
     assert np.abs(np.diff(column["Wet"] - column["Clear"])).max() < 8
 
 
-@pytest.mark.slow
 def test_pictures_are_the_seeds_alone(world, rig_of):
     first, again = (picture(rig_of(world, sky=("HardRain", "Night"))) for _ in range(2))
     np.testing.assert_array_equal(first, again)
     assert (picture(rig_of(world, sky=("HardRain", "Night"), seed=(1,))) != first).any()
 
 
-@pytest.mark.slow
 def test_the_smallest_and_an_odd_size_work(world, hilly_world, rig_of):
     for size in ((16, 9), (33, 19)):
         for roads in (world, hilly_world):

@@ -5,6 +5,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 from accident_scenes import scene, standing
 
 from deepaccident_devkit.evaluation import Accident, MotionOutput
@@ -58,6 +59,7 @@ def test_of_two_pairs_alike_that_with_the_lower_ids_collides() -> None:
         assert accident_of(maps, GRID, None, AccidentReading()).contact.ids == (1, 2)
 
 
+@pytest.mark.slow
 def test_a_difference_of_exactly_the_distance_is_not_within_it_and_the_gate_is() -> None:
     for row, column in PLACES:
         truth = pair_at(row, column)

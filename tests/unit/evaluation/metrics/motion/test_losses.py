@@ -40,6 +40,7 @@ def test_who_comes_back_has_a_new_id() -> None:
     assert lost_instances(label.instance, linked.instance) == [LostInstance(frame=2, identity=2, reason="renamed")]
 
 
+@pytest.mark.slow
 def test_each_lost_match_of_perfect_heads_is_explained(da_motion: DeepAccident) -> None:
     """What VPQ misses is in the list, and where nothing is lost the accident is the same but for the ids."""
     explained = 0

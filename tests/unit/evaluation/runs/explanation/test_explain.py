@@ -25,6 +25,8 @@ from deepaccident_devkit.evaluation.runs.explanation.variants import Refusal, Si
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionHeads, MotionLabelConfig, MotionLabels
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def tokens(da_motion: DeepAccident) -> list[str]:
@@ -105,7 +107,6 @@ def test_labels_are_a_choice(da_motion: DeepAccident, tokens: list[str]) -> None
     assert not [each for each in found.numbers if "ids_kept_between_samples" in each.choice]
 
 
-@pytest.mark.slow
 def test_of_heads_what_reads_them_is_a_choice_and_of_maps_it_changes_nothing(
     da_motion: DeepAccident, tokens: list[str]
 ) -> None:
@@ -128,7 +129,6 @@ def test_explicit_accidents_are_not_for_every_protocol(da_motion: DeepAccident, 
     assert found.chosen["apa"] == 1.0
 
 
-@pytest.mark.slow
 def test_accidents_of_maps_by_released_have_labels_as_choices(da_motion: DeepAccident, tokens: list[str]) -> None:
     results = motion(da_motion, tokens, still)
     found = explain(da_motion, results, EvaluationSetup(task="accident"), tokens)
@@ -139,7 +139,6 @@ def test_accidents_of_maps_by_released_have_labels_as_choices(da_motion: DeepAcc
     assert found.refused == {}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("protocol", DETECTION_PROTOCOLS)
 def test_every_choice_of_detection_can_be_counted(da_motion: DeepAccident, tokens: list[str], protocol: str) -> None:
     results, setup = detections(da_motion, tokens), EvaluationSetup(task="detection", protocol=protocol)
