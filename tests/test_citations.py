@@ -1,7 +1,6 @@
 """Pages that the text cites ship with it: whoever reads of `docs/protocols.md` in a docstring can open it."""
 
 import re
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from posixpath import normpath
@@ -21,8 +20,11 @@ _SECTION = re.compile(r"\b(docs/\w+\.md),[\s#]+([A-Z][\w'-]*)")
 
 
 def repository_files() -> list[str]:
-    listed = subprocess.run(["git", "ls-files"], cwd=TOP, capture_output=True, text=True, check=True)
-    return listed.stdout.splitlines()
+    """Without git, since a copy of the checkout has none."""
+    found = [path for path in TOP.iterdir() if path.is_file()]
+    for folder in ("deepaccident_devkit", "docs", "schema", "tests", "tutorials", "benchmarks", ".ci"):
+        found += [path for path in (TOP / folder).rglob("*") if path.is_file() and "__pycache__" not in path.parts]
+    return [path.relative_to(TOP).as_posix() for path in found]
 
 
 def texts(files: list[str]) -> Iterator[tuple[str, str]]:
