@@ -111,3 +111,7 @@ def test_a_notebooks_lines_are_those_of_the_file() -> None:
     cells = '{"cell_type": "code", "source": [\n"colide"]},\n{"cell_type": "markdown", "source": [\n"colide"]}'
     text = f'{{"cells": [\n{cells}]}}'
     assert misspelt(notebook(text), []) == [(5, "colide")]
+
+
+def test_the_readme_is_short() -> None:
+    assert len((TOP / "README.md").read_text(encoding="utf-8").split()) < 700
