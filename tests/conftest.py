@@ -1,7 +1,6 @@
 """Fixtures that all tests share: one synthetic release a session, made and indexed once."""
 
 import importlib
-import importlib.util
 import os
 import shutil
 from pathlib import Path
@@ -10,6 +9,7 @@ from types import ModuleType
 import matplotlib as mpl
 import pytest
 from hypothesis import settings
+from scripts import loaded_script
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.synth import SynthConfig, make_release
@@ -90,12 +90,7 @@ def both_layouts(request: pytest.FixtureRequest) -> DeepAccident:
 @pytest.fixture(scope="session")
 def schema_generator() -> ModuleType:
     """The script schema/generate.py, whose functions give the files as they should be."""
-    spec = importlib.util.spec_from_file_location("generate", Path(__file__).parents[1] / "schema" / "generate.py")
-    assert spec
-    assert spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return loaded_script("schema/generate.py")
 
 
 @pytest.fixture

@@ -1,22 +1,17 @@
 """docs/cli.md has the help of all commands as it is now."""
 
-import importlib.util
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+from scripts import loaded_script
 
 DOCS = Path(__file__).parents[1] / "docs"
 
 
 @pytest.fixture(scope="module")
 def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("make_cli_page", DOCS / "make_cli_page.py")
-    assert spec
-    assert spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return loaded_script("docs/make_cli_page.py")
 
 
 def test_the_page_is_up_to_date(script: ModuleType) -> None:

@@ -1,7 +1,6 @@
 """The pages' code runs as it stands, and what must be listed is."""
 
 import ast
-import importlib.util
 import inspect
 import re
 import shlex
@@ -13,6 +12,7 @@ from typing import Any
 import pytest
 from click import Context, Group
 from click.testing import CliRunner
+from scripts import loaded_script
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
@@ -324,9 +324,5 @@ def test_the_functions_on_a_labels_way_are_where_architecture_says() -> None:
 
 
 def test_the_picture_of_the_layers_is_that_of_the_contract() -> None:
-    spec = importlib.util.spec_from_file_location("make_architecture", DOCS / "make_architecture.py")
-    assert spec
-    assert spec.loader
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
+    script = loaded_script("docs/make_architecture.py")
     assert script.PICTURE.read_text(encoding="utf-8") == script.picture(), "run: python docs/make_architecture.py"

@@ -1,12 +1,12 @@
 """The documentation site: what it lists, and how docstrings get onto it. `.ci/run` builds it, warnings as errors."""
 
-import importlib.util
 import pkgutil
 import re
 from importlib import import_module
 from pathlib import Path
 
 import pytest
+from scripts import loaded_script
 
 import deepaccident_devkit
 
@@ -47,12 +47,7 @@ def test_every_page_is_listed(folder: Path) -> None:
 
 
 def docstring_lines(text: str) -> str:
-    name = "markdown_docstrings"
-    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = loaded_script("docs/markdown_docstrings.py")
     return "\n".join(module.restructured(text.split("\n")))
 
 

@@ -200,14 +200,14 @@ def _small_split(pair: int) -> str:
 
 def _mini(plans: Sequence[ScenarioPlan], split: Sequence[str], wanted: Collection[str]) -> tuple[str, ...]:
     """Whole pairs of those wanted, as many as `_MINI_SHARE` of the split allows; if none, the split's smallest pair."""
-    members = set(split)
+    members, wanted = set(split), set(wanted)
     pairs: dict[int, list[str]] = {}
     for plan in plans:
         if plan.token in members:
             pairs.setdefault(plan.pair, []).append(plan.token)
     mini: list[str] = []
     for pair in pairs.values():
-        if set(pair) <= set(wanted) and len(mini) + len(pair) <= _MINI_SHARE * len(split):
+        if wanted.issuperset(pair) and len(mini) + len(pair) <= _MINI_SHARE * len(split):
             mini += pair
     if not mini and pairs:
         mini = min(pairs.values(), key=len)

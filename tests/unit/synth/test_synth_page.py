@@ -1,10 +1,10 @@
 """docs/synth.md: its tables are what was measured, what was measured is still so, and its code runs."""
 
-import importlib.util
 import re
 from pathlib import Path
 
 import pytest
+from scripts import loaded_script
 
 from deepaccident_devkit.synth.spec import DESIGNS
 
@@ -18,16 +18,7 @@ def script():
     """The module that writes the page; another module of its folder measures what stands beside the real scenario."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(DOCS)
-        return loaded_script()
-
-
-def loaded_script():
-    spec = importlib.util.spec_from_file_location("make_synth_page", DOCS / "make_synth_page.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+        return loaded_script("docs/make_synth_page.py")
 
 
 def test_the_tables_are_made_of_what_was_measured(script):

@@ -1,10 +1,10 @@
 """docs/testing.md: its code runs as it stands, its table is that of the breakages."""
 
-import importlib.util
 import re
 from pathlib import Path
 
 import pytest
+from scripts import loaded_script
 
 pytestmark = pytest.mark.slow
 
@@ -57,9 +57,5 @@ def test_the_code_without_pytest_runs(tmp_path: Path, monkeypatch, capsys) -> No
 
 
 def test_the_table_is_that_of_the_breakages() -> None:
-    spec = importlib.util.spec_from_file_location("make_testing_page", DOCS / "make_testing_page.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = loaded_script("docs/make_testing_page.py")
     assert module.with_table(PAGE) == PAGE, "run: python docs/make_testing_page.py"

@@ -3,7 +3,6 @@
 Planted faults are in tests/fault_injection; here are the rules behind them and what a fault cannot show.
 """
 
-import importlib.util
 import json
 import shutil
 from collections.abc import Callable
@@ -14,6 +13,7 @@ import pytest
 import tiny
 from click.testing import CliRunner
 from PIL import Image
+from scripts import loaded_script
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
@@ -298,10 +298,6 @@ def test_split_faults_are_findings(own_release: Path) -> None:
 
 
 def test_the_docs_list_every_finding() -> None:
-    spec = importlib.util.spec_from_file_location("make_validation_page", DOCS / "make_validation_page.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = loaded_script("docs/make_validation_page.py")
     assert module.PAGE.read_text() == module.page(), "run: python docs/make_validation_page.py"
     assert all(f"`{code}`" in module.page() for code in CODES)

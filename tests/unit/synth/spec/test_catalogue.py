@@ -1,12 +1,12 @@
 """The twelve designs are the paper's: the accident that each means is of its type (docs/format.md, Accident types)."""
 
 import dataclasses
-import importlib.util
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scripts import loaded_script
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.release import Collision, Meta
@@ -120,11 +120,7 @@ def test_the_designs_are_listed():
 
 
 def test_the_page_is_what_the_fields_make():
-    spec = importlib.util.spec_from_file_location("make_scenarios_page", DOCS / "make_scenarios_page.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = loaded_script("docs/make_scenarios_page.py")
     assert module.PAGE.read_text(encoding="utf-8") == module.page(), "run: python docs/make_scenarios_page.py"
 
 
