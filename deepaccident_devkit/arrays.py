@@ -92,7 +92,8 @@ def as_numbers(
         array = given.astype(wanted)
     if wanted.kind in "iu":
         if not np.array_equal(array, given):
-            raise GeometryError(f"{name}: expected whole numbers of {wanted}, found {given}")
+            other = given[array != given].flat[0]
+            raise GeometryError(f"{name}: expected whole numbers of {wanted}, found {other}")
     elif wanted.kind == "f" and wanted.itemsize < given.dtype.itemsize and not np.isfinite(array).all():
         lost = np.isinf(array) & np.isfinite(given)
         if lost.any():
