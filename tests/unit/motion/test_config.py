@@ -89,7 +89,7 @@ def test_unknown_words_are_refused() -> None:
             MotionLabelConfig(protocol=protocol)
     with pytest.raises(ConfigError, match="half_cell_shift: expected True or False, found 1"):
         replace(LABEL_PROTOCOLS["clean"], half_cell_shift=1)
-    with pytest.raises(ConfigError, match="warp 'fiery' is counted in native 'fiery', found 'released'"):
+    with pytest.raises(ConfigError, match="warp 'fiery' needs native 'fiery', found 'released'"):
         replace(LABEL_PROTOCOLS["released"], warp="fiery")
     for agents in ("nobody", ["pole"], [], 5, "ego_vehicle"):
         with pytest.raises(ChoiceError, match="agents: expected"):

@@ -276,7 +276,7 @@ def test_arrays_are_read_only_and_whole() -> None:
 
 
 def test_what_does_not_fit_is_refused_with_the_remedy() -> None:
-    with pytest.raises(GeometryError, match=r"frames: expected 5.* found 4; give None for those beyond the recording"):
+    with pytest.raises(GeometryError, match=r"frames: expected 5.* found 4; give None for frames beyond the recording"):
         labels([frame()] * 4)
     with pytest.raises(GeometryError, match=r"egomotion: expected shape \(7, 6\), found \(5, 6\)"):
         labels([frame()] * 5, np.zeros((5, 6)))
