@@ -41,7 +41,7 @@ class MotionLabelConfig:
         only_vehicle: leave out pedestrians (two-wheelers are vehicles, as in all three codes).
         filter_invisible: rasterise only what the cooperating agents see by the released rule (docs/released_code.md,
             Visibility and attributes).
-        agents: the agents whose sight counts; None for all agents of the scenario, as in the released code. Names are
+        agents: the agents whose sight counts; None for all that are there, as in the released code. Names are
             kept as a tuple.
         draw_ego: rasterise the ego's own box (the infrastructure has none).
         ignore_index: the value of offset and flow outside instances, and of missing frames that are ignored: 255, or a

@@ -53,7 +53,10 @@ def test_a_presets_orientation_is_kept_unless_the_grid_or_the_caller_says_otherw
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"future_frames": 0}, r"future_frames: expected a whole number from 1 to 1,000 \(frames to come.*found 0"),
+        (
+            {"future_frames": 0},
+            r"future_frames: expected a whole number from 1 to 1,000 \(frames after the present.*found 0",
+        ),
         ({"future_frames": 10**9}, "found 1000000000"),
         ({"receptive_field": True}, "receptive_field: expected a whole number from 1 .* found True"),
         ({"step": 2.5}, r"step: expected a whole number from 1 to 1,000 \(recorded frames .* found 2.5"),

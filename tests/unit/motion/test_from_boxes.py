@@ -288,7 +288,7 @@ def test_what_does_not_fit_is_refused_with_the_remedy() -> None:
         frame((0, 0, 1, 0, 1), (0, np.nan, 2, 0, 1))
     with pytest.raises(GeometryError, match=r"FrameBoxes.center: expected shape \(N, 3\), found \(\)"):
         replace(frame(), center=5)
-    with pytest.raises(GeometryError, match=r"FrameBoxes.ego_from_lidar: row 0 is not finite; a frame without"):
+    with pytest.raises(GeometryError, match=r"FrameBoxes.ego_from_lidar: row 0 is not finite; give None for"):
         replace(frame(), ego_from_lidar=np.full((4, 4), np.nan))
     with pytest.raises(GeometryError, match="frames: expected FrameBoxes, or None beyond the recording, found 'a'"):
         labels(["a"] * 5)
