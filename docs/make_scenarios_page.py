@@ -123,7 +123,7 @@ A full example is design 3:
 
 
 def page() -> str:
-    """The page's text."""
+    """The text of the page."""
     parts = [_HEAD, _indented(designs_text()), _FIELDS, f"```yaml\n{design_text(3)}```\n\n## All fields\n"]
     for path, entries in field_tables().items():
         parts.append(f"\n### {f'`{path}`' if path else 'The file'}\n\n")

@@ -218,7 +218,7 @@ def ground_distance(terrain: Terrain, origin: FloatArray, rays: FloatArray) -> F
 
 
 def plane_distance(height: float | FloatArray, upwards: NDArray[Any]) -> NDArray[Any]:
-    """The distance from a height to z = 0, along rays with z components `upwards` (N,); infinite if they do not fall."""
+    """The distance from a height to z = 0 along rays with z components `upwards` (N,); infinite if they do not fall."""
     falling = upwards < 0
     return np.where(falling, height / -np.where(falling, upwards, -1.0), np.inf)
 

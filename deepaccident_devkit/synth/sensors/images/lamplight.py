@@ -22,7 +22,7 @@ _WITH_LAMPS = tuple(CATEGORIES.index(name) for name in ("car", "van", "truck", "
 def lamplight(scene: Scene) -> Float32Array:
     """Light on the ground, (600, 600), cells of 0.5 m, row = y, column = x; 1 is as bright as noon.
 
-    All moving vehicles have a wide beam ahead and a little light behind them; lanterns have a circle of light around them.
+    All moving vehicles have a wide beam ahead and a little light behind them; lanterns have light around them.
     """
     import cv2
 

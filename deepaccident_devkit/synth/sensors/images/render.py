@@ -141,7 +141,7 @@ def _below_level_ground(eye: FloatArray, rays: Float32Array) -> tuple[FloatArray
 def _off_slopes(
     eye: FloatArray, rays: Float32Array, depth: Float32Array, terrain: Terrain
 ) -> tuple[FloatArray, Float32Array, AnyArray]:
-    """The same for slopes: each ray is mirrored where it ends, at `depth` (R, C), so they begin at points (R · C, 3)."""
+    """The same for slopes: each ray is mirrored where it ends, at `depth` (R, C); so they begin at (R · C, 3)."""
     met = eye + rays * depth[..., None]
     normal = terrain.normal(met[..., :2])
     falling = -(rays * normal).sum(axis=-1)
