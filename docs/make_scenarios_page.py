@@ -24,7 +24,7 @@ weather: [SoftRain, HardRain]
 
     deepaccident synth OUT --spec mine.yaml --scenarios 8     # four accidents and their normal twins
 
-Each pair is another draw of the file. In Python:
+Each pair is another draw from the file. In Python:
 
 ```python
 import numpy as np
@@ -37,28 +37,27 @@ print(scenario.weather, scenario.actor("ego").max_speed)
 
 ## What is drawn
 
-- A number can be a range: `max_speed: [8, 12]`. Every number between is as likely; both ends are possible.
-- A word, a `true` or `false`, or a group such as `hump` can be a list: `from: [north, south]`. One of them is drawn;
-  one that stands there twice is twice as likely. Only `name`, `design`, `exchange` and `role` have one value.
-- What a file does not name has its default. `actors` and `ignores` are lists all of which hold.
-- Ego and other are needed. Those behind them are in every scenario, named or not, since they record too.
+- A number can be a range: `max_speed: [8, 12]`. Every number in the range is equally likely; both ends are possible.
+- A word, a `true` or `false`, or a group such as `hump` can be a list: `from: [north, south]`. One item is drawn;
+  an item that is listed twice is twice as likely. Only `name`, `design`, `exchange` and `role` must have one value.
+- Fields that a file does not name have their defaults. Of the lists `actors` and `ignores` all items are kept.
+- Ego and other are required. The two behind them are in every scenario, named or not, because they are agents too.
 
 ## What happens
 
-- The junction lies at the middle, its arms are `west`, `south`, `east` and, at a four-way junction, `north`. Traffic
-  keeps right. At lights the phases take turns. Without lights who comes from the right goes first, at a three-way
-  junction who stays on the road that goes on.
-- The actors of `meet` are timed so that both come to where their ways cross, the second `offset` seconds later. In the
-  accident they see each other too late and keep neither lights nor priority, and everyone else lets them go first. If
-  the two miss each other, all values are drawn once more. Lights are green for the one of them who does not ignore
-  `signal`.
-- All others keep the rules that they do not ignore: `signal` drives at red, `priority` gives way to nobody, `crosswalk`
-  does not wait for pedestrians.
-- The recording ends with the collision, or else when ego arrives or at `end.time`; `--frames N` keeps the last N.
-- The normal twin is the same scene with the same people in it, but all look out and nobody breaks a rule.
-- A file without `meet` gives normal scenarios alone.
+- The junction lies in the middle. Its arms are `west`, `south`, `east` and, at a four-way junction, `north`. Traffic
+  keeps right. With traffic lights the two roads have green by turns. Without lights, vehicles from the right go first;
+  at a three-way junction, those on the road that does not end there.
+- The actors of `meet` are timed so that both come to the crossing of their paths, the second `offset` seconds later.
+  In the accident they see each other too late, obey neither lights nor priority, and all others let them go first. If
+  the two miss each other, all values are drawn again. The one of the two that does not ignore `signal` has green.
+- All others obey the rules, except those in their `ignores`. Who ignores `signal` drives at red; `priority`, gives way
+  to nobody; `crosswalk`, does not wait for pedestrians.
+- The recording ends with the collision; without one, when ego arrives or at `end.time`. `--frames N` keeps the last N.
+- The normal twin has the same scene and the same road users, but all of them pay attention and obey all rules.
+- A file without `meet` gives only normal scenarios.
 
-A mistake is told with file, line and field:
+The message for a mistake names file, line and field:
 
     mine.yaml:4: actors[1].turn: expected one of left, straight, right, found 'lef'
 
@@ -83,7 +82,7 @@ weather: [Clear, SoftRain]
 time_of_day: [Noon, Sunset]
 ```
 
-A rear-end. Who comes by the same lane follows, and who follows keeps its distance; so a slow van changes into ego's
+A rear-end collision. Vehicles that begin in the same lane keep their distance, so here a slow van changes into ego's
 lane, and ego comes there 0.7 s later:
 
 ```yaml
@@ -95,7 +94,7 @@ actors:
 meet: {actors: [other, ego], offset: 0.7}
 ```
 
-A normal scenario, in which nobody is to meet anybody:
+A normal scenario, in which nobody is timed to meet:
 
 ```yaml
 # quiet.yaml
@@ -124,7 +123,7 @@ A full example is design 3:
 
 
 def page() -> str:
-    """The page's text."""
+    """The text of the page."""
     parts = [_HEAD, _indented(designs_text()), _FIELDS, f"```yaml\n{design_text(3)}```\n\n## All fields\n"]
     for path, entries in field_tables().items():
         parts.append(f"\n### {f'`{path}`' if path else 'The file'}\n\n")

@@ -1,4 +1,4 @@
-"""All that one scenario holds, made so that what its plan says happens."""
+"""All that one scenario holds, made so that it happens as its plan says."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -40,25 +40,25 @@ AGENT_OF_ROLE: Mapping[Role, AgentName] = {
     "other_behind": "other_vehicle_behind",
 }
 MAX_DRAWS = 100
-"""Draws of a scenario after which it is given up."""
+"""After this many draws without a collision a scenario is given up."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scenario:
-    """All that is there to be recorded; time 0 is the time of the first recorded frame.
+    """All that can be recorded; time 0 is the time of the first recorded frame.
 
     Attributes:
         plan: which scenario it is.
-        spec: the draw that it plays.
+        spec: the draw that was simulated.
         world: what stands still.
         actors: what moves, and parked vehicles.
         agents: actor ids of the four vehicle agents.
         weather: one of `WEATHERS`.
         time_of_day: one of `taxonomy.TIMES_OF_DAY`.
-        meta: as its file says.
+        meta: the contents of its meta file.
         frames: how many are recorded.
-        signals: the traffic lights' phases; None if there are none.
-        draws: how many it took.
+        signals: the phases of the traffic lights; None if there are no lights.
+        draws: how many draws were needed.
     """
 
     plan: ScenarioPlan
@@ -89,12 +89,12 @@ class RandomStreams(NamedTuple):
 
 
 def build_scenario(config: SynthConfig, plan: ScenarioPlan) -> Scenario:
-    """Make up a scenario; the same seed and pair give the same scene, for the accident and for its twin.
+    """Make a scenario; the same seed and pair give the same scene, for the accident and for its twin.
 
-    The scene is drawn until those who are timed to meet touch, if anybody is.
+    If two actors are timed to meet, the scene is drawn again until they touch.
 
     Raises:
-        ConfigError: they never do, in `MAX_DRAWS` draws.
+        ConfigError: they do not touch in `MAX_DRAWS` draws.
     """
     random = RandomStreams.of(config.seed, plan.pair)
     stage, accident, draws = _first_good_draw(random.traffic, config, plan)
@@ -123,7 +123,7 @@ def build_scenario(config: SynthConfig, plan: ScenarioPlan) -> Scenario:
 def _first_good_draw(
     rng: np.random.Generator, config: SynthConfig, plan: ScenarioPlan
 ) -> tuple[Stage, Performance | None, int]:
-    """The first draw in which the pair touches, what then happens, and how many draws it took."""
+    """The first draw in which the pair touches, what happens in it, and how many draws were needed."""
     for draws in range(1, MAX_DRAWS + 1):
         spec = plan.draw(rng)
         junction = Junction(spec.road)
@@ -136,8 +136,8 @@ def _first_good_draw(
         if accident is not None:
             return stage, accident, draws
     raise ConfigError(
-        f"{plan.template.name}: those of meet.actors did not collide in {MAX_DRAWS} draws; choose paths that cross, or "
-        "a smaller meet.offset"
+        f"{plan.template.name}: the two of meet.actors did not collide in {MAX_DRAWS} draws; choose paths that cross, "
+        "or a smaller meet.offset"
     )
 
 
@@ -145,14 +145,14 @@ def _twin(stage: Stage, config: SynthConfig, plan: ScenarioPlan) -> Recorded:
     normal = perform_twin(stage, latest_end(stage, config.frames))
     if normal is None:
         raise ConfigError(
-            f"{plan.template.name}: nothing keeps the road users of the normal twin apart; let them start farther from "
-            "each other"
+            f"{plan.template.name}: the road users collide in the normal twin too, even if one of them comes later; "
+            "let them start farther from each other"
         )
     return recorded_normal(stage, normal, config.frames)
 
 
 class _Ids(NamedTuple):
-    """The numbers of all actors of a stage: those that move first, then the parked ones."""
+    """The ids of all actors of a stage: first the moving ones, then the parked ones."""
 
     actor: tuple[int, ...]
     camera: tuple[int, ...]
@@ -160,7 +160,7 @@ class _Ids(NamedTuple):
 
     @classmethod
     def of(cls, rng: np.random.Generator, stage: Stage) -> "_Ids":
-        """Moving ones are numbered in the thousands, parked ones from 20000, in the order of their making."""
+        """Moving actors get ids from 1000 on, parked ones from 20000 on, in the order in which they were made."""
         moving, count = len(stage.users), len(stage.users) + len(stage.parked)
         actor = (rng.integers(1000, 2000) + rng.integers(1, 4, moving).cumsum()).tolist()
         actor += [STATIC_ACTOR_ID + row for row in range(moving, count)]
@@ -233,6 +233,6 @@ def _collision(stage: Stage, recorded: Recorded, ids: _Ids) -> Collision | None:
 
 
 def _pair_agents(stage: Stage) -> tuple[AgentName | None, AgentName | None]:
-    """Which agents the two are who are timed to meet; None for a road user that records nothing, or if nobody is."""
+    """The agents of the two who are timed to meet; None for a road user that is no agent, or if nobody is timed."""
     first, second = (stage.users[row] for row in stage.cast.pair) if stage.cast.pair else (None, None)
     return AGENT_OF_ROLE.get(first.role) if first else None, AGENT_OF_ROLE.get(second.role) if second else None

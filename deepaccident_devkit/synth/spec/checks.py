@@ -1,4 +1,4 @@
-"""Whether a scenario file can be carried out, whatever is drawn."""
+"""Checks that a scenario file is a possible scenario with all values that can be drawn."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,7 +13,7 @@ from deepaccident_devkit.synth.spec.model import Role
 _Way: TypeAlias = tuple[Arm, Turn, int]
 """Arm, turn and lane."""
 LEADERS: Final[Mapping[Role, Role]] = {"ego_behind": "ego", "other_behind": "other"}
-"""Those who follow → whom."""
+"""Role of a follower → role of its leader."""
 _LEADING: Final = tuple(LEADERS.values())
 _AGENTS: Final = (*_LEADING, *LEADERS)
 _AGENT_CATEGORIES: Final = ("car", "truck", "van", "motorcycle")
@@ -26,14 +26,14 @@ _FORBIDDEN: Final[Mapping[str, tuple[str, ...]]] = {
     _WALKING: ("turn", "lane", "gap", "ignores", "lane_change"),
     "parked": ("turn", "lane", "gap", "ignores", "max_speed", "delay", "lane_change"),
 }
-"""Role → fields that mean nothing for it."""
+"""Role → fields that it cannot have."""
 
 
 def check_scenario(root: Part) -> None:
-    """Check what the fields' types cannot say.
+    """Check what the fields' types alone cannot show.
 
     Raises:
-        ConfigError: there is something that cannot be, by at least one of its draws; the message names line and field.
+        ConfigError: at least one of its draws is impossible; the message names line and field.
     """
     actors = _actors(root)
     _check_roles(root, actors)
@@ -59,7 +59,7 @@ def _role(actor: Part) -> Role:
 
 def _check_roles(root: Part, actors: Sequence[Part]) -> None:
     if len(actors) > _MOST_ACTORS:
-        raise _fault(root, "actors", f"there are {len(actors)}, for which no road has room", f"keep {_MOST_ACTORS}")
+        raise _fault(root, "actors", f"there are {len(actors)}; no road has room for so many", f"keep {_MOST_ACTORS}")
     counts = Counter(_role(actor) for actor in actors)
     for role in _LEADING:
         if not counts[role]:
@@ -70,7 +70,7 @@ def _check_roles(root: Part, actors: Sequence[Part]) -> None:
 
 
 def _junctions(root: Part) -> tuple[Junction, ...]:
-    """One of each kind and number of lanes that can be drawn."""
+    """One junction of each kind and number of lanes that can be drawn."""
     pairs = {
         pair
         for road in root.values("road")
@@ -83,7 +83,7 @@ def _check_fields(actor: Part) -> None:
     role = _role(actor)
     for name in actor.fields:
         if name in _FORBIDDEN[role]:
-            raise _fault(actor, name, f"means nothing for the role {role}", "leave it out")
+            raise _fault(actor, name, f"is not possible for the role {role}", "leave it out")
     if role not in LEADERS and "from_arm" not in actor.fields:
         raise _fault(actor, "from_arm", f"is missing; the role {role} needs it", f"add one of {', '.join(ARMS)}")
 
@@ -114,7 +114,7 @@ def _check_way(actor: Part, junctions: Sequence[Junction]) -> None:
             raise _fault(actor, "from_arm", f"a {kind} junction has no {arm} arm", remedy)
         if _drives(actor) and turn not in junction.turns(arm):
             remedy = f"choose {' or '.join(junction.turns(arm))}"
-            raise _fault(actor, "turn", f"a {kind} junction has no way {turn} from the {arm} arm", remedy)
+            raise _fault(actor, "turn", f"nobody can go {turn} from the {arm} arm of a {kind} junction", remedy)
 
 
 def _drives(actor: Part) -> bool:
@@ -131,11 +131,12 @@ def _check_lane(actor: Part, junctions: Sequence[Junction]) -> None:
             sentence = "there is no other lane where the road has one lane in each direction"
             raise _fault(actor, "lane_change", sentence, "leave it out, or give the road two lanes")
         if set(actor.values("turn")) != {"straight"}:
-            raise _fault(actor, "lane_change", "goes with the turn straight alone", "leave it out, or go straight on")
+            sentence = "is possible only with the turn straight"
+            raise _fault(actor, "lane_change", sentence, "leave it out, or go straight on")
 
 
 def _check_roads(root: Part) -> None:
-    """Make every road, which checks itself."""
+    """Make every road that can be drawn; a road checks itself."""
     for road in root.values("road"):
         if isinstance(road, Part):
             for hump in road.values("hump"):
@@ -206,19 +207,19 @@ def _check_crossing(meeting: Part, first: Part, second: Part, junctions: Sequenc
 def _way_to_meet(one: _Way, other: _Way) -> str:
     """What to do about two ways that do not meet."""
     if (one[0], one[2]) == (other[0], other[2]):
-        return "who comes by the same lane follows; let one of them come by the other lane, with a lane_change"
+        return "in one lane they follow each other; let one of them come by the other lane, with a lane_change"
     return "change an arm, a turn or a lane"
 
 
 def _ways(actor: Part, junction: Junction) -> Iterator[_Way]:
-    """Arm, turn and lane of a driver, all that can be drawn."""
+    """Every arm, turn and lane of a driver that can be drawn."""
     for arm, turn in product(actor.values("from_arm"), actor.values("turn")):
         lanes = actor.values("lane") if "lane" in actor.fields else usual_lanes(turn, junction.spec.lanes)
         yield from ((arm, turn, lane) for lane in lanes)
 
 
 def usual_lanes(turn: Turn, lanes: int) -> range:
-    """From which of a road's lanes one does a turn."""
+    """The lanes of a road from which a turn is usually made."""
     return {"left": range(lanes - 1, lanes), "right": range(1), "straight": range(lanes)}[turn]
 
 

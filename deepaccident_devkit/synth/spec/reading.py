@@ -14,24 +14,24 @@ from deepaccident_devkit.synth.spec.yaml_nodes import Node
 from deepaccident_devkit.text import possible_text
 
 _SETTLED = {"name", "design", "exchange", "role"}
-"""Fields of which a file says one value: they decide what else it has to say."""
+"""Fields with one value, no range or list of choices: they decide which other fields the file needs."""
 _MOST = 1e9
-"""No number of a scenario is as large."""
+"""All numbers of a scenario are smaller."""
 _SHOWN_LENGTH = 80
-"""Of what was found, in a message."""
+"""The most characters of a found value that a message shows."""
 
 
 @dataclass(frozen=True, slots=True)
 class FieldType:
-    """What a field of the model can be.
+    """The possible values of a field of the model.
 
     Attributes:
         base: `str`, `bool`, `int`, `float`, a dataclass, or `tuple` for a list.
         optional: whether it can be null.
-        words: all that it can be, of a word that is not free.
-        bounds: of a number.
-        items: of a list: the type of each item, or of all of them if there is one.
-        length: of a list, if it is given.
+        words: the possible words; empty for a free text.
+        bounds: the bounds of a number.
+        items: of a list, the type of its items.
+        length: of a list, its length; None if any length is possible.
     """
 
     base: type[Any]
@@ -59,8 +59,7 @@ def read_part(node: Node, kind: type[Any], path: str = "") -> Part:
     """A part of a scenario, from a mapping.
 
     Raises:
-        ConfigError: it is no mapping, has a key that the part has not, lacks one that it needs, or a value is not
-            what its field takes.
+        ConfigError: it is no mapping, has an unknown key, lacks a required one, or a value does not fit its field.
     """
     entries = node.value
     if not isinstance(entries, Mapping):
@@ -102,7 +101,7 @@ def _read(node: Node, wanted: FieldType, path: str, *, settled: bool = False) ->
     if not isinstance(node.value, tuple):
         return _read_one(node, wanted, path)
     if settled:
-        raise _wrong(node, path, f"{_described(wanted)}, and not several", node)
+        raise _wrong(node, path, f"{_described(wanted)}, one value and not several", node)
     if wanted.base in (int, float):
         return _read_range(node, wanted, path)
     if not node.value:
@@ -160,7 +159,7 @@ def _wrong(node: Node, path: str, expected: str, found: Node, remedy: str = "") 
 
 
 def _meant(wanted: FieldType, value: object) -> str:
-    """The remedy where only quotes are wrong, or lacking."""
+    """The remedy if only quotes are wrong or missing."""
     if wanted.base is str and not wanted.words and not isinstance(value, Mapping | tuple) and value is not None:
         return "; put it in quotes"
     if wanted.base in (int, float) and isinstance(value, str) and _is_number(value):
@@ -176,7 +175,7 @@ def _is_number(text: str) -> bool:
 
 
 def _described(wanted: FieldType, found: object = None) -> str:
-    """A type in words; of a choice of words, those like the one found come first."""
+    """A type in words; for a choice of words, those similar to the found one come first."""
     if wanted.words:
         return f"one of {possible_text(str(found), wanted.words)}"
     if wanted.base is tuple and wanted.items is not None:

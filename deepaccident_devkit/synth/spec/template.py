@@ -1,4 +1,4 @@
-"""A scenario whose ranges and choices are still open, and drawing from it."""
+"""A scenario whose ranges and choices are still open, and how to draw from it."""
 
 from dataclasses import dataclass, replace
 from typing import cast
@@ -17,27 +17,27 @@ _EXCHANGED: dict[Role, Role] = {
 
 @dataclass(frozen=True, slots=True)
 class SpecTemplate:
-    """A scenario as a file says it.
+    """A scenario as a file describes it.
 
     Attributes:
-        root: what it says, checked.
+        root: the contents of the file, checked.
     """
 
     root: Part
 
     @property
     def name(self) -> str:
-        """The scenario's, for people."""
+        """The scenario's name, for readers."""
         return str(self.root.values("name")[0])
 
     @property
     def design(self) -> int | None:
-        """Which of the paper's twelve it is, if it is one."""
+        """Number of the paper's design, if it is one of the twelve."""
         return cast("int | None", self.root.values("design")[0])
 
     @property
     def meeting_roles(self) -> frozenset[Role]:
-        """Who is timed to meet; empty if nobody is."""
+        """The roles that are timed to meet; empty if there are none."""
         meetings = [meeting for meeting in self.root.values("meet") if isinstance(meeting, Part)]
         return frozenset(role for meeting in meetings for role in meeting_roles(meeting))
 
@@ -50,13 +50,13 @@ class SpecTemplate:
 def draw(template: SpecTemplate, rng: np.random.Generator) -> ScenarioSpec:
     """Make every choice of a scenario.
 
-    The four agents are there: followers that the file does not name are cars. Where the file asks for an exchange,
-    ego and other change places in half of the draws, and a four-way junction is then turned so that ego comes from the
-    arm from which it came before.
+    It always has all four vehicle agents: followers that the file does not name are cars. If the file asks for an
+    exchange, ego and other change places in half of the draws; a four-way junction is then turned, so that ego comes
+    from the same arm as before.
 
     Args:
-        template: of `read_spec`, or one of `DESIGNS`.
-        rng: random numbers; the same give the same scenario.
+        template: from `read_spec`, or one of `DESIGNS`.
+        rng: random numbers; the same numbers give the same scenario.
     """
     spec = cast("ScenarioSpec", template.root.draw(rng))
     named = cast("Items", template.root.fields["actors"]).items
@@ -79,7 +79,7 @@ def _completed(actor: ActorSpec, part: Part, spec: ScenarioSpec, rng: np.random.
 
 
 def _exchanged(spec: ScenarioSpec) -> ScenarioSpec:
-    """Ego in the place of other, and the reverse."""
+    """The scenario with ego in the place of other, and other in the place of ego."""
     came_from = spec.actor("ego").from_arm
     actors = tuple(replace(actor, role=_EXCHANGED.get(actor.role, actor.role)) for actor in spec.actors)
     meet = spec.meet
@@ -94,7 +94,7 @@ def _exchanged(spec: ScenarioSpec) -> ScenarioSpec:
 
 
 def _turned(spec: ScenarioSpec, quarters: int) -> ScenarioSpec:
-    """All arms so many quarter turns on, counter-clockwise."""
+    """The scenario with all arms turned by so many quarter turns, counter-clockwise."""
 
     def turned(arm: Arm) -> Arm:
         return ARMS[(ARMS.index(arm) + quarters) % len(ARMS)]

@@ -122,5 +122,5 @@ def test_a_scenario_in_which_nobody_meets_is_given_up(tmp_path, monkeypatch):
         "background: {vehicles: 0, two_wheelers: 0, parked: 0, walking: 0, crossing: 0}\n"
     )
     config = SynthConfig(scenarios=1, spec=file)
-    with pytest.raises(ConfigError, match=r"late: those of meet.actors did not collide in 2 draws; choose paths that"):
+    with pytest.raises(ConfigError, match=r"late: the two of meet.actors did not collide in 2 draws; choose paths"):
         build_scenario(config, plan_scenarios(config)[0])

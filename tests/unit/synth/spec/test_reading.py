@@ -41,7 +41,7 @@ def test_a_wrong_value_is_refused_with_line_and_field(with_other, entries, sente
     [
         ("actor: []", f"f.yaml:7: actor: no such field; possible: actors, {FIELDS.replace('actors, ', '')}"),
         ("design: 13", "design: expected a whole number, 1 to 12, found 13"),
-        ("exchange: [true, false]", "exchange: expected true or false, and not several"),
+        ("exchange: [true, false]", "exchange: expected true or false, one value and not several"),
         ("background: none", "f.yaml:7: background: expected keys and values, found 'none'"),
         (f"road: {{kerb_radius: {'9' * 400}}}", "road.kerb_radius: expected a number, found 9"),
         ("exchange: 'true'", "exchange: expected true or false, found 'true'; leave the quotes out"),
