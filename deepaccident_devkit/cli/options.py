@@ -52,7 +52,10 @@ def where_parameter(verb: Verb) -> Verb:
 def agents_parameter(verb: Verb) -> Verb:
     """Give a verb `agents`, the texts of repeated --agents (`agent_names` reads them)."""
     option = click.option(
-        "--agents", multiple=True, metavar="NAME[,NAME…]", help="Only samples of these agents.  [default: all]"
+        "--agents",
+        multiple=True,
+        metavar="NAME[,NAME…]",
+        help="Only samples of these agents; it does not choose who cooperates.  [default: all]",
     )
     return option(verb)
 
@@ -62,7 +65,7 @@ def agent_names(given: tuple[str, ...]) -> tuple[str, ...]:
     names = [name for text in given for name in text.split(",")]
     unknown = [name for name in names if name not in (*AGENTS, "all")]
     if unknown:
-        raise click.BadParameter(f"--agents: expected all or some of {', '.join(AGENTS)}; found {unknown[0]!r}")
+        raise click.BadParameter(f"--agents: whose samples: expected all or some of {', '.join(AGENTS)}; found {unknown[0]!r}")
     return AGENTS if not names or "all" in names else tuple(names)
 
 
