@@ -34,7 +34,7 @@ class SynthConfig:
             one it computes wrong camera geometry.
         layout: `A`, all splits in one folder, or `B`, one folder for each split.
         seed: the same seed gives the same bytes (on the same machine with the same package versions).
-        sensors: whether to write images, point clouds and BEV arrays besides labels, calib and meta.
+        sensors: whether to write images, point clouds and BEV arrays too, not only labels, calib and meta.
         view: `hidden` puts a house on the kerb of the corner between ego and other, who drive a little faster than
             with the view `open`. They see each other only about a second before they meet; the infrastructure sees
             both all the time. With None the scenario files decide.

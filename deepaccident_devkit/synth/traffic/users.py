@@ -121,7 +121,7 @@ class RoadUser:
         span: where the part of its path that may cross others begins and ends, metres; empty for a pedestrian who
             stays on the sidewalk.
         ignores: the rules that it breaks.
-        alert: seconds before a contact at which it notices the one whom it is timed to meet; 0 for never.
+        alert: seconds before a contact at which it notices the other one of the pair; 0 for never.
     """
 
     role: Role

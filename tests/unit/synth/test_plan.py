@@ -143,7 +143,7 @@ def test_a_hidden_view_has_designs_that_a_house_can_hide_and_faster_cars():
     spec = plans[0].draw(np.random.default_rng(0))
     assert spec.view == "hidden"
     assert all(12 <= spec.actor(role).max_speed <= 14 for role in ("ego", "other"))
-    with pytest.raises(ConfigError, match=r"view: hidden needs .* in 'unprotected left turn' it comes from opposite"):
+    with pytest.raises(ConfigError, match=r"view: hidden needs .* in 'unprotected left turn' it is on the side 'opp"):
         plans_of(view="hidden", designs=(3,))
 
 
