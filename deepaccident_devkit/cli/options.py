@@ -65,7 +65,9 @@ def agent_names(given: tuple[str, ...]) -> tuple[str, ...]:
     names = [name for text in given for name in text.split(",")]
     unknown = [name for name in names if name not in (*AGENTS, "all")]
     if unknown:
-        raise click.BadParameter(f"--agents: whose samples: expected all or some of {', '.join(AGENTS)}; found {unknown[0]!r}")
+        raise click.BadParameter(
+            f"--agents: expected all or some of {', '.join(AGENTS)}, whose samples are taken; found {unknown[0]!r}"
+        )
     return AGENTS if not names or "all" in names else tuple(names)
 
 

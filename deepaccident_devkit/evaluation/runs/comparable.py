@@ -89,8 +89,8 @@ def _check_rules(one: Bundle, other: Bundle) -> None:
         told = "; ".join(f"{where} {first!r} and {second!r}" for where, first, second in unlike[:_SHOWN])
         more = f", and {len(unlike) - _SHOWN} more" if len(unlike) > _SHOWN else ""
         raise EvaluationError(
-            f"{one.folder} and {other.folder}: were not evaluated by the same rules: {told}{more}; evaluate both in the "
-            "same way"
+            f"{one.folder} and {other.folder}: were not evaluated by the same rules: {told}{more}; evaluate both in "
+            "the same way"
         )
 
 
