@@ -317,7 +317,10 @@ def _product(sizes: FloatArray) -> FloatArray:
 def checked_boxes(name: str, boxes: object) -> Boxes:
     """`boxes` if they are `Boxes`; raises GeometryError."""
     if not isinstance(boxes, Boxes):
-        raise GeometryError(f"{name}: expected Boxes, found {type(boxes).__name__}; Boxes.from_arrays makes some")
+        raise GeometryError(
+            f"{name}: expected Boxes, found {type(boxes).__name__}; da.boxes(sample, frame=…) gives those of a sample, "
+            "Boxes.from_arrays makes some"
+        )
     return boxes
 
 

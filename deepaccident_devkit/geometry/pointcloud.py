@@ -115,7 +115,10 @@ class LidarPointCloud(FrozenArrays):
         if not distance >= 0:
             raise GeometryError(f"radius: expected metres from 0 on, found {radius}")
         if sensor is None and self.frame == "world":
-            raise GeometryError("a cloud in the world frame does not know its sensor; give sensor=(x, y, z)")
+            raise GeometryError(
+                "a cloud in the world frame does not know its sensor; give sensor=(x, y, z), or load the cloud with "
+                "frame='lidar' and remove there"
+            )
         place = checked("sensor", (0.0, 0.0, 0.0) if sensor is None else sensor, (3,))
         return self.select(np.hypot(*(self.xyz[:, :2] - place[:2]).T) >= distance)
 

@@ -182,6 +182,7 @@ class SE3(FrozenArrays):
         given = as_numbers("points", points, "points of shape (N, 3) or (3,), boxes or a point cloud")
         if given.ndim == 0 or given.ndim > 2 or given.shape[-1] != 3:
             hint = "; of a matrix (4, 4) make SE3(matrix)" if given.shape == (4, 4) else ""
+            hint = "; transpose it (.T)" if given.ndim == 2 and given.shape[0] == 3 else hint
             raise GeometryError(f"points: expected shape (N, 3) or (3,), found {given.shape}{hint}")
         with np.errstate(invalid="ignore"):
             return given @ self.rotation.T + self.translation
