@@ -12,12 +12,14 @@ from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.geometry.boxes import Boxes, checked_boxes
 from deepaccident_devkit.geometry.se3 import SE3
+from deepaccident_devkit.nuscenes_names import BOX, without_names
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 if TYPE_CHECKING:
     from pyquaternion import Quaternion
 
 
+@without_names(BOX)
 class Box:
     """One oriented box in a right-handed coordinate frame: a view of one row of `Boxes`.
 

@@ -25,6 +25,7 @@ from deepaccident_devkit.files import DAMAGED_ARCHIVE, replacing
 from deepaccident_devkit.geometry.bev_grid import BevGrid
 from deepaccident_devkit.geometry.frames import checked_frame
 from deepaccident_devkit.geometry.se3 import SE3, checked_transform
+from deepaccident_devkit.nuscenes_names import CLOUD, without_names
 
 Range = tuple[float, float]
 _FIELDS = ("xyz", "intensity", "frame")
@@ -32,6 +33,7 @@ _FAULTS = (*DAMAGED_ARCHIVE, TypeError, AttributeError)  # the last two: a bare 
 """The errors of reading a damaged file or one of another kind."""
 
 
+@without_names(CLOUD)
 @dataclass(frozen=True, slots=True, eq=False)
 class LidarPointCloud(FrozenArrays):
     """N points in one right-handed coordinate frame; arrays are read-only views.

@@ -9,9 +9,7 @@ from numpy.typing import ArrayLike
 
 from deepaccident_devkit.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays, checked
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import LidarPointCloud, PinholeCamera
-from deepaccident_devkit.taxonomy import CAMERAS
 from deepaccident_devkit.v2x.transforms import transform
 
 
@@ -106,11 +104,7 @@ def camera_of(dataset: Dataset, camera: RowArgument) -> PinholeCamera:
         TokenError: no such sensor file.
         ChoiceError: the sensor is no camera.
     """
-    record = dataset.get("sample_data", camera)
-    if record["modality"] != "camera":
-        raise ChoiceError(f"camera: expected one of {', '.join(CAMERAS)}, found {record['channel']}")
-    sensor = dataset.get("calibrated_sensor", record["calibrated_sensor_token"])
-    return PinholeCamera(np.array(sensor["camera_intrinsic"]), record["width"], record["height"])
+    return dataset.camera(camera)
 
 
 def _colors_at(image: ByteArray, lens: PinholeCamera, pixels: FloatArray, mask: BoolArray) -> ByteArray:
