@@ -8,11 +8,12 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 from tiny import NAME, TYPE, write_tiny_release
 
-from deepaccident_devkit import DeepAccident
+from deepaccident_devkit import DeepAccident, __version__
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, LabelFiles, MotionLabelConfig
 from deepaccident_devkit.release import read_split_file
@@ -88,7 +89,17 @@ def test_help_names_the_verbs_and_wrong_usage_is_status_2() -> None:
         assert verb in text
     assert runner.invoke(deepaccident, ["info"]).exit_code == 2
     assert runner.invoke(deepaccident, ["dance"]).exit_code == 2
-    assert "0.1.0" in runner.invoke(deepaccident, ["--version"]).output
+    assert runner.invoke(deepaccident, ["--version"]).output == f"deepaccident, version {__version__}\n"
+    assert runner.invoke(deepaccident, ["--all"]).exit_code == 2
+
+
+def test_versions_for_a_report() -> None:
+    lines = [line.split() for line in CliRunner().invoke(deepaccident, ["--version", "--all"]).output.splitlines()]
+    told = {words[0]: words[1:] for words in lines}
+    assert told["deepaccident"] == [__version__]
+    assert told["numpy"] == [np.__version__]
+    assert {"Python", "system", "torch", "mcap"} <= told.keys()
+    assert told.keys().isdisjoint({"ruff", "sphinx", "deepaccident_devkit"})
 
 
 @pytest.mark.slow

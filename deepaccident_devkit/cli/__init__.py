@@ -8,8 +8,8 @@ import sys
 
 import click
 
-from deepaccident_devkit._version import __version__
 from deepaccident_devkit.cli.groups import ModuleVerbs
+from deepaccident_devkit.cli.versions import version_text
 from deepaccident_devkit.errors import DeepAccidentError
 
 _ERROR_STATUS = 2
@@ -37,11 +37,20 @@ _VERBS = (
     cls=ModuleVerbs,
     package=__name__,
     verbs=_VERBS,
+    invoke_without_command=True,
+    no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-@click.version_option(__version__, prog_name="deepaccident")
-def deepaccident() -> None:
+@click.option("--version", is_flag=True, help="Show the version and exit.")
+@click.option("--all", "every", is_flag=True, help="With --version: also the versions of Python and all libraries.")
+@click.pass_context
+def deepaccident(context: click.Context, version: bool, every: bool) -> None:
     """Tools for the DeepAccident V2X accident dataset."""
+    if version:
+        click.echo(version_text(every=every))
+        context.exit()
+    if every:
+        raise click.UsageError("--all needs --version")
 
 
 def main() -> None:

@@ -1,0 +1,145 @@
+"""The repository's furniture says what is so: citation, hooks, workflow, templates, and what a wheel and an sdist hold."""
+
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+import yaml
+from click import Group
+from click.testing import CliRunner
+from test_words import TOP
+
+from deepaccident_devkit import __version__
+from deepaccident_devkit.cli import deepaccident
+
+CI = (TOP / ".ci" / "run").read_text(encoding="utf-8")
+PYPROJECT = (TOP / "pyproject.toml").read_text(encoding="utf-8")
+TEMPLATES = sorted((TOP / ".github" / "ISSUE_TEMPLATE").glob("*.yml"))
+BUILT = ("pyproject.toml", "setup.py", "MANIFEST.in", "README.md", "LICENSE", "CHANGELOG.md", "CITATION.cff")
+
+
+def parsed(path: Path) -> dict:
+    return yaml.safe_load(path.read_text(encoding="utf-8"))
+
+
+def test_the_citation_is_of_this_version_and_of_the_paper() -> None:
+    citation = parsed(TOP / "CITATION.cff")
+    assert citation["version"] == __version__
+    paper = citation["preferred-citation"]
+    readme = " ".join((TOP / "README.md").read_text(encoding="utf-8").split())
+    assert paper["title"] in readme
+    assert paper["url"] in readme
+
+
+def test_the_hooks_are_checks_of_ci() -> None:
+    [local] = parsed(TOP / ".pre-commit-config.yaml")["repos"]
+    for hook in local["hooks"]:
+        command = hook["entry"].removesuffix(" --force-exclude")
+        assert re.search(rf"^{re.escape(command)}( \.)?$", CI, re.MULTILINE), hook["id"]
+
+
+def test_the_workflow_runs_ci_on_every_python() -> None:
+    job = parsed(TOP / ".github" / "workflows" / "ci.yml")["jobs"]["ci"]
+    assert job["strategy"]["matrix"]["python"] == re.findall(r"Python :: (3\.\d+)", PYPROJECT)
+    assert "bash .ci/run" in [step.get("run") for step in job["steps"]]
+
+
+@pytest.mark.parametrize("path", TEMPLATES, ids=lambda path: path.name)
+def test_the_templates_ask_for_commands_that_exist(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    commands = re.findall(r"`deepaccident ([^`]*)`", text)
+    assert ("--version --all" in commands) == (path.name != "config.yml")
+    for command in commands:
+        verb = command.split()[0]
+        words = [verb, "--help"] if isinstance(deepaccident, Group) and not verb.startswith("-") else command.split()
+        result = CliRunner().invoke(deepaccident, words)
+        assert result.exit_code == 0
+        assert all(word in result.output for word in command.split()[1:] if word.startswith("--") and verb[0] != "-")
+
+
+@pytest.fixture(scope="module")
+def distributions(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a wheel and an sdist, built from a copy without network."""
+    pytest.importorskip("setuptools", minversion="77")
+    source = tmp_path_factory.mktemp("source")
+    for name in BUILT:
+        shutil.copy(TOP / name, source)
+    unwanted = shutil.ignore_patterns("__pycache__")
+    shutil.copytree(TOP / "deepaccident_devkit", source / "deepaccident_devkit", ignore=unwanted)
+    (source / "tests").mkdir()
+    shutil.copy(__file__, source / "tests")
+    code = "from setuptools import build_meta as b; b.build_wheel('dist'); b.build_sdist('dist')"
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], cwd=source, check=True, capture_output=True)
+    return source / "dist"
+
+
+def package_files() -> set[str]:
+    return {
+        path.relative_to(TOP).as_posix()
+        for path in (TOP / "deepaccident_devkit").rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+
+
+@pytest.mark.slow
+def test_a_wheel_holds_the_package_and_nothing_else(distributions: Path) -> None:
+    [wheel] = distributions.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+    assert {name for name in names if ".dist-info/" not in name} == package_files()
+    assert "deepaccident_devkit/py.typed" in names
+    assert {name.rpartition("/")[2] for name in names if ".dist-info/" in name} == {
+        "LICENSE",
+        "METADATA",
+        "RECORD",
+        "WHEEL",
+        "entry_points.txt",
+        "top_level.txt",
+    }
+
+
+@pytest.mark.slow
+def test_an_sdist_holds_the_package_and_what_builds_it(distributions: Path) -> None:
+    [sdist] = distributions.glob("*.tar.gz")
+    with tarfile.open(sdist) as archive:
+        names = {each.name.partition("/")[2] for each in archive.getmembers() if each.isfile()}
+    made = {"PKG-INFO", "setup.cfg"}
+    assert {name for name in names if ".egg-info/" not in name} == package_files() | set(BUILT) | made
+
+
+STRANGER = """
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.geometry import Boxes
+
+da = DeepAccident(dataroot="release")
+boxes: Boxes = da.boxes(da.samples("train", "evaluate")[0], frame="ego")
+reveal_type(boxes.center)
+reveal_type(da.get_sample)
+boxes.no_such_field
+"""
+
+
+@pytest.mark.slow
+def test_a_strangers_type_checker_reads_the_types(distributions: Path, tmp_path: Path) -> None:
+    """`py.typed` ships in the wheel, and annotations reach those who use the package."""
+    pytest.importorskip("mypy")
+    environment = tmp_path / "environment"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", environment], check=True)
+    [installed] = environment.glob("lib/python*/site-packages")
+    [wheel] = distributions.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(installed)
+    (installed / "libraries.pth").write_text(sysconfig.get_path("purelib"), encoding="utf-8")
+    (tmp_path / "stranger.py").write_text(STRANGER, encoding="utf-8")
+    command = [sys.executable, "-m", "mypy", "--strict", "--python-executable", environment / "bin" / "python"]
+    found = subprocess.run([*command, "stranger.py"], cwd=tmp_path, capture_output=True, text=True, check=False).stdout
+    assert re.search(r'Revealed type is "numpy\.ndarray\[', found), found
+    assert "def (" in found
+    assert '"Boxes" has no attribute "no_such_field"' in found
+    assert found.rstrip().endswith("Found 1 error in 1 file (checked 1 source file)")
