@@ -231,7 +231,7 @@ def test_stats_of_nothing(own_release: Path, tmp_path: Path) -> None:
     assert "no scenario meets the filters, so there is nothing to count" in nothing.stdout
     failed = run("stats", own_release, "--where", "length=1..2", "--out", tmp_path / "new")
     assert (failed.returncode, failed.stdout) == (2, "")
-    assert "no scenario meets --where, so there is nothing to write" in failed.stderr
+    assert "no scenario matches --where, so there is nothing to write" in failed.stderr
     assert not (tmp_path / "new").exists()
 
 
@@ -244,14 +244,14 @@ def test_labels_writes_a_split_and_goes_on_where_it_stopped(own_release: Path, t
     scenarios = release.split_scenarios("train")
     assert (made.returncode, made.stdout) == (
         0,
-        f"{8 * len(scenarios)} samples in {out}: {2 * len(scenarios)} files written, 0 were there\n",
+        f"{8 * len(scenarios)} samples in {out}: {2 * len(scenarios)} files written, 0 were there already\n",
     ), made.stderr
     assert "motion labels: 100%" in made.stderr
     rules = replace(LABEL_PROTOCOLS["released"], half_cell_shift=False, own_box_default=False)
     files = LabelFiles(out, MotionLabelConfig(protocol=rules))
     assert {token.rsplit("/", 1)[0] for token in files} == {f"{one}/{agent}" for one in scenarios for agent in agents}
     kept = run(*verb, "--agents", "infrastructure", "--switch", "half_cell_shift=no", "--switch", "own_box_default=no")
-    assert (kept.returncode, f"0 files written, {len(scenarios)} were there" in kept.stdout) == (0, True)
+    assert (kept.returncode, f"0 files written, {len(scenarios)} were there already" in kept.stdout) == (0, True)
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     other = run(*verb, "--protocol", "clean")
     assert (other.returncode, other.stdout) == (2, "")
@@ -311,7 +311,7 @@ def test_labels_of_what_has_none(tmp_path: Path) -> None:
     write_tiny_release(tmp_path / "partial", agents=("ego_vehicle",))
     verb = ("labels", tmp_path / "partial", "--split", tmp_path / "mine.txt", "--out", tmp_path / "labels")
     for options, told in {
-        ("--agents", "infrastructure"): "has no such samples of infrastructure with labels",
+        ("--agents", "infrastructure"): "has no labelled samples of infrastructure for --samples",
         ("--seen-by", "+other"): "agents: other_vehicle is not in this release",
     }.items():
         failed = run(*verb, *options)

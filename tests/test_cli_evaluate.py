@@ -226,7 +226,7 @@ class TestCompare:
         with pytest.raises(EvaluationError, match=r"samples only in .*; evaluate both at the same samples"):
             evaluate("compare", two[0], bundle)
         text = evaluate("compare", *two, "--out", tmp_path / "numbers.txt", status=2).output
-        assert "--out: expected a file ….csv or ….json" in text
+        assert "--out: expected a file that ends in .csv or .json" in text
 
 
 class TestValidate:

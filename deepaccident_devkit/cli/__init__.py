@@ -1,4 +1,4 @@
-"""The command line: `deepaccident <verb>`, one module a verb.
+"""The command line: `deepaccident <verb>`, one module for each verb.
 
 A verb parses, makes one library call and prints. Exit status: 0 good, 1 findings, 2 error.
 """

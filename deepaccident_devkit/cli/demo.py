@@ -18,10 +18,11 @@ from deepaccident_devkit.synth import SynthConfig, make_release
 _RELEASE = SynthConfig(scenarios=2, frames=40, image_size=(320, 180), view="hidden")
 _SECONDS_BEFORE = 1.0
 _LABELS = MotionLabelConfig(future_frames=2)
-"""The released ones up to the impact."""
+"""The released labels, but they end at the impact."""
 _HIDDEN = """\
-A house hides the other car from the ego vehicle. What either foresees of the crash if all that it sees goes on at its
-speed (a baseline, docs/baselines.md; warning: from when on every moment has the right alarm):
+A house hides the other car from the ego vehicle. This table shows how well one car, and five agents together, predict
+the crash. The predictor is a baseline: each actor that is seen keeps its speed (docs/baselines.md). "warning" is the
+time before the impact from which every moment has the right alarm:
 """
 
 

@@ -52,7 +52,7 @@ def evaluate() -> None:
 
 
 def _threshold_options(task: TaskName) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Where the task is warnings: which bundle of another split says from which score on there is an alarm."""
+    """For the task `warning`: options that take the alarm threshold from the bundle of another split."""
     if task != "warning":
         return lambda verb: verb
     options = (
@@ -169,7 +169,7 @@ def _evaluate(setup: EvaluationSetup, results: Path, *, by: tuple[str, ...], as_
 def _examined(
     run: EvaluationRun, dataset: DeepAccident, results: Results, options: dict[str, Any]
 ) -> tuple[EvaluationRun, list[str]]:
-    """The run with the examinations that were asked for, and their texts."""
+    """The run with the requested checks (sanity, explanation), and their texts."""
     texts, tokens, workers = [], sorted(run.evaluator.tokens), options["workers"]
     if options["sanity"]:
         report = check_sanity(dataset, results, run.setup, tokens, workers=workers)

@@ -1,4 +1,4 @@
-"""`deepaccident evaluate validate|verify|compare`: results files before, and evaluations after they are made."""
+"""`deepaccident evaluate validate|verify|compare`: check results; repeat or compare evaluations."""
 
 import json
 import sys
@@ -33,7 +33,7 @@ _workers = click.option("--workers", type=click.IntRange(min=1), help="Number of
 def validate(results: Path, dataroot: Path | None, version: str, workers: int | None, **options: Any) -> None:
     """Check every entry of the results file or folder RESULTS, and print a summary.
 
-    Exit status 1: with --dataroot, samples of --split are missing or there are others. 2: an entry is wrong.
+    Exit status 1: with --dataroot, samples of --split are missing, or RESULTS has others. 2: an entry is wrong.
     """
     opened = read_results(results)
     opened.check(workers=workers, progress=True)
@@ -91,7 +91,7 @@ def verify(
 def compare(a: Path, b: Path, common: bool, resamples: int, out: Path | None, as_json: bool) -> None:
     """Compare the evaluations in the folders A and B, and test which differences are statistically significant."""
     if out is not None and out.suffix not in (".csv", ".json"):
-        raise click.BadParameter(f"--out: expected a file ….csv or ….json, found {str(out)!r}")
+        raise click.BadParameter(f"--out: expected a file that ends in .csv or .json, found {str(out)!r}")
     comparison = compare_bundles(a, b, Resampling(resamples=resamples), common=common)
     as_text = json.dumps(comparison.as_dict(), indent=1)
     click.echo(as_text if as_json else comparison.to_text())

@@ -63,7 +63,7 @@ def selection_of(setup: EvaluationSetup, options: Mapping[str, Any]) -> SampleSe
 
 
 def switches_of(texts: tuple[str, ...]) -> dict[str, Any]:
-    """The choices that repeated --switch NAME=VALUE name; values as JSON has them, other words as they are."""
+    """The names and values of repeated --switch NAME=VALUE; a value that is no JSON stays a text."""
     switches: dict[str, Any] = {}
     for text in texts:
         name, equals, value = text.partition("=")

@@ -1,4 +1,4 @@
-"""Groups of verbs: those that are imported when they are asked for, and a verb with further verbs below it."""
+"""Groups of verbs: one imports a verb only when it is needed, the other is a verb with further verbs below it."""
 
 from collections.abc import Sequence
 from importlib import import_module
@@ -8,16 +8,16 @@ import click
 
 
 class ModuleVerbs(click.Group):
-    """Verbs that lie in modules of their names: each imports what it needs, and none waits for the others' imports."""
+    """Verbs that lie in modules of the same names: only the module of the verb that is run is imported."""
 
     def __init__(self, *arguments: Any, package: str, verbs: Sequence[str], **options: Any) -> None:
-        """Take what `click.Group` takes, and the names of modules of a package that hold a verb of the same name."""
+        """Take what `click.Group` takes, a package, and names of modules in it; each holds a verb of the same name."""
         super().__init__(*arguments, **options)
         self._package = package
         self._verbs = tuple(verbs)
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
-        """The verbs by their alphabet, as click lists commands."""
+        """The verbs in alphabetical order, as click lists commands."""
         return sorted(self._verbs)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002 - click's signature
@@ -29,9 +29,9 @@ class ModuleVerbs(click.Group):
 
 
 class VerbGroup(click.Group):
-    """A group that is a verb itself: words that begin with none of its subcommands are its own arguments.
+    """A group that is a verb itself: if the first word is no subcommand, all words are its own arguments.
 
-    An argument that is called like a subcommand can be given as a path: `./info`.
+    An argument with the name of a subcommand can be given as a path: `./info`.
     """
 
     allow_extra_args = False
@@ -44,7 +44,7 @@ class VerbGroup(click.Group):
     def make_context(
         self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
     ) -> click.Context:
-        """The context of the subcommand that the first word names, else of the verb itself."""
+        """The context of the subcommand that the first word names; if there is none, that of the verb itself."""
         if args and args[0] in self.commands:
             name, *rest = args
             return self.commands[name].make_context(f"{info_name} {name}", rest, parent, **extra)

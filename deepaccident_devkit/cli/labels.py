@@ -69,9 +69,9 @@ def labels(split: str, out: str, agents: tuple[str, ...], purpose: Purpose, **op
     dataset = DeepAccident(**options)
     tokens = [token for token in dataset.samples(split, purpose) if token.rsplit("/", 2)[1] in chosen]
     if not tokens:
-        raise NotAvailableError(f"{split}: has no such samples of {', '.join(chosen)} with labels")
+        raise NotAvailableError(f"{split}: has no labelled samples of {', '.join(chosen)} for --samples {purpose}")
     done = write_label_files(dataset, out, tokens, config, workers=options["workers"], progress=True)
-    click.echo(f"{done.samples:,} samples in {out}: {done.written} files written, {done.kept} were there")
+    click.echo(f"{done.samples:,} samples in {out}: {done.written} files written, {done.kept} were there already")
 
 
 def _config(

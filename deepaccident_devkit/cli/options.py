@@ -1,4 +1,4 @@
-"""The arguments that every verb on a release takes, in one grammar."""
+"""The arguments that every verb on a release takes, the same for all verbs."""
 
 import re
 from collections.abc import Callable
@@ -58,7 +58,7 @@ def agents_parameter(verb: Verb) -> Verb:
 
 
 def agent_names(given: tuple[str, ...]) -> tuple[str, ...]:
-    """The agents that --agents names, each text one or several with commas; all for `all`, or for nothing."""
+    """The agents of repeated --agents, each text one name or several with commas; `all` or no text means all."""
     names = [name for text in given for name in text.split(",")]
     unknown = [name for name in names if name not in (*AGENTS, "all")]
     if unknown:
@@ -67,7 +67,7 @@ def agent_names(given: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def names_or_configuration(given: tuple[str, ...]) -> str | list[str] | None:
-    """What repeated --agents means where agents cooperate: one configuration, names, or None if it was not given."""
+    """Repeated --agents for agents that cooperate: one configuration, names, or None if it was not given."""
     names = [name for text in given for name in text.split(",")]
     return names[0] if len(names) == 1 and names[0] in AGENT_CONFIGS else names or None
 

@@ -1,4 +1,4 @@
-"""`deepaccident render`: pictures and videos of a release, a verb a view."""
+"""`deepaccident render`: pictures and videos of a release, one verb for each view."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -38,10 +38,11 @@ _OUT = f"File to write ({', '.join(PICTURE_SUFFIXES)}), or a folder for several 
 
 
 def _linked(draw: Callable[..., Any]) -> Callable[..., Any]:
-    """A function that takes `link`, as one that takes --latency, --pose-noise and --seed."""
+    """Turn a function that takes `link` into one that takes --latency, --pose-noise and --seed."""
 
     def drawn(dataset: Dataset, token: str, *, latency: float, pose_noise: float, seed: int, **choices: Any) -> Any:
-        link = Link(latency=latency, pose_noise=pose_noise or None, seed=seed)  # noise of 0 m would still spread
+        noise = pose_noise or None  # noise with a mean of 0 m would still have a spread
+        link = Link(latency=latency, pose_noise=noise, seed=seed)
         return draw(dataset, token, link=link, **choices)
 
     return drawn
@@ -52,7 +53,7 @@ def _evaluated(dataset: Dataset, token: str, *, results: Path, **choices: Any) -
 
 
 def _words(given: Sequence[str]) -> list[str] | None:
-    """The words of repeated texts with commas; None if there are none."""
+    """The words of repeated texts, split at commas; None if there are no texts."""
     return [word for text in given for word in text.split(",")] or None
 
 
@@ -83,7 +84,9 @@ _AGENTS = click.option(
     help=f"Agents, or one of {', '.join(AGENT_CONFIGS)}.  [default: chosen by the view]",
 )
 _VIEW_RANGE = click.option("--view-range", type=float, metavar="M", help="Metres to show on each side.")
-_COORDINATES = click.option("--frame", type=click.Choice(get_args(Frame)), help="Frame of the axes.  [default: ego]")
+_COORDINATES = click.option(
+    "--frame", type=click.Choice(get_args(Frame)), help="Coordinate frame of the axes.  [default: ego]"
+)
 _LAYERS = click.option(
     "--layers",
     multiple=True,
@@ -100,9 +103,9 @@ class _Picture:
     """A view that is rendered into a picture.
 
     Attributes:
-        draw: the function of the render package, or one about it.
-        of: the table whose rows it draws.
-        canvas: `fig` if it draws on a figure, `ax` if on axes.
+        draw: the function of the render package, or one that calls it.
+        of: the table whose rows it renders.
+        canvas: `fig` if it renders into a figure, `ax` if into axes.
         options: of this verb.
         help: the first line of the verb's help.
         default: what is rendered without a token.
@@ -118,7 +121,7 @@ class _Picture:
     def drawn(
         self, dataset: Dataset, row: str, size: tuple[int, int] | None, dpi: float, choices: dict[str, Any]
     ) -> Any:
-        """Render a row on a figure of a size in pixels, or on one as large as the view wants."""
+        """Render a row into a figure of the given size in pixels, or of the view's own size."""
         canvas = {}
         if size is not None:
             figure = figure_of_pixels(*size, dpi=dpi)
@@ -259,7 +262,7 @@ _PICTURES = {
 @click.group()
 def render() -> None:
     """Render pictures of a release, one command per view; `video` makes a video of them."""
-    os.environ.setdefault("MPLBACKEND", "Agg")  # files alone: no window system is asked for anything
+    os.environ.setdefault("MPLBACKEND", "Agg")  # only files are written, so no window system is needed
 
 
 def _verb(name: str, picture: _Picture) -> click.Command:
@@ -302,7 +305,7 @@ def _verb(name: str, picture: _Picture) -> click.Command:
             save_picture(picture.drawn(dataset, row, size, dpi, choices), path, dpi=dpi)
             click.echo(f"rendered: {row} in {path}")
 
-    for option in picture.options:  # of a command they are appended, of a function they would come in front
+    for option in picture.options:  # on a command they come last, on a function they would come first
         verb = option(verb)
     return verb
 

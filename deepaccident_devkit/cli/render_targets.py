@@ -24,16 +24,16 @@ def rows_to_draw(dataset: Dataset, table: str, tokens: Sequence[str], frames: ra
 
     Args:
         dataset: the release.
-        table: what the verb renders.
-        tokens: of rows of this table, or of scenarios: their first agent at some of their frames, and there the actor
-            that it collides with. None at all stands for the first accident.
-        frames: numbers of scenarios' frames; None for one second before their end.
+        table: the table whose rows the verb renders.
+        tokens: of rows of this table or of scenarios. A scenario stands for its first agent at `frames`, and for the
+            actor that this agent collides with. No tokens stand for the first accident.
+        frames: frame numbers of the scenarios; None for one second before their end.
 
     Raises:
         TokenError: no such scenario.
         ChoiceError: a scenario does not have such frames.
         NotAvailableError: there is no accident, or the moment has no boxes.
-        click.UsageError: `frames` are given for what is no moment of a scenario.
+        click.UsageError: `frames` are given, but the table or a token has no frames to choose from.
     """
     if frames is not None and table in ("scenario", "instance"):
         raise click.UsageError(f"--frame-range is for moments; a whole {table} is rendered, leave it out")
@@ -66,7 +66,7 @@ def _of_scenario(dataset: Dataset, table: str, token: str, frames: range | None)
 
 
 def _instance(dataset: Dataset, scenario: str) -> str:
-    """The actor that the first agent collides with, else the first actor that there is."""
+    """The actor that the first agent collides with; without a collision, the scenario's first actor."""
     record = dataset.get("scenario", scenario)
     if record["collision"] is None:
         return dataset.field2token("instance", "scenario_token", scenario)[0]
@@ -76,17 +76,17 @@ def _instance(dataset: Dataset, scenario: str) -> str:
 
 
 def _annotation(dataset: Dataset, sample: str) -> str:
-    """Of the colliding pair the one that the sample's agent is not, else the box with the most LiDAR points."""
+    """The box of a colliding actor that is not the sample's agent, or the box with the most LiDAR points."""
     boxes = dataset.boxes(sample)
     boxes = boxes.select(boxes.actor_id != OWN_ACTOR_ID)
     if not len(boxes):
-        raise NotAvailableError(f"{sample}: has no boxes of others; name an annotation")
+        raise NotAvailableError(f"{sample}: has no boxes of other actors; name an annotation")
     collides = np.isin(boxes.actor_id, list(collider_ids(dataset, sample)))
     return annotation_token(sample, int(boxes.row[np.lexsort((boxes.num_lidar_pts, collides))[-1]]))
 
 
 def picture_paths(out: Path, view: str, rows: Sequence[str]) -> list[Path]:
-    """Where the pictures of rows go: the file `out` for a single one, else files in the folder `out`.
+    """Where the pictures of rows go: the file `out` for a single picture, or files in the folder `out`.
 
     Raises:
         click.UsageError: several pictures for one file.

@@ -1,4 +1,4 @@
-"""`deepaccident split`: the official split, made again, or the scenarios that filters let through."""
+"""`deepaccident split`: the official split, made again, or the scenarios that match filters."""
 
 from pathlib import Path
 from typing import Any
@@ -59,11 +59,11 @@ def split(
 
 
 def _refuse(*parameters: str) -> None:
-    """End with a usage error if one of these options, which a selection has no use for, was given."""
+    """End with a usage error if one of these options was given: a selection does not use them."""
     context = click.get_current_context()
     for name in parameters:
         if context.get_parameter_source(name) is not ParameterSource.DEFAULT:
             option = f"--{name.replace('_', '-')}"
             raise click.UsageError(
-                f"{option} is for the official split; --where shuffles nothing, leave one of them out"
+                f"{option} is for the official split and has no effect with --where; leave one of them out"
             )

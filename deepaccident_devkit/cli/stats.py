@@ -28,7 +28,7 @@ from deepaccident_devkit.statistics import dataset_statistics, writable_folder
 def stats(
     where: tuple[str, ...], out: str | None, formats: tuple[PictureFormat, ...], as_json: bool, **release: Any
 ) -> None:
-    """Print the paper's statistics of the release in DATAROOT by split: scenarios, actors, boxes, ends.
+    """Print the paper's statistics of the release in DATAROOT by split: scenarios and their ends, actors, boxes.
 
     With --out, also write them into files. Earlier statistics in that folder are replaced.
     """
@@ -37,7 +37,7 @@ def stats(
     dataset = DeepAccident(**release)
     chosen = dataset.find(*where) if where else None
     if out is not None and chosen == []:
-        raise click.UsageError("no scenario meets --where, so there is nothing to write; change it or leave --out away")
+        raise click.UsageError("no scenario matches --where, so there is nothing to write; change it or omit --out")
     statistics = dataset_statistics(dataset, chosen)
     folder = None if out is None else writable_folder(out)
     click.echo(statistics.to_json() if as_json else statistics.to_text())

@@ -48,8 +48,8 @@ def _show_design(context: click.Context, _parameter: click.Parameter, number: in
     "--image-size",
     callback=pixel_size,
     metavar="WxH",
-    help="Size of the camera images in pixels. The real ones have 1600x900, and the released DeepAccident code takes "
-    "that for granted: with another size it computes wrong camera geometry.  [default: {}x{}; {}x{} with "
+    help="Size of the camera images in pixels. The real ones have 1600x900, and the released DeepAccident code assumes "
+    "this size: with another size it computes wrong camera geometry.  [default: {}x{}; {}x{} with "
     "--for-released-code]".format(*IMAGE_SIZE, *RELEASED_IMAGE_SIZE),
 )
 @click.option(

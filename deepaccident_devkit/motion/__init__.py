@@ -1,4 +1,4 @@
-"""Motion labels and model outputs: FIERY-style maps of the bird's-eye view, and what is read off them.
+"""Motion labels and model outputs: FIERY-style maps of the bird's-eye view, and what is computed from them.
 
 The way of a label, from a release to a model, and of a model's outputs to instances:
 
@@ -9,7 +9,7 @@ The way of a label, from a release to a model, and of a model's outputs to insta
 | which cells those are | polygons → cells | `drawing.polygon_fill` |
 | ids, centres, flow | cells → centres here and at the next frame | `drawing.from_boxes` |
 | maps | cells and centres → `MotionLabels` | `drawing.label_maps`, `labels` |
-| all frames in the present one | `MotionLabels` → the same, warped | `warps.to_present` |
+| all frames in the present ego frame | `MotionLabels` → the same, warped | `warps.to_present` |
 | to another code, to disk | `MotionLabels` → batches; files | `batch_names`; `label_files` |
 | a prediction | arrays → `MotionHeads` | `postprocessing.heads` |
 | instances of a frame | heads → centres, and cells by centre | `postprocessing.grouping` |
@@ -17,8 +17,8 @@ The way of a label, from a release to a model, and of a model's outputs to insta
 | boxes along the paths | linked instances → their redrawn maps | `postprocessing.redrawing` |
 
 A `MotionLabelConfig` (`config`) says what is rasterised, a `LabelProtocol` how (`protocols`: every quirk of the
-released code a switch), how cells lie by a grid's orientation (`orientations`). `warps.feature_warps` moves a model's
-own maps as labels are moved.
+released code is a switch), and a grid's orientation how cells lie (`orientations`). `warps.feature_warps` warps a
+model's own maps as labels are warped.
 """
 
 from deepaccident_devkit.motion.augmentation import Augmentation

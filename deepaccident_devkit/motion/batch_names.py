@@ -10,10 +10,11 @@
 | future_egomotion (R, 6) | future_egomotion (R, 6) | future_egomotions (R, 6) | – |
 | valid (R,) | – | img_is_valid (R,), has_invalid_frame | – |
 
-Whole numbers are int64 there, all else float32; one sample has no batch axis. FIERY's maps start with the past frames,
-which its trainer cuts off: they are empty here. FIERY's cells lie as `fiery`, BEVerse's as `devkit`, and DeepAccident
-keeps CARLA's left-handed frames, `released`, in its egomotion too. Sources: fiery/data.py and fiery/trainer.py of
-wayveai/fiery; projects/mmdet3d_plugin/datasets of zhangyp15/BEVerse and of tianqi-wang1996/DeepAccident.
+Whole numbers are int64 there, all others float32; one sample has no batch axis. FIERY's maps start with the past
+frames, which its trainer cuts off: they are empty here. The orientation of FIERY's cells is `fiery`, of BEVerse's
+`devkit`, and of DeepAccident's `released`: it keeps CARLA's left-handed coordinate frames, in its egomotion too.
+Sources: fiery/data.py and fiery/trainer.py of wayveai/fiery; projects/mmdet3d_plugin/datasets of zhangyp15/BEVerse and
+of tianqi-wang1996/DeepAccident.
 """
 
 from __future__ import annotations
@@ -112,12 +113,12 @@ def to_batch(labels: Mapping[str, AnyArray], config: MotionLabelConfig, names: B
 
 
 def from_batch(batch: Mapping[str, Any], config: MotionLabelConfig, names: BatchNames) -> dict[str, AnyArray]:
-    """Our maps, `future_egomotion` and `valid` of one sample of a code; what `to_batch` gives, back.
+    """Our maps, `future_egomotion` and `valid` from one sample of another code: the reverse of `to_batch`.
 
     Args:
         batch: a sample, without a batch axis, of any framework's arrays (`arrays.as_numbers`).
         config: what the labels were made with.
-        names: whose names they are.
+        names: the code whose names they are.
 
     Raises:
         ChoiceError: no such code.
@@ -156,13 +157,13 @@ def from_batch(batch: Mapping[str, Any], config: MotionLabelConfig, names: Batch
 
 
 def config_from_names(settings: Mapping[str, Any], names: BatchNames) -> MotionLabelConfig:
-    """The label configuration that a code's own settings mean, on top of the preset of that name.
+    """A code's preset, changed as the code's own settings say.
 
-    FIERY's are its `cfg` as nested dictionaries (TIME_RECEPTIVE_FIELD, N_FUTURE_FRAMES, LIFT.X_BOUND, LIFT.Y_BOUND,
-    DATASET.IGNORE_INDEX, DATASET.FILTER_INVISIBLE_VEHICLES); BEVerse's and DeepAccident's `receptive_field`,
-    `future_frames`, and the arguments of ConvertMotionLabels: `grid_conf` (xbound, ybound), `ignore_index`,
-    `only_vehicle`, `filter_invisible`. What is not given stays as in the preset; keys that do not concern labels are
-    passed over.
+    FIERY's settings are its `cfg` as nested dictionaries (TIME_RECEPTIVE_FIELD, N_FUTURE_FRAMES, LIFT.X_BOUND,
+    LIFT.Y_BOUND, DATASET.IGNORE_INDEX, DATASET.FILTER_INVISIBLE_VEHICLES). BEVerse's and DeepAccident's are
+    `receptive_field`, `future_frames`, and the arguments of ConvertMotionLabels: `grid_conf` (xbound, ybound),
+    `ignore_index`, `only_vehicle`, `filter_invisible`. What is not given stays as in the preset; keys that do not
+    concern labels are ignored.
 
     Raises:
         ChoiceError: no such code.

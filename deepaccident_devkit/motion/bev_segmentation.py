@@ -29,7 +29,7 @@ COVERAGE: Final[Mapping[str, float]] = {
     "vehicle": 0.5,
     "pedestrian": 0.0,
 }
-"""The share of a cell that a class must cover; 0: any bit of it, as for what is thinner than a cell."""
+"""The share of a cell that a class must cover; 0: any part is enough, for classes that are thinner than a cell."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -38,9 +38,9 @@ class BevSegmentation:
 
     Attributes:
         grid: the cells and how they lie.
-        masks: (5, H, W) bool, a layer a class of `BEV_CLASSES`. Only the upper surface counts: no road beneath a car,
-            nothing beneath a bridge or a tree.
-        known: (H, W) bool, whether the cell is within the camera's ±60 m; beside it all masks are False.
+        masks: (5, H, W) bool, one layer for each of `BEV_CLASSES`. Only the upper surface counts: no road beneath a
+            car, nothing beneath a bridge or a tree.
+        known: (H, W) bool, whether the cell is within the camera's ±60 m; outside all masks are False.
     """
 
     grid: BevGrid
@@ -74,14 +74,14 @@ def bev_segmentation(
         dataset: the release.
         sample: token or record.
         grid: cells, right-handed metres; None for ±50 m in cells of 0.5 m.
-        coverage: class → share of a cell in [0, 1) that it must cover, where it is to differ from `COVERAGE`.
-        augmentation: turns, scales or mirrors the ground as it does labels; None for none.
+        coverage: class → share of a cell in [0, 1) that it must cover; other classes are as in `COVERAGE`.
+        augmentation: turns, scales or mirrors the ground as it does labels; None for no change.
 
     Raises:
         TokenError: no such sample.
-        ConfigError: a class in `coverage` does not exist, or its share is not in [0, 1].
+        ConfigError: a class in `coverage` does not exist, or its share is not in [0, 1).
         MissingFileError: the BEV camera's file was not downloaded (the test split has none).
-        SensorFileError: it cannot be read.
+        SensorFileError: the file cannot be read.
     """
     return segmentation_of(dataset.load_bev(sample), grid or BevGrid(), coverage=coverage, augmentation=augmentation)
 
@@ -99,7 +99,7 @@ def segmentation_of(
         if name not in BEV_CLASSES:
             raise ConfigError(f"coverage: expected classes of {', '.join(BEV_CLASSES)}, found {name!r}")
         if not 0 <= share < 1:
-            raise ConfigError(f"coverage: {name} is {share}; choose a share of a cell from 0, below 1")
+            raise ConfigError(f"coverage: {name} is {share}; choose a share of a cell, at least 0 and below 1")
     index = _pixels_of_cells(grid, augmentation)
     tags = np.append(image.semantic.reshape(-1), np.uint8(0))[index]
     needed = [max(1, math.ceil(shares[name] * index.shape[-1])) for name in BEV_CLASSES]
@@ -110,7 +110,7 @@ def segmentation_of(
 
 @functools.lru_cache(maxsize=4)
 def _pixels_of_cells(grid: BevGrid, augmentation: Augmentation | None) -> IntArray:
-    """(H, W, P) flat indices of the pixels at P points spread evenly over each cell; beside the image its size."""
+    """(H, W, P) flat indices of the pixels at P points spread evenly over each cell; outside the image, its size."""
     size_x, size_y = grid.x[2], grid.y[2]
     per_cell = [max(1, round(size / BEV_RESOLUTION)) for size in (size_x, size_y)]
     within = [(np.arange(count) + 0.5) / count - 0.5 for count in per_cell]
@@ -118,7 +118,7 @@ def _pixels_of_cells(grid: BevGrid, augmentation: Augmentation | None) -> IntArr
     points = grid.centers()[:, :, None] + spread
     if augmentation is not None:
         points = points @ np.linalg.inv(augmentation.matrix)[:2, :2].T
-    # pixel centres are at multiples of the resolution from the middle of the image, half a pixel off
+    # from the middle of the image to a pixel's centre there are whole pixels and a half
     row, column = (np.rint(BEV_SHAPE[axis] / 2 - 0.5 - points[..., axis] / BEV_RESOLUTION) for axis in (0, 1))
     inside = (row >= 0) & (row < BEV_SHAPE[0]) & (column >= 0) & (column < BEV_SHAPE[1])
     index = np.where(inside, row * BEV_SHAPE[1] + column, BEV_SHAPE[0] * BEV_SHAPE[1]).astype(np.int64)

@@ -1,4 +1,4 @@
-"""`MotionLabelConfig`: what labels show, how far and how, with the presets that papers name."""
+"""`MotionLabelConfig`: what labels show and how, with presets for the papers' settings."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ _STEPS_PER_SECOND: Final = 2
 _BYTE: Final = 255
 _MOST_FRAMES: Final = 1000
 _COUNTS: Final = {
-    "receptive_field": "frames up to the present, itself included",
-    "future_frames": "frames to come, of which labels of motion need one at least",
+    "receptive_field": "frames up to the present, the present included",
+    "future_frames": "frames after the present; labels of motion need at least one",
     "step": "recorded frames from one label frame to the next, 5 for 2 Hz",
 }
 _SIGMAS: Final = (0.01, 10_000.0)
@@ -41,16 +41,16 @@ class MotionLabelConfig:
         only_vehicle: leave out pedestrians (two-wheelers are vehicles, as in all three codes).
         filter_invisible: rasterise only what the cooperating agents see by the released rule (docs/released_code.md,
             Visibility and attributes).
-        agents: whose sight counts; None for all that are there, which is the released way. Names are kept
-            as a tuple.
+        agents: the agents whose sight counts; None for all that are there, as in the released code. Names are
+            kept as a tuple.
         draw_ego: rasterise the ego's own box (the infrastructure has none).
-        ignore_index: what stands in offset and flow beside instances, and in missing frames where they are ignored:
-            255, or any number from the grid's longer side on, in cells, which no vector can have.
-        orientation: an argument of the constructor: the orientation of `grid`, None for its own. The grid keeps it:
-            this field is always None.
-        sigma: radius of the centres' peaks, cells: exp(−d² / σ²), as FIERY.
-        protocol: `released`, `clean`, `beverse`, `fiery`, or a `LabelProtocol` of your own; one that has a name is kept
-            by its name.
+        ignore_index: the value of offset and flow outside instances, and of missing frames that are ignored: 255, or a
+            number of at least the grid's longer side in cells, which no vector can have.
+        orientation: only an argument of the constructor: the new orientation of `grid`; None keeps the grid's own. The
+            field itself is always None.
+        sigma: radius of the centres' peaks, cells: exp(−d² / σ²), as in FIERY.
+        protocol: `released`, `clean`, `beverse`, `fiery`, or a `LabelProtocol` of your own. One that is equal to a
+            named protocol is replaced by the name.
         augmentation: a rotation, scale and flip in each frame's ego frame; None for none.
     """
 
@@ -90,7 +90,7 @@ class MotionLabelConfig:
     def preset(cls, name: str, **changes: Any) -> MotionLabelConfig:
         """A preset of `PRESETS`, with some fields changed.
 
-        A grid of the devkit's orientation, the default, is laid out as the preset's; another one keeps its own.
+        A grid in the default orientation `devkit` gets the preset's orientation; any other grid keeps its own.
 
         Raises:
             ChoiceError: no such preset.
@@ -128,7 +128,7 @@ class MotionLabelConfig:
         return range(-(self.receptive_field - 1) * self.step, self.future_frames * self.step + 1, self.step)
 
     def as_dict(self) -> dict[str, Any]:
-        """All that affects the labels' values, as JSON can hold it; protocols as their switches."""
+        """All that affects the labels' values, in types that JSON has; the protocol as its switches."""
         described = asdict(self)
         described["grid"] = {"x": list(self.grid.x), "y": list(self.grid.y)}
         described["orientation"] = self.grid.orientation
@@ -141,7 +141,7 @@ class MotionLabelConfig:
         """The configuration that `as_dict` describes.
 
         Raises:
-            ConfigError: it describes none.
+            ConfigError: it is not the description of a configuration.
             ChoiceError: a choice in it does not exist.
         """
         try:
@@ -192,13 +192,13 @@ def _checked_grid(grid: object, orientation: Orientation | None) -> BevGrid:
 
 
 def _checked_mark(ignore_index: object, grid: BevGrid) -> int:
-    """The mark beside the maps' values: a byte, and no vector between two cells of the grid may have it twice.
+    """The `ignore_index`, checked: it fits into a byte, and no vector has it as both components.
 
-    Both components of a vector are less than the longer side, so that a larger number is never one of them, turned or
-    not. On grids of more than 255 cells only 255 is possible: there it is the vector over 360 cells, at 45 degrees to
-    the axes, further than an actor reaches from its centre or gets in a step.
+    Both components of a vector are less than the longer side, so a larger number never occurs, even after a turn. On
+    grids with a side of more than 255 cells only 255 is possible. There the vector (255, 255) is 360 cells long,
+    farther than an actor reaches from its centre or moves in a step.
     """
-    mark = count("ignore_index", ignore_index, "a mark beside the maps' values, such as 255", _BYTE)
+    mark = count("ignore_index", ignore_index, "a value that no vector has, such as 255", _BYTE)
     least = min(max(grid.shape), _BYTE)
     if mark < least:
         raise ConfigError(
@@ -212,18 +212,18 @@ def _checked_agents(agents: object) -> AgentConfig | str | tuple[str, ...] | Non
         return agents
     if isinstance(agents, str):
         if agents in AGENTS:
-            raise ChoiceError(f"agents: expected a configuration, found {agents!r}; for it alone give [{agents!r}]")
+            raise ChoiceError(f"agents: expected a configuration, found {agents!r}; for one agent give [{agents!r}]")
         return choice("agents", agents, AGENT_CONFIGS)
     if not isinstance(agents, Iterable):
         raise ChoiceError(f"agents: expected agents' names or a configuration, found {agents!r}")
     names = tuple(choice("agents", agent, AGENTS) for agent in agents)
     if not names:
-        raise ChoiceError("agents: expected at least one agent, found none; None stands for all that are there")
+        raise ChoiceError("agents: expected at least one agent, found none; None stands for all agents")
     return names
 
 
 def _named(protocol: LabelProtocol) -> str | LabelProtocol:
-    """The name of a protocol that has one."""
+    """A protocol's name if it has one, or the protocol itself."""
     return next((name for name, rules in LABEL_PROTOCOLS.items() if rules == protocol), protocol)
 
 
@@ -240,4 +240,4 @@ PRESETS: Final[Mapping[str, MotionLabelConfig]] = MappingProxyType(
         "fiery": replace(_BEVERSE, protocol="fiery", orientation="fiery"),
     }
 )
-"""The released labels (2 s ahead), the same 3, 4 and 5 s ahead, and those of the two codes it comes from."""
+"""The released labels (2 s ahead), the same 3, 4 and 5 s ahead, and those of the two codes that it is based on."""

@@ -1,7 +1,7 @@
-"""Motion labels of many samples in one folder: a npz file a scenario and agent, read a sample at a time.
+"""Motion labels of many samples in one folder: one npz file for each scenario and agent, read sample by sample.
 
-schema/motion_labels.md says what is in them. What follows from instance maps is not stored: segmentation, centerness
-and offset come from the instances' centres, flow from one vector an instance.
+schema/motion_labels.md describes the files. Maps that follow from instance maps are not stored: segmentation,
+centerness and offset are made from the instances' centres, flow from one vector for each instance.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ class LabelsWritten:
     """What `write_label_files` did.
 
     Attributes:
-        samples: how many the folder now holds of those asked for.
+        samples: how many of the requested samples the folder now holds.
         written: files made.
-        kept: files that were there and hold the same.
+        kept: files that were there already and hold the same.
     """
 
     samples: int
@@ -64,18 +64,18 @@ def write_label_files(
     executor: Executor | None = None,
     progress: bool = False,
 ) -> LabelsWritten:
-    """Write the motion labels of samples into a folder, one file a scenario and agent.
+    """Write the motion labels of samples into a folder, one file for each scenario and agent.
 
-    Files are whole or absent. A call that was broken off goes on where it stopped; samples may be added later; what
-    the release changed in the meantime is written again.
+    Files are complete or absent. If a call is interrupted, the same call continues it. Samples can be added later;
+    files are written again if the release has changed in the meantime.
 
     Args:
         dataset: the release.
         folder: made where needed; or one with labels of the same configuration.
         tokens: tokens or records of labelled samples.
         config: what labels show, or the name of a preset; None for the released ones in the devkit's orientation.
-        workers: processes; None takes what the work is worth.
-        executor: to run on instead, any of `concurrent.futures`.
+        workers: processes; None chooses by the amount of work.
+        executor: any executor of `concurrent.futures` to run on, in place of own workers.
         progress: whether to show a bar.
 
     Raises:
@@ -115,11 +115,11 @@ class LabelFiles(Mapping[str, MotionLabels]):
         """Open a folder that `write_label_files` or `deepaccident labels` made.
 
         Args:
-            folder: where.
+            folder: its path.
             config: what the labels must show, or the name of a preset; None for any.
 
         Raises:
-            LabelFilesError: there is no such folder, its making was broken off, or its manifest cannot be read.
+            LabelFilesError: there is no such folder, its labels are not complete, or its manifest cannot be read.
             ConfigError: the labels are of another configuration.
         """
         self.folder = folder_path(folder)
@@ -127,7 +127,7 @@ class LabelFiles(Mapping[str, MotionLabels]):
         if config is not None:
             manifest.check(self.folder, label_config(config))
         if not manifest.samples:
-            raise LabelFilesError(f"{self.folder}: its making was broken off; run `deepaccident labels` on it again")
+            raise LabelFilesError(f"{self.folder}: its labels are not complete; run `deepaccident labels` on it again")
         self.config = manifest.config
         self._digest = manifest.config.digest
         self._frames = {
@@ -140,7 +140,7 @@ class LabelFiles(Mapping[str, MotionLabels]):
         """Everything except open files."""
         return {**self.__dict__, "_open": OrderedDict()}
 
-    __eq__, __hash__ = object.__eq__, object.__hash__  # a mapping's would read all files
+    __eq__, __hash__ = object.__eq__, object.__hash__  # those of a mapping would read all files
 
     def __repr__(self) -> str:
         return f"<motion labels: {len(self):,} samples in {self.folder}>"
@@ -164,7 +164,7 @@ class LabelFiles(Mapping[str, MotionLabels]):
 
         Raises:
             TokenError: the sample is not here.
-            LabelFilesError: its file is missing, damaged or of other labels.
+            LabelFilesError: its file is missing, damaged or of another configuration.
         """
         if token not in self:
             raise TokenError(f"{self.folder}: has no labels of {token!r}; `deepaccident labels` can add them")
@@ -230,7 +230,7 @@ def _source(task: _Task) -> str:
 
 
 def _scenario_arrays(dataset: Dataset, scenario: str) -> Iterator[AnyArray]:
-    """What the tables hold of a scenario that labels are made from, of all agents."""
+    """The columns of the tables that a scenario's labels are made from, of all agents."""
     row, samples = dataset.getind("scenario", scenario), dataset.columns("sample")
     first, last = samples["scenario_row"].searchsorted((row, row + 1))
     yield dataset.columns("ego_pose")["matrix"][first:last]
@@ -264,7 +264,7 @@ def _by_recording(dataset: Dataset, tokens: Iterable[RowArgument]) -> dict[str, 
         row = dataset.getind("sample", given)
         token = given if isinstance(given, str) else given["token"]
         if not labelled[row]:
-            raise NotAvailableError(f"{token} has no label (the test split ships without them)")
+            raise NotAvailableError(f"{token} has no label (the test split has none)")
         recording, number = _parts(token)
         found.setdefault(recording, set()).add(number)
     if not found:
@@ -280,7 +280,7 @@ def _check_agents(dataset: Dataset, wanted: Mapping[str, list[int]], config: Mot
 
 
 def _with_kept(dataset: Dataset, root: Path, recording: str, frames: list[int], manifest: Manifest) -> tuple[int, ...]:
-    """The frames to be in a file: those asked for, and those it has; raises LabelFilesError."""
+    """The frames that a file should have: the requested ones and those that it has; raises LabelFilesError."""
     kept = manifest.samples.get(recording, [])
     try:
         for frame in kept:

@@ -1,4 +1,4 @@
-"""A folder of motion labels: its manifest, whose configuration it keeps to, and its lock (schema/motion_labels.md)."""
+"""A folder of motion labels: its manifest, which fixes the configuration, and its lock (schema/motion_labels.md)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ logger = logging.getLogger(__name__)
 
 FORMAT: Final = "DeepAccident motion labels"
 FORMAT_VERSION: Final = 1
-"""Counted up with what files hold, and with what labels of the same configuration and release look like."""
+"""Increased when the files' contents change, or the labels of the same configuration and release."""
 MANIFEST: Final = "manifest.json"
 _LOCK: Final = ".lock"
 _HALF_WRITTEN: Final = re.compile(rf"\.({re.escape(MANIFEST)}|({'|'.join(AGENTS)})\.npz)\.\d+\.tmp")
@@ -30,12 +30,12 @@ _RECORDING: Final = re.compile(rf"(?!\.)[^/\\\0]+/(?!\.)[^/\\\0]+/({'|'.join(AGE
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """What a folder of labels says of itself.
+    """The manifest of a folder of labels.
 
     Attributes:
         config: what its labels show.
         samples: scenario and agent → numbers of the frames whose labels are there for sure; none until the first call
-            that wrote there was through.
+            that writes there has finished.
     """
 
     config: MotionLabelConfig
@@ -43,11 +43,11 @@ class Manifest:
 
     @classmethod
     def of(cls, root: Path, config: MotionLabelConfig) -> Manifest:
-        """The manifest of a folder that labels of a configuration are to go to; touches nothing.
+        """The manifest of a folder into which labels of a configuration will be written; changes nothing.
 
         Raises:
-            ConfigError: it holds labels of another configuration.
-            LabelFilesError: it holds something else, is a file, or cannot be read.
+            ConfigError: the folder holds labels of another configuration.
+            LabelFilesError: the folder holds something else, is a file, or cannot be read.
         """
         try:
             if (root / MANIFEST).exists():
@@ -77,7 +77,7 @@ class Manifest:
             _check_version(path, told["format"], told["version"])
             config, samples = MotionLabelConfig.from_dict(told["config"]), _samples(told["samples"])
             if config.digest != told["config_digest"]:
-                raise ValueError("the digest of its configuration is another one")
+                raise ValueError("its digest is not that of its configuration")
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             if isinstance(error, LabelFilesError):
                 raise
@@ -91,27 +91,28 @@ class Manifest:
         mine, others = (_flat(one.as_dict()) for one in (self.config, config))
         changed = sorted(name for name in {*mine, *others} if mine.get(name) != others.get(name))
         if changed:
-            told = "; ".join(f"{name}: {mine.get(name)!r}, asked for {others.get(name)!r}" for name in changed)
-            raise ConfigError(f"{root}: holds labels of another configuration ({told}); choose another folder")
+            text = "; ".join(f"{name}: {mine.get(name)!r}, asked for {others.get(name)!r}" for name in changed)
+            raise ConfigError(f"{root}: holds labels of another configuration ({text}); choose another folder")
 
     def write(self, root: Path) -> None:
         """Write the manifest into its folder."""
-        told = {
+        manifest = {
             "format": FORMAT,
             "version": FORMAT_VERSION,
             "config_digest": self.config.digest,
             "config": self.config.as_dict(),
             "samples": dict(sorted(self.samples.items())),
         }
-        lists_in_a_line = re.sub(r"\[[^][{}]*\]", lambda found: " ".join(found[0].split()), json.dumps(told, indent=1))
+        text = json.dumps(manifest, indent=1)
+        lists_in_a_line = re.sub(r"\[[^][{}]*\]", lambda found: " ".join(found[0].split()), text)
         write_bytes(root / MANIFEST, f"{lists_in_a_line}\n".encode())
 
 
 @contextmanager
 def writing_to(root: Path) -> Iterator[None]:
-    """Hold the lock of a folder while labels are written into it; make it, and clear up what killed processes left.
+    """Hold the lock of a folder while labels are written into it; make it, and remove what killed processes left.
 
-    The system takes the lock back when a process ends, however it ends.
+    The system releases the lock when the process ends, even if it is killed.
 
     Raises:
         LabelFilesError: the folder cannot be made, locked or written to, or a worker was killed.
@@ -143,7 +144,7 @@ def writing_to(root: Path) -> Iterator[None]:
 
 
 def folder_path(folder: str | os.PathLike[str]) -> Path:
-    """The absolute path of a folder that somebody named; raises LabelFilesError where it is empty."""
+    """The absolute path of a given folder; raises LabelFilesError if it is empty."""
     if not os.fspath(folder):
         raise LabelFilesError("expected a folder of motion labels, found an empty path; give '.' for the current one")
     return Path(folder).expanduser().absolute()
@@ -165,7 +166,7 @@ def _acquire(lock: Any, root: Path) -> None:
 
 
 def _remove_half_written(root: Path) -> None:
-    """Remove the temporary files of stopped processes; failures are left to the next time."""
+    """Remove the temporary files of stopped processes; what cannot be removed stays until the next call."""
     with suppress(OSError):
         for path in [*root.glob(".*.tmp"), *root.glob("*/*/.*.tmp")]:
             if _HALF_WRITTEN.fullmatch(path.name):
@@ -179,10 +180,10 @@ def _is_own(name: str) -> bool:
 
 def _check_version(path: Path, form: object, version: object) -> None:
     if form != FORMAT or not isinstance(version, int):
-        raise ValueError(f"expected the manifest of {FORMAT}, found that of {form!r}, version {version!r}")
+        raise ValueError(f"expected a manifest of {FORMAT}, found one of {form!r}, version {version!r}")
     if version != FORMAT_VERSION:
         kind, remedy = (
-            ("a newer", "update the devkit, or") if version > FORMAT_VERSION else ("an older", "use that one, or")
+            ("a newer", "update the devkit, or") if version > FORMAT_VERSION else ("an older", "use that devkit, or")
         )
         raise LabelFilesError(
             f"{path}: {kind} devkit's labels (format version {version}, this devkit's is {FORMAT_VERSION}); {remedy} "
@@ -190,13 +191,13 @@ def _check_version(path: Path, form: object, version: object) -> None:
         )
 
 
-def _samples(told: Mapping[str, Any]) -> dict[str, list[int]]:
+def _samples(read: Mapping[str, Any]) -> dict[str, list[int]]:
     """Scenario and agent → frame numbers; raises ValueError."""
-    for recording, frames in told.items():
+    for recording, frames in read.items():
         good = _RECORDING.fullmatch(recording) and isinstance(frames, list)
         if not good or not all(type(frame) is int and frame > 0 for frame in frames):
             raise ValueError(f"samples of {recording!r}: expected a scenario, agent and frame numbers")
-    return {recording: list(frames) for recording, frames in told.items()}
+    return {recording: list(frames) for recording, frames in read.items()}
 
 
 def _flat(described: Mapping[str, Any]) -> dict[str, Any]:

@@ -24,13 +24,14 @@ OWN_BOX_ID: Final = -101
 class MotionLabels(FrozenArrays):
     """Labels of T = `config.label_frames` frames on H × W cells in `config.grid.orientation`; arrays are read-only.
 
-    The five maps share one block of memory, which is there as long as any of them is: of many samples keep copies.
+    The five maps share one block of memory, which stays as long as any of them is used. To keep some maps of many
+    samples, copy them.
 
     Attributes:
         config: how they were made.
         segmentation: (T, H, W) uint8: 1 where an actor is, 0 elsewhere.
         instance: (T, H, W) int32: ids from 1 in the order rasterised, 0 elsewhere. Missing frames that a protocol
-            ignores are all `ignore_index`, which can also be an id: `label_valid` tells which it is.
+            ignores are all `ignore_index`, which can also be an id: `label_valid` says which frames are missing.
         centerness: (T, 1, H, W) float32 in [0, 1].
         offset: (T, 2, H, W) float32, cells (down the rows, along the columns) from a cell to its instance's centre;
             `ignore_index` elsewhere.
@@ -41,7 +42,7 @@ class MotionLabels(FrozenArrays):
         valid: (R,) bool: which frames, from the first past one on, are in the recording.
         id_map: actor id → id in `instance`; the ego's own box is −101, and untracked actors that are each their own
             instance are not in it.
-        at_present: whether all frames were warped to the present ego frame; else each is in its own.
+        at_present: whether all frames were warped to the present ego frame; if not, each is in its own.
     """
 
     config: MotionLabelConfig
@@ -63,7 +64,7 @@ class MotionLabels(FrozenArrays):
         object.__setattr__(self, "id_map", MappingProxyType(dict(self.id_map)))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """A view of a dict cannot be pickled; the dict can."""
+        """Pickle a dict in place of its view, which cannot be pickled."""
         return _remade, (
             {field.name: getattr(self, field.name) for field in fields(self)} | {"id_map": dict(self.id_map)},
         )
@@ -79,7 +80,7 @@ class MotionLabels(FrozenArrays):
         return self.future_egomotion[self.config.receptive_field - 1 :]
 
     def to_present(self, centerness: WarpMode = "nearest") -> MotionLabels:
-        """The labels with every frame in the present ego frame, as models are trained on and evaluated against them.
+        """The labels with every frame in the present ego frame, as in training and evaluation.
 
         `motion.warps.to_present` says how. Labels that are not warped equal the released code's in every cell; warped
         ones can differ in single cells, at ties of the sampling (docs/motion_labels.md, "How equal they are").
@@ -100,17 +101,17 @@ class MotionLabels(FrozenArrays):
 
     @property
     def instance_center(self) -> AnyArray:
-        """`centerness`, as the models' outputs are named."""
+        """`centerness`, under the name of the models' output."""
         return self.centerness
 
     @property
     def instance_offset(self) -> AnyArray:
-        """`offset`, as the models' outputs are named."""
+        """`offset`, under the name of the models' output."""
         return self.offset
 
     @property
     def instance_flow(self) -> AnyArray:
-        """`flow`, as the models' outputs are named."""
+        """`flow`, under the name of the models' output."""
         return self.flow
 
     def as_batch(self, names: BatchNames) -> dict[str, AnyArray]:
@@ -125,12 +126,12 @@ class MotionLabels(FrozenArrays):
     def from_batch(
         cls, batch: Mapping[str, Any], config: MotionLabelConfig | str, names: BatchNames, *, at_present: bool = False
     ) -> MotionLabels:
-        """Labels from a sample of another code's loader, `as_batch` the other way; whose ids they are is not known.
+        """Labels from a sample of another code's loader, the reverse of `as_batch`; the ids' actors are not known.
 
         Args:
             batch: arrays or tensors of one sample, without a batch axis.
             config: what they were made with, or the name of a preset; its orientation is that of the result.
-            names: whose names they have.
+            names: the code whose names they have.
             at_present: whether they were warped to the present.
 
         Raises:

@@ -1,7 +1,7 @@
 """The same maps in another orientation: cells change places, and the channels of offset and flow with them.
 
-The devkit's orientation is the hub: `released` has its rows in reverse order, so that what points down the rows
-changes its sign; `fiery` is its transpose, so that rows and columns, and the two channels, change places.
+Each change goes through the devkit's orientation. `released` has its rows in reverse order, so vectors down the rows
+change their sign. `fiery` is its transpose, so rows and columns, and the two channels, change places.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ __all__ = ["axes_of", "cells_in", "to_orientation", "vectors_in"]
 def to_orientation(
     array: AnyArray, *, vectors: bool, source: Orientation, target: Orientation, ignore: float | None = None
 ) -> AnyArray:
-    """Maps (…, H, W) that lie as `source` says, lying as `target` says.
+    """Maps (…, H, W) in the orientation `source`, turned into the orientation `target`.
 
     Args:
         array: any maps; with `vectors`, (…, 2, H, W), down the rows and along the columns.
         vectors: whether the values point along rows and columns (offset, flow).
-        source: how they lie.
-        target: how they are to lie.
-        ignore: what stands in both channels where there is no vector; None where all values are vectors.
+        source: the orientation of `array`.
+        target: the orientation of the result.
+        ignore: the value of both channels where there is no vector; None if all values are vectors.
 
     Returns:
-        A view where no value changes, else a new array.
+        A view if no value changes, or a new array.
 
     Raises:
         GeometryError: `vectors` have another shape.
@@ -53,7 +53,7 @@ def to_orientation(
 
 
 def vectors_in(down: AnyArray, along: AnyArray, source: Orientation, target: Orientation) -> tuple[AnyArray, AnyArray]:
-    """What points down the rows and along the columns of one orientation, in another."""
+    """The components down the rows and along the columns of one orientation, as those of another."""
     if source == "fiery":
         down, along = along, down
     if (source == "released") != (target == "released"):

@@ -29,32 +29,32 @@ class LabelProtocol:
     docs/released_code.md, Motion labels, Warps, and FIERY's own labels.
 
     Attributes:
-        own_box_moved_twice: the ego's own row is taken to the ego frame twice, with the released box constructor
-            between; else once.
-        own_box_default: where not exactly one row is the ego's own, a box of 3.99 m x 1.85 m at the LiDAR is rasterised
-            in its place; else the first own row is rasterised, if there is one.
+        own_box_moved_twice: the ego's own row is moved to the ego frame twice, and the released box constructor runs
+            in between; if False, once.
+        own_box_default: if not exactly one row is the ego's own, a box of 3.99 m x 1.85 m at the LiDAR is rasterised
+            in its place; if False, the first own row is rasterised, if there is one.
         own_box_not_augmented: an augmentation moves all boxes except the ego's own.
-        half_cell_shift: the corners of boxes are rounded to the nearest *edge* between cells, so that boxes lie half a
-            cell too far along both axes; else to the cell that they lie in.
-        drawn_when: which of the actors that somebody sees are rasterised at a frame: those seen at the `present` frame
-            and no others (released: who appears later never is), those seen at that frame or `since` the present at an
-            earlier one, or those seen `now`, at that frame (FIERY and BEVerse).
-        untracked_share_an_id: all untracked rows (−1), where they are rasterised at all, are one instance; else each
-            row of each frame is one of its own.
+        half_cell_shift: the corners of boxes are rounded to the nearest *edge* between cells, so boxes lie half a cell
+            too far along both axes; if False, to the cell that they lie in.
+        drawn_when: which visible actors are rasterised at a frame. `present`: those seen at the present frame
+            (released: who appears later is never rasterised); `since`: those seen at that frame or at an earlier one
+            since the present; `now`: those seen at that frame (FIERY and BEVerse).
+        untracked_share_an_id: all untracked rows (−1) that are rasterised are one instance; if False, each row of each
+            frame is an instance of its own.
         missing_frames_are_empty: a frame beyond the recording is all zeros, as if nobody were there (offset and
-            flow 255); else it is all `ignore_index`.
-        outside_is_zero: what a warp brings in from outside the grid is 0 in every map; else 0 in segmentation,
+            flow 255); if False, it is all `ignore_index`.
+        outside_is_zero: cells that a warp takes from outside the grid are 0 in every map; if False, 0 in segmentation,
             instance and centerness, and `ignore_index` in offset and flow.
-        vectors_not_rotated: offset and flow keep their values when a warp turns the cells that they stand in; else
-            they turn along.
-        ids_kept_between_samples: samples may go on with the ids of one before (`id_map`), as the released code keeps
-            them for a scenario and agent as long as a worker meets no other, so that ids depend on what it met; else
+        vectors_not_rotated: offset and flow keep their values when a warp turns their cells; if False, they turn with
+            the cells.
+        ids_kept_between_samples: samples may continue the ids of an earlier one (`id_map`). The released code does so
+            while a worker reads samples of one scenario and agent: ids depend on what the worker read before. If False,
             ids count from 1 in every sample.
         warp: the sampling rule: `stretched` (released and BEVerse: sample points 0.50125 m apart), `exact` (cell
-            centres, whole transforms) or `fiery` (cell centres; yaw and planar translation of the 6-vector alone).
-        native: the orientation that corners are rounded, centres are counted and rasters are sampled in, and whose
-            handedness the boxes and motions have meanwhile; `fiery` for the warp of that name. It decides how halves of
-            a cell are rounded; `MotionLabelConfig.grid` has the orientation of the labels.
+            centres, whole transforms) or `fiery` (cell centres; only yaw and planar translation of the 6-vector).
+        native: the orientation in which corners are rounded, centres are computed and rasters are sampled; boxes and
+            motions have its handedness in these steps. The warp `fiery` needs `fiery`. It decides how halves of a cell
+            are rounded; `MotionLabelConfig.grid` has the orientation of the labels.
     """
 
     own_box_moved_twice: bool
@@ -77,18 +77,18 @@ class LabelProtocol:
             allowed = _CHOICES.get(field.name)
             object.__setattr__(self, field.name, flag(name, value) if allowed is None else choice(name, value, allowed))
         if self.warp == "fiery" and self.native != "fiery":
-            raise ConfigError(f"label protocol: warp 'fiery' is counted in native 'fiery', found {self.native!r}")
+            raise ConfigError(f"label protocol: warp 'fiery' needs native 'fiery', found {self.native!r}")
 
     @property
     def right_handed(self) -> bool:
-        """Whether boxes and motions are right-handed in the native orientation; else y and all turns are negated."""
+        """Whether boxes and motions are right-handed in the native orientation; if not, y and all turns are negated."""
         return self.native != "released"
 
     @property
     def place_in_cell(self) -> tuple[float, float]:
         """The point for which a rasterised cell stands, in cells along x and y from its low corner.
 
-        With `half_cell_shift` it is the corner that the native orientation counts the cell from.
+        With `half_cell_shift` it is the corner with the lowest row and column in the native orientation.
         """
         if not self.half_cell_shift:
             return 0.5, 0.5
@@ -131,7 +131,7 @@ LABEL_PROTOCOLS: Final[Mapping[str, LabelProtocol]] = MappingProxyType(
         "fiery": _FIERY,
     }
 )
-"""By name: the released code, the same without its quirks, and the two codes that it comes from."""
+"""By name: the released code, the same without its quirks, and the two codes that it is based on."""
 
 
 def label_protocol(protocol: str | LabelProtocol) -> LabelProtocol:
@@ -142,5 +142,5 @@ def label_protocol(protocol: str | LabelProtocol) -> LabelProtocol:
 
 
 def slip_names() -> list[str]:
-    """The fields of `LabelProtocol` that are either kept or not."""
+    """The names of the quirks of `LabelProtocol` that are either kept or not."""
     return [field.name for field in fields(LabelProtocol) if field.name not in _CHOICES]

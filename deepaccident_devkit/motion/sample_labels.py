@@ -1,6 +1,6 @@
 """Motion labels of a sample of a release: the input of `motion_labels_from_boxes`, read from the tables.
 
-The columns are read as they are, all frames at once: records and `Boxes` would cost as much as rasterising.
+The columns are read as they are, all frames at once: records and `Boxes` would take as long as rasterising.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ def motion_labels(
 
     The agent's own row (−100) shows only as the ego's own box, and not at all with `draw_ego=False`. The released code
     does the same, since no agent ever sees that row; but with `filter_invisible=False` that code would rasterise it
-    again, over the ego's box and under an id of its own. Here it does not.
+    again, over the ego's box and under an id of its own. Here this never happens.
 
     Args:
         dataset: the release.
         sample: token or record of the present.
         config: what labels show, or the name of a preset; None for the released ones in the devkit's orientation.
-        id_map: actor id → id that a sample before this one had: the released code keeps them for a scenario and agent
-            as long as a worker meets no other, so that ids depend on what it met. None starts at 1.
+        id_map: actor id → its id in an earlier sample. The released code keeps ids while a worker reads samples of one
+            scenario and agent, so they depend on what the worker read before. With None ids start at 1.
 
     Returns:
-        Labels of `config.label_frames` frames; what is beyond the recording is not valid.
+        Labels of `config.label_frames` frames; those beyond the recording are not valid.
 
     Raises:
         TokenError: no such sample.
@@ -57,7 +57,7 @@ def motion_labels(
     row, samples = dataset.getind("sample", sample), dataset.columns("sample")
     if not samples["labelled"][row]:
         token = dataset.sample[row]["token"]
-        raise NotAvailableError(f"{token} has no label (the test split ships without them)")
+        raise NotAvailableError(f"{token} has no label (the test split has none)")
     length = dataset.columns("scenario")["num_frames"].item(samples["scenario_row"].item(row))
     first_row = dataset.columns("agent")["first_sample_row"].item(samples["agent_row"].item(row))
     present = row - first_row
@@ -86,7 +86,7 @@ def _world_from_ego(dataset: Dataset, rows: IntArray, there: BoolArray) -> Float
 def _frames(
     dataset: Dataset, sample: RowArgument, first_row: int, index: IntArray, config: MotionLabelConfig
 ) -> list[FrameBoxes]:
-    """What the sample's agent, whose samples begin at `first_row`, annotated at the frames `index`, from 0."""
+    """The boxes of the sample's agent, whose samples begin at `first_row`, at the frames `index`, from 0."""
     boxes, rows = dataset.columns("annotation"), first_row + index
     slices = _annotations(dataset, rows)
     actors = [boxes["actor_id"][one] for one in slices]
@@ -140,7 +140,7 @@ def _annotations(dataset: Dataset, rows: IntArray) -> list[slice]:
 
 
 def _pairs(actors: list[AnyArray]) -> IntArray:
-    """Of actors frame by frame: one number a row for the pair of actor and frame."""
+    """One number for each row of `actors`, frame by frame: it stands for the pair of actor and frame."""
     number = np.repeat(np.arange(len(actors)), [len(actor) for actor in actors])
     pairs: IntArray = np.concatenate(actors) * len(actors) + number
     return pairs

@@ -16,7 +16,7 @@ Purpose = Literal["train", "evaluate", "all", "every"]
 SampleProtocol = Literal["released", "paper"]
 Scope = Literal["accident", "all"]
 _KEY_STEP: Final = 5
-"""Recorded frames between key frames, counted back from a scenario's last."""
+"""Recorded frames from one key frame to the next, counted back from a scenario's last frame."""
 _STEPS: Final = {"train": 10, "evaluate": _KEY_STEP, "all": _KEY_STEP, "every": 1}
 _RELEASED_HORIZON: Final = 2.0
 
@@ -35,10 +35,10 @@ def samples(
     Frames are counted back from a scenario's last one, which in an accident scenario is the collision:
 
     - `train`: one a second, of normal and accident scenarios;
-    - `evaluate`: two a second within the last `horizon` seconds except the last frame. Of scenarios designed to end
+    - `evaluate`: two a second within the last `horizon` seconds except the last frame, of scenarios designed to end
       in an accident (`_accident` in their folder); `scope="all"` adds the normal ones;
     - `all`: two a second, the whole of every scenario;
-    - `every`: all there are, ten a second.
+    - `every`: all samples, ten a second.
 
     The released V2X class stops after 50 samples of a list in an unknown order; this function does not.
 
@@ -46,18 +46,18 @@ def samples(
         dataset: the release.
         split: `train`, `val`, … or a split file, as `Dataset.split_scenarios` takes it.
         purpose: `train`, `evaluate`, `all` or `every`.
-        protocol: `released` has a horizon of 2 s and accident scenarios alone; `paper` leaves both open.
-        horizon: seconds before the end, a multiple of 0.5; only to `evaluate`.
-        scope: `accident` or `all`; only to `evaluate`.
+        protocol: `released` has only a horizon of 2 s and accident scenarios; `paper` allows others.
+        horizon: seconds before the end, a multiple of 0.5; only for `evaluate`.
+        scope: `accident` or `all`; only for `evaluate`.
 
     Returns:
         Tokens by scenario, agent and time.
 
     Raises:
         ChoiceError: no such split, purpose, protocol or scope.
-        ConfigError: a horizon that is no number of steps, or one that the released protocol does not have.
+        ConfigError: a horizon that is no multiple of 0.5 s, or one that the released protocol does not have.
         NotAvailableError: the split is unknown, this release has no scenario of it, or none of its samples has labels
-            (the test split ships without).
+            (the test split has none).
     """
     for name, value, choices in (
         ("purpose", purpose, Purpose),
@@ -69,7 +69,7 @@ def samples(
     seconds = checked_number("horizon", horizon, "a number of seconds", ConfigError)
     steps = seconds / (_KEY_STEP * FRAME_PERIOD)
     if not (1 <= steps < float("inf") and abs(steps - round(steps)) < 1e-6):
-        raise ConfigError(f"horizon: {horizon} s is no number of steps of 0.5 s; choose 0.5, 1, 1.5, …")
+        raise ConfigError(f"horizon: {horizon} s is no multiple of 0.5 s; choose 0.5, 1, 1.5, …")
     if protocol == "released" and (seconds != _RELEASED_HORIZON or scope != "accident"):
         raise ConfigError("the released protocol looks 2 s ahead in accident scenarios; choose protocol='paper'")
 
@@ -84,7 +84,7 @@ def samples(
     row = columns["scenario_row"]
     in_split = wanted[row] & columns["labelled"][:]
     if not in_split.any():
-        raise NotAvailableError(f"{split}: none of its samples here has labels (the test split ships without them)")
+        raise NotAvailableError(f"{split}: none of its samples here has labels (the test split has none)")
     to_end = scenarios["num_frames"][row] - (columns["frame_row"] - scenarios["first_frame_row"][row] + 1)
     chosen = to_end % _STEPS[purpose] == 0
     if purpose == "evaluate":
@@ -102,5 +102,5 @@ def evaluation_samples(
     horizon: float = _RELEASED_HORIZON,
     scope: Scope = "accident",
 ) -> list[str]:
-    """The samples that a model is evaluated at: `samples` for the purpose `evaluate`, which says all the rest."""
+    """The samples that a model is evaluated at: `samples` for the purpose `evaluate`; see there."""
     return samples(dataset, split, "evaluate", protocol, horizon=horizon, scope=scope)

@@ -1,4 +1,4 @@
-"""Checks of single settings, which make numpy's scalars Python's own: equal configurations are then written alike."""
+"""Checks of single settings. They make numpy's scalars Python's own, so equal configurations are written alike."""
 
 from __future__ import annotations
 

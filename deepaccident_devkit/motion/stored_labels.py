@@ -1,4 +1,4 @@
-"""What is stored of one sample's motion labels, from which all maps are made again (schema/motion_labels.md)."""
+"""The stored part of one sample's motion labels, from which all maps are made again (schema/motion_labels.md)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class StoredLabels:
     Attributes:
         instance: (T, H, W) uint8 or uint16; 0 in missing frames.
         center: (T, 1 + K, 2) int16 row and column of each instance's centre, `NOWHERE` if the frame does not show it.
-        flow: (T, 1 + K, 2) int16 how far it moves along them up to the next frame; `NOWHERE` where unknown.
+        flow: (T, 1 + K, 2) int16 rows and columns that it moves up to the next frame; `NOWHERE` if unknown.
         actor: (1 + K,) int64 actor ids, `NOBODY` without one; −101 for the ego's own box, and −1 for all untracked
             rows where they are one instance.
         future_egomotion: (R, 6) float32.
@@ -46,7 +46,7 @@ class StoredLabels:
 
     @classmethod
     def of(cls, labels: MotionLabels) -> StoredLabels:
-        """The members of labels whose frames are in their own ego frames."""
+        """The stored arrays of labels whose frames are in their own ego frames."""
         instance = np.where(labels.label_valid[:, None, None], labels.instance, 0)
         frame, row, column = np.nonzero(instance)
         identity = instance[frame, row, column]
@@ -70,7 +70,7 @@ class StoredLabels:
         )
 
     def labels(self, config: MotionLabelConfig) -> MotionLabels:
-        """The labels again, all maps of them; raises GeometryError if the arrays cannot be theirs."""
+        """The labels with all their maps; raises GeometryError if the arrays do not fit the configuration."""
         self._check(config)
         shape, given = config.grid.shape, config.grid.orientation
         native = config.rules.native
@@ -124,7 +124,7 @@ class StoredLabels:
 
 
 def write_array(archive: zipfile.ZipFile, name: str, array: AnyArray) -> None:
-    """Add `<name>.npy` to an archive that numpy can load; the same bytes whenever that is."""
+    """Add `<name>.npy` to an archive that numpy can load; the bytes do not depend on the date."""
     buffer = io.BytesIO()
     np.lib.format.write_array(buffer, np.asarray(array, order="C"), allow_pickle=False)
     entry = zipfile.ZipInfo(f"{name}.npy", _FIRST_DATE)

@@ -1,4 +1,4 @@
-"""All pictures. One panel takes `ax=` and returns the Axes; nothing here shows a window."""
+"""All pictures. A function for one panel takes `ax=` and returns the Axes; nothing here opens a window."""
 
 from deepaccident_devkit.render.accident import render_accident
 from deepaccident_devkit.render.annotation import render_annotation

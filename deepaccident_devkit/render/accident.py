@@ -1,4 +1,4 @@
-"""The countdown to an impact, as a figure of several moments and as a video's picture of one."""
+"""The countdown to an impact: a figure of several moments, and a video's picture of one moment."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ COUNTDOWN_LAYERS: Final[tuple[Layer, ...]] = (*CAMERA_LAYERS, "trajectories", "g
 _SHOWN: Final[tuple[Layer, ...]] = ("image", "boxes", "trajectories", "grid")
 _NEAR: Final = 18.0
 _NEAR_IN_VIDEO: Final = 28.0
-"""Metres around the place of contact that are shown."""
+"""How many metres around the place of contact are shown."""
 _WIDTH: Final = 3.3
-"""Inches of a panel."""
+"""Width of a panel in inches."""
 _MOSAIC: Final[list[Any]] = [[*AGENTS[:3]], ["above", *AGENTS[3:]], ["above", "speeds", "speeds"]]
-"""Of a video's picture."""
+"""The panels of a video's picture."""
 _SHOWS_BEST: Final = 0.5
 """Seconds before the impact at which the cameras are chosen: at the impact the pair may be beside each other."""
 _DASHES: Final = ("-", "--")
@@ -53,16 +53,16 @@ def render_accident(
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Render the countdown to an accident: a column a moment, a row an agent, and the pair from above at the bottom.
+    """Render the countdown to an accident: a column for each moment, a row for each agent, and one from above.
 
-    Each agent has the image of its camera that sees the colliding pair best (the front one where none does). From above
-    there is the place of contact (a cross), the pair's speeds, and where they came from and go to until they meet.
+    Each agent has the image of the camera that sees the colliding pair best (the front one if no camera does). The view
+    from above has the place of contact (a cross), the pair's speeds, and the pair's paths up to the contact.
 
     Args:
         dataset: the release.
         scenario: token or record of one with a collision.
-        seconds: before the impact, which is the recording's last frame; what was before its first is left out.
-        agents: whose images; None for all that are there, and an empty list for none.
+        seconds: before the impact, which is the recording's last frame; moments before the first are left out.
+        agents: whose images are shown; None for all that are there, and an empty list for none.
         layers: `image`, `boxes`, `trajectories` and `grid` are the default; also `points` (of the LiDAR, in images),
             `ids` and `velocities`. Without `image` no image file is read.
         fig: an empty figure to render on; a new one if None.
@@ -114,7 +114,7 @@ def draw_countdown(
         dataset: the release.
         frame: token.
         agents: whose cameras are shown.
-        layers: of `render_accident`; None for its default.
+        layers: as in `render_accident`; None for its default.
         fig: an empty figure to render on, about 16 to 9.
 
     Raises:
@@ -149,7 +149,7 @@ def draw_countdown(
 
 
 def accident_words(dataset: Dataset, contact: Contact) -> str:
-    """Who hits whom, with which sides, how fast and at which angle, in two lines."""
+    """Two lines: who hits whom, with which sides, how fast and at which angle."""
     scenario = contact.frame.rsplit("/", 1)[0]
     owners = {
         dataset.agent.get(f"{scenario}/{agent}")["actor_id"]: short_name(agent)
@@ -171,7 +171,7 @@ def accident_words(dataset: Dataset, contact: Contact) -> str:
 
 
 def _contact(dataset: Dataset, scenario: RowArgument, instead: str) -> Contact:
-    """How the accident of a scenario happened; raises NotAvailableError, with what to do instead, if there is none."""
+    """How the accident of a scenario happened; raises NotAvailableError, with a remedy, if there is none."""
     contact = collision(dataset, scenario)
     if contact is None:
         raise NotAvailableError(
@@ -187,14 +187,14 @@ def _moments(seconds: Sequence[float], last: int) -> list[tuple[float, int]]:
     recorded = [(left, index) for left, index in moments if 1 <= index <= last]
     if not recorded:
         raise ChoiceError(
-            f"seconds: expected some from 0 to {(last - 1) * FRAME_PERIOD:.1f}, which are recorded before the impact, "
+            f"seconds: expected some from 0 to {(last - 1) * FRAME_PERIOD:.1f}, as recorded before the impact, "
             f"found {list(seconds)}"
         )
     return recorded
 
 
 def _pair_at(tracks: ScenarioTracks, contact: Contact, index: int) -> Boxes:
-    """The boxes, in world, of those who collide that are there in a frame (number from 1)."""
+    """The boxes, in world, of the colliding actors that exist in a frame (number from 1)."""
     there = tracks.at(index)
     return there.select(np.isin(there.actor_id, contact.actor_ids))
 
@@ -216,7 +216,7 @@ def _draw_contact(
     *,
     near: float = _NEAR,
 ) -> None:
-    """Render the moment of a sample (a token) around the place of contact, in world: of the layers `shown` its own."""
+    """Render a sample (a token) around the place of contact, in world; of the layers `shown`, those that it has."""
     record, index = dataset.get("sample", sample), int(sample.rsplit("/", 1)[1])
     x, y = contact.point[:2].tolist()
     ax.set(xlim=(x - near, x + near), ylim=(y - near, y + near), aspect="equal")
@@ -259,7 +259,7 @@ def _draw_camera(dataset: Dataset, camera: str, shown: Collection[Layer], ax: Ax
 
 
 def _draw_speeds(dataset: Dataset, contact: Contact, tracks: ScenarioTracks, index: int, ax: Axes) -> None:
-    """Render how fast the pair is over the seconds before the impact, up to the present full, then pale."""
+    """Render the pair's speeds over the seconds before the impact: strong up to the present, pale after it."""
     impact, fastest = int(tracks.index.max()), 1.0
     for actor, instance, dashes in zip(contact.actor_ids, contact.instances, _DASHES, strict=True):
         rows = np.flatnonzero(tracks.actor_id == actor)

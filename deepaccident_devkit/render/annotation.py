@@ -40,13 +40,13 @@ def render_annotation(
         dataset: the release.
         annotation: token or record.
         margin: metres shown from above to each side of the box's centre.
-        layers: `image`, `boxes` (this box in the camera, all boxes from above) and, from above, the others of
-            `render_bev`; by default image, bev, points, boxes and grid. Without `boxes` the box itself is rendered
-            alone.
+        layers: `image`, `boxes` (this box in the camera, all boxes from above) and, from above, the other layers of
+            `render_bev`; by default image, bev, points, boxes and grid. Without `boxes` only the box itself is
+            rendered.
         fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure: the camera cut to the box, then the box from above in the agent's ego frame, then words.
+        The figure: the part of the camera's image around the box, the box from above in the agent's ego frame, words.
 
     Raises:
         TokenError: no such annotation.
@@ -84,7 +84,7 @@ def _draw_in_camera(
 ) -> None:
     if view is None:
         ax.set_axis_off()
-        ax.text(0.5, 0.5, "in no camera of its agent", ha="center", va="center", transform=ax.transAxes)
+        ax.text(0.5, 0.5, "in no image of its agent's cameras", ha="center", va="center", transform=ax.transAxes)
         return
     draw_view(dataset, view, box, color, ax, image=image)
 
@@ -92,7 +92,7 @@ def _draw_in_camera(
 def draw_view(
     dataset: Dataset, view: BestView, boxes: Boxes, colors: list[str], ax: Axes, *, image: bool = True
 ) -> None:
-    """Render the part of a best view's image about boxes, in world, and their edges; the title is the camera."""
+    """Render the part of a best view's image around boxes, in world, and their edges; the title is the camera."""
     camera = dataset.get("sample_data", view.camera)
     lens = camera_of(dataset, camera)
     draw_image(dataset, camera, ax, image=image)
@@ -103,7 +103,7 @@ def draw_view(
 
 
 def _facts(dataset: Dataset, record: dict[str, Any], own: Boxes) -> list[list[str]]:
-    """The facts on a box (its only row in the ego frame), in columns of lines."""
+    """The facts about a box, in columns of lines; `own` has only this box, in the ego frame."""
     length, width, height = record["size"]
     speed = float(np.linalg.norm(record["velocity"]))
     countdown = "none" if record["time_to_impact"] is None else f"in {record['time_to_impact']:.1f} s"

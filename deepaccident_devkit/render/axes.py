@@ -50,14 +50,14 @@ def titled_from_above(ax: Axes, title: str, *, grid: bool) -> Axes:
 
 
 def detached_figure(size: tuple[float, float]) -> Figure:
-    """A figure that pyplot does not know, for files: loops pile none up, and no display is needed."""
+    """A figure that pyplot does not know, for files: pyplot does not keep it, and no display is needed."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=size, layout="constrained")
 
 
 def with_light_grid(ax: Axes, grid: Literal["x", "y", "both"]) -> Axes:
-    """The axes, with a light grid behind what is rendered, and without a frame at the top and right."""
+    """The axes, with a light grid in the background, and without lines at the top and right."""
     ax.grid(axis=grid, color=GRID_COLOR, linewidth=0.5)
     ax.set_axisbelow(True)
     ax.spines[["top", "right"]].set_visible(False)
@@ -67,8 +67,8 @@ def with_light_grid(ax: Axes, grid: Literal["x", "y", "both"]) -> Axes:
 def settled(fig: Figure) -> Figure:
     """The figure, laid out once.
 
-    matplotlib measures the room for titles and legends on panels as they are before it makes their scales equal, so
-    that it takes too little of it; laid out again at rendering, it starts from panels that are nearly right.
+    matplotlib measures the room for titles and legends before it makes the panels' scales equal, so the room is too
+    small. When it lays the figure out again at rendering, it starts from panels that are nearly right.
     """
     engine = fig.get_layout_engine() if fig.figure is fig else None  # a part of a figure is laid out with it
     if engine is not None:

@@ -26,7 +26,7 @@ CONFIGURATION_COLORS: Final[Mapping[str, str]] = {
     "vehicles": "#6a4fc4",
     "all": "#1a9850",
 }
-"""Of the paper's seven."""
+"""Colours of the paper's seven configurations."""
 _OTHER: Final = "#b5651d"
 _DARK: Final = "#333333"
 _PANEL: Final = (4.2, 3.8)
@@ -39,15 +39,15 @@ _ABOVE: Final = 1.04
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Panel:
-    """Numbers to compare, a colour a configuration.
+    """Numbers to compare, one colour for each configuration.
 
     Attributes:
-        values: configuration → group, or number varied → result; None where there is none.
+        values: configuration → group, or varied number → result; None where there is none.
         title: of the panel.
         ylabel: what the results are.
-        top: the largest result that there can be.
-        xlabel: what is varied: then there are lines; None for bars in groups.
-        intervals: configuration → group, or number varied → (low, high); rendered where there is one.
+        top: the largest possible result.
+        xlabel: the name of the varied number, for lines; None for bars in groups.
+        intervals: configuration → group, or varied number → (low, high); rendered where there is one.
     """
 
     values: Mapping[str, Mapping[str | float, float | None]]
@@ -101,7 +101,7 @@ def render_panels(panels: Sequence[Sequence[Panel]], title: str, *, fig: Figure 
 
 
 def save_panels(panels: Sequence[Sequence[Panel]], title: str, path: Path) -> None:
-    """Render `render_panels` into a PNG file, over the one that is there. Raises OSError."""
+    """Write `render_panels` into a PNG file, which it replaces. Raises OSError."""
     write_figure(render_panels(panels, title, fig=detached_figure(_size(panels))), path, dpi=_DPI)
 
 
@@ -132,7 +132,7 @@ def _draw_lines(panel: Panel, ax: Axes) -> None:
             [y for _, y in known],
             color=CONFIGURATION_COLORS.get(name, _OTHER),
             label=name,
-            linestyle=("-", "--")[place % 2],  # so that of two equal lines both are seen
+            linestyle=("-", "--")[place % 2],  # so that both of two equal lines are seen
             marker="so"[place % 2],
             markersize=6 - 2 * (place % 2),
         )

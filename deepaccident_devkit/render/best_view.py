@@ -14,7 +14,7 @@ from deepaccident_devkit.v2x.projection import camera_of
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BestView:
-    """The image in which some boxes are largest, also if other things hide them.
+    """The image in which some boxes are largest, even if other things hide them.
 
     Attributes:
         camera: token of the image (sample data).
@@ -30,15 +30,15 @@ class BestView:
 
 
 def best_view(dataset: Dataset, samples: Iterable[str], boxes: Boxes) -> BestView | None:
-    """The view of boxes, in world, that shows most of them, and among equal ones shows them largest.
+    """The view of boxes, in world, that shows most of them; of equal views, the one that shows them largest.
 
     Args:
         dataset: the release.
-        samples: tokens of those whose cameras are asked, of the moment of the boxes.
+        samples: tokens of the samples whose cameras are compared, at the moment of the boxes.
         boxes: at least one.
 
     Returns:
-        The first best view; None if no camera has any box, all of it in front, in its image.
+        The first best view; None if no camera has, in its image, any box that is entirely in front of it.
 
     Raises:
         TokenError: no such sample.
@@ -51,7 +51,7 @@ def best_view(dataset: Dataset, samples: Iterable[str], boxes: Boxes) -> BestVie
 def best_camera(dataset: Dataset, sample: str, boxes: Boxes) -> str:
     """The channel of a sample whose image shows most of some boxes, in world, without the agent itself.
 
-    The front camera where none shows any.
+    The front camera if no image shows any.
 
     Raises:
         TokenError: no such sample.
@@ -87,13 +87,13 @@ def _view(dataset: Dataset, camera: str, boxes: Boxes) -> BestView | None:
 def crop_about(
     bounds: tuple[float, float, float, float], *, width: int, height: int, share: float = 0.25
 ) -> tuple[float, float, float, float]:
-    """Left, top, right and bottom of a part of an image, of its shape, with the bounds in the middle of it.
+    """Left, top, right and bottom of a part of an image, of the image's shape, with the bounds in its middle.
 
     Args:
         bounds: left, top, right and bottom, pixels.
         width: of the image.
         height: of the image.
-        share: of the width that the part has at least; it is twice as wide and high as the bounds where it can.
+        share: of the image's width that the part has at least. If possible it is twice as wide and high as the bounds.
     """
     left, top, right, bottom = bounds
     scale = min(1.0, max(share, 2 * (right - left) / width, 2 * (bottom - top) / height))

@@ -40,11 +40,11 @@ BEV_LAYERS: Final[tuple[Layer, ...]] = ("bev", "points", "boxes", "ids", "veloci
 BEV_DEFAULT: Final[tuple[Layer, ...]] = ("bev", "points", "boxes", "grid")
 _OF_BOXES: Final = frozenset(("boxes", "ids", "velocities", "trajectories"))
 _BEYOND: Final = 5.0
-"""Metres past the edge of the picture at which a box may still reach into it."""
+"""Metres outside the picture up to which a box may still reach into it."""
 _MARK: Final = np.array([[1.8, 0.0], [-1.2, 1.1], [-0.6, 0.0], [-1.2, -1.1]])
 """An arrow head, metres of an agent's ego frame."""
 _MOST_PIXELS: Final = 400
-"""Along a side, in round numbers: panels of a video have less, and more takes time."""
+"""Pixels along a side, about: panels of a video have fewer, and more take time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,7 +58,7 @@ class BevView:
         link: what happens to the partners' data.
         sweeps: frames of points, the present included.
         seconds: how far trajectories reach back and ahead.
-        center: of the picture, metres of `frame`; None for the agent.
+        center: of the picture, metres of `frame`; None for the agent's place.
     """
 
     view_range: float = 50.0
@@ -89,22 +89,22 @@ def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a 
     seconds: tuple[float, float] = (1.0, 3.0),
     ax: Axes | None = None,
 ) -> Axes:
-    """Render a moment from above: boxes, LiDAR points and more, in one frame, metres.
+    """Render a moment from above: boxes, LiDAR points and more, in one coordinate frame, metres.
 
     The colliding pair is red, their companions green, the others coloured by category. The sample's own agent has a
-    dark mark, other agents one in their colour with their name; where several agents' points are rendered, they have
-    their agents' colours.
+    dark mark, other agents have a mark in their colour and their name. If several agents' points are rendered, they
+    have their agents' colours.
 
     Args:
         dataset: the release.
-        sample: token or record: its agent is in the middle, its frame the present.
+        sample: token or record: its agent is in the middle, its frame is the present.
         view_range: metres shown to each side of the agent.
         agents: whose points and boxes: names of agents, a configuration or its name, or None for all that are there;
-            by default the sample's own agent alone. Several agents' boxes are rendered once an actor.
+            by default only the sample's own agent. If there are several agents, each actor has one box.
         frame: of the axes: `ego` or `lidar` (forward to the right, left up), or `world`.
-        layers: of `bev` (what the agent's BEV camera saw, muted), `points`, `boxes`, `ids`, `velocities` (arrows of a
-            second), `trajectories` (past thin, future thick, fading) and `grid`; by default bev, points, boxes, grid.
-            Points and the BEV camera are left out where their files are not there.
+        layers: some of `bev` (the agent's BEV camera, in pale colours), `points`, `boxes`, `ids`, `velocities` (arrows
+            for one second), `trajectories` (past thin, future thick, fading) and `grid`; by default bev, points, boxes,
+            grid. Points and the BEV camera are left out if their files are missing.
         link: what happens to the partners' data; None for nothing.
         sweeps: how many frames of points, the present included.
         seconds: how far trajectories reach back and ahead.
@@ -184,7 +184,7 @@ def _draw_clouds(
     center: FloatArray,
     ax: Axes,
 ) -> None:
-    """The points of each agent, in its colour where there are several."""
+    """The points of each agent, in its colour if there are several agents."""
     for agent in names:
         there = at_once(record, agent)
         if not dataset.get_sample_data_path(f"{there}/{LIDAR}").is_file():
@@ -197,7 +197,7 @@ def _draw_clouds(
 
 
 def _draw_marks(dataset: Dataset, record: SampleRecord, frame: str, names: Sequence[AgentName], ax: Axes) -> None:
-    """An arrow head at the true pose of each agent; of several agents with their names."""
+    """An arrow head at the true pose of each agent; with names if there are several agents."""
     from matplotlib.collections import PolyCollection
 
     heads, colors = [], []
@@ -224,7 +224,7 @@ def _finish(record: SampleRecord, frame: str, *, grid: bool, ax: Axes) -> None:
 def draw_points_from_above(
     xyz: FloatArray, ax: Axes, *, center: FloatArray, view_range: float, color: str = POINT_COLOR
 ) -> None:
-    """Render the points (P, 3) within a square of ±`view_range` metres about `center` (2,), all in one colour."""
+    """Render the points (P, 3) within a square of ±`view_range` metres around `center` (2,), all in one colour."""
     near = (np.abs(xyz[:, :2] - center) < view_range).all(axis=1)
     ax.scatter(xyz[near, 0], xyz[near, 1], s=0.6, c=color, linewidths=0, rasterized=True, zorder=1)
 
@@ -236,7 +236,7 @@ def draw_underlay(image: BevImage, ax: Axes, *, target_from_ego: SE3, view_range
         image: of an agent.
         ax: axes to render on; its limits stay as they are.
         target_from_ego: from the agent's ego frame into the frame of the axes; its tilt is left out.
-        view_range: metres about the agent; a turned picture is cut to a square that the corners reach.
+        view_range: metres around the agent; of a turned picture a larger square is taken, so that it fills the corners.
     """
     from matplotlib.transforms import Affine2D
 

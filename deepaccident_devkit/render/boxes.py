@@ -1,4 +1,4 @@
-"""Drawing boxes: from above, and in camera images."""
+"""Rendering boxes: from above, and in camera images."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
 """The twelve edges of a box between its corners, in `Box.corners` order; the first four are its front."""
 NEAREST_DRAWN = 0.1
-"""Metres before the camera at which edges are cut off."""
+"""Metres in front of the camera at which edges are cut off."""
 SMALLEST_TEXT: Final = 7
-"""Points: what is still read in a notebook."""
+"""In points: text of this size can still be read in a notebook."""
 
 
 def draw_box(box: Box, ax: Axes, color: str | None = None) -> Axes:
@@ -37,9 +37,9 @@ def draw_boxes_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str], *, fill
     Args:
         boxes: in any frame that stands on the ground.
         ax: axes to render on.
-        colors: a colour a box.
+        colors: one colour for each box.
         fill: how opaque the inside is, from 0 to 1.
-        how: of the outlines, such as `linestyle` or `linewidths`.
+        how: matplotlib's arguments for the outlines, such as `linestyle` or `linewidths`.
     """
     _draw_footprints(boxes.center[:, :2], boxes.bottom_corners()[..., :2], ax, colors, fill, how)
 
@@ -61,7 +61,7 @@ def draw_velocities_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str]) ->
 
 
 def draw_actors_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str], layers: Collection[Layer]) -> None:
-    """Render those of the layers `boxes`, `velocities` and `ids` that are asked for, as the functions above do."""
+    """Render the requested ones of the layers `boxes`, `velocities` and `ids`, as the functions above do."""
     if "boxes" in layers:
         draw_boxes_from_above(boxes, ax, colors)
     if "velocities" in layers:
@@ -71,9 +71,9 @@ def draw_actors_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str], layers
 
 
 def draw_boxes_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Sequence[str]) -> None:
-    """Render the edges of boxes given in the camera's optical frame, as far as they lie before the camera.
+    """Render the edges of boxes given in the camera's optical frame, as far as they lie in front of the camera.
 
-    The front of a box is filled where all of it is before the camera.
+    The front of a box is filled if all of it is in front of the camera.
     """
     from matplotlib.collections import LineCollection, PolyCollection
     from matplotlib.colors import to_rgba_array
@@ -90,7 +90,7 @@ def draw_boxes_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: S
 
 
 def draw_ids_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Sequence[str]) -> None:
-    """Write the ids of tracked boxes of the camera's optical frame above them, where their top is in the image."""
+    """Write the ids of tracked boxes of the camera's optical frame above them, if their top is in the image."""
     top = boxes.corners()[:, (0, 1, 4, 5)].mean(axis=1)
     pixels, depth = camera.project(top)
     seen = camera.in_image(pixels, depth, min_depth=NEAREST_DRAWN)
@@ -111,7 +111,7 @@ def draw_velocities_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colo
 
 
 def segments_in_image(segments: FloatArray, camera: PinholeCamera) -> tuple[FloatArray, BoolArray]:
-    """Line segments (S, 2, 3) of the optical frame as pixels (V, 2, 2), and which (S,) of them are before the camera.
+    """Line segments (S, 2, 3) of the optical frame as pixels (V, 2, 2), and which (S,) of them are in front of it.
 
     Parts nearer than `NEAREST_DRAWN` are cut off.
     """
@@ -143,7 +143,7 @@ def _draw_footprints(
 
 
 def _moving(boxes: Boxes) -> BoolArray:
-    moving: BoolArray = np.linalg.norm(boxes.velocity, axis=1) > 0  # NaN, an unknown speed, is not
+    moving: BoolArray = np.linalg.norm(boxes.velocity, axis=1) > 0  # False for NaN, an unknown speed
     return moving
 
 
@@ -155,7 +155,7 @@ def _write_id(ax: Axes, place: tuple[float, float], actor_id: int, color: str) -
 
 
 def write_beside(ax: Axes, words: str, place: tuple[float, float], color: str) -> None:
-    """Write a few words right above a place in data coordinates, legible on any ground; not outside the axes."""
+    """Write a few words just above a place in data coordinates, readable on any background; not outside the axes."""
     from matplotlib.patheffects import withStroke
 
     ax.annotate(

@@ -1,4 +1,4 @@
-"""Whether the transforms are right, to be seen at a glance."""
+"""Pictures that show whether the transforms are right."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 CALIBRATION_LAYERS: Final[tuple[Layer, ...]] = ("image", "points", "boxes", "ids")
 _DEFAULT: Final[tuple[Layer, ...]] = ("image", "points", "boxes")
 _FARTHEST: Final = 60.0
-"""Metres from the camera up to which boxes are rendered: far ones are as small as the error that one looks for."""
+"""Metres from the camera up to which boxes are rendered: farther ones are as small as the errors to be found."""
 _COLUMNS: Final = 3
 
 
@@ -40,19 +40,19 @@ def render_calibration(
 ) -> Figure:
     """Render the LiDAR points of all agents and all agents' boxes in camera images, to prove the calibration.
 
-    Where the transforms are right, the points of each agent, which have its colour, lie on the same kerbs, walls and
-    cars as the image's; where an agent's pose or a sensor's place is wrong, its colour is off everywhere. Points and
-    boxes are rendered also if other things hide them.
+    Each agent's points have its colour. If the transforms are right, they lie on the kerbs, walls and cars of the
+    image. If an agent's pose or a sensor's place is wrong, all points of its colour are in wrong places. Points and
+    boxes are rendered even if other things hide them.
 
     Args:
         dataset: the release.
-        frame_or_sample: token or record: of a sample its six cameras, of a frame the front cameras of the agents.
-        agents: whose points and boxes (and, of a frame, whose cameras); None for all that are there.
-        layers: of `image`, `points`, `boxes` (up to 60 m) and `ids`; by default all but ids.
+        frame_or_sample: token or record: a sample shows its six cameras, a frame the front cameras of the agents.
+        agents: whose points and boxes (and, for a frame, whose cameras); None for all that are there.
+        layers: some of `image`, `points`, `boxes` (up to 60 m) and `ids`; by default all except ids.
         fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure, three panels a row.
+        The figure, three panels in a row.
 
     Raises:
         TokenError: no such sample or frame.
@@ -87,7 +87,7 @@ def render_calibration(
 
 
 def _present(dataset: Dataset, row: RowArgument) -> tuple[str, bool]:
-    """The token of a sample of the moment, and whether the row is a frame; the frame's first sample then."""
+    """The token of a sample (of a frame's first one), and whether the row is a frame."""
     try:
         return dataset.get("sample", row)["token"], False
     except TokenError:

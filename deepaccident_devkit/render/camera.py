@@ -32,9 +32,9 @@ CAMERA_LAYERS: Final[tuple[Layer, ...]] = ("image", "points", "boxes", "ids", "v
 CAMERA_DEFAULT: Final[tuple[Layer, ...]] = ("image", "boxes")
 ColorBy = Literal["depth", "height", "agent"]
 _DEPTHS: Final = (0.0, 50.0)
-"""Metres from the camera between which the colours of depth go."""
+"""Metres from the camera at which the colours of depth begin and end."""
 _HEIGHTS: Final = (-1.0, 6.0)
-"""Metres above the origin of the camera's agent between which the colours of height go."""
+"""Metres above the origin of the camera's agent at which the colours of height begin and end."""
 
 
 def render_sample_data(
@@ -47,19 +47,19 @@ def render_sample_data(
     Args:
         dataset: the release.
         sample_data: token or record of a sensor file.
-        layers: of a camera: `image`, `points` (of the agent's LiDAR, coloured by depth up to 50 m), `boxes` (those that
-            any of the agent's cameras sees, without its own), `ids` and `velocities` (a line of a second); by default
-            image and boxes. From above those of `render_bev`; by default points and boxes of the LiDAR, in its frame,
-            and the picture and boxes of the BEV camera, in the ego frame.
+        layers: for a camera: `image`, `points` (of the agent's LiDAR, coloured by depth up to 50 m), `boxes` (those
+            that any of the agent's cameras sees, without its own), `ids` and `velocities` (a line for one second); by
+            default image and boxes. From above the layers of `render_bev`: by default points and boxes for the LiDAR,
+            in its frame, and the picture and boxes for the BEV camera, in the ego frame.
         ax: axes to render on; new ones if None.
 
     Returns:
-        The axes: pixels of a camera, else metres.
+        The axes: pixels for a camera, metres for other sensors.
 
     Raises:
         TokenError: no such sensor file.
         ChoiceError: the sensor has no such layer.
-        MissingFileError: the image, or the points asked for in it, were not downloaded.
+        MissingFileError: the image, or the points to render in it, were not downloaded.
     """
     record = dataset.get("sample_data", sample_data)
     if record["modality"] != "camera":
@@ -82,7 +82,7 @@ def render_sample_data(
 
 
 def draw_image(dataset: Dataset, camera: Any, ax: Axes, *, image: bool = True) -> None:
-    """Render a camera's image in pixels of its calib, without ticks, or leave its place empty.
+    """Render a camera's image, or an empty place for it, in pixels of its calib, without ticks.
 
     Args:
         dataset: the release.
@@ -105,13 +105,13 @@ def draw_points_in_image(pixels: FloatArray, ax: Axes, *, size: float = 2.0, **c
     """Render points at pixels (P, 2) of an image.
 
     Args:
-        pixels: as (u, v), those in the image alone.
+        pixels: as (u, v), only those in the image.
         ax: axes to render on, in pixels.
         size: of a point, in points².
-        colors: `color`, one for all; or `c`, a number a point, with `cmap`, `vmin` and `vmax`.
+        colors: `color`, one for all; or `c`, a number for each point, with `cmap`, `vmin` and `vmax`.
 
     Returns:
-        What was rendered, for a colour bar.
+        The rendered points, for a colour bar.
     """
     return ax.scatter(pixels[:, 0], pixels[:, 1], s=size, linewidths=0, rasterized=True, **colors)
 
@@ -136,15 +136,15 @@ def render_pointcloud_in_image(
     color_by: ColorBy = "depth",
     ax: Axes | None = None,
 ) -> Axes:
-    """Render a camera's image and LiDAR points upon it, also hidden ones.
+    """Render a camera's image with LiDAR points on it, even those that other things hide.
 
     Args:
         dataset: the release.
         camera: token or record of the image (sample data).
-        sample: token or record: whose points, of any agent and moment of the scenario; by default the camera's own
-            sample's, and of `color_by="agent"` those of all agents at its moment.
-        color_by: `depth` along the camera's axis, up to 50 m; `height` above the ground that the camera's agent is on;
-            or `agent`, a colour for each.
+        sample: token or record of the sample whose points are rendered: any agent and moment of the scenario. By
+            default the camera's own sample, and with `color_by="agent"` the samples of all agents at its moment.
+        color_by: `depth` along the camera's axis, up to 50 m; `height` above the ground under the camera's agent; or
+            `agent`, a colour for each.
         ax: axes to render on; new ones if None.
 
     Returns:
@@ -152,7 +152,7 @@ def render_pointcloud_in_image(
 
     Raises:
         TokenError: no such sample or sensor file.
-        ChoiceError: the sensor is no camera, the two are of two scenarios, or there is no such way to colour.
+        ChoiceError: the sensor is no camera, the two are of different scenarios, or there is no such way to colour.
         MissingFileError: the image or a cloud was not downloaded.
     """
     if color_by not in get_args(ColorBy):
@@ -185,7 +185,7 @@ def _draw_agent(dataset: Dataset, source: SampleRecord, camera: RowArgument, ax:
 def _draw_metres(
     dataset: Dataset, source: SampleRecord, camera: RowArgument, color_by: Literal["depth", "height"], ax: Axes
 ) -> None:
-    """Points coloured by depth or height, and what the colours mean."""
+    """Points coloured by depth or height, and a colour bar."""
     cloud = dataset.load_point_cloud(source, "world")
     points = project_to_image(dataset, cloud, source, camera, colors=False)
     values, limits, colormap = points.depth, _DEPTHS, DEPTH_COLORMAP
@@ -199,7 +199,7 @@ def _draw_metres(
 def _draw_numbers(
     points: ImagePoints, values: FloatArray, limits: tuple[float, float], colormap: str, ax: Axes
 ) -> PathCollection:
-    """Points coloured by a number (P,) each, the far ones first."""
+    """Points coloured by one number each (P,), the far points first."""
     shown = np.flatnonzero(points.mask)
     shown = shown[np.argsort(-points.depth[shown])]
     low, high = limits

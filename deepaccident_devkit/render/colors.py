@@ -15,7 +15,7 @@ CATEGORY_COLORS: Mapping[str, str] = {
 AGENT_COLORS: Mapping[str, str] = dict(
     zip(AGENTS, ("#1f6fe0", "#1fb5d6", "#f07f09", "#c9a800", "#9b4de0"), strict=True)
 )
-"""Legible on white and in camera images; without red and green, which mark the accident's actors."""
+"""Easy to see on white and in camera images; without red and green, which mark the accident's actors."""
 SPLIT_COLORS: Mapping[str, str] = dict(
     zip((*SPLITS, "unknown"), ("#2f6fde", "#e08a1e", "#1a9850", "#9a9a9a"), strict=True)
 )
@@ -23,11 +23,11 @@ COLLIDER_COLOR = "#e60026"
 COMPANION_COLOR = "#1a9850"
 """The agents behind the colliding pair, as in the paper."""
 OWN_COLOR = "#111111"
-"""The recording agent itself: a mark beside the colour that its part in the accident gives it."""
+"""A mark for the recording agent itself, in addition to the colour of its part in the accident."""
 POINT_COLOR = "#9a9a9a"
 """LiDAR points that are not coloured by a value."""
 DEPTH_COLORMAP = "turbo_r"
-"""LiDAR points in images, the nearest red."""
+"""LiDAR points in images; the nearest are red."""
 HEIGHT_COLORMAP = "viridis"
 BEV_COLORS: Mapping[str, str] = {
     "road": "#e9e9ec",
@@ -36,19 +36,19 @@ BEV_COLORS: Mapping[str, str] = {
     "vehicle": "#cdd6e6",
     "pedestrian": "#ecd2e4",
 }
-"""CARLA's tags in the BEV camera, muted: boxes are rendered upon it."""
+"""CARLA's tags in the BEV camera, in pale colours: boxes are rendered over them."""
 GRID_COLOR = "#d0d0d0"
 MUTED_COLOR = "#666666"
-"""Words of less weight."""
+"""Less important words."""
 TRUE_PLACE_COLOR = "#8a8a8a"
-"""Where something truly is that is rendered elsewhere, too."""
+"""The true place of something that is also rendered at another place."""
 OUTCOME_COLORS: Mapping[str, str] = {"right": "#1a9850", "false": "#e08a1e", "missed": "#9a9a9a"}
-"""Predictions that are right, predictions that are wrong, and truths that are missed."""
+"""Predictions that are right, predictions that are false, and truths that are missed."""
 SERIES_COLORS = ("#08306b", "#2f6fde", "#7fb2e5", "#9a9a9a")
-"""Lines or bars of one kind that differ in one number, the strictest first."""
+"""Lines or bars of the same kind for several values of one number, the strictest value first."""
 ESTIMATE_COLOR = "#2f6fde"
 """A number with an interval."""
 WARNING_COLOR = "#b00020"
 """Important words; dark enough for text on white."""
 BEYOND_COLOR = "#e4e4e4"
-"""Ground of a frame that is not recorded."""
+"""Background of a frame that is not recorded."""

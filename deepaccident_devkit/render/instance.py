@@ -35,7 +35,7 @@ _CROPS: Final = ("first", "second", "third", "fourth")
 _MOSAIC: Final[list[Any]] = [["path", "first", "second"], ["path", "third", "fourth"], ["speed", "points", "seen"]]
 _FRAMES_A_SECOND: Final = round(1 / FRAME_PERIOD)
 _AROUND: Final = 10.0
-"""Metres rendered beyond the path to each side, at least."""
+"""At least so many metres are rendered around the path, on each side."""
 
 
 def render_instance(
@@ -52,14 +52,14 @@ def render_instance(
         dataset: the release.
         instance: token or record.
         agents: whose views are shown, or None for all that are there; a configuration is as seen from the first agent.
-        layers: of the path `bev` (what a BEV camera saw, muted), `trajectories` (the path), `boxes` (each second) and
-            `grid`; of the camera pictures `image` and `boxes`. By default all.
+        layers: for the path `bev` (a BEV camera's picture, in pale colours), `trajectories` (the path), `boxes` (one
+            a second) and `grid`; for the camera images `image` and `boxes`. By default all.
         fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure: the path in world from above with its seconds and the impact; the largest views of it at
-        four moments; below them speed, LiDAR points in its box and who sees it (by the released rule; pale where an
-        agent annotated it only), over the time of the recording.
+        The figure: the actor's path in world from above with its seconds and the impact; the largest images of it at
+        four moments; below them its speed, LiDAR points in its box and who sees it (by the released rule; pale if an
+        agent only annotated it), over the time of the recording.
 
     Raises:
         TokenError: no such instance.
@@ -96,7 +96,7 @@ class _Actor:
         index: (T,) their frame numbers from 1.
         duration: of the scenario, seconds.
         impact: seconds from the first frame to the recorded impact.
-        color: of its part in the accident, or its category.
+        color: that of its part in the accident, or of its category.
     """
 
     scenario: str
@@ -134,7 +134,7 @@ def _actor(dataset: Dataset, instance: RowArgument) -> _Actor:
 
 
 def _draw_path(dataset: Dataset, actor: _Actor, layers: frozenset[Layer], ax: Axes) -> None:
-    """The path from above, in world: the start pale, each second marked, and the impact of one that collides."""
+    """The path from above, in world: the start pale, each second marked, and the impact if the actor collides."""
     path = actor.boxes.center[:, :2]
     center = (path.min(axis=0) + path.max(axis=0)) / 2
     reach = float(np.ptp(path, axis=0).max()) / 2 + _AROUND
@@ -168,7 +168,7 @@ def _draw_path(dataset: Dataset, actor: _Actor, layers: frozenset[Layer], ax: Ax
 def _draw_crops(
     dataset: Dataset, actor: _Actor, known: Sequence[Sightings], layers: frozenset[Layer], axes: Sequence[Axes]
 ) -> None:
-    """The largest views at moments spread over those at which some camera sees the actor."""
+    """The largest views at several of the moments at which some camera sees the actor."""
     moments = np.unique(np.concatenate([one.index[one.camera] for one in known]))
     picked = moments[np.unique(np.linspace(0, len(moments) - 1, len(axes)).round().astype(int))] if len(moments) else []
     for ax in axes[len(picked) :]:
@@ -204,7 +204,7 @@ def _draw_points(known: Sequence[Sightings], ax: Axes) -> None:
 
 
 def _draw_seen(actor: _Actor, known: Sequence[Sightings], ax: Axes) -> None:
-    """A bar an agent, from the top: full where it sees the actor, pale where it annotated it only."""
+    """One bar for each agent, from the top: full where it sees the actor, pale where it only annotated it."""
     for row, one in enumerate(known):
         for which, opacity in ((one.seen, 1.0), (~one.seen, 0.25)):
             spans = [(time - FRAME_PERIOD / 2, FRAME_PERIOD) for time in one.timestamp[which].tolist()]

@@ -19,8 +19,8 @@ def layers_of(
     """The layers to render.
 
     Args:
-        given: what the caller asked for; one alone may stand without a list. None stands for the default, and nothing
-            at all for an empty picture.
+        given: the caller's layers, in a list or one alone. None stands for the default, an empty list for an empty
+            picture.
         default: the layers rendered when the caller does not choose.
         possible: the layers that the picture has.
 
@@ -28,7 +28,7 @@ def layers_of(
         The layers chosen.
 
     Raises:
-        ChoiceError: a layer that the picture has not.
+        ChoiceError: the picture does not have a layer.
     """
     words = default if given is None else given
     chosen = cast(tuple[Layer, ...], (words,) if isinstance(words, str) else tuple(words))

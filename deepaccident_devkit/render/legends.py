@@ -17,7 +17,7 @@ BESIDE: Final[Mapping[str, Any]] = {"loc": "upper left", "bbox_to_anchor": (1.01
 
 
 def box_handles(colors: Collection[str]) -> list[Artist]:
-    """A patch for each meaning that a box's colour has, of those colours that are there."""
+    """A patch with its meaning for each of these colours of boxes."""
     from matplotlib.colors import to_rgba
     from matplotlib.patches import Patch
 

@@ -1,4 +1,4 @@
-"""The effects of a link on shared data: where partners' boxes arrive, and the clouds with and without it."""
+"""The effects of a link on shared data: where partners' boxes arrive, and the clouds with and without the link."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class SharedBoxes:
     Attributes:
         agent: the partner.
         true: the boxes of its label at the present, at their true places.
-        received: those that arrive, where the receiver places them; none if the message is lost.
+        received: the boxes that arrive, where the receiver places them; none if the message is lost.
     """
 
     agent: str
@@ -65,15 +65,16 @@ def render_link(
 ) -> Figure:
     """Render the effects of latency, wrong poses and losses on the data that partners share with a sample's agent.
 
-    The first panel has the partners' boxes: dashed where they truly are, in the partner's colour where they arrive,
-    with an arrow from one to the other and the metres in the legend. Beside it are the agents' clouds, without the link
-    and with it.
+    The first panel has the partners' boxes: dashed at their true places, in the partner's colour at the received
+    places, with arrows between these places and the metres in the legend. The next panels have the agents' clouds,
+    without the link and with it.
 
     Args:
         dataset: the release.
         sample: token or record: its agent receives.
         link: what happens to the partners' data.
-        agents: who cooperates: names, a configuration or its name as seen from the ego; None for all that are there.
+        agents: which agents cooperate: names, a configuration or its name as seen from the ego; None for all that are
+            there.
         view_range: metres shown to each side of the ego.
         layers: `points`, `boxes` and `grid` are the default; also `ids`. Without `points` there are no clouds.
         fig: an empty figure to render on; a new one if None.
@@ -115,7 +116,7 @@ def shared_boxes(dataset: Dataset, sample: RowArgument, link: Link, agents: Agen
     record = dataset.get("sample", sample)
     partners = [agent for agent in cooperating_agents(dataset, sample, agents) if agent != record["agent"]]
     if not partners:
-        raise ChoiceError(f"agents: expected a partner of {record['agent']}, found none; a link has two ends")
+        raise ChoiceError(f"agents: expected a partner of {record['agent']}, found none; a link needs two agents")
     return [
         SharedBoxes(
             agent=agent,

@@ -24,7 +24,7 @@ CAMERA_GRID: Final = (
     ("Camera_FrontLeft", "Camera_Front", "Camera_FrontRight"),
     ("Camera_BackLeft", "Camera_Back", "Camera_BackRight"),
 )
-"""Where the six cameras are in a picture of them all."""
+"""The places of the six cameras in a picture of all of them."""
 _TALL_GRID: Final = (
     ("Camera_Front", "Camera_Back"),
     ("Camera_FrontLeft", "Camera_FrontRight"),
@@ -32,12 +32,12 @@ _TALL_GRID: Final = (
 )
 """The same in a figure of about 16 to 9."""
 _WIDE: Final = 2.1
-"""Width by height from which a figure has room for three cameras and a view from above beside each other."""
+"""The least width by height of a figure with room for three cameras and a view from above side by side."""
 _VIEW_RANGE: Final = 50.0
-"""Metres to each side of an agent among others; to its left and right more, where the figure is tall."""
+"""Metres to each side of an agent if there are several; in a tall figure more to its left and right."""
 _TALLEST: Final = 2.0
 _BESIDE, _ABOUT = 0.9, 1.6
-"""Inches that words take beside panels, and above and below them."""
+"""Inches of room for words beside panels, and above and below them."""
 MOMENT_LAYERS: Final = tuple(layer for layer in LAYERS if layer in {*CAMERA_LAYERS, *BEV_LAYERS})
 
 
@@ -50,14 +50,14 @@ def render_sample(
     link: Link | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Render a sample: its six cameras as they look, and boxes and LiDAR from above.
+    """Render a sample: its six cameras at their places around the agent, and boxes and LiDAR from above.
 
     Args:
         dataset: the release.
         sample: token or record.
-        agents: whose points and boxes are rendered from above (`render_bev`); by default the sample's own agent's.
-        layers: each panel renders those of them that it has: cameras those of `render_sample_data`, the panel from
-            above those of `render_bev`; by default each its own default.
+        agents: whose points and boxes are rendered from above (`render_bev`); by default only the sample's own agent.
+        layers: each panel renders those of them that it has: cameras have those of `render_sample_data`, the panel from
+            above those of `render_bev`. By default each panel has its own default.
         link: what happens to the partners' data; None for nothing.
         fig: an empty figure to render on; a new one if None.
 
@@ -105,15 +105,15 @@ def render_frame(
     Args:
         dataset: the release.
         frame: token or record.
-        agents: which, or None for all that are there; a configuration is as seen from the first that is there. Their
-            order is always that of `taxonomy.AGENTS`.
-        layers: each panel renders those of them that it has: cameras those of `render_sample_data`, panels from above
-            those of `render_bev`; by default each its own default.
-        fig: an empty figure to render on; a new one if None. In a tall one, panels from above reach farther to the left
-            and right of the agent than the 50 m before and behind it.
+        agents: which agents, or None for all that are there; a configuration is as seen from the first that is there.
+            Their order is always that of `taxonomy.AGENTS`.
+        layers: each panel renders those of them that it has: cameras have those of `render_sample_data`, panels from
+            above those of `render_bev`. By default each panel has its own default.
+        fig: an empty figure to render on; a new one if None. Panels from above show 50 m in front of and behind the
+            agent, and in a tall figure more to its left and right.
 
     Returns:
-        The figure, a column an agent.
+        The figure, one column for each agent.
 
     Raises:
         TokenError: no such frame.
@@ -146,7 +146,7 @@ def render_frame(
 
 
 def panel_layers(layers: Iterable[Layer] | None) -> tuple[frozenset[Layer], frozenset[Layer]]:
-    """The layers of the cameras and of the panels from above, of those asked for; raises ChoiceError."""
+    """The requested layers of the cameras, and of the panels from above; raises ChoiceError."""
     if layers is None:
         return frozenset(CAMERA_DEFAULT), frozenset(BEV_DEFAULT)
     chosen = layers_of(layers, (), MOMENT_LAYERS)
@@ -154,14 +154,14 @@ def panel_layers(layers: Iterable[Layer] | None) -> tuple[frozenset[Layer], froz
 
 
 def _tallness(fig: Figure, columns: int) -> float:
-    """Height by width of panels from above that fill the figure below cameras of 16 to 9: a square's at least."""
+    """Height by width, at least 1, of panels from above that fill the figure below cameras of 16 to 9."""
     width = (fig.bbox.width / fig.dpi - _BESIDE) / columns
     height = fig.bbox.height / fig.dpi - _ABOUT
     return min(max(height / width - 9 / 16, 1.0), _TALLEST)
 
 
 def _plain(ax: Axes, *, labelled: bool) -> None:
-    """A panel beside others that look alike: its title is above, its axes are those of the first."""
+    """Remove a panel's title and, unless it is `labelled`, the labels of its y axis."""
     ax.set_title("")
     if not labelled:
         ax.set_ylabel("")

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MotionStyle = Literal["maps", "trail"]
-"""`maps`: a panel a map and frame; `trail`: one panel, the present opaque and later frames paler."""
+"""`maps`: one panel for each map and frame; `trail`: one panel, the present opaque and later frames paler."""
 _MAP_LAYERS: Final[tuple[Layer, ...]] = ("labels", "velocities", "ids", "grid")
 TRAIL_LAYERS: Final[tuple[Layer, ...]] = ("labels", "trajectories", "ids", "grid")
 _SHOWN: Final[dict[MotionStyle, tuple[Layer, ...]]] = {
@@ -29,7 +29,7 @@ _SHOWN: Final[dict[MotionStyle, tuple[Layer, ...]]] = {
 }
 _POSSIBLE: Final[dict[MotionStyle, tuple[Layer, ...]]] = {"maps": _MAP_LAYERS, "trail": TRAIL_LAYERS}
 _KEY_WIDTH: Final = 0.5
-"""Of the column that explains the colours, in widths of a panel."""
+"""Width of the column that explains the colours, in widths of a panel."""
 
 
 def render_motion_labels(
@@ -42,16 +42,16 @@ def render_motion_labels(
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Render a sample's motion labels: a column a frame; instances, centerness, offset and flow below each other.
+    """Render a sample's motion labels: one column for each frame, with instances, centerness, offset and flow.
 
     Args:
         dataset: the release.
         sample: token or record.
         config: what labels show; None for the released ones.
-        at_present: warp all frames to the present ego frame; else each is in its own.
-        style: `maps`, or `trail` for one panel with all frames, the later the paler, and the actors' paths.
-        layers: of maps `labels` (the cells), `velocities` (the arrows of the flow), both of which are the default,
-            `ids` and `grid`; of a trail `trajectories` in place of `velocities`.
+        at_present: warp all frames to the present ego frame; if False, each is in its own.
+        style: `maps`, or `trail` for one panel with all frames, later ones paler, and the actors' paths.
+        layers: for maps `labels` (the cells) and `velocities` (the arrows of the flow), which are the default, `ids`
+            and `grid`; for a trail `trajectories` in place of `velocities`.
         fig: an empty figure to render on; a new one if None.
 
     Returns:
@@ -81,7 +81,7 @@ def draw_motion_labels(
     """Render labels as `render_motion_labels` does; actors whose label ids are `marked` are red (the ego itself: −100).
 
     Args:
-        labels: at the present or each frame in its own ego frame, as they are.
+        labels: warped to the present or not; they are rendered as they are.
         marked: label ids.
         style: `maps` or `trail`.
         layers: as of `render_motion_labels`.
@@ -107,13 +107,13 @@ def draw_motion_output(
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Render what a model predicts, as `draw_motion_labels` renders labels; of instance maps only the instances.
+    """Render a prediction as `draw_motion_labels` renders labels; instance maps have only the instances.
 
     Args:
         output: in the present ego frame, in any orientation.
         number: which of its K predictions, from 0 or from the end.
         step: seconds from frame to frame.
-        post_processing: how instances are read off heads: of `POST_PROCESSING` by name, or your own.
+        post_processing: how instances are found in heads: a name in `POST_PROCESSING`, or your own.
         marked: ids of instances that are red.
         style: `maps` or `trail`.
         layers: as of `render_motion_labels`.
@@ -138,18 +138,17 @@ def draw_motion_map(
     layers: Iterable[Layer] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Render one map of one label frame, in metres of the ego frame that it is in: forward to the right, left up.
+    """Render one map of one label frame, in metres of its ego frame: forward to the right, left up.
 
-    Instances have a colour each, which they keep over the frames; `marked` ones are red. The ego's own box has a dark
-    edge, and is dark where it is not marked. Colours of offset and flow are directions, paler for shorter vectors, on
-    a scale of their own for each map. Each instance has an arrow to where its flow takes it, or a dot if it stays. A
-    frame beyond the recording is grey.
+    Each instance has one colour in all frames; `marked` ones are red. The ego's own box has a dark edge, and is dark if
+    it is not marked. Colours of offset and flow are directions, paler for shorter vectors; each map has its own scale.
+    Each instance has an arrow to where its flow moves it, or a dot if it stays. A frame beyond the recording is grey.
 
     Args:
-        labels: at the present or not; or a prediction, of which the last one is rendered.
+        labels: warped to the present or not; or an output, of which the last prediction is rendered.
         name: of the map.
         frame: 0 is the present.
-        marked: label ids of actors, the ego's own is −100; of a prediction, ids of instances.
+        marked: label ids of actors, the ego's own is −100; for a prediction, ids of instances.
         layers: `labels` and `velocities`, which are the default, `ids` and `grid`.
         ax: axes to render on; new ones if None.
 
@@ -174,11 +173,11 @@ def draw_motion_trail(
     layers: Iterable[Layer] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Render all frames over each other, the present opaque and on top, later ones the paler; and the actors' paths.
+    """Render all frames over each other, the present opaque and on top, later ones paler; and the actors' paths.
 
     Args:
-        labels: at the present; or a prediction, of which the last one is rendered.
-        marked: as of `draw_motion_map`.
+        labels: warped to the present; or an output, of which the last prediction is rendered.
+        marked: as in `draw_motion_map`.
         layers: `labels` (the cells) and `trajectories` (from centre to centre), which are the default, `ids`, `grid`.
         ax: axes to render on; new ones if None.
 

@@ -45,7 +45,7 @@ def draw_trail_of(maps: MotionMaps, shown: frozenset[Layer], ax: Axes) -> Axes:
 
 
 def trail_picture(maps: MotionMaps) -> FloatArray:
-    """(H, W, 3) the colours of all frames over each other, the earlier the stronger and on top."""
+    """(H, W, 3) the colours of all frames over each other; earlier frames are stronger and on top."""
     frames = np.flatnonzero(maps.valid).tolist()
     opacity = np.linspace(1.0, PALEST, max(len(maps.valid), 2))
     picture = np.ones((*maps.instance.shape[1:], 3))
@@ -105,7 +105,7 @@ def _edge_own(maps: MotionMaps, frame: int, ax: Axes) -> None:
 
 
 def _draw_arrows(maps: MotionMaps, frame: int, ax: Axes) -> None:
-    """An arrow an instance, from the mean of its cells, as long as the mean of their flow."""
+    """One arrow for each instance, from the mean of its cells, along the mean of their flow."""
     flow, instance = maps.vectors("flow")[frame], maps.instance[frame]
     known = ~np.isnan(flow[0])
     if not known.any():
@@ -122,7 +122,7 @@ def _draw_arrows(maps: MotionMaps, frame: int, ax: Axes) -> None:
 
 
 def _draw_paths(maps: MotionMaps, ax: Axes) -> None:
-    """A line an instance over the centres of its cells, with a dot at each frame after the present."""
+    """One line for each instance along the centres of its cells, with a dot at each frame after the present."""
     from matplotlib.collections import LineCollection
 
     paths = {identity: path for identity, path in maps.paths().items() if len(path) > 1}
@@ -163,6 +163,6 @@ def _draw_instance_key(maps: MotionMaps, ax: Axes) -> None:
 
 
 def _cell_centers(maps: MotionMaps) -> tuple[FloatArray, FloatArray]:
-    """Metres x of the columns' and y of the rows' middles."""
+    """Metres: x of the columns' centres and y of the rows' centres."""
     centers = maps.grid.centers()
     return centers[0, :, 0], centers[:, 0, 1]

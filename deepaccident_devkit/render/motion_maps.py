@@ -1,4 +1,4 @@
-"""`MotionMaps`: what pictures show of motion, the same of labels and of predictions."""
+"""`MotionMaps`: what pictures show of motion, in one form for labels and for predictions."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from deepaccident_devkit.taxonomy import FRAME_PERIOD, OWN_ACTOR_ID
 DrawnMap = Literal["instance", "centerness", "offset", "flow"]
 MAPS: Final[tuple[DrawnMap, ...]] = get_args(DrawnMap)
 _PALETTE: Final = (0, 1, 2, 3, 8, 9, 10, 11, 12, 13, 16, 17, 18, 19)
-"""Of matplotlib's tab20: without its greens, reds and greys, which mean something here."""
+"""Colours of matplotlib's tab20, without its greens, reds and greys: these have a meaning here."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -37,13 +37,13 @@ class MotionMaps(FrozenArrays):
     Attributes:
         grid: the cells, in the devkit's orientation.
         step: seconds from frame to frame.
-        at_present: whether all frames are in the present ego frame; else each is in its own.
-        valid: (T,) bool: which frames are there.
-        instance: (T, H, W) ids from 1, 0 elsewhere and in frames that are not there.
+        at_present: whether all frames are in the present ego frame; if not, each is in its own.
+        valid: (T,) bool: which frames exist.
+        instance: (T, H, W) ids from 1, 0 elsewhere and in frames that do not exist.
         colors: (1 + ids, 3) red, green, blue of each id; white of 0.
         own: the id of the ego's own box; −1 if it is not known.
-        centerness: (T, H, W) in [0, 1]; None where the maps are instances alone.
-        offset: (T, 2, H, W) cells to the left and forward, NaN outside instances; None likewise.
+        centerness: (T, H, W) in [0, 1]; None if there are only instances.
+        offset: (T, 2, H, W) cells to the left and forward, NaN outside instances; None if there are only instances.
         flow: (T, 2, H, W) as the offset; NaN also where it is not known.
     """
 
@@ -60,19 +60,19 @@ class MotionMaps(FrozenArrays):
 
     @property
     def names(self) -> tuple[DrawnMap, ...]:
-        """The maps that there are."""
+        """The names of the maps that are not None."""
         return tuple(name for name in MAPS if getattr(self, name) is not None)
 
     def vectors(self, name: DrawnMap) -> AnyArray:
         """`offset` or `flow`, (T, 2, H, W); raises ChoiceError if it is not there."""
         maps = getattr(self, name)
         if maps is None:
-            raise ChoiceError(f"map: this prediction has {', '.join(self.names)} alone, not {name}; give heads for it")
+            raise ChoiceError(f"map: this prediction has only {', '.join(self.names)}, not {name}; give heads for it")
         chosen: AnyArray = maps
         return chosen
 
     def longest(self, name: DrawnMap) -> float:
-        """Cells, at least 1: the longest vector of a map in all frames; 1 of maps without vectors."""
+        """The length of a map's longest vector in all frames, in cells, at least 1; 1 for maps without vectors."""
         if name not in ("offset", "flow"):
             return 1.0
         length = np.linalg.norm(self.vectors(name), axis=1)
@@ -122,11 +122,11 @@ def maps_of_output(
     """One prediction as it is rendered.
 
     Args:
-        output: what a model says.
+        output: a model's output.
         number: which of its predictions; the last is the mean, in the released order.
         step: seconds from frame to frame.
         marked: ids of instances that are red.
-        post_processing: how instances are read off heads.
+        post_processing: how instances are found in heads.
 
     Raises:
         ChoiceError: no such prediction, or no such post-processing.
@@ -153,11 +153,11 @@ def maps_of_output(
 def _found(
     output: MotionOutput, heads: MotionHeads | None, number: int, post_processing: PostProcessing | str
 ) -> AnyArray:
-    """(T, H, W) the instances of one prediction, as it lies."""
+    """(T, H, W) the instances of one prediction, in its own orientation."""
     if output.instances is not None:
         given: AnyArray = output.instances[number]
         return given
-    if heads is None:  # only for the type: an output has the one or the other
+    if heads is None:  # only for the type checker: an output has one of them
         raise ChoiceError("prediction: has neither heads nor instances")
     return predict_instances(heads, post_processing).instance
 
@@ -174,7 +174,7 @@ def _head_maps(heads: MotionHeads, instance: AnyArray) -> dict[str, AnyArray]:
 
 
 def _label_colors(labels: MotionLabels, instance: AnyArray, marked: Collection[int]) -> FloatArray:
-    """The palette with red for marked actors, and the dark of the ego's own box where that is not."""
+    """The palette with red for marked actors, and a dark colour for the ego's own box if it is not marked."""
     from matplotlib.colors import to_rgb
 
     highest = max([int(instance.max(initial=0)), *labels.id_map.values()])

@@ -1,4 +1,4 @@
-"""Pictures into files."""
+"""Writing pictures into files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PICTURE_SUFFIXES: Final = (".png", ".pdf", ".svg", ".jpg", ".webp")
 
 
 def check_picture_path(path: str | os.PathLike[str]) -> Path:
-    """The path, if it ends as a picture does; raises ChoiceError."""
+    """The path, if it has the suffix of a picture; raises ChoiceError."""
     path = Path(path).expanduser()
     if path.suffix.lower() not in PICTURE_SUFFIXES:
         raise ChoiceError(f"path: expected a file that ends in {', '.join(PICTURE_SUFFIXES)}, found {str(path)!r}")
@@ -29,17 +29,17 @@ def check_picture_path(path: str | os.PathLike[str]) -> Path:
 
 def figure_of_pixels(width: int, height: int, *, dpi: float) -> Figure:
     """A figure that pyplot does not know, whose picture has exactly this width and height."""
-    whole = 1e-3  # a canvas cuts off fractions of pixels, and inches are rounded
+    whole = 1e-3  # a canvas drops fractions of pixels, and inches are rounded
     figure = detached_figure(((width + whole) / dpi, (height + whole) / dpi))
     figure.set_dpi(dpi)
     return figure
 
 
 def save_picture(drawn: Axes | Figure, path: str | os.PathLike[str], *, dpi: float = 100) -> Path:
-    """Write what a `render_…` function returned, atomically, over a file that is there; pyplot then forgets it.
+    """Write the result of a `render_…` function atomically into a file, which it replaces, and close it in pyplot.
 
     Args:
-        drawn: axes, of whose whole figure the picture is, or a figure.
+        drawn: a figure, or axes, whose whole figure is written.
         path: the file, by its suffix one of `PICTURE_SUFFIXES`.
         dpi: pixels an inch.
 
@@ -63,7 +63,7 @@ def write_figure(figure: Figure, path: Path, *, dpi: float, words: dict[str, Any
     """Write a figure as the path's suffix says, atomically and without a date: the same picture makes the same bytes.
 
     Args:
-        figure: as `detached_figure` makes it; pyplot does not forget others.
+        figure: from `detached_figure`; others stay open in pyplot.
         path: a file that is there is replaced.
         dpi: pixels an inch.
         words: the text entries of a PNG file.

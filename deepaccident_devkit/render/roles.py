@@ -1,4 +1,4 @@
-"""Who is who in a picture: the colliding pair, the agents beside them, the recording agent."""
+"""The roles of actors in a picture: the colliding pair, the other agents, the recording agent."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def collider_ids(dataset: Dataset, sample: RowArgument) -> set[int]:
 def companion_ids(dataset: Dataset, sample: RowArgument) -> set[int]:
     """The label ids, in this sample, of the recording vehicles that do not collide: −100 where the agent is one.
 
-    In an accident of the paper's design these are the two behind the colliding pair.
+    In an accident of the paper's design these are the two vehicles behind the colliding pair.
     """
     record = dataset.get("sample", sample)
     actors = agent_actors(dataset, record["scenario_token"])
@@ -35,13 +35,13 @@ def companion_ids(dataset: Dataset, sample: RowArgument) -> set[int]:
 
 
 def agent_actors(dataset: Dataset, scenario: str) -> dict[AgentName, int]:
-    """The recording vehicles of a scenario (a token) → their actor ids, of those that meta names."""
+    """The recording vehicles of a scenario (a token) → their actor ids, if meta names them."""
     actors = {agent: dataset.agent.get(f"{scenario}/{agent}")["actor_id"] for agent in agents_of(dataset, scenario)}
     return {agent: actor for agent, actor in actors.items() if actor is not None}
 
 
 def box_colors(boxes: Boxes, colliders: Collection[int] = (), companions: Collection[int] = ()) -> list[str]:
-    """A colour a box: the colliding pair red, their companions green, the others by category."""
+    """One colour for each box: the colliding pair red, their companions green, the others by category."""
     colors = []
     for actor_id, name in zip(boxes.actor_id.tolist(), boxes.category_names, strict=True):
         other = COMPANION_COLOR if actor_id in companions else CATEGORY_COLORS[name]
@@ -61,16 +61,16 @@ def role_colors(dataset: Dataset, sample: RowArgument, boxes: Boxes) -> list[str
 
 
 def short_name(agent: str) -> str:
-    """An agent's name as pictures have room for it: `ego`, `ego behind`, `other`, `other behind`, `infrastructure`."""
+    """An agent's short name for pictures: `ego`, `ego behind`, `other`, `other behind`, `infrastructure`."""
     return agent.replace("_vehicle", "").replace("_", " ")
 
 
 def in_drawing_order(agents: Collection[str]) -> list[str]:
-    """Agents in the order of `taxonomy.AGENTS`, which panels and legends have."""
+    """Agents in the order of `taxonomy.AGENTS`, as in panels and legends."""
     return sorted(agents, key=AGENTS.index)
 
 
 def at_once(sample: Mapping[str, Any], agent: str) -> str:
-    """The token of an agent's sample at the moment of another's record."""
+    """The token of an agent's sample at the moment of another agent's sample, given by its record."""
     scenario, _, number = sample["token"].rsplit("/", 2)
     return sample_token(scenario, agent, int(number))

@@ -17,7 +17,7 @@ from deepaccident_devkit.v2x import Agents, cooperating_agents, cooperative_boxe
 from deepaccident_devkit.v2x.cooperation import visible_actors
 
 _FRAME_SLASHES: Final = 2
-"""Of `<scenario_type>/<name>/<NNN>`; a sample's token has an agent, too."""
+"""The slashes of a frame's token, `<scenario_type>/<name>/<NNN>`; a sample's token has one more, for the agent."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -26,10 +26,10 @@ class Sights(FrozenArrays):
 
     Attributes:
         sample: token of the sample whose agent is the ego.
-        agents: those that look, the ego first if it is one.
+        agents: the agents that look, the ego first if it is one of them.
         boxes: the actors in one frame, by ascending id; an agent's own has the agent's actor id.
         place: (A, 2) x and y of the agents in that frame, metres.
-        actor: (A,) int64 the agents' own actor ids; −1 of the pole, and where meta does not say.
+        actor: (A,) int64 the agents' own actor ids; −1 for the infrastructure, and if meta does not give it.
         seen: (N, A) bool: whether the agent counts as seeing the actor.
         annotated: (N, A) bool: whether its label has the actor at all.
         points: (N, A) int64: LiDAR points of the agent in the box that its label has.
@@ -68,9 +68,9 @@ class Sights(FrozenArrays):
         return np.isin(self.boxes.actor_id, self.actor[self.actor >= 0])
 
     def hidden_from(self, agent: str) -> BoolArray:
-        """(N,) which of the accident's actors, the pair and the agents, an agent does not see, without itself.
+        """(N,) which actors of the accident (the pair and the agents, without itself) an agent does not see.
 
-        None at all if the agent is not one of those that look, or if nobody collides.
+        All are False if the agent is not one of those that look, or if nobody collides.
         """
         if agent not in self.agents or not self.pair:
             return np.zeros(len(self.boxes), dtype=bool)
@@ -85,8 +85,8 @@ def sights(dataset: Dataset, moment: RowArgument, agents: Agents = None, frame: 
     Args:
         dataset: the release.
         moment: token or record of a sample, or of a frame: then its first agent's sample is taken.
-        agents: who looks: as `visible_instances` takes them; None for all that are there.
-        frame: of the result: of the sample.
+        agents: the agents that look, as `visible_instances` takes them; None for all that are there.
+        frame: coordinate frame of the result, of the sample.
 
     Raises:
         TokenError: no such sample or frame.
@@ -126,7 +126,7 @@ def sights(dataset: Dataset, moment: RowArgument, agents: Agents = None, frame: 
 
 
 def sample_at(dataset: Dataset, moment: RowArgument) -> str:
-    """Token of a sample, or of a frame's first one; raises TokenError if it is neither's."""
+    """Token of a sample, or of a frame's first sample; raises TokenError if `moment` is neither."""
     token = str(moment["token"]) if isinstance(moment, Mapping) else moment
     if token.count("/") == _FRAME_SLASHES:
         first: str = dataset.samples_of(token)[0]["token"]
@@ -161,7 +161,7 @@ class Sightings(FrozenArrays):
 
 
 def sightings(dataset: Dataset, scenario: str, agent: str, actor_id: int) -> Sightings:
-    """What an agent of a scenario (tokens) annotated of an actor; its own row of itself does not count."""
+    """The moments at which an agent of a scenario (tokens) annotated an actor; its row of itself does not count."""
     rows: list[tuple[int, int, bool, bool]] = []
     for index in range(1, dataset.get("scenario", scenario)["num_frames"] + 1):
         sample = sample_token(scenario, agent, index)

@@ -1,4 +1,4 @@
-"""Figures of a release's statistics: one a group of panels, and the files that they become."""
+"""Figures of a release's statistics: one for each group of panels, and their files."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def _motion(statistics: DatasetStatistics, fig: Figure) -> None:
 
 
 def _collisions(statistics: DatasetStatistics, fig: Figure) -> None:
-    fig.suptitle("The colliding pair at the last frame: the other, as the first sees it\n")
+    fig.suptitle("The colliding pair at the last frame: the other actor, seen from the first\n")
     angles = fig.add_subplot(1, 3, 1, projection="polar")
     bearings = fig.add_subplot(1, 3, 2, projection="polar")
     render_angles(statistics.histograms["collision_angles"], ax=angles)
@@ -144,7 +144,7 @@ def save_statistics(
     folder: str | os.PathLike[str],
     formats: Sequence[PictureFormat] = ("png", "pdf"),
 ) -> list[Path]:
-    """Render all groups of statistics into files `<group>.<format>`, each atomically, over those that are there.
+    """Render all groups of statistics into files `<group>.<format>`, each atomically; earlier ones are replaced.
 
     Args:
         statistics: of `dataset_statistics`.

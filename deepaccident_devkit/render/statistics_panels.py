@@ -1,4 +1,4 @@
-"""Panels of a release's statistics, one a table: counts, histograms, quantiles, angles, positions."""
+"""Panels of a release's statistics, one for each table: counts, histograms, quantiles, angles, positions."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def render_angles(histogram: Histogram, *, ax: Axes | None = None) -> Axes:
 
 
 def render_relative_positions(pairs: Sequence[CollisionPair], *, ax: Axes | None = None) -> Axes:
-    """Render where the other of each colliding pair was at the last frame, seen by the first, forward up.
+    """Render where the other actor of each colliding pair was at the last frame, seen from the first, forward up.
 
     Args:
         pairs: `DatasetStatistics.collisions`.
@@ -156,7 +156,7 @@ def render_relative_positions(pairs: Sequence[CollisionPair], *, ax: Axes | None
     reach = max([6.0, *(1.1 * max(abs(pair.x), abs(pair.y)) for pair in pairs)])
     ax.set(xlim=(reach, -reach), ylim=(-reach, reach), aspect="equal")
     ax.set(xlabel="to the left of the first (m)", ylabel="forward of the first (m)")
-    ax.set_title("Centre of the other (red: the first, as a median car)", fontsize=10)
+    ax.set_title("Centre of the other actor (red: the first, as a median car)", fontsize=10)
     if pairs:
         ax.legend(fontsize=8, loc="upper right", title="the other", title_fontsize=8)
     return with_light_grid(ax, "both")
@@ -185,7 +185,7 @@ def draw_quantile_boxes(rows: Mapping[str, QuantileRow], ax: Axes) -> None:
 def _draw_stacked(
     histogram: Histogram, ax: Axes, places: Sequence[float], width: float | Sequence[float], **how: Any
 ) -> None:
-    """Bars at some places, the splits on top of each other; those without any have none."""
+    """Bars at some places, the splits on top of each other; splits with only zeros have no bars."""
     base, style = [0] * len(places), {"edgecolor": "white", "linewidth": 0.5, **how}
     for group in GROUPS[1:]:
         counts = histogram.counts[group]

@@ -30,7 +30,7 @@ def draw_trail(path: FloatArray, ax: Axes, color: str, **how: Any) -> LineCollec
         path: from the present on, or back.
         ax: axes to render on.
         color: of the line.
-        how: of the line, such as `linewidths` or `linestyles`.
+        how: matplotlib's arguments for the line, such as `linewidths` or `linestyles`.
     """
     return _draw_trails([path], ax, [color], how)
 
@@ -51,8 +51,8 @@ def draw_trails(
         dataset: the release.
         sample: record of the present.
         boxes: the actors; those without an id have no trail.
-        colors: a colour a box.
-        target_from_world: into the frame of the axes.
+        colors: one colour for each box.
+        target_from_world: transform into the frame of the axes.
         seconds: how far back and how far ahead.
         ax: axes to render on.
     """

@@ -33,16 +33,16 @@ if TYPE_CHECKING:
 VISIBILITY_LAYERS: Final[tuple[Layer, ...]] = ("points", "boxes", "ids", "velocities", "visibility", "grid")
 _SHOWN: Final[tuple[Layer, ...]] = ("boxes", "visibility", "grid")
 _MARGIN: Final = 10.0
-"""Metres around the agents and the colliding pair."""
+"""Metres that are shown around the agents and the colliding pair."""
 _LEAST: Final = 25.0
-"""Metres to each side that are shown at least."""
+"""At least so many metres are shown to each side."""
 _SLOT: Final = 4.6
 """Points from one agent's dot to the next."""
 _ABOVE: Final = 10.0
 """Points from an actor's centre up to its dots."""
 _MOST_ROWS: Final = 24
 _BRIGHT: Final = 0.3
-"""Relative luminance (as of sRGB) from which black is read on a colour."""
+"""Relative luminance (as in sRGB) of a colour from which black text on it is easier to read."""
 
 
 def render_visibility(
@@ -57,17 +57,19 @@ def render_visibility(
 ) -> Axes:
     """Render who sees whom, from above: each actor has a dot for each agent that sees it by the released rule.
 
-    A dot has its agent's colour and its own place in the row, and lines lead from the agents to those of the colliding
-    pair that they see. The accident's actors that the sample's agent does not see are dashed, and the pair says so.
+    A dot has its agent's colour and its own place in the row, and lines go from the agents to those of the colliding
+    pair that they see. The accident's actors that the sample's agent does not see are dashed, and for the colliding
+    pair words say so.
 
     Args:
         dataset: the release.
         moment: token or record of a sample, or of a frame: then the first agent there is the ego.
-        agents: who looks: names, a configuration or its name as seen from the ego; None for all that are there.
+        agents: the agents that look: names, a configuration or its name as seen from the ego; None for all that are
+            there.
         frame: `ego`, `lidar` or `world`.
         view_range: metres to each side of the ego; None shows all agents and the colliding pair.
-        layers: `boxes`, `visibility` (dots, lines, words) and `grid` are the default; also `points` (the LiDAR of those
-            who look), `ids` and `velocities`.
+        layers: `boxes`, `visibility` (dots, lines, words) and `grid` are the default; also `points` (the LiDAR of the
+            agents that look), `ids` and `velocities`.
         ax: axes to render on; new ones if None.
 
     Returns:
@@ -77,7 +79,7 @@ def render_visibility(
         TokenError: no such sample or frame.
         ChoiceError: no such agent, configuration, frame or layer, or `view_range` is not above 0.
         NotAvailableError: an agent is not in this (partial) release.
-        MissingFileError: points are asked for, and a cloud was not downloaded.
+        MissingFileError: `layers` have points, and a cloud was not downloaded.
     """
     shown = layers_of(layers, _SHOWN, VISIBILITY_LAYERS)
     if frame not in get_args(Frame):
@@ -115,15 +117,16 @@ def render_visibility(
 def render_visibility_matrix(
     dataset: Dataset, moment: RowArgument, *, agents: Agents = None, ax: Axes | None = None
 ) -> Axes:
-    """Render who sees whom as a table: a row an actor, a column an agent; a full cell is seen, a hollow one is not.
+    """Render who sees whom as a table: one row for each actor, one column for each agent.
 
-    The number in a cell is the agent's LiDAR points in the box; where its label lacks the actor there is no cell. The
-    colliding pair comes first, then the agents, then who is seen by more.
+    A filled cell means that the agent sees the actor, an empty one that it does not. The number is the agent's LiDAR
+    points in the box; if its label lacks the actor, there is no cell. The colliding pair comes first, then the agents,
+    then the actors that most agents see.
 
     Args:
         dataset: the release.
         moment: token or record of a sample, or of a frame.
-        agents: who looks, as of `render_visibility`.
+        agents: the agents that look, as in `render_visibility`.
         ax: axes to render on; new ones if None.
 
     Returns:
@@ -166,7 +169,7 @@ def _title(dataset: Dataset, known: Sights) -> str:
 
 
 def _view(known: Sights, view_range: float | None) -> tuple[FloatArray, FloatArray]:
-    """The lower left and the upper right corner (2,) of what is shown, a square."""
+    """The lower left and the upper right corner, (2,) each, of the square that is shown."""
     if view_range is not None:
         column = known.agents.index(known.ego) if known.ego in known.agents else 0
         middle, half = known.place[column], view_range
@@ -259,7 +262,7 @@ def _draw_column(known: Sights, rows: IntArray, agent: str, column: int, ax: Axe
 
 
 def _legible_on(color: str) -> str:
-    """Black or white, which of them is read on a colour."""
+    """Black or white, the one that is easier to read on a colour."""
     from matplotlib.colors import to_rgb
 
     luminance = np.dot(np.power(to_rgb(color), 2.2), (0.2126, 0.7152, 0.0722))

@@ -1,7 +1,7 @@
 """Which boxes labels show at a frame, and where their corners lie on the ground of the agent's ego frame.
 
-The released code turns label rows into mmdet3d boxes and moves those, all in float32 and CARLA's left-handed frames;
-the cells depend on the rounding, so its steps are repeated here one by one (docs/released_code.md, Conventions and
+The released code turns label rows into mmdet3d boxes and moves those, all in float32 and in CARLA's left-handed frames.
+The cells depend on the rounding, so its steps are repeated here one by one (docs/released_code.md, Conventions and
 samples, Motion labels).
 """
 
@@ -23,7 +23,7 @@ from deepaccident_devkit.motion.warps import single_precision
 from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID, UNTRACKED_ID
 
 _DEFAULT_SIZE: Final = (3.99, 1.85, 1.62)
-"""The box that the released code rasterises where it finds no own row; it has the size of a Lincoln."""
+"""The agent's box in the released code if it finds no row of the agent itself; it has the size of a Lincoln car."""
 _CORNERS: Final = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]], dtype=np.float32) / 2
 """mmdet3d's corners 0, 3, 7, 4 from above, in lengths and widths."""
 _UP: Final = np.array([0, 0, 1, 0, 0, 0, 0], dtype=np.float32)
@@ -40,7 +40,7 @@ class FrameBoxes:
         yaw: (N,) float64, heading about z, radians.
         actor_id: (N,) int64; −100 is the agent's own row, −1 an untracked actor's.
         category: (N,) int, position in `taxonomy.CATEGORIES`.
-        visible: (N,) bool, whether anybody whose sight counts sees the actor (docs/released_code.md, Visibility and
+        visible: (N,) bool, whether any agent whose sight counts sees the actor (docs/released_code.md, Visibility and
             attributes).
         ego_from_lidar: (4, 4) float64.
     """
@@ -69,7 +69,7 @@ class FrameBoxes:
             array = checked(f"FrameBoxes.{name}", getattr(self, name), shape, dtype)
             if not np.isfinite(array).all():
                 row = int(np.argwhere(~np.isfinite(array))[0, 0])
-                remedy = "a frame without a pose is None" if name == "ego_from_lidar" else "leave such rows out"
+                remedy = "give None for a frame without a pose" if name == "ego_from_lidar" else "leave out such rows"
                 raise GeometryError(f"FrameBoxes.{name}: row {row} is not finite; {remedy}")
             object.__setattr__(self, name, readonly(array))
 
@@ -105,10 +105,11 @@ def box_polygons(
         is_vehicle: whether the agent is a vehicle, with a box of its own (the infrastructure has none).
 
     Returns:
-        A frame's polygons, the ego's own first and the others in the order of their rows; None for None.
+        Each frame's polygons, the ego's own first, then the others in the order of their rows; None where there is
+        no recording.
 
     Raises:
-        GeometryError: something else than boxes was given.
+        GeometryError: a frame is neither `FrameBoxes` nor None.
     """
     for given in frames:
         if not isinstance(given, FrameBoxes | None):
@@ -176,7 +177,7 @@ class _Joined:
 
 
 def _drawn(boxes: _Joined, first: int, config: MotionLabelConfig) -> BoolArray:
-    """Which rows are rasterised, where frame 0 is number `first`; own rows are not: the ego has a box of its own."""
+    """Which rows are rasterised; `first` is the number of the first frame. Own rows are not: `_own_boxes` has them."""
     rows: BoolArray = boxes.actor_id != OWN_ACTOR_ID
     if config.only_vehicle:
         rows &= boxes.category != _PEDESTRIAN
@@ -198,7 +199,7 @@ def _drawn(boxes: _Joined, first: int, config: MotionLabelConfig) -> BoolArray:
 def _own_boxes(
     frames: Sequence[FrameBoxes], moved: Float32Array, pose: Float32Array, config: MotionLabelConfig
 ) -> tuple[Float32Array, IntArray]:
-    """The ego's own boxes in the ego frames, at most one a frame, and which frames they are of."""
+    """The ego's own boxes in the ego frames, at most one for each frame, and the numbers of their frames."""
     rules, own, of_frame, to_move = config.rules, [], [], []
     start = 0
     for number, frame in enumerate(frames):
@@ -222,7 +223,7 @@ def _own_boxes(
 
 
 def _constructed(center: FloatArray, size: FloatArray, yaw: FloatArray) -> Float32Array:
-    """mmdet3d's boxes of right-handed ones: (N, 7) float32 x, y (right), z of the bottom, l, w, h, yaw."""
+    """Right-handed boxes as mmdet3d's: (N, 7) float32 x, y (right), z of the bottom, l, w, h, yaw."""
     boxes = np.column_stack([center * (1, -1, 1), size, yaw]).astype(np.float32)
     boxes[:, 2] -= boxes[:, 5] / 2
     return boxes
@@ -231,7 +232,7 @@ def _constructed(center: FloatArray, size: FloatArray, yaw: FloatArray) -> Float
 def _moved(boxes: Float32Array, pose: Float32Array) -> Float32Array:
     """mmdet3d's rotate by the transposed rotations of left-handed poses (N, 4, 4), then translate."""
     xyz = single_precision.product(pose[:, :3, :3], boxes[:, :3, None])[..., 0] + pose[:, :3, 3]
-    # by way of float64, whose rounding is torch's in all but a few cases; numpy's own float32 one is not
+    # computed in float64 and then rounded: equal to torch's in nearly all cases, unlike numpy's own float32
     turned = np.arctan2(pose[:, 0, 1].astype(np.float64), pose[:, 0, 0]).astype(np.float32)
     yaw = boxes[:, 6] + turned
     return np.column_stack([xyz, boxes[:, 3:6], yaw])

@@ -30,9 +30,9 @@ from deepaccident_devkit.taxonomy import UNTRACKED_ID
 
 __all__ = ["FrameBoxes", "FramePolygons", "labels_from_polygons", "motion_labels_from_boxes"]
 _FAR: Final = 2**24
-"""Cells: corners farther off are moved to here; the grid is far from both."""
+"""In cells: corners farther away are moved to this distance, which is far outside the grid."""
 _MOST_IDS: Final = 2**24
-"""float32 counts no further."""
+"""The largest id: float32 holds all whole numbers up to here."""
 
 
 def motion_labels_from_boxes(
@@ -50,12 +50,12 @@ def motion_labels_from_boxes(
         frames: what the agent annotated at each of `config.label_frames` moments from the present on; None where there
             is no recording.
         egomotion: (R, 6) `next_from_this` ego poses, right-handed, R = `config.frames`, from the first past frame on,
-            as `v2x.future_egomotion` gives them; taken as float32.
+            as `v2x.future_egomotion` gives them; converted to float32.
         config: what labels show, or the name of a preset; None for the released ones in the devkit's orientation.
-        valid: (R,) bool, which frames are in the recording; all but those that are None in `frames`, if None.
+        valid: (R,) bool, which frames are in the recording; if None, all except those that are None in `frames`.
         is_vehicle: whether the agent is a vehicle, with a box of its own (the infrastructure has none).
-        id_map: actor id → id that a sample before this one had: the released code keeps them for a scenario and agent
-            until a worker meets another one. None starts at 1.
+        id_map: actor id → its id in an earlier sample. The released code keeps ids while a worker reads samples of one
+            scenario and agent. With None ids start at 1.
 
     Raises:
         GeometryError: another number of frames or rows, or a motion that is not finite.
@@ -75,16 +75,16 @@ def labels_from_polygons(
     valid: ArrayLike | None = None,
     id_map: Mapping[int, int] | None = None,
 ) -> MotionLabels:
-    """The motion labels of footprints, each frame in its own ego frame; all else as in `motion_labels_from_boxes`."""
+    """The motion labels of footprints, each frame in its own ego frame; see `motion_labels_from_boxes`."""
     config = label_config(config)
     if len(polygons) != config.label_frames:
         raise GeometryError(
             f"frames: expected {config.label_frames}, the present and {config.future_frames} after it, "
-            f"found {len(polygons)}; give None for those beyond the recording"
+            f"found {len(polygons)}; give None for frames beyond the recording"
         )
     motion = checked("egomotion", egomotion, (config.frames, 6), np.float32)
     if not np.isfinite(motion).all():
-        raise GeometryError("egomotion: not all numbers are finite; rows without a motion are zero")
+        raise GeometryError("egomotion: not all numbers are finite; set rows without a motion to zero")
     past = config.receptive_field - 1
     there = np.array([True] * past + [frame is not None for frame in polygons])
     known = there if valid is None else there & checked("valid", valid, (config.frames,), np.bool_)
@@ -128,7 +128,7 @@ def _checked_ids(id_map: Mapping[int, int] | None, config: MotionLabelConfig) ->
 def _numbered(
     polygons: Sequence[FramePolygons | None], config: MotionLabelConfig, id_map: dict[int, int]
 ) -> tuple[IntArray, dict[int, int]]:
-    """The id of each polygon of all frames, and the map continued: ids from 1 in the order rasterised."""
+    """The id of each polygon of all frames, and the extended map; ids count from 1 in the order of rasterising."""
     highest, ids = max(id_map.values(), default=0), []
     nobody = None if config.rules.untracked_share_an_id else UNTRACKED_ID
     for key in (key for frame in polygons if frame is not None for key in frame.key.tolist()):
@@ -141,14 +141,14 @@ def _numbered(
 
 
 def _covered(polygons: Sequence[FramePolygons | None], ids: IntArray, config: MotionLabelConfig) -> CoveredCells:
-    """The native cells of the polygons with these ids; later ones lie on top."""
+    """The cells of the polygons with these ids, in native orientation; later polygons lie on top."""
     native = config.grid.with_orientation(config.rules.native)
     there = [(number, frame) for number, frame in enumerate(polygons) if frame is not None]
     corners = np.concatenate([np.zeros((0, 4, 2), dtype=np.float32), *(frame.corners for _, frame in there)])
     image = np.repeat([number for number, _ in there], [len(frame.key) for _, frame in there]).astype(np.int64)
     cells, owner = filled_cells(_vertices(corners, native, config.rules), native.shape, image, len(polygons))
     frame = image[owner]
-    row = cells // native.shape[1]  # of all frames on end
+    row = cells // native.shape[1]  # rows of all frames, one frame after another
     return CoveredCells(
         frame=frame,
         row=row - frame * native.shape[0],
@@ -180,7 +180,7 @@ def _steps(values: AnyArray, axis: Axis, rules: LabelProtocol) -> IntArray:
 def _following_centers(covered: CoveredCells, next_from_this: AnyArray, config: MotionLabelConfig) -> Float32Array:
     """(T, 1 + ids, 2) centres of the instances at the next frame, warped to each frame; NaN where they are not seen."""
     columns = config.grid.with_orientation(config.rules.native).shape[1]
-    cells = config.grid.cells + 1  # the last one for OUTSIDE, −1
+    cells = config.grid.cells + 1  # one more at the end, where the index OUTSIDE, −1, points
     identity = np.zeros((covered.frames, cells), dtype=np.int32)
     identity.reshape(-1)[covered.frame * cells + covered.row * columns + covered.column] = covered.identity
     targets, sources = [], []

@@ -1,7 +1,7 @@
 """From the cells that instances cover to the maps of `MotionLabels`: centres, peaks, offsets and flow.
 
-Counting is done in the protocol's native orientation, in which the released code rounds; the maps are written where
-the configuration's orientation has their cells.
+Centres and vectors are computed in the protocol's native orientation, in which the released code rounds. The maps are
+written in the configuration's orientation.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ class CoveredCells:
     ids: int
 
     def centers(self) -> Float32Array:
-        """(frames, 1 + ids, 2) the cell nearest to the mean of each instance's cells, half to even; NaN without any."""
+        """(frames, 1 + ids, 2) the cell nearest to the mean of each instance's cells, half to even; NaN for none."""
         slot, slots = self.frame * (1 + self.ids) + self.identity, self.frames * (1 + self.ids)
         count = np.bincount(slot, minlength=slots).astype(np.float32)
-        # sums of whole numbers, which float32 holds exactly on all but huge grids: as torch's mean
+        # sums of whole numbers are exact in float32, except on huge grids: so the mean is torch's
         sums = [
             np.bincount(slot, weights=values, minlength=slots).astype(np.float32) for values in (self.row, self.column)
         ]
@@ -68,8 +68,8 @@ class LabelMaps:
     def empty(cls, config: MotionLabelConfig) -> LabelMaps:
         """Maps of frames without any actor.
 
-        All in one piece of memory: five pieces of a megabyte each would go back to the system with every sample, and
-        fetching them again takes as long as all the rasterising.
+        They share one piece of memory. Five pieces of a megabyte each would be returned to the system after every
+        sample, and to get them again takes as long as all the rasterising.
         """
         frames, (height, width) = config.label_frames, config.grid.shape
         count = frames * height * width
@@ -92,7 +92,7 @@ def label_maps(
     """The maps of instances and their centres.
 
     Args:
-        covered: what is rasterised, native.
+        covered: the rasterised cells, native.
         centers: (T, 1 + ids, 2) each instance's centre, row and column, native; NaN where there is none.
         following: (T, 1 + ids, 2) where it is at the next frame, seen from this one; NaN where that is not known.
         missing: (T,) which frames are not in the recording.
@@ -107,7 +107,7 @@ def label_maps(
     cell += before
     maps.segmentation.reshape(-1)[cell] = 1
     maps.instance.reshape(-1)[cell] = covered.identity
-    cell += before  # of two channels
+    cell += before  # offset and flow have two channels
     slot = covered.frame * (1 + covered.ids) + covered.identity
     place = np.stack([covered.row, covered.column], axis=1).astype(np.float32)
     own = centers.reshape(-1, 2)
@@ -132,7 +132,7 @@ def label_maps(
 
 
 def _draw_peaks(centerness: AnyArray, frame: IntArray, center: IntArray, sigma: float) -> None:
-    """Put peaks around centres (n, 2), row and column, of frames (n,) into (T, 1, H, W); the higher one counts."""
+    """Put peaks around centres (n, 2), row and column, of frames (n,) into (T, 1, H, W); the higher value counts."""
     shape = centerness.shape[-2:]
     peak = _peak(sigma, max(shape))
     reach = len(peak) // 2
@@ -145,7 +145,7 @@ def _draw_peaks(centerness: AnyArray, frame: IntArray, center: IntArray, sigma: 
 
 @functools.lru_cache(maxsize=8)
 def _peak(sigma: float, farthest: int) -> Float32Array:
-    """(2 r + 1, 2 r + 1) exp(−d² / σ²) around a centre, in float32 as far as it is above 0 and the grid goes."""
+    """(2 r + 1, 2 r + 1) exp(−d² / σ²) around a centre in float32, until it is 0 or the grid ends."""
     radius = min(math.ceil(sigma * math.sqrt(_VANISHED)), farthest)
     steps = np.arange(-radius, radius + 1, dtype=np.float32)
     squares = np.add.outer(steps**2, steps**2) / np.float32(sigma**2)

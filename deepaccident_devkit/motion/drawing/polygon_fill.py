@@ -1,13 +1,13 @@
 """Filling many polygons at a time on cells as OpenCV 4.7's fillPoly does, with any installed OpenCV.
 
 Labels are rasterised by `cv2.fillPoly` (8-connected, whole-cell corners), and what it rasterises changed with OpenCV
-4.8 (the interior of small polygons) and 4.11 (at the image's border). The released labels are those of 4.7; so its rule
-is written out here: the outline as clipped Bresenham lines, and between the edges the cells of each row from the first
-at or right of the left edge to the last at or left of the right one, in fixed point with 16 binary digits. Source:
-OpenCV 4.7.0, imgproc, drawing.cpp: clipLine, LineIterator, CollectPolyEdges and FillEdgeCollection.
+4.8 (the interior of small polygons) and 4.11 (at the image's border). The released labels are those of 4.7, so its rule
+is written out here: the outline as clipped Bresenham lines, and in each row all cells from the first one at or right
+of the left edge to the last one at or left of the right edge, in fixed point with 16 binary digits. Source: OpenCV
+4.7.0, imgproc, drawing.cpp: clipLine, LineIterator, CollectPolyEdges and FillEdgeCollection.
 
-In each row of a convex polygon inside the image, what lies between the edges fills the gap between their outlines and
-no more: there the outline's ends suffice. All others go through the whole rule.
+In a convex polygon inside the image, the cells between the edges of a row only fill the gap between the outlines: the
+outline's ends are enough. All other polygons go through the whole rule.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray, checked
 from deepaccident_devkit.errors import GeometryError
 
 _FIXED = 16
-"""Binary digits after the point of where an edge crosses a row."""
+"""Binary digits after the point, for the place where an edge crosses a row."""
 _BEYOND = np.int64(1) << 62
-"""Where an edge crosses a row that it does not reach: after all others."""
+"""The place of an edge that does not reach a row: it comes after all others."""
 
 
 def filled_cells(
@@ -32,14 +32,14 @@ def filled_cells(
     """The cells that polygons cover, their outlines included; where several do, the last one counts.
 
     Args:
-        polygons: (N, V, 2) whole numbers, column and row of V ≥ 3 corners in either direction; they may lie beside the
-            image, coincide or cross.
+        polygons: (N, V, 2) whole numbers, column and row of V ≥ 3 corners in either direction; they may lie outside
+            the image, coincide or cross.
         shape: rows and columns of one image.
         image: (N,) which of the images each polygon is rasterised into; the first if None.
         images: how many images there are.
 
     Returns:
-        (P,) int64 indices into the flattened (images, rows, columns), ascending, none twice; and (P,) int64, which
+        (P,) int64 indices into the flattened (images, rows, columns), ascending, each once; and (P,) int64, which
         polygon is on top there.
 
     Raises:
@@ -63,7 +63,7 @@ def filled_cells(
 
 
 def _runs(corners: IntArray, shape: tuple[int, int]) -> tuple[IntArray, IntArray, IntArray]:
-    """First and last cells of runs that cover the polygons, which may overlap, and whose they are."""
+    """First and last cells of runs that cover the polygons, and each run's polygon; runs may overlap."""
     low, high = corners.min(axis=1), corners.max(axis=1)
     near = np.flatnonzero(((high >= 0) & (low < shape[::-1])).all(axis=1))
     corners, low, high = corners[near], low[near], high[near]
@@ -83,7 +83,7 @@ def _runs(corners: IntArray, shape: tuple[int, int]) -> tuple[IntArray, IntArray
 
 
 def _merged(row: IntArray, first: IntArray, last: IntArray, owner: IntArray) -> tuple[IntArray, ...]:
-    """Runs (R,) of each polygon's rows put together to one a row, from the first column of all to the last."""
+    """The runs (R,) of each polygon merged into one for each row, from the first column of all to the last."""
     if not len(row):
         return row, first, last, owner
     low = row.min()
@@ -98,7 +98,7 @@ def _merged(row: IntArray, first: IntArray, last: IntArray, owner: IntArray) -> 
 
 
 def _convex(corners: IntArray) -> BoolArray:
-    """Which quadrangles have an area and turn one way at all corners; with more corners, a star may do so too."""
+    """Which quadrangles have an area and turn the same way at all corners; False for others: a star may do so too."""
     if corners.shape[1] != 4:
         return np.zeros(len(corners), dtype=bool)
     ahead = corners[:, [1, 2, 3, 0]] - corners
@@ -142,8 +142,8 @@ class _Lines:
         x1, y1, x2, y2 = np.where(leftward, np.hstack([end, start]).T, np.hstack([start, end]).T)
         across, down = x2 - x1, y2 - y1
         self.y, self.rise, self.direction = y1, np.abs(down), np.where(down < 0, -1, 1)
-        # After k of the D steps along its longer side a line has made (2 d k + D − 1) // 2 D along the other (d). A
-        # steep line has one cell a row; where a flat one enters row j and leaves it is the same, solved for k.
+        # After k of the D steps along its longer side a line has made (2 d k + D − 1) // 2 D steps along the other
+        # side (d). A steep line has one cell in each row. Where a flat line enters and leaves row j, solved for k.
         level, steep = self.rise == 0, self.rise > across
         enter = np.where(steep, self.rise - 1, np.where(level, 0, 2 * self.rise - across))
         leave = np.where(steep, self.rise - 1, across)
@@ -154,14 +154,14 @@ class _Lines:
         """First and last columns of lines in their rows number `step`, counted from the left end."""
         x, across, enter, leave, divisor = self._numbers[:, line]
         travelled = 2 * across * step
-        # quotients of small whole numbers: rounding carries none over a whole number
+        # quotients of small whole numbers: rounding moves none past a whole number
         first = np.maximum(np.floor((travelled + enter) / divisor), 0)
         last = np.minimum(np.floor((travelled + leave) / divisor), across)
         return (x + first).astype(np.int64), (x + last).astype(np.int64)
 
 
 def _between(corners: IntArray, shape: tuple[int, int]) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    """The runs between the edges of polygons in the image: row, first and last column, whose."""
+    """The runs between the edges of polygons in the image: row, first and last column, polygon."""
     height, width = shape
     low = np.maximum(corners[..., 1].min(axis=1), 0)
     rows = np.minimum(corners[..., 1].max(axis=1), height - 1) - low + 1
@@ -171,7 +171,7 @@ def _between(corners: IntArray, shape: tuple[int, int]) -> tuple[IntArray, IntAr
     downward = (start[..., 1] < corners[..., 1])[..., None]
     upper, lower = np.where(downward, start, corners), np.where(downward, corners, start)
     ahead = (lower[..., 0] - upper[..., 0]) << _FIXED
-    slope = np.sign(ahead) * (np.abs(ahead) // np.maximum(lower[..., 1] - upper[..., 1], 1))  # C++ cuts towards 0
+    slope = np.sign(ahead) * (np.abs(ahead) // np.maximum(lower[..., 1] - upper[..., 1], 1))  # C++ rounds towards 0
     below = row[:, None] - upper[owner, :, 1]
     crossing = (upper[owner, :, 0] << _FIXED) + below * slope[owner]
     crossing[(below < 0) | (row[:, None] >= lower[owner, :, 1])] = _BEYOND
@@ -185,7 +185,7 @@ def _between(corners: IntArray, shape: tuple[int, int]) -> tuple[IntArray, IntAr
 
 
 def _clip(start: IntArray, end: IntArray, shape: tuple[int, int]) -> BoolArray:
-    """Clip lines (L, 2) to the image in place as clipLine does it, first to its rows; which of them touch it."""
+    """Clip lines (L, 2) to the image in place as clipLine does, first to its rows; returns which of them touch it."""
     right, bottom = shape[1] - 1, shape[0] - 1
     inside = _not_beside(start, end, 0, right) & _not_beside(start, end, 1, bottom)
     _clip_end(start, end, 1, bottom, inside)
@@ -197,7 +197,7 @@ def _clip(start: IntArray, end: IntArray, shape: tuple[int, int]) -> BoolArray:
 
 
 def _not_beside(start: IntArray, end: IntArray, axis: int, most: int) -> BoolArray:
-    """Which lines (L, 2) do not lie before 0 or after `most` as a whole."""
+    """Which lines (L, 2) lie neither entirely before 0 nor entirely after `most`."""
     result: BoolArray = (np.maximum(start[:, axis], end[:, axis]) >= 0) & (
         np.minimum(start[:, axis], end[:, axis]) <= most
     )
@@ -213,5 +213,5 @@ def _clip_end(near: IntArray, far: IntArray, axis: int, most: int, which: BoolAr
     edge, corner = edge[beyond], near[beyond]
     way = far[beyond] - corner
     share: FloatArray = (edge - corner[:, axis]).astype(np.float64) * way[:, 1 - axis] / way[:, axis]
-    near[beyond, 1 - axis] += share.astype(np.int64)  # C++ cuts numbers towards 0
+    near[beyond, 1 - axis] += share.astype(np.int64)  # C++ rounds towards 0
     near[beyond, axis] = edge

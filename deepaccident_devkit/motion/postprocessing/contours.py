@@ -1,8 +1,8 @@
-"""The outline of a mask that OpenCV lists first, and its convex hull in OpenCV's order, without OpenCV.
+"""The outline that OpenCV lists first for a mask, and its convex hull in OpenCV's order, without OpenCV.
 
-The released code takes `cv2.findContours(mask, …)[0][0]` and hands it to `cv2.minAreaRect`, whose result hangs on which
-part of a broken mask that is and on which corner of the hull comes first. Both are written out here (OpenCV 4.7.0,
-imgproc: contours.cpp, convhull.cpp), so that every version gives the same. Points are (x, y) = (column, row).
+The released code gives `cv2.findContours(mask, …)[0][0]` to `cv2.minAreaRect`. The result depends on which part of a
+broken mask that is, and on which corner of the hull comes first. Both rules are written out here (OpenCV 4.7.0,
+imgproc: contours.cpp, convhull.cpp), so the result is the same with every version. Points are (x, y) = (column, row).
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ Point = tuple[int, int]
 
 
 def first_contour(rows: IntArray, columns: IntArray, *, one_part: bool = False) -> list[Point]:
-    """The outer border of a mask's last part: what OpenCV lists first.
+    """The outer border of a mask's last part, which OpenCV lists first.
 
-    Of the 8-connected parts that lie in no hole of another one it is the one whose first cell, in row-major order,
-    comes last. The border starts there and runs down its left side.
+    The last part is the 8-connected part, in no hole of another part, whose first cell in row-major order comes last.
+    The border starts at this cell and runs down the left side.
 
     Args:
         rows: (P,) rows of the mask's cells, in row-major order.
@@ -42,7 +42,7 @@ def first_contour(rows: IntArray, columns: IntArray, *, one_part: bool = False) 
 
 
 def are_one_part(rows: IntArray, columns: IntArray, instance: IntArray, count: int) -> BoolArray:
-    """Which of many masks are surely one part: one run of cells a row, each touching the next row's.
+    """Which of many masks are surely one part: each row has one run of cells, which touches the next row's run.
 
     Args:
         rows: (P,) rows of the masks' cells, sorted by mask, row, column.
@@ -99,8 +99,8 @@ def _follow(mask: bytes, width: int, start: int) -> list[int]:
 def convex_hull(contour: list[Point]) -> list[Point]:
     """The corners of the convex hull, turning from the x axis towards the y axis, as OpenCV lists them.
 
-    That list starts at the rightmost corner, unless the corners' places in the contour fall (or rise) along it with one
-    jump: then it starts at the jump.
+    That list starts at the rightmost corner. But if the corners' places in the contour fall (or rise) along the list
+    with only one jump, it starts at the jump.
     """
     first = {point: place for place, point in reversed(list(enumerate(contour)))}
     last = {point: place for place, point in enumerate(contour)}
@@ -110,8 +110,8 @@ def convex_hull(contour: list[Point]) -> list[Point]:
     lowest, highest = min(points, key=itemgetter(1)), max(points, key=itemgetter(1))
     down, up = _chain(points[::-1]), _chain(points)
     hull = down + up
-    # A thin part's contour passes a corner twice. Which of the two places counts is a matter of the order in which
-    # OpenCV comes by: the last one at the rightmost corner and between the leftmost one and the highest or lowest.
+    # A thin part's contour passes a corner twice. OpenCV's order of work decides which of the two places counts: the
+    # last one at the rightmost corner and between the leftmost one and the highest or lowest, the first one elsewhere.
     beyond_highest = down.index(highest) + 1 if highest in down else len(down)
     until_lowest = up.index(lowest) if lowest in up else len(up)
     passed_later = {*down[:1], *down[beyond_highest:], *up[1:until_lowest]} - {highest}

@@ -1,8 +1,7 @@
-"""Instances of one frame from a model's maps: peaks of the centerness, and each foreground cell to its nearest one.
+"""Instances of one frame from a model's maps: peaks of the centerness, and the nearest peak of each foreground cell.
 
-The rules are the released ones (docs/released_code.md, Post-processing), FIERY's: everything in float32, first come
-first served on ties, and cells in row-major order. Arrays here lie in the orientation that the rules count in; see
-`postprocessing`.
+The rules are the released ones (docs/released_code.md, Post-processing), FIERY's: everything in float32, cells in
+row-major order, and of equals the first one counts. Arrays here are in the orientation of `PostProcessing.scan`.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ class FrameGroups:
     """The instances of one frame; ids run from 1 to I without gaps, (row, column) are cells.
 
     Attributes:
-        ids: (P,) int64 the instance of each cell of the foreground; 0 for cells that count as background nevertheless.
+        ids: (P,) int64 the instance of each cell of the foreground; 0 for cells that count as background all the same.
         count: (I + 1,) cells of each id.
         position_sum: (2, I + 1) float64 sums of their rows and columns.
         moved_sum: (2, I + 1) float64 sums of where the flow takes them.
@@ -38,11 +37,11 @@ class FrameGroups:
 
 
 def find_peaks(centerness: AnyArray, threshold: float, most: int) -> IntArray:
-    """Cells of one frame above `threshold` that no neighbour of the eight exceeds; all cells of a plateau are peaks.
+    """Cells of one frame above `threshold` and not below any of their 8 neighbours; all cells of a plateau are peaks.
 
     Args:
         centerness: (H, W) float32.
-        threshold: strict, not negative.
+        threshold: peaks are above it, not equal to it; not negative.
         most: how many are kept: the first ones in row-major order, not the highest ones.
 
     Returns:
@@ -63,14 +62,15 @@ def group_cells(
 ) -> FrameGroups:
     """Instances of one frame: the foreground's cells by the peak nearest to where their offset points.
 
-    Where no background is left, the lowest instance becomes it: ids are the ranks of what occurs, from 0.
+    If all cells are foreground, the lowest instance becomes the background: ids are the ranks of all ids that occur,
+    from 0.
 
     Args:
         peaks: (K, 2) rows and columns; at least one unless there are no cells.
         position: (2, P) float32 rows and columns of the foreground's cells.
         offset: (2, P) float32 rows and columns from each to its instance's centre.
         flow: (2, P) float32 rows and columns to where each is at the next frame.
-        all_cells: whether these are all cells that there are.
+        all_cells: whether these are all cells of the frame.
     """
     nearest = nearest_peaks(position + offset, peaks.astype(np.float32)) + 1
     occurs = np.bincount(nearest, minlength=len(peaks) + 1) > 0
@@ -92,5 +92,5 @@ def sums_by(ids: IntArray, values: AnyArray, length: int) -> FloatArray:
 
 
 def means(sums: FloatArray, counts: FloatArray) -> AnyArray:
-    """(2, N) sums over (N,) counts → (N, 2) float32 means, as torch's of float32 values."""
+    """(2, N) sums over (N,) counts → (N, 2) float32 means, equal to torch's of float32 values."""
     return (sums / counts).T.astype(np.float32)

@@ -15,9 +15,9 @@ from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.orientations import to_orientation
 
 LABEL_LOGIT: Final = 10.0
-"""What the released evaluation gives the right class when it treats labels as a prediction; the other one gets 0."""
+"""The right class's logit when the released evaluation treats labels as a prediction; the other class has 0."""
 _LARGEST: Final = 1e15
-"""Cells: no offset or flow is longer, and the squares of longer ones would soon overflow in float32."""
+"""In cells: no offset or flow may be longer; the squares of much longer ones overflow in float32."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -26,12 +26,12 @@ class MotionHeads:
 
     Attributes:
         segmentation: (T, 2, H, W) float32 logits: background, actor.
-        centerness: (T, 1, H, W) float32: how much a cell is an instance's centre; also taken as (T, H, W).
+        centerness: (T, 1, H, W) float32: how surely a cell is an instance's centre; (T, H, W) is accepted, too.
         offset: (T, 2, H, W) float32 cells (down the rows, along the columns) to the instance's centre.
         flow: (T, 2, H, W) float32 cells (rows, columns) to where the instance is at the next frame.
         orientation: how the cells lie; the vectors' channels follow the rows and columns of that orientation.
-        ignore_index: what stands in offset and flow where they are undefined, as in labels, and is therefore no vector
-            that turns with the orientation; None where all values are vectors.
+        ignore_index: the value of offset and flow where they are undefined, as in labels; it stays the same in all
+            orientations. None if all values are vectors.
     """
 
     segmentation: AnyArray
@@ -75,7 +75,7 @@ class MotionHeads:
         *,
         ignore_index: int | None = None,
     ) -> MotionHeads:
-        """The same in the order in which models give them; arrays of any framework (`arrays.as_numbers`), and lists.
+        """Heads from arrays of any framework (`arrays.as_numbers`) or lists, in the order in which models give them.
 
         float32 arrays in the processor's memory are not copied.
 
@@ -94,7 +94,7 @@ class MotionHeads:
 
     @classmethod
     def from_labels(cls, labels: MotionLabels) -> MotionHeads:
-        """Labels as the prediction of a model that is right: what the released evaluation compares with.
+        """Labels as the prediction of a perfect model, with which the released evaluation compares.
 
         Segmentation is 10 for the right class and 0 for the other; centerness, offset and flow are as they are.
         """
@@ -133,5 +133,5 @@ def _check_values(name: str, values: AnyArray, most: float) -> None:
     if not (lowest >= -most and highest <= most):  # NaN is neither
         at = tuple(np.argwhere(~(np.abs(values) <= most))[0].tolist())
         raise GeometryError(
-            f"{name}: {values[at]} at {at} is no value to work with; a model that diverged, or a mask in its output?"
+            f"{name}: {values[at]} at {at} cannot be used; did the model diverge, or is there a mask in its output?"
         )

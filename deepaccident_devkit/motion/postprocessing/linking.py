@@ -1,4 +1,4 @@
-"""The same id for the same instance in all frames: the flow takes those of a frame to the next, where they are matched.
+"""The same id for the same instance in all frames: the flow moves instances to the next frame, where they are matched.
 
 The rules are the released ones (docs/released_code.md, Post-processing), FIERY's with another distance.
 """
@@ -17,10 +17,10 @@ from deepaccident_devkit.motion.postprocessing.grouping import FrameGroups, mean
 def link_frames(groups: Sequence[FrameGroups], distance: float) -> list[IntArray]:
     """Consistent ids of the instances of consecutive frames.
 
-    Instances go one to one to those of the frame before, so that the distances between where they are and where the
-    flow took those add up to the least. Pairs nearer than `distance` share an id; the others get new ones, counted on
-    from the first frame's highest. A frame without instances, and the one after it, keep their own ids, which do not
-    count: ids may come twice there.
+    Instances are paired one to one with those of the frame before, which the flow has moved, so that the sum of the
+    distances is smallest. Pairs nearer than `distance` share an id. The others get new ids, counted from the first
+    frame's highest id. A frame without instances, and the frame after it, keep their own ids, which do not count as
+    given: later instances may get the same ids.
 
     Args:
         groups: the frames' instances.

@@ -1,7 +1,7 @@
 """The smallest rectangle around each of many convex hulls, to the last bit as OpenCV 4.5.5 to 4.7 finds it.
 
-`cv2.minAreaRect` changed its angles with OpenCV 4.13, and one cannot be turned into the other without moving a few of
-the cells rasterised from it. Source: OpenCV 4.7.0, imgproc, rotcalipers.cpp: which side is tried next is decided in
+`cv2.minAreaRect` changed its angles with OpenCV 4.13, and new angles cannot be converted to old ones without moving a
+few of the rasterised cells. Source: OpenCV 4.7.0, imgproc, rotcalipers.cpp: which side is tried next is decided in
 whole numbers, lengths and areas are float32.
 """
 
@@ -15,7 +15,7 @@ from deepaccident_devkit.arrays import AnyArray, IntArray
 from deepaccident_devkit.motion.postprocessing.contours import Point
 
 _QUARTER_TURNS = np.array([[[1, 0], [0, 1]], [[0, 1], [-1, 0]], [[-1, 0], [0, -1]], [[0, -1], [1, 0]]])
-"""What turns an edge at the lowest, rightmost, highest and leftmost corner to lie as one at the lowest would."""
+"""The turns that make edges at the lowest, rightmost, highest and leftmost corner lie like one at the lowest."""
 
 
 def min_area_rects(hulls: Sequence[Sequence[Point]]) -> tuple[AnyArray, AnyArray]:

@@ -1,4 +1,4 @@
-"""Which of many peaks is nearest to each point, decided as the reference's float32 distances decide it."""
+"""Which of many peaks is nearest to each point, by the same float32 distances as in the released code."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ import numpy as np
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
 
 _BLOCK: Final = 1 << 15
-"""Distances computed at once: what a processor's caches hold."""
+"""How many distances are computed at once: as many as a processor's caches hold."""
 _MANY: Final = 1 << 18
-"""Distances from which on it pays to leave out the peaks that cannot be nearest."""
+"""With at least so many distances it is faster to leave out the peaks that cannot be nearest."""
 _TILES: Final = 12
-"""Tiles along each axis in which that is found out."""
+"""Number of tiles along each axis; for each tile such peaks are found."""
 _ROUNDING: Final = 1e-5
-"""Share by which squared distances may change their order in float32, with a wide margin (its steps are 1.2e-7)."""
+"""Squared distances that differ by a smaller share may change their order in float32 (its steps are 1.2e-7)."""
 
 
 def nearest_peaks(points: AnyArray, peaks: AnyArray) -> IntArray:
     """The nearest peak of each point; of several equally near ones the first.
 
-    Every distance is rounded to float32 at each step, the root included: that makes equals of some that are not.
+    Every distance is rounded to float32 at each step, the root included, so some different distances become equal.
 
     Args:
         points: (2, P) float32 rows and columns, finite.
@@ -49,20 +49,20 @@ def nearest_peaks(points: AnyArray, peaks: AnyArray) -> IntArray:
         down *= down
         across *= across
         down += across
-        np.sqrt(down, out=down)  # squares one step apart have equal roots
+        np.sqrt(down, out=down)  # squares one float32 step apart can have the same root
         nearest[block] = choice[here, down.argmin(axis=1)]
     return nearest
 
 
 def _choices(points: AnyArray, peaks: AnyArray) -> tuple[IntArray, IntArray]:
-    """The tile (P,) of each point, and for each tile (R, C) peaks, rising, with all that can be nearest in it."""
+    """The tile (P,) of each point, and for each tile the peaks (R, C) that can be nearest in it, ascending."""
     low = points.min(axis=1).astype(np.float64)
     size = np.maximum(points.max(axis=1) - low, 1) / _TILES
     inside = np.minimum((points - low[:, None]) / size[:, None], _TILES - 1).astype(np.int64)
     possible = _possible(low[:, None] + np.arange(_TILES + 1) * size[:, None], peaks)
     counts = possible.sum(axis=1)
     choice = np.argsort(~possible, axis=1, kind="stable")[:, : counts.max()]
-    # what is too short is filled up with its first peak, which a later equal one never replaces
+    # short rows are filled up with their first peak, which a later equal one never replaces
     choice = np.where(np.arange(choice.shape[1]) < counts[:, None], choice, choice[:, :1])
     return inside[0] * _TILES + inside[1], choice
 

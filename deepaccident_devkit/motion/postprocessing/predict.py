@@ -29,24 +29,24 @@ _MOST_CENTERS: Final = 2**24
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PostProcessing:
-    """How instances are read off a model's maps; the defaults are the released ones for VPQ.
+    """How instances are found in a model's maps; the defaults are the released ones for VPQ.
 
     See docs/released_code.md, Post-processing.
 
     Attributes:
         foreground: which cells are actors: `argmax` of both logits (background where they are equal), or `sigmoid`:
             those whose actor logit's sigmoid exceeds the threshold, whatever the background's is.
-        foreground_threshold: of `sigmoid`, strict.
-        labels_bypass_sigmoid: with `sigmoid`, where the highest of all logits is 10 and the lowest 0 they are taken for
-            labels (`MotionHeads.from_labels`), and the actor's logit itself is compared: the sigmoid of its 0 would be
-            above the released threshold.
+        foreground_threshold: for `sigmoid`; a cell must exceed it.
+        labels_bypass_sigmoid: with `sigmoid`, if the highest of all logits is 10 and the lowest 0, they are treated as
+            labels (`MotionHeads.from_labels`), and the actor's logit itself is compared with the threshold: the sigmoid
+            of its 0 would be above the released threshold.
         center_threshold: centerness that a centre must exceed.
-        max_centers: how many centres a frame can have; of more, the first ones in row-major order are kept, not the
-            highest.
-        scan: the orientation in which that order runs, and in which the first of several equally near centres is
-            chosen; heads in another one are turned there and the result back.
-        link_distance: cells; how near an instance must be to where the flow takes one of the frame before to share its
-            id.
+        max_centers: how many centres a frame can have; if there are more, the first ones in row-major order are kept,
+            not the highest.
+        scan: the orientation in which cells are in that order; of several equally near centres, the first one in it is
+            chosen. Heads in another orientation are turned to it, and the result is turned back.
+        link_distance: cells; an instance has the id of one of the frame before if it is nearer than this to where the
+            flow moves that one.
         redraw: rasterise boxes along the paths of the first frame's instances, for the accident evaluation.
     """
 
@@ -84,7 +84,7 @@ POST_PROCESSING: Final[Mapping[str, PostProcessing]] = MappingProxyType(
         "fiery": PostProcessing(link_distance=3.0, scan="fiery"),
     }
 )
-"""The released evaluation's of motion (IoU, VPQ) and of accidents, and FIERY's."""
+"""The settings of the released evaluation of motion (IoU, VPQ) and of accidents, and those of FIERY."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -116,10 +116,10 @@ class LinkedInstances:
         orientation: how the cells lie; that of the heads.
         instance: (T, H, W) int32: ids that are the same in all frames, 0 elsewhere.
         frame_instance: (T, H, W) int32: each frame's own ids before linking, 1 to I without gaps, 0 elsewhere.
-        redrawn: (T, H, W) int32: the ids of boxes rasterised along the paths, 0 elsewhere; None unless the settings
-            ask.
+        redrawn: (T, H, W) int32: the ids of boxes rasterised along the paths, 0 elsewhere; None without
+            `settings.redraw`.
         frame_centers: T times (K, 2) int64: rows and columns of the centres that cells were grouped around.
-        paths: by id, ascending, the instances of the first frame.
+        paths: the instances of the first frame by id, ascending.
     """
 
     settings: PostProcessing
@@ -151,11 +151,11 @@ def predict_instances(heads: MotionHeads, settings: PostProcessing | str = "moti
 
     Args:
         heads: a model's maps, or `MotionHeads.from_labels`.
-        settings: of `POST_PROCESSING` by name, or your own.
+        settings: a name in `POST_PROCESSING`, or your own.
 
     Raises:
         ChoiceError: no settings have that name.
-        ConfigError: something else than heads or settings was given.
+        ConfigError: `heads` are no heads, or `settings` no settings.
     """
     rules = post_processing(settings)
     if not isinstance(heads, MotionHeads):
@@ -221,12 +221,12 @@ def trajectories(
     Args:
         linked: from `predict_instances`.
         grid: what the cells cover, in any orientation.
-        protocol: of the labels, or of those that the model learned. Where it has the `half_cell_shift`, that is undone:
-            a cell stands for the corner that the protocol's native orientation counts it from.
+        protocol: of the labels, or of the labels that the model learned. If it has the `half_cell_shift`, that is
+            undone: a cell stands for its corner with the lowest row and column in the protocol's native orientation.
         half_cell_shift: in place of the protocol's own; with False a cell always stands for its middle.
 
     Returns:
-        Id → (n, 2) x forward, y left, metres in the ego frame that the maps are in, at `linked.paths[id].frames`.
+        Id → (n, 2) x forward, y left, metres in the maps' ego frame, at the frames `linked.paths[id].frames`.
 
     Raises:
         GeometryError: the grid has other rows and columns than the instances.
@@ -254,8 +254,8 @@ def _foreground(segmentation: AnyArray, rules: PostProcessing) -> BoolArray:
     threshold = np.float32(rules.foreground_threshold)
     if rules.labels_bypass_sigmoid and segmentation.max() == LABEL_LOGIT and segmentation.min() == 0:
         return np.asarray(actor > threshold)
-    # A float32 sigmoid exceeds the threshold from half-way to the next float32 on. That point's own logit is compared
-    # with instead, which needs no exponential of every cell.
+    # A sigmoid in float32 exceeds the threshold if it is beyond the middle between the threshold and the next float32.
+    # Logits are compared with the logit of that middle, which needs no exponential of every cell.
     beyond = (float(threshold) + float(np.nextafter(threshold, np.float32(1)))) / 2
     return np.asarray(actor > np.float32(np.log(beyond / (1 - beyond))))
 
@@ -272,7 +272,7 @@ def _paths(groups: Sequence[FrameGroups], names: Sequence[IntArray]) -> tuple[Fl
 
 @dataclass(frozen=True, slots=True)
 class _Turn:
-    """The way from the heads' orientation, `shape` its rows and columns, to the one that is scanned, and back."""
+    """From the heads' orientation, in which the shape is `shape`, to the scanned orientation, and back."""
 
     shape: tuple[int, int]
     heads: Orientation
@@ -284,25 +284,25 @@ class _Turn:
         return self.shape[::-1] if (self.heads == "fiery") != (self.scan == "fiery") else self.shape
 
     def maps(self, maps: AnyArray) -> AnyArray:
-        """The heads' maps (…, H, W), as scanned."""
+        """The heads' maps (…, H, W), in the scanned orientation."""
         return to_orientation(maps, vectors=False, source=self.heads, target=self.scan)
 
     def vectors_at(self, position: IntArray, vectors: AnyArray, ignore: int | None) -> AnyArray:
         """The heads' vectors (2, H, W) at scanned rows and columns (2, P), as (2, P) scanned ones."""
         taken = np.take(vectors.reshape(2, -1), self._flat(position), axis=1)
-        rasters = taken.T[..., None, None]  # of one cell each: only what they hold can turn
+        rasters = taken.T[..., None, None]  # of one cell each: no cell moves, only the vectors turn
         turned = to_orientation(rasters, vectors=True, source=self.heads, target=self.scan, ignore=ignore)
         return turned[..., 0, 0].T
 
     def raster(self, positions: Sequence[IntArray], ids: Sequence[IntArray]) -> AnyArray:
-        """(T, H, W) int32 as the heads lie, with `ids` (P,) at each frame's scanned rows and columns (2, P)."""
+        """(T, H, W) int32 in the heads' orientation, with `ids` (P,) at each frame's scanned positions (2, P)."""
         result = np.zeros((len(positions), math.prod(self.shape)), dtype=np.int32)
         for frame, position, values in zip(result, positions, ids, strict=True):
             frame[self._flat(position)] = values
         return result.reshape(-1, *self.shape)
 
     def points(self, points: AnyArray) -> AnyArray:
-        """Scanned rows and columns (…, 2), as the heads lie."""
+        """Scanned rows and columns (…, 2), in the heads' orientation."""
         return _points_in(points, self.scanned_shape, self.scan, self.heads)
 
     def _flat(self, position: IntArray) -> IntArray:

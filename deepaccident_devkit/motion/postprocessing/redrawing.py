@@ -26,7 +26,7 @@ TURNING_MOVE: Final = 4
 _PI: Final = 3.1415926
 """The released code's π."""
 _CORNERS: Final = np.array([[1, -1], [-1, -1], [-1, 1], [1, 1]])
-"""Of a rectangle: across, along its long side."""
+"""A rectangle's corners: across and along its long side."""
 
 
 def redrawn_cells(
@@ -35,8 +35,9 @@ def redrawn_cells(
     """Boxes of the first frame's instances in all frames.
 
     An instance's first box has the length, width and angle of the smallest rectangle around its (last) part in the
-    first frame; the later ones turn to where it moved if that was far enough. Boxes are rasterised one a frame from the
-    first on, for as many frames as the instance is in: after a gap they are in the wrong ones. Later ids overwrite.
+    first frame; the later ones turn to where it moved if that was far enough. Boxes are rasterised in frames without a
+    gap from the first on, as many as the instance is in: after a gap they are in the wrong frames. Later ids overwrite
+    earlier ones.
 
     Args:
         hulls: of ids 1 to I in the first frame, from `first_hulls`.
@@ -67,7 +68,7 @@ def redrawn_cells(
 
 
 def first_hulls(position: IntArray, ids: IntArray, instances: int) -> list[list[Point]]:
-    """The convex hulls, (x, y), of instances 1 to I: of the part of each that OpenCV would name first.
+    """The convex hulls, (x, y), of instances 1 to I: of each one the part that OpenCV lists first.
 
     Args:
         position: (2, P) rows and columns of the cells, in row-major order.
@@ -93,7 +94,7 @@ def _first_boxes(hulls: Sequence[Sequence[Point]]) -> tuple[FloatArray, FloatArr
 
 
 def _headings(path: FloatArray, angle: FloatArray) -> FloatArray:
-    """(I, T) angles of the boxes at each step of the paths (I, T, 2): the first, then that of the last far move."""
+    """(I, T) angles of the boxes at each step of the paths (I, T, 2): first `angle`, then that of the last far move."""
     moved = np.diff(np.rint(path), axis=1)
     far = (moved**2).sum(axis=-1) >= TURNING_MOVE**2
     headings = np.zeros(path.shape[:2])

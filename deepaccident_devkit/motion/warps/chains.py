@@ -36,8 +36,8 @@ _DOUBLE = _Arithmetic(six_vectors.to_matrices, np.linalg.inv, np.linalg.inv, np.
 def egomotion(world_from_ego: ArrayLike, valid: ArrayLike, rules: LabelProtocol) -> AnyArray:
     """An agent's motion from each of its moments to the next, as `v2x.future_egomotion`, in a protocol's arithmetic.
 
-    The released code has the poses in float32, and a sample point on a border between cells falls where their last
-    bits say.
+    The released code has the poses in float32. If a sample point lies on a border between cells, their last bits decide
+    to which cell it belongs.
 
     Args:
         world_from_ego: (T + 1, 4, 4) right-handed poses in the order of time.
@@ -86,7 +86,7 @@ def present_from_frames(
 
 
 def frames_from_next(egomotion: ArrayLike, rules: LabelProtocol, augmentation: Augmentation | None = None) -> AnyArray:
-    """Transforms from each frame's next one to it; the released code inverts these in a way of their own.
+    """Transforms from each frame's next frame to that frame; the released code has a special way to invert these.
 
     Args:
         egomotion: (T, 6) right-handed, `next_from_this`.

@@ -62,7 +62,7 @@ def agents_to_ego(
     Args:
         features: (K, …, H, W) maps in the orientation of `grid`, the ego's first.
         relative_pose: (K, 6) right-handed 6-vectors `ego_from_agent`, as `v2x.relative_pose_to_ego` gives them.
-        grid: as all that follows, the result and the errors: see `past_to_present`.
+        grid: see `past_to_present`, as for all later arguments, the result and the errors.
         protocol: whose sampling rule.
         mode: how to sample.
         augmentation: the one that all maps have.

@@ -1,10 +1,9 @@
-"""Small rigid matrices in float32, step by step as the released code's torch computes them on a processor.
+"""Small rigid matrices in float32, step by step as the released code's torch computes them on a CPU.
 
-A nearest warp decides by rounding which cell a sample point lies in, and points close to a border between cells fall
-to one side or the other by the last bit of the matrix. So the labels' warps repeat each rounding: products summed in
-order of the inner index, without fused multiply-add, the inverse by elimination as LAPACK's getrf and getrs do it, and
-sine and cosine by a polynomial. Checked against torch 2.13 on random poses: equal bits. Not so the angles of
-`six_vectors`.
+A nearest warp decides by rounding which cell a sample point lies in. For points close to a border between cells the
+last bit of the matrix decides. So the labels' warps repeat each rounding: products summed in order of the inner index,
+without fused multiply-add, the inverse by elimination as LAPACK's getrf and getrs do it, and sine and cosine by a
+polynomial. Checked against torch 2.13 on random poses: all bits are equal, except for the angles of `six_vectors`.
 """
 
 from typing import Any, Final
@@ -18,9 +17,9 @@ from deepaccident_devkit.geometry import six_vectors as geometry_six_vectors
 _SINE: Final = (2.605780704850265e-06, -0.00019809602928568679, 0.008333066246354204, -0.16666659550431576, 1.0)
 """sin t / t as a polynomial of t², the highest power first.
 
-torch rounds 2–5 % of all sines and cosines to the neighbour of the nearest float32, because it takes a polynomial of
-ninth degree. The coefficients were found from its results alone, as the ones that give all of them: of 24 million
-angles in [−π, π] a handful differ.
+torch rounds 2–5 % of all sines and cosines to the neighbour of the nearest float32, because it uses a polynomial of
+ninth degree. The coefficients were found only from its results, so that they give the same results: of 24 million
+angles in [−π, π] very few differ.
 """
 
 
@@ -51,7 +50,7 @@ def sine(angle: ArrayLike) -> Float32Array:
 
 
 def cosine(angle: ArrayLike) -> Float32Array:
-    """Cosines of float32 angles (…), radians: sines a quarter turn on."""
+    """Cosines of float32 angles (…), radians: sines of the angles plus a quarter turn."""
     radians = np.asarray(angle, dtype=np.float32).astype(np.float64)
     half_turns = np.rint(radians / np.pi + 0.5)
     return _sine_within(radians - (half_turns - 0.5) * np.pi, half_turns)
@@ -75,10 +74,11 @@ def fused_product(first: Float32Array, second: Float32Array) -> Float32Array:
 
 
 def six_vectors(matrix: Float32Array) -> Float32Array:
-    """Matrices (…, 4, 4) → 6-vectors (…, 6), by way of float64: translations as they are, angles rounded once.
+    """Matrices (…, 4, 4) → 6-vectors (…, 6), through float64: translations as they are, angles rounded once.
 
-    torch's atan2 in float32 is not correctly rounded, so that its angles can differ in the last bit. At a tie, where a
-    sample point lies on a border between cells, that can change the cell: of about 330 warped dumps, three had one off.
+    torch's atan2 in float32 is not correctly rounded, so its angles can differ in the last bit. At a tie, where a
+    sample point lies on a border between cells, that can change the cell: in three of about 330 warped outputs of the
+    released code one cell was different.
     """
     return geometry_six_vectors.from_matrices(matrix).astype(np.float32)
 

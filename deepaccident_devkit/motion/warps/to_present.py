@@ -31,11 +31,10 @@ def maps_to_present(
 ) -> dict[str, AnyArray]:
     """The maps of `MotionLabels` with every frame warped to the present ego frame; the present itself stays as it is.
 
-    Segmentation, instance, offset and flow take the nearest cell's values. The protocol says how (`warp`), what comes
-    in from beside the grid (`outside_is_zero`) and whether offset and flow turn with the frame
+    Segmentation, instance, offset and flow take the nearest cell's values. The protocol says how (`warp`), what value
+    cells from outside the grid have (`outside_is_zero`) and whether offset and flow turn with the frame
     (`vectors_not_rotated`). An augmentation of the configuration counts on both sides: A C A⁻¹ (docs/released_code.md,
-    Warps). A missing frame that is all `ignore_index` (not `missing_frames_are_empty`) stays so: there is nothing to
-    warp.
+    Warps). A missing frame that is all `ignore_index` (not `missing_frames_are_empty`) is not warped.
 
     Args:
         maps: segmentation, instance, centerness, offset and flow, each frame in its own ego frame.
@@ -76,7 +75,7 @@ def maps_to_present(
 def _empty_like(maps: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
     """Arrays of these shapes in one block, which the allocator keeps for the next sample.
 
-    One by one they go back to the system each time, and their pages, taken again, cost more than the warps.
+    Separate arrays would be returned to the system each time, and to get their pages again costs more than the warps.
     """
     block = np.empty(sum(given.nbytes for given in maps.values()), dtype=np.uint8)
     result, start = {}, 0
@@ -92,8 +91,8 @@ def _warp_instances(
 ) -> None:
     """Fill one frame's instance, segmentation, offset and flow; the last three differ from the background on few cells.
 
-    Beside instances segmentation is 0, offset and flow are `ignore_index` (see `MotionLabels`): it is the cells of
-    instances alone that are fetched.
+    Outside instances segmentation is 0, offset and flow are `ignore_index` (see `MotionLabels`), so only the cells of
+    instances are fetched.
     """
     target["instance"][...] = _taken(source["instance"], indices)
     on_instance = np.flatnonzero(target["instance"] != 0)  # of a mask: seven times as fast as of integers
@@ -118,7 +117,7 @@ def _blend(source: AnyArray, target: AnyArray, points: tuple[AnyArray, AnyArray]
 
 
 def _vector_turn(present_from_frame: AnyArray, config: MotionLabelConfig) -> FloatArray:
-    """(2, 2) how offset and flow (rows, columns) of a frame turn on the way to the present."""
+    """(2, 2) how offset and flow (rows, columns) of a frame turn when it is warped to the present."""
     transform = present_from_frame if config.rules.right_handed else flip_pose(present_from_frame)
     metres_from_cells = _metres_from_cells(config.grid)
     turn: FloatArray = np.linalg.inv(metres_from_cells) @ transform[:2, :2] @ metres_from_cells

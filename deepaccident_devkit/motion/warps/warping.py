@@ -1,23 +1,24 @@
 """Warping a raster into another ego frame: which source cell or point each target cell takes its value from.
 
-Sampling is counted in a protocol's `native` orientation, with matrices of that orientation's handedness, by one of
+Sampling is done in a protocol's `native` orientation, with matrices of that orientation's handedness, by one of
 three rules (`WarpRule`):
 
 - `stretched`: the released `FeatureWarper` (docs/released_code.md, Warps), which is BEVerse's. Sample points stand at
-  linspace(−49.75, 50, 200) along either axis instead of at the cells' centres, and the outermost of them are taken for
-  the grid's ends: without motion, cell i samples 0.4975 + 0.9975 i, which nearest sampling rounds to i, and which blurs
-  bilinear sampling by up to half a cell. In float32, rounding for rounding, since the last bit decides for points that
-  lie on the border between two cells (except for the angles of the egomotion: `single_precision.six_vectors`). Grids
-  that are not centred on the ego, where the released code has no meaning, are stretched about their own middle.
+  linspace(−49.75, 50, 200) along either axis instead of at the cells' centres, and the outermost of them are treated
+  as the grid's ends: without motion, cell i samples 0.4975 + 0.9975 i, which nearest sampling rounds to i, and which
+  blurs bilinear sampling by up to half a cell. Each rounding to float32 is repeated, since the last bit decides for
+  points that lie on the border between two cells (except for the angles of the egomotion:
+  `single_precision.six_vectors`). Grids that are not centred on the ego have no meaning in the released code; they are
+  stretched about their own middle.
 - `exact`: cell centres, in float64; without motion every cell gets its own value, in either mode.
-- `fiery`: FIERY's (docs/released_code.md, FIERY's own labels), native in `fiery`. Cell centres, but of the motion only
-  yaw and planar translation as the 6-vector has them count, and they are put together as source = Rot(−yaw) · target +
-  (−tx, +ty): the sideways shift has the wrong sign, and neither shift is turned. FIERY knows square grids centred on
-  the ego; on others we measure in metres from the ego.
+- `fiery`: FIERY's (docs/released_code.md, FIERY's own labels), native in `fiery`. Cell centres; of the motion only
+  the 6-vector's yaw and planar translation count, combined as source = Rot(−yaw) · target + (−tx, +ty): the sideways
+  shift has the wrong sign, and neither shift is turned. FIERY has only square grids centred on the ego; on others we
+  measure in metres from the ego.
 
-The transform is rigid (or A · rigid · A⁻¹ with an augmentation A); points lie on the plane z = 0, of whose images x and
-y count. `source_from_target` maps points of the frame that the result is in to points of the frame that the raster is
-in: `sampling_matrix` gets it from the released code's arguments, which go the other way.
+The transform is rigid (or A · rigid · A⁻¹ with an augmentation A). Points lie on the plane z = 0; only x and y of the
+transformed points count. `source_from_target` maps points of the result's frame to points of the raster's frame:
+`sampling_matrix` gets it from the released code's arguments, which go the other way.
 """
 
 import functools
@@ -37,9 +38,9 @@ from deepaccident_devkit.motion.warps import single_precision
 WarpMode = Literal["nearest", "bilinear"]
 CellIndices = NDArray[np.intp]
 OUTSIDE: Final = -1
-"""In `nearest_indices`: nothing there to take a value from."""
+"""In `nearest_indices`: the sample point is outside the grid and has no value."""
 _COUNTABLE: Final = 2**24
-"""Cells that float32 can number."""
+"""How many cells float32 can number."""
 
 
 def sampling_matrix(target_from_source: ArrayLike, rules: LabelProtocol) -> AnyArray:
@@ -65,11 +66,11 @@ def nearest_indices(
         source_from_target: (4, 4) metres, in the protocol's handedness.
         grid: the cells of both rasters; its own orientation does not matter.
         rules: the protocol that says how to sample.
-        orientation: how the rasters lie that the indices are for; None for the protocol's native orientation.
+        orientation: of the rasters that the indices are for; None for the protocol's native orientation.
 
     Returns:
         (H·W,) intp, row · W + column of the source cell, in the order of the target's cells; −1 (`OUTSIDE`) where the
-        sample point is beside the grid.
+        sample point is outside the grid.
 
     Raises:
         GeometryError: the matrix has another shape or is not finite, or the grid has more than 2²⁴ cells.
@@ -96,7 +97,7 @@ def rounded_points(
     row += column
     row += first
     np.copyto(row, OUTSIDE, where=beside)
-    cells = row.astype(np.int32)  # on the way to intp: three times as fast
+    cells = row.astype(np.int32)  # first to int32, then to intp: three times as fast
     return grid.with_orientation(native).reorient(cells, lying).astype(np.intp).ravel()
 
 
@@ -118,8 +119,9 @@ def warp(
         grid: the cells; its own orientation does not matter.
         rules: the protocol that says how to sample.
         mode: the value of the nearest cell, or of the four around the sample point, weighted.
-        fill: what stands beside the grid; it mixes with the border's cells where the mode is bilinear.
-        orientation: how the rasters lie; None for the protocol's native orientation. Only cells change places.
+        fill: the value outside the grid; if the mode is bilinear, it mixes with the border's cells.
+        orientation: how the rasters lie; None for the protocol's native orientation. Only cells change places: vectors
+            do not turn.
 
     Returns:
         The same shape and orientation; of the same dtype if `nearest`, float32 if `bilinear`.
@@ -226,7 +228,7 @@ def _exact_points(matrix: FloatArray, grid: BevGrid) -> tuple[AnyArray, AnyArray
 
 
 def _plane(matrix: AnyArray, grid: BevGrid) -> AnyArray:
-    """(2, 3) what the plane z = 0 keeps of a matrix, metres along rows and columns: their factors and the shift."""
+    """(2, 3) the part of a matrix that counts on the plane z = 0, metres along rows and columns: factors and shift."""
     order = [0, 1] if grid.orientation == "fiery" else [1, 0]
     return matrix[order][:, [*order, 3]]
 
@@ -283,7 +285,7 @@ def _centers(axis: Axis) -> FloatArray:
 
 @functools.lru_cache(maxsize=64)
 def _fiery_coordinates(axis: Axis, half: float) -> Float32Array:
-    """(n,) the cells' centres in units of `half` metres; if −1 to 1, as torch's affine_grid makes them in float32."""
+    """(n,) the cells' centres in units of `half` metres; from −half to half as torch's affine_grid, in float32."""
     low, high, size = axis
     count = round((high - low) / size)
     if (low, high) != (-half, half):

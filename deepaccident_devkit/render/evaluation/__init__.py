@@ -1,4 +1,4 @@
-"""Figures of an evaluation, and the report that holds them all. One panel takes `ax=` and returns the Axes."""
+"""Figures of an evaluation, and the report with all of them. A panel's function takes `ax=` and returns the Axes."""
 
 from deepaccident_devkit.render.evaluation.accident import (
     render_accuracy,

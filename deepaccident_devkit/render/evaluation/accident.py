@@ -1,4 +1,4 @@
-"""Accident results as pictures: accuracy over the distance allowed, outcomes, errors, and alarms by their score."""
+"""Accident results as pictures: accuracy over the allowed distance, outcomes, errors, and alarms by their score."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _FARTHEST: Final = 20.0
-"""Metres: where the axis of the distance allowed ends."""
+"""Metres: where the axis of the allowed distance ends."""
 _TIME_EDGES: Final = np.arange(-2.25, 2.3, 0.5)
-"""Seconds: half a second a bin, the middle one around no error."""
+"""Seconds: each bin has half a second, and the middle bin is around no error."""
 
 
 def render_accuracy(evaluator: AccidentEvaluator, *, ax: Axes | None = None) -> Axes:
     """Render the accident accuracy over the distance that a prediction may be off, with the three official distances.
 
     Args:
-        evaluator: with samples counted. Where its counts hold how far off each alarm is there is a curve from 0 to
-            20 m; the released protocol's hold the outcomes at the official distances alone.
+        evaluator: with samples counted. If its counts hold how far off each alarm is, there is a curve from 0 to 20 m.
+            The released protocol's counts hold only the outcomes at the official distances.
         ax: axes to render on; new ones if None.
 
     Returns:
@@ -55,7 +55,7 @@ def render_accuracy(evaluator: AccidentEvaluator, *, ax: Axes | None = None) -> 
 
 
 def render_outcomes(result: AccidentResult, *, ax: Axes | None = None) -> Axes:
-    """Render how many accidents are foreseen, predicted falsely and missed, at each distance allowed.
+    """Render how many accidents are foreseen, predicted falsely and missed, at each allowed distance.
 
     Args:
         result: of `AccidentEvaluator.compute`.
@@ -84,25 +84,25 @@ def render_outcomes(result: AccidentResult, *, ax: Axes | None = None) -> Axes:
 
 
 def render_errors(evaluator: AccidentEvaluator, error: Literal["position", "time"], *, ax: Axes | None = None) -> Axes:
-    """Render a histogram of how far off the predicted accidents are, of the samples that have one to come.
+    """Render a histogram of how far off the predicted accidents are, for samples before an accident.
 
     Args:
-        evaluator: with samples counted, of a protocol whose counts hold it (not the released one's).
+        evaluator: with samples counted, of a protocol whose counts hold the errors (not the released one).
         error: of `position`, metres; or of `time`, seconds by which the prediction is late.
         ax: axes to render on; new ones if None.
 
     Returns:
-        The axes; what lies beyond the bins is in the outermost.
+        The axes; values outside the bins are in the first and the last bin.
     """
     from matplotlib.ticker import MaxNLocator
 
     ax, values = axes_or_new(ax, PANEL), errors_of_first(evaluator, error)
     if error == "position":
-        edges, label = np.arange(0, _FARTHEST + 1.1), "positions off in sum of the two (m); the last bin: and more"
+        edges, label = np.arange(0, _FARTHEST + 1.1), "position errors of the two, sum (m); the last bin: and more"
         for distance in DISTANCES:
             ax.axvline(distance, color=GRID_COLOR, linestyle="--", zorder=0)
     else:
-        edges, label = _TIME_EDGES, "predicted moment minus true one (s): late to the right"
+        edges, label = _TIME_EDGES, "predicted moment minus true moment (s): late to the right"
     ax.set_title(f"Errors of {error}: {len(values):,} accidents with a prediction", fontsize=10)
     if not len(values):
         return draw_nothing(ax, "no accident has a prediction")
@@ -115,7 +115,7 @@ def render_errors(evaluator: AccidentEvaluator, error: Literal["position", "time
 
 
 def render_alarms(evaluator: AccidentEvaluator, *, ax: Axes | None = None) -> Axes:
-    """Render precision over recall of alarms, from the surest on.
+    """Render precision over recall of alarms, beginning with the surest alarm.
 
     Args:
         evaluator: with samples counted, of a protocol whose alarms have scores (`boxes`).
@@ -125,7 +125,7 @@ def render_alarms(evaluator: AccidentEvaluator, *, ax: Axes | None = None) -> Ax
         The axes: each point is all alarms of at least some score.
     """
     ax = axes_or_new(ax, PANEL)
-    ax.set_title("Alarms from the surest on", fontsize=10)
+    ax.set_title("Alarms, the surest first", fontsize=10)
     recall, precision = alarm_precision_recall(evaluator)
     if not len(recall):
         return draw_nothing(ax, "no alarms, or no accidents")
@@ -137,14 +137,14 @@ def render_alarms(evaluator: AccidentEvaluator, *, ax: Axes | None = None) -> Ax
 
 
 def accuracy_by_distance(evaluator: AccidentEvaluator, distances: FloatArray) -> FloatArray | None:
-    """The accident accuracy with each of some distances allowed; at the official ones it is the result's.
+    """The accident accuracy at each of some allowed distances; at the official ones it is the result's.
 
     Args:
         evaluator: with samples counted.
         distances: (D,) metres.
 
     Returns:
-        (D,) tp / (tp + fp / 2 + fn / 2), NaN where nothing is counted; None if the protocol's counts do not hold how
+        (D,) tp / (tp + fp / 2 + fn / 2), NaN if nothing is counted; None if the protocol's counts do not hold how
         far off each alarm is.
     """
     protocol = evaluator.protocol
@@ -164,12 +164,12 @@ def accuracy_by_distance(evaluator: AccidentEvaluator, distances: FloatArray) ->
 
 
 def has_alarms(evaluator: AccidentEvaluator) -> bool:
-    """Whether the counts hold how far off each alarm is; the released protocol's hold outcomes alone."""
+    """Whether the counts hold how far off each alarm is; the released protocol's counts hold only outcomes."""
     return isinstance(evaluator.protocol, BoxAccidents | PaperAccidents)
 
 
 def errors_of_first(evaluator: AccidentEvaluator, error: Literal["position", "time"]) -> FloatArray:
-    """How far off the most important alarm is of each sample with an accident to come, however far that is.
+    """How far off the most important alarm of each sample before an accident is, without a limit.
 
     Args:
         evaluator: with samples counted.
@@ -183,9 +183,9 @@ def errors_of_first(evaluator: AccidentEvaluator, error: Literal["position", "ti
 
 
 def alarm_precision_recall(evaluator: AccidentEvaluator) -> tuple[FloatArray, FloatArray]:
-    """Recall and precision (N,) each of all alarms of at least each score, from the surest on.
+    """Recall and precision, (N,) each, of all alarms with at least each score, the highest score first.
 
-    Equally sure alarms come in together. Both are empty without any alarm, or any accident, and where alarms have no
+    Alarms with equal scores count together. Both are empty if there is no alarm or no accident, or if alarms have no
     scores.
     """
     if not isinstance(evaluator.protocol, BoxAccidents):
@@ -205,7 +205,7 @@ def alarm_precision_recall(evaluator: AccidentEvaluator) -> tuple[FloatArray, Fl
 
 
 def _samples(evaluator: AccidentEvaluator) -> list[tuple[bool, Sequence[Alarm]]]:
-    """Of each sample whether an accident comes, and its alarms, the most important first; in the order of tokens."""
+    """For each sample, in the order of tokens: whether an accident comes, and its alarms, the most important first."""
     counts = sorted(evaluator.counts.items())
     return [(bool(sample["positive"]), _alarms(evaluator.protocol, sample)) for _, sample in counts]
 

@@ -21,13 +21,13 @@ def render_breakdown(task: str, broken: Breakdown[Any], number: str, *, ax: Axes
     """Render one headline number of each group as a bar, with its interval as a whisker.
 
     Args:
-        task: whose headline numbers there are.
-        broken: of `breakdown`.
-        number: path of the number, as of `Headline`: `apa`, `ranges/30x30/iou`.
+        task: whose headline numbers they are.
+        broken: the result of `breakdown`.
+        number: path of the number, as in `Headline`: `apa`, `ranges/30x30/iou`.
         ax: axes to render on; new ones if None.
 
     Returns:
-        The axes; each bar has its value, and of how many samples and scenarios it is.
+        The axes; each bar has its value and its numbers of samples and scenarios.
     """
     ax, bars, shown = axes_or_new(ax, PANEL), [], None
     for group in broken.groups:

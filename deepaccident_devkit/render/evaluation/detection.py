@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _DASHES: Final = ("-", "--", "-.", ":")
-"""Styles that distinguish lines also in print without colours."""
+"""Styles that distinguish lines even in print without colours."""
 
 
 def render_precision_recall(result: DetectionResult, name: str, *, ring: int = 0, ax: Axes | None = None) -> Axes:
-    """Render precision over recall of one class, a line a threshold.
+    """Render precision over recall of one class, one line for each threshold.
 
     Args:
         result: of `DetectionEvaluator.compute`.
@@ -52,7 +52,7 @@ def render_precision_recall(result: DetectionResult, name: str, *, ring: int = 0
         reached = np.isfinite(recall) & (precision > 0)
         average = float(result.average_precision[row, ring, level])
         label = f"{threshold:g}: AP {average:.1f} %" if math.isfinite(average) else f"{threshold:g}: –"
-        width = 1.2 + 0.8 * (count - 1 - level)  # equal curves are all seen
+        width = 1.2 + 0.8 * (count - 1 - level)  # so that all of several equal curves are seen
         ax.plot(recall[reached], precision[reached], dash, color=color, label=label, linewidth=width)
     ax.set(xlim=(0, 1.02), ylim=(0, 1.02), xlabel="recall", ylabel="precision")
     ax.legend(title="threshold", fontsize=8, title_fontsize=8, loc="best")

@@ -1,4 +1,4 @@
-"""The figures of a run: which there are, and the files that they become."""
+"""The figures of a run, and their files."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ if TYPE_CHECKING:
 
 _DPI: Final = 130
 _ROW: Final = 0.36
-"""Inches that a bar needs at least."""
+"""The least height of a bar in inches."""
 MAIN_NUMBERS: Final = {
     "motion": ("ranges/100x100/pq", "ranges/100x100/iou"),
     "accident": ("apa", "position_error"),
     "detection": ("mean_average_precision",),
     "warning": ("groups/ego_involved/auc_ahead", "recording_precision"),
 }
-"""Task → paths of the headline numbers that figures show by attribute: the first by all attributes, and samples are
-ranked by it; the others by time to impact alone."""
+"""Task → paths of the headline numbers that figures show by attribute. The first one is shown by all attributes, and
+samples are ranked by it; the others are shown only by time to impact."""
 _BY_TIME: Final = "time_to_impact"
 
 
@@ -60,7 +60,7 @@ class RunFigure:
         caption: what the figure shows, for the reader of the report.
         alt: the same in words and numbers, for readers who cannot see it.
         draw: renders it on axes.
-        rows: how many bars are below each other; the figure is higher for many.
+        rows: how many bars are below each other; with many bars the figure is higher.
     """
 
     name: str
@@ -79,8 +79,7 @@ def save_figure(run: EvaluationRun, drawn: RunFigure, folder: Path) -> Path:
         folder: where; it is made if it is not there.
 
     Returns:
-        The file's path. The figure says the task, protocol, devkit and release that it is of, and in red what is
-        missing of a partial run.
+        The file's path. The figure names its task, protocol, devkit and release, and in red what a partial run lacks.
     """
     path = folder / f"{drawn.name}.png"
     figure = detached_figure((PANEL[0], max(PANEL[1], _ROW * drawn.rows + 1.2)))
@@ -111,16 +110,16 @@ def _accident(run: EvaluationRun) -> Iterator[RunFigure]:
     evaluator, result = run.evaluator, run.result
     if not isinstance(evaluator, AccidentEvaluator):
         return
-    curve = "" if accident.has_alarms(evaluator) else " The released protocol counts at these three distances alone."
+    curve = "" if accident.has_alarms(evaluator) else " The released protocol counts only at these three distances."
     yield RunFigure(
         name="accuracy",
-        caption=f"Accident prediction accuracy over the distance allowed; APA is the mean of the three points.{curve}",
+        caption=f"Accident prediction accuracy over the allowed distance; APA is the mean of the three points.{curve}",
         alt=f"Accuracy {_listed((f'within {d:g} m', x.accuracy) for d, x in result.within.items())}.",
         draw=partial(accident.render_accuracy, evaluator),
     )
     yield RunFigure(
         name="outcomes",
-        caption="Accidents foreseen, false and missed, by the distance allowed.",
+        caption="Accidents foreseen, false and missed, by the allowed distance.",
         alt="; ".join(f"within {d:g} m {x.tp} foreseen, {x.fp} false, {x.fn} missed" for d, x in result.within.items()),
         draw=partial(accident.render_outcomes, result),
     )
@@ -128,20 +127,20 @@ def _accident(run: EvaluationRun) -> Iterator[RunFigure]:
         return
     yield RunFigure(
         name="position_errors",
-        caption="How far off the predicted positions are, the sum over the two agents, where an accident is to come.",
+        caption="Errors of the predicted positions, the sum over the two actors, in samples before an accident.",
         alt="Histogram of position errors in metres.",
         draw=partial(accident.render_errors, evaluator, "position"),
     )
     yield RunFigure(
         name="time_errors",
-        caption="How late the predicted moments are, where an accident is to come.",
+        caption="How late the predicted moments are, in samples before an accident.",
         alt="Histogram of time errors in seconds.",
         draw=partial(accident.render_errors, evaluator, "time"),
     )
     if hasattr(result, "average_precision"):
         yield RunFigure(
             name="alarms",
-            caption="Precision over recall of the alarms, from the surest on.",
+            caption="Precision over recall of the alarms, beginning with the surest alarm.",
             alt=f"Precision over recall of alarms; {_listed([('average precision', result.average_precision)])}.",
             draw=partial(accident.render_alarms, evaluator),
         )
@@ -165,7 +164,7 @@ def _detection(run: EvaluationRun) -> Iterator[RunFigure]:
         limits = zip(result.thresholds[row].tolist(), result.average_precision[row, ring].tolist(), strict=True)
         yield RunFigure(
             name=f"precision_recall_{name}" + f"_{low:g}_{high:g}m" * several,
-            caption=f"Precision over recall: {name}{where}, a line a threshold ({unit}).",
+            caption=f"Precision over recall: {name}{where}, one line for each threshold ({unit}).",
             alt=f"{name}{where}, average precision in percent: {_listed((f'{t:g}', x) for t, x in limits)}.",
             draw=partial(detection.render_precision_recall, result, name, ring=ring),
         )
@@ -198,7 +197,7 @@ def _warning(run: EvaluationRun) -> Iterator[RunFigure]:
     if isinstance(result, AnticipationResult):
         yield RunFigure(
             name="predictors",
-            caption="Accidents told from other recordings, beside predictors that know nothing or the present alone.",
+            caption="Accidents against other recordings: how well they are distinguished, also by simple predictors.",
             alt="Chance that an accident's score is above another recording's at the same moment, by predictor.",
             draw=partial(warning.render_predictors, result),
         )
@@ -213,19 +212,19 @@ def _warning(run: EvaluationRun) -> Iterator[RunFigure]:
     )
     yield RunFigure(
         name="detection_rates",
-        caption="Share of the accidents of which a right alarm warns so long before the impact, or earlier.",
+        caption="Share of the accidents with a right alarm at this time before the impact, or earlier.",
         alt=f"Share of accidents with a right alarm: {rates}.",
         draw=partial(warning.render_detection_rates, result),
     )
     yield RunFigure(
         name="false_alarms",
-        caption="False alarms a minute, by kind of recording; twins are normal scenarios made like an accident.",
+        caption="False alarms a minute, by kind of recording; a twin is a normal scenario made like an accident.",
         alt=f"False alarms a minute: {_listed(result.false_alarms_per_minute.items())}.",
         draw=partial(warning.render_false_alarms, result),
     )
     yield RunFigure(
         name="warning_curve",
-        caption="Detection rate over false alarms a minute, a point a score from which alarms are raised.",
+        caption="Detection rate over false alarms a minute; each point has another least score of alarms.",
         alt="Detection rate over false alarms a minute.",
         draw=partial(warning.render_warning_curve, result),
     )

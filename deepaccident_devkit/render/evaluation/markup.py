@@ -1,4 +1,4 @@
-"""HTML out of plain values: all text that is not `Markup` is escaped, so that no name can bring in tags."""
+"""HTML from plain values: all text that is not `Markup` is escaped, so no name can add tags."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from deepaccident_devkit.render.colors import GRID_COLOR, WARNING_COLOR
 _VOID: Final = ("img", "meta")
 _MOST_DIGITS: Final = 6
 _LONG: Final = 40
-"""A text of more letters is no name."""
+"""A text with more letters than this is not a name."""
 
 
 class Markup(str):
@@ -37,12 +37,12 @@ def tag(name: str, *content: str, **attributes: str) -> Markup:
 
 
 def joined(parts: Iterable[str]) -> Markup:
-    """Texts, which are escaped, and `Markup` behind one another."""
+    """Texts, which are escaped, and `Markup`, one after another."""
     return Markup("".join(part if isinstance(part, Markup) else html.escape(part) for part in parts))
 
 
 def table(heading: Sequence[str], rows: Iterable[Sequence[str]], caption: str = "") -> Markup:
-    """A table in a box that scrolls where it is too wide; the first column is the rows' heading."""
+    """A table in a box that scrolls if the table is too wide; the first column has the rows' headings."""
     head = tag("tr", *(tag("th", each, scope="col") for each in heading))
     body = [tag("tr", tag("th", first, scope="row"), *map(_cell, others)) for first, *others in rows]
     above = [tag("caption", caption)] if caption else []
@@ -71,7 +71,7 @@ def tree(value: Any) -> Markup:
 
 
 def scalar(value: Any) -> str:
-    """A value as text: numbers with few digits, a dash for what is not known."""
+    """A value as text: numbers with few digits, a dash for an unknown value."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "–"
     if isinstance(value, bool):
@@ -80,7 +80,7 @@ def scalar(value: Any) -> str:
 
 
 def _cell(content: str) -> Markup:
-    """Numbers and names stay on a line, sentences do not."""
+    """Numbers and names stay on one line, sentences may have several."""
     is_sentence = "<" not in content and len(content) > _LONG
     return tag("td", content, class_="long") if is_sentence else tag("td", content)
 
@@ -98,7 +98,7 @@ def _list(values: Sequence[Any]) -> Markup:
 
 
 _POLICY: Final = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-"""A browser loads nothing and runs nothing, also if a name tries to."""
+"""A browser loads nothing and runs nothing, even if a name in the results tries to."""
 _STYLE: Final = f"""
 :root {{ color-scheme: light; }}
 * {{ box-sizing: border-box; }}
@@ -158,7 +158,7 @@ footer {{ margin-top: 3rem; color: #555; font-size: .88rem; }}
 
 
 def document(title: str, *content: Markup) -> str:
-    """A whole page in HTML.
+    """A complete HTML page.
 
     Args:
         title: of the window.

@@ -26,7 +26,7 @@ def render_ranges(result: MotionResult, *, ax: Axes | None = None) -> Axes:
         ax: axes to render on; new ones if None.
 
     Returns:
-        The axes, in percent; what has nothing to count has no bar.
+        The axes, in percent; a number with nothing to count has no bar.
     """
     ax, count = axes_or_new(ax, PANEL), len(result.ranges)
     for offset, ((name, within), color) in enumerate(
@@ -46,7 +46,7 @@ def render_ranges(result: MotionResult, *, ax: Axes | None = None) -> Axes:
 
 
 def render_quality_by_time(evaluator: MotionEvaluator, step: float = 0.5, *, ax: Axes | None = None) -> Axes:
-    """Render the panoptic quality of each frame ahead, a line a range.
+    """Render the panoptic quality of each future frame, one line for each range.
 
     Args:
         evaluator: with samples counted.
@@ -54,8 +54,8 @@ def render_quality_by_time(evaluator: MotionEvaluator, step: float = 0.5, *, ax:
         ax: axes to render on; new ones if None.
 
     Returns:
-        The axes, in percent over seconds from the present. The result's quality is that of the sums over all
-        frames.
+        The axes, in percent over seconds from the present. The quality in the result is computed from the sums over
+        all frames.
     """
     ax, counts = axes_or_new(ax, PANEL), evaluator.counts.values()
     ax.set_title("Panoptic quality by time ahead", fontsize=10)
@@ -73,7 +73,7 @@ def render_quality_by_time(evaluator: MotionEvaluator, step: float = 0.5, *, ax:
 
 
 def _quality(samples: list[list[list[float]]], frame: int) -> float:
-    """PQ in percent of one frame of samples' four lists by frame; NaN without any instance."""
+    """PQ in percent of one frame, from the four lists by frame of each sample; NaN without any instance."""
     there = [[values[frame] for values in each] for each in samples if frame < len(each[0])]
     overlap, *numbers = (math.fsum(each[kind] for each in there) for kind in range(4))
     found, false, missed = map(int, numbers)

@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 PANEL: Final = (6.4, 4.2)
-"""Inches of one panel."""
+"""Width and height of one panel in inches."""
 _BESIDE: Final = 1.22
-"""Of the longest bar: where the axis ends, so that the words beside the bars have room."""
+"""The axis' length in lengths of the longest bar, so that the words beside the bars have room."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,8 +26,8 @@ class Bar:
     Attributes:
         label: beside the axis.
         below: a smaller line below the label; empty for none.
-        value: None where there is nothing to count.
-        interval: low and high; None without.
+        value: None if there is nothing to count.
+        interval: low and high; None for none.
         text: beside the bar.
         color: of the bar.
     """
@@ -46,7 +46,7 @@ def draw_bars(bars: Sequence[Bar], ax: Axes, limit: float | None = None) -> Axes
     Args:
         bars: an unknown value has a dash in place of a bar.
         ax: the axes to render on.
-        limit: where the values end; None for as far as they go.
+        limit: the largest possible value; None for the largest of the bars.
 
     Returns:
         The axes.
@@ -82,7 +82,7 @@ def draw_bars(bars: Sequence[Bar], ax: Axes, limit: float | None = None) -> Axes
 
 
 def draw_nothing(ax: Axes, why: str = "nothing to count") -> Axes:
-    """Say why a panel is empty; returns the axes."""
+    """Write into a panel why it is empty; returns the axes."""
     ax.text(0.5, 0.5, why, ha="center", va="center", transform=ax.transAxes, color="#555555")
     ax.set(xticks=[], yticks=[])
     return ax

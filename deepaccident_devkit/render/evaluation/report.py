@@ -1,4 +1,4 @@
-"""`save_report`: one HTML file with all of an evaluation, and its figures as PNG files."""
+"""`save_report`: one HTML file with the whole evaluation, and its figures as PNG files."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ def save_report(
 ) -> Path:
     """Write `report.html` and `figures/*.png` into a folder; the same run makes the same bytes.
 
-    The report needs no other file and asks for none: it can be sent as it is. Each section and each figure of a partial
-    run says so.
+    The report needs no other file: it can be sent as it is. In a partial run each section and each figure says that it
+    is partial.
 
     Args:
         run: of `evaluate_results`.
         folder: where; it is made if it is not there, and files of an earlier report there are replaced.
-        dataset: with `results`, to show the worst and the best samples, too.
+        dataset: the release; with it and `results` the report also shows the worst and the best samples.
         results: the predictions that were evaluated.
 
     Returns:
@@ -58,7 +58,7 @@ def save_report(
 
 
 def report_html(run: EvaluationRun, figures: Sequence[tuple[RunFigure, Path]]) -> str:
-    """The whole page.
+    """The complete page.
 
     Args:
         run: of `evaluate_results`.
@@ -72,7 +72,7 @@ def report_html(run: EvaluationRun, figures: Sequence[tuple[RunFigure, Path]]) -
         "Figures": tag("div", *(_figure(*each) for each in figures), class_="figures"),
         "Breakdowns": joined(sections.breakdowns(run)),
         **({"Sanity": sections.sanity(run.sanity)} if run.sanity is not None else {}),
-        **({"What each choice changes": sections.explanation(run.explanation)} if run.explanation is not None else {}),
+        **({"What each switch changes": sections.explanation(run.explanation)} if run.explanation is not None else {}),
         "Choices": sections.choices(run),
         "Check these numbers": sections.checking(),
     }

@@ -30,14 +30,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _EACH: Final = 3
-"""So many of the worst and of the best samples."""
+"""How many of the worst, and of the best, samples are shown."""
 
 
 def sample_figures(run: EvaluationRun, dataset: Dataset, results: Results) -> tuple[RunFigure, ...]:
     """The worst and the best samples of a run by its task's main number, the worst first.
 
-    Samples for which there is nothing to count are left out, and of the task `warning`, which is about whole
-    recordings, there are none.
+    Samples with nothing to count are left out. The task `warning` has none, because it is about whole recordings.
 
     Args:
         run: of `evaluate_results`.
@@ -54,7 +53,7 @@ def sample_figures(run: EvaluationRun, dataset: Dataset, results: Results) -> tu
         RunFigure(
             name=f"sample_{kind}_{number}",
             caption=f"One of the {kind} samples: {token}, {text}.",
-            alt=f"Seen from above: what was predicted of sample {token}, over what is true; {text}.",
+            alt=f"Seen from above: the prediction for sample {token} over the truth; {text}.",
             draw=partial(_draw, load, token, text),
         )
         for kind, chosen in (("worst", worst), ("best", best[::-1]))
@@ -63,11 +62,11 @@ def sample_figures(run: EvaluationRun, dataset: Dataset, results: Results) -> tu
 
 
 def draw_motion_outcome(prediction: MotionOutput, label: MotionLabels, *, ax: Axes | None = None) -> Axes:
-    """Render the last frame's cells: actors that are predicted rightly, falsely, and missed.
+    """Render the last frame's cells: actors that are predicted, predicted falsely, and missed.
 
     Args:
         prediction: of a model; the last of several predictions is rendered.
-        label: the truth, on the same ground; frames in their own ego frames are warped to the present.
+        label: the truth, on the same grid; frames in their own ego frames are warped to the present.
         ax: axes to render on; new ones if None.
 
     Returns:
@@ -120,7 +119,7 @@ def _ranked(run: EvaluationRun) -> list[tuple[str, str]]:
 
 
 def _actors(prediction: MotionOutput, frame: int) -> BoolArray:
-    """(H, W) which cells the last prediction says have an actor, as it lies."""
+    """(H, W) which cells have an actor by the last prediction, in its own orientation."""
     if prediction.instances is not None:
         cells: BoolArray = prediction.instances[-1, frame] > 0
         return cells

@@ -1,4 +1,4 @@
-"""The sections of a report, each from a run's summary or its results; all of them escaped."""
+"""The sections of a report, each from a run's summary or its results; all text is escaped."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from deepaccident_devkit.render.evaluation.markup import Markup, facts, joined, 
 
 _BETTER: Final = {True: "higher", False: "lower", None: ""}
 _PARTS: Final = {
-    "truths": "Whom the truth of the samples names",
-    "within": "By the distance allowed (m)",
+    "truths": "Actors in the samples' true accidents",
+    "within": "By the allowed distance (m)",
     "ranges": "By range",
     "classes": "By class",
     "recordings": "Recordings",
     "minutes": "Minutes",
     "false_alarms": "False alarms",
-    "detection_recordings": "Recordings that reach back so many seconds",
-    "beside": "With other choices, always told along",
+    "detection_recordings": "Recordings with so many seconds before the end",
+    "beside": "With other choices, always reported as well",
 }
 """Field of a result → heading of its table."""
 _SHOWN_META: Final = ("method", "name", "authors", "url", "date")
-"""Fields of the results' own words that stand at the top, where there are any."""
+"""Fields that results give about themselves and that are shown at the top, if there are any."""
 _SIDES: Final = {"empty": "nothing predicted", "given": "given", "perfect": "perfect"}
 
 
@@ -57,7 +57,7 @@ def header(run: EvaluationRun) -> Markup:
 
 
 def headline_table(run: EvaluationRun) -> Markup:
-    """The numbers that come first, with intervals where the run has them."""
+    """The headline numbers, with intervals if the run has them."""
     everything = next((each for each in run.breakdowns if each.by == EVERYTHING), None)
     group = everything.groups[0] if everything is not None and everything.groups else None
     rows = [
@@ -70,7 +70,7 @@ def headline_table(run: EvaluationRun) -> Markup:
 
 
 def predictors(run: EvaluationRun) -> Markup:
-    """The predictions beside predictors that know nothing or the present alone; empty except for warnings."""
+    """The predictions beside predictors that know nothing or only the present; empty except for warnings."""
     return joined(
         joined(
             [table(list(each.rows[0]), [list(row) for row in each.rows[1:]]), *(tag("p", note) for note in each.notes)]
@@ -80,7 +80,7 @@ def predictors(run: EvaluationRun) -> Markup:
 
 
 def counts(run: EvaluationRun) -> Markup:
-    """What was counted: the whole numbers of a result, its notes, and what stands beside it."""
+    """What was counted: the whole numbers of a result, its notes, and its other tables."""
     told = run.result.as_dict()
     numbers = {name: f"{value:,}" for name, value in told.items() if isinstance(value, int)}
     named = {title: told[name] for name, title in _PARTS.items() if told.get(name)}
@@ -90,9 +90,9 @@ def counts(run: EvaluationRun) -> Markup:
 
 
 def breakdowns(run: EvaluationRun) -> Iterator[Markup]:
-    """A table for each attribute, vehicles alone below it where that is another number of samples.
+    """A table for each attribute, and a table of only the vehicles below it if the numbers of samples differ.
 
-    An attribute that has the same value in all samples is only named.
+    If all samples have the same value of an attribute, only this value is given.
     """
     same = {each.by: each.groups[0].value or UNKNOWN for each in run.breakdowns if len(each.groups) == 1}
     for each in run.breakdowns:
@@ -123,18 +123,18 @@ def sanity(report: Mapping[str, Any]) -> Markup:
     found = [tag("p", each, class_="warning") for each in report["warnings"]]
     found += [tag("p", report["verdict"])] * bool(report["verdict"])
     found += [tag("p", f"Not looked at: {each}") for each in report["unchecked"]]
-    heading = ["mistake", "fits as given", "fits set right", "suspected", "what it is"]
+    heading = ["mistake", "fits as given", "fits if corrected", "suspected", "what it is"]
     return joined(
         [
             table(["number", *_SIDES.values()], rows, f"of {report['samples']:,} samples"),
             *found,
-            tag("details", tag("summary", "All that was looked for"), table(heading, looked)),
+            tag("details", tag("summary", "All mistakes that were checked"), table(heading, looked)),
         ]
     )
 
 
 def explanation(report: Mapping[str, Any]) -> Markup:
-    """What the other protocols, and a change of each choice, do to the headline numbers.
+    """The headline numbers by the other protocols, and their changes by each switch.
 
     Args:
         report: as `Explanation.as_dict` has it.
@@ -147,19 +147,23 @@ def explanation(report: Mapping[str, Any]) -> Markup:
     ]
     changes: dict[str, dict[str, Markup]] = {}
     for each in report["numbers"]:
-        told = changes.setdefault(each["choice"], {})
+        numbers = changes.setdefault(each["choice"], {})
         if each["changed"]:
-            told[each["headline"]] = _change(each, units[each["headline"]])
-    shown = [name for name in units if any(name in told for told in changes.values())]
-    same = [choice for choice, told in changes.items() if not told]
-    otherwise = [[choice, *(told.get(name, "") for name in shown)] for choice, told in changes.items() if told]
+            numbers[each["headline"]] = _change(each, units[each["headline"]])
+    shown = [name for name in units if any(name in numbers for numbers in changes.values())]
+    same = [choice for choice, numbers in changes.items() if not numbers]
+    otherwise = [[choice, *(each.get(name, "") for name in shown)] for choice, each in changes.items() if each]
     refused = [tag("li", tag("b", name), f": {why}") for name, why in report["refused"].items()]
     return joined(
         [
             table(["number", *protocols], rows, f"by protocol, of {report['samples']:,} samples"),
-            table(["choice", *shown], otherwise, "one choice changed, all else as chosen") if otherwise else "",
+            table(["switch", *shown], otherwise, "one switch changed, all others as chosen") if otherwise else "",
             tag("p", f"No number changes with: {', '.join(same)}.") if same else "",
-            tag("details", tag("summary", "What these results cannot be evaluated by"), tag("ul", *refused))
+            tag(
+                "details",
+                tag("summary", "Protocols and switches that these results cannot be evaluated by"),
+                tag("ul", *refused),
+            )
             if refused
             else "",
         ]
@@ -167,13 +171,13 @@ def explanation(report: Mapping[str, Any]) -> Markup:
 
 
 def choices(run: EvaluationRun) -> Markup:
-    """Every switch of the protocol, and all other settings; folded up."""
+    """Every switch of the protocol, and all other settings; closed until the reader opens them."""
     given = run.setup.as_dict()
-    said = [("Every choice of the protocol", given["settings"]), ("Selection of samples", run.selection.as_dict())]
+    said = [("Every switch of the protocol", given["settings"]), ("Selection of samples", run.selection.as_dict())]
     if run.results.form is not None:
         said.append(("Form of the results", run.results.form))
     if run.results.meta:
-        said.append(("What the results say of themselves", run.results.meta))
+        said.append(("What the results say about themselves", run.results.meta))
     return joined(
         tag("details", tag("summary", name), tag("div", tree(value), class_="wide text")) for name, value in said
     )
@@ -186,7 +190,7 @@ def checking() -> Markup:
             tag(
                 "p",
                 "This report is one file of a bundle. Anyone who has the bundle, the results and the release can "
-                "recompute all numbers, and is told each that differs:",
+                "compute all numbers again, and the command lists all that differ:",
             ),
             tag("p", tag("code", "deepaccident evaluate verify DIR")),
             tag(
@@ -226,7 +230,7 @@ def _interval_text(headline: Headline, group: Group[Any] | None) -> str:
 
 
 def _columns(value: Any) -> Markup:
-    """A mapping of mappings as a table with a row each, one of numbers as facts; else pairs: ranges from and to."""
+    """A mapping of mappings as a table with one row each, a mapping of numbers as facts, pairs as ranges."""
     if not isinstance(value, Mapping):
         return tag(
             "p", "; ".join(f"{low:g} m and more" if high is None else f"{low:g} to {high:g} m" for low, high in value)

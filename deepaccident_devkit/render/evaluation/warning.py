@@ -1,4 +1,4 @@
-"""Warning results as pictures: how early, how often in time, how many false alarms, and all of it over the score."""
+"""Warning results as pictures: how early, how often in time, how many false alarms, and a curve over the score."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _BIN: Final = 0.5
 
 
 def render_warning_times(result: WarningResult, *, ax: Axes | None = None) -> Axes:
-    """Render a histogram of the seconds of warning, over the recordings of accidents that are warned of.
+    """Render a histogram of the seconds of warning, of the recordings of accidents with a right alarm.
 
     Args:
         result: of `WarningEvaluator.compute`.
@@ -33,7 +33,7 @@ def render_warning_times(result: WarningResult, *, ax: Axes | None = None) -> Ax
 
     ax, seconds = axes_or_new(ax, PANEL), result.warning_seconds
     accidents = result.recordings.get("accident", 0)
-    ax.set_title(f"{len(seconds):,} of {accidents:,} recordings of accidents are warned of", fontsize=10)
+    ax.set_title(f"{len(seconds):,} of {accidents:,} recordings of accidents have a right alarm", fontsize=10)
     if not len(seconds):
         return draw_nothing(ax, "no recording has a right alarm")
     bins = max(1, math.ceil(float(seconds.max()) / _BIN + 1e-6))
@@ -48,14 +48,14 @@ def render_warning_times(result: WarningResult, *, ax: Axes | None = None) -> Ax
 
 
 def render_predictors(result: AnticipationResult, *, ax: Axes | None = None) -> Axes:
-    """Render how well accidents are told from other recordings before they happen, beside the reference predictors.
+    """Render how well accidents are distinguished from other recordings before they happen, and reference predictors.
 
     Args:
         result: of `WarningEvaluator("clean").compute`.
         ax: axes to render on; new ones if None.
 
     Returns:
-        The axes; of the first group of recordings, a bar a predictor; a line is at 0.5, which chance has.
+        The axes, for the first group of recordings: one bar for each predictor, and a line at 0.5, which is chance.
     """
     ax, group = axes_or_new(ax, PANEL), next(iter(result.groups), None)
     if group is None:
@@ -72,8 +72,8 @@ def render_predictors(result: AnticipationResult, *, ax: Axes | None = None) -> 
     ]
     ax = draw_bars(bars, ax, 1.0)
     ax.axvline(0.5, color="black", linestyle="--", linewidth=1)
-    ax.set(xlabel="chance that an accident's score is above another's at the same moment")
-    ax.set_title(f"Accidents told from other recordings: {group}", fontsize=10)
+    ax.set(xlabel="chance that an accident's score is above another recording's at the same moment")
+    ax.set_title(f"Accidents distinguished from other recordings: {group}", fontsize=10)
     return ax
 
 
@@ -85,7 +85,7 @@ def render_detection_rates(result: WarningResult, *, ax: Axes | None = None) -> 
         ax: axes to render on; new ones if None.
 
     Returns:
-        The axes; each bar has its value, and of how many recordings it is.
+        The axes; each bar has its value and its number of recordings.
     """
     bars = [
         Bar(
@@ -110,7 +110,7 @@ def render_false_alarms(result: WarningResult, *, ax: Axes | None = None) -> Axe
         ax: axes to render on; new ones if None.
 
     Returns:
-        The axes; each bar has its value, and the alarms and minutes that it is of.
+        The axes; each bar has its value, and its alarms and minutes.
     """
     bars = [
         Bar(
@@ -129,7 +129,7 @@ def render_false_alarms(result: WarningResult, *, ax: Axes | None = None) -> Axe
 
 
 def render_warning_curve(result: WarningResult, *, ax: Axes | None = None) -> Axes:
-    """Render the detection rate over the false alarms a minute, a point a score from which alarms are raised.
+    """Render the detection rate over the false alarms a minute, one point for each least score of alarms.
 
     Args:
         result: of `WarningEvaluator.compute`.
@@ -139,7 +139,7 @@ def render_warning_curve(result: WarningResult, *, ax: Axes | None = None) -> Ax
         The axes; some points have their score beside them.
     """
     ax, curve = axes_or_new(ax, PANEL), result.curve
-    ax.set_title("If only alarms of at least a score were raised", fontsize=10)
+    ax.set_title("Results if alarms need at least a score", fontsize=10)
     known = np.isfinite(curve.detection_rate) & np.isfinite(curve.false_alarms_per_minute)
     if not known.any():
         return draw_nothing(ax, "needs alarms, accidents and normal scenarios")

@@ -1,4 +1,4 @@
-"""Accidents foreseen against the one that comes: where, when, and how far off."""
+"""Foreseen accidents against the true one: where, when, and how far off."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ def draw_accident_outcome(
     layers: Iterable[Layer] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Render where two collide in truth and where they are foreseen to, with the metres between the places.
+    """Render the true places of the two that collide and the foreseen places, with the metres between them.
 
     Args:
-        compared: what a protocol compares, of `compared_accidents`.
+        compared: what a protocol compares, from `compared_accidents`.
         truth: the actors around, as they are now, and where the pair goes; None renders the accidents alone.
         layers: `boxes` (the actors now), `trajectories` (of the pair) and `grid` are the default; also `ids`.
         ax: axes to render on; new ones if None.
@@ -76,7 +76,7 @@ def draw_accident_outcome(
 
 
 def difference_words(compared: ComparedAccidents) -> str:
-    """The true accident, and the errors of the surest alarm, in both places together and in time."""
+    """The true accident, and the errors of the surest alarm: of both places in sum, and of the time."""
     true = compared.true
     comes = "no accident comes" if true is None else f"an accident comes in {true.time:.1f} s"
     if not compared.predicted:
@@ -89,12 +89,12 @@ def difference_words(compared: ComparedAccidents) -> str:
 
 
 def verdict_words(result: AccidentResult) -> str:
-    """What one sample counts as, by the distance allowed: `5 m: FP + FN, 10 m: TP`; `TN` where nothing is counted."""
+    """What one sample counts as, by the allowed distance: `5 m: FP + FN, 10 m: TP`; `TN` if nothing is counted."""
     return ", ".join(f"{distance:g} m: {count_words(within)}" for distance, within in result.within.items())
 
 
 def count_words(within: AccidentsWithin) -> str:
-    """What one sample counts as within a distance, such as `FP + FN`; `TN` where nothing is counted."""
+    """What one sample counts as within a distance, such as `FP + FN`; `TN` if nothing is counted."""
     counts = {"TP": within.tp, "FP": within.fp, "FN": within.fn}
     said = [f"{count} {name}" if count > 1 else name for name, count in counts.items() if count]
     return " + ".join(said) or "TN"
@@ -124,7 +124,7 @@ def _draw_actors(truth: BoxTruth, compared: ComparedAccidents, shown: frozenset[
 
 
 def _draw_differences(alarm: Accident, true: Accident, ax: Axes) -> None:
-    """Dotted lines from the two foreseen places to the two true ones, whichever way they fit better, with metres."""
+    """Dotted lines with metres from the two foreseen places to the two true ones, paired so that they are nearest."""
     for start, end in _pairs(alarm.positions, true.positions):
         ax.plot(*np.stack([start, end]).T, ":", color="black", linewidth=1.2, zorder=4)
         x, y = ((start + end) / 2).tolist()

@@ -41,19 +41,19 @@ def draw_detection_outcome(
     layers: Iterable[Layer] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Render detections over true boxes: matched ones with a line to their true box, false ones, and who is missed.
+    """Render detections over true boxes: matched ones with a line to their true box, false ones, and missed boxes.
 
     Args:
-        prediction: in the protocol's frame.
+        prediction: in the protocol's coordinate frame.
         truth: the true boxes in that frame, as `detection_truth` gives them.
         protocol: name, or a protocol: its matching decides.
-        threshold: one of the protocol's; None for that of its errors, or else the middle one.
+        threshold: one of the protocol's; None for the threshold of its errors or, if it has none, the middle one.
         layers: `boxes` and `grid` are the default; also `ids`, those of the true boxes.
         ax: axes to render on; new ones if None.
 
     Returns:
-        The axes, in metres of that frame; the title counts. What does not count, such as boxes beyond the
-        protocol's area, is not rendered.
+        The axes, in metres of that frame; the title has the counts. Boxes that do not count, such as those outside the
+        protocol's area, are not rendered.
 
     Raises:
         ChoiceError: no such protocol, threshold or layer.
@@ -76,7 +76,7 @@ def draw_detection_outcome(
 
 
 def draw_true(truth: Boxes, matches: DetectionMatches, ax: Axes) -> None:
-    """Render the true boxes that count, those that are missed dashed."""
+    """Render the true boxes that count; missed ones are dashed."""
     found, missed = truth.select(matches.truth), truth.select(matches.missed)
     draw_boxes_from_above(found, ax, ["black"] * len(found), fill=0, linewidths=0.7)
     colors = [OUTCOME_COLORS["missed"]] * len(missed)
@@ -86,7 +86,7 @@ def draw_true(truth: Boxes, matches: DetectionMatches, ax: Axes) -> None:
 def detection_words(
     prediction: DetectedBoxes, truth: Boxes, matches: DetectionMatches, protocol: str | DetectionProtocol
 ) -> str:
-    """How many are right, false and missed at which threshold, and how far off the right ones are."""
+    """The threshold, how many boxes are right, false and missed, and how far off the right ones are."""
     metres = detection_protocol(protocol).measure.startswith("distance")
     limit = f"{matches.threshold:g} m" if metres else f"overlap {matches.threshold:g}"
     counts = f"at {limit}: {len(matches.detection)} TP, {len(matches.false)} FP, {len(matches.missed)} FN"

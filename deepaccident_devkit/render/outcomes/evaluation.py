@@ -55,20 +55,21 @@ def render_evaluation(
 ) -> Figure:
     """Render a sample's truth and beside it a model's prediction, with a protocol's verdict in numbers.
 
-    Motion has true instances as found or missed and predicted ones as right or false, frame by frame; accidents have
-    the places where two collide, with the metres between foreseen and true ones; detections have matched, false and
-    missed boxes. What is right is green, what is false orange, what is missed grey.
+    Motion: true instances are found or missed, predicted ones right or false, frame by frame. Accidents: the places
+    where two collide, with the metres between foreseen and true places. Detections: matched, false and missed boxes.
+    Right is green, false is orange, missed is grey.
 
     Args:
         dataset: the release.
         sample: token or record.
         prediction: motion, explicit accidents (a list, empty for none), or detected boxes in any frame of the sample.
-        task: `motion`, `accident` or `detection`; None for that of the prediction. Motion can be seen as both.
-        protocol: of the task, by name, or your own; None for `released`, and for `boxes` of explicit accidents.
-        label: the motion labels that motion is compared with; None makes those that the protocol asks for, on the
+        task: `motion`, `accident` or `detection`; None for the prediction's. Motion can be evaluated as motion or as
+            accident.
+        protocol: of the task, by name, or your own; None for `released`, with explicit accidents for `boxes`.
+        label: the motion labels that motion is compared with; None makes the labels that the protocol needs, on the
             prediction's cells and half a second apart.
-        layers: of motion `labels`, `trajectories`, `ids`, `grid`; of accidents `boxes`, `trajectories`, `ids`, `grid`;
-            of detections `boxes`, `ids`, `grid`. All but `ids` are the default.
+        layers: for motion `labels`, `trajectories`, `ids`, `grid`; for accidents `boxes`, `trajectories`, `ids`,
+            `grid`; for detections `boxes`, `ids`, `grid`. All except `ids` are the default.
         fig: an empty figure to render on; a new one if None.
 
     Returns:
@@ -77,7 +78,7 @@ def render_evaluation(
     Raises:
         TokenError: no such sample.
         NotAvailableError: the sample has no label, or its scenario no meta that an accident needs.
-        ChoiceError: no such task, protocol or layer, or a task that the prediction is not for.
+        ChoiceError: no such task, protocol or layer, or the prediction is not of this task.
         EvaluationError: the protocol cannot evaluate such a prediction.
     """
     given = prediction if isinstance(prediction, DetectedBoxes) else checked_prediction(prediction)
@@ -180,7 +181,7 @@ def _draw_detection(
 
 
 def _frames(given: Prediction) -> int | None:
-    """How many frames motion has; None of other predictions."""
+    """How many frames motion has; None for other predictions."""
     if not isinstance(given, MotionOutput):
         return None
     if given.instances is not None:

@@ -34,13 +34,13 @@ _WORDS: Final[dict[Side, tuple[str, str]]] = {"true": ("found", "missed"), "pred
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MotionOutcome:
-    """The true and the predicted instances of the frames that are evaluated, and who is whom.
+    """The true and the predicted instances of the evaluated frames, and which of them match.
 
     Attributes:
         true: the labels' instances.
         predicted: the last prediction's.
-        matches: (N, 3) int64: frame from 0, predicted id, true id of the true positives.
-        extent: metres: side of the square around the ego in which they are matched, the widest of the protocol.
+        matches: (N, 3) int64: frame from 0, predicted id and true id of the true positives.
+        extent: metres: side of the square around the ego in which instances are matched, the protocol's widest.
     """
 
     true: MotionMaps
@@ -49,7 +49,7 @@ class MotionOutcome:
     extent: float
 
     def outcomes(self, side: Side) -> AnyArray:
-        """(T, H, W) 1 where an instance is matched in that frame, 2 where not, 3 beyond the range, 0 elsewhere."""
+        """(T, H, W) 1 for instances matched in that frame, 2 for unmatched ones, 3 beyond the range, 0 elsewhere."""
         maps = self.true if side == "true" else self.predicted
         result = np.zeros(maps.instance.shape, dtype=np.int64)
         within = cells_within(maps.grid, self.extent)
@@ -64,11 +64,11 @@ class MotionOutcome:
 def motion_outcome(
     prediction: MotionOutput, label: MotionLabels, protocol: str | MotionProtocol = "released"
 ) -> MotionOutcome:
-    """Who is whom by a motion protocol's VPQ, in its widest range.
+    """Which instances match by a motion protocol's VPQ, in its widest range.
 
     Args:
-        prediction: what a model says; of several predictions the last one is taken.
-        label: the truth on the same ground; frames in their own ego frames are warped to the present.
+        prediction: a model's output; of several predictions the last one is taken.
+        label: the truth on the same grid; frames in their own ego frames are warped to the present.
         protocol: name, or a protocol.
 
     Raises:
@@ -91,7 +91,7 @@ def draw_motion_side(
     """Render `true` instances as found or missed, or `predicted` ones as right or false; later frames are paler.
 
     Args:
-        outcome: of `motion_outcome`.
+        outcome: from `motion_outcome`.
         side: which.
         layers: `labels` (the cells), `trajectories` and `grid` are the default; also `ids`.
         ax: axes to render on; new ones if None.
@@ -127,7 +127,7 @@ def _cut(maps: MotionMaps, frames: int) -> MotionMaps:
 
 
 def _recolored(maps: MotionMaps, instance: AnyArray, colors: list[str]) -> MotionMaps:
-    """The maps with other ids in their cells and a colour for each; with none, black paths."""
+    """The maps with other ids in their cells and a colour for each; without colours, for black paths."""
     from matplotlib.colors import to_rgb
 
     chosen = ["white", *colors, BEYOND_COLOR] if colors else ["white", *["black"] * int(instance.max(initial=0))]

@@ -18,7 +18,7 @@ from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
 
 def agent_entries(recording: Recording) -> list[dict[str, Any]]:
-    """The agents as the page has them: names, colour, actor id, and a pose a frame (cm, cm, mrad)."""
+    """The agents as the page has them: names, colour, actor id, and one pose for each frame (cm, cm, mrad)."""
     described = []
     for agent in recording.agents:
         poses = [recording.dataset.world_from(recording.sample(agent, frame), "ego") for frame in recording.frames]
@@ -40,8 +40,9 @@ def agent_entries(recording: Recording) -> list[dict[str, Any]]:
 def actor_entries(recording: Recording) -> list[dict[str, Any]]:
     """The actors as the page has them: the colliding pair, the agents, then the others by id.
 
-    Each has its name, role and colour, length and width (cm), a state a frame (cm, cm, mrad, dm/s or null; null where
-    nobody annotated it), and a bit mask a frame over the page's agents: who sees it by the released rule.
+    Each has its name, role and colour, length and width (cm), one state for each frame (cm, cm, mrad, dm/s or null;
+    null if nobody annotated it), and for each frame a bit mask over the page's agents: who sees it by the released
+    rule.
     """
     tracks = scenario_tracks(recording.dataset, recording.scenario)
     recorders = recording.recorders

@@ -1,4 +1,4 @@
-"""The facts on a scenario in words, and what its page does not show."""
+"""The facts about a scenario in words, and what its page does not show."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD
 
 
 def facts(recording: Recording) -> list[list[str]]:
-    """Names and values of a scenario's facts and its end; unknown ones are left out."""
+    """Names and values of the facts about a scenario and its end; unknown values are left out."""
     return [[name, value] for name, value in (*_setting(recording), *_ending(recording)) if value]
 
 
@@ -21,7 +21,7 @@ def notes(recording: Recording, pictures: CameraPictures, *, points: bool) -> li
 
     Args:
         recording: the scenario and the agents.
-        pictures: those of the cameras.
+        pictures: the cameras' pictures.
         points: whether there are LiDAR points.
     """
     return [*_labels(recording), *_pictures(recording, pictures), *_points(recording, points=points)]
@@ -70,9 +70,9 @@ def _labels(recording: Recording) -> Iterator[str]:
     samples = [recording.sample(agent, frame) for agent in recording.agents for frame in recording.frames]
     unlabelled = sum(not recording.dataset.sample.get(sample)["labelled"] for sample in samples)
     if unlabelled == len(samples):
-        yield "The release has no labels of this scenario: nobody's boxes, and not who sees whom."
+        yield "The release has no labels of this scenario: the page has no boxes and does not show who sees whom."
     elif unlabelled:
-        yield f"{unlabelled} of {len(samples)} samples have no label: what those agents see then is not known."
+        yield f"{unlabelled} of {len(samples)} samples have no label: what the agents see there is not known."
     if recording.unknown:
         yield f"How the accident happened is not known: {recording.unknown}."
     elif recording.contact is not None and recording.contact.disagreements:
@@ -88,15 +88,15 @@ def _pictures(recording: Recording, pictures: CameraPictures) -> Iterator[str]:
         missing = pictures.wanted - pictures.found
         yield f"{missing} of {pictures.wanted} camera files are missing in the release; unpack the cameras' archives."
     if settings is None:
-        yield "No pictures: they do not fit beside the rest."
+        yield "No pictures: the file would be too large with them."
         return
     kept = [short_name(agent) for agent in recording.agents]
     others = kept if settings.front_only else kept[1:]
     yield f"Pictures are up to {settings.width} pixels wide, of JPEG quality {settings.quality}."
     if settings.every > 1:
-        yield f"Of {settings.every} frames one has pictures, to keep the file small."
+        yield f"One of every {settings.every} frames has pictures, to keep the file small."
     if others:
-        yield f"Left out to keep the file small: all but the front camera of {', '.join(others)}."
+        yield f"To keep the file small, these agents have only the front camera: {', '.join(others)}."
 
 
 def _points(recording: Recording, *, points: bool) -> Iterator[str]:

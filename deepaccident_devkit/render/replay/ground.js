@@ -1,6 +1,6 @@
 "use strict";
 
-// The scene from above, drawn on a canvas: x of the world to the right, y up. Data are centimetres and milliradians.
+// The scene from above, rendered on a canvas: x of the world to the right, y up. Data are centimetres and milliradians.
 
 const TRAIL_FRAMES = 20;
 const GRID_METRES = 10;
@@ -19,7 +19,7 @@ class Ground {
     this.showWhole();
   }
 
-  // All agents' ways and the colliding pair's, in metres.
+  // All agents' paths and the colliding pair's, in metres.
   showWhole() {
     const pair = this.data.actors.filter((actor) => actor.role === "pair");
     const states = [...this.data.agents.flatMap((agent) => agent.poses), ...pair.flatMap((actor) => actor.states)];
@@ -290,7 +290,7 @@ class Ground {
   }
 }
 
-// Little-endian int16 from base64: x and y in turn, decimetres.
+// Little-endian int16 from base64: x, y, x, y, …, decimetres.
 function decodedCloud(coded) {
   const text = atob(coded);
   const view = new DataView(Uint8Array.from(text, (character) => character.charCodeAt(0)).buffer);

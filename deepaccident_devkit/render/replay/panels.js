@@ -1,4 +1,4 @@
-// What stands beside the ground: cameras, who sees whom, what was foreseen. Text of the data is only set as text.
+// The panels beside the scene: cameras, who sees whom, predictions. Text of the data is only set as text, not as HTML.
 
 const data = JSON.parse(document.getElementById("data").textContent);
 const last = data.countdown.length - 1;
@@ -66,7 +66,7 @@ const cameras = data.agents.map((agent, number) => {
   return card;
 });
 
-// The picture of a frame, or the one before where not every frame has one.
+// The picture of a frame, or the last picture before it if not every frame has one.
 function pictureAt(camera, frame) {
   for (let at = frame; at >= 0; at -= 1) if (camera.pictures[at] !== null) return camera.pictures[at];
   return null;
@@ -83,7 +83,7 @@ function showCameras() {
     card.picture.hidden = coded === null;
     card.none.hidden = coded !== null;
     card.none.classList.toggle("absent", !camera);
-    card.none.textContent = camera ? "no picture of this moment" : "no pictures of this agent";
+    card.none.textContent = camera ? "no picture at this moment" : "no pictures from this agent";
     card.picture.alt = camera ? `${card.agent.title}, camera ${camera.title}, frame ${state.frame + 1}` : "";
     const others = data.actors.filter((actor) => actor.states[state.frame] && actor.id !== card.agent.actor);
     const seen = others.filter((actor) => actor.seen[state.frame] & (1 << bit));
@@ -128,7 +128,7 @@ function showSeen() {
   byId("pair").textContent = sentences.join(" ");
 }
 
-// what was foreseen
+// predictions
 
 const verdictColors = {
   TP: data.colors.right,
@@ -166,7 +166,7 @@ if (data.prediction) {
   byId("samples").append(made("table", {}, made("thead", {}, heading), made("tbody", {}, ...body)));
 }
 
-// Between the samples that were evaluated the one before stays.
+// Between evaluated samples the last one before stays.
 function showForeseen() {
   if (!data.prediction) return;
   const frames = [...samplesAt.keys()].filter((frame) => frame <= state.frame);
@@ -175,7 +175,7 @@ function showForeseen() {
   const lines = state.foreseen.flatMap((sample) => [
     made("p", {}, badge(sample.verdict), sample.text),
     ...sample.alarms.map((alarm) => small(alarm.text, alarm.right ? "right" : "")),
-    ...(sample.more ? [small(`and ${sample.more} less sure`)] : []),
+    ...(sample.more ? [small(`and ${sample.more} more, less sure`)] : []),
   ]);
   byId("foreseen").replaceChildren(...(lines.length ? lines : [small("Nothing was evaluated yet.")]));
   for (const row of byId("samples").querySelectorAll("tbody tr")) {

@@ -1,4 +1,4 @@
-"""`Recording`: the scenario that is replayed, whose view it is shown in, and how its numbers are written."""
+"""`Recording`: the scenario that is replayed, the agents whose view is shown, and how its numbers are written."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class Recording(FrozenArrays):
         dataset: the release.
         scenario: its record.
         agents: in the order of `taxonomy.AGENTS`.
-        contact: how the accident happened; None where nobody collides, or where that is not known.
-        unknown: why it is not known, a sentence; empty if it is, or if nobody collides.
-        origin: (2,) float64 x and y in world, metres: the page counts from there.
+        contact: how the accident happened; None if nobody collides, or if that is not known.
+        unknown: a sentence that says why it is not known; empty if it is known, or if nobody collides.
+        origin: (2,) float64 x and y in world, metres: the origin of the page's coordinates.
     """
 
     dataset: Dataset
@@ -59,12 +59,12 @@ class Recording(FrozenArrays):
 
     @property
     def recorders(self) -> dict[int, AgentName]:
-        """Actor id → agent, of all in the release that are vehicles with a known id, shown or not."""
+        """Actor id → agent, for all agents in the release that are vehicles with a known id, shown or not."""
         actors = agent_actors(self.dataset, self.scenario["token"])
         return {actor: agent for agent, actor in actors.items()}
 
     def actor_of(self, agent: str) -> int | None:
-        """The actor id of an agent; None for the pole, and where meta is silent."""
+        """The actor id of an agent; None for the infrastructure, and if meta does not give it."""
         actor: int | None = self.dataset.get("agent", f"{self.scenario['token']}/{agent}")["actor_id"]
         return actor
 
@@ -84,7 +84,7 @@ def recording_of(dataset: Dataset, scenario: RowArgument | None, agents: Agents)
 
     Raises:
         TokenError: no such scenario.
-        NotAvailableError: the release has no accident, or not one of the agents.
+        NotAvailableError: the release has no accident, or lacks one of the agents.
         ChoiceError: no such agent or configuration.
     """
     record = dataset.scenario[dataset.getind("scenario", first_accident(dataset) if scenario is None else scenario)]
@@ -109,7 +109,7 @@ def _contact(dataset: Dataset, record: ScenarioRecord) -> tuple[Contact | None, 
 
 
 def _origin(dataset: Dataset, record: ScenarioRecord, contact: Contact | None) -> FloatArray:
-    """The place of the impact, else the middle of the agents at the end; of whole metres."""
+    """The place of the impact or, without one, the middle of the agents at the end; in whole metres."""
     if contact is not None:
         return as_floats(np.round(contact.point[:2]))
     poses = [dataset.world_from(sample, "ego").translation for sample in dataset.samples_of(record["last_frame_token"])]

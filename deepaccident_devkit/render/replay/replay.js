@@ -69,7 +69,7 @@ function step(frames) {
   go(state.frame + frames);
 }
 
-// what one can touch
+// controls
 
 byId("play").addEventListener("click", () => play(!state.playing));
 byId("back").addEventListener("click", () => step(-1));
@@ -156,7 +156,7 @@ document.addEventListener("keydown", (event) => {
 });
 new ResizeObserver(() => ground.draw()).observe(ground.canvas);
 
-// what stays
+// what does not change with time
 
 document.documentElement.style.setProperty("--alarm", data.colors.pair);
 byId("scenario").textContent = data.scenario;

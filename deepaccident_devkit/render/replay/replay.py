@@ -31,12 +31,12 @@ from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x import Agents
 
 SIZE_LIMIT: Final = 15_000_000
-"""Bytes of a page, so that it can go by mail."""
+"""The most bytes of a page, so that it can be sent by mail."""
 _BASE64: Final = 4 / 3
 _BESIDE: Final = 8
-"""Bytes of a picture in JSON beside its base64: quotes, a comma, filled up."""
+"""Bytes of a picture in JSON in addition to its base64: quotes, a comma and padding."""
 _SCRIPTS: Final = ("ground.js", "panels.js", "replay.js")
-"""In the order in which they build on each other."""
+"""Each script uses the ones before it."""
 
 
 def render_replay(
@@ -52,9 +52,9 @@ def render_replay(
 ) -> Path:
     """Write a scenario as one HTML file that plays in any browser: no server, no network, small enough for a mail.
 
-    It shows the agents' front cameras and all six of the first agent, everybody from above with trails, who sees whom
-    by the released rule, the LiDAR of the first agent and the countdown to the impact. What the release lacks (images,
-    points, labels) is left out, and the page says so.
+    It shows the agents' front cameras and all six cameras of the first agent, all actors from above with trails, who
+    sees whom by the released rule, the LiDAR of the first agent and the countdown to the impact. What the release lacks
+    (images, points, labels) is left out, and the page says so.
 
     Args:
         dataset: the release.
@@ -62,9 +62,10 @@ def render_replay(
         path: the file to write.
         prediction: a model's results of motion or accidents, or predictions by sample token: the page shows what they
             foresee and whether it is right by the accident protocol `boxes`. None for none.
-        agents: whose cameras, views and predictions, as of `v2x.cooperating_agents`; None for all that are there.
-        image_width: of the pictures, in pixels; None for what keeps the page within `SIZE_LIMIT`.
-        quality: of the pictures' JPEG, 1 to 95; None likewise. If both are given, the page is as large as that takes.
+        agents: whose cameras, views and predictions are shown, as in `v2x.cooperating_agents`; None for all that are
+            there.
+        image_width: of the pictures, in pixels; None chooses it so that the page is within `SIZE_LIMIT`.
+        quality: of the pictures' JPEG, 1 to 95; None chooses it in the same way. If both are given, there is no limit.
         progress: whether to show a bar.
 
     Returns:
@@ -74,7 +75,7 @@ def render_replay(
         TokenError: no such scenario.
         ChoiceError: no such agent, or `path` is a folder.
         ConfigError: the width or quality is not possible.
-        NotAvailableError: the release has no accident, not one of the agents, or the prediction is of other samples.
+        NotAvailableError: the release has no accident, lacks one of the agents, or the prediction is of other samples.
         EvaluationError: the prediction is neither of motion nor of accidents.
         SensorFileError: an image or a point cloud cannot be read.
     """
@@ -101,7 +102,7 @@ def render_replay(
 
 
 def _data(recording: Recording, prediction: Foreseen | None) -> dict[str, Any]:
-    """All but the pictures."""
+    """The page's data, except the pictures."""
     first, contact = recording.agents[0], recording.contact
     moments = [
         recording.dataset.get("frame", f"{recording.scenario['token']}/{frame:03d}") for frame in recording.frames
@@ -127,7 +128,7 @@ def _data(recording: Recording, prediction: Foreseen | None) -> dict[str, Any]:
 
 
 def _cameras(recording: Recording, pictures: CameraPictures) -> list[list[dict[str, Any]]]:
-    """Of each agent its cameras, with a picture a frame in base64; null where there is none."""
+    """For each agent its cameras, with one picture for each frame in base64; null where there is none."""
     return [
         [
             {
@@ -141,10 +142,10 @@ def _cameras(recording: Recording, pictures: CameraPictures) -> list[list[dict[s
 
 
 def replay_page(title: str, data: Mapping[str, Any]) -> str:
-    """A whole page in HTML.
+    """A complete HTML page.
 
-    By its policy a browser runs only this script, uses only this style, and loads nothing. All text of the data is
-    shown as text by the script, never as HTML.
+    By its policy a browser runs only this script, uses only this style, and loads nothing. The script shows all text
+    of the data as text, never as HTML.
 
     Args:
         title: of the window.
@@ -163,13 +164,13 @@ def replay_page(title: str, data: Mapping[str, Any]) -> str:
         "data": _json(data),
     }
     page = _part("replay.html")
-    for name, part in parts.items():  # the data come last, so that nothing in them is taken for a mark
+    for name, part in parts.items():  # the data come last, so that nothing in them is replaced
         page = page.replace(f"<!--{name}-->", part)
     return page
 
 
 def _json(data: Mapping[str, Any]) -> str:
-    """JSON that cannot end the element in which it stands."""
+    """JSON that cannot end the HTML element around it."""
     text = json.dumps(data, allow_nan=False, separators=(",", ":"))
     for character in "<>&":
         text = text.replace(character, f"\\u{ord(character):04x}")
@@ -181,5 +182,5 @@ def _part(name: str) -> str:
 
 
 def _hash(text: str) -> str:
-    """A source of a content security policy that is this text alone."""
+    """A source in a content security policy that allows only this text."""
     return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")

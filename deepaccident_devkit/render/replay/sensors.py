@@ -23,21 +23,21 @@ from deepaccident_devkit.taxonomy import CAMERAS
 
 FRONT: Final = CAMERAS[0]
 _LADDER: Final = ((960, 80), (800, 75), (640, 75), (640, 65), (560, 60), (480, 60), (480, 50), (400, 50), (320, 45))
-"""Width in pixels and JPEG quality, the first that fits is taken."""
+"""Width in pixels and JPEG quality; the first pair that fits is taken."""
 _WIDTHS: Final = (960, 800, 640, 560, 480, 400, 320, 256)
 _QUALITIES: Final = (80, 70, 60, 50, 40, 30)
-"""Where the other one is given."""
+"""The widths to try if the quality is given, and the qualities to try if the width is given."""
 _PROBED: Final = 12
-"""Pictures from which the size of all is estimated."""
+"""The number of pictures from which the size of all is estimated."""
 _QUALITY_RANGE: Final = (1, 95)
 _LEAST_WIDTH: Final = 32
 _CELL: Final = 0.4
-"""Metres: of the points in such a square one is kept."""
+"""Metres: side of a square; of the points in it one is kept."""
 _MOST: Final = 1500
 _LEAST_HEIGHT: Final = 0.3
-"""Metres above the ground: lower points are of the road."""
+"""Metres above the ground: lower points are on the road."""
 _GROUND: Final = 5.0
-"""Percentile of the points' heights that is the ground: the ego frame of the pole is not on it."""
+"""Percentile of the points' heights that counts as the ground: the infrastructure's ego frame is not on the ground."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,10 +45,10 @@ class PictureSettings:
     """How pictures are written.
 
     Attributes:
-        width: pixels; those of narrower files stay as they are.
+        width: pixels; narrower images stay as they are.
         quality: of JPEG.
-        every: of so many frames one has a picture.
-        front_only: whether the other cameras of the first agent are left out, too.
+        every: one of so many frames has a picture.
+        front_only: whether the other cameras of the first agent are left out as well.
     """
 
     width: int
@@ -62,10 +62,10 @@ class CameraPictures:
     """The pictures of a scenario.
 
     Attributes:
-        jpegs: agent → camera → a picture a frame; None where there is none. Cameras without any are left out.
-        settings: how they are written; None if there is none.
-        found: files that are there, of those looked for.
-        wanted: files looked for.
+        jpegs: agent → camera → one picture for each frame; None where there is none. Cameras without any are left out.
+        settings: how they are written; None if there is no picture.
+        found: how many of the wanted files exist.
+        wanted: how many files the pictures need.
     """
 
     jpegs: Mapping[str, Mapping[str, tuple[bytes | None, ...]]]
@@ -75,26 +75,29 @@ class CameraPictures:
 
 
 def check_picture_settings(width: int | None, quality: int | None) -> None:
-    """Raise ConfigError if pictures cannot be of a width or quality; None is for what fits."""
+    """Raise ConfigError if pictures cannot have a width or quality; None stands for a value that fits."""
     if width is not None and width < _LEAST_WIDTH:
-        raise ConfigError(f"image_width: expected pixels from {_LEAST_WIDTH}, or None for what fits, found {width!r}")
+        raise ConfigError(
+            f"image_width: expected at least {_LEAST_WIDTH} pixels, or None for a fitting width, found {width!r}"
+        )
     least, most = _QUALITY_RANGE
     if quality is not None and not least <= quality <= most:
         raise ConfigError(
-            f"quality: expected a JPEG quality from {least} to {most}, or None for what fits, found {quality!r}"
+            f"quality: expected a JPEG quality from {least} to {most}, or None for a fitting one, found {quality!r}"
         )
 
 
 def camera_pictures(
     recording: Recording, limit: float, *, width: int | None = None, quality: int | None = None, progress: bool = False
 ) -> CameraPictures:
-    """The pictures of the agents' front cameras, and of the first agent's others.
+    """The pictures of the agents' front cameras, and of the first agent's other cameras.
 
     Args:
         recording: the scenario and the agents.
-        limit: bytes that all may have together: the largest pictures are taken that keep it, and at last fewer.
-        width: pixels; None for what fits.
-        quality: of JPEG; None for what fits.
+        limit: the most bytes of all pictures together: the largest pictures within it are taken. If the smallest ones
+            do not fit, there are fewer pictures.
+        width: pixels; None for a width that fits.
+        quality: of JPEG; None for a quality that fits.
         progress: whether to show a bar.
 
     Raises:
@@ -112,7 +115,7 @@ def camera_pictures(
 
 
 _Files = dict[tuple[str, str], list[Path | None]]
-"""Agent and camera → a file a frame; None where there is none."""
+"""Agent and camera → one file for each frame; None where there is none."""
 _Jpegs = dict[str, dict[str, tuple[bytes | None, ...]]]
 
 
@@ -165,7 +168,7 @@ def _kept(files: _Files, settings: PictureSettings) -> _Files:
 
 
 def _encoded(paths: Sequence[Path], settings: PictureSettings, *, progress: bool) -> list[bytes]:
-    """In threads: most of the work is done by libraries that let others run meanwhile."""
+    """The pictures as JPEG; made in threads, because the libraries that do most of the work let other threads run."""
     work = partial(_jpeg_of, settings=settings)
     with ThreadPoolExecutor(os.cpu_count()) as threads:
         return run_batch(work, paths, executor=threads, label="pictures", progress=progress)
@@ -198,10 +201,10 @@ def _jpeg(image: ByteArray, settings: PictureSettings) -> bytes:
 
 
 def lidar_points(recording: Recording, agent: str) -> list[str | None] | None:
-    """A cloud a frame: int16 x and y in turn, little-endian, in decimetres from the origin, as base64.
+    """One cloud for each frame: int16 x, y, x, y, …, little-endian, in decimetres from the origin, as base64.
 
     Returns:
-        None where files are missing; None as a whole if all are.
+        The clouds, with None for a missing file; None in place of the list if all files are missing.
 
     Raises:
         SensorFileError: a file cannot be read.

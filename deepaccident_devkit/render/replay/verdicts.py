@@ -1,4 +1,4 @@
-"""What a model foresees in a scenario, and whether it is right: by the accident protocol `boxes`, sample by sample."""
+"""The accidents that a model foresees in a scenario, and whether they are right by the accident protocol `boxes`."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ Foreseen = Results | Mapping[str, MotionOutput | Iterable[Accident]]
 """A results file of motion or accidents, or predictions by sample token."""
 _RULES: Final = BoxAccidents()
 _SHOWN: Final = 3
-"""Alarms of a sample: those that are right, then the surest."""
+"""The most alarms of a sample that are shown: right alarms first, then the surest ones."""
 
 
 def verdicts(recording: Recording, prediction: Foreseen) -> dict[str, Any]:
-    """What is foreseen, as the page has it: the rule in words, and each sample that has a prediction.
+    """The foreseen accidents as the page has them: the rule in words, and each sample that has a prediction.
 
     Args:
-        recording: the scenario and the agents, whose samples alone are taken.
-        prediction: what a model says. Instance maps that are given by token are taken as the released labels lie.
+        recording: the scenario and the agents; only their samples are taken.
+        prediction: a model's predictions. Instance maps given by token have the orientation of the released labels.
 
     Raises:
-        NotAvailableError: none is of this scenario and these agents, or a sample has no label.
+        NotAvailableError: no prediction is of this scenario and these agents, or a sample has no label.
         EvaluationError: a prediction is neither motion nor accidents.
     """
     horizon = _horizon(prediction)
@@ -47,12 +47,12 @@ def verdicts(recording: Recording, prediction: Foreseen) -> dict[str, Any]:
     ]
     if not samples:
         raise NotAvailableError(
-            f"prediction: none is of a sample of {recording.scenario['token']} and {', '.join(recording.agents)}; "
+            f"prediction: has no sample of {recording.scenario['token']} and {', '.join(recording.agents)}; "
             "choose a scenario and agents that it has, or replay without it"
         )
     rule = (
-        f"Protocol boxes: an accident within {horizon:g} s counts as foreseen if the two places are off by less than "
-        f"{_RULES.scoring.errors_at:g} m together."
+        f"Protocol boxes: an accident within {horizon:g} s counts as foreseen if the errors of the two places "
+        f"are less than {_RULES.scoring.errors_at:g} m in sum."
     )
     return {"rule": rule, "samples": samples}
 
@@ -66,7 +66,7 @@ def _sample(recording: Recording, prediction: Foreseen, agent: str, frame: int, 
     token = recording.sample(agent, frame)
     given, label, context = _loaded(recording, prediction, token, horizon)
     truth = context.truth
-    if truth is None:  # only for the type: a context with a horizon has one
+    if truth is None:  # only for the type checker: a context with a horizon has a truth
         raise NotAvailableError(f"{token}: has no truth to compare with; choose a labelled sample")
     world_from_ego = recording.dataset.world_from(token, "ego")
     alarms = [
@@ -114,10 +114,10 @@ def _alarm(
     if off and off["position"] is not None:
         text += f": places off by {off['position']:.1f} m, time by {off['time']:+.1f} s"
     elif off is None:
-        text += ": for later than the recording shows"
+        text += ": it would be after the end of the recording"
     if ids is not None:
         right_two = context.pair is not None and set(ids) == set(context.pair)
-        names = " and ".join("nobody known" if each is None else str(each) for each in ids)
+        names = " and ".join("an unknown actor" if each is None else str(each) for each in ids)
         text += f"; names {names}{', who collide' if right_two else ''}"
     return {
         "places": recording.places(_on_ground(world_from_ego, accident.positions)),
@@ -130,7 +130,7 @@ def _alarm(
 def _truth_text(context: AccidentContext) -> str:
     truth = context.truth
     if truth is None or truth.accident is None:
-        return "no accident comes within the time looked ahead"
+        return "no accident comes within the horizon"
     return f"an accident comes in {truth.accident.time:.1f} s"
 
 

@@ -1,4 +1,4 @@
-"""A scenario as a video: any of the views, frame by frame, one alone or several side by side."""
+"""A scenario as a video: any of the views, frame by frame, one view or several side by side."""
 
 from deepaccident_devkit.render.video.scenario import render_scenario_video
 from deepaccident_devkit.render.video.views import VIEWS, Moment, View

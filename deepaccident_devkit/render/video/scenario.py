@@ -36,23 +36,23 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
 
     The views are those of the `render_…` functions: `frame` (the agents side by side), `sample` (six cameras), `bev`,
     `visibility`, `visibility_matrix`, `calibration`, `labels` (motion labels as a trail), a camera by its channel, and
-    `accident`: the countdown to the impact in five cameras, from above and in speeds. `accident`, and two or three of
-    the others side by side, fill 16 to 9; `frame` alone fills (1280, 448).
+    `accident`: the countdown to the impact in five cameras, from above and in speeds. `accident`, or two or three of
+    the others side by side, fill a picture of 16 to 9; `frame` alone fills (1280, 448).
 
     Args:
         dataset: the release.
         scenario: token or record.
         path: the file to write, by its suffix: `.mp4` (which browsers play if the extra `video` is installed), `.gif`
-            or `.webp`. One that is there is replaced, once the new one is whole.
+            or `.webp`. An earlier file is replaced when the new one is complete.
         what: a view by name, a function (dataset, frame record, figure) that renders one, or several side by side.
         agents: who is shown, or None for all that are there. Views of one agent (`sample`, `bev`, cameras, …) show the
-            first one named, else the first one there; their boxes and points from above are of all of `agents`.
-        layers: each view renders those of them that it has; None for each one's default.
-        frames: numbers of frames, from 1, in the order given; or a slice of all of them, as of a list; None for all.
+            first one named, or the first one there; their boxes and points from above are of all of `agents`.
+        layers: each view renders those of them that it has; None for the default of each view.
+        frames: numbers of frames, from 1, in the order given; or a slice of the list of all frames; None for all.
         size: width and height, pixels; even numbers for MP4.
-        fps: frames a second; recorded are 10.
-        workers: processes that render. None takes what the work is worth, and this one alone for functions of your own;
-            with more, these must be importable from a module.
+        fps: frames a second; the recordings have 10.
+        workers: processes that render. None chooses by the amount of work, and only this process for functions of your
+            own; with several processes these functions must be importable from a module.
         progress: whether to show a bar.
 
     Returns:
@@ -60,7 +60,7 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
 
     Raises:
         TokenError: no such scenario.
-        ChoiceError: no such view, layer, agent, frame or kind of file, or a size or rate that it cannot have.
+        ChoiceError: no such view, layer, agent, frame or kind of file, or the file cannot have this size or rate.
         NotAvailableError: an agent is not in this release, the sample has no label, or nobody collides and the view
             is `accident`.
         MissingFileError: an image was not downloaded.
@@ -110,7 +110,7 @@ def _workers(own: Sequence[OwnView], workers: int | None) -> int | None:
 
 
 def _in_order(results: Generator[tuple[int, ByteArray], None, None]) -> Generator[ByteArray, None, None]:
-    """Results by position, each as soon as those before it are there."""
+    """The results in the order of their positions, each as soon as all before it are ready."""
     waiting: dict[int, ByteArray] = {}
     upcoming = 0
     for position, result in results:

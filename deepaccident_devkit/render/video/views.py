@@ -31,10 +31,10 @@ if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import FrameRecord
 
 OwnView = Callable[[Dataset, "FrameRecord", "Figure"], object]
-"""Renders a moment, given by its record, on an empty figure; what it returns does not matter."""
+"""Renders a moment, given by its record, on an empty figure; its result is not used."""
 _DPI: Final = 100.0
 _DPI_AT: Final = 1280 * 720
-"""Pixels of the picture whose inch has `_DPI` pixels; that of larger ones has more, so that words stay as large."""
+"""A picture with so many pixels has `_DPI` pixels an inch; larger ones have more, so words keep their share."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -44,8 +44,8 @@ class Moment:
     Attributes:
         dataset: the release.
         frame: token.
-        agents: as of `cooperating_agents`.
-        names: the agents meant, the one whose view it is first.
+        agents: as in `cooperating_agents`.
+        names: the names of these agents; the first one is the agent whose view it is.
         layers: None for the view's default.
     """
 
@@ -67,11 +67,11 @@ class View:
     """One way to render a moment.
 
     Attributes:
-        draw: on an empty figure.
-        layers: that it has.
-        share: of a picture's width, beside others.
-        inches: width that it needs for its words; where there is less, they become smaller.
-        own: the function that `draw` calls, if it is a caller's.
+        draw: renders on an empty figure.
+        layers: the layers that it has.
+        share: of a picture's width, if there are several views.
+        inches: width that it needs for its words; if there is less, they become smaller.
+        own: the caller's function that `draw` calls, if there is one.
     """
 
     draw: Callable[[Moment, Figure], object]
@@ -145,7 +145,7 @@ VIEWS: Final[Mapping[str, View]] = {
     "labels": View(draw=_labels, layers=TRAIL_LAYERS, inches=5.5),
     **{channel: View(draw=_Camera(channel), layers=CAMERA_LAYERS) for channel in CAMERAS},
 }
-"""By name; those of cameras are the first agent's."""
+"""The views by name; cameras are those of the first agent."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -155,7 +155,7 @@ class Scene:
     Attributes:
         dataset: the release.
         views: side by side, each with the layers that it renders.
-        agents: as of `cooperating_agents`.
+        agents: as in `cooperating_agents`.
         width: pixels.
         height: pixels.
     """
@@ -191,7 +191,7 @@ class Scene:
 
 
 def names_at(dataset: Dataset, frame: str, agents: Agents) -> tuple[str, ...]:
-    """The agents meant at a frame, the one whose view it is first: the first one named, else the first one there."""
+    """The chosen agents at a frame; first is the one whose view it is: the first one named, or the first one there."""
     first = dataset.samples_of(frame)[0]
     names = cooperating_agents(dataset, first, agents)
     if agents is None or isinstance(agents, str) or not isinstance(agents, Sequence):
@@ -202,7 +202,7 @@ def names_at(dataset: Dataset, frame: str, agents: Agents) -> tuple[str, ...]:
 def views_of(
     what: str | OwnView | Iterable[str | OwnView], layers: Iterable[Layer] | None
 ) -> tuple[tuple[View, tuple[Layer, ...] | None], ...]:
-    """The views that are named, with those of the layers that each has; raises ChoiceError."""
+    """The named views, each with those of the layers that it has; raises ChoiceError."""
     given: list[Any] = [what] if isinstance(what, str) or callable(what) else list(what)
     if not given:
         raise ChoiceError(f"what: expected at least one of {', '.join(VIEWS)}, found none")

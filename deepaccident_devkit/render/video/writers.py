@@ -1,4 +1,4 @@
-"""Pictures into a video file: MP4 by the extra `video` or by OpenCV, GIF and WebP by pillow."""
+"""Writing pictures into a video file: MP4 by the extra `video` or by OpenCV, GIF and WebP by pillow."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ if TYPE_CHECKING:
 
 _INSTALL: Final = "in a checkout, pip install '.[video]'"
 _CRF: Final = "20"
-"""Of H.264: 0 loses nothing, 51 is the worst."""
+"""Quality of H.264: 0 loses nothing, 51 is the worst."""
 _WEBP_QUALITY: Final = 70
 _COLORS: Final = 255
-"""Of a GIF; one more is kept for pixels that do not change."""
+"""Colours of a GIF; one more is kept for pixels that do not change."""
 _LOOKED_AT: Final = 2_000_000
-"""Pixels of all pictures, about, by which the palette is chosen."""
+"""About so many pixels of all pictures are used to choose the palette."""
 _log = logging.getLogger(__name__)
 
 
 def check_target(path: Path, *, size: tuple[int, int], fps: float) -> None:
-    """Tell before anything is rendered whether it can be written; raises ChoiceError."""
+    """Check before anything is rendered that the file can be written; raises ChoiceError."""
     if path.suffix.lower() not in SUFFIXES:
         raise ChoiceError(f"path: expected a file that ends in {', '.join(SUFFIXES)}, found {str(path)!r}")
     if path.is_dir():
@@ -61,7 +61,7 @@ def write_video(path: Path, pictures: Iterable[ByteArray], *, fps: float) -> Non
 
 def _write_mp4(path: Path, pictures: Iterable[ByteArray], fps: float) -> None:
     try:
-        import av  # noqa: F401 - whether it is there
+        import av  # noqa: F401 - whether it is installed
     except ImportError:
         _log.warning("writing MPEG-4 Part 2, which browsers do not play; for H.264: %s", _INSTALL)
         _write_by_opencv(path, pictures, fps)
@@ -81,7 +81,7 @@ def _write_h264(path: Path, pictures: Iterable[ByteArray], fps: float) -> None:
                 stream.height, stream.width = picture.shape[:2]
                 stream.pix_fmt = "yuv420p"
                 stream.options = {"crf": _CRF}
-                stream.codec_context.thread_count = 1  # the bytes depend on it
+                stream.codec_context.thread_count = 1  # the bytes depend on the number of threads
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
         if stream is not None:
             container.mux(stream.encode(None))
@@ -110,7 +110,7 @@ def _write_by_opencv(path: Path, pictures: Iterable[ByteArray], fps: float) -> N
 
 
 def _write_gif(path: Path, pictures: Iterable[ByteArray], fps: float) -> None:
-    """One palette for all pictures, without dithering: what stays the same is stored once and does not flicker."""
+    """One palette for all pictures, without dithering: pixels that stay the same are stored once and do not flicker."""
     import numpy as np
     from PIL import Image
 
@@ -131,7 +131,7 @@ def _write_webp(path: Path, pictures: Iterable[ByteArray], fps: float) -> None:
 
 
 def _save_animation(path: Path, images: Sequence[Image], fps: float, **how: Any) -> None:
-    """Write images of pillow that follow each other, over and over again."""
+    """Write pillow's images as an animation that repeats forever."""
     first, *others = images
     first.save(path, save_all=True, append_images=others, duration=round(1000 / fps), loop=0, **how)
 

@@ -53,7 +53,10 @@ def test_a_presets_orientation_is_kept_unless_the_grid_or_the_caller_says_otherw
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"future_frames": 0}, r"future_frames: expected a whole number from 1 to 1,000 \(frames to come.*found 0"),
+        (
+            {"future_frames": 0},
+            r"future_frames: expected a whole number from 1 to 1,000 \(frames after the present.*found 0",
+        ),
         ({"future_frames": 10**9}, "found 1000000000"),
         ({"receptive_field": True}, "receptive_field: expected a whole number from 1 .* found True"),
         ({"step": 2.5}, r"step: expected a whole number from 1 to 1,000 \(recorded frames .* found 2.5"),
@@ -89,7 +92,7 @@ def test_unknown_words_are_refused() -> None:
             MotionLabelConfig(protocol=protocol)
     with pytest.raises(ConfigError, match="half_cell_shift: expected True or False, found 1"):
         replace(LABEL_PROTOCOLS["clean"], half_cell_shift=1)
-    with pytest.raises(ConfigError, match="warp 'fiery' is counted in native 'fiery', found 'released'"):
+    with pytest.raises(ConfigError, match="warp 'fiery' needs native 'fiery', found 'released'"):
         replace(LABEL_PROTOCOLS["released"], warp="fiery")
     for agents in ("nobody", ["pole"], [], 5, "ego_vehicle"):
         with pytest.raises(ChoiceError, match="agents: expected"):

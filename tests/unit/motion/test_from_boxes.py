@@ -276,7 +276,7 @@ def test_arrays_are_read_only_and_whole() -> None:
 
 
 def test_what_does_not_fit_is_refused_with_the_remedy() -> None:
-    with pytest.raises(GeometryError, match=r"frames: expected 5.* found 4; give None for those beyond the recording"):
+    with pytest.raises(GeometryError, match=r"frames: expected 5.* found 4; give None for frames beyond the recording"):
         labels([frame()] * 4)
     with pytest.raises(GeometryError, match=r"egomotion: expected shape \(7, 6\), found \(5, 6\)"):
         labels([frame()] * 5, np.zeros((5, 6)))
@@ -288,7 +288,7 @@ def test_what_does_not_fit_is_refused_with_the_remedy() -> None:
         frame((0, 0, 1, 0, 1), (0, np.nan, 2, 0, 1))
     with pytest.raises(GeometryError, match=r"FrameBoxes.center: expected shape \(N, 3\), found \(\)"):
         replace(frame(), center=5)
-    with pytest.raises(GeometryError, match=r"FrameBoxes.ego_from_lidar: row 0 is not finite; a frame without"):
+    with pytest.raises(GeometryError, match=r"FrameBoxes.ego_from_lidar: row 0 is not finite; give None for"):
         replace(frame(), ego_from_lidar=np.full((4, 4), np.nan))
     with pytest.raises(GeometryError, match="frames: expected FrameBoxes, or None beyond the recording, found 'a'"):
         labels(["a"] * 5)

@@ -535,7 +535,7 @@ class TestDamage:
         told = json.loads(path.read_text())
         told["config"]["draw_ego"] = False
         path.write_text(json.dumps(told))
-        with pytest.raises(LabelFilesError, match="the digest of its configuration is another one"):
+        with pytest.raises(LabelFilesError, match="its digest is not that of its configuration"):
             LabelFiles(folder)
 
     @pytest.mark.parametrize(("version", "kind"), [(FORMAT_VERSION + 1, "newer"), (0, "older")])
@@ -619,7 +619,7 @@ class TestStops:
             for after in (False, True):
                 folder = tmp_path / "killed" / f"{step} {after}"
                 if (step, after) != (3, True):
-                    with pytest.raises(LabelFilesError, match=r"broken off; run|holds no motion labels"):
+                    with pytest.raises(LabelFilesError, match=r"not complete; run|holds no motion labels"):
                         LabelFiles(folder)
                 done = write(small, folder, tokens)
                 assert done.kept == max(0, min(2, step - (not after))), folder

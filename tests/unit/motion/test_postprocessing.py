@@ -262,7 +262,7 @@ def test_heads_that_cannot_be() -> None:
     assert MotionHeads.from_arrays(certain, heat, good, good).segmentation[1, 0, 2, 3] == -np.inf
     broken = good.copy()
     broken[1, 0, 2, 3] = np.nan
-    with pytest.raises(GeometryError, match=r"segmentation: nan at \(1, 0, 2, 3\) is no value to work with"):
+    with pytest.raises(GeometryError, match=r"segmentation: nan at \(1, 0, 2, 3\) cannot be used"):
         MotionHeads.from_arrays(broken, heat, good, good)
     with pytest.raises(GeometryError, match=r"offset: inf at \(0, 0, 0, 0\)"):
         MotionHeads.from_arrays(good, heat, good + np.inf, good)

@@ -269,7 +269,7 @@ def spread(labels: MotionLabels, t: int, actor: int) -> float:
 class TestErrors:
     def test_a_sample_without_a_label(self, tmp_path: Path) -> None:
         release = opened(tiny.write_tiny_release(tmp_path, labelled=False))
-        with pytest.raises(NotAvailableError, match=r"ego_vehicle/002 has no label \(the test split ships"):
+        with pytest.raises(NotAvailableError, match=r"ego_vehicle/002 has no label \(the test split has"):
             release.motion_labels(f"{EGO}/002")
 
     @pytest.mark.parametrize("sample", ["", "nothing", f"{EGO}/0", f"{EGO}/2", f"{EGO}/099", None, 3, {"token": 3}])

@@ -39,4 +39,4 @@ def test_an_agent_s_own_box_is_in_none_of_its_cameras(da: DeepAccident, frame: s
     sample = f"{frame.rsplit('/', 1)[0]}/ego_vehicle/004"
     own = da.boxes(sample, "lidar").actor_id.tolist().index(OWN_ACTOR_ID)
     fig = render_annotation(da, f"{sample}/{own}", fig=detached_figure((10, 5)))
-    assert [one.get_text() for one in fig.axes[0].texts] == ["in no camera of its agent"]
+    assert [one.get_text() for one in fig.axes[0].texts] == ["in no image of its agent's cameras"]

@@ -192,7 +192,7 @@ def test_outputs_have_the_rows_that_they_have(labels: MotionLabels) -> None:
     alone = instances_of(labels.instance, labels.config.grid)
     assert len(draw_motion_output(alone, fig=detached_figure((10, 3))).axes) == 5 + 1
     assert len(draw_motion_output(alone, style="trail", fig=detached_figure((6, 5))).axes) == 2
-    with pytest.raises(ChoiceError, match="map: this prediction has instance alone, not flow; give heads for it"):
+    with pytest.raises(ChoiceError, match="map: this prediction has only instance, not flow; give heads for it"):
         draw_motion_map(alone, "flow", 0, ax=new_axes())
     with pytest.raises(ChoiceError, match="prediction: expected a number from 0 to 0, or from the end, found 1"):
         draw_motion_output(alone, number=1)

@@ -56,6 +56,9 @@ def test_without_labels_there_are_the_agents(own_release: Path, tmp_path: Path) 
     data = data_of(render_replay(dataset, None, tmp_path / "replay.html"))
     assert data["actors"] == []
     assert [len(agent["poses"]) for agent in data["agents"]] == [4] * 5
-    assert data["notes"][0] == "The release has no labels of this scenario: nobody's boxes, and not who sees whom."
+    assert (
+        data["notes"][0]
+        == "The release has no labels of this scenario: the page has no boxes and does not show who sees whom."
+    )
     assert any(note.startswith("How the accident happened is not known: ") for note in data["notes"])
     assert data["countdown"][-1] == 0

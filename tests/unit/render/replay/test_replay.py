@@ -55,8 +55,16 @@ def test_text_stays_text() -> None:
     [
         ({"scenario": "type1_subtype1_accident/nowhere"}, TokenError, "nowhere"),
         ({"agents": ["pedestrian"]}, ChoiceError, "agent: expected one of ego_vehicle"),
-        ({"image_width": 4}, ConfigError, "image_width: expected pixels from 32, or None for what fits, found 4"),
-        ({"quality": 0}, ConfigError, "quality: expected a JPEG quality from 1 to 95, or None for what fits, found 0"),
+        (
+            {"image_width": 4},
+            ConfigError,
+            "image_width: expected at least 32 pixels, or None for a fitting width, found 4",
+        ),
+        (
+            {"quality": 0},
+            ConfigError,
+            "quality: expected a JPEG quality from 1 to 95, or None for a fitting one, found 0",
+        ),
         ({"path": "."}, ChoiceError, "is a folder; name a file in it, such as replay.html"),
     ],
 )

@@ -47,7 +47,7 @@ def test_the_first_agent_has_six_cameras_and_the_others_one(da: DeepAccident, da
     assert len(shown) == 20
     for token, pixels in shown.items():
         assert min(true, key=lambda other: np.abs(true[other] - pixels).mean()) == token
-    assert any("all but the front camera of ego behind, other" in note for note in data["notes"])
+    assert any("have only the front camera: ego behind, other" in note for note in data["notes"])
 
 
 def test_width_and_quality_are_as_asked(da: DeepAccident, tmp_path: Path) -> None:

@@ -39,7 +39,7 @@ def test_each_sample_has_its_verdict(
     assert "places off by 40.0 m" in far["alarms"][0]["text"]
     assert missed["text"] == "ego at frame 30: an accident comes in 0.5 s"
     assert (len(many["alarms"]), many["more"]) == (3, 1)
-    assert "names nobody known" in many["alarms"][0]["text"]
+    assert "names an unknown actor" in many["alarms"][0]["text"]
     # the true places are those of the pair at the end, in the page's own ground: centimetres; a slope takes a few
     pair = [actor["states"][-1][:2] for actor in data["actors"] if actor["role"] == "pair"]
     assert_allclose(sorted(right["truth"]), sorted(pair), atol=8)
@@ -58,7 +58,9 @@ def test_alarms_without_an_accident_are_false_or_not_judged(da_motion: DeepAccid
     path = render_replay(da_motion, normal(da_motion), tmp_path / "a.html", prediction=given)
     samples = data_of(path)["prediction"]["samples"]
     assert [each["verdict"] for each in samples] == ["FP", "not judged", "TN"]
-    assert samples[1]["alarms"][0]["text"].startswith("foreseen in 1.9 s, score 1: for later than the recording shows")
+    assert samples[1]["alarms"][0]["text"].startswith(
+        "foreseen in 1.9 s, score 1: it would be after the end of the recording"
+    )
     assert all(each["truth"] is None for each in samples)
 
 
@@ -97,9 +99,7 @@ def test_motion_is_read_for_accidents(da_motion: DeepAccident, tmp_path: Path) -
 def test_predictions_of_something_else_are_refused(
     da_motion: DeepAccident, predictions: dict[str, list[Accident]], tmp_path: Path
 ) -> None:
-    with pytest.raises(
-        NotAvailableError, match=r"prediction: none is of a sample of .* and ego_vehicle, ego_vehicle_b"
-    ):
+    with pytest.raises(NotAvailableError, match=r"prediction: has no sample of .* and ego_vehicle, ego_vehicle_b"):
         render_replay(da_motion, normal(da_motion), tmp_path / "a.html", prediction=predictions)
     token = next(iter(predictions))
     boxes = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [], frame="world")
