@@ -264,7 +264,10 @@ def test_labels_writes_a_split_and_goes_on_where_it_stopped(own_release: Path, t
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        (("--agents", "ego_vehicle,pole"), "--agents: expected all or some of ego_vehicle, ego_vehicle_behind,"),
+        (
+            ("--agents", "ego_vehicle,pole"),
+            "--agents: expected all, available or some of ego_vehicle, ego_vehicle_behind,",
+        ),
         (("--agents", ""), "found ''"),
         (("--agents", "ego_vehicle,"), "found ''"),
         (("--switch", "half_cell_shift"), "--switch: expected NAME=yes or NAME=no, NAME one of own_box_moved_twice,"),

@@ -8,7 +8,13 @@ from typing import Any, cast, get_args
 
 import click
 
-from deepaccident_devkit.cli.options import frame_range, names_or_configuration, pixel_size, release_parameters
+from deepaccident_devkit.cli.options import (
+    cooperating_parameter,
+    frame_range,
+    names_or_configuration,
+    pixel_size,
+    release_parameters,
+)
 from deepaccident_devkit.cli.render_targets import picture_paths, rows_to_draw
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.deepaccident import DeepAccident
@@ -29,7 +35,7 @@ from deepaccident_devkit.render.video import SUFFIXES, VIEWS, render_scenario_vi
 from deepaccident_devkit.render.video.writers import check_target
 from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix
 from deepaccident_devkit.taxonomy import Frame
-from deepaccident_devkit.v2x import AGENT_CONFIGS, Link
+from deepaccident_devkit.v2x import Link
 from deepaccident_devkit.v2x.collisions import first_accident
 
 _RELEASE = ("dataroot", "version", "index_dir", "workers", "on_error")
@@ -77,12 +83,7 @@ def _link_options(latency: float, pose_noise: float) -> tuple[Any, ...]:
     )
 
 
-_AGENTS = click.option(
-    "--agents",
-    multiple=True,
-    metavar="NAME[,NAME…]",
-    help=f"Agents, or one of {', '.join(AGENT_CONFIGS)}.  [default: chosen by the view]",
-)
+_AGENTS = cooperating_parameter("Agents to show", "chosen by the view")
 _VIEW_RANGE = click.option("--view-range", type=float, metavar="M", help="Metres to show on each side.")
 _COORDINATES = click.option(
     "--frame", type=click.Choice(get_args(Frame)), help="Coordinate frame of the axes.  [default: ego]"

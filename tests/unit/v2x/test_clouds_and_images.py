@@ -1,11 +1,13 @@
 import itertools
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError, ConfigError, TokenError
+from deepaccident_devkit.errors import ChoiceError, ConfigError, MissingFileError, TokenError
 from deepaccident_devkit.geometry import Boxes, LidarPointCloud, PinholeCamera
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 from deepaccident_devkit.v2x import Link
@@ -36,6 +38,41 @@ def test_agents_and_sweeps_come_one_after_another(da: DeepAccident, sample: str)
     )
     with pytest.raises(ChoiceError, match="sweeps: expected a whole number of frames from 1, found 0"):
         da.aggregate_point_cloud(sample, sweeps=0)
+
+
+@pytest.fixture
+def without_clouds(release_root: Path, tmp_path: Path) -> DeepAccident:
+    """A copy of the release without the infrastructure's point clouds."""
+    root = tmp_path / "partial"
+    shutil.copytree(release_root, root, ignore=shutil.ignore_patterns("Camera_*", "BEV_*"))
+    for folder in root.glob("*/infrastructure/lidar01"):
+        shutil.rmtree(folder)
+    return DeepAccident(dataroot=root, verbose=False)
+
+
+def test_missing_clouds_are_an_error_or_left_out(
+    da: DeepAccident, without_clouds: DeepAccident, sample: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    names = list(AGENTS[:-1])
+    for call in (without_clouds.aggregate_point_cloud, without_clouds.message_sizes):
+        with pytest.raises(MissingFileError, match=r"no such file; .*, or leave out .* with on_missing='skip'"):
+            call(sample)
+        with pytest.raises(ChoiceError, match="on_missing: expected one of raise, skip, found 'ignore'"):
+            call(sample, on_missing="ignore")
+    assert not caplog.records
+    cloud = without_clouds.aggregate_point_cloud(sample, sweeps=2, on_missing="skip")
+    assert len(cloud) == len(da.aggregate_point_cloud(sample, agents=names, sweeps=2))
+    sizes = without_clouds.message_sizes(sample, on_missing="skip")
+    assert sizes["infrastructure"].cloud is None
+    assert {name: sizes[name] for name in names} == da.message_sizes(sample, agents=names)
+    counts = ["left out files that are not in", "2 of 10 of lidar01", "1 of 5 of lidar01"]
+    assert [counts[0] in record.getMessage() for record in caplog.records] == [True, True]
+    assert [record.getMessage().endswith(end) for record, end in zip(caplog.records, counts[1:], strict=True)] == [
+        True,
+        True,
+    ]
+    only = without_clouds.aggregate_point_cloud(sample, agents=["infrastructure"], on_missing="skip")
+    assert (len(only), only.frame) == (0, "world")
 
 
 def test_compensated_points_lie_on_the_actors_of_the_present(da: DeepAccident, sample: str) -> None:
