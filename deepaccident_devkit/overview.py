@@ -74,7 +74,10 @@ class Overview:
         """Some aligned blocks for a terminal."""
         scenarios = self.tables["scenario"]
         head = f"DeepAccident {self.version} at {self.dataroot} (layout {self.layout})\nindex: {self.index}"
-        splits = [(name, f"{count} of {self.expected.get(name, 0)}") for name, count in self.splits.items()]
+        splits = [
+            (name, f"{count} of {self.expected[name]}" if name in self.expected else str(count))
+            for name, count in self.splits.items()
+        ]
         if self.selected:
             head += f"\nselected: {scenarios} of {self.scenarios} scenarios; all counts are of these"
         if set(self.expected) != set(SPLITS):

@@ -167,7 +167,11 @@ def test_split_saves_a_selection(own_release: Path, tmp_path: Path) -> None:
     found = DeepAccident(dataroot=own_release).find(collision=True, split="train")
     assert read_split_file(tmp_path / "a.txt") == [scenario["token"] for scenario in found]
     assert f"scenarios {len(found)}" in " ".join(saved.stdout.split())
-    assert run("split", own_release, "--save", tmp_path / "b.txt").returncode == 2
+    assert run("split", own_release, "--save", tmp_path / "b.txt").returncode == 0
+    everything = [scenario["token"] for scenario in DeepAccident(dataroot=own_release).scenario]
+    assert read_split_file(tmp_path / "b.txt") == everything
+    assert run("split", own_release, "--save", tmp_path / "d.txt", "--out", tmp_path / "d").returncode == 2
+    assert run("split", own_release, "--save", tmp_path / "d.txt", "--seed", 1).returncode == 2
     assert run("split", own_release, "--where", "split=train", "--out", tmp_path / "b").returncode == 2
     for options in (("--seed", 3), ("--seed", 17), ("--released-skip",)):
         refused = run("split", own_release, "--where", "split=train", "--save", tmp_path / "c.txt", *options)

@@ -9,11 +9,12 @@ from deepaccident_devkit.baselines.figures import save_study
 from deepaccident_devkit.cli.evaluate_options import resamples_parameter
 from deepaccident_devkit.cli.options import cooperating_parameter, names_or_configuration, release_parameters
 from deepaccident_devkit.deepaccident import DeepAccident
+from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS
 from deepaccident_devkit.evaluation.results import ResultsTask
 from deepaccident_devkit.files import write_bytes
-from deepaccident_devkit.motion.sample_lists import Scope
+from deepaccident_devkit.motion.sample_lists import Scope, no_samples_text
 from deepaccident_devkit.statistics import writable_folder
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x import Link
@@ -95,6 +96,8 @@ def predict(split: str, tasks: tuple[str, ...], purpose: Any, scope: Scope, out:
     dataset = DeepAccident(**options)
     released = chosen.horizon == _RELEASED_HORIZON and scope == "accident"
     tokens = dataset.samples(split, purpose, "released" if released else "paper", horizon=chosen.horizon, scope=scope)
+    if not tokens:
+        raise NotAvailableError(f"{split}: has no samples to predict; {no_samples_text(dataset, split, scope)}")
     for task in get_args(ResultsTask):
         if task in tasks or "all" in tasks:
             path = folder / _FILES[task]

@@ -1,5 +1,6 @@
 """`deepaccident render`: pictures and videos of a release, one verb for each view."""
 
+import logging
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ from deepaccident_devkit.render.camera import ColorBy, render_pointcloud_in_imag
 from deepaccident_devkit.render.instance import render_instance
 from deepaccident_devkit.render.layers import LAYERS, Layer
 from deepaccident_devkit.render.link import render_link
+from deepaccident_devkit.render.missing import missing_words
 from deepaccident_devkit.render.moments import render_frame, render_sample
 from deepaccident_devkit.render.motion import MotionStyle, render_motion_labels
 from deepaccident_devkit.render.outcomes import render_evaluation
@@ -36,9 +38,10 @@ from deepaccident_devkit.render.video.writers import check_target
 from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix
 from deepaccident_devkit.taxonomy import Frame
 from deepaccident_devkit.v2x import Link
-from deepaccident_devkit.v2x.collisions import first_accident
+from deepaccident_devkit.v2x.collisions import default_scenario
 
 _RELEASE = ("dataroot", "version", "index_dir", "workers", "on_error")
+_logger = logging.getLogger(__name__)
 _DPI = 100.0
 _OUT = f"File to write ({', '.join(PICTURE_SUFFIXES)}), or a folder for several pictures."
 
@@ -117,7 +120,7 @@ class _Picture:
     help: str
     canvas: str = "fig"
     options: tuple[Any, ...] = (_LAYERS,)
-    default: str = "the first accident"
+    default: str = "the first accident, or if there is none, the first scenario"
 
     def drawn(
         self, dataset: Dataset, row: str, size: tuple[int, int] | None, dpi: float, choices: dict[str, Any]
@@ -214,6 +217,7 @@ _PICTURES = {
     ),
     "accident": _Picture(
         draw=render_accident,
+        default="the first accident",
         of="scenario",
         help="Render the countdown to an accident: one column per moment, one row per agent.",
         options=(
@@ -303,7 +307,10 @@ def _verb(name: str, picture: _Picture) -> click.Command:
         dataset = DeepAccident(**release)
         rows = rows_to_draw(dataset, picture.of, tokens, frames)
         for row, path in zip(rows, picture_paths(out, name, rows), strict=True):
-            save_picture(picture.drawn(dataset, row, size, dpi, choices), path, dpi=dpi)
+            drawn = picture.drawn(dataset, row, size, dpi, choices)
+            save_picture(drawn, path, dpi=dpi)
+            if words := missing_words(drawn):
+                _logger.warning("%s: %s", path, "; ".join(words))
             click.echo(f"rendered: {row} in {path}")
 
     for option in picture.options:  # on a command they come last, on a function they would come first
@@ -348,15 +355,15 @@ def video(
 ) -> None:
     """Write one scenario of the release in DATAROOT as a video.
 
-    Without SCENARIO the command takes the first accident. An MP4 file plays in browsers if the extra `video` is
-    installed; in a checkout: pip install '.[video]'.
+    Without SCENARIO the command takes the first accident, or if there is none, the first scenario. An MP4 file plays in
+    browsers if the extra `video` is installed; in a checkout: pip install '.[video]'.
     """
     release = {option: options.pop(option) for option in _RELEASE}
     check_target(out, size=options["size"], fps=options["fps"])  # before the release is indexed
     dataset = DeepAccident(**release)
     path = render_scenario_video(
         dataset,
-        scenario or first_accident(dataset),
+        scenario or default_scenario(dataset),
         out,
         what=_words(what) or "frame",
         agents=names_or_configuration(agents),

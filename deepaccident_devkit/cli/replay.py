@@ -33,7 +33,8 @@ def replay(
 ) -> None:
     """Write one scenario of the release in DATAROOT as one HTML file that plays in any browser, without a network.
 
-    SCENARIO is a token of the form TYPE/NAME. Without SCENARIO the command takes the first accident.
+    SCENARIO is a token of the form TYPE/NAME. Without SCENARIO the command takes the first
+    accident, or if there is none, the first scenario.
     """
     prediction = None if results is None else read_results(results)  # before the release is indexed
     path = render_replay(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -63,7 +64,16 @@ class Coverage:
         if self.guess is None:
             return told
         shared = "they have just its samples" if self.guess_share == 1 else f"{self.guess_share:.0%} in common"
-        return f"{told}; the results were probably made for {self.guess.text()} ({shared})"
+        return f"{told}; the results were probably made for {self.guess.text()} ({shared}); {_again(self.guess)}"
+
+
+def _again(guess: SampleSelection) -> str:
+    """How to evaluate another list, with options of the command line and in Python."""
+    choices = guess.choices()
+    words = {name: ",".join(value) if name == "agents" else str(value) for name, value in choices.items()}
+    options = " ".join(f"--{name} {shlex.quote(value)}" for name, value in words.items())
+    arguments = ", ".join(f"{name}={value!r}" for name, value in choices.items())
+    return f"repeat with {options}, in Python with SampleSelection({arguments})"
 
 
 def coverage(dataset: Dataset, results: Collection[str], selection: SampleSelection) -> Coverage:
