@@ -21,6 +21,7 @@ from deepaccident_devkit.render.trails import draw_trails
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD
 from deepaccident_devkit.v2x import Agents, Contact, collision, cooperating_agents
+from deepaccident_devkit.v2x.collisions import CONTACT_GAP
 from deepaccident_devkit.v2x.configurations import agents_of
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
@@ -69,7 +70,8 @@ def render_accident(
         fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure; its title says who hits whom, how fast and at which angle.
+        The figure; its title says who hits whom, how fast and at which angle, and whether the recording ends before
+        the pair are near enough to touch.
 
     Raises:
         TokenError: no such scenario.
@@ -80,6 +82,7 @@ def render_accident(
     shown = layers_of(layers, _SHOWN, COUNTDOWN_LAYERS)
     contact = _contact(dataset, scenario, "look at moments of this one with render_frame")
     record = dataset.get("scenario", scenario)
+    cut = _cut_words(contact, record["num_frames"])
     moments = _moments(seconds, record["num_frames"])
     there = agents_of(dataset, scenario)
     first = sample_token(record["token"], there[0], record["num_frames"])
@@ -94,12 +97,13 @@ def render_accident(
             _draw_image(dataset, sample, _pair_at(tracks, contact, index), shown, axes[row, column])
         moment = sample_token(record["token"], there[0], index)
         _draw_contact(dataset, moment, contact, tracks, shown, axes[-1, column])
-        axes[0, column].set_title("the impact" if left == 0 else f"{left:g} s before")
+        end = "the last frame" if cut else "the impact"
+        axes[0, column].set_title(end if left == 0 else f"{left:g} s before")
     for row, agent in enumerate(names):
         _write_row(short_name(agent), AGENT_COLORS[agent], axes[row, 0])
     for ax in axes[-1, 1:]:
         ax.set_ylabel("")
-    set_title(fig, accident_words(dataset, contact), fontsize=11)
+    set_title(fig, "\n".join(filter(None, [accident_words(dataset, contact), cut])), fontsize=11)
     return settled(fig)
 
 
@@ -167,6 +171,14 @@ def accident_words(dataset: Dataset, contact: Contact) -> str:
         f"{hitting} {verb} {hit}, {sides}\n{speeds}, closing at {_number(contact.closing_speed, 'm/s')}, "
         f"{np.degrees(contact.impact_angle):.0f}° between their headings"
     )
+
+
+def _cut_words(contact: Contact, frames: int) -> str:
+    """Says that a recording of so many frames does not end with its accident; empty if it does."""
+    last = int(contact.frame.rsplit("/", 1)[1])
+    if last == frames and contact.gap <= CONTACT_GAP:
+        return ""
+    return f"cut short? the pair are {contact.gap:.1f} m apart at frame {last} of {frames}, the last that shows both"
 
 
 def _contact(dataset: Dataset, scenario: RowArgument, instead: str) -> Contact:

@@ -16,9 +16,11 @@ if TYPE_CHECKING:
 
 _BREAKS: Final = re.compile(r"(?<=/)|(?<=, )")
 """Where a title may be broken."""
-_TITLE_SHARE: Final = 0.96
+_TITLE_SHARE: Final = 0.92
 """Of a figure's width that a title may take."""
-_PANEL_SHARE: Final = 0.88
+_LEAST_SHRINKING: Final = 0.85
+"""How small letters may become, by size, before a title is broken into lines."""
+_PANEL_SHARE: Final = 0.86
 """Of a panel's width: what is beside the axes moves their title to one side."""
 
 
@@ -43,7 +45,7 @@ def figure_or_new(fig: Figure | None, size: tuple[float, float]) -> Figure:
 def set_title(where: Axes | Figure, words: str, *, fontsize: float | str | None = None, **style: Any) -> None:
     """Give axes or a figure a title that its figure's width does not cut off.
 
-    A line that is too long is broken after `/` or a comma; if a part of it is still too long, the letters are smaller.
+    If a line is a little too long, the letters are smaller. If it is far too long, it is broken after `/` or a comma.
     """
     from matplotlib import rcParams
     from matplotlib.axes import Axes
@@ -53,8 +55,10 @@ def set_title(where: Axes | Figure, words: str, *, fontsize: float | str | None 
         size=fontsize or rcParams["axes.titlesize" if isinstance(where, Axes) else "figure.titlesize"]
     )
     room = 72 * _room(where)
-    text = "\n".join(_broken(line, room, font) for line in words.split("\n"))
-    longest = max(_text_width(line, font) for line in text.split("\n"))
+    text, longest = words, _longest(words, font)
+    if longest > room / _LEAST_SHRINKING:
+        text = "\n".join(_broken(line, room, font) for line in words.split("\n"))
+        longest = _longest(text, font)
     size = font.get_size_in_points() * min(1.0, room / max(longest, 1.0))
     if isinstance(where, Axes):
         where.set_title(text, fontsize=size, **style)
@@ -84,6 +88,11 @@ def _broken(line: str, room: float, font: FontProperties) -> str:
             lines.append("")
         lines[-1] += part
     return "\n".join(each.rstrip() for each in lines)
+
+
+def _longest(text: str, font: FontProperties) -> float:
+    """Points of the longest line."""
+    return max(_text_width(line, font) for line in text.split("\n"))
 
 
 def _text_width(text: str, font: FontProperties) -> float:

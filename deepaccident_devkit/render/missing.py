@@ -57,4 +57,5 @@ def missing_words(drawn: Axes | Figure) -> list[str]:
     """What a picture, or the picture of these axes, says of files that are not there, each once."""
     figure: Any = drawn.figure
     texts = figure.findobj(lambda artist: artist.get_gid() == _GID)
-    return list(dict.fromkeys(" ".join(text.get_text().split()) for text in texts))
+    words = (" ".join(text.get_text().split()) for text in texts)
+    return list(dict.fromkeys(part for text in words for part in text.split("; ")))
