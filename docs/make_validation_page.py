@@ -13,6 +13,7 @@ minutes.
 
     deepaccident validate DATAROOT            # labels, calib, meta and the names of all files: a minute or two
     deepaccident validate DATAROOT --deep     # also decodes every image and array: hours for the whole release
+    deepaccident validate DATAROOT --all      # lists all findings of a scenario, not only the first eight
     deepaccident validate DATAROOT --json     # one JSON document
 
 ```python

@@ -109,7 +109,8 @@ def _probably_meant(
 ) -> tuple[SampleSelection | None, float]:
     """The list with the largest share of common samples, the first of equal ones; none if the asked one is no worse."""
     present = {agent_of(token) for token in given}
-    agents = None if present.issuperset(AGENTS) else tuple(name for name in AGENTS if name in present)
+    here = {agent["name"] for agent in dataset.agent}  # a partial release may lack some
+    agents = None if present.issuperset(here) else tuple(name for name in AGENTS if name in present)
     best, most = None, _overlap(given, selection.tokens(dataset))
     for candidate in _candidates(selection, agents):
         try:
