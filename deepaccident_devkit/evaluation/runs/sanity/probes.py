@@ -145,7 +145,7 @@ def candidates_of(suspicions: Iterable[Suspicion], samples: Iterable[Mapping[str
     return tuple(
         Candidate(
             name=each.name,
-            description=f"{each.says}; {each.remedy}",
+            description=f"{each.says}; remedy: {each.remedy}",
             score=_share(*sums[each.name][:2]),
             given=_share(*sums[each.name][2:4]),
             suspected=best.get(each.group) == each.name,
@@ -240,7 +240,7 @@ SYMMETRIES: Final = (
     Symmetry("mirrored x", "what is ahead is behind", swapped=False, x_sign=-1, y_sign=1),
     Symmetry("mirrored y", "what is on the left is on the right", swapped=False, x_sign=1, y_sign=-1),
     Symmetry("transposed", "x and y are swapped", swapped=True, x_sign=1, y_sign=1),
-    Symmetry("anti-transposed", "x and y are swapped, both with the wrong sign", swapped=True, x_sign=-1, y_sign=-1),
+    Symmetry("anti-transposed", "x and y are swapped and negated", swapped=True, x_sign=-1, y_sign=-1),
     Symmetry("turned by 90°", "what is ahead is on the left", swapped=True, x_sign=-1, y_sign=1),
     Symmetry("turned by 180°", "what is ahead on the left is behind on the right", swapped=False, x_sign=-1, y_sign=-1),
     Symmetry("turned by 270°", "what is ahead is on the right", swapped=True, x_sign=1, y_sign=-1),

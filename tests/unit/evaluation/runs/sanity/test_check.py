@@ -125,7 +125,9 @@ def test_a_mistake_of_detections_is_told_with_its_remedy(da_motion: DeepAccident
         )
     report = sanity(da_motion, MemoryResults("detection", found), EvaluationSetup(task="detection"), tokens)
     (warning,) = report.warnings
-    assert warning.startswith("ego frame: it looks as if boxes are given in the agent's ego frame; translations are")
+    assert warning.startswith(
+        "ego frame: it looks as if boxes are given in the agent's ego frame; remedy: translations"
+    )
     assert report.to_text().endswith(f"WARNING: {warning}")
 
 
@@ -308,7 +310,7 @@ def test_past_frames_at_the_beginning_are_told(da_motion: DeepAccident, tokens: 
         found[token] = instances_of(label.instance, label.config.grid)
     (warning,) = sanity(da_motion, MemoryResults("motion", found), MOTION, [*found]).warnings
     assert warning.startswith(
-        "two steps late: it looks as if each frame shows the moment two steps before it; the first"
+        "two steps late: it looks as if each frame shows the moment two steps before it; remedy: "
     )
     assert "the first frame must be the present: leave out the past frames (IoU in the cells" in warning
 
