@@ -12,7 +12,7 @@ from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.synth.checking import checked_text
 from deepaccident_devkit.synth.config import IMAGE_SIZE, RELEASED_IMAGE_SIZE
 from deepaccident_devkit.synth.sensors.caster import has_embree
-from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, View, design_text, designs_text
+from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, View, design_text, designs_text, read_spec
 from deepaccident_devkit.taxonomy import Layout
 
 _DEFAULTS = SynthConfig()
@@ -132,7 +132,7 @@ def _show_design(context: click.Context, _parameter: click.Parameter, number: in
 )
 @click.pass_context
 def synth(
-    context: click.Context, out: Path | None, *, no_sensors: bool, check: bool, workers: int | None, **options: Any
+    context: click.Context, /, out: Path | None, *, no_sensors: bool, check: bool, workers: int | None, **options: Any
 ) -> None:
     """Make a complete synthetic release in the new folder OUT.
 
@@ -151,6 +151,9 @@ def synth(
     frames = "" if config.frames is None else f" of {config.frames} frame{'s' if config.frames > 1 else ''}"
     click.echo(f"{made}: {scenarios}{frames} with five agents, layout {config.layout}")
     click.echo(f"next: deepaccident info {made}")
+    if config.spec is None or read_spec(config.spec).meets:
+        layers = " --layers boxes" if no_sensors else ""
+        click.echo(f"or:   deepaccident render accident {made}{layers} --out countdown.png")
 
 
 def _check(context: click.Context, out: Path | None, options: Mapping[str, Any]) -> None:

@@ -139,6 +139,7 @@ def _first_good_draw(
     from tqdm.auto import tqdm
 
     misses: list[Miss] = []
+    roles: tuple[Role, Role] = ("ego", "other")
     counted = tqdm(range(1, MAX_DRAWS + 1), "draws", leave=False, disable=not progress, delay=_SHOWN_AFTER)
     with closing(counted):
         for draws in counted:
@@ -149,21 +150,22 @@ def _first_good_draw(
             stage = set_stage(rng, spec, junction, usual_duration(rng, spec, config.frames))
             if spec.meet is None:
                 return stage, None, draws
-            tried = try_accident(stage)
+            tried, roles = try_accident(stage), spec.meet.actors
             if isinstance(tried, Performance):
                 return stage, tried, draws
             misses.append(tried)
             if draws == FAR_DRAWS and plan.template.draws_alike and by_far(misses):
                 break
-    raise ConfigError(f"{plan.template.place('meet')}: {misses_text(misses, spec.meet.actors)}")
+    raise ConfigError(f"{plan.template.place('meet')}: {misses_text(misses, roles)}")
 
 
 def _twin(stage: Stage, config: SynthConfig, plan: ScenarioPlan) -> Recorded:
     normal = perform_twin(stage, latest_end(stage, config.frames))
     if normal is None:
+        where = "in the normal twin too" if stage.spec.meet else "although all obey the rules"
         raise ConfigError(
-            f"{plan.template.place('actors')}: the road users collide in the normal twin too, even if one of them "
-            "comes later; let them start farther from each other"
+            f"{plan.template.place('actors')}: the road users collide {where}, even if one of them comes later; let "
+            "them start farther from each other"
         )
     return recorded_normal(stage, normal, config.frames)
 

@@ -102,7 +102,9 @@ def _check_category(actor: Part) -> None:
     possible = _possible_categories(role)
     for category in actor.values("category") if "category" in actor.fields else ():
         if category not in possible:
-            instead = f"; give the {category} the role {_ROLE_OF_CATEGORY[category]}" if _moves_to(role, category) else ""
+            instead = (
+                f"; give the {category} the role {_ROLE_OF_CATEGORY[category]}" if _moves_to(role, category) else ""
+            )
             remedy = f"choose {', '.join(possible)}{instead}"
             raise _fault(actor, "category", f"the role {role} cannot be a {category}", remedy)
 

@@ -93,7 +93,8 @@ class _Tree:
         if isinstance(raw, yaml.SequenceNode):
             items = enumerate(raw.value)
             return Node(where, tuple(self.node(item, item.start_mark.line, f"{path}[{k}]") for k, item in items))
-        return Node(where, self._scalar(raw, line, path), quoted=raw.style in ("'", '"'))
+        quoted = isinstance(raw, yaml.ScalarNode) and raw.style in ("'", '"')
+        return Node(where, self._scalar(raw, line, path), quoted)
 
     def _scalar(self, raw: yaml.Node, line: int, path: str) -> Scalar:
         try:

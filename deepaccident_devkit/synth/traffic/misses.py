@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from deepaccident_devkit.synth.traffic.casting import WARM_UP
 from deepaccident_devkit.synth.traffic.simulate import Simulation
 from deepaccident_devkit.synth.traffic.users import RoadUser
 
-_Roles = tuple[Role, Role]
+_Roles: TypeAlias = tuple[Role, Role]
 FAR: Final = 8.0
 """Metres: two whose least distance is larger miss each other by far."""
 _LATE: Final = 0.5
@@ -28,18 +28,20 @@ class Arrival:
     """When one of the two comes to the crossing of their paths.
 
     Attributes:
+        role: who it is.
         time: seconds since the beginning of the recording; if it does not come, the end of the simulation.
         came: whether it comes there.
         late: seconds after the planned time.
     """
 
+    role: Role
     time: float
     came: bool
     late: float
 
     def __str__(self) -> str:
-        """Such as `at 6.2 s`."""
-        return f"{'at' if self.came else 'not before'} {self.time:.1f} s"
+        """Such as `ego at 6.2 s`."""
+        return f"{self.role} {'at' if self.came else 'not before'} {self.time:.1f} s"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,7 +80,12 @@ def measured_miss(
         there = users[row].path.project(track[:, :2])[0] >= place
         time = float(simulation.time[there.argmax() if there.any() else -1])
         arrivals.append(
-            Arrival(time=time - float(simulation.time[0]) - WARM_UP, came=bool(there.any()), late=max(time - due, 0.0))
+            Arrival(
+                role=users[row].role,
+                time=time - float(simulation.time[0]) - WARM_UP,
+                came=bool(there.any()),
+                late=max(time - due, 0.0),
+            )
         )
     least = float(gap(poses[0], sizes[0], poses[1], sizes[1]).min())
     return Miss(gap=least, arrivals=tuple(arrivals))
@@ -102,35 +109,33 @@ def misses_text(misses: Sequence[Miss], roles: _Roles) -> str:
     measured = [miss for miss in misses if miss.arrivals]
     if measured:
         nearest = min(measured, key=lambda miss: miss.gap)
-        one, other = nearest.arrivals
+        came = " and ".join(map(str, nearest.arrivals))
         parts.append(
-            f"the least distance was {nearest.gap:.1f} m, where {first} came to the crossing of their paths {one} and "
-            f"{second} {other}"
+            f"the least distance was {nearest.gap:.1f} m, where they came to the crossing of their paths: {came}"
         )
-    parts += _late_texts(measured, roles)
-    if touching := Counter(miss.touched for miss in misses if miss.touched):
-        others, _ = touching.most_common(1)[0]
-        parts.append(f"in {touching.total()} of the draws others touched before, such as {' and '.join(others or ())}")
-    return f"{'; '.join(parts)}; {_remedy(misses, roles)}"
-
-
-def _late_texts(measured: Sequence[Miss], roles: _Roles) -> list[str]:
-    counts = [sum(miss.arrivals[k].late > _LATE for miss in measured) for k in range(2)]
-    return [
-        f"{role} came {_LATE:g} s or more later than planned in {count} of the draws"
-        for role, count in zip(roles, counts, strict=True)
-        if count
+    late = _late_counts(misses)
+    parts += [
+        f"{role} came {_LATE:g} s or more later than planned in {count} of the draws" for role, count in late.items()
     ]
+    if touching := Counter(miss.touched for miss in misses if miss.touched is not None):
+        others, _ = touching.most_common(1)[0]
+        parts.append(f"in {touching.total()} of the draws others touched before, such as {' and '.join(others)}")
+    return f"{'; '.join(parts)}; {_remedy(misses)}"
 
 
-def _remedy(misses: Sequence[Miss], roles: _Roles) -> str:
+def _late_counts(misses: Sequence[Miss]) -> dict[Role, int]:
+    """Role → in how many draws it was late; only those who were."""
+    return dict(Counter(arrival.role for miss in misses for arrival in miss.arrivals if arrival.late > _LATE))
+
+
+def _remedy(misses: Sequence[Miss]) -> str:
     """What to change: the cause of more than half of the misses decides."""
     most = len(misses) / 2
     if sum(miss.gap == inf for miss in misses) > most:
         return "their paths do not cross: change from, turn or side of one of them"
     if sum(miss.touched is not None for miss in misses) > most:
         return "let those who touched start farther apart (gap, from, lane), or give them another max_speed"
-    for k, role in enumerate(roles):
-        if sum(bool(miss.arrivals) and miss.arrivals[k].late > _LATE for miss in misses) > most:
+    for role, count in _late_counts(misses).items():
+        if count > most:
             return f"others are in the way of {role}: choose fewer background.vehicles, or another lane"
     return "choose a meet.offset nearer to 0, or another max_speed for one of the two"

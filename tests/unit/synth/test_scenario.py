@@ -125,13 +125,13 @@ background: {vehicles: 0, two_wheelers: 0, parked: 0, walking: 0, crossing: 0}
 
 @pytest.fixture
 def build_own(tmp_path):
-    """A function: text of a scenario file → the accident of its first pair."""
+    """A function: text of a scenario file → its first scenario, or the twin of it."""
 
-    def build(text, *, progress=False):
+    def build(text, *, progress=False, twin=False):
         path = tmp_path / "own.yaml"
         path.write_text(text, encoding="utf-8")
-        config = SynthConfig(scenarios=1, spec=path, frames=None)
-        return build_scenario(config, plan_scenarios(config)[0], progress=progress)
+        config = SynthConfig(scenarios=2, spec=path, frames=None)
+        return build_scenario(config, plan_scenarios(config)[int(twin)], progress=progress)
 
     return build
 
@@ -141,8 +141,8 @@ def test_a_scenario_in_which_nobody_meets_is_given_up(build_own, monkeypatch, ca
     monkeypatch.setattr("deepaccident_devkit.synth.scenario.MAX_DRAWS", 2)
     monkeypatch.setattr("deepaccident_devkit.synth.scenario._SHOWN_AFTER", 0.0)
     message = (
-        r"own.yaml:6: meet: ego and other did not collide in 2 draws; the least distance was 1\d\.\d m, where ego came "
-        r"to the crossing of their paths at \d+\.\d s and other not before \d+\.\d s; choose a meet.offset nearer to 0"
+        r"own.yaml:6: meet: ego and other did not collide in 2 draws; the least distance was 1\d\.\d m, where they "
+        r"came to the crossing of their paths: ego at \d+\.\d s and other not before \d+\.\d s; choose a meet.offset"
     )
     with pytest.raises(ConfigError, match=message):
         build_own(LATE, progress=True)
@@ -167,14 +167,20 @@ def test_paths_that_do_not_cross_are_named(build_own, monkeypatch):
 
 def test_a_twin_that_cannot_be_made_is_named_by_its_file(build_own, monkeypatch):
     monkeypatch.setattr("deepaccident_devkit.synth.scenario.perform_twin", lambda *_: None)
-    with pytest.raises(ConfigError, match=r"own.yaml:3: actors: the road users collide in the normal twin too"):
+    with pytest.raises(ConfigError, match=r"own.yaml:3: actors: the road users collide although all obey the rules"):
         build_own(LATE.partition("meet:")[0])
+    with pytest.raises(
+        ConfigError, match=r"own.yaml:3: actors: the road users collide in the normal twin too, even if"
+    ):
+        build_own(LATE.replace("offset: 3", "offset: 0"), twin=True)
 
 
 def test_a_slow_cyclist_is_hit(build_own):
     """It needs more than 24 s from its usual start to the crossing, and once never came there."""
     cyclist = "  - {role: background, category: cyclist, from: west, max_speed: 3}\nmeet: {actors: [background, ego]"
-    text = LATE.replace("ego, from: west", "ego, from: south, turn: right").replace("other, from: south", "other, from: east")
+    text = LATE.replace("ego, from: west", "ego, from: south, turn: right").replace(
+        "other, from: south", "other, from: east"
+    )
     scenario = build_own(text.replace("meet: {actors: [ego, other], offset: 3", f"{cyclist}, offset: 0.5"))
     assert scenario.draws == 1
     assert scenario.meta.collision.classes == ("cyclist", "car")

@@ -10,13 +10,15 @@ from deepaccident_devkit.synth.spec import parse_spec
         ("gap: 3", r"f.yaml:4: actors\[1\].gap: is not possible for the role other; leave it out"),
         (
             "category: cyclist",
-            "category: the role other cannot be a cyclist; choose car, truck, van, motorcycle; give the cyclist the role "
-            "background$",
+            "category: the role other cannot be a cyclist; choose car, .*cle; give the cyclist the role background$",
         ),
-        ("category: [car, pedestrian]", "the role other cannot be a pedestrian; .*; give the pedestrian the role pedes"),
+        (
+            "category: [car, pedestrian]",
+            "the role other cannot be a pedestrian; .*; give the pedestrian the role pedes",
+        ),
         (
             "start_distance: 30",
-            r"f.yaml:4: actors\[1\].start_distance: follows from meet \(f.yaml:5\) for other, who is timed; leave it out",
+            r"f.yaml:4: actors\[1\].start_distance: follows from meet \(f.yaml:5\) for other, who is timed; leave it",
         ),
         ("delay: [0, 2]", r"actors\[1\].delay: follows from meet"),
         ("lane: 1", "there is no lane 1 where the road has one lane in each direction; choose 0, or give the road two"),
@@ -74,11 +76,11 @@ EGO, OTHER = "role: ego, from: west", "role: other, from: south"
         (scenario(EGO, OTHER, "role: parked, category: cyclist, from: east"), "choose car, truck, van, motorcycle$"),
         (
             scenario(EGO, OTHER, "role: pedestrian, from: east, max_speed: [2, 3.5]"),
-            r"actors\[2\].max_speed: expected 0.5 to 3 m/s for a pedestrian, found 3.5; walking is 1 to 2 m/s, running 3",
+            r"actors\[2\].max_speed: expected 0.5 to 3 m/s for a pedestrian, found 3.5; walking is 1 to 2 m/s",
         ),
         (
             scenario(EGO, OTHER, "role: parked, from: east", more="road:\n  parking: [true, false]"),
-            r"f.yaml:4: actors\[2\].role: a vehicle cannot park where .* strips \(f.yaml:6\); leave it out, or set road",
+            r"f.yaml:4: actors\[2\].role: a vehicle cannot park where .* strips \(f.yaml:6\); leave it out, or set",
         ),
         (scenario(EGO, OTHER, "role: parked, from: east, turn: left"), "turn: is not possible for the role parked"),
         (

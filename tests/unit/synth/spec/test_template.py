@@ -118,7 +118,7 @@ def test_whether_draws_differ_in_more_than_numbers(small, more, alike):
 
 def test_a_list_of_an_actor_makes_draws_differ(with_other):
     assert parse_spec(with_other("max_speed: [8, 9], ignores: [signal, priority]")).draws_alike
-    assert not parse_spec(with_other("turn: [left, right]")).draws_alike
+    assert not parse_spec(with_other("turn: [left, straight]")).draws_alike
     assert not any(template.draws_alike for template in DESIGNS.values())
 
 

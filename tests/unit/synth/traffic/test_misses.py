@@ -10,19 +10,19 @@ from deepaccident_devkit.synth.traffic.simulate import simulate
 ROLES = ("ego", "background")
 
 
-def arrival(time, *, late=0.0, came=True):
-    return Arrival(time=time, came=came, late=late)
+def arrival(role, time, *, late=0.0, came=True):
+    return Arrival(role=role, time=time, came=came, late=late)
 
 
-NEAR = Miss(gap=1.5, arrivals=(arrival(6.0), arrival(7.0, late=0.6)))
-FAR = Miss(gap=20.0, arrivals=(arrival(6.0), arrival(8.0, came=False)))
+NEAR = Miss(gap=1.5, arrivals=(arrival("ego", 6.0), arrival("background", 7.0, late=0.6)))
+FAR = Miss(gap=20.0, arrivals=(arrival("ego", 6.0), arrival("background", 8.0, came=False)))
 
 
 def test_the_nearest_draw_is_told():
     assert misses_text([FAR, NEAR], ROLES) == (
-        "ego and background did not collide in 2 draws; the least distance was 1.5 m, where ego came to the crossing of "
-        "their paths at 6.0 s and background at 7.0 s; background came 0.5 s or more later than planned in 1 of the "
-        "draws; choose a meet.offset nearer to 0, or another max_speed for one of the two"
+        "ego and background did not collide in 2 draws; the least distance was 1.5 m, where they came to the "
+        "crossing of their paths: ego at 6.0 s and background at 7.0 s; background came 0.5 s or more later than "
+        "planned in 1 of the draws; choose a meet.offset nearer to 0, or another max_speed for one of the two"
     )
     assert "background not before 8.0 s" in misses_text([FAR], ROLES)
 
