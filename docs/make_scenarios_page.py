@@ -65,11 +65,11 @@ print(scenario.weather, scenario.actor("ego").max_speed)
   In the accident they see each other too late, obey neither lights nor priority, and all others let them go first. The
   one of the two that does not ignore `signal` has green.
 - If the two miss each other, all values are drawn again. After 100 draws the command stops. Its message says how near
-  they came, when, and which field to change. If all draws miss by far, it stops after 25.
-- Cyclists and pedestrians are no agents: give them the role `background` or `pedestrian`, and write for example
-  `meet: {actors: [ego, background]}`. `other` must still be there: it is one of the five that record.
+  they came, when, and which field to change. If draws differ only in numbers and all miss by far, it stops after 25.
 - All others obey the rules, except those in their `ignores`. Who ignores `signal` drives at red; `priority`, gives way
   to nobody; `crosswalk`, does not wait for pedestrians.
+- Cyclists and pedestrians are no agents: give them the role `background` or `pedestrian`, and write for example
+  `meet: {actors: [ego, background]}`. `other` must still be there: it is one of the five that record.
 - The recording ends with the collision; without one, when ego arrives or at `end.time`. It has 40 frames (4 s) or more.
   `--frames N` keeps the last N.
 - The normal twin has the same scene and the same road users, but all of them pay attention and obey all rules.

@@ -59,7 +59,7 @@ def make_release(
 
 
 def _jobs(
-    unfinished: Unfinished, config: SynthConfig, plan: ScenarioPlan, *, progress: bool
+    unfinished: Unfinished, config: SynthConfig, plan: ScenarioPlan, *, progress: bool = False
 ) -> dict[str, RecordingJob]:
     """The parts of a scenario by their names; `progress` shows the draws, where no other process writes too."""
     parts = parts_of(config)

@@ -7,7 +7,7 @@ from typing import Final, TypeAlias, cast
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.roads import ARMS, Arm, Junction, RoadSpec, Turn
-from deepaccident_devkit.synth.spec.choices import Items, Part
+from deepaccident_devkit.synth.spec.choices import Items, Part, default_of
 from deepaccident_devkit.synth.spec.model import Role
 
 _Way: TypeAlias = tuple[Arm, Turn, int]
@@ -224,7 +224,7 @@ def _check_meeting(root: Part, actors: Sequence[Part], junctions: Sequence[Junct
 def _check_timed(meeting: Part, actor: Part) -> None:
     """Start and delay of those who are timed follow from the meeting; of a pedestrian the start is its place."""
     for name in ("delay",) if _role(actor) == _WALKING else ("start_distance", "delay"):
-        if any(actor.values(name)):
+        if any(value != default_of(actor.kind, name) for value in actor.values(name)):
             sentence = f"follows from meet ({meeting.where}) for {_role(actor)}, who is timed"
             raise _fault(actor, name, sentence, "leave it out; meet.offset says who comes later")
 

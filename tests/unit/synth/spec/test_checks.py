@@ -20,6 +20,7 @@ from deepaccident_devkit.synth.spec import parse_spec
             "start_distance: 30",
             r"f.yaml:4: actors\[1\].start_distance: follows from meet \(f.yaml:5\) for other, who is timed; leave it",
         ),
+        ("start_distance: 0", "start_distance: follows from meet"),
         ("delay: [0, 2]", r"actors\[1\].delay: follows from meet"),
         ("lane: 1", "there is no lane 1 where the road has one lane in each direction; choose 0, or give the road two"),
         ("lane: [0, 1]", "there is no lane 1"),
