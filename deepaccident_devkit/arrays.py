@@ -54,10 +54,9 @@ def checked(
             integer type, numbers must be whole and in its range.
     """
     array = as_numbers(name, values, f"an array of shape {_shape_text(shape)}", dtype)
-    if array.ndim != len(shape) or any(
-        want is not None and want != have for want, have in zip(shape, array.shape, strict=True)
-    ):
-        raise GeometryError(f"{name}: expected shape {_shape_text(shape)}, found {array.shape}")
+    if not _fits(array.shape, shape):
+        remedy = "; transpose it (.T)" if array.ndim == 2 and _fits(array.shape[::-1], shape) else ""
+        raise GeometryError(f"{name}: expected shape {_shape_text(shape)}, found {array.shape}{remedy}")
     return array
 
 
@@ -92,7 +91,8 @@ def as_numbers(
         array = given.astype(wanted)
     if wanted.kind in "iu":
         if not np.array_equal(array, given):
-            raise GeometryError(f"{name}: expected whole numbers of {wanted}, found {given}")
+            other = given[array != given].flat[0]
+            raise GeometryError(f"{name}: expected whole numbers of {wanted}, found {other}")
     elif wanted.kind == "f" and wanted.itemsize < given.dtype.itemsize and not np.isfinite(array).all():
         lost = np.isinf(array) & np.isfinite(given)
         if lost.any():
@@ -161,8 +161,16 @@ def _read(name: str, values: Any, expected: str) -> AnyArray:
         ) from error
 
 
+def _fits(found: Sequence[int], shape: Sequence[int | None]) -> bool:
+    return len(found) == len(shape) and all(
+        want is None or want == have for want, have in zip(shape, found, strict=True)
+    )
+
+
 def _remedy(values: object) -> str:
-    """The remedy for another framework's array that numpy does not read; empty for all other objects."""
+    """The remedy for a point cloud, or another framework's array that numpy does not read; empty for the rest."""
+    if hasattr(values, "xyz"):
+        return "; give its array, .xyz"
     if isinstance(values, np.ndarray) or not (hasattr(values, "__array__") or hasattr(values, "__dlpack__")):
         return ""
     return "; pass a torch tensor as tensor.detach().cpu().float(), another framework's as a float32 numpy array"

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
+from deepaccident_devkit import nuscenes_names
 from deepaccident_devkit.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.geometry import SE3, Box, Boxes, LidarPointCloud
+from deepaccident_devkit.geometry import SE3, Box, Boxes, LidarPointCloud, PinholeCamera
 from deepaccident_devkit.geometry.boxes import trusted_boxes
 from deepaccident_devkit.geometry.se3 import stored_transforms, trusted_se3
 from deepaccident_devkit.release import BevImage, read_bev, read_image, read_lidar
@@ -36,6 +37,14 @@ _FRAMES = frozenset((*get_args(Frame), *CHANNELS))
 
 class Dataset(OpenTables):
     """One release: its tables (`OpenTables`), poses, boxes and sensor files."""
+
+    if not TYPE_CHECKING:  # which would take every name for a known one
+
+        def __getattr__(self, name: str) -> Any:
+            """Say what to use in place of a name of the nuScenes devkit; raises MissingNameError."""
+            if name in nuscenes_names.DATASET:
+                raise nuscenes_names.missing_name(type(self), name, nuscenes_names.DATASET[name])
+            return object.__getattribute__(self, name)  # raises as it did before
 
     # poses
 
@@ -150,31 +159,55 @@ class Dataset(OpenTables):
 
     # sensor data
 
-    def get_sample_data_path(self, sample_data: RowArgument) -> Path:
-        """The path of a sensor file, which need not exist; raises TokenError."""
-        return self.dataroot / self._tables.resolver.filename(self.sample_data.row(token_of(sample_data)))
+    def get_sample_data_path(self, sample_data: RowArgument, channel: str | None = None) -> Path:
+        """The path of a sensor file, which need not exist; arguments as of `get_sample_data`. Raises TokenError."""
+        return self.dataroot / self._tables.resolver.filename(self._sample_data_row(sample_data, channel))
 
-    def get_sample_data(self, sample_data: RowArgument) -> tuple[Path, list[Box], FloatArray | None]:
+    def get_sample_data(
+        self, sample_data: RowArgument, channel: str | None = None
+    ) -> tuple[Path, list[Box], FloatArray | None]:
         """A sensor file's path, all boxes of its sample in the sensor's frame, and K (3, 3) of a camera.
 
-        Boxes are not tested against the image: those behind a camera are among them.
+        Boxes are not tested against the image: those behind a camera are among them (`camera` finds those in it).
+
+        Args:
+            sample_data: token or record of a sensor file; with `channel`, of a sample.
+            channel: the sensor, such as `Camera_Front` or `lidar01`; None where `sample_data` names it.
 
         Raises:
             TokenError: no such sensor file.
         """
-        row = self.sample_data.row(token_of(sample_data))
+        row = self._sample_data_row(sample_data, channel)
         sample_row, channel_code = divmod(row, len(CHANNELS))
-        channel = CHANNELS[channel_code]
-        intrinsic = None
-        if channel in CAMERAS:
-            calibrated = self._tables.views["sample_data"]["calibrated_sensor_row"].item(row)
-            intrinsic = self._tables.views["calibrated_sensor"]["camera_intrinsic"][calibrated].reshape(3, 3).copy()
-        sample_token = self._tables.resolver.token("sample", sample_row)
-        boxes = self.get_boxes(sample_token, channel)
-        return self.get_sample_data_path(sample_data), boxes, intrinsic
+        name = CHANNELS[channel_code]
+        intrinsic = self._intrinsic(row) if name in CAMERAS else None
+        boxes = self.get_boxes(self._tables.resolver.token("sample", sample_row), name)
+        return self.dataroot / self._tables.resolver.filename(row), boxes, intrinsic
 
-    def load_image(self, sample_data: RowArgument) -> ByteArray:
+    def camera(self, sample_data: RowArgument, channel: str | None = None) -> PinholeCamera:
+        """A camera's K and image size as its calib file gives them, which projects points and finds visible boxes.
+
+        Args:
+            sample_data: token or record of a camera's sensor file; with `channel`, of a sample.
+            channel: the camera, such as `Camera_Front`; None where `sample_data` names it.
+
+        Raises:
+            TokenError: no such sensor file.
+            ChoiceError: the sensor is no camera.
+        """
+        row = self._sample_data_row(sample_data, channel)
+        name = CHANNELS[row % len(CHANNELS)]
+        if name not in CAMERAS:
+            raise ChoiceError(f"camera: expected one of {', '.join(CAMERAS)}, found {name}")
+        view = self._tables.views["sample_data"]
+        return PinholeCamera(self._intrinsic(row), view["width"].item(row), view["height"].item(row))
+
+    def load_image(self, sample_data: RowArgument, channel: str | None = None) -> ByteArray:
         """A camera's image (H, W, 3) uint8, RGB.
+
+        Args:
+            sample_data: token or record of a camera's sensor file; with `channel`, of a sample.
+            channel: the camera, such as `Camera_Front`; None where `sample_data` names it.
 
         Raises:
             TokenError: no such sensor file.
@@ -182,11 +215,11 @@ class Dataset(OpenTables):
             MissingFileError: the image was not downloaded.
             SensorFileError: it cannot be read.
         """
-        path = self.get_sample_data_path(sample_data)
-        channel = CHANNELS[self.sample_data.row(token_of(sample_data)) % len(CHANNELS)]
-        if channel not in CAMERAS:
-            raise ChoiceError(f"{channel} holds no images; the cameras are {', '.join(CAMERAS)}")
-        return read_image(path)
+        row = self._sample_data_row(sample_data, channel)
+        name = CHANNELS[row % len(CHANNELS)]
+        if name not in CAMERAS:
+            raise ChoiceError(f"{name} holds no images; the cameras are {', '.join(CAMERAS)}")
+        return read_image(self.dataroot / self._tables.resolver.filename(row))
 
     def load_point_cloud(self, sample: RowArgument, frame: Frame = "world") -> LidarPointCloud:
         """A sample's LiDAR points in `world`, `ego` or `lidar`.
@@ -219,6 +252,16 @@ class Dataset(OpenTables):
 
     def _sample_row(self, sample: RowArgument) -> int:
         return self._tables.resolver.row("sample", token_of(sample))
+
+    def _sample_data_row(self, sample_data: RowArgument, channel: str | None) -> int:
+        token = token_of(sample_data)
+        return self.sample_data.row(token if channel is None else f"{token}/{channel}")
+
+    def _intrinsic(self, sample_data_row: int) -> FloatArray:
+        """K (3, 3) of a camera, the caller's own."""
+        calibrated = self._tables.views["sample_data"]["calibrated_sensor_row"].item(sample_data_row)
+        intrinsic: FloatArray = self._tables.views["calibrated_sensor"]["camera_intrinsic"][calibrated]
+        return intrinsic.reshape(3, 3).copy()
 
     def _channel_path(self, sample_row: int, channel: str) -> Path:
         row = sample_row * len(CHANNELS) + CHANNELS.index(channel)

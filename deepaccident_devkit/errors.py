@@ -78,6 +78,10 @@ class FieldError(LookupFailedError):
     """The table has no such field."""
 
 
+class MissingNameError(DeepAccidentError, AttributeError):
+    """An object has no attribute of this name; the nuScenes devkit's has."""
+
+
 class ChoiceError(DeepAccidentError, ValueError):
     """An argument is not one of the values it can take (a frame, a channel, a layout, …)."""
 

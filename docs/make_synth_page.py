@@ -1,7 +1,7 @@
 """Measure the tables of docs/synth.md: `python docs/make_synth_page.py`, from a checkout; takes minutes.
 
-What was measured is kept in docs/synth_statistics.json; `--tables` makes the tables from that again. `--real DIR`
-measures the real scenario under DIR as well; without it, its numbers stay as they are.
+The measured values are kept in docs/synth_statistics.json; `--tables` makes the tables from them again. `--real DIR`
+measures the real scenario under DIR too; without it, its numbers do not change.
 """
 
 import argparse
@@ -33,18 +33,19 @@ PAGE, MEASURED = HERE / "synth.md", HERE / "synth_statistics.json"
 SEEDS = 20
 """Pairs of each design."""
 STEP, EVALUATED, OBSERVED = 5, 4, 3
-"""Frames between two observations; moments that are evaluated before the last frame, and that each looks at."""
+"""Frames between two observations; number of evaluated moments before the last frame; observations for each of them."""
 RELEASED_SCENARIOS, RELEASED_FRAMES = 691, 57_000
-"""As its authors say (paper, abstract: 57K frames)."""
+"""Numbers of its authors (paper, abstract: 57K frames)."""
 WORKERS = 2
 
 
 class Pair(TypedDict):
-    """What was measured of an accident and its normal twin.
+    """The measured values of an accident and its normal twin.
 
-    `views` has for each agent a letter for 2, 1.5, 1 and 0.5 s before the impact: `v`, it sees the accident by the
-    released rule; `c`, it does not, but the five together see the pair; `u`, neither. `sees_both` is of 1 s before it.
-    `twin_gap` is the least distance between any two of the four vehicle agents, metres.
+    `views` has for each agent one letter for each of 2, 1.5, 1 and 0.5 s before the impact: `v`, it sees the accident
+    by the released rule; `c`, it does not, but the five together see the pair; `u`, the five do not see it either.
+    `sees_both` is for 1 s before the impact. `twin_gap` is the least distance between any two of the four vehicle
+    agents, metres.
     """
 
     design: int
@@ -61,7 +62,7 @@ class Pair(TypedDict):
 
 
 class Measured(TypedDict):
-    """All that was measured: of a real scenario, of generated ones like it, and of pairs of all designs."""
+    """All measured values: of a real scenario, of similar generated ones, and of pairs of all designs."""
 
     real: synth_beside.Numbers
     generated: synth_beside.Numbers
@@ -72,12 +73,12 @@ _WATCHING = (VEHICLE_AGENTS[1], VEHICLE_AGENTS[3], INFRASTRUCTURE)
 
 
 def config(pairs: int) -> SynthConfig:
-    """The release that is measured: designed accidents alone, of natural length."""
+    """The release that is measured: only designed accidents, with all their frames."""
     return SynthConfig(scenarios=2 * pairs, frames=None, unplanned=0.0, sensors=False)
 
 
 def measure(number: int, *, views: bool = True) -> Pair:
-    """Make a pair, and measure it; without `views` what agents see is left out."""
+    """Make a pair, and measure it; without `views` the results do not say what agents see."""
     whole = config(number + 1)
     accident, twin = (build_scenario(whole, plan) for plan in plan_scenarios(whole)[-2:])
     assert accident.meta.collision is not None
@@ -129,7 +130,7 @@ def _labels(scenario: Scenario, seed: int) -> dict[str, list[Labels]]:
 
 
 def _in_view(scenario: Scenario, labels: Sequence[Labels], agents: Sequence[str], own: str) -> bool:
-    """Whether some agents together have in view those of the pair who are not `own`."""
+    """Whether some agents together have the pair in view; the agent `own` itself does not count."""
     assert scenario.meta.collision is not None
     seen = [
         visible_mask(
@@ -159,9 +160,10 @@ def _letters(scenario: Scenario, labels: dict[str, list[Labels]], agent: str) ->
 
 
 def designs_table(pairs: Sequence[Pair]) -> str:
-    """One line a design."""
-    head = "| design | collide at the first draw | draws | meta says it | angle (°) | slower, faster (m/s) | frames "
-    head += "| followers of ego, of other, and the pole see both | twins without contact | agents in twins (m) |"
+    """One row for each design."""
+    head = "| design | collide at the first draw | draws | type in meta is the design | angle (°) "
+    head += "| slower, faster (m/s) | frames | follower of ego, of other, infrastructure: each sees both "
+    head += "| twins without contact | least gap of agents in twins (m) |"
     lines = [head, "|---" * (head.count("|") - 1) + "|"]
     for design, template in DESIGNS.items():
         of_design = [pair for pair in pairs if pair["design"] == design]
@@ -183,7 +185,7 @@ def designs_table(pairs: Sequence[Pair]) -> str:
 
 
 def views_table(pairs: Sequence[Pair]) -> str:
-    """One line an agent, and one for all."""
+    """One row for each agent, and one for all."""
     head = "| samples of | evaluated | accident-invisible | of these, the five together see it |"
     lines = [head, "|---" * 4 + "|"]
     for name, agents in {**{f"`{agent}`": (agent,) for agent in AGENTS}, "all": AGENTS}.items():
@@ -195,7 +197,7 @@ def views_table(pairs: Sequence[Pair]) -> str:
 
 
 def lengths_table(pairs: Sequence[Pair]) -> str:
-    """Frames of a scenario, beside the release's."""
+    """Numbers of frames of scenarios, in the release and here."""
     accidents, twins = [pair["frames"] for pair in pairs], [pair["twin_frames"] for pair in pairs]
     rows = {
         "the release": (RELEASED_SCENARIOS, f"{RELEASED_FRAMES / RELEASED_SCENARIOS:.0f}", "40–100"),
@@ -203,12 +205,12 @@ def lengths_table(pairs: Sequence[Pair]) -> str:
         "here, accidents": (len(pairs), f"{np.mean(accidents):.0f}", _ends(accidents)),
         "here, normal twins": (len(pairs), f"{np.mean(twins):.0f}", _ends(twins)),
     }
-    lines = ["| | scenarios | frames of one, mean | from, to |", "|---" * 4 + "|"]
+    lines = ["| | scenarios | frames of a scenario, mean | least–most |", "|---" * 4 + "|"]
     return "\n".join(lines + [f"| {name} | {' | '.join(map(str, cells))} |" for name, cells in rows.items()])
 
 
 def tables(measured: Measured) -> dict[str, str]:
-    """What stands between the page's markers."""
+    """The tables between the page's markers."""
     pairs = measured["pairs"]
     return {
         "designs": designs_table(pairs),
@@ -230,13 +232,13 @@ def with_tables(page: str, measured: Measured) -> str:
 
 
 def measured() -> Measured:
-    """What was measured last."""
+    """The values of the last measurement."""
     content: Measured = json.loads(MEASURED.read_text(encoding="utf-8"))
     return content
 
 
 def save(content: Measured) -> None:
-    """Keep what was measured, a pair a line."""
+    """Save the measured values, one pair on each line."""
     beside = [f'"{key}": {json.dumps(content[key], indent=1)}' for key in ("real", "generated")]
     pairs = ",\n".join(json.dumps(pair) for pair in content["pairs"])
     MEASURED.write_text("{\n" + ",\n".join([*beside, f'"pairs": [\n{pairs}\n]']) + "\n}\n", encoding="utf-8")
@@ -255,11 +257,11 @@ def _ends(values: Sequence[float]) -> str:
 
 
 def main() -> None:
-    """Measure, unless the tables alone are wanted, and write them into the page."""
+    """Measure (not with `--tables`), and write the tables into the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--tables", action="store_true", help="only make the tables again")
-    parser.add_argument("--beside", action="store_true", help="measure only what stands beside the real scenario")
-    parser.add_argument("--real", type=Path, metavar="DIR", help="a release with one real scenario, measured too")
+    parser.add_argument("--beside", action="store_true", help="measure only what is compared with the real scenario")
+    parser.add_argument("--real", type=Path, metavar="DIR", help="a release with one real scenario to measure too")
     options = parser.parse_args()
     content = measured()
     if options.real:

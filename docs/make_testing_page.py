@@ -1,4 +1,4 @@
-"""Bring the table of breakages in testing.md up to date: `python docs/make_testing_page.py`."""
+"""Update the table of breakages in testing.md: `python docs/make_testing_page.py`."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ from deepaccident_devkit.testing import BREAKAGES, Breakage
 
 PAGE = Path(__file__).parent / "testing.md"
 _START, _END = "<!-- breakages -->\n", "<!-- end of breakages -->\n"
-_HEAD = "| name | what it is | `validate` says | opening raises | reading raises |\n|---|---|---|---|---|\n"
+_HEAD = "| name | what it is | `validate` finds | opening raises | reading raises |\n|---|---|---|---|---|\n"
 
 
 def row_of(breakage: Breakage) -> str:

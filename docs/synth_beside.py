@@ -1,4 +1,4 @@
-"""Numbers of a scenario that tell how like the real release a generated one is, for docs/make_synth_page.py."""
+"""Numbers that show how similar generated scenarios are to the real release, for docs/make_synth_page.py."""
 
 import tempfile
 from collections.abc import Callable, Sequence
@@ -29,7 +29,7 @@ from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, INFRASTRUCTURE, LID
 Numbers = dict[str, float]
 
 SENSOR_STEP = 25
-"""Frames from each whose sensor files are measured to the next."""
+"""Sensor files are measured at one of so many frames."""
 PAIRS = 4
 _CAR, _PEDESTRIAN = CATEGORIES.index("car"), CATEGORIES.index("pedestrian")
 _TWO_WHEELERS = [CATEGORIES.index(name) for name in ("motorcycle", "cyclist")]
@@ -42,16 +42,16 @@ _BINS = {
     "70–120": (70, 120),
 }
 _MOVING = 0.5
-"""m/s from which on one moves."""
+"""m/s: an actor that is faster counts as moving."""
 
 
 def measure_real(folder: Path) -> Numbers:
-    """Of a release with one real scenario, or the first of several."""
+    """The numbers of a release's first scenario, the real one."""
     return measure([find_release(folder).scenarios[0]])
 
 
 def measure_generated() -> Numbers:
-    """Of normal scenarios like the real one: a three-way junction with lights, clear noon; ego turns right."""
+    """The numbers of normal scenarios like the real one: three-way, with lights, clear noon; ego turns right."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         spec = folder / "like_the_real_one.yaml"
@@ -68,7 +68,7 @@ def measure_generated() -> Numbers:
 
 
 def _like_the_real_one() -> str:
-    """Design 6 without what the real scenario is not: two lanes, a hump, a hidden view, rain, night."""
+    """Design 6 without what the real scenario does not have: two lanes, a hump, a hidden view, rain, night."""
     spec = yaml.safe_load(design_text(6))
     spec["road"] = {"kind": "three-way", "signalized": True, "lanes": 1}
     ego, other = spec["actors"][0], spec["actors"][2]
@@ -77,7 +77,7 @@ def _like_the_real_one() -> str:
 
 
 def measure(scenarios: Sequence[ScenarioFolder]) -> Numbers:
-    """Of some scenarios together: means of numbers of actors, and shares and percentiles of all rows."""
+    """The numbers of scenarios together: mean numbers of actors, and shares and percentiles of all rows."""
     numbers: Numbers = {"scenarios": len(scenarios), "frames": mean(map(_frames, scenarios))}
     by_scenario = [_actors(scenario) for scenario in scenarios]
     numbers |= {key: mean(each[key] for each in by_scenario) for key in by_scenario[0]}
@@ -97,7 +97,7 @@ def _labels(scenario: ScenarioFolder, agent: str) -> Labels:
 
 
 def _actors(scenario: ScenarioFolder) -> Numbers:
-    """How many of each kind anybody annotates, and how fast those drive that move."""
+    """How many annotated actors of each kind there are."""
     own_ids = dict(zip(AGENTS, read_meta(scenario.meta_path).agent_ids or (), strict=False))
     fastest: dict[int, float] = {}
     category: dict[int, int] = {}
@@ -194,7 +194,7 @@ def _clouded(scenarios: Sequence[ScenarioFolder]) -> list[tuple[ScenarioFolder, 
 
 
 def _calibs(scenarios: Sequence[ScenarioFolder]) -> Numbers:
-    """How a vehicle's LiDAR and front camera move against it from frame to frame."""
+    """How much a vehicle's LiDAR and front camera move relative to it from frame to frame."""
     shifts, turns, heights = [], [], []
     for scenario in scenarios:
         for agent in AGENTS[:-1]:
@@ -216,7 +216,7 @@ def _calibs(scenarios: Sequence[ScenarioFolder]) -> Numbers:
 
 
 def _sizes(scenarios: Sequence[ScenarioFolder]) -> Numbers:
-    """Means of the sizes of files, kB; images of the pole, at the frames whose clouds are measured."""
+    """Mean sizes of files, kB; of images only those of the pole, at the frames whose clouds are measured."""
     frames = [(s, agent, frame) for s in scenarios for agent in AGENTS for frame in range(1, _frames(s) + 1)]
     paths = {
         "label": [s.label_path(agent, frame) for s, agent, frame in frames],
@@ -243,9 +243,9 @@ _ROWS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("motorcycles and cyclists", "{:.1f}", ("two-wheelers",)),
     ("pedestrians", "{:.1f}", ("pedestrians",)),
     ("parked vehicles", "{:.1f}", ("parked",)),
-    ("speed of who drives: median, 95 % (m/s)", "{:.1f}, {:.1f}", ("speed, median", "speed, 95 %")),
-    ("speed of who walks: median (m/s)", "{:.1f}", ("walking, median",)),
-    ("boxes a label: mean (least–most)", "{:.0f} ({:.0f}–{:.0f})", ("boxes, mean", "boxes, least", "boxes, most")),
+    ("speed of moving vehicles: median, 95 % (m/s)", "{:.1f}, {:.1f}", ("speed, median", "speed, 95 %")),
+    ("speed of moving pedestrians: median (m/s)", "{:.1f}", ("walking, median",)),
+    ("boxes in a label: mean (least–most)", "{:.0f} ({:.0f}–{:.0f})", ("boxes, mean", "boxes, least", "boxes, most")),
     (
         "distance of boxes: 10, 50, 90, 100 % (m)",
         "{:.0f}, {:.0f}, {:.0f}, {:.0f}",
@@ -260,7 +260,7 @@ _ROWS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     *((f"… at {name} m", "{:.0f}", (f"points on a car {name}",)) for name in list(_BINS)[1:]),
     ("points on the agent's own box: median", "{:.0f}", ("points on itself",)),
     (
-        "counts that differ from a recount, by (median)",
+        "counts that differ from a recount; median difference",
         "{:.0%}, {:.1%}",
         ("counts that differ", "counts, by"),
     ),
@@ -270,18 +270,18 @@ _ROWS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ),
     ("LiDAR above its vehicle's box height (m)", "{:.2f}", ("LiDAR above its vehicle",)),
     ("calib, from frame to frame: greatest shift (mm)", "{:.2f}", ("calib, shift",)),
-    ("calib, from frame to frame: greatest change of a rotation's number", "{:.0e}", ("calib, turn",)),
+    ("calib, from frame to frame: greatest change of an element of a rotation", "{:.0e}", ("calib, turn",)),
     ("label file (kB)", "{:.1f}", ("kB, label",)),
     ("calib file (kB)", "{:.1f}", ("kB, calib",)),
     ("LiDAR file (kB)", "{:.0f}", ("kB, LiDAR",)),
     ("image of the pole's front camera, 1600×900 (kB)", "{:.0f}", ("kB, image",)),
 )
-"""What the table says: heading, form of a cell, and the numbers in it."""
+"""The rows of the table: heading, format of a cell, and the numbers in it."""
 _SCALE = {"calib, shift": 1000.0}
 
 
 def table(real: Numbers, generated: Numbers) -> str:
-    """The real scenario beside the generated ones, a number a line."""
+    """The table of the real scenario and the generated ones, one number in each row."""
     lines = ["| | real | generated |", "|---|---|---|"]
     for heading, form, keys in _ROWS:
         cells = [

@@ -2,6 +2,7 @@
 
 import multiprocessing
 import pickle
+import re
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
@@ -32,6 +33,15 @@ def test_dataroots_that_are_none(tmp_path: Path, release_root: Path) -> None:
     with pytest.raises(DatarootError, match="is a file"):
         DeepAccident(dataroot=release_root / "train.txt")
     with pytest.raises(VersionError, match="unknown version 'v2'; known are v1, v1-mini"):
+        DeepAccident("v2", release_root)
+    for path, written in ((str(release_root), str(release_root)), (Path("a/b"), "a/b"), ("~", "~"), ("./x", "./x")):
+        remedy = f"; to open the folder, write DeepAccident(dataroot='{written}')"
+        with pytest.raises(VersionError, match=f"{re.escape(remedy)}$"):
+            DeepAccident(path)  # type: ignore[arg-type]
+    for nuscenes, ours in (("v1.0-mini", "v1-mini"), ("v1.0-trainval", "v1"), ("V1", "v1")):
+        with pytest.raises(VersionError, match=rf"known are v1, v1-mini; did you mean '{ours}'\?$"):
+            DeepAccident(nuscenes, release_root)
+    with pytest.raises(VersionError, match=r"known are v1, v1-mini$"):
         DeepAccident("v2", release_root)
     with pytest.raises(VersionError, match="holds no mini release"):
         DeepAccident("v1-mini", release_root)
@@ -67,6 +77,36 @@ def test_unknown_sample_tokens(da: DeepAccident, token: str, why: str) -> None:
         with pytest.raises(TokenError, match=why) as raised:
             call()
         assert str(raised.value).startswith("table 'sample' has no token")
+
+
+def test_a_sensor_file_and_a_sample_are_not_taken_for_each_other(da: DeepAccident) -> None:
+    sample, cloud = da.sample[0], da.get("sample_data", f"{da.sample[0]['token']}/lidar01")
+    front = f"{sample['token']}/Camera_Front"
+    with pytest.raises(TokenError, match=r"it names a sensor file: leave out '/lidar01'$"):
+        da.map_pointcloud_to_image(front, cloud)
+    with pytest.raises(TokenError, match=r"it names a sample: add a channel, such as '/Camera_Front'$"):
+        da.map_pointcloud_to_image(sample, front)
+    for token in (f"{sample['token']}/7", f"{front}/lidar01"):
+        with pytest.raises(TokenError, match=r"expected the form <scenario>/<agent>/<NNN>$"):
+            da.get("sample", token)
+    with pytest.raises(TokenError, match=r"expected the form <scenario>/<agent>/<NNN>/<channel>$"):
+        da.get("sample_data", f"{sample['scenario_token']}/actor/x")
+
+
+def test_a_scenarios_name_alone_is_completed(da: DeepAccident) -> None:
+    scenario = da.scenario[0]
+    kinds = [one["scenario_type"] for one in da.scenario if one["name"] == scenario["name"]]
+    for rest, call in (
+        ("", lambda: da.get("scenario", scenario["name"])),
+        ("/ego_vehicle/003", lambda: da.get_sample(scenario["name"], "ego_vehicle", 3)),
+        ("/actor/7", lambda: da.get("instance", f"{scenario['name']}/actor/7")),
+        ("/ego_vehicle/lidar01/2", lambda: da.get("calibrated_sensor", f"{scenario['name']}/ego_vehicle/lidar01/2")),
+    ):
+        written = " or ".join(f"'{kind}/{scenario['name']}{rest}'" for kind in kinds)
+        with pytest.raises(TokenError, match=f"a scenario's name is not unique, .*; write {written}$"):
+            call()
+    with pytest.raises(TokenError, match="expected the form"):
+        da.get_sample("Town99", "ego_vehicle", 3)
 
 
 @pytest.mark.parametrize("table", ["scenario", "sample_data", "instance", "annotation", "track", "calibrated_sensor"])
@@ -226,6 +266,42 @@ def test_sensor_data_is_where_it_should_be(da: DeepAccident) -> None:
         image = da.load_image(f"{sample['token']}/{CAMERAS[0]}")
         assert image.shape == (36, 64, 3)
         assert da.load_bev(sample).semantic.shape == (1200, 1200)
+
+
+@pytest.mark.parametrize("channel", ["Camera_Back", "lidar01"])
+def test_a_sensor_file_is_named_by_its_sample_and_channel_too(da: DeepAccident, channel: str) -> None:
+    sample = da.sample[1]
+    token = f"{sample['token']}/{channel}"
+    path, boxes, intrinsic = da.get_sample_data(token)
+    for named in (sample, sample["token"]):
+        assert da.get_sample_data_path(named, channel) == da.get_sample_data_path(token) == path
+        same_path, same_boxes, same_intrinsic = da.get_sample_data(named, channel)
+        assert same_path == path
+        assert [repr(box) for box in same_boxes] == [repr(box) for box in boxes]
+        assert (intrinsic is None) == (channel == "lidar01")
+        np.testing.assert_array_equal(same_intrinsic, intrinsic)
+    if channel != "lidar01":
+        np.testing.assert_array_equal(da.load_image(sample, channel), da.load_image(token))
+    for call in (da.get_sample_data_path, da.get_sample_data, da.load_image, da.camera):
+        with pytest.raises(TokenError, match="the channels are Camera_Front, "):
+            call(sample, "CAM_FRONT")
+        with pytest.raises(TokenError, match="it names a sample: add a channel"):
+            call(sample)
+
+
+def test_a_camera_is_its_calibs(da: DeepAccident) -> None:
+    sample = da.sample[0]
+    record = da.get("sample_data", f"{sample['token']}/Camera_Front")
+    camera = da.camera(record)
+    assert (camera.width, camera.height) == (record["width"], record["height"]) == (64, 36)
+    np.testing.assert_array_equal(camera.intrinsic, da.get_sample_data(record)[2])
+    for other in (da.camera(record["token"]), da.camera(sample, "Camera_Front")):
+        np.testing.assert_array_equal(other.intrinsic, camera.intrinsic)
+    seen = camera.boxes_in_image(da.boxes(sample, frame="Camera_Front"))
+    assert 0 < seen.sum() < len(seen)
+    for channel in ("lidar01", "BEV_instance_camera"):
+        with pytest.raises(ChoiceError, match=f"camera: expected one of Camera_Front, .*, found {channel}$"):
+            da.camera(sample, channel)
 
 
 def test_listings_print(da: DeepAccident, capsys: pytest.CaptureFixture[str]) -> None:

@@ -325,3 +325,11 @@ def test_labels_of_what_has_none(tmp_path: Path) -> None:
         assert (failed.returncode, told in failed.stderr) == (2, True), failed.stderr
     assert not (tmp_path / "labels").exists()
     assert run(*verb, "--seen-by", "single").returncode == 0
+
+
+def test_a_verb_that_is_nearly_written_is_named() -> None:
+    result = CliRunner().invoke(deepaccident, ["rendr", "out"])
+    assert result.exit_code == 2
+    assert "No such command 'rendr'. Did you mean 'render'?" in result.output
+    result = CliRunner().invoke(deepaccident, ["xyz"])
+    assert (result.exit_code, "No such command 'xyz'.\n" in result.output) == (2, True)

@@ -9,6 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from click import Context, Group
 from click.testing import CliRunner
@@ -33,7 +34,7 @@ from deepaccident_devkit.evaluation.metrics.warning import (
     FieldWarnings,
     WarningProtocol,
 )
-from deepaccident_devkit.geometry import Box
+from deepaccident_devkit.geometry import Box, Boxes, LidarPointCloud, PinholeCamera
 from deepaccident_devkit.motion import LabelProtocol, MotionLabelConfig, PostProcessing
 from deepaccident_devkit.synth import SynthConfig, make_release
 
@@ -70,11 +71,15 @@ STAND_FOR = {
 """What the words in capitals of a command line may be."""
 NOT_RUN = {
     "synth ": "tests/test_cli_synth.py has them; some take minutes",
+    "render accident OUT": "tests/unit/synth/test_own_files.py has it, on a release of a scenario file",
     "baseline v2x": "tests/test_cli_baseline.py has it, on smaller releases",
     "export mcap": "tests/unit/export has it, which has the extra",
 }
 """Command lines of pages that begin so are parsed alone, and why."""
-NO_CALLS = ("<sample>/Camera_Front", ".intensity", '"paper"', "link=", "agents=")
+NO_CALLS = (
+    *("<sample>/Camera_Front", ".intensity", '"paper"', "link=", "agents=", "sweeps=5"),
+    *('.figure.savefig("a.png")', '.savefig("a.png")', "found.pixels[found.mask]", "len(cloud)"),
+)
 
 
 def python_blocks(page: Path) -> str:
@@ -207,9 +212,15 @@ def test_the_code_on_from_nuscenes_runs(in_demo: Path) -> None:
     """That of its tables, too, but for the pictures."""
     names = run_page(DOCS / "from_nuscenes.md")
     assert isinstance(names["box"], Box)
-    calls = [code for code in COUNTERPARTS if re.match(r"(da|box)\.\w+\(", code) and not code.startswith("da.render_")]
-    assert len(calls) > 30
-    for code in calls:
+    assert names["each"]["token"].endswith("/ego_vehicle/032")  # the loop has come to the last sample
+    assert len(names["visible"]) > 0
+    assert names["camera"].in_image(names["pixels"]).all()
+    short = names["da"].world_from(names["sample"], "lidar01")
+    np.testing.assert_allclose(names["world_from_lidar"].matrix, short.matrix, atol=1e-3)
+    objects = re.compile(r"(da|box|boxes|camera|cloud|found)\.|len\(")
+    codes = [code for code in COUNTERPARTS if objects.match(code) and not code.startswith("da.render_")]
+    assert len(codes) > 60
+    for code in codes:
         eval(compile(code, "from_nuscenes.md", "eval"), names)  # noqa: S307
 
 
@@ -277,14 +288,25 @@ def test_a_page_begins_with_whom_it_is_for_and_how_long_it_takes(page: Path) -> 
     assert abs(int(told[1]) - words) <= max(1, words / 3)
 
 
+KINDS = {
+    "da": DeepAccident,
+    "DeepAccident": DeepAccident,
+    "box": Box,
+    "boxes": Boxes,
+    "camera": PinholeCamera,
+    "cloud": LidarPointCloud,
+}
+"""What the names on the page are."""
+
+
 def named(expression: ast.expr) -> Any:
-    """What a dotted name on the page stands for: of `da` and `box` the member of their class."""
+    """What a dotted name on the page stands for: of `da`, `box` and others the member of their class."""
     if isinstance(expression, ast.Attribute):
-        if isinstance(expression.value, ast.Name) and expression.value.id not in ("da", "box"):
+        if isinstance(expression.value, ast.Name) and expression.value.id not in KINDS:
             return getattr(import_module(f"deepaccident_devkit.{expression.value.id}"), expression.attr)
         return getattr(named(expression.value), expression.attr)
     assert isinstance(expression, ast.Name)
-    return {"da": DeepAccident, "DeepAccident": DeepAccident, "box": Box}[expression.id]
+    return KINDS[expression.id]
 
 
 def test_the_counterparts_are_found_on_the_page() -> None:
@@ -304,6 +326,19 @@ def test_every_counterpart_of_a_nuscenes_call_exists(code: str) -> None:
     keywords = {keyword.arg: keyword.value for keyword in expression.keywords if keyword.arg}
     of_instance = isinstance(expression.func, ast.Attribute)
     inspect.signature(named(expression.func)).bind(*([None] if of_instance else []), *expression.args, **keywords)
+
+
+def test_the_page_says_which_pictures_are_axes_and_which_figures() -> None:
+    lists = re.findall(r"^- (.*?return \w+.*?)\.$", FROM_NUSCENES.replace("\n  ", " "), re.MULTILINE)
+    told = {name: line for line in lists for name in re.findall(r"`(render_\w+)`", line)}
+    assert sorted(told) == sorted(name for name in dir(DeepAccident) if name.startswith("render_"))
+    for name, line in told.items():
+        signature = inspect.signature(getattr(DeepAccident, name))
+        kind, parameter = {"Axes": ("axes", "ax"), "Figure": ("a figure", "fig"), "Path": ("the path", "path")}[
+            signature.return_annotation
+        ]
+        assert f"return {kind}" in line, name
+        assert parameter in signature.parameters, name
 
 
 @pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "ARCHITECTURE.md"])

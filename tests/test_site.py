@@ -11,7 +11,9 @@ from scripts import loaded_script
 import deepaccident_devkit
 
 DOCS = Path(__file__).parents[1] / "docs"
-NOT_FOR_USERS = {"arrays", "cli", "dataset", "deepaccident", "files", "overview", "parallel", "tables", "text"}
+NOT_FOR_USERS = {
+    *("arrays", "cli", "dataset", "deepaccident", "files", "nuscenes_names", "overview", "parallel", "tables", "text"),
+}
 """Command line, base of the facade, and what only the devkit itself calls."""
 
 

@@ -53,7 +53,10 @@ def where_parameter(verb: Verb) -> Verb:
 def agents_parameter(verb: Verb) -> Verb:
     """Give a verb `agents`, the texts of repeated --agents (`agent_names` reads them)."""
     option = click.option(
-        "--agents", multiple=True, metavar="NAME[,NAME…]", help="Only samples of these agents.  [default: all]"
+        "--agents",
+        multiple=True,
+        metavar="NAME[,NAME…]",
+        help="Only samples of these agents; it does not choose who cooperates.  [default: all]",
     )
     return option(verb)
 
@@ -67,7 +70,8 @@ def agent_names(given: tuple[str, ...]) -> tuple[str, ...]:
     unknown = [name for name in names if name not in (*AGENTS, *_ALL)]
     if unknown:
         raise click.BadParameter(
-            f"--agents: expected {', '.join(_ALL)} or some of {', '.join(AGENTS)}; found {unknown[0]!r}"
+            f"--agents: expected {', '.join(_ALL)} or some of {', '.join(AGENTS)}, whose samples are taken; "
+            f"found {unknown[0]!r}"
         )
     return AGENTS if not names or set(names) & set(_ALL) else tuple(names)
 

@@ -1,1 +1,1 @@
-"""The dataset in the formats of other frameworks; each needs an extra of its own."""
+"""The dataset in the formats of other frameworks; each needs its own extra."""

@@ -17,22 +17,22 @@ Orientation = Literal["devkit", "released", "fiery"]
 Axis = tuple[float, float, float]
 ORIENTATIONS: tuple[Orientation, ...] = get_args(Orientation)
 _WHOLE = 1e-6
-"""The largest distance of a range from a whole number of cells: decimal resolutions are not exact in binary."""
+"""The largest distance of a range from a whole number of cells, because decimal cell sizes are not exact in binary."""
 
 
 @dataclass(frozen=True, slots=True)
 class BevGrid:
-    """Square or oblong cells over a piece of ground; equal ones are equal and hash alike.
+    """Square or rectangular cells over a part of the ground; equal grids compare equal and have equal hashes.
 
-    Ranges are always right-handed metres, x forward and y **left**, in every orientation; that only says how the
-    cells lie in an array (for the default ranges, 200 × 200):
+    Ranges are always right-handed metres, x forward and y **left**. The orientation only says how the cells lie in an
+    array (for the default ranges, 200 × 200):
 
     - `"devkit"`: row = y index, column = x index, both rising: row 0 is the far right (y = −50), column 0 the far
       rear (x = −50).
     - `"released"`: the released labels' left-handed rows, column = x index: row 0 is the far **left** (y = 50).
-      Exactly the devkit's rows in reverse order: `released[..., ::-1, :]` is the devkit's.
+      Exactly the devkit's rows in reverse order: `released[..., ::-1, :]` is the devkit's array.
     - `"fiery"`: row = x index, column = y index, both rising: row 0 is the far rear, column 0 the far right. Exactly
-      the devkit's, transposed.
+      the devkit's array, transposed.
 
     Attributes:
         x: start, end and cell size along x, metres.
@@ -55,7 +55,7 @@ class BevGrid:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of an array of this orientation; (y cells, x cells), for `"fiery"` (x cells, y cells)."""
+        """Rows and columns of an array in this orientation: (y cells, x cells), for `"fiery"` (x cells, y cells)."""
         along_x, along_y = self._counts
         return (along_x, along_y) if self.orientation == "fiery" else (along_y, along_x)
 
@@ -65,20 +65,20 @@ class BevGrid:
         return math.prod(self._counts)
 
     def with_orientation(self, orientation: Orientation) -> BevGrid:
-        """The same cells, in another order in an array. Raises ChoiceError."""
+        """The same cells with another order in an array. Raises ChoiceError."""
         if orientation in ORIENTATIONS:
             return _with_orientation(self, orientation)
-        return replace(self, orientation=orientation)  # which refuses it
+        return replace(self, orientation=orientation)  # the new grid checks it
 
     def index_of(self, points: ArrayLike) -> tuple[IntArray, BoolArray]:
-        """The cells that points (N, 2) or (N, 3) lie in; x forward, y left, metres.
+        """The cells in which points (N, 2) or (N, 3) lie; x forward, y left, metres.
 
-        A cell owns its lower edges in x and y, in every orientation. (Label rasters round polygon corners by a
-        rule of their own, docs/released_code.md, Motion labels; this one is for points.)
+        In every orientation, a cell includes its lower edges in x and y. (Label rasters round polygon corners by
+        another rule, docs/released_code.md, Motion labels; this one is for points.)
 
         Returns:
-            (N, 2) int64 row and column in this orientation, −1 −1 for points beside the grid; and (N,) bool, which
-            points are on it (NaN is not).
+            (N, 2) int64 row and column in this orientation, −1 −1 for points outside the grid; and (N,) bool, which
+            points are in it (NaN is not).
 
         Raises:
             GeometryError: `points` has another shape.
@@ -106,10 +106,10 @@ class BevGrid:
         return self._laid_out(np.stack(np.meshgrid(across, along), axis=-1))
 
     def reorient(self, raster: AnyArray, orientation: Orientation) -> AnyArray:
-        """A raster (…, rows, columns) of this grid as a view that lies as `orientation` says.
+        """A raster (…, rows, columns) of this grid as a view in another orientation.
 
-        Only cells change places: the values of offset and flow channels point along rows and columns, and the caller
-        has to negate or swap them.
+        Only cells change places. The values of offset and flow channels point along rows and columns: the caller has
+        to negate or swap them.
 
         Raises:
             GeometryError: the raster has another shape than the grid.
@@ -122,14 +122,14 @@ class BevGrid:
         return turned(turned(array, self.orientation), target.orientation)
 
     def _laid_out(self, devkit: FloatArray) -> FloatArray:
-        """An array (rows, columns, …) of the devkit's orientation in this one."""
+        """An array (rows, columns, …) in the devkit's orientation, changed to this one."""
         if self.orientation == "fiery":
             return devkit.swapaxes(0, 1)
         return devkit if self.orientation == "devkit" else devkit[::-1]
 
 
 def turned(raster: AnyArray, orientation: Orientation) -> AnyArray:
-    """A raster (…, rows, columns) of the devkit's orientation in another, or back: each is its own inverse."""
+    """A raster (…, rows, columns) from the devkit's orientation to another, or back: each is its own inverse."""
     if orientation == "fiery":
         return raster.swapaxes(-1, -2)
     return raster if orientation == "devkit" else raster[..., ::-1, :]
@@ -138,7 +138,7 @@ def turned(raster: AnyArray, orientation: Orientation) -> AnyArray:
 def cells_in(
     row: AnyArray, column: AnyArray, shape: tuple[int, int], source: Orientation, target: Orientation
 ) -> tuple[AnyArray, AnyArray]:
-    """Where cells of one orientation, `shape` its rows and columns, are in another: row and column."""
+    """Row and column in another orientation, of cells of one orientation with `shape` (rows, columns)."""
     rows, columns = shape
     if source == "fiery":
         row, column, rows, columns = column, row, columns, rows
@@ -149,7 +149,7 @@ def cells_in(
 
 @functools.lru_cache(maxsize=256)
 def _with_orientation(grid: BevGrid, orientation: Orientation) -> BevGrid:
-    """Kept, since labels ask for the same few many times a sample."""
+    """The grid in another orientation, cached, because labels need the same few many times for each sample."""
     return replace(grid, orientation=orientation)
 
 

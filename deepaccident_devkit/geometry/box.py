@@ -1,4 +1,4 @@
-"""`Box`: one oriented box with the nuScenes devkit's vocabulary, immutable."""
+"""`Box`: one oriented box, immutable, with the names of the nuScenes devkit."""
 
 from __future__ import annotations
 
@@ -12,17 +12,19 @@ from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.geometry.boxes import Boxes, checked_boxes
 from deepaccident_devkit.geometry.se3 import SE3
+from deepaccident_devkit.nuscenes_names import BOX, without_names
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 if TYPE_CHECKING:
     from pyquaternion import Quaternion
 
 
+@without_names(BOX)
 class Box:
-    """One oriented box in a right-handed frame: a one-row view of `Boxes`.
+    """One oriented box in a right-handed coordinate frame: a view of one row of `Boxes`.
 
-    Where the nuScenes devkit's box changes in place, `translate` and `rotate` return a new one here; where its size
-    is width, length, height, `size` is length, width, height (`wlh` gives the nuScenes order).
+    Two differences from the nuScenes devkit's box: `translate` and `rotate` return a new box and change nothing in
+    place, and `size` is length, width, height (`wlh` gives the nuScenes order).
     """
 
     __slots__ = ("_boxes", "instance_token", "token")
@@ -37,7 +39,7 @@ class Box:
 
     @property
     def frame(self) -> str:
-        """The frame that centre, orientation and velocity are in."""
+        """The coordinate frame of centre, orientation and velocity."""
         return self._boxes.frame
 
     @property
@@ -74,7 +76,7 @@ class Box:
 
     @property
     def velocity(self) -> FloatArray:
-        """(3,) m/s over the ground, NaN where unknown, read-only."""
+        """(3,) m/s over the ground, NaN if unknown, read-only."""
         return as_floats(self._boxes.velocity[0])
 
     @property

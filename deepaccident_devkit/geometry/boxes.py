@@ -1,4 +1,4 @@
-"""`Boxes`: the oriented boxes of a sample as a struct of arrays; `Box` is the one-row view of it."""
+"""`Boxes`: the oriented boxes of a sample as a struct of arrays; `Box` is a view of one row."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ CORNER_SIGNS = np.array(
     [[1, 1, 1], [1, -1, 1], [1, -1, -1], [1, 1, -1], [-1, 1, 1], [-1, -1, 1], [-1, -1, -1], [-1, 1, -1]],
     dtype=np.float64,
 )
-"""Signs of (length, width, height) of the eight corners: four in front, then four behind, each from upper left
-clockwise seen from the front's inside (the nuScenes devkit's order, with y left)."""
+"""Signs of (length, width, height) of the eight corners: four in front, then four behind, each four clockwise from the
+upper left, for a viewer inside who looks forward (the nuScenes devkit's order, with y left)."""
 BOTTOM_CORNERS = (2, 3, 7, 6)
 
 _COLUMNS: dict[str, tuple[tuple[int | None, ...], type]] = {
@@ -47,23 +47,23 @@ _COLUMNS: dict[str, tuple[tuple[int | None, ...], type]] = {
 }
 _FINITE = ("center", "size", "rotation")
 _UNIT_TOLERANCE = 1e-3
-"""The largest distance of a quaternion's norm from 1; it is then scaled to 1."""
+"""How far the norm of a quaternion may be from 1; it is then scaled to 1."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Boxes(FrozenArrays):
-    """N oriented boxes in one right-handed frame; immutable, arrays are read-only copies of those given.
+    """N oriented boxes in one right-handed coordinate frame; immutable, arrays are read-only copies of those given.
 
     Attributes:
-        frame: the frame of all of it: `world`, `ego`, `lidar` or a camera channel (then optical axes).
+        frame: the coordinate frame: `world`, `ego`, `lidar` or a camera channel (then with optical axes).
         center: (N, 3) float64, metres.
         size: (N, 3) float64, full length, width, height, metres.
         rotation: (N, 4) float64, unit quaternions w, x, y, z: the box's axes (x along its length) in `frame`.
-        velocity: (N, 3) float64, m/s over the ground (not relative to the agent), NaN where unknown.
+        velocity: (N, 3) float64, m/s over the ground (not relative to the agent), NaN if unknown.
         category: (N,) int8, index into `taxonomy.CATEGORIES`.
-        actor_id: (N,) int64, the label's id; −100 is the recording agent, −1 untracked.
+        actor_id: (N,) int64, the label's id; −100 is the recording agent, −1 an untracked actor.
         num_lidar_pts: (N,) int64, LiDAR points of the recording agent in the box.
-        camera_visible: (N,) bool, seen by any of the recording agent's cameras.
+        camera_visible: (N,) bool, whether any of the recording agent's cameras sees it.
         row: (N,) int64, row of each box among those of its label file, counted from 0.
     """
 
@@ -147,7 +147,7 @@ class Boxes(FrozenArrays):
         """The boxes that a mask (N,) or an integer array of rows picks.
 
         Raises:
-            GeometryError: `which` is neither, or names a row that is not there.
+            GeometryError: `which` is neither of the two, or has a row that does not exist.
         """
         picked = np.asarray(which)
         if picked.ndim != 1:
@@ -159,7 +159,7 @@ class Boxes(FrozenArrays):
         return trusted_boxes(self.frame, columns)
 
     def transform(self, target_from_source: SE3, frame: str) -> Boxes:
-        """The same boxes in another frame: sizes stay. Raises GeometryError."""
+        """The same boxes in another coordinate frame, with the same sizes. Raises GeometryError."""
         checked_transform("target_from_source", target_from_source)
         checked_frame("frame", frame)
         turn = target_from_source.rotation
@@ -190,7 +190,7 @@ class Boxes(FrozenArrays):
         return self.corners()[:, BOTTOM_CORNERS]
 
     def contains(self, points: ArrayLike) -> BoolArray:
-        """Which points (P, 3) of the same frame lie in which box, faces included: (N, P) bool."""
+        """Whether each point (P, 3) of the same coordinate frame lies in each box, faces included: (N, P) bool."""
         given = checked("points", points, (None, 3))
         inside = np.zeros((len(self), len(given)), dtype=bool)
         inside[self._points_within(given)] = True
@@ -205,7 +205,7 @@ class Boxes(FrozenArrays):
         """Intersection over union of the footprints of these N boxes and M others: (N, M) in [0, 1].
 
         A footprint is the rectangle of length × width at the box's yaw: a tilted box counts as if it stood upright in
-        the frame, with the same centre, size and yaw. Two boxes without any area have 0.
+        the frame, with the same centre, size and yaw. For two boxes without any area the result is 0.
 
         Raises:
             GeometryError: the frames differ, or are a camera's (whose z points forward).
@@ -218,8 +218,8 @@ class Boxes(FrozenArrays):
         """Intersection over union of the volumes of these N boxes and M others: (N, M) in [0, 1].
 
         The common volume is the footprints' common area times the common height. That is exact for boxes that stand
-        upright in the frame, as the labels' do in the LiDAR frame; a tilted box counts as if it stood upright, with
-        the same centre, size and yaw. Two boxes without any volume have 0.
+        upright in the frame, like those of labels in the LiDAR frame; a tilted box counts as if it stood upright, with
+        the same centre, size and yaw. For two boxes without any volume the result is 0.
 
         Raises:
             GeometryError: the frames differ, or are a camera's (whose z points forward).
@@ -231,20 +231,20 @@ class Boxes(FrozenArrays):
         return _over_union(common * np.maximum(shared, 0), _product(self.size), _product(other.size))
 
     def distance_bev(self, other: Boxes) -> FloatArray:
-        """The gap between the footprints of these N boxes and M others: (N, M) metres, 0 where they touch or overlap.
+        """The gap between the footprints of these N boxes and M others: (N, M) metres, 0 if they touch or overlap.
 
-        Footprints are those of `iou_bev`. Raises GeometryError likewise.
+        Footprints and errors are those of `iou_bev`.
         """
         self._check_ground(other)
         return gaps(self._footprints(), other._footprints())
 
     def center_distance(self, other: Boxes, *, in_3d: bool = False) -> FloatArray:
-        """From the centres of these N boxes to those of M others: (N, M) metres.
+        """The distance from the centres of these N boxes to those of M others: (N, M) metres.
 
         Args:
-            other: boxes of the same frame.
-            in_3d: count the difference in height too; without it, distances are those on the ground, as the nuScenes
-                devkit's of this name.
+            other: boxes of the same coordinate frame.
+            in_3d: whether to use the difference in height too; if not, distances are those on the ground, like those
+                of the nuScenes devkit's function of this name.
 
         Raises:
             GeometryError: the frames differ or, for distances on the ground, are a camera's.
@@ -257,7 +257,7 @@ class Boxes(FrozenArrays):
         return as_floats(np.linalg.norm(self.center[:, None, :axes] - other.center[:, :axes], axis=-1))
 
     def _points_within(self, points: FloatArray) -> tuple[IntArray, IntArray]:
-        """Rows of boxes and of points (P, 3), a pair for each point in a box."""
+        """Rows of boxes and rows of points (P, 3), one pair for each point in a box."""
         return points_in_boxes(points, self.center, self.size / 2, quaternions.to_matrix(self.rotation))
 
     def _footprints(self) -> FloatArray:
@@ -283,7 +283,7 @@ class Boxes(FrozenArrays):
 
 
 def trusted_boxes(frame: str, columns: dict[str, AnyArray]) -> Boxes:
-    """Boxes over columns that are correct by construction: the hot path, without checks.
+    """Boxes with columns that are surely correct: fast, without checks.
 
     `columns` holds every column of `Boxes`; the arrays must be fresh or read-only, and become read-only.
     """
@@ -317,7 +317,10 @@ def _product(sizes: FloatArray) -> FloatArray:
 def checked_boxes(name: str, boxes: object) -> Boxes:
     """`boxes` if they are `Boxes`; raises GeometryError."""
     if not isinstance(boxes, Boxes):
-        raise GeometryError(f"{name}: expected Boxes, found {type(boxes).__name__}; Boxes.from_arrays makes some")
+        raise GeometryError(
+            f"{name}: expected Boxes, found {type(boxes).__name__}; da.boxes(sample, frame=…) gives those of a sample, "
+            "Boxes.from_arrays makes some"
+        )
     return boxes
 
 
@@ -338,7 +341,7 @@ def _check_numbers(columns: dict[str, AnyArray]) -> None:
 
 
 def _unit(rotation: FloatArray) -> FloatArray:
-    """The quaternions (N, 4), which must be unit ones, apart from rounding."""
+    """The quaternions (N, 4) scaled to norm 1; before, they must have it up to `_UNIT_TOLERANCE`."""
     norm = np.linalg.norm(rotation, axis=1)
     off = np.abs(norm - 1)
     if (off > _UNIT_TOLERANCE).any():
@@ -350,7 +353,7 @@ def _unit(rotation: FloatArray) -> FloatArray:
 
 
 def _category_codes(category: ArrayLike) -> AnyArray:
-    """Codes of categories, given by code or by name."""
+    """The codes of categories that are given as codes or names."""
     given = np.asarray(category)
     if given.dtype.kind not in "US":
         if not np.isin(given, range(len(CATEGORIES))).all():

@@ -1,4 +1,4 @@
-"""Pinhole cameras with ordinary optical axes: x right, y down, z forward."""
+"""Pinhole cameras with the usual optical axes: x right, y down, z forward."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from deepaccident_devkit.geometry.boxes import Boxes, checked_boxes
 from deepaccident_devkit.taxonomy import BEV_CAMERA, LIDAR, Frame
 
 VISIBLE_DEPTH = 1.0
-"""A corner in the image counts as seen at this distance, metres, or farther (as in the nuScenes devkit)."""
+"""A corner in the image counts as seen from this distance on, metres (as in the nuScenes devkit)."""
 IN_FRONT_DEPTH = 0.1
-"""Metres in front of the camera that all corners of a visible box must be (the nuScenes devkit's)."""
+"""All corners of a visible box must be so many metres in front of the camera (as in the nuScenes devkit)."""
 _NO_PINHOLE: Final = (*get_args(Frame), LIDAR, BEV_CAMERA)
 """The known frames whose axes are not optical."""
 
@@ -34,7 +34,7 @@ _NO_PINHOLE: Final = (*get_args(Frame), LIDAR, BEV_CAMERA)
 class BoxVisibility(IntEnum):
     """How much of a box an image shows, with the nuScenes devkit's names and numbers.
 
-    The lower, the stricter: a box that meets `ALL` meets `ANY`, and every box meets `NONE`, so
+    A lower number is stricter: a box that meets `ALL` meets `ANY` too, and every box meets `NONE`. So
     `camera.box_visibility(boxes) <= BoxVisibility.ANY` are the boxes that the nuScenes devkit lists by default.
     """
 
@@ -43,7 +43,7 @@ class BoxVisibility(IntEnum):
     ANY = 1
     """A corner is in the image, and all are in front of the camera."""
     NONE = 2
-    """Nothing is asked."""
+    """No condition."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,8 +52,8 @@ class PinholeCamera(FrozenArrays):
 
     Attributes:
         intrinsic: (3, 3) float64, K = [[f, 0, cx], [0, f, cy], [0, 0, 1]], pixels.
-        width: of the image, pixels.
-        height: of the image, pixels.
+        width: width of the image, pixels.
+        height: height of the image, pixels.
     """
 
     intrinsic: FloatArray
@@ -86,7 +86,7 @@ class PinholeCamera(FrozenArrays):
     def project(self, points: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Points (N, 3) of the optical frame → pixels (N, 2) as (u, v), and depths (N,) metres.
 
-        Pixels of points that are not in front of the camera (depth ≤ 0) are NaN, and so are those of infinite ones.
+        Pixels of points that are not in front of the camera (depth ≤ 0) or are infinite are NaN.
         """
         given = checked("points", points, (None, 3))
         depth: FloatArray = given[:, 2]
@@ -119,8 +119,8 @@ class PinholeCamera(FrozenArrays):
         Args:
             pixels: as (u, v).
             depth: (N,) metres along the optical axis; without it only the pixels count.
-            min_depth: points not deeper than this many metres are left out.
-            margin: a strip of this many pixels along the edges is left out; a negative one takes in as many beside.
+            min_depth: points that are not deeper than this do not count, metres.
+            margin: width of a strip along the edges that does not count, pixels; a negative one makes the image larger.
         """
         uv = checked("pixels", pixels, (None, 2))
         u, v = uv[:, 0], uv[:, 1]
@@ -132,14 +132,14 @@ class PinholeCamera(FrozenArrays):
     def box_visibility(self, boxes: Boxes) -> AnyArray:
         """The strictest `BoxVisibility` that each of N boxes meets: (N,) int8.
 
-        As in the nuScenes devkit, a corner is seen if it is in the image and deeper than 1 m, and a box of which a
-        corner is not deeper than 0.1 m is `NONE`. (Its image lacks the pixels of u = 0 and of v = 0; ours has them.)
+        As in the nuScenes devkit, a corner is seen if it is in the image and deeper than 1 m, and a box with a corner
+        that is not deeper than 0.1 m is `NONE`. (Its image has no pixels with u = 0 or v = 0; ours has them.)
 
         Args:
-            boxes: in this camera's optical frame.
+            boxes: boxes in this camera's optical frame.
 
         Raises:
-            GeometryError: they are not boxes, or not in a camera's frame but in world, ego, LiDAR or the BEV camera's.
+            GeometryError: they are not boxes, or are in the frame of world, ego, LiDAR or the BEV camera.
         """
         if checked_boxes("boxes", boxes).frame in _NO_PINHOLE:
             raise GeometryError(
@@ -158,7 +158,7 @@ class PinholeCamera(FrozenArrays):
 
         Raises:
             ChoiceError: there is no such level.
-            GeometryError: as `box_visibility`.
+            GeometryError: as in `box_visibility`.
         """
         if level not in list(BoxVisibility):
             names = ", ".join(f"BoxVisibility.{one.name}" for one in BoxVisibility)

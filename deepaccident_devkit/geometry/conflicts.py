@@ -10,19 +10,19 @@ from deepaccident_devkit.arrays import FloatArray
 def time_to_collision(
     first: FloatArray, second: FloatArray, first_velocity: FloatArray, second_velocity: FloatArray
 ) -> FloatArray:
-    """Seconds until P pairs of boxes touch, seen from above, each moving on at its velocity without turning.
+    """Seconds until P pairs of boxes touch, seen from above, if each keeps its velocity and does not turn.
 
-    Two boxes touch while none of the four directions of their sides separates them; along each direction that is an
-    interval of time, so that the boxes touch from the latest begin to the earliest end.
+    Two boxes touch while they overlap along each of the four directions of their sides. For each direction that is an
+    interval of time. So the boxes touch from the latest begin to the earliest end of the four.
 
     Args:
-        first: (P, 5) x, y, length, width, yaw; metres and radians, in one frame.
-        second: (P, 5) likewise.
+        first: (P, 5) x, y, length, width, yaw; metres and radians, in one coordinate frame.
+        second: (P, 5) the same of the second boxes.
         first_velocity: (P, 2) metres a second, over the ground, along the axes of that frame.
-        second_velocity: (P, 2) likewise.
+        second_velocity: (P, 2) the same of the second boxes.
 
     Returns:
-        (P,) 0 for boxes that touch now, infinite for those that never do.
+        (P,) 0 for boxes that touch now, infinite for boxes that never touch.
     """
     apart, speed = second[:, :2] - first[:, :2], second_velocity - first_velocity
     yaw = np.stack([first[:, 4], first[:, 4] + np.pi / 2, second[:, 4], second[:, 4] + np.pi / 2], axis=1)

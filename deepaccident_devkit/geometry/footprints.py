@@ -1,4 +1,4 @@
-"""Rectangles on the ground, over arrays: areas in common and gaps.
+"""Rectangles on the ground, over arrays: common areas and gaps.
 
 A footprint is a row (x, y, length, width, yaw): metres and radians in any right-handed frame whose z points up.
 Only differences of positions are used, so that world coordinates lose no digits.
@@ -9,13 +9,13 @@ import numpy as np
 from deepaccident_devkit.arrays import FloatArray
 
 _SIGNS = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]) / 2
-"""Corners over (length, width), counter-clockwise from front left."""
+"""Corners as shares of (length, width), counter-clockwise from front left."""
 _PAIRS_AT_ONCE = 1 << 14
-"""Bounds the memory that areas and gaps of many pairs take."""
+"""Pairs that are computed together; it limits the memory for the areas and gaps of many pairs."""
 
 
 def intersection_areas(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Areas that each of N footprints has in common with each of M: (N, 5) and (M, 5) → (N, M), m²."""
+    """Common areas of each of N footprints with each of M: (N, 5) and (M, 5) → (N, M), m²."""
     reach = np.hypot(first[:, 2], first[:, 3])[:, None] + np.hypot(second[:, 2], second[:, 3])
     apart = np.hypot(first[:, None, 0] - second[:, 0], first[:, None, 1] - second[:, 1])
     rows, columns = np.nonzero(apart <= reach / 2 * (1 + 1e-9))
@@ -27,9 +27,9 @@ def intersection_areas(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def gaps(first: FloatArray, second: FloatArray) -> FloatArray:
-    """The shortest way from each of N footprints to each of M: (N, 5) and (M, 5) → (N, M), metres.
+    """The shortest distance from each of N footprints to each of M: (N, 5) and (M, 5) → (N, M), metres.
 
-    0 if they touch; NaN where one of the two is.
+    0 if they touch; NaN if one of the two has a NaN.
     """
     result = np.zeros((len(first), len(second)))
     step = max(1, _PAIRS_AT_ONCE // max(1, len(second)))
@@ -47,11 +47,11 @@ def gaps_of_pairs(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def _areas_of_pairs(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Area in common of `first[i]` and `second[i]`, (P,) m².
+    """Common area of `first[i]` and `second[i]`, (P,) m².
 
-    In the second's own axes, where it is |x| ≤ h, |y| ≤ k, the area is −∮ clamp(y, ±k) d clamp(x, ±h) around the
-    first: every edge adds a sum of trapezoids. No vertices are computed, so identical and touching rectangles are no
-    special cases: the result depends continuously on the input.
+    In the second's own axes, in which it is |x| ≤ h, |y| ≤ k, the area is −∮ clamp(y, ±k) d clamp(x, ±h) around the
+    first: every edge adds a sum of trapezoids. No corners of the overlap are computed, so identical and touching
+    rectangles are no special cases: the result depends continuously on the input.
     """
     x, y = _corners_in(first, second)
     half = second[:, 2:4, None] / 2
@@ -66,8 +66,8 @@ def _areas_of_pairs(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def _stretch_within(start: FloatArray, change: FloatArray, limit: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The part [t0, t1] of [0, 1] where |start + t·change| ≤ limit; empty ones have t0 = t1."""
-    divisor = np.where(change == 0, 1.0, change)  # then the caller multiplies by the change itself
+    """The part [t0, t1] of [0, 1] where |start + t·change| ≤ limit; if it is empty, t0 = t1."""
+    divisor = np.where(change == 0, 1.0, change)  # with 0 the caller multiplies by 0 later
     with np.errstate(over="ignore"):
         one = np.clip((-limit - start) / divisor, 0, 1)
         two = np.clip((limit - start) / divisor, 0, 1)
@@ -75,7 +75,7 @@ def _stretch_within(start: FloatArray, change: FloatArray, limit: FloatArray) ->
 
 
 def _mean_of_clamped(start: FloatArray, change: FloatArray, limit: FloatArray) -> FloatArray:
-    """The mean over t in [0, 1] of start + t·change held within ±limit."""
+    """The mean over t in [0, 1] of start + t·change, clamped to ±limit."""
     enters, leaves = _stretch_within(start, change, limit)
     at = [np.clip(start + t * change, -limit, limit) for t in (0.0, enters, leaves, 1.0)]
     steps = (enters, leaves - enters, 1 - leaves)
@@ -86,7 +86,7 @@ def _mean_of_clamped(start: FloatArray, change: FloatArray, limit: FloatArray) -
 
 
 def _outside(first: FloatArray, second: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """How far the first lies beside the second along the second's axes (negative: not), and its nearest corner."""
+    """The gap along the second's axes (negative if they overlap), and the distance of the first's nearest corner."""
     x, y = _corners_in(first, second)
     half = second[..., 2:4, None] / 2
     half_x, half_y = half[..., 0, :], half[..., 1, :]

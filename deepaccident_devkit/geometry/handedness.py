@@ -2,10 +2,10 @@
 
 CARLA's frames have x forward, y **right**, z up, and yaw clockwise seen from above. The devkit's have x forward,
 y **left**, z up, yaw counter-clockwise. With S = diag(1, −1, 1) every conversion of a point, a pose or an angle is its
-own inverse, so `flip_*` serves both directions. Cameras also change from CARLA's axes (x depth, y right, z up) to
-optical ones (x right, y down, z forward), which is not its own inverse: those two have a `*_to_raw` each.
+own inverse, so each `flip_*` works in both directions. Cameras also change from CARLA's axes (x depth, y right, z up)
+to optical axes (x right, y down, z forward), which is not its own inverse: these two functions have a `*_to_raw` each.
 
-All functions take arrays with any leading axes, return new float64 arrays and change nothing they are given.
+All functions take arrays with any leading axes, return new float64 arrays and do not change their arguments.
 """
 
 import numpy as np
@@ -23,7 +23,7 @@ _OPTICAL_FROM_RAW = _OPTICAL_FROM_FORWARD * _S
 
 
 def flip_points(points: ArrayLike) -> FloatArray:
-    """Points or vectors (…, 3) of one handedness in the other: y changes its sign."""
+    """Points or vectors (…, 3) in the other handedness: y changes its sign."""
     return as_floats(as_floats(points) * _S)
 
 
@@ -61,7 +61,7 @@ def camera_from_lidar(lidar_to_cam: ArrayLike) -> FloatArray:
 
 
 def camera_from_lidar_to_raw(camera_from_lidar: ArrayLike) -> FloatArray:
-    """Undo `camera_from_lidar`: what CARLA writes as `lidar_to_<Camera>` (…, 4, 4)."""
+    """The inverse of `camera_from_lidar`: CARLA's `lidar_to_<Camera>` (…, 4, 4)."""
     flipped = as_floats(camera_from_lidar) * _S4
     result = flipped.copy()
     result[..., :3, :] = _OPTICAL_FROM_RAW.T @ flipped[..., :3, :]
@@ -69,10 +69,10 @@ def camera_from_lidar_to_raw(camera_from_lidar: ArrayLike) -> FloatArray:
 
 
 def intrinsic(raw_intrinsic: ArrayLike) -> FloatArray:
-    """CARLA's permuted intrinsic (…, 3, 3) → the ordinary K = [[f, 0, cx], [0, f, cy], [0, 0, 1]]."""
+    """CARLA's permuted intrinsic (…, 3, 3) → the usual K = [[f, 0, cx], [0, f, cy], [0, 0, 1]]."""
     return as_floats(as_floats(raw_intrinsic) @ _OPTICAL_FROM_RAW.T)
 
 
 def intrinsic_to_raw(intrinsic: ArrayLike) -> FloatArray:
-    """Undo `intrinsic`: K (…, 3, 3) for CARLA's camera axes (x depth, y right, z up)."""
+    """The inverse of `intrinsic`: K (…, 3, 3) for CARLA's camera axes (x depth, y right, z up)."""
     return as_floats(as_floats(intrinsic) @ _OPTICAL_FROM_RAW)

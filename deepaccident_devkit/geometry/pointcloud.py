@@ -25,16 +25,18 @@ from deepaccident_devkit.files import DAMAGED_ARCHIVE, replacing
 from deepaccident_devkit.geometry.bev_grid import BevGrid
 from deepaccident_devkit.geometry.frames import checked_frame
 from deepaccident_devkit.geometry.se3 import SE3, checked_transform
+from deepaccident_devkit.nuscenes_names import CLOUD, without_names
 
 Range = tuple[float, float]
 _FIELDS = ("xyz", "intensity", "frame")
 _FAULTS = (*DAMAGED_ARCHIVE, TypeError, AttributeError)  # the last two: a bare array, which is no archive
-"""The errors of reading a damaged or foreign file."""
+"""The errors of reading a damaged file or one of another kind."""
 
 
+@without_names(CLOUD)
 @dataclass(frozen=True, slots=True, eq=False)
 class LidarPointCloud(FrozenArrays):
-    """N points in one right-handed frame; arrays are read-only views.
+    """N points in one right-handed coordinate frame; arrays are read-only views.
 
     Clouds are large, so arrays of the right type are not copied: a change of the caller's array changes the cloud.
 
@@ -82,11 +84,12 @@ class LidarPointCloud(FrozenArrays):
     def crop(
         self, grid: BevGrid | None = None, *, x: Range | None = None, y: Range | None = None, z: Range | None = None
     ) -> LidarPointCloud:
-        """The points over the cells of `grid` and within the ranges given, in their order.
+        """The points above or below the cells of `grid` and within the given ranges, in their order.
 
         Args:
-            grid: x forward and y left of the cloud's own frame; its orientation does not matter.
-            x: metres, with the start and without the end, as a grid's cells; likewise `y` and `z`. None: any.
+            grid: x forward and y left of the cloud's own coordinate frame; its orientation does not matter.
+            x: start (included) and end (not included), metres, as in a grid's cells; the same for `y` and `z`. None
+                for all.
             y: see `x`.
             z: see `x`.
         """
@@ -101,11 +104,11 @@ class LidarPointCloud(FrozenArrays):
     def remove_close(self, radius: float, sensor: ArrayLike | None = None) -> LidarPointCloud:
         """The points that are `radius` or more from the sensor, measured on the ground (x and y), in their order.
 
-        The nuScenes devkit removes a square of that half side, this a circle.
+        The nuScenes devkit removes the points in a square with this half side; here it is a circle.
 
         Args:
             radius: metres.
-            sensor: (3,) where the sensor is in the cloud's frame, metres; without it, at the frame's origin.
+            sensor: (3,) position of the sensor in the cloud's coordinate frame, metres; by default the origin.
 
         Raises:
             GeometryError: the cloud is in the world frame and `sensor` is missing, or the radius is negative.
@@ -114,14 +117,17 @@ class LidarPointCloud(FrozenArrays):
         if not distance >= 0:
             raise GeometryError(f"radius: expected metres from 0 on, found {radius}")
         if sensor is None and self.frame == "world":
-            raise GeometryError("a cloud in the world frame does not know its sensor; give sensor=(x, y, z)")
+            raise GeometryError(
+                "a cloud in the world frame does not know its sensor; give sensor=(x, y, z), or load the cloud with "
+                "frame='lidar' and remove there"
+            )
         place = checked("sensor", (0.0, 0.0, 0.0) if sensor is None else sensor, (3,))
         return self.select(np.hypot(*(self.xyz[:, :2] - place[:2]).T) >= distance)
 
     def voxel_downsample(self, size: float) -> LidarPointCloud:
-        """One point a cube of `size` metres: the first one in it, unchanged, and the points keep their order.
+        """One point for each cube of `size` metres: the first one in it, unchanged; the points keep their order.
 
-        Cubes are counted from the frame's origin, each owns its lower faces.
+        Cubes are counted from the frame's origin; each includes its lower faces.
 
         Raises:
             GeometryError: the size is not above 0, or so small that the cubes cannot be counted; or a point is not
@@ -140,9 +146,9 @@ class LidarPointCloud(FrozenArrays):
         return self.select(np.sort(first))
 
     def save(self, path: str | Path) -> None:
-        """Write the cloud to an `.npz` of its own (xyz float64, intensity, frame), whole or not at all.
+        """Write the cloud to an `.npz` file (xyz float64, intensity, frame), completely or not at all.
 
-        `load` gives the same cloud back, to the bit. It is not the release's format, which is single precision,
+        `load` returns the same cloud, equal to the bit. This is not the release's format, which is single precision,
         left-handed and in the LiDAR frame: `release.write_lidar` writes that.
         """
         with replacing(Path(path)) as temporary, temporary.open("wb") as file:
@@ -150,14 +156,14 @@ class LidarPointCloud(FrozenArrays):
 
     @classmethod
     def load(cls, path: str | Path) -> LidarPointCloud:
-        """Read what `save` wrote.
+        """Read a file that `save` wrote.
 
         Raises:
             MissingFileError: there is no such file.
             SensorFileError: it cannot be read, or is another kind of file.
         """
         try:
-            # never unpickles; release.npz, which reads the release's own arrays, stands above this layer
+            # never unpickles; release.npz, which reads the release's own arrays, is in a higher layer
             with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:  # noqa: TID251
                 xyz, intensity, frame = (archive[name] for name in _FIELDS)
             return cls(xyz, intensity, str(frame))
@@ -189,7 +195,7 @@ def _within(name: str, values: FloatArray, limits: Range) -> BoolArray:
 
 
 def _voxel_keys(xyz: FloatArray, size: float) -> IntArray:
-    """One integer a voxel, (N,)."""
+    """An integer (N,) for each point, equal for points in one voxel."""
     voxels = np.floor(xyz / size)
     lowest = voxels.min(axis=0)
     along_x, along_y, along_z = (int(length) for length in (voxels.max(axis=0) - lowest + 1).tolist())

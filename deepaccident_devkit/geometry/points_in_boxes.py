@@ -1,4 +1,4 @@
-"""Which points lie in which oriented box, over arrays: a coarse grid excludes most points at once."""
+"""Which points lie in which oriented box, over arrays; a coarse grid quickly excludes most points."""
 
 import numpy as np
 
@@ -7,9 +7,9 @@ from deepaccident_devkit.arrays import FloatArray, IntArray
 _CELLS = 128
 """Cells of the coarse grid along x and along y, over the ground that the boxes cover."""
 _POINTS_AT_ONCE = 1 << 13
-"""Keeps intermediate arrays so small that the allocator reuses their memory, which halves the time."""
+"""Points that are processed together: the arrays are so small that their memory is reused, which halves the time."""
 _PAIRS_AT_ONCE = 1 << 17
-"""Bounds the memory that windows × points take, and keeps it in the processor's cache."""
+"""Pairs of windows and points that are processed together: their memory fits into the processor's cache."""
 
 
 def points_in_boxes(
@@ -17,13 +17,13 @@ def points_in_boxes(
 ) -> tuple[IntArray, IntArray]:
     """Every pair of a box and a point in it, faces included: rows of boxes (K,) and rows of points (K,).
 
-    A point p is in a box if |(p − centre) · a| ≤ half for each of its three axes a, the products summed as
-    (x + y) + z. Grid and windows only leave out points that cannot be inside, so the answer equals that rule's to the
-    bit. NaN lies in no box. Pairs ascend by box, then by point.
+    A point p is in a box if |(p − centre) · a| ≤ half for each of its three axes a, with the products summed as
+    (x + y) + z. Grid and windows only leave out points that cannot be inside, so the result is exactly that of this
+    rule. NaN lies in no box. Pairs are sorted by box, then by point.
 
     Args:
         points: (P, 3), metres.
-        center: (N, 3), metres, same frame.
+        center: (N, 3), metres, in the same coordinate frame.
         half: (N, 3), half of length, width, height, metres.
         axes: (N, 3, 3), rotation matrices: the columns are the box's axes.
     """
@@ -56,13 +56,13 @@ def _in_windows(x: FloatArray, y: FloatArray, low: FloatArray, high: FloatArray)
 
 
 def _near_any(points: FloatArray, low: FloatArray, high: FloatArray) -> IntArray:
-    """Rows of the points in a coarse cell that the window (`low` to `high`) of some box touches, ascending."""
+    """Rows, ascending, of the points in coarse cells that the window (`low` to `high`) of any box touches."""
     windows = np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1)
     if not windows.any():
         return np.zeros(0, dtype=np.int64)
     low, high = low[windows, :2], high[windows, :2]
     origin, end = low.min(axis=0), high.max(axis=0)
-    scale = (_CELLS - 1) / np.maximum(end - origin, 1e-6)  # far out, where numbers are coarse, a width can be 0
+    scale = (_CELLS - 1) / np.maximum(end - origin, 1e-6)  # the width can be 0 after rounding of very large numbers
     touched = np.zeros((_CELLS, _CELLS), dtype=bool)
     # points and windows go through the same rising function, so a point in a window is in a cell of the window
     first, last = ((low - origin) * scale).astype(int), ((high - origin) * scale).astype(int)

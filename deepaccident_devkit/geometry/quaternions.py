@@ -1,4 +1,4 @@
-"""Unit quaternions (w, x, y, z) over arrays; pyquaternion serves the public API, one at a time."""
+"""Unit quaternions (w, x, y, z) over arrays; the public API uses pyquaternion for single ones."""
 
 import math
 
@@ -19,7 +19,7 @@ def from_yaw(yaw: ArrayLike) -> FloatArray:
 def from_matrix(rotation: ArrayLike) -> FloatArray:
     """Rotation matrices (…, 3, 3) → unit quaternions (…, 4) with w ≥ 0.
 
-    Of the four ways to read a quaternion off a matrix, each row takes the one that divides by its largest component.
+    There are four formulas; each row uses the one that divides by its largest component.
     """
     m = as_floats(rotation)
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
@@ -55,10 +55,10 @@ def to_matrix(quaternion: ArrayLike) -> FloatArray:
 
 
 def single_from_matrix(rotation: FloatArray) -> tuple[float, float, float, float]:
-    """`from_matrix` of one rotation (3, 3): on plain floats, which is twenty times faster for a single one.
+    """`from_matrix` of one rotation (3, 3), with Python's floats: twenty times faster for a single one.
 
-    Of a matrix that is off a rotation by a small e, such as one of single precision, it is the nearest rotation's up
-    to e².
+    If the matrix differs from a rotation by a small e, for example in single precision, the result is the quaternion
+    of the nearest rotation, with an error of about e².
     """
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation.tolist()
     rows = (
@@ -68,7 +68,7 @@ def single_from_matrix(rotation: FloatArray) -> tuple[float, float, float, float
         (yx - xy, xz + zx, zy + yz, 1 - xx - yy + zz),
     )
     best = max(range(4), key=lambda part: rows[part][part])
-    # the nearest rotation's is the first eigenvector of these rows; all of them are near it, and once through closer
+    # the nearest rotation's quaternion is the first eigenvector of these rows: each row is near it, a product nearer
     w, x, y, z = rows[best]
     w, x, y, z = (a * w + b * x + c * y + d * z for a, b, c, d in rows)
     norm = math.copysign(math.sqrt(w * w + x * x + y * y + z * z), w)
@@ -82,7 +82,7 @@ def single_left_multiplier(rotation: FloatArray) -> FloatArray:
 
 
 def left_multiplier(quaternion: ArrayLike) -> FloatArray:
-    """The matrices L (…, 4, 4) with L @ r = q ⊗ r, so that rotating many quaternions is one product."""
+    """The matrices L (…, 4, 4) with L @ r = q ⊗ r: one product rotates many quaternions."""
     q = as_floats(quaternion)
     w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
@@ -97,7 +97,7 @@ def yaw_of(quaternion: ArrayLike) -> FloatArray:
 
 
 def slerp(first: ArrayLike, second: ArrayLike, share: ArrayLike) -> FloatArray:
-    """Rotations on the shorter way between unit quaternions (…, 4): share (…) 0 is the first, 1 the second."""
+    """Rotations on the shorter arc between unit quaternions (…, 4): share (…) 0 is the first, 1 the second."""
     a, b = as_floats(first), as_floats(second)
     cosine = np.sum(a * b, axis=-1, keepdims=True)
     a, cosine = np.where(cosine < 0, -a, a), np.abs(cosine)

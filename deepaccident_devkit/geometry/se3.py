@@ -1,4 +1,4 @@
-"""Rigid transforms between frames, always named `target_from_source`."""
+"""Rigid transforms between coordinate frames, always named `target_from_source`."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ if TYPE_CHECKING:
     from pyquaternion import Quaternion
 
 RIGID_TOLERANCE = 1e-3
-"""The largest distance of a rotation from an orthonormal one; files have poses of single precision, or rounded ones."""
+"""How far a rotation may be from an orthonormal one: files have poses in single precision, or rounded ones."""
 LAST_ROW = (0.0, 0.0, 0.0, 1.0)
 
 
 @runtime_checkable
 class Movable(Protocol):
-    """What a transform moves from frame to frame: boxes, a box, a point cloud."""
+    """What a transform can convert to another coordinate frame: boxes, a box, a point cloud."""
 
     @property
     def frame(self) -> str:
-        """The frame that it is in."""
+        """Its coordinate frame."""
         ...
 
     def transform(self: MovableT, target_from_source: SE3, frame: str) -> MovableT:
-        """The same in another frame."""
+        """The same in another coordinate frame."""
         ...
 
 
@@ -42,8 +42,8 @@ MovableT = TypeVar("MovableT", bound=Movable)
 class SE3(FrozenArrays):
     """A rigid transform, right-handed: `target_from_source.apply(p_source)` is `p_target`.
 
-    A rotation that is a little off an orthonormal one, as files have them, is kept as it is, to the bit. `inverse` is
-    the true inverse nevertheless, so that there and back gives the same point.
+    A rotation that differs a little from an orthonormal one, as in files, is not changed. `inverse` is nevertheless
+    the true inverse, so that a transform and then its inverse give the same point.
 
     Attributes:
         matrix: (4, 4) float64, column-vector convention, read-only.
@@ -94,8 +94,8 @@ class SE3(FrozenArrays):
     def from_six(cls, vector: ArrayLike) -> SE3:
         """From (6,) tx, ty, tz, rx, ry, rz: metres and radians, R = Rx(rx) · Ry(ry) · Rz(rz).
 
-        See docs/released_code.md, Poses. The vector is right-handed, as all of SE3; one of the released code goes
-        through `handedness.flip_six_vector` first. Raises GeometryError if a number is not finite.
+        See docs/released_code.md, Poses. The vector is right-handed, like all of SE3; convert one of the released code
+        with `handedness.flip_six_vector` first. Raises GeometryError if a number is not finite.
         """
         six = checked("vector", vector, (6,))
         if not np.isfinite(six).all():
@@ -109,7 +109,7 @@ class SE3(FrozenArrays):
 
     @property
     def translation(self) -> FloatArray:
-        """Where the source's origin lies in the target frame (3,), metres, read-only."""
+        """The position of the source's origin in the target frame, (3,), metres, read-only."""
         return self.matrix[:3, 3]
 
     @property
@@ -125,17 +125,17 @@ class SE3(FrozenArrays):
         return float(np.arctan2(self.matrix[1, 0], self.matrix[0, 0]))
 
     def to_six(self) -> FloatArray:
-        """The 6-vector (6,) tx, ty, tz, rx, ry, rz: metres and radians, right-handed, as `from_six` takes it.
+        """The 6-vector (6,) tx, ty, tz, rx, ry, rz for `from_six`: metres and radians, right-handed.
 
-        ry is in [−π/2, π/2]; at its ends, a source x axis that points straight up or down, rx and rz are not
-        determined one by one.
+        ry is in [−π/2, π/2]; at its ends (the source's x axis points straight up or down) there are many pairs of rx
+        and rz for the same rotation.
         """
         return six_vectors.from_matrices(self.matrix)
 
     def interpolate(self, other: SE3, share: float) -> SE3:
         """The pose at `share` of the way from this one (0) to `other` (1), both between the same two frames.
 
-        The rotation turns evenly about one axis on the shorter way (slerp), the translation goes straight.
+        The rotation turns evenly about one axis by the smaller angle (slerp), the translation moves in a straight line.
 
         Raises:
             GeometryError: `share` is not between 0 and 1, or `other` is no SE3.
@@ -153,7 +153,7 @@ class SE3(FrozenArrays):
         return trusted_se3(matrix)
 
     def inverse(self) -> SE3:
-        """The transform the other way, `source_from_target`."""
+        """The inverse transform, `source_from_target`."""
         return trusted_se3(inverses(self.matrix))
 
     @overload
@@ -166,14 +166,14 @@ class SE3(FrozenArrays):
         Args:
             points: (N, 3) or one point (3,), metres; or `Boxes`, a `Box` or a `LidarPointCloud`. NaN stays NaN, and
                 infinity becomes NaN in a rotation.
-            frame: of boxes and clouds: the target frame's name, since a transform does not know between which frames
-                it leads. Without it they keep the name that they have, as after a motion within one frame.
+            frame: for boxes and clouds, the name of the target frame, because a transform does not know the names of
+                its frames. Without it they keep their name, as after a motion within one frame.
 
         Returns:
-            Points as a new array of their shape; boxes and clouds as their `transform` gives them.
+            Points as a new array of their shape; boxes and clouds as the result of their `transform`.
 
         Raises:
-            GeometryError: `points` is neither, or a frame is named for plain points.
+            GeometryError: `points` is none of these, or `frame` is given for an array.
         """
         if not isinstance(points, np.ndarray) and isinstance(points, Movable):
             return points.transform(self, points.frame if frame is None else frame)
@@ -182,6 +182,7 @@ class SE3(FrozenArrays):
         given = as_numbers("points", points, "points of shape (N, 3) or (3,), boxes or a point cloud")
         if given.ndim == 0 or given.ndim > 2 or given.shape[-1] != 3:
             hint = "; of a matrix (4, 4) make SE3(matrix)" if given.shape == (4, 4) else ""
+            hint = "; transpose it (.T)" if given.ndim == 2 and given.shape[0] == 3 else hint
             raise GeometryError(f"points: expected shape (N, 3) or (3,), found {given.shape}{hint}")
         with np.errstate(invalid="ignore"):
             return given @ self.rotation.T + self.translation
@@ -213,7 +214,7 @@ class SE3(FrozenArrays):
 
 
 def stored_transforms(numbers: FloatArray) -> FloatArray:
-    """Transforms stored as 12 or 16 numbers, (…, 12 or 16), as a new array (…, 4, 4) with the exact last row."""
+    """Transforms stored as 12 or 16 numbers, (…, 12 or 16), as a new array (…, 4, 4) whose last row is exact."""
     transforms = np.empty((*numbers.shape[:-1], 4, 4))
     transforms[..., :3, :] = numbers[..., :12].reshape(*numbers.shape[:-1], 3, 4)
     transforms[..., 3, :] = LAST_ROW
@@ -221,7 +222,7 @@ def stored_transforms(numbers: FloatArray) -> FloatArray:
 
 
 def trusted_se3(matrix: FloatArray) -> SE3:
-    """An SE3 over a fresh matrix that is rigid by construction, or was checked when it was read."""
+    """An SE3 of a new matrix, without checks: it must be surely rigid, or checked when it was read."""
     result = object.__new__(SE3)
     matrix.setflags(write=False)
     object.__setattr__(result, "matrix", matrix)
@@ -229,9 +230,9 @@ def trusted_se3(matrix: FloatArray) -> SE3:
 
 
 def inverses(matrix: AnyArray) -> AnyArray:
-    """The inverses of transforms (…, 4, 4), also of those whose rotations are a little off; raises GeometryError.
+    """The inverses of transforms (…, 4, 4), right for slightly wrong rotations too; raises GeometryError.
 
-    Transposing a rotation that is off by 1e-3 would put what is 600 m away 60 cm beside its place.
+    To transpose a rotation with an error of 1e-3 would move a point 600 m away by 60 cm.
     """
     result = np.zeros_like(matrix)
     try:
@@ -253,7 +254,7 @@ def checked_transform(name: str, transform: object) -> SE3:
 
 
 def rigid_fault(matrix: FloatArray) -> str | None:
-    """Say why `matrix` (4, 4) is no rigid transform, or None if it is one."""
+    """Why `matrix` (4, 4) is no rigid transform, in words; None if it is one."""
     if not np.isfinite(matrix).all():
         return "holds NaN or infinity"
     if not np.allclose(matrix[3], LAST_ROW, atol=RIGID_TOLERANCE):

@@ -2,10 +2,10 @@
 
 See docs/released_code.md, Poses. R = Rx(rx) · Ry(ry) · Rz(rz): about z first, then y, then x, each about the target
 frame's own, fixed axes; angles in radians, ry in [−π/2, π/2]. The functions do not depend on the handedness: a raw
-matrix gives the raw vector, a right-handed one the right-handed vector, and `handedness.flip_six_vector` leads from one
-to the other.
+matrix gives the raw vector, a right-handed one the right-handed vector, and `handedness.flip_six_vector` converts one
+into the other.
 
-At ry = ±π/2 (the gimbal) only rx ± rz is determined, and the formula reads both off the last bits.
+At ry = ±π/2 (gimbal lock) only rx ± rz is determined, and rounding errors decide how it is divided.
 """
 
 import numpy as np
@@ -28,7 +28,7 @@ def from_matrices(matrix: ArrayLike) -> FloatArray:
 
 
 def to_matrices(six: ArrayLike) -> FloatArray:
-    """6-vectors (…, 6), metres and radians → rigid matrices (…, 4, 4); any angles are good. Raises GeometryError."""
+    """6-vectors (…, 6), metres and radians → rigid matrices (…, 4, 4); all angles are allowed. Raises GeometryError."""
     vector = as_floats(six)
     if vector.shape[-1:] != (6,):
         raise GeometryError(f"six: expected shape (…, 6), found {vector.shape}")

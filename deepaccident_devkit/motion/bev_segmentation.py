@@ -93,7 +93,7 @@ def segmentation_of(
     coverage: Mapping[str, float] | None = None,
     augmentation: Augmentation | None = None,
 ) -> BevSegmentation:
-    """The targets on a grid, from a BEV camera's array; arguments and errors as of `bev_segmentation`."""
+    """The targets on a grid, from a BEV camera's array; arguments and errors as in `bev_segmentation`."""
     shares = {**COVERAGE, **(coverage or {})}
     for name, share in shares.items():
         if name not in BEV_CLASSES:

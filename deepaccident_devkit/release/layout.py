@@ -100,7 +100,7 @@ def find_release(root: Path, version: str = "v1") -> ReleaseLayout:
         VersionError: the version is unknown or not under this folder.
     """
     if version not in VERSIONS:
-        raise VersionError(f"unknown version {version!r}; known are {', '.join(VERSIONS)}")
+        raise VersionError(f"unknown version {version!r}; known are {', '.join(VERSIONS)}{_version_remedy(version)}")
     if not _is_unicode(root):
         raise DatarootError(f"{str(root)!r}: is not UTF-8, which Arrow needs a path to be; rename the folder")
     if not root.is_dir():
@@ -121,6 +121,16 @@ def find_release(root: Path, version: str = "v1") -> ReleaseLayout:
         scenarios=tuple(sorted(scenarios, key=lambda scenario: (scenario.token, scenario.folder))),
         split_files=_split_files(root),
     )
+
+
+def _version_remedy(version: object) -> str:
+    """What to write where a folder, or a version of nuScenes, was given as the version."""
+    text = os.fspath(version) if isinstance(version, os.PathLike) else str(version)
+    if os.path.isdir(text) or os.sep in text or text.startswith(("~", ".")):  # noqa: PTH112 - odd texts are no folder
+        return f"; to open the folder, write DeepAccident(dataroot={text!r})"
+    if text.lower().startswith("v1"):
+        return f"; did you mean {'v1-mini' if text.lower().endswith('mini') else 'v1'!r}?"
+    return ""
 
 
 def _is_unicode(path: Path) -> bool:

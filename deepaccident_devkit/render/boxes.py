@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from deepaccident_devkit.arrays import BoolArray, FloatArray
+from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import Box, Boxes, PinholeCamera
 from deepaccident_devkit.render.colors import CATEGORY_COLORS
 from deepaccident_devkit.render.layers import Layer
@@ -25,7 +26,15 @@ SMALLEST_TEXT: Final = 7
 
 
 def draw_box(box: Box, ax: Axes, color: str | None = None) -> Axes:
-    """Render one box from above, in its own frame's x and y, metres, with a line towards its front."""
+    """Render one box from above, in its own frame's x and y, metres, with a line towards its front.
+
+    Raises:
+        GeometryError: `box` is no `Box`, such as the axes.
+    """
+    if not isinstance(box, Box):
+        raise GeometryError(
+            f"box: expected a Box, found {type(box).__name__}; the box is first, then the axes: draw_box(box, ax)"
+        )
     chosen = color or CATEGORY_COLORS[box.category]
     _draw_footprints(box.center[None, :2], box.bottom_corners().T[None, :, :2], ax, [chosen], 0.25, {})
     return ax

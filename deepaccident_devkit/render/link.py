@@ -112,7 +112,7 @@ def render_link(
 
 
 def shared_boxes(dataset: Dataset, sample: RowArgument, link: Link, agents: Agents = None) -> list[SharedBoxes]:
-    """Each partner's tracked boxes as they arrive; arguments and errors as of `render_link`."""
+    """Each partner's tracked boxes as they arrive; arguments and errors as in `render_link`."""
     record = dataset.get("sample", sample)
     partners = [agent for agent in cooperating_agents(dataset, sample, agents) if agent != record["agent"]]
     if not partners:

@@ -84,7 +84,7 @@ def draw_motion_labels(
         labels: warped to the present or not; they are rendered as they are.
         marked: label ids.
         style: `maps` or `trail`.
-        layers: as of `render_motion_labels`.
+        layers: as in `render_motion_labels`.
         fig: an empty figure to render on; a new one if None.
 
     Returns:
@@ -116,7 +116,7 @@ def draw_motion_output(
         post_processing: how instances are found in heads: a name in `POST_PROCESSING`, or your own.
         marked: ids of instances that are red.
         style: `maps` or `trail`.
-        layers: as of `render_motion_labels`.
+        layers: as in `render_motion_labels`.
         fig: an empty figure to render on; a new one if None.
 
     Returns:

@@ -13,7 +13,7 @@ from deepaccident_devkit.synth.solids import Solids
 from deepaccident_devkit.taxonomy import CATEGORIES, STATIC_ACTOR_ID
 
 _SLACK = 1e-9
-"""Seconds by which a time may miss a sample."""
+"""Seconds: a time may be this far before the first sample or after the last one and still counts as inside."""
 
 
 class Motion(Protocol):
@@ -30,11 +30,11 @@ class Motion(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Uniform:
-    """Straight on at a constant speed (or standing still, at speed 0).
+    """A motion straight on at a constant speed (speed 0: standing still).
 
     Attributes:
-        x: at time 0, metres.
-        y: at time 0, metres.
+        x: position at time 0, metres.
+        y: position at time 0, metres.
         yaw: radians.
         speed: m/s.
     """
@@ -55,13 +55,13 @@ class Uniform:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sampled(FrozenArrays):
-    """As simulated, between samples straight lines; before the first sample and after the last it stands there.
+    """A simulated motion: straight lines between samples; it stands still before the first and after the last one.
 
     Attributes:
         start: time of the first sample, seconds.
         period: seconds between samples.
-        samples: (S, 3) x, y (metres), yaw (radians, without jumps) of the box's centre; of M together, (S, M, 3).
-        sample_velocities: (S, 2) m/s; or (S, M, 2).
+        samples: (S, 3) x, y (metres), yaw (radians, without jumps) of the box's centre; (S, M, 3) for M actors.
+        sample_velocities: (S, 2) m/s; (S, M, 2) for M actors.
     """
 
     start: float
@@ -94,12 +94,12 @@ class Actor:
     """One road user.
 
     Attributes:
-        actor_id: the label's id; from `STATIC_ACTOR_ID` on it is parked.
+        actor_id: the label's id; an actor whose id is `STATIC_ACTOR_ID` or more is parked.
         object_id: the BEV camera's own id, 1 to 65535.
         category: one of `taxonomy.CATEGORIES`.
         size: length, width, height of the label box, metres.
         shape: its solids, x forward, origin on the road below the box's centre.
-        motion: of the box's centre.
+        motion: how the box's centre moves.
         origin: (x, y) of its reference point (the ego origin of an agent) seen from the box's centre, metres.
     """
 
@@ -128,9 +128,9 @@ class Actors:
         category: (A,) int8, index into `taxonomy.CATEGORIES`.
         size: (A, 3) float64, metres.
         origin: (A, 2) float64, as in `Actor`.
-        solids: of all actors, each in its own frame.
+        solids: the solids of all actors, each in its actor's own coordinate frame.
         solid_actor: (P,) int64, row of the actor that each solid belongs to.
-        motions: rows of actors, and their motion; of several whose samples are of the same times, one together.
+        motions: rows of actors, with their motion; actors whose samples have the same times share one motion.
     """
 
     all: tuple[Actor, ...]
@@ -190,7 +190,7 @@ class Snapshot:
 
 
 def _together(motions: Sequence[Motion]) -> tuple[tuple[list[int], Motion], ...]:
-    """As `Actors.motions`."""
+    """The motions, grouped as in `Actors.motions`."""
     rows_of: dict[Hashable, list[int]] = {}
     for row, motion in enumerate(motions):
         times = (motion.start, motion.period, len(motion.samples)) if isinstance(motion, Sampled) else row
@@ -199,7 +199,7 @@ def _together(motions: Sequence[Motion]) -> tuple[tuple[list[int], Motion], ...]
 
 
 def _joined(motions: Sequence[Motion]) -> Motion:
-    """One motion of several of the same times, or the only one there is."""
+    """One motion made of several with the same times; a single motion stays as it is."""
     sampled = [motion for motion in motions if isinstance(motion, Sampled)]
     if not sampled:
         return motions[0]

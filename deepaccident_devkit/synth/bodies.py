@@ -17,9 +17,9 @@ MEDIAN_SIZES: dict[str, Size] = {
     "cyclist": (1.64, 0.37, 1.77),
     "pedestrian": (0.38, 0.38, 1.86),
 }
-"""Of the real release: length, width, height, metres (docs/format.md, Label)."""
+"""Median length, width and height in the real release, metres (docs/format.md, Label)."""
 _SPREAD = (0.05, 0.05, 0.04)
-"""Of length, width and height."""
+"""By which share of the median length, width and height a body may differ from it."""
 _FARTHEST_ORIGIN = 0.3
 _PAINTS: tuple[Color, ...] = (
     (196, 30, 36), (28, 74, 160), (226, 228, 230), (150, 155, 160), (46, 50, 56), (236, 196, 56), (40, 120, 72),
@@ -39,7 +39,7 @@ class Body:
         category: one of `taxonomy.CATEGORIES`.
         size: length, width, height of the label box, metres.
         shape: its solids, x forward, origin on the road below the box's centre.
-        origin: reference point seen from the box's centre, metres.
+        origin: (x, y) of its reference point seen from the box's centre, metres.
     """
 
     category: str
@@ -64,5 +64,5 @@ def _colors(rng: np.random.Generator, category: str) -> tuple[Color, Color]:
 
 
 def _random_origin(rng: np.random.Generator) -> tuple[float, float]:
-    """Where an ego origin lies: ahead of the box's centre, by some centimetres, of a few by up to 0.3 m."""
+    """Where an ego origin lies: ahead of the box's centre, mostly by some centimetres, seldom by up to 0.3 m."""
     return round(float(_FARTHEST_ORIGIN * rng.random() ** 3), 4), 0.0

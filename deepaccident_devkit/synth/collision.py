@@ -8,13 +8,13 @@ _SIGNS = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]], dtype=np.float64)
 
 
 def separation(poses_a: FloatArray, size_a: FloatArray, poses_b: FloatArray, size_b: FloatArray) -> FloatArray:
-    """The widest gap along any side's normal (…), metres: 0 where rectangles just touch, negative if they overlap.
+    """The widest gap (…) along any side's normal, metres: 0 where rectangles just touch, negative if they overlap.
 
     Args:
         poses_a: (…, 3) x, y, yaw of the rectangles' centres.
         size_a: (…, 2) full length and width, metres.
         poses_b: like `poses_a`, of any shape that broadcasts.
-        size_b: likewise.
+        size_b: like `size_a`.
     """
     turn = poses_b[..., 2] - poses_a[..., 2]
     cos, sin = np.abs(np.cos(turn)), np.abs(np.sin(turn))
@@ -52,7 +52,7 @@ def _relative(poses: FloatArray, points: FloatArray) -> FloatArray:
 def _corner_distance(
     poses: FloatArray, size: FloatArray, corner_poses: FloatArray, corner_size: FloatArray
 ) -> FloatArray:
-    """From each rectangle at `poses` to the nearest corner of the one at `corner_poses` (…)."""
+    """The distance (…) from each rectangle at `poses` to the nearest corner of the one at `corner_poses`."""
     offsets = corner_size[..., None, :] / 2 * _SIGNS
     cos, sin = np.cos(corner_poses[..., None, 2]), np.sin(corner_poses[..., None, 2])
     corners = corner_poses[..., None, :2] + np.stack(

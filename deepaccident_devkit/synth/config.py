@@ -1,4 +1,4 @@
-"""What a synthetic release should be like."""
+"""The settings of a synthetic release."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,13 +11,13 @@ from deepaccident_devkit.taxonomy import Layout
 MAX_FRAMES = 999
 MIN_IMAGE_SIZE = (16, 9)
 IMAGE_SIZE: Final = (480, 270)
-"""Pixels, of images whose size nobody asks for; small, since larger ones take long."""
+"""The default size of images, pixels; small, because larger ones take long."""
 RELEASED_IMAGE_SIZE: Final = (1600, 900)
-"""Pixels, of the real images. The released code does not look: it takes every image for one of this size."""
+"""The size of the real images, pixels. The released code does not read the size: it assumes this one."""
 DESIGN_ROUND: Final = (1, 7, 2, 8, 3, 9, 4, 10, 5, 11, 6, 12)
-"""All designs in the order in which they take turns: with traffic lights and without, so that two pairs have both."""
+"""All designs in the order of use: with and without traffic lights by turns, so that two pairs have both."""
 HIDDEN_DESIGN_ROUND: Final = (1, 7)
-"""Those in which a house on a street corner can hide the two who collide from each other till the end."""
+"""The designs in which a house on a street corner can hide the two colliding vehicles from each other to the end."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,27 +26,29 @@ class SynthConfig:
 
     Attributes:
         scenarios: how many; they alternate between an accident and its normal twin.
-        frames: recorded frames of each scenario, at 10 Hz: the last ones before its end. None records it from when the
-            cars set off until it ends, 40 to 100 frames; a normal one up to 200, if `end.time` of its file says so.
+        frames: recorded frames of each scenario, at 10 Hz: the last ones before its end. None records from the moment
+            when the cars set off to the end, 40 to 100 frames; a normal one up to 200, if `end.time` of its file says
+            so.
         image_size: width and height of the camera images, pixels; None for 480×270, or 1600×900 with
-            `for_released_code`. The real ones have 1600×900. The released code takes that for granted: with another
-            size it computes wrong camera geometry.
-        layout: `A`, all splits in one folder, or `B`, a folder a split.
+            `for_released_code`. The real images have 1600×900. The released code assumes this size: with another
+            one it computes wrong camera geometry.
+        layout: `A`, all splits in one folder, or `B`, one folder for each split.
         seed: the same seed gives the same bytes (on the same machine with the same package versions).
-        sensors: whether to write images, point clouds and BEV arrays besides labels, calib and meta.
+        sensors: whether to write images, point clouds and BEV arrays too, not only labels, calib and meta.
         view: `hidden` puts a house on the kerb of the corner between ego and other, who drive a little faster than
-            where the view is `open`: they see each other about a second before they meet, the pole all the time. None
-            leaves it to the scenario files.
-        designs: which of the paper's twelve take turns, in this order; empty for all (for those that a house can hide
-            where the view is `hidden`).
-        unplanned: share of the accidents that are none of the design: a pedestrian, a third vehicle.
-            None are where `spec` or the view `hidden` asks for one certain accident.
-        spec: a scenario file (docs/scenarios.md) of which every pair is a draw, in place of the designs.
+            with the view `open`. They see each other only about a second before they meet; the infrastructure sees
+            both all the time. With None the scenario files decide.
+        designs: which of the paper's twelve are used by turns, in this order; empty for all (with the view `hidden`,
+            for all in which a house can hide the two from each other).
+        unplanned: share of accidents that differ from the design: with a pedestrian or a third vehicle. It is 0
+            where `spec` or the view `hidden` asks for one certain accident.
+        spec: a scenario file (docs/scenarios.md) to use instead of the designs; every pair is one draw from it.
         unlabelled_test: whether the test split lacks labels, BEV arrays and meta, as the real one does.
-        exact: whether calib files are the same at each frame, and `num_lidar_pts` what a recount gives. Else both are
-            a little off, as in the real release.
-        for_released_code: whether the released code has to read the release: images of 1600×900, layout `A`, a
-            labelled test split, and the split files under `split_txt_files/` too. What contradicts it is refused.
+        exact: whether calib files are the same at each frame, and `num_lidar_pts` is the exact number of points. If
+            not, both are a little wrong, as in the real release.
+        for_released_code: whether the released code must be able to read the release: images of 1600×900, layout `A`,
+            a labelled test split, and split files under `split_txt_files/` too. Settings that contradict it are
+            refused.
     """
 
     scenarios: int = 4
@@ -79,7 +81,7 @@ class SynthConfig:
         for design in self.designs:
             _check_range("designs", design, DESIGN_NUMBERS[0], DESIGN_NUMBERS[-1])
         if not 0 <= self.unplanned <= 1:
-            raise ConfigError(f"unplanned: {self.unplanned} is no share; choose a number from 0 to 1")
+            raise ConfigError(f"unplanned: {self.unplanned} is not a share; choose a number from 0 to 1")
         if self.spec is not None and self.designs:
             raise ConfigError(
                 "spec, designs: a release is made of a scenario file or of designs; choose one of the two"
@@ -96,7 +98,7 @@ class SynthConfig:
 
     @property
     def design_round(self) -> tuple[int, ...]:
-        """The designs that take turns."""
+        """The designs that are used by turns."""
         return self.designs or (HIDDEN_DESIGN_ROUND if self.view == "hidden" else DESIGN_ROUND)
 
     def _check_for_released_code(self) -> None:
@@ -105,8 +107,7 @@ class SynthConfig:
         if self.pixels != RELEASED_IMAGE_SIZE:
             real, found = ("{}x{}".format(*size) for size in (RELEASED_IMAGE_SIZE, self.pixels))
             raise ConfigError(
-                f"image_size, for_released_code: the released code takes every image for one of {real}, found {found}; "
-                f"{remedy}"
+                f"image_size, for_released_code: the released code expects images of {real}, found {found}; {remedy}"
             )
         if self.layout != "A":
             raise ConfigError(
@@ -115,8 +116,8 @@ class SynthConfig:
             )
         if self.unlabelled_test:
             raise ConfigError(
-                "unlabelled_test, for_released_code: the released converter finds the frames of each split, test too, "
-                f"by their labels; {remedy}"
+                "unlabelled_test, for_released_code: the released converter finds the frames of each split by their "
+                f"labels, those of test too; {remedy}"
             )
 
 

@@ -16,7 +16,7 @@ from deepaccident_devkit.synth.sensors.caster import require_embree
 from deepaccident_devkit.synth.unfinished import Unfinished, unfinished_release
 
 _USUAL_FRAMES = 70
-"""Of a scenario of natural length."""
+"""About how many frames a scenario has if the configuration does not say it."""
 
 
 def make_release(
@@ -24,19 +24,19 @@ def make_release(
 ) -> Path:
     """Write a complete synthetic release; returns its folder.
 
-    The release is made in a hidden folder beside `out`, `.NAME.unfinished`, and renamed when it is whole. After a break
-    (a full disk, a kill) the same call goes on with what is not made yet.
+    The release is made in a hidden folder beside `out`, `.NAME.unfinished`, and renamed when it is complete. After an
+    interruption (a full disk, a kill) the same call makes only what is still missing.
 
     Args:
-        out: the folder to make; must not exist or be empty.
-        config: what the release is like; `SynthConfig()` if None.
-        workers: processes, of which several may record one scenario; None chooses. The files depend neither on it nor
-            on breaks.
+        out: the folder to make; it must be empty, or not exist yet.
+        config: the settings of the release; `SynthConfig()` if None.
+        workers: number of processes; several may record one scenario. With None the generator chooses. The files
+            depend neither on it nor on interruptions.
         progress: whether to show a progress bar.
 
     Raises:
-        ConfigError: `out` is a file, holds something or cannot be made; an unfinished release of another
-            configuration is there; the scenario file cannot be read or carried out.
+        ConfigError: `out` is a file, is not empty or cannot be made; an unfinished release of another
+            configuration is there; the scenario file cannot be read or simulated.
         MissingExtraError: sensors are wanted and the package embreex is not installed.
     """
     wanted = config or SynthConfig()
@@ -48,8 +48,9 @@ def make_release(
     if not is_writable_folder(out.parent):
         raise ConfigError(f"{out.parent}: cannot be written; choose another folder")
     with unfinished_release(out, wanted) as unfinished:
-        jobs = [_jobs(unfinished, wanted, plan) for plan in plans]
-        _record_all(unfinished, jobs, workers or _worker_count(wanted, len(plans)), progress=progress)
+        count = workers or _worker_count(wanted, len(plans))
+        jobs = [_jobs(unfinished, wanted, plan, progress=progress and count == 1) for plan in plans]
+        _record_all(unfinished, jobs, count, progress=progress)
         splits = plan_splits(plans)
         splits.save(unfinished.release, overwrite=True)
         if wanted.for_released_code:
@@ -57,11 +58,15 @@ def make_release(
     return out
 
 
-def _jobs(unfinished: Unfinished, config: SynthConfig, plan: ScenarioPlan) -> dict[str, RecordingJob]:
-    """The parts of a scenario by their names."""
+def _jobs(
+    unfinished: Unfinished, config: SynthConfig, plan: ScenarioPlan, *, progress: bool = False
+) -> dict[str, RecordingJob]:
+    """The parts of a scenario by their names; `progress` shows the draws, where no other process writes too."""
     parts = parts_of(config)
     names = {first: f"{plan.scenario_type}_{plan.name}_{first}of{parts}" for first in range(1, parts + 1)}
-    return {name: RecordingJob(unfinished.part(name), config, plan, first, parts) for first, name in names.items()}
+    return {
+        name: RecordingJob(unfinished.part(name), config, plan, first, parts, progress) for first, name in names.items()
+    }
 
 
 def _record_all(
@@ -90,6 +95,6 @@ def _record_all(
 
 
 def _worker_count(config: SynthConfig, scenarios: int) -> int:
-    """As many as there are cores, where that pays for starting processes: a frame with sensors costs up to a second."""
+    """One worker for each core, or 1 if the work is too short for it: a frame with sensors takes up to a second."""
     frames = scenarios * (config.frames or _USUAL_FRAMES)
     return (os.cpu_count() or 1) if frames >= (20 if config.sensors else 400) else 1

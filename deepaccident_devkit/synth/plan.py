@@ -15,13 +15,13 @@ from deepaccident_devkit.tables.records import ScenarioRecord
 from deepaccident_devkit.taxonomy import ROAD_TYPES, SPLITS, TOWNS
 
 OFFICIAL_FROM_PAIRS: Final = 12
-"""Pairs from which the official procedure splits a release; of fewer it would leave val and test empty."""
+"""From this many pairs on the official procedure splits a release; with fewer it would leave val and test empty."""
 _GOLDEN_RATIO: Final = 0.6180339887498949
-"""Its multiples fill [0, 1) evenly, whatever their number."""
+"""The fractional parts of its multiples fill [0, 1) evenly, for any number of them."""
 _MINI_SHARE: Final = Fraction(1, 5)
-"""Of its split, what a mini split may hold at most."""
+"""The largest share of its split that a mini split may hold."""
 _PLAN_STREAM: Final = 1
-"""Sets the plan's random numbers apart from those of the pair's scene."""
+"""Makes the plan's random numbers independent of those of the pair's scene."""
 _HIDDEN_SPEEDS: Final = (12.0, 14.0)
 """m/s: with a house on the kerb between them, slower cars would see each other earlier."""
 
@@ -33,11 +33,11 @@ class ScenarioPlan:
     Attributes:
         pair: number of its pair, from 0; an accident and its normal twin share scene, name and split.
         accident: whether it is the accident.
-        unplanned: whether the pair's accident is another one than the designed.
+        unplanned: whether the pair's accident differs from the designed one.
         name: such as `Town03_type001_subtype0001_scenario00024`.
         split: `train`, `val` or `test`.
-        traits: of all its draws.
-        template: of which its scene is a draw.
+        traits: what all its draws have in common.
+        template: from which its scene is drawn.
         view: as the release asks for it; None for what the template says.
     """
 
@@ -71,7 +71,7 @@ class ScenarioPlan:
         return f"{self.scenario_type}/{self.name}"
 
     def draw(self, rng: np.random.Generator) -> ScenarioSpec:
-        """A draw of its template that has the plan's traits; the same numbers give the same one."""
+        """A draw from its template that has the plan's traits; the same random numbers give the same draw."""
         spec = draw(self.template, rng)
         while Traits.of(spec) != self.traits:
             spec = draw(self.template, rng)
@@ -80,12 +80,12 @@ class ScenarioPlan:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Traits:
-    """What of a scenario decides its folder and its split.
+    """The properties of a scenario that decide its folder and its split.
 
     Attributes:
         signalized: whether its junction has traffic lights.
-        road_type: as meta names it.
-        spawn_side: where other comes from, as meta names it.
+        road_type: as the meta file names it.
+        spawn_side: where other comes from, as the meta file names it.
     """
 
     signalized: bool
@@ -94,7 +94,7 @@ class Traits:
 
     @classmethod
     def of(cls, spec: ScenarioSpec) -> "Traits":
-        """Those of a draw."""
+        """The traits of a draw."""
         four_way, three_way = ROAD_TYPES
         return cls(
             signalized=spec.road.signalized,
@@ -109,12 +109,12 @@ class Traits:
 
 
 def plan_scenarios(config: SynthConfig) -> list[ScenarioPlan]:
-    """The scenarios of a release: accidents and their twins by turns, going round the designs.
+    """The scenarios of a release: each accident, then its twin, with the designs by turns.
 
-    A scenario file of one's own in which nobody is timed to meet gives normal scenarios alone.
+    A scenario file in which nobody is timed to meet gives only normal scenarios.
 
     Raises:
-        ConfigError: the scenario file cannot be read or carried out; the view is to be hidden where none can be.
+        ConfigError: the scenario file cannot be read or simulated; a hidden view is wanted where it is impossible.
     """
     own = None if config.spec is None else read_spec(config.spec)
     twins = own is None or own.meets
@@ -133,13 +133,13 @@ def plan_scenarios(config: SynthConfig) -> list[ScenarioPlan]:
 def plan_splits(plans: Sequence[ScenarioPlan]) -> Splits:
     """The split files of a release.
 
-    The official procedure deals the scenarios out, as `deepaccident split` does. Of fewer than `OFFICIAL_FROM_PAIRS`
-    pairs, the first goes to train, the second to val, the third to test, and of those after them about 70, 15 and
+    The official procedure makes the splits, as `deepaccident split` does. With fewer than `OFFICIAL_FROM_PAIRS`
+    pairs, the first goes to train, the second to val, the third to test, and of the later ones about 70, 15 and
     15 %.
 
-    A mini split is what the procedure makes of its split (of fewer pairs: the first ones of the split), with two
-    differences. The procedure rounds a fifth of the split, up too, and leaves the mini split of a small one empty. Here
-    it holds at most a fifth, and where that is less than a pair, one pair: a loader of the mini splits finds something.
+    A mini split is what the procedure makes of its split (with fewer pairs: the first pairs of the split), with two
+    differences. The procedure rounds a fifth of the split up or down, and leaves the mini split of a small split empty.
+    Here it holds at most a fifth, but at least one pair, so that a loader of the mini splits finds something.
     """
     if len({plan.pair for plan in plans}) >= OFFICIAL_FROM_PAIRS:
         dealt = split_records([_record(plan) for plan in plans])
@@ -161,9 +161,11 @@ def _plan(config: SynthConfig, pair: int, template: SpecTemplate, *, accident: b
     unplanned = bool(rng.random() < config.unplanned) and config.spec is None and config.view != "hidden"
     traits = Traits.of(draw(template, rng))
     if config.view == "hidden" and traits.spawn_side not in ("left", "right"):
+        place = "" if config.spec is None else f"{template.place('actors')}: "
+        others = "designs" if config.spec is None else "arms"
         raise ConfigError(
-            f"view: hidden needs an other vehicle from ego's left or right, and in '{template.name}' it comes from "
-            f"{traits.spawn_side}; choose other designs, or the view open"
+            f"{place}view: hidden needs the other vehicle to come from ego's left or right, but in '{template.name}' "
+            f"it is on the side '{traits.spawn_side}'; choose other {others}, or the view open"
         )
     return ScenarioPlan(
         pair=pair,
@@ -178,7 +180,7 @@ def _plan(config: SynthConfig, pair: int, template: SpecTemplate, *, accident: b
 
 
 def _seen(spec: ScenarioSpec, view: View, rng: np.random.Generator) -> ScenarioSpec:
-    """A scenario with another view; where a house hides them, the two who meet drive faster, on a narrow road."""
+    """A scenario with another view; where a house hides ego and other, they drive faster, on a narrow road."""
     if view == "open":
         return replace(spec, view=view)
     actors = tuple(
@@ -191,7 +193,7 @@ def _seen(spec: ScenarioSpec, view: View, rng: np.random.Generator) -> ScenarioS
 
 
 def _small_split(pair: int) -> str:
-    """Both of a pair go together: one pair to each split, then about 70, 15 and 15 %."""
+    """The split of both scenarios of a pair: one pair to each split, of the later ones about 70, 15 and 15 %."""
     if pair < len(SPLITS):
         return SPLITS[pair]
     share = pair * _GOLDEN_RATIO % 1
@@ -199,7 +201,7 @@ def _small_split(pair: int) -> str:
 
 
 def _mini(plans: Sequence[ScenarioPlan], split: Sequence[str], wanted: Collection[str]) -> tuple[str, ...]:
-    """Whole pairs of those wanted, as many as `_MINI_SHARE` of the split allows; if none, the split's smallest pair."""
+    """The wanted whole pairs, as many as `_MINI_SHARE` of the split allows; if none, the split's smallest pair."""
     members, wanted = set(split), set(wanted)
     pairs: dict[int, list[str]] = {}
     for plan in plans:
@@ -215,7 +217,7 @@ def _mini(plans: Sequence[ScenarioPlan], split: Sequence[str], wanted: Collectio
 
 
 def _record(plan: ScenarioPlan) -> ScenarioRecord:
-    """What the split procedure asks of a scenario's record, as it will be."""
+    """The fields of a scenario's later record that the split procedure reads."""
     designed = plan.accident and not plan.unplanned and plan.template.meeting_roles == {"ego", "other"}
     agents = ("ego_vehicle", "other_vehicle") if designed else (None, None)
     record = {

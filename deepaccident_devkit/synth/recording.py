@@ -1,6 +1,6 @@
 """Recording a scenario: what all agents see, frame by frame, written as files of a release.
 
-A scenario is recorded in parts, each of which takes every nth frame, so that several processes can work on one.
+A scenario is recorded in parts; each part takes every nth frame, so that several processes can share a scenario.
 """
 
 import multiprocessing
@@ -29,7 +29,7 @@ from deepaccident_devkit.synth.sensors.scene import Scene
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, LIDAR, frame_timestamp
 
 _PARTS = 8
-"""Of a scenario with sensors; a frame of one without takes less time than the scenario takes to be thought out."""
+"""Parts of a scenario with sensors. Without sensors it has one: simulating it takes longer than writing a frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,11 +37,12 @@ class RecordingJob:
     """A scenario to make, or a part of one.
 
     Attributes:
-        root: the release that it is to be in.
-        config: what the release is like.
+        root: the release to write it into.
+        config: the settings of the release.
         plan: which scenario it is.
         first: the first frame, counted from 1.
         step: from each frame to the next one.
+        progress: whether to show the number of draws.
     """
 
     root: Path
@@ -49,6 +50,7 @@ class RecordingJob:
     plan: ScenarioPlan
     first: int = 1
     step: int = 1
+    progress: bool = False
 
     @property
     def folder(self) -> ScenarioFolder:
@@ -58,14 +60,14 @@ class RecordingJob:
 
 
 def parts_of(config: SynthConfig) -> int:
-    """In how many parts each scenario is recorded."""
+    """The number of parts in which each scenario is recorded."""
     return min(_PARTS, config.frames or _PARTS) if config.sensors else 1
 
 
 def record_scenario(job: RecordingJob) -> None:
     """Make a scenario and write all its files, or those of a part of it."""
     _share_cores()
-    scenario, rig = _made_ready(_Task(job.config, job.plan))
+    scenario, rig = _made_ready(_Task(job.config, job.plan, job.progress))
     labelled = job.plan.split != "test" or not job.config.unlabelled_test
     recorder = _Recorder(folder=job.folder, scenario=scenario, rig=rig, labelled=labelled)
     if labelled and job.first == 1:
@@ -75,12 +77,12 @@ def record_scenario(job: RecordingJob) -> None:
 
 
 def forget_scenario() -> None:
-    """Let go of the scenario that is kept for its next part."""
+    """Free the memory of the scenario that is kept for its next part."""
     _made_ready.cache_clear()
 
 
 def _share_cores() -> None:
-    """Where several scenarios are made at a time, each has one core; OpenCV would start threads for all of them."""
+    """Give OpenCV one thread in a worker process: each worker has one core, and OpenCV would start threads for all."""
     import cv2
 
     if multiprocessing.parent_process() is not None:
@@ -93,13 +95,14 @@ class _Task:
 
     config: SynthConfig
     plan: ScenarioPlan = field(hash=False)
+    progress: bool = field(compare=False)
 
 
 @lru_cache(maxsize=1)
 def _made_ready(task: _Task) -> tuple[Scenario, Rig]:
     """A scenario and its sensors; the last one is kept for the next part of it."""
     config, plan = task.config, task.plan
-    scenario = build_scenario(config, plan)
+    scenario = build_scenario(config, plan, progress=task.progress)
     rig = make_rig(
         scenario.world,
         scenario.actors,
@@ -115,7 +118,7 @@ def _made_ready(task: _Task) -> tuple[Scenario, Rig]:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Recorder:
-    """Writes the files of one scenario; from a rig without images, only what needs no sensor."""
+    """Writes the files of one scenario; if the rig makes no images, only the files that need no sensor."""
 
     folder: ScenarioFolder
     scenario: Scenario
@@ -138,7 +141,7 @@ class _Recorder:
                 self._record_pictures(scene, around, agent, frame)
 
     def _record_pictures(self, scene: Scene, around: Surroundings, agent: Agent, frame: int) -> None:
-        """Write the images, and the view from above, whose instances are labels too."""
+        """Write the images, and if there are labels also the BEV arrays, whose instances are labels too."""
         if self.labelled:
             bev = self.rig.bev(scene, agent)
             write_bev(self.folder.channel_path(agent.name, BEV_CAMERA, frame), bev.semantic, bev.instance)
@@ -146,7 +149,7 @@ class _Recorder:
             write_image(self.folder.channel_path(agent.name, channel, frame), image)
 
     def _signals(self, time: float) -> Mapping[Arm, int]:
-        """Of each arm's traffic light, its state."""
+        """Arm → the state of its traffic light."""
         signals = self.scenario.signals
         if signals is None:
             return {}

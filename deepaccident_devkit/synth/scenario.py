@@ -1,6 +1,7 @@
-"""All that one scenario holds, made so that what its plan says happens."""
+"""All that one scenario holds, made so that it happens as its plan says."""
 
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -21,14 +22,15 @@ from deepaccident_devkit.synth.traffic.drama import (
     Recorded,
     Stage,
     latest_end,
-    perform_accident,
     perform_twin,
     recorded_accident,
     recorded_normal,
     set_stage,
+    try_accident,
     usual_duration,
 )
 from deepaccident_devkit.synth.traffic.kinematics import PERIOD
+from deepaccident_devkit.synth.traffic.misses import Miss, by_far, misses_text
 from deepaccident_devkit.synth.traffic.signals import SignalPlan
 from deepaccident_devkit.synth.traffic.unplanned import unplanned
 from deepaccident_devkit.taxonomy import STATIC_ACTOR_ID, VEHICLE_AGENTS, WARM_UP_FRAMES, AgentName
@@ -40,25 +42,29 @@ AGENT_OF_ROLE: Mapping[Role, AgentName] = {
     "other_behind": "other_vehicle_behind",
 }
 MAX_DRAWS = 100
-"""Draws of a scenario after which it is given up."""
+"""After this many draws without a collision a scenario is given up."""
+FAR_DRAWS = 25
+"""After this many it is given up if all missed by far and a draw differs from another one only in its numbers."""
+_SHOWN_AFTER = 1.0
+"""Seconds after which the number of draws is shown."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scenario:
-    """All that is there to be recorded; time 0 is the time of the first recorded frame.
+    """All that can be recorded; time 0 is the time of the first recorded frame.
 
     Attributes:
         plan: which scenario it is.
-        spec: the draw that it plays.
+        spec: the draw that was simulated.
         world: what stands still.
         actors: what moves, and parked vehicles.
         agents: actor ids of the four vehicle agents.
         weather: one of `WEATHERS`.
         time_of_day: one of `taxonomy.TIMES_OF_DAY`.
-        meta: as its file says.
+        meta: the contents of its meta file.
         frames: how many are recorded.
-        signals: the traffic lights' phases; None if there are none.
-        draws: how many it took.
+        signals: the phases of the traffic lights; None if there are no lights.
+        draws: how many draws were needed.
     """
 
     plan: ScenarioPlan
@@ -88,16 +94,22 @@ class RandomStreams(NamedTuple):
         return cls(*map(np.random.default_rng, spawned))
 
 
-def build_scenario(config: SynthConfig, plan: ScenarioPlan) -> Scenario:
-    """Make up a scenario; the same seed and pair give the same scene, for the accident and for its twin.
+def build_scenario(config: SynthConfig, plan: ScenarioPlan, *, progress: bool = False) -> Scenario:
+    """Make a scenario; the same seed and pair give the same scene, for the accident and for its twin.
 
-    The scene is drawn until those who are timed to meet touch, if anybody is.
+    If two actors are timed to meet, the scene is drawn again until they touch.
+
+    Args:
+        config: the settings of the release.
+        plan: which scenario it is.
+        progress: whether to show the number of draws if they take long.
 
     Raises:
-        ConfigError: they never do, in `MAX_DRAWS` draws.
+        ConfigError: they do not touch in `MAX_DRAWS` draws, or miss each other by far in the first `FAR_DRAWS`; the
+            message says how near they came, and what to change.
     """
     random = RandomStreams.of(config.seed, plan.pair)
-    stage, accident, draws = _first_good_draw(random.traffic, config, plan)
+    stage, accident, draws = _first_good_draw(random.traffic, config, plan, progress=progress)
     if plan.accident and accident is not None:
         recorded = recorded_accident(stage, accident, config.frames)
     else:
@@ -121,38 +133,45 @@ def build_scenario(config: SynthConfig, plan: ScenarioPlan) -> Scenario:
 
 
 def _first_good_draw(
-    rng: np.random.Generator, config: SynthConfig, plan: ScenarioPlan
+    rng: np.random.Generator, config: SynthConfig, plan: ScenarioPlan, *, progress: bool
 ) -> tuple[Stage, Performance | None, int]:
-    """The first draw in which the pair touches, what then happens, and how many draws it took."""
-    for draws in range(1, MAX_DRAWS + 1):
-        spec = plan.draw(rng)
-        junction = Junction(spec.road)
-        if plan.unplanned:
-            spec = unplanned(rng, spec, junction)
-        stage = set_stage(rng, spec, junction, usual_duration(rng, spec, config.frames))
-        if spec.meet is None:
-            return stage, None, draws
-        accident = perform_accident(stage)
-        if accident is not None:
-            return stage, accident, draws
-    raise ConfigError(
-        f"{plan.template.name}: those of meet.actors did not collide in {MAX_DRAWS} draws; choose paths that cross, or "
-        "a smaller meet.offset"
-    )
+    """The first draw in which the pair touches, what happens in it, and how many draws were needed."""
+    from tqdm.auto import tqdm
+
+    misses: list[Miss] = []
+    roles: tuple[Role, Role] = ("ego", "other")
+    counted = tqdm(range(1, MAX_DRAWS + 1), "draws", leave=False, disable=not progress, delay=_SHOWN_AFTER)
+    with closing(counted):
+        for draws in counted:
+            spec = plan.draw(rng)
+            junction = Junction(spec.road)
+            if plan.unplanned:
+                spec = unplanned(rng, spec, junction)
+            stage = set_stage(rng, spec, junction, usual_duration(rng, spec, config.frames))
+            if spec.meet is None:
+                return stage, None, draws
+            tried, roles = try_accident(stage), spec.meet.actors
+            if isinstance(tried, Performance):
+                return stage, tried, draws
+            misses.append(tried)
+            if draws == FAR_DRAWS and plan.template.draws_alike and by_far(misses):
+                break
+    raise ConfigError(f"{plan.template.place('meet')}: {misses_text(misses, roles)}")
 
 
 def _twin(stage: Stage, config: SynthConfig, plan: ScenarioPlan) -> Recorded:
     normal = perform_twin(stage, latest_end(stage, config.frames))
     if normal is None:
+        where = "in the normal twin too" if stage.spec.meet else "although all obey the rules"
         raise ConfigError(
-            f"{plan.template.name}: nothing keeps the road users of the normal twin apart; let them start farther from "
-            "each other"
+            f"{plan.template.place('actors')}: the road users collide {where}, even if one of them comes later; let "
+            "them start farther from each other"
         )
     return recorded_normal(stage, normal, config.frames)
 
 
 class _Ids(NamedTuple):
-    """The numbers of all actors of a stage: those that move first, then the parked ones."""
+    """The ids of all actors of a stage: first the moving ones, then the parked ones."""
 
     actor: tuple[int, ...]
     camera: tuple[int, ...]
@@ -160,7 +179,7 @@ class _Ids(NamedTuple):
 
     @classmethod
     def of(cls, rng: np.random.Generator, stage: Stage) -> "_Ids":
-        """Moving ones are numbered in the thousands, parked ones from 20000, in the order of their making."""
+        """Moving actors get ids from 1000 on, parked ones from 20000 on, in the order in which they were made."""
         moving, count = len(stage.users), len(stage.users) + len(stage.parked)
         actor = (rng.integers(1000, 2000) + rng.integers(1, 4, moving).cumsum()).tolist()
         actor += [STATIC_ACTOR_ID + row for row in range(moving, count)]
@@ -233,6 +252,6 @@ def _collision(stage: Stage, recorded: Recorded, ids: _Ids) -> Collision | None:
 
 
 def _pair_agents(stage: Stage) -> tuple[AgentName | None, AgentName | None]:
-    """Which agents the two are who are timed to meet; None for a road user that records nothing, or if nobody is."""
+    """The agents of the two who are timed to meet; None for a road user that is no agent, or if nobody is timed."""
     first, second = (stage.users[row] for row in stage.cast.pair) if stage.cast.pair else (None, None)
     return AGENT_OF_ROLE.get(first.role) if first else None, AGENT_OF_ROLE.get(second.role) if second else None

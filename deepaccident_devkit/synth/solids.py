@@ -1,4 +1,4 @@
-"""Six-faced solids, the one kind of surface that the synthetic world is made of (besides the flat ground)."""
+"""Six-faced solids: all of the synthetic world except the ground is made of them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ class Solids:
         corners: (P, 8, 3) float64, metres, in the order of `CORNER_SIGNS`.
         colors: (P, 6, 3) uint8, RGB of each face in white light.
         facade: (P,) bool, whether the upright faces carry rows of windows.
-        main: (P,) bool, whether it is large enough to tell by it that its owner is seen.
+        main: (P,) bool, whether it is so large that who sees it sees its owner.
     """
 
     corners: FloatArray
@@ -60,8 +60,8 @@ class Block:
         x: from, to, metres.
         y: from, to, metres.
         z: from, to, metres.
-        color: of all faces.
-        glass: faces that take `GLASS` instead.
+        color: the colour of all faces.
+        glass: faces that have the colour `GLASS` instead.
         inset: by how much the upper face is smaller at the front, at the rear and at each side, metres.
         facade: as in `Solids`.
         main: as in `Solids`.
@@ -81,7 +81,7 @@ GLASS: Color = (52, 66, 80)
 
 
 def build(blocks: Sequence[Block]) -> Solids:
-    """The solids of some blocks, in order."""
+    """The solids of blocks, in order."""
     return Solids(
         np.array([_corners(block) for block in blocks]).reshape(-1, 8, 3),
         np.array([_colors(block) for block in blocks], dtype=np.uint8).reshape(-1, 6, 3),

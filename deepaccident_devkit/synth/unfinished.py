@@ -1,4 +1,4 @@
-"""A release that is being made: a folder beside its place, with which a later call can go on after a break."""
+"""A release that is being made: a folder beside its place, so that a later call can continue after an interruption."""
 
 import json
 import shutil
@@ -36,21 +36,21 @@ class Unfinished:
         return self.folder / "parts" / name
 
     def clear(self, name: str) -> None:
-        """Remove what a break left of a part."""
+        """Remove the incomplete files of a part that was interrupted."""
         shutil.rmtree(self.part(name), ignore_errors=True)
 
     def made(self) -> frozenset[str]:
-        """Names of the parts that are whole; a line that a break cut off is none of them."""
+        """Names of the complete parts; a last line without its end does not count."""
         path = self.folder / _MADE_FILE
         return frozenset(path.read_text(encoding="utf-8").split("\n")[:-1] if path.is_file() else ())
 
     def note(self, name: str) -> None:
-        """Remember that a part is whole."""
+        """Remember that a part is complete."""
         with (self.folder / _MADE_FILE).open("a", encoding="utf-8") as file:
             file.write(f"{name}\n")
 
     def gather(self, names: Iterable[str]) -> None:
-        """Move the files of a scenario's parts into the release, as far as they are not there yet."""
+        """Move the files of a scenario's parts into the release, if they are not there yet."""
         for name in names:
             if self.part(name).is_dir():
                 _merge(self.part(name), self.release)
@@ -58,10 +58,10 @@ class Unfinished:
 
 @contextmanager
 def unfinished_release(out: Path, config: SynthConfig) -> Iterator[Unfinished]:
-    """The release that becomes `out` when the block succeeds; a block that fails leaves it to be gone on with.
+    """The release that becomes `out` when the block succeeds; if the block fails, a later call can continue it.
 
     Raises:
-        ConfigError: the one that is there is of another configuration or version, or another process is making it.
+        ConfigError: the unfinished release is of another configuration or version, or another process is making it.
     """
     from filelock import FileLock, Timeout
 
@@ -103,7 +103,7 @@ def _agree(path: Path, config: SynthConfig) -> None:
 
 
 def _as_json(config: SynthConfig) -> dict[str, Any]:
-    """All that the bytes of a release depend on, as it comes back from JSON; the scenario file with what it says."""
+    """All that the bytes of a release depend on, as JSON returns it; of the scenario file its text."""
     text = None if config.spec is None else config.spec.read_text(encoding="utf-8")
     fields = {"version": __version__, **asdict(config), "image_size": config.pixels, "spec": text}
     as_read: dict[str, Any] = json.loads(json.dumps(fields))

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from deepaccident_devkit.errors import TokenError
 from deepaccident_devkit.tables import tokens
-from deepaccident_devkit.tables.tokens import parse_number, unknown_token
+from deepaccident_devkit.tables.tokens import Parts, parse_number, unknown_token
 from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, CHANNEL_FORMAT, CHANNELS
 
 Views = Mapping[str, Mapping[str, Any]]
@@ -137,13 +138,32 @@ class Resolver:
         actor = self._views["instance"]["actor_id"].item(view["instance_row"].item(row))
         return tokens.track_token(self._frame_token(view["frame_row"].item(row)), actor)
 
+    def _split(self, table: str, token: str) -> Parts:
+        try:
+            return tokens.split(table, token)
+        except TokenError:
+            why = self._lacks_its_type(token)
+            if why:
+                raise unknown_token(table, token, why) from None
+            raise
+
+    def _lacks_its_type(self, token: str) -> str:
+        """What to write where a token begins with the name of a scenario; empty for all others."""
+        name, slash, rest = token.partition("/")
+        here = [f"'{scenario}{slash}{rest}'" for scenario in self.scenario_tokens if scenario.split("/")[1] == name]
+        if not here:
+            return ""
+        shown = " or ".join(here[:3]) + (f" or one of {len(here) - 3} more" if len(here) > 3 else "")
+        return f"a scenario's name is not unique, its token begins with its type; write {shown}"
+
     def _scenario_row(self, token: str) -> int:
         return self._scenario_of("scenario", token, token)
 
     def _scenario_of(self, table: str, token: str, scenario: str) -> int:
         row = self._scenario_rows.get(scenario)
         if row is None:
-            raise unknown_token(table, token, f"this release has no scenario '{scenario}' (see list_scenarios())")
+            why = self._lacks_its_type(token) or f"this release has no scenario '{scenario}' (see list_scenarios())"
+            raise unknown_token(table, token, why)
         return row
 
     def _agent_of(self, table: str, token: str, scenario_row: int, agent: str) -> int:
@@ -160,16 +180,16 @@ class Resolver:
         return index
 
     def _agent_row(self, token: str) -> int:
-        scenario, (agent,) = tokens.split("agent", token)
+        scenario, (agent,) = self._split("agent", token)
         return self._agent_of("agent", token, self._scenario_of("agent", token, scenario), agent)
 
     def _frame_row(self, token: str) -> int:
-        scenario, (word,) = tokens.split("frame", token)
+        scenario, (word,) = self._split("frame", token)
         scenario_row = self._scenario_of("frame", token, scenario)
         return self._first_frame[scenario_row] + self._index_of("frame", token, scenario_row, word) - 1
 
     def _sample_row(self, token: str) -> int:
-        scenario, (agent, word) = tokens.split("sample", token)
+        scenario, (agent, word) = self._split("sample", token)
         return self._sample_of("sample", token, scenario, agent, word)
 
     def _sample_of(self, table: str, token: str, scenario: str, agent: str, word: str) -> int:
@@ -178,7 +198,7 @@ class Resolver:
         return self.sample_at(agent_row, self._index_of(table, token, scenario_row, word))
 
     def _sample_data_row(self, token: str) -> int:
-        scenario, (agent, word, channel) = tokens.split("sample_data", token)
+        scenario, (agent, word, channel) = self._split("sample_data", token)
         sample = self._sample_of("sample_data", token, scenario, agent, word)
         return sample * len(CHANNELS) + self._channel_code("sample_data", token, channel)
 
@@ -192,7 +212,7 @@ class Resolver:
 
     def _calibrated_sensor_row(self, token: str) -> int:
         table = "calibrated_sensor"
-        scenario, (agent, channel, *rest) = tokens.split(table, token)
+        scenario, (agent, channel, *rest) = self._split(table, token)
         agent_row = self._agent_of(table, token, self._scenario_of(table, token, scenario), agent)
         wanted = (self._channel_code(table, token, channel), parse_number(rest[0]) if rest else 1)
         view = self._views[table]
@@ -204,7 +224,7 @@ class Resolver:
         raise unknown_token(table, token, "this sensor has fewer distinct values")
 
     def _instance_row(self, token: str) -> int:
-        scenario, (word, actor) = tokens.split("instance", token)
+        scenario, (word, actor) = self._split("instance", token)
         return self._instance_of("instance", token, self._scenario_of("instance", token, scenario), word, actor)
 
     def _instance_of(self, table: str, token: str, scenario_row: int, word: str, actor: str) -> int:
@@ -219,7 +239,7 @@ class Resolver:
         return int(first) + position
 
     def _annotation_row(self, token: str) -> int:
-        scenario, (agent, word, row_word) = tokens.split("annotation", token)
+        scenario, (agent, word, row_word) = self._split("annotation", token)
         sample = self._sample_of("annotation", token, scenario, agent, word)
         row, count = parse_number(row_word), self._views["sample"]["num_annotations"].item(sample)
         if row is None or not 0 <= row < count:
@@ -228,7 +248,7 @@ class Resolver:
         return first + row
 
     def _track_row(self, token: str) -> int:
-        scenario, (frame, word, actor) = tokens.split("track", token)
+        scenario, (frame, word, actor) = self._split("track", token)
         scenario_row = self._scenario_of("track", token, scenario)
         frame_row = self._first_frame[scenario_row] + self._index_of("track", token, scenario_row, frame) - 1
         instance = self._instance_of("track", token, scenario_row, word, actor)

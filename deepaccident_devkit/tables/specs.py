@@ -6,6 +6,7 @@ from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from deepaccident_devkit.errors import TableError
+from deepaccident_devkit.nuscenes_names import table_remedy
 from deepaccident_devkit.tables.columns import Column, Derived, Key, Kind, TableSpec
 from deepaccident_devkit.tables.records import RECORDS
 
@@ -21,7 +22,7 @@ def table_spec(name: str) -> TableSpec:
     try:
         return table_specs()[name]
     except KeyError:
-        raise TableError(f"no table {name!r}; there are {', '.join(table_specs())}") from None
+        raise TableError(f"no table {name!r}; there are {', '.join(table_specs())}{table_remedy(name)}") from None
 
 
 def record_columns(record: type) -> tuple[Column, ...]:

@@ -1,8 +1,10 @@
 """Tokens: readable, stable, and made of the names on disk, so that no dictionary of them is needed."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from deepaccident_devkit.errors import TokenError
+from deepaccident_devkit.taxonomy import CHANNELS
 
 ACTOR = "actor"
 FORMS = {
@@ -36,8 +38,17 @@ def split(table: str, token: str) -> Parts:
     if table == "calibrated_sensor":
         wanted = {4, 5}
     if len(words) not in wanted:
-        raise unknown_token(table, token, f"expected the form {FORMS[table]}")
+        raise unknown_token(table, token, f"expected the form {FORMS[table]}{_remedy(table, words)}")
     return Parts(f"{words[0]}/{words[1]}", words[2:])
+
+
+def _remedy(table: str, words: Sequence[str]) -> str:
+    """What to do where a sensor file's token was given as a sample's, or a sample's as a sensor file's."""
+    if table == "sample" and len(words) == 5 and words[-1] in CHANNELS:
+        return f"; it names a sensor file: leave out '/{words[-1]}'"
+    if table == "sample_data" and len(words) == 4 and parse_number(words[-1], 3) is not None:
+        return f"; it names a sample: add a channel, such as '/{CHANNELS[0]}'"
+    return ""
 
 
 def unknown_token(table: str, token: str, why: str) -> TokenError:

@@ -1,4 +1,4 @@
-"""Test kit: releases of under 1 MB in both layouts, healthy or broken in a named way, for tests of loaders.
+"""Test kit: releases of less than 1 MB in both layouts, healthy or broken in a named way, for tests of loaders.
 
 A pytest plugin (`plugin`, loaded by pytest where the devkit is installed) has fixtures, and `strategies` draws contents
 with hypothesis; the functions here need neither of them. See docs/testing.md.
@@ -35,7 +35,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name's module when it is asked for: pytest imports this package at every start."""
+    """Import a public name's module only when the name is used: pytest imports this package at every start."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

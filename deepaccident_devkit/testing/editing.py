@@ -1,4 +1,4 @@
-"""`ScenarioEditor`: changes the files of one scenario, raw as they are; files are replaced, never written into."""
+"""`ScenarioEditor`: changes the raw files of one scenario; files are replaced, never changed in place."""
 
 import io
 import shutil
@@ -25,14 +25,14 @@ FIELD: Mapping[str, int] = {name: place for place, name in enumerate(FIELDS)}
 
 
 class ScenarioEditor:
-    """One scenario's files, to be damaged; a release of hard links is safe, for no file is written into.
+    """One scenario's files, to be damaged; a release of hard links is safe, because no file is changed in place.
 
     Attributes:
         root: the release's folder.
-        scenario: where the files lie.
-        token: the scenario's.
-        agents: those with calib files.
-        frames: their numbers, from the first agent's calib files.
+        scenario: the scenario's folder.
+        token: the scenario's token.
+        agents: the agents with calib files.
+        frames: numbers of the frames, from the first agent's calib files.
     """
 
     def __init__(self, root: Path, scenario: ScenarioFolder) -> None:
@@ -43,14 +43,14 @@ class ScenarioEditor:
         self.frames = frame_numbers(scenario.kind_folder(scenario.agents[0], "calib"), "pkl")[0]
 
     def changing(self, path: Path) -> None:
-        """Called before a file is made, replaced or removed; for those who keep what was there."""
+        """Called before a file is made, replaced or removed; a subclass can save the old file here."""
 
     def file(self, agent: str, kind: str, frame: int) -> Path:
         """A file of a kind: `label`, `calib` or a channel."""
         return self.scenario.file(agent, kind, frame, ENDINGS[kind])
 
     def folder(self, agent: str, kind: str) -> Path:
-        """The folder of such files."""
+        """The folder of the files of a kind."""
         return self.scenario.kind_folder(agent, kind)
 
     def write(self, path: Path, content: bytes) -> None:
@@ -64,7 +64,7 @@ class ScenarioEditor:
         path.unlink()
 
     def remove_folder(self, folder: Path) -> None:
-        """Remove a folder with all that is in it; one that is not there stays away."""
+        """Remove a folder with all its contents; if there is none, do nothing."""
         for path in sorted(folder.rglob("*")):
             if path.is_file():
                 self.changing(path)
@@ -82,7 +82,7 @@ class ScenarioEditor:
         self.write(other, content)
 
     def rows(self, agent: str, frame: int) -> Rows:
-        """A label's words."""
+        """The words of a label file's lines."""
         return [line.split() for line in self.file(agent, "label", frame).read_text("ascii").splitlines()]
 
     def write_rows(self, agent: str, frame: int, rows: Rows) -> None:
@@ -92,7 +92,7 @@ class ScenarioEditor:
     def edit_rows(
         self, agent: str, frames: Sequence[int], edit: Callable[[list[str]], None], *, actor: int | None = None
     ) -> None:
-        """Apply `edit` to the words of each box line of the frames, or to those of one actor id alone."""
+        """Apply `edit` to the words of each box line of the frames; with `actor`, only to lines with this id."""
         for frame in frames:
             rows = self.rows(agent, frame)
             for row in rows[1:]:
@@ -101,7 +101,7 @@ class ScenarioEditor:
             self.write_rows(agent, frame, rows)
 
     def calib(self, agent: str, frame: int) -> dict[str, AnyArray]:
-        """A calib file's own dict. Raises CalibError if it is damaged already."""
+        """The dict in a calib file. Raises CalibError if the file is already damaged."""
         return read_calib(self.file(agent, "calib", frame), raw=True)
 
     def write_calib(self, agent: str, frame: int, calib: Mapping[str, AnyArray]) -> None:
@@ -117,11 +117,11 @@ class ScenarioEditor:
             self.write_calib(agent, frame, {**calib, key: edit(calib[key])})
 
     def array(self, agent: str, channel: str, frame: int) -> AnyArray:
-        """The array of an npz file, as it is."""
+        """The array of an npz file, unchanged."""
         return read_npz(self.file(agent, channel, frame))
 
     def write_array(self, agent: str, channel: str, frame: int, array: Any, *, key: str = KEY) -> None:
-        """Replace an npz file by one that holds any array, of objects too, under any key."""
+        """Replace an npz file by one with any array, of objects too, under any key."""
         content = io.BytesIO()
         np.savez_compressed(content, **{key: array})
         self.write(self.file(agent, channel, frame), content.getvalue())

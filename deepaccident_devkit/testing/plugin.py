@@ -1,7 +1,7 @@
 """The pytest plugin `deepaccident`: fixtures that give small releases, healthy and broken, as folders.
 
-It adds no options, hooks or marks, and imports the rest of the devkit when a fixture is asked for. Turn it off with
-`-p no:deepaccident`. Override a fixture in a `conftest.py` to have all others use your value.
+It adds no options, hooks or marks, and imports the rest of the devkit only when a test uses a fixture. Turn it off with
+`-p no:deepaccident`. Override a fixture in a `conftest.py`, and all others use your value.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
 MakeRelease = Callable[..., Path]
 """Options of `SmallRelease` → the folder of such a release."""
 BreakRelease = Callable[[str], "BrokenRelease"]
-"""The name of a breakage → a release that is broken so."""
+"""The name of a breakage → a release with this breakage."""
 
 
 @pytest.fixture(scope="session", params=["A", "B"], ids=["layout_A", "layout_B"])
 def deepaccident_layout(request: pytest.FixtureRequest) -> Layout:
-    """Each of the two layouts in turn: a test that gets it, or a release, runs twice."""
+    """Each of the two layouts in turn: a test that uses it, or a release, runs twice."""
     layout: Layout = request.param
     return layout
 
 
 @pytest.fixture(scope="session")
 def deepaccident_config(deepaccident_layout: Layout) -> SmallRelease:
-    """What the releases of all other fixtures are like."""
+    """The options of the releases of all other fixtures."""
     from deepaccident_devkit.testing.releases import SmallRelease
 
     return SmallRelease(layout=deepaccident_layout)
@@ -42,9 +42,9 @@ def deepaccident_config(deepaccident_layout: Layout) -> SmallRelease:
 
 @pytest.fixture(scope="session")
 def make_deepaccident_release(tmp_path_factory: pytest.TempPathFactory) -> MakeRelease:
-    """A factory: options of `SmallRelease` → the folder of a healthy release; the same options, the same folder.
+    """A factory: options of `SmallRelease` → the folder of a healthy release; the same options give the same folder.
 
-    `make(config, frames=2)` is like `config`, but with two frames. Files are read-only by agreement, as those of
+    `make(config, frames=2)` is like `config`, but with two frames. Tests must not change the files, as with
     `deepaccident_release`.
     """
     from deepaccident_devkit.testing.releases import SmallRelease, write_small_release
@@ -62,19 +62,19 @@ def make_deepaccident_release(tmp_path_factory: pytest.TempPathFactory) -> MakeR
 
 @pytest.fixture(scope="session")
 def deepaccident_release(deepaccident_config: SmallRelease, make_deepaccident_release: MakeRelease) -> Path:
-    """The folder of a healthy release, one a session and layout; read-only by agreement."""
+    """The folder of a healthy release, one for each session and layout; tests must not change it."""
     return make_deepaccident_release(deepaccident_config)
 
 
 @pytest.fixture
 def deepaccident_release_copy(deepaccident_release: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of `deepaccident_release`, without an index, that the test may change as it likes."""
+    """A copy of `deepaccident_release`, without an index, that the test may change."""
     return _copied(deepaccident_release, tmp_path_factory.mktemp("deepaccident") / "copy")
 
 
 @pytest.fixture
 def deepaccident_broken(deepaccident_release: Path, tmp_path_factory: pytest.TempPathFactory) -> BreakRelease:
-    """A factory: a name of `BREAKAGES` → a copy of `deepaccident_release` that is broken so."""
+    """A factory: a name of `BREAKAGES` → a copy of `deepaccident_release` with this breakage."""
     from deepaccident_devkit.testing.breakages import break_release, checked_breakage
 
     def broken(name: str) -> BrokenRelease:

@@ -31,18 +31,18 @@ from deepaccident_devkit.testing.scene import FAR_ACTOR_ID, POLE_HEIGHT, SmallSc
 from deepaccident_devkit.testing.sensors import cloud_of, picture_of, top_view_of
 
 _BEV_COMPRESSION = 6
-"""A quarter of the bytes that the writer's default gives, which is quicker."""
+"""It gives a quarter of the bytes of the writer's default, which is faster."""
 
 
 class Recorder:
     """Writes what one agent recorded at one frame, file by file.
 
     Args:
-        folder: the scenario's.
-        scene: what happens in it.
-        agent: who records.
-        frame: counted from 1.
-        image_size: width, height, pixels.
+        folder: the scenario's folder.
+        scene: what happens in the scenario.
+        agent: the agent that records.
+        frame: number of the frame, counted from 1.
+        image_size: width and height, pixels.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class Recorder:
         write_calib(self._folder.calib_path(self._agent, self._frame), self._calib)
 
     def write_label(self) -> None:
-        """The boxes: the own row first; the pedestrian who is far away is not tracked."""
+        """The boxes: the own row is first; the pedestrian who is far away is not tracked."""
         labels = self._labels()
         points = labels.boxes().count_points(self._cloud)
         write_label(self._folder.label_path(self._agent, self._frame), replace(labels, num_lidar_pts=points))
@@ -90,7 +90,7 @@ class Recorder:
         return picture_of(boxes, self._cameras[channel], sky=sky, road=road)
 
     def _labels(self) -> Labels:
-        """What the label says, without the numbers of points."""
+        """The contents of the label, without the numbers of points."""
         boxes = self._boxes
         yaw = np.where(self._own, 0.0, boxes.yaw)
         return Labels(
@@ -110,7 +110,7 @@ class Recorder:
         )
 
     def _visible(self) -> BoolArray:
-        """(N,) whether a corner of the box is in any of the pictures; nobody hides anybody."""
+        """(N,) whether a corner of the box is in any of the pictures; no actor hides another."""
         seen = np.zeros(len(self._boxes), dtype=bool)
         for channel, camera in self._cameras.items():
             boxes = self._boxes.transform(self._calib.camera_from_lidar[channel], channel)

@@ -1,4 +1,4 @@
-"""`write_small_release`: a whole release of a few hundred kilobytes, with everything that the format names."""
+"""`write_small_release`: a complete release of a few hundred kilobytes, with all parts of the format."""
 
 import re
 from collections.abc import Sequence
@@ -32,17 +32,17 @@ _LEAST_IMAGE, _MOST_IMAGE = (16, 9), (1600, 900)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SmallRelease:
-    """What a small release is like; checked when made, raises ConfigError.
+    """The options of a small release; checked when made, raises ConfigError.
 
     Attributes:
-        layout: `A`, all splits in one folder, or `B`, a folder a split.
-        frames: recorded frames of each scenario, at 10 Hz; three to a whole release of less than 1 MB.
-        splits: which of `train` (an accident and its normal twin, signalised), `val` (an accident, unsignalised) and
-            `test` (a normal scenario without labels, BEV arrays and meta, as published) there are.
-        agents: who records.
-        channels: the sensors whose files there are; none for labels, calib and meta alone.
+        layout: `A`, all splits in one folder, or `B`, one folder for each split.
+        frames: recorded frames of each scenario, at 10 Hz; with three, the release has less than 1 MB.
+        splits: the splits to make, of `train` (an accident and its normal twin, signalised), `val` (an accident,
+            unsignalised) and `test` (a normal scenario without labels, BEV arrays and meta, as published).
+        agents: the agents.
+        channels: the sensors whose files are written; empty for only labels, calib and meta.
         image_size: width and height of the pictures, pixels.
-        seed: draws places in town, speeds and weather; the same seed gives the same values.
+        seed: it decides places in town, speeds and weather; the same seed gives the same values.
     """
 
     layout: Layout = "A"
@@ -54,7 +54,7 @@ class SmallRelease:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Check every field; lists become tuples, so that equal configurations are one key."""
+        """Check every field; lists become tuples, so that equal configurations have equal hashes."""
         for name in ("splits", "agents", "channels", "image_size"):
             object.__setattr__(self, name, _as_tuple(name, getattr(self, name)))
         for name, value, known in (
@@ -88,7 +88,7 @@ def _as_tuple(name: str, value: object) -> tuple[object, ...]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Story:
-    """One scenario of the release; twins share their name and all that is drawn."""
+    """One scenario of the release; twins have the same name and the same random values."""
 
     split: str
     scenario_type: str
@@ -104,12 +104,12 @@ class _Story:
 
     @property
     def published(self) -> bool:
-        """Whether labels, BEV arrays and meta are; those of the test split are not."""
+        """Whether its labels, BEV arrays and meta are published; those of the test split are not."""
         return self.split != "test"
 
     @property
     def number(self) -> int:
-        """At the name's end."""
+        """The number at the end of the name."""
         return int(re.sub(r".*scenario", "", self.name))
 
 
@@ -124,15 +124,15 @@ _STORIES = (
 def write_small_release(out: Path, config: SmallRelease | None = None) -> Path:
     """Write a healthy release of less than 1 MB; returns its folder.
 
-    It needs neither a generator nor a GPU. `deepaccident validate --deep` has nothing to say against it. The default
-    takes a second or two, `SmallRelease(channels=())` a tenth of it.
+    It needs neither a generator nor a GPU. `deepaccident validate --deep` finds nothing in it. The default takes a
+    second or two, `SmallRelease(channels=())` a tenth of it.
 
     Args:
-        out: the folder to make; must not exist or be empty.
-        config: what the release is like; `SmallRelease()` if None.
+        out: the folder to make; it must be empty, or not exist yet.
+        config: the options of the release; `SmallRelease()` if None.
 
     Raises:
-        ConfigError: `out` is a file or holds something.
+        ConfigError: `out` is a file or is not empty.
     """
     wanted = config or SmallRelease()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -191,7 +191,7 @@ def _meta(rng: np.random.Generator, scene: SmallScene, *, accident: bool) -> Met
 
 
 def _write_splits(root: Path, stories: Sequence[_Story]) -> None:
-    """Every split file, empty where nothing falls into it; the mini splits hold all of train and val."""
+    """Write all split files, empty ones too; the mini splits hold all of train and val."""
     for split in (*SPLITS, *MINI_SPLITS):
         of_split = [story.token for story in stories if story.split == split.removesuffix("_mini")]
         write_split_file(root / f"{split}.txt", of_split)

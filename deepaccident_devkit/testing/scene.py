@@ -1,4 +1,4 @@
-"""Who drives where in a small release: a junction at the ground frame's origin, everybody at a constant velocity."""
+"""Who drives where in a small release: a junction at the ground frame's origin, all with constant velocities."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,11 +11,11 @@ from deepaccident_devkit.taxonomy import FRAME_PERIOD, VEHICLE_AGENTS, AgentName
 AGENT_IDS = (1223, 1236, 1212, 1237)
 """Actor ids of `taxonomy.VEHICLE_AGENTS`."""
 FAR_ACTOR_ID = 1399
-"""The pedestrian whom every label calls untracked (−1)."""
+"""The pedestrian that is untracked (−1) in every label."""
 PAIR: tuple[AgentName, AgentName] = ("ego_vehicle", "other_vehicle")
 """The two that collide."""
 _DELAY = 15.0
-"""Metres by which the other vehicle and its follower are late in a normal scenario."""
+"""How many metres the other vehicle and its follower are farther back in a normal scenario."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,7 +23,7 @@ class RoadUser:
     """A box on the ground that moves straight ahead; ground frame, right-handed, metres.
 
     Attributes:
-        actor_id: CARLA's.
+        actor_id: CARLA's id.
         category: class name.
         size: length, width, height.
         end: x, y of its centre at the last frame.
@@ -47,7 +47,7 @@ _AGENTS = (
     RoadUser(actor_id=1212, category="car", size=_CAR, end=(1.75, -1.75), yaw=_SOUTH_TO_NORTH, speed=7.0),
     RoadUser(actor_id=1237, category="car", size=_CAR, end=(1.75, -12.0), yaw=_SOUTH_TO_NORTH, speed=7.0),
 )
-"""At the last frame the ego's front has touched the other's left side: the boxes overlap by 0.1 m."""
+"""At the last frame the ego's front touches the left side of the other vehicle: the boxes overlap by 0.1 m."""
 _TRAFFIC = (
     RoadUser(actor_id=1301, category="truck", size=(8.4, 2.6, 3.6), end=(18.0, 1.75), yaw=_EAST_TO_WEST, speed=6.0),
     RoadUser(actor_id=1302, category="cyclist", size=(1.64, 0.5, 1.77), end=(5.5, 12.0), yaw=np.pi / 2, speed=4.0),
@@ -57,7 +57,7 @@ _TRAFFIC = (
     RoadUser(actor_id=FAR_ACTOR_ID, category="pedestrian", size=(0.4, 0.4, 1.86), end=(70, 8), yaw=2.2, speed=0.0),
 )
 POLE_HEIGHT = 4.0
-"""Of the infrastructure's LiDAR above the ground, metres."""
+"""Height of the infrastructure's LiDAR above the ground, metres."""
 _POLE = (8.0, 8.0, POLE_HEIGHT)
 
 
@@ -67,7 +67,7 @@ class SmallScene:
 
     Attributes:
         world_from_ground: where the junction lies in its town.
-        users: everybody, the four vehicle agents first.
+        users: all road users, the four vehicle agents first.
         frames: how many are recorded.
     """
 
@@ -76,7 +76,7 @@ class SmallScene:
     frames: int
 
     def boxes(self, frame: int) -> Boxes:
-        """Everybody's boxes at a frame (counted from 1), world frame; points and visibility are not known yet."""
+        """The boxes of all at a frame (counted from 1), world frame; points and visibility are not known yet."""
         seconds = (self.frames - frame) * FRAME_PERIOD
         yaw = np.array([user.yaw for user in self.users])
         size = np.array([user.size for user in self.users])
@@ -94,7 +94,7 @@ class SmallScene:
         )
 
     def world_from_ego(self, agent: AgentName, frame: int) -> SE3:
-        """An agent's pose at a frame: on the road under the middle of its box, or where the pole's LiDAR is."""
+        """An agent's pose at a frame: on the road below the middle of its box; for the pole, where its LiDAR is."""
         if agent not in VEHICLE_AGENTS:
             return self.world_from_ground @ SE3.from_yaw(0.0, _POLE)
         boxes, row = self.boxes(frame), VEHICLE_AGENTS.index(agent)
@@ -102,7 +102,7 @@ class SmallScene:
 
 
 def small_scene(rng: np.random.Generator, *, frames: int, accident: bool) -> SmallScene:
-    """A scene whose place in its town and whose speeds are drawn; the same draws with and without the accident."""
+    """A scene with a random place in its town and random speeds; they are the same with and without the accident."""
     x, y, yaw = rng.uniform(-200.0, 200.0), rng.uniform(-200.0, 200.0), rng.uniform(-np.pi, np.pi)
     ego_speed, other_speed = rng.uniform(0.8, 1.2, 2).tolist()
     factors = (ego_speed, ego_speed, other_speed, other_speed)

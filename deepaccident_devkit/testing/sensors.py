@@ -1,4 +1,4 @@
-"""Sensor files of a small release: tiny pictures, few points and a top-down view, all of the labels' boxes."""
+"""Sensor files of a small release: tiny pictures, few points and a view from above; all show the labels' boxes."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,7 @@ from deepaccident_devkit.release.bev_camera import TAGS
 from deepaccident_devkit.taxonomy import BEV_RESOLUTION, BEV_SHAPE, CATEGORIES
 
 _MOST_POINTS, _POINT_METRES = 20, 120.0
-"""Points on a box, and those on one that is 1 m away; they thin out with the distance."""
+"""The most points on a box, and the number of points on a box 1 m away; it becomes smaller with the distance."""
 _GROUND_RADII, _GROUND_POINTS = (6.0, 12.0, 24.0), 12
 _LIDAR_RANGE = 65.0
 _LEAST_DEPTH = 0.5
@@ -19,11 +19,11 @@ _MIDDLE = (BEV_SHAPE[0] - 1) / 2
 
 
 def cloud_of(boxes: Boxes, lidar_height: float) -> FloatArray:
-    """Points (N, 3) in the LiDAR frame, metres, with the digits of the file's float32: in the boxes, and on the ground.
+    """Points (N, 3) in the LiDAR frame, metres, in the boxes and on the ground, rounded to the file's float32.
 
     Args:
-        boxes: in the LiDAR frame.
-        lidar_height: above the ground, metres.
+        boxes: boxes in the LiDAR frame.
+        lidar_height: height of the LiDAR above the ground, metres.
     """
     parts = [_ground(lidar_height)]
     distance = np.linalg.norm(boxes.center[:, :2], axis=1)
@@ -41,9 +41,9 @@ def picture_of(
     """A picture (H, W, 3), RGB: sky, road, and each box's outline filled with its class's colour, far ones first.
 
     Args:
-        boxes: in the camera's optical frame.
+        boxes: boxes in the camera's optical frame.
         camera: its optics.
-        sky: RGB; no two pictures should have the same sky and road, so that no two files are the same.
+        sky: RGB; sky and road should differ between all pictures, so that no two files are equal.
         road: RGB.
     """
     import cv2
@@ -61,11 +61,11 @@ def picture_of(
 
 
 def top_view_of(boxes: Boxes, object_ids: NDArray[np.uint16]) -> tuple[ByteArray, NDArray[np.uint16]]:
-    """Tags (1200, 1200) uint8 and object ids (1200, 1200) uint16 around an agent, forward up, left left.
+    """Tags (1200, 1200) uint8 and object ids (1200, 1200) uint16 around an agent: up is forward, left is left.
 
     Args:
-        boxes: in the ego or LiDAR frame.
-        object_ids: (N,) what the simulator calls them.
+        boxes: boxes in the ego or LiDAR frame.
+        object_ids: (N,) the simulator's ids of the boxes.
     """
     import cv2
 
@@ -83,7 +83,7 @@ def top_view_of(boxes: Boxes, object_ids: NDArray[np.uint16]) -> tuple[ByteArray
 
 
 def _spread(count: int) -> FloatArray:
-    """(count, 3) places in a box of edges 1 around 0, evenly spread, a little away from its faces."""
+    """(count, 3) places in a box with edges of 1 around 0, evenly distributed, a little away from its faces."""
     steps = np.arange(1, count + 1)[:, None] * (0.8191725, 0.6710436, 0.5497005)  # the R3 sequence
     return as_floats((steps % 1.0 - 0.5) * 0.9)
 

@@ -1,7 +1,7 @@
-"""Hypothesis strategies for what a release is made of: poses, points, boxes, the files' contents, small releases.
+"""Hypothesis strategies for the parts of a release: poses, points, boxes, contents of files, small releases.
 
-Contents (`labels`, `metas`, `calibs`, `clouds`) are all that the files can hold, also odd values; `label_texts` look
-like real files. Raises MissingExtraError on import if hypothesis is not installed.
+Contents (`labels`, `metas`, `calibs`, `clouds`) can be all that the files can hold, unusual values too; `label_texts`
+look like real files. Raises MissingExtraError on import if hypothesis is not installed.
 """
 
 from collections.abc import Sequence
@@ -42,17 +42,17 @@ ANGLES = st.floats(-np.pi, np.pi, allow_nan=False)
 
 
 def numbers(reach: float) -> st.SearchStrategy[float]:
-    """Finite floats between ±reach."""
+    """Finite floats from −`reach` to `reach`."""
     return st.floats(-reach, reach, allow_nan=False)
 
 
 def arrays(shape: tuple[int, ...], reach: float) -> st.SearchStrategy[FloatArray]:
-    """Float64 arrays of numbers between ±reach."""
+    """Float64 arrays of numbers from −`reach` to `reach`."""
     return hnp.arrays(np.float64, shape, elements=numbers(reach))
 
 
 def rotation_matrix(yaw: float, pitch: float, roll: float) -> FloatArray:
-    """Rz(yaw) · Ry(pitch) · Rx(roll), (3, 3), right-handed: written out, so that no test leans on the devkit's own."""
+    """Rz(yaw) · Ry(pitch) · Rx(roll), (3, 3), right-handed: computed here, so that tests do not use the devkit's."""
     (cy, cp, cr), (sy, sp, sr) = np.cos([yaw, pitch, roll]), np.sin([yaw, pitch, roll])
     about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
     about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
@@ -71,18 +71,18 @@ def matrices(draw: st.DrawFn, reach: float = 1e3) -> FloatArray:
 
 
 def poses(reach: float = 1e3) -> st.SearchStrategy[SE3]:
-    """SE3 objects over `matrices`."""
+    """SE3 objects of `matrices`."""
     return matrices(reach).map(SE3)
 
 
 def points(max_count: int = 8, reach: float = 100.0) -> st.SearchStrategy[FloatArray]:
-    """Arrays (N, 3), N from 0."""
+    """Arrays (N, 3), N from 0 to `max_count`."""
     return st.integers(0, max_count).flatmap(lambda count: arrays((count, 3), reach))
 
 
 @st.composite
 def boxes(draw: st.DrawFn, max_count: int = 5, frame: str = "lidar") -> Boxes:
-    """Boxes with any rotation, unknown velocities among them."""
+    """Boxes with any rotation; some velocities are unknown."""
     count = draw(st.integers(0, max_count))
     rotation = [SE3(draw(matrices())).quaternion.elements for _ in range(count)]
     velocity = draw(arrays((count, 3), 30.0))
@@ -103,7 +103,7 @@ def boxes(draw: st.DrawFn, max_count: int = 5, frame: str = "lidar") -> Boxes:
 
 @st.composite
 def upright_boxes(draw: st.DrawFn, max_count: int = 4, reach: float = 10.0, frame: str = "lidar") -> Boxes:
-    """Boxes that stand on the ground, so near to one another that many overlap, axis-parallel ones among them."""
+    """Boxes that stand on the ground, so near to each other that many overlap; some are parallel to the axes."""
     count = draw(st.integers(0, max_count))
     yaws = ANGLES | st.sampled_from([0.0, np.pi / 2, -np.pi / 2, np.pi])
     return Boxes.from_arrays(
@@ -125,7 +125,7 @@ def cameras() -> st.SearchStrategy[PinholeCamera]:
 
 @st.composite
 def labels(draw: st.DrawFn, max_count: int = 5) -> Labels:
-    """The content of one label file: any finite numbers, velocities unknown among them, either handedness."""
+    """The content of one label file: any finite numbers, some unknown velocities, either handedness."""
     count = draw(st.integers(0, max_count))
     anything = st.floats(allow_nan=False, allow_infinity=False)
     velocity = draw(hnp.arrays(np.float64, (count, 2), elements=st.floats(allow_infinity=False)))
@@ -147,7 +147,7 @@ def labels(draw: st.DrawFn, max_count: int = 5) -> Labels:
 
 @st.composite
 def label_lines(draw: st.DrawFn) -> str:
-    """A box line of a label file with numbers as real ones have them: an actor, an untracked or a parked one."""
+    """A box line of a label file with realistic numbers: of a tracked, an untracked or a parked actor."""
     number = numbers(100.0)
     size = st.floats(0.3, 10.0)
     floats = [draw(number) for _ in range(3)] + [draw(size) for _ in range(3)] + [draw(ANGLES)]
@@ -161,7 +161,7 @@ def label_lines(draw: st.DrawFn) -> str:
 
 @st.composite
 def label_texts(draw: st.DrawFn, max_count: int = 5) -> str:
-    """A whole label file of a vehicle: header, own line, other lines; blank and one-word lines, which are skipped, too.
+    """A complete label file of a vehicle: header, own line, other lines, and blank and one-word lines to be skipped.
 
     Line ends are those of Unix or Windows.
     """
@@ -176,7 +176,7 @@ def label_texts(draw: st.DrawFn, max_count: int = 5) -> str:
 
 @st.composite
 def metas(draw: st.DrawFn) -> Meta:
-    """The content of a meta file, with and without a collision, whole and with lines missing."""
+    """The content of a meta file, with or without a collision, complete or with missing lines."""
     actors = st.integers(1, 30_000)
     agents = st.sampled_from(list(META_AGENTS.values()))
     collision = Collision(
@@ -203,7 +203,7 @@ def metas(draw: st.DrawFn) -> Meta:
 
 @st.composite
 def calibs(draw: st.DrawFn) -> Calib:
-    """The content of a calib file: arbitrary poses, cameras with focal lengths and centres of their own."""
+    """The content of a calib file: any poses, and cameras with different focal lengths and centres."""
     focal = st.floats(100, 2000)
     return Calib(
         ego_from_lidar=draw(poses(5.0)),
@@ -218,13 +218,13 @@ def calibs(draw: st.DrawFn) -> Calib:
 
 @st.composite
 def clouds(draw: st.DrawFn) -> LidarPointCloud:
-    """Point clouds of single-precision numbers, which is what the files hold."""
+    """Point clouds of single-precision numbers, as in the files."""
     values = draw(hnp.arrays(np.float32, (draw(st.integers(0, 20)), 4), elements=st.floats(-100, 100, width=32)))
     return LidarPointCloud(values[:, :3].astype(np.float64), values[:, 3])
 
 
 def damaged(content: bytes) -> st.SearchStrategy[bytes]:
-    """Damaged copies of `content`: bytes changed, inserted, taken out, pieces repeated, the end cut off."""
+    """Damaged copies of `content`: bytes changed, inserted or removed, pieces repeated, the end cut off."""
     places = st.integers(0, len(content) - 1)
     few = st.integers(0, 12)
 
@@ -257,6 +257,6 @@ def small_releases() -> st.SearchStrategy[SmallRelease]:
 
 
 def _some_of(names: Sequence[T]) -> st.SearchStrategy[tuple[T, ...]]:
-    """At least one of some names, in their order."""
+    """One or more of some names, in their order."""
     chosen = st.sets(st.sampled_from(names), min_size=1)
     return chosen.map(lambda some: tuple(name for name in names if name in some))

@@ -28,22 +28,23 @@ def aggregate_point_cloud(
     link: Link | None = None,
     on_missing: OnError = "raise",
 ) -> LidarPointCloud:
-    """The LiDAR points of some agents at a sample's moment and the frames before it, in one frame.
+    """The LiDAR points of some agents at a sample's moment and the frames before it, in one coordinate frame.
 
     Args:
         dataset: the release.
         sample: token or record: its agent is the ego, its frame the present.
         agents: names of agents, a configuration or its name as seen from the ego, or None for all that are there.
         sweeps: how many frames (0.1 s), the present included; those before the recording began are left out.
-        frame: frame of the result, of the sample at the present: `world`, `ego`, `lidar` or a camera channel.
-        compensate: move the points in the box of an actor from where it was to where it is at the present, by the
+        frame: coordinate frame of the result, at the sample: `world`, `ego`, `lidar` or a camera channel.
+        compensate: whether to move the points in the box of an actor to where the actor is at the present, by the
             track table (all agents' labels); points of actors that are not annotated at both moments stay.
         link: what happens to the partners' data; None for nothing. Each sweep is a message of its own, with its own
             loss, pose error and delay. `compensate` corrects latency, not wrong poses.
         on_missing: of point clouds that were not downloaded: `raise`, or `skip` leaves them out and logs how many.
 
     Returns:
-        The points by frame from the present back, then by agent, the ego first; no points if all were lost or left out.
+        The points by frame, the present first and then backwards, and for each frame by agent, the ego first; no
+        points if all were lost or left out.
 
     Raises:
         TokenError: no such sample.
@@ -51,7 +52,7 @@ def aggregate_point_cloud(
         NotAvailableError: an agent is not in this (partial) release.
         ConfigError: `link` is no Link, or its latency is longer than the scenario's past.
         MissingFileError: a point cloud was not downloaded, and `on_missing` is `raise`.
-        SensorFileError: one cannot be read.
+        SensorFileError: a point cloud cannot be read.
     """
     sweeps = checked_whole("sweeps", sweeps, "a whole number of frames from 1", ChoiceError)
     if sweeps < 1:
@@ -76,16 +77,16 @@ def aggregate_point_cloud(
 
 
 def moved_points(points: FloatArray, then: Boxes, now: Boxes) -> FloatArray:
-    """Points (P, 3) carried along by the boxes that they lie in.
+    """Points (P, 3), each moved with the box that it lies in.
 
     Args:
-        points: in the frame of the boxes, metres.
-        then: the actors when the points were taken.
+        points: in the coordinate frame of the boxes, metres.
+        then: the actors when the points were recorded.
         now: actors at another moment, each id once; actors that are not among `then` are ignored.
 
     Returns:
-        (P, 3): a point in a box of `then` has the same place in that actor's box of `now`; in several, the last
-        one's. The others are where they were.
+        (P, 3): a point in a box of `then` has the same place in that actor's box of `now`. If it lies in several
+        boxes, the last one counts. Points outside all boxes do not move.
     """
     both, row_then, row_now = np.intersect1d(then.actor_id, now.actor_id, return_indices=True)
     before, after = then.select(row_then), now.select(row_now)

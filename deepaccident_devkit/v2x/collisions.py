@@ -22,31 +22,31 @@ if TYPE_CHECKING:
 
 ContactSide = Literal["front", "rear", "left", "right"]
 CONTACT_GAP: Final = 1.5
-"""Metres between the pair at the last frame up to which they can have collided within the next tenth of a second."""
+"""The largest gap at the last frame, metres, with which a pair can collide within the next tenth of a second."""
 _TOUCHING: Final = 0.02
-"""Metres; with a gap of at least this the direction of the shortest line between two outlines is used."""
+"""Metres; if the gap is this large or larger, the direction of the shortest line between two outlines is used."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Contact(FrozenArrays):
-    """The end of an accident scenario; pairs are in meta's order; world, right-handed, metres, seconds, radians.
+    """The end of an accident scenario: world, right-handed, metres, seconds, radians; pairs in the meta file's order.
 
     Attributes:
         instances: tokens of the pair.
         actor_ids: their CARLA ids.
-        frame: token of the last moment at which both are annotated: of a whole recording the last frame, which is at
-            most 0.1 s before the impact.
-        point: (3,) where they touch, seen from above: half-way between their outlines where these are nearest, the
-            middle of the overlap where they overlap already; at the mean height of their centres. Read-only.
-        gap: metres between the outlines from above, 0 where they overlap.
-        speeds: m/s over the ground, by the displacements of the last 0.1 s; NaN where unknown.
-        closing_speed: m/s at which they approach each other along the shortest line between their outlines (along the
-            normal of the sides that meet where they touch or overlap); negative if they part; NaN where unknown.
-        impact_angle: between their headings, in [0, π]: 0 the same way, π head-on.
+        frame: token of the last moment at which both are annotated: in a complete recording the last frame, which is
+            at most 0.1 s before the impact.
+        point: (3,) where they touch, seen from above: the middle between their outlines where these are nearest; if
+            they overlap already, the middle of the overlap; at the mean height of their centres. Read-only.
+        gap: metres between the outlines seen from above, 0 if they overlap.
+        speeds: m/s over the ground, from the displacements of the last 0.1 s; NaN if unknown.
+        closing_speed: m/s with which they approach each other along the shortest line between their outlines (if they
+            touch or overlap, along the normal of the sides that meet); negative if they part; NaN if unknown.
+        impact_angle: angle between their headings, in [0, π]: 0 the same direction, π head-on.
         sides: the side of each that faces the other across the widest gap along any side's normal (the least overlap).
-        agrees: whether meta agrees with the recording: `disagreements` is empty.
-        disagreements: each contradiction in words: a gap of more than 1.5 m, another class than meta's, other
-            agents than meta's, an end before the last frame, or a contact side in meta that is neither of the two
+        agrees: whether the meta file agrees with the recording: `disagreements` is empty.
+        disagreements: each contradiction in words: a gap of more than 1.5 m, other classes or other agents than in the
+            meta file, an end before the last frame, or a contact side in the meta file that is neither of the two
             sides.
     """
 
@@ -63,12 +63,12 @@ class Contact(FrozenArrays):
 
     @property
     def agrees(self) -> bool:
-        """Whether meta agrees with the recording."""
+        """Whether the meta file agrees with the recording."""
         return not self.disagreements
 
 
 def first_accident(dataset: Dataset) -> str:
-    """The token of the first scenario that ends in an accident; raises NotAvailableError if meta names none."""
+    """The token of the first scenario that ends in an accident; raises NotAvailableError if no meta file names one."""
     for record in dataset.scenario:
         if record["collision"] is not None:
             return record["token"]
@@ -94,21 +94,21 @@ def default_scenario(dataset: Dataset) -> str:
 
 
 def collision(dataset: Dataset, scenario: RowArgument) -> Contact | None:
-    """How a scenario's accident happened: the pair that meta names, where and how fast they met.
+    """How a scenario's accident happened: the pair that the meta file names, where they met and how fast.
 
-    Recorded at 10 Hz, the last frame may still show a gap, up to a metre at 10 m/s.
+    As the recording has 10 Hz, the last frame may still show a gap, up to a metre at 10 m/s.
 
     Args:
         dataset: the release.
         scenario: token or record.
 
     Returns:
-        None if meta names no collision.
+        None if the meta file names no collision.
 
     Raises:
         TokenError: no such scenario.
-        NotAvailableError: the scenario has no meta, it names one actor twice, or nobody annotated the pair at one
-            moment.
+        NotAvailableError: the scenario has no meta file, the file names one actor twice, or no label shows both of the
+            pair at the same moment.
     """
     record = dataset.scenario[dataset.getind("scenario", scenario)]
     if record["weather"] is None:
@@ -145,12 +145,12 @@ def collision(dataset: Dataset, scenario: RowArgument) -> Contact | None:
 
 
 def _velocities_into(dataset: Dataset, frame: str, pair: Boxes) -> FloatArray:
-    """(2, 3) m/s in world, by the pair's displacements: a label's velocity at the impact may be that after the blow.
+    """(2, 3) m/s in world, from the pair's displacements: a label's velocity may already be that after the impact.
 
-    Where there is no displacement, the label's counts.
+    If a displacement is unknown, the label's velocity counts.
     """
     velocity = np.full((2, 3), np.nan)
-    for own in (False, True):  # an actor's own row lies up to 0.3 m off
+    for own in (False, True):  # an agent's own row can be wrong by 0.3 m
         for sample in dataset.samples_of(frame):
             boxes, actors = dataset.boxes(sample, velocity="derived"), dataset.actor_ids(sample)
             for which, actor in enumerate(pair.actor_id.tolist()):
@@ -170,10 +170,10 @@ def _last_moment(tracks: ScenarioTracks, scenario: str, first: int, second: int)
 def _contact(pair: Boxes, facing: FloatArray) -> tuple[FloatArray, float, FloatArray]:
     """The point of contact (3,), the gap from above, and the horizontal unit vector (2,) from first to second.
 
-    That vector leads along the shortest line between the outlines; where they touch it is `facing`.
+    That vector is along the shortest line between the outlines; if they touch, it is `facing`.
 
-    The second outline is pushed against the first, a little into it, and the middle of what they then share is taken:
-    for two parallel faces that is the middle of the stretch where they face each other.
+    To find the point, the second outline is moved a little into the first. The point is the middle of their overlap:
+    for two parallel faces, the middle of the part where they are opposite each other.
     """
     from shapely import Polygon, get_coordinates, shortest_line
     from shapely.affinity import translate
@@ -191,7 +191,7 @@ def _contact(pair: Boxes, facing: FloatArray) -> tuple[FloatArray, float, FloatA
 
 
 def _facing(pair: Boxes) -> tuple[FloatArray, tuple[ContactSide, ContactSide]]:
-    """The normal (2,) of a side, from first to second, along which the gap is widest (or the overlap least).
+    """The normal (2,) of a side, from first to second, along which the gap is widest (or the overlap smallest).
 
     Returns:
         The unit vector, and the side of each box that faces the other along it.
@@ -239,18 +239,18 @@ def _disagreements(
 
 
 def _agent_ids(dataset: Dataset, scenario: str) -> dict[str, int | None]:
-    """The vehicles that recorded a scenario in this release → their actor ids, None where meta does not say."""
+    """The vehicles that recorded a scenario in this release → their actor ids; None if the meta file does not say."""
     agents = (dataset.agent.get(f"{scenario}/{name}") for name in agents_of(dataset, scenario))
     return {agent["name"]: agent["actor_id"] for agent in agents if not agent["is_infrastructure"]}
 
 
 def _other_agents(ids: Mapping[str, int | None], pair: Sequence[int], told: Sequence[str | None] | None) -> list[str]:
-    """How the agents that collided by meta differ from those that have the pair's ids, in words.
+    """How the colliding agents in the meta file differ from those that have the pair's ids, in words.
 
     Args:
-        ids: the vehicles that are agents here → their actor ids; None where meta does not say.
+        ids: the vehicles that are agents here → their actor ids; None if the meta file does not say.
         pair: actor ids.
-        told: names of agents, None for a road user that records nothing; None if meta is silent.
+        told: names of agents from the meta file, None for a road user that is no agent; None if it does not say.
     """
     if told is None:
         return []

@@ -11,7 +11,7 @@ from deepaccident_devkit.errors import ChoiceError, NotAvailableError
 from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE, AgentName
 
 Role = Literal["behind", "other", "other_behind", "infrastructure"]
-"""The role of a partner: the vehicle behind the ego, the other side's two, the infrastructure."""
+"""The role of a partner: the vehicle behind the ego, the two vehicles of the other side, the infrastructure."""
 Side = Literal["ego_vehicle", "other_vehicle"]
 
 _PARTNERS: Final[dict[AgentName, dict[Role, AgentName]]] = {
@@ -44,7 +44,7 @@ _PARTNERS: Final[dict[AgentName, dict[Role, AgentName]]] = {
 
 
 def _names(argument: str, expected: str, given: Iterable[str]) -> tuple[str, ...]:
-    """What a caller gave as several names; raises ChoiceError."""
+    """Several names from a caller, checked; raises ChoiceError."""
     if isinstance(given, str) or not isinstance(given, Iterable):
         raise ChoiceError(f"{argument}: expected {expected}, found {given!r}")
     return tuple(given)
@@ -52,11 +52,11 @@ def _names(argument: str, expected: str, given: Iterable[str]) -> tuple[str, ...
 
 @dataclass(frozen=True, slots=True)
 class AgentConfig:
-    """Who cooperates with an ego agent, named by their roles.
+    """The agents that cooperate with an ego agent, named by their roles.
 
     Attributes:
         name: as in `AGENT_CONFIGS`.
-        partners: the roles beside the ego.
+        partners: the roles of the partners.
     """
 
     name: str
@@ -74,15 +74,14 @@ class AgentConfig:
 
         Seen from a vehicle, `behind` is the other vehicle of its side (for a vehicle behind: the one in front), and
         `other` the first of the other side. Seen from the infrastructure, `infrastructure` is the first vehicle of
-        `side`,
-        `behind` the one behind that, `other` and `other_behind` those of the other side. So `vehicles` always is four
-        agents, three of them partners.
+        `side`, `behind` the one behind that, and `other` and `other_behind` those of the other side. So `vehicles`
+        always means four agents, three of them partners.
 
-        The released code shuffles the vehicles and draws the pole's side at random; here the order is that of the
-        roles and the side is the caller's.
+        The released code shuffles the vehicles and draws the infrastructure's side at random. Here the agents have the
+        order of the roles, and the caller chooses the side.
 
         Args:
-            ego: the agent that the others serve.
+            ego: the agent that receives the data of the others.
             side: the side that the infrastructure takes; not used for a vehicle.
 
         Raises:
@@ -110,28 +109,28 @@ AGENT_CONFIGS: Final[dict[str, AgentConfig]] = {
         AgentConfig("all", ("behind", "other", "other_behind", "infrastructure")),
     )
 }
-"""The paper's seven, by name."""
+"""The paper's seven configurations, by name."""
 AVAILABLE: Final = "available"
 """The name of all agents that a (partial) release has of a scenario, as text for None."""
 AGENT_SETS: Final = (*AGENT_CONFIGS, AVAILABLE)
 """The names that `agents=` takes beside agents' own."""
 
 Agents = AgentConfig | str | Sequence[str] | None
-"""Who cooperates, as calls take it for `agents=`: agents' names, a configuration or the name of one as seen from the
-sample's agent, or None or `available` for all that are there."""
+"""What `agents=` can be: names of agents, a configuration or its name as seen from the sample's agent, or None or
+`available` for all agents that are there."""
 
 
 def cooperating_agents(dataset: Dataset, sample: RowArgument, agents: Agents = None) -> tuple[AgentName, ...]:
-    """The agents that an `agents=` argument means at a sample, each once; the sample's own first, if it is one.
+    """The agents that an `agents=` argument means at a sample, each once; the sample's own first if it is among them.
 
     Args:
         dataset: the release.
         sample: token or record: its agent is the ego.
-        agents: names of agents, a configuration, the name of one, or None or `available` for all that are there.
+        agents: names of agents, a configuration or its name, or None or `available` for all that are there.
 
     Raises:
         TokenError: no such sample.
-        ChoiceError: no such agent or configuration, or none at all.
+        ChoiceError: no such agent or configuration, or no agent is given.
         NotAvailableError: an agent is not in this (partial) release of the scenario.
     """
     scenario, ego, _ = dataset.get("sample", sample)["token"].rsplit("/", 2)

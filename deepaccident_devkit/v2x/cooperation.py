@@ -1,4 +1,4 @@
-"""What a set of agents sees together: visible actors and boxes, one an actor."""
+"""What a set of agents sees together: visible actors, and one box for each actor."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from deepaccident_devkit.v2x.link import Link
 from deepaccident_devkit.v2x.messages import Message, messages
 
 SAME_PLACE: Final = 0.5
-"""Metres between two centres below which two agents' boxes of one class are of the same untracked actor."""
+"""Metres: two agents' boxes of one class whose centres are nearer than this are of the same untracked actor."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CooperativeView(FrozenArrays):
-    """What several agents see at one moment, one box an actor; arrays are read-only.
+    """What several agents see at one moment, one box for each actor; arrays are read-only.
 
     Attributes:
-        boxes: N boxes in one frame, tracked actors by ascending id, then untracked ones (−1). An agent's own row has
-            the agent's id. `num_lidar_pts` is the sum over the agents and `camera_visible` whether any camera of
-            theirs sees it (own rows do not count, and of rows that a label repeats the first alone); `row` is the row
-            in the label of `source`.
+        boxes: N boxes in one coordinate frame, tracked actors by ascending id, then untracked ones (−1). An agent's
+            own row has the agent's id. `num_lidar_pts` is the sum over the agents, and `camera_visible` says whether
+            any of their cameras sees it (own rows do not count, and of rows that a label repeats only the first
+            counts); `row` is the row in the label of `source`.
         source: (N,) int8, index into `taxonomy.AGENTS`: whose box it is.
-        seen_by: (N,) uint8, bit mask over `taxonomy.AGENTS`: who contributed a box of it; of an untracked actor only
-            the source, since its rows in other labels are known by their place alone.
+        seen_by: (N,) uint8, bit mask over `taxonomy.AGENTS`: the agents that have a box of it; for an untracked actor
+            only the source, because its rows in other labels are known only by their place.
     """
 
     boxes: Boxes
@@ -48,7 +48,7 @@ def visible_instances(
     """The instances that at least one of some agents sees at a sample's moment, by the released rule.
 
     With all five agents and no link, these are the actors that the released labels count as visible
-    (docs/released_code.md, Visibility and attributes). Own rows and untracked ones never are.
+    (docs/released_code.md, Visibility and attributes). Own rows and untracked rows never count.
 
     Args:
         dataset: the release.
@@ -57,7 +57,7 @@ def visible_instances(
         link: what happens to the partners' data; None for nothing.
 
     Returns:
-        Tokens by ascending actor id; of agents without labels nothing.
+        Tokens by ascending actor id; agents without labels add nothing.
 
     Raises:
         TokenError: no such sample.
@@ -73,7 +73,7 @@ def visible_instances(
 def visible_actors(
     dataset: Dataset, sample: RowArgument, *, agents: Agents = None, link: Link | None = None
 ) -> IntArray:
-    """The actor ids of `visible_instances`, ascending; arguments and errors as there."""
+    """The actor ids of `visible_instances`, ascending; it has the same arguments and errors."""
     masks, ids = [], []
     for message in messages(dataset, sample, agents, link):
         boxes = dataset.boxes(message.sample, "lidar")
@@ -91,20 +91,20 @@ def cooperative_boxes(
     visible: Visible | None = None,
     link: Link | None = None,
 ) -> Boxes:
-    """The union of what some agents annotated at a sample's moment, one box an actor, in one frame.
+    """The actors that some agents annotated at a sample's moment, one box for each actor, in one coordinate frame.
 
-    If several agents have an actor, the ego's box counts, else the box of the first other agent. An agent's own
-    row (which becomes the agent's actor) counts only if no other agent has the actor, since it lies up to 0.3 m off.
-    Untracked rows (−1) are kept once: a row within 0.5 m of another agent's row of the same class, or of a tracked
-    actor's chosen box, is left out. `cooperative_view` also says who saw what.
+    If several agents have an actor, the ego's box counts; without one, the box of the first other agent. An agent's
+    own row (which becomes the agent's actor) counts only if no other agent has the actor, because it is wrong by up to
+    0.3 m. Untracked rows (−1) are kept once: a row within 0.5 m of another agent's row of the same class, or of a
+    tracked actor's chosen box, is left out. `cooperative_view` also says who saw what.
 
     Args:
         dataset: the release.
         sample: token or record: its agent is the ego, its frame the present.
         agents: names of agents, a configuration or its name as seen from the ego, or None for all that are there.
-        frame: frame of the result, of the sample: `world`, `ego`, `lidar` or a camera channel (optical).
-        visible: None for all that is annotated, own rows among it; `camera` for what a camera of the agent itself
-            sees; `released` for what the agent itself sees by the released rule (docs/released_code.md, Visibility and
+        frame: coordinate frame of the result, at the sample: `world`, `ego`, `lidar` or a camera channel (optical).
+        visible: None for all that is annotated, with own rows; `camera` for what a camera of the same agent sees;
+            `released` for what the same agent sees by the released rule (docs/released_code.md, Visibility and
             attributes).
         link: what happens to the partners' data; None for nothing.
 
@@ -129,7 +129,7 @@ def cooperative_view(
     visible: Visible | None = None,
     link: Link | None = None,
 ) -> CooperativeView:
-    """`cooperative_boxes` and who saw each of them; arguments and errors as there."""
+    """`cooperative_boxes`, and who saw each of them; it has the same arguments and errors."""
     frame = dataset.frame_name(frame)
     target_from_world = dataset.world_from(sample, frame).inverse()
     parts, actors, agent_codes = [], [], []
@@ -148,7 +148,7 @@ def cooperative_view(
 
 
 def _one_an_actor(boxes: Boxes, actor: IntArray, agent: AnyArray) -> CooperativeView:
-    """Merge all agents' boxes (N), which are in the order of preference, with their actors and agents (N,)."""
+    """Merge all agents' boxes (N), the preferred ones first, with their actors and agents (N,)."""
     own = boxes.actor_id == OWN_ACTOR_ID
     tracked = np.flatnonzero(actor != UNTRACKED_ID)
     order = tracked[np.lexsort((own[tracked], actor[tracked]))]
@@ -188,7 +188,7 @@ def _first_of_each(actor: IntArray, agent: AnyArray) -> IntArray:
 
 
 def _repeated(boxes: Boxes, agent: AnyArray, loose: IntArray, chosen: IntArray) -> BoolArray:
-    """Which untracked rows stand where a tracked actor does, or where an agent before them has an untracked one."""
+    """Which untracked rows are at the place of a tracked actor, or of an untracked row of an earlier agent."""
     against = np.concatenate([chosen, loose])
     apart: FloatArray = np.linalg.norm(boxes.center[loose][:, None] - boxes.center[against][None], axis=-1)
     same = (apart < SAME_PLACE) & (boxes.category[loose][:, None] == boxes.category[against])

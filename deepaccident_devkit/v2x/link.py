@@ -23,12 +23,12 @@ _FRAME_TOLERANCE: Final = 1e-6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoseNoise:
-    """How wrongly a partner knows where it is: one draw a partner and frame.
+    """The error of a partner's own pose: one draw for each partner and frame.
 
-    The law `paper`: the partner is off by a distance drawn from a normal distribution of `mean` and `std`. The paper
-    studies means of 0.1 to 0.5 m with σ = 0.02 m and does not say in which direction; ours is horizontal, uniform over
-    the compass and drawn with the distance. The law `zero-mean`: x and y of the world are each off by a normal number
-    of mean 0 and deviation `std`, as other V2X studies do; its `mean` must be 0.
+    The law `paper`: the error of the position is a distance from a normal distribution of `mean` and `std`. The paper
+    studies means of 0.1 to 0.5 m with σ = 0.02 m and does not name the direction; ours is horizontal and uniform over
+    all directions. The law `zero-mean`: x and y of the world each have a normal error of mean 0 and deviation `std`,
+    as in other V2X studies; its `mean` must be 0.
 
     Attributes:
         mean: metres.
@@ -55,7 +55,7 @@ class PoseNoise:
             raise ConfigError(f"pose noise: the law zero-mean takes no mean, found {self.mean}; give std alone")
 
     def draw(self, key: str) -> tuple[float, float, float]:
-        """The error of one partner at one frame: x and y in world, metres, and heading, radians; the same by key."""
+        """The error of one partner at one frame: x and y in world, metres, and heading, radians; `key` decides it."""
         turn, distance, sideways, heading = uniforms(f"{key}/pose")
         about = self.heading_std * _NORMAL.inv_cdf(heading)
         if self.law == "zero-mean":
@@ -66,17 +66,17 @@ class PoseNoise:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Link:
-    """What happens to the data of partners on their way to the ego; the ego's own are never touched.
+    """What happens to the data of partners on their way to the ego; the ego's own data are never changed.
 
-    Every draw depends on the seed, the scenario, the partner and the frame at which the ego receives, and on nothing
-    else: not on the order of calls, on other agents or on the other effects.
+    Every draw depends only on the seed, the scenario, the partner and the frame at which the ego receives: not on the
+    order of calls, on other agents or on the other effects.
 
     Attributes:
         latency: seconds, a multiple of 0.1 (the paper: 0.1 to 0.5): a partner's data are those of an earlier frame,
-            placed by its pose at that time: standing actors stay in place, moving ones lag behind.
+            placed by its pose at that time: standing actors are right, moving ones are where they were.
         pose_noise: None for exact poses; a number is `PoseNoise(mean=…)`.
-        packet_loss: probability in [0, 1] that nothing of a partner arrives at a frame.
-        seed: of all draws.
+        packet_loss: probability in [0, 1] that a partner's data do not arrive at a frame.
+        seed: seed of all draws.
     """
 
     latency: float = 0.0
@@ -85,7 +85,7 @@ class Link:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Check the numbers and make them Python's own; raises ConfigError."""
+        """Check the numbers and convert them to Python's types; raises ConfigError."""
         loss = checked_number("packet_loss", self.packet_loss, "a probability from 0 to 1", ConfigError)
         if not 0 <= loss <= 1:
             raise ConfigError(f"packet_loss: {loss:g} is no probability; choose a number from 0 to 1")
@@ -107,7 +107,7 @@ class Link:
         """The number of the frame whose data arrive at frame `index` of a scenario.
 
         Raises:
-            ConfigError: that was before the recording began.
+            ConfigError: that frame would be before the recording began.
         """
         sent = index - self.latency_frames
         if sent < 1:
@@ -119,17 +119,17 @@ class Link:
         return sent
 
     def loses(self, scenario: str, partner: str, index: int) -> bool:
-        """Whether nothing of a partner arrives at frame number `index`."""
+        """Whether a partner's data do not arrive at frame number `index`."""
         return self.packet_loss > 0 and uniforms(f"{self._key(scenario, partner, index)}/loss")[0] < self.packet_loss
 
     def pose_error(self, scenario: str, partner: str, index: int, position: FloatArray) -> SE3 | None:
-        """From true places to where the ego puts the partner's data: `claimed_from_world`; None without noise.
+        """From true places to those where the ego puts the partner's data: `claimed_from_world`; None without noise.
 
         Args:
             scenario: token.
             partner: the agent's name.
             index: number of the frame at which the ego receives.
-            position: (3,) where the partner truly was, world, metres: its heading is wrong about this point.
+            position: (3,) the partner's true position, world, metres: the error of the heading turns about this point.
         """
         if not isinstance(self.pose_noise, PoseNoise):
             return None
@@ -142,14 +142,14 @@ class Link:
 
 
 def checked_link(link: object) -> Link | None:
-    """What a call's `link=` may be; raises ConfigError."""
+    """The `link=` of a call, checked; raises ConfigError."""
     if link is None or isinstance(link, Link):
         return link
     raise ConfigError(f"link: expected a Link, such as Link(latency=0.2, pose_noise=0.3), or None, found {link!r}")
 
 
 def _whole_frames(latency: object) -> float:
-    """The latency in seconds, exactly that of its frames."""
+    """The latency in seconds, as exactly a whole number of frames."""
     seconds = checked_number("latency", latency, "seconds from 0", ConfigError)
     if not 0 <= seconds < math.inf:
         raise ConfigError(f"latency: {seconds} is not possible; choose a finite number of seconds from 0")
@@ -170,7 +170,7 @@ def _noise(noise: object) -> PoseNoise | None:
 
 
 def uniforms(key: str) -> tuple[float, float, float, float]:
-    """Four numbers strictly between 0 and 1 that a text determines, on every machine and numpy."""
+    """Four numbers between 0 and 1 (both excluded) from a text, the same on every machine and with every numpy."""
     digest = hashlib.sha256(key.encode()).digest()
     numbers = [int.from_bytes(digest[start : start + 8], "big") >> 12 for start in range(0, 32, 8)]
     first, second, third, fourth = ((number + 0.5) / 2**52 for number in numbers)

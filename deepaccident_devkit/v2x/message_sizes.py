@@ -29,13 +29,13 @@ POSE_BYTES: Final = 6 * 4
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MessageSize:
-    """Bytes of one agent's message at one moment, by what it shares; each with a pose (24 bytes), uncompressed.
+    """Bytes of one agent's message at one moment, uncompressed, for each kind of data; each includes a pose (24 bytes).
 
     Attributes:
         images: the six cameras' pixels, 3 bytes each, in the size that calib gives.
         cloud: the LiDAR's points, 16 bytes each; None if points were not counted, or the file is not there.
         boxes: the boxes that it annotated, its own included, 45 bytes each.
-        bev: a BEV feature map of the shape and type asked for.
+        bev: a BEV feature map of the given shape and type.
     """
 
     images: int
@@ -55,31 +55,31 @@ def message_sizes(
     link: Link | None = None,
     on_missing: OnError = "raise",
 ) -> dict[str, MessageSize]:
-    """Bytes that each agent sends for a sample's moment, by modality.
+    """Bytes that each agent sends for a sample's moment, for each kind of data.
 
     Args:
         dataset: the release.
         sample: token or record: its frame is the moment.
         agents: names of agents, a configuration or its name as seen from the ego, or None for all that are there.
         bev_shape: channels, rows, columns of the BEV features.
-        bev_dtype: their type.
-        clouds: whether to read the point clouds in order to count their points.
-        link: what happens to the partners' data; None for nothing. Under latency, sizes are those of the earlier frame
-            that arrives; pose noise makes no message longer or shorter.
+        bev_dtype: type of the BEV features.
+        clouds: whether to read the point clouds, to count their points.
+        link: what happens to the partners' data; None for nothing. With latency, sizes are those of the earlier frame
+            that arrives; pose noise does not change the size of a message.
         on_missing: of point clouds that were not downloaded: `raise`, or `skip` leaves their size out (`cloud` is None)
             and logs how many.
 
     Returns:
-        Agent → sizes of what arrives, the sample's own agent (who sends nothing to itself) first, if it is among them.
-        A partner whose message is lost is left out; a call without `link` gives the size of the lost message.
+        Agent → sizes of what arrives. The sample's own agent (which sends nothing to itself) is first, if it is among
+        them. A partner whose message is lost is left out; a call without `link` gives the size of that message.
 
     Raises:
         TokenError: no such sample.
         ChoiceError: no such agent, configuration or `on_missing`, or `bev_shape` is no shape or `bev_dtype` no type.
         NotAvailableError: an agent is not in this (partial) release.
         ConfigError: `link` is no Link, or its latency is longer than the scenario's past.
-        MissingFileError: a point cloud was not downloaded (and is to be counted), and `on_missing` is `raise`.
-        SensorFileError: one cannot be read (and is to be counted).
+        MissingFileError: `clouds` is true, `on_missing` is `raise`, and a point cloud was not downloaded.
+        SensorFileError: `clouds` is true and a point cloud cannot be read.
     """
     bev = _bev_bytes(bev_shape, bev_dtype)
     files = MissingFiles(dataset.dataroot, on_missing)

@@ -18,9 +18,9 @@ class Message:
     """One agent's data as the ego receives them.
 
     Attributes:
-        agent: who sent them.
-        sample: token of the sample that they are of: an earlier one under latency.
-        pose_error: `claimed_from_world` under pose noise, else None.
+        agent: the agent that sent them.
+        sample: token of the sample of the data: with latency an earlier one.
+        pose_error: `claimed_from_world`; None without pose noise.
     """
 
     agent: AgentName
@@ -48,10 +48,10 @@ def messages(
         sweeps: number of frames, the present included; those before the recording began are left out.
 
     Yields:
-        By frame from the present back, then by agent; nothing for a lost message.
+        By frame, the present first and then backwards, and for each frame by agent; nothing for a lost message.
 
     Raises:
-        TokenError, ChoiceError, NotAvailableError: as `cooperating_agents`.
+        TokenError, ChoiceError, NotAvailableError: as in `cooperating_agents`.
         ConfigError: `link` is no Link, or its latency is longer than the scenario's past at the present.
     """
     link = checked_link(link)

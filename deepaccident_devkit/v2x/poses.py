@@ -1,8 +1,8 @@
 """Poses of agents relative to each other and to their own next moment, as functions of arrays.
 
-See docs/released_code.md, Poses. Every function serves both handednesses: right-handed poses (the devkit's) give
-right-handed 6-vectors, CARLA's raw poses give the released code's; `geometry.handedness.flip_six_vector` leads from one
-to the other.
+See docs/released_code.md, Poses. Every function works for both kinds of handedness: right-handed poses (the devkit's)
+give right-handed 6-vectors, CARLA's raw poses give those of the released code; `geometry.handedness.flip_six_vector`
+converts one into the other.
 """
 
 from collections.abc import Iterable, Sequence
@@ -21,7 +21,7 @@ Poses = Sequence[SE3] | ArrayLike
 
 
 def relative_pose_to_ego(world_from_agent: Poses) -> FloatArray:
-    """Where agents stand in the ego's frame: `ego_from_agent` of each as a 6-vector (docs/released_code.md, Poses).
+    """Agents' poses in the ego's frame: `ego_from_agent` of each as a 6-vector (docs/released_code.md, Poses).
 
     Args:
         world_from_agent: (K, 4, 4), or K SE3: poses of one moment, the ego's first.
@@ -41,12 +41,12 @@ def relative_pose_to_ego(world_from_agent: Poses) -> FloatArray:
 def future_egomotion(world_from_ego: Poses, valid: ArrayLike | None = None) -> FloatArray:
     """An agent's motion from each of its moments to the next: `next_from_this` as 6-vectors.
 
-    See docs/released_code.md, Poses. A row maps points of a moment's ego frame into the next one's. For the released
-    seven rows give eight poses: 1 s before the present to 2.5 s after it, in steps of 0.5 s.
+    See docs/released_code.md, Poses. A row maps points of a moment's ego frame into the next moment's ego frame. For
+    the seven rows of the released code give eight poses: 1 s before the present to 2.5 s after it, in steps of 0.5 s.
 
     Args:
         world_from_ego: (T + 1, 4, 4), or T + 1 SE3: poses of one agent in the order of time.
-        valid: (T + 1,) whether each moment is in the recording; the poses of other moments do not matter. None: all
+        valid: (T + 1,) whether each moment is in the recording; the poses of other moments do not matter. None if all
             are.
 
     Returns:
@@ -67,7 +67,7 @@ def future_egomotion(world_from_ego: Poses, valid: ArrayLike | None = None) -> F
 
 
 def _stacked(name: str, poses: Poses) -> FloatArray:
-    """(K, 4, 4)."""
+    """The poses as an array (K, 4, 4)."""
     matrices: Any = poses
     if isinstance(poses, Iterable) and not isinstance(poses, np.ndarray):
         matrices = [pose.matrix if isinstance(pose, SE3) else pose for pose in poses]

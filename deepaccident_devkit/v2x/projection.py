@@ -9,9 +9,7 @@ from numpy.typing import ArrayLike
 
 from deepaccident_devkit.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays, checked
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import LidarPointCloud, PinholeCamera
-from deepaccident_devkit.taxonomy import CAMERAS
 from deepaccident_devkit.v2x.transforms import transform
 
 
@@ -20,10 +18,10 @@ class ImagePoints(FrozenArrays):
     """Where N points fall in an image; arrays are read-only.
 
     Attributes:
-        pixels: (N, 2) float64 as (u, v); pixel centres are at halves; NaN behind the camera.
+        pixels: (N, 2) float64 as (u, v); pixel centres are at 0.5, 1.5, …; NaN behind the camera.
         depth: (N,) float64, metres along the optical axis.
-        color: (N, 3) uint8 RGB of the pixel, black outside the image; None if no colours were asked for.
-        mask: (N,) bool, in front of the camera and in the image (also behind other things).
+        color: (N, 3) uint8 RGB of the pixel, black outside the image; None if no colours are wanted.
+        mask: (N,) bool, whether a point is in front of the camera and in the image (other things may hide it).
     """
 
     pixels: FloatArray
@@ -43,23 +41,23 @@ def project_to_image(
 ) -> ImagePoints:
     """Points of one agent in an image of any agent at any moment of the same scenario.
 
-    The points are taken to stand still: those of another moment are wrong where something moved.
+    The points are assumed to stand still: points of another moment are wrong for things that moved.
 
     Args:
         dataset: the release.
         points: a point cloud, or an array (N, 3), metres.
-        sample: token or record of the sample that the points' frame belongs to.
+        sample: token or record of the sample to which the points' coordinate frame belongs.
         camera: token or record of the image (sample data).
-        frame: the points' frame: `world`, `ego`, `lidar` or a channel of `sample`; None for a cloud's own, and `world`
-            of an array.
+        frame: the points' coordinate frame: `world`, `ego`, `lidar` or a channel of `sample`; None for that of a
+            cloud, or for `world` with an array.
         colors: whether to load the image for its colours.
 
     Raises:
         TokenError: no such sample or sensor file, such as a camera that does not exist.
-        ChoiceError: the sensor is no camera, there is no such frame, or the two are of two scenarios.
+        ChoiceError: the sensor is no camera, there is no such frame, or `sample` and `camera` are of two scenarios.
         GeometryError: the points are no array (N, 3).
-        MissingFileError: the image was not downloaded (and colours are asked for).
-        SensorFileError: it cannot be read.
+        MissingFileError: colours are wanted and the image was not downloaded.
+        SensorFileError: the image cannot be read.
     """
     if isinstance(points, LidarPointCloud):
         xyz, source = points.xyz, frame or points.frame
@@ -77,7 +75,7 @@ def project_to_image(
 def map_pointcloud_to_image(
     dataset: Dataset, camera: RowArgument, sample: RowArgument | None = None, *, colors: bool = True
 ) -> ImagePoints:
-    """The points of a sample's LiDAR in an image, as the nuScenes devkit's explorer has it.
+    """The points of a sample's LiDAR in an image, like the nuScenes explorer's function of this name.
 
     Args:
         dataset: the release.
@@ -86,13 +84,13 @@ def map_pointcloud_to_image(
         colors: whether to load the image for its colours.
 
     Returns:
-        A row a point, in the cloud's order.
+        One row for each point, in the cloud's order.
 
     Raises:
         TokenError: no such sample or sensor file.
-        ChoiceError: the sensor is no camera, or the two are of two scenarios.
+        ChoiceError: the sensor is no camera, or `sample` and `camera` are of two scenarios.
         MissingFileError: the image or the cloud was not downloaded.
-        SensorFileError: one cannot be read.
+        SensorFileError: the image or the cloud cannot be read.
     """
     record = dataset.get("sample_data", camera)
     source = record["sample_token"] if sample is None else sample
@@ -100,21 +98,17 @@ def map_pointcloud_to_image(
 
 
 def camera_of(dataset: Dataset, camera: RowArgument) -> PinholeCamera:
-    """The lens of an image, of the size that calib gives it.
+    """The pinhole camera of an image, with the image size that calib gives.
 
     Raises:
         TokenError: no such sensor file.
         ChoiceError: the sensor is no camera.
     """
-    record = dataset.get("sample_data", camera)
-    if record["modality"] != "camera":
-        raise ChoiceError(f"camera: expected one of {', '.join(CAMERAS)}, found {record['channel']}")
-    sensor = dataset.get("calibrated_sensor", record["calibrated_sensor_token"])
-    return PinholeCamera(np.array(sensor["camera_intrinsic"]), record["width"], record["height"])
+    return dataset.camera(camera)
 
 
 def _colors_at(image: ByteArray, lens: PinholeCamera, pixels: FloatArray, mask: BoolArray) -> ByteArray:
-    """(N, 3) uint8; an image that was stored smaller than its calib says is read at the same place."""
+    """Colours (N, 3) uint8; pixels are scaled if the image was stored smaller than its calib says."""
     height, width = image.shape[:2]
     columns = (pixels[mask, 0] * (width / lens.width)).astype(np.intp)
     rows = (pixels[mask, 1] * (height / lens.height)).astype(np.intp)

@@ -1,7 +1,7 @@
 """`seen_actors`: which actors a set of agents knows at a moment, with perfect detection.
 
-Every actor that the released rule calls seen (docs/released_code.md, Visibility and attributes) is known exactly, apart
-from the effects of the link. Velocities are the labels', decoded.
+Every actor that is seen by the released rule (docs/released_code.md, Visibility and attributes) is known exactly, apart
+from the effects of the link. Velocities are those of the labels, decoded.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ class SeenActors(FrozenArrays):
     """Who is known at a sample; arrays are read-only.
 
     Attributes:
-        boxes: N boxes, one an actor; the ego's own comes first and has the id −100, as in its label.
-        seen_by: (N,) uint8, bit mask over `taxonomy.AGENTS`: who sees it; of the ego, the ego.
-        own_actor_id: the ego's id among the actors; None for the infrastructure, or if meta does not say it.
+        boxes: N boxes, one for each actor; the ego's own box is first and has the id −100, as in its label.
+        seen_by: (N,) uint8, bit mask over `taxonomy.AGENTS`: the agents that see it; for the ego's box, the ego.
+        own_actor_id: the ego's id among the actors; None for the infrastructure, or if the meta file does not say it.
     """
 
     boxes: Boxes
@@ -51,15 +51,16 @@ def seen_actors(
 ) -> SeenActors:
     """The actors that at least one of some agents sees at a sample's moment, and the ego itself.
 
-    A partner's box of itself does not count, as in the released rule: another of the agents has to see
-    it. Untracked actors (−1) are never seen.
+    A partner's box of itself does not count, as in the released rule: another agent has to see it. Untracked actors
+    (−1) never count as seen.
 
     Args:
         dataset: the release.
         sample: token or record: its agent is the ego, its frame the present.
-        agents: who cooperates, as of `v2x.cooperating_agents`.
-        link: what happens to the partners' data; None for nothing. A delay is not compensated: moving actors lag.
-        frame: of the boxes: `ego`, `world`, `lidar` or a camera channel of the sample.
+        agents: who cooperates, as in `v2x.cooperating_agents`.
+        link: what happens to the partners' data; None for nothing. A delay is not compensated: moving actors are where
+            they were.
+        frame: coordinate frame of the boxes: `ego`, `world`, `lidar` or a camera channel of the sample.
 
     Raises:
         TokenError: no such sample.

@@ -1,4 +1,4 @@
-"""Where actors were and will be, from all agents' labels."""
+"""Where actors were and will be, from the labels of all agents."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Trajectory(FrozenArrays):
-    """An actor at the T moments at which anybody annotated it, in one right-handed frame; arrays are read-only.
+    """An actor at the T moments at which a label has it, in one right-handed coordinate frame; arrays are read-only.
 
     Attributes:
         instance: token of the actor.
-        frame: `world`, or a frame of the sample that was asked for.
+        frame: `world`, or a coordinate frame of the given sample.
         index: (T,) int64, frame numbers from 1, ascending; gaps where nobody annotated the actor.
         center: (T, 3) float64, metres.
         rotation: (T, 4) float64, unit quaternions w, x, y, z.
         size: (T, 3) float64, length, width, height, metres.
-        velocity: (T, 3) float64, m/s over the ground, NaN where unknown.
+        velocity: (T, 3) float64, m/s over the ground, NaN if unknown.
         agents: (T,) uint8, bit masks over `taxonomy.AGENTS`: who annotated it.
-        present: frame number of the sample that was asked for; None without one.
+        present: frame number of the given sample; None without one.
     """
 
     instance: str
@@ -77,17 +77,18 @@ class Trajectory(FrozenArrays):
 def trajectory(
     dataset: Dataset, instance: RowArgument, sample: RowArgument | None = None, frame: str = "world"
 ) -> Trajectory:
-    """An actor's past and future from all agents' labels: the rows of the track table.
+    """An actor's past and future from the labels of all agents: the rows of the track table.
 
     Args:
         dataset: the release.
         instance: token or record.
-        sample: token or record of the present: it divides past from future, and `frame` is one of its frames.
-        frame: `world`, or `ego`, `lidar` or a channel of `sample`, which stays where it is at that moment.
+        sample: token or record of the present: it divides past from future, and `frame` is one of its coordinate
+            frames.
+        frame: `world`, or `ego`, `lidar` or a channel of `sample`, always as it is at that sample.
 
     Raises:
         TokenError: no such instance or sample.
-        ChoiceError: no such frame, one other than `world` without a sample, or a sample of another scenario.
+        ChoiceError: no such frame, another frame than `world` without a sample, or a sample of another scenario.
     """
     record = dataset.get("instance", instance)
     tracks = scenario_tracks(dataset, record["scenario_token"])
@@ -118,7 +119,7 @@ def trajectory(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ScenarioTracks(FrozenArrays):
-    """All actors of a scenario at all moments, one row an actor and moment, ordered by frame and actor; in world.
+    """All actors of a scenario at all moments, in world; one row for each actor and moment, ordered by frame and actor.
 
     Attributes:
         boxes: M boxes in world; points and cameras are not known (0, False).

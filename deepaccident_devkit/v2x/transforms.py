@@ -16,10 +16,10 @@ def transform(
 
     Args:
         dataset: the release.
-        target_sample: token or record of the sample that the target frame belongs to.
-        source_sample: token or record of the sample that the source frame belongs to.
-        target: `world`, `ego`, `lidar` or a channel (cameras optical).
-        source: likewise.
+        target_sample: token or record of the sample to which the target frame belongs.
+        source_sample: token or record of the sample to which the source frame belongs.
+        target: `world`, `ego`, `lidar` or a channel (cameras: the optical frame).
+        source: the same choice as for `target`.
 
     Raises:
         TokenError: no such sample.

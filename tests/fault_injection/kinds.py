@@ -17,13 +17,13 @@ class Mutation:
     """One way to damage a release.
 
     Attributes:
-        name: as the table lists it.
+        name: its name in the table.
         group: what kind of file it damages.
         apply: damages a scenario; returns what was done.
-        deep: whether the sensors' files alone show it.
-        harmless: why nobody can or need tell, None for a fault.
-        beyond: why `validate` does not tell this fault, None if it must.
-        only: the kind of scenario that it can be done to, None for both.
+        deep: whether only the sensors' files show it.
+        harmless: why it cannot be found, or need not be; None for a fault.
+        beyond: why `validate` need not find this fault; None if it must.
+        only: the kind of scenario that it can damage; None for both.
     """
 
     name: str

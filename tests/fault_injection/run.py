@@ -56,7 +56,7 @@ class Outcome:
 
 
 def jobs(count: int = NUM_MUTATIONS) -> list[Job]:
-    """Every mutation with seed 0, then every one with seed 1, … up to `count`, and besides those that may go untold."""
+    """Every mutation with seed 0, then every one with seed 1, … up to `count`, then those that need not be found."""
     names = [name for name in MUTATIONS if name not in BEYOND]
     counted = [Job(names[number % len(names)], number // len(names)) for number in range(count)]
     return [*counted, *(Job(name, seed) for seed in range(SEEDS_BEYOND) for name in BEYOND)]

@@ -1,4 +1,4 @@
-"""The table of found and missed, as Markdown: made from a run, read back by a test."""
+"""The table of found and missed faults, as Markdown: made from a run, and read by a test."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -8,15 +8,16 @@ from fault_injection.run import Outcome
 
 _HEAD = """# What `deepaccident validate` finds
 
-For everybody who asks how much `deepaccident validate` finds: each planted fault, and what it says of it. 29 minutes.
+For everybody who asks how much `deepaccident validate` finds: each planted fault, and the findings for it. 29 minutes.
 
-{count} seeded mutations of a synthetic release ({kinds} kinds), each applied to one scenario that is otherwise sound.
-*Found* means an error or a warning; the healthy release has neither. Of these mutations {found} are found, {harmless}
-are *harmless* (nobody can or need tell them) and {missed} are missed. The {beyond} kinds that may go untold, for a
-stated reason, are tried besides and not counted among the {count}. *Needs* says what `validate` was run with. Made by
-`python docs/make_fault_table.py`; a test holds kinds and verdicts against its own run.
+A synthetic release was damaged {count} times, with {kinds} kinds of damage (mutations), each in one healthy scenario.
+*Found* means that `validate` reports an error or a warning; for the healthy release it reports neither. Of these
+mutations {found} are found, {harmless} are *harmless* (they cannot be found, or need not be) and {missed} are missed.
+{beyond} more kinds are applied too, but not counted among the {count}: `validate` need not find them, for the reason
+that the table gives. *Needs* is the option that `validate` needs. `python docs/make_fault_table.py` makes this page; a
+test compares its kinds and verdicts with a new run.
 """
-_COLUMNS = ("kind", "what is done", "needs", "applied", "found", "verdict", "told by, or why not")
+_COLUMNS = ("kind", "what is done", "needs", "applied", "found", "verdict", "found by, or why not")
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,12 +29,12 @@ class Row:
 
     @property
     def found(self) -> int:
-        """How many applications were told."""
+        """How many applications were found."""
         return sum(outcome.found for outcome in self.outcomes)
 
     @property
     def verdict(self) -> str:
-        """`found`, `harmless`, `missed`, or `by chance` for what is found now and then."""
+        """`found`, `harmless`, `missed`, or `by chance` for what is found only sometimes."""
         if self.mutation.harmless is not None:
             return "harmless"
         if self.mutation.beyond is not None and self.found:
@@ -41,7 +42,7 @@ class Row:
         return "found" if self.found == len(self.outcomes) else "missed"
 
     def cells(self) -> list[str]:
-        """As the table shows it."""
+        """The cells of its row of the table."""
         codes = sorted({code for outcome in self.outcomes for code in (*outcome.errors, *outcome.warnings)})
         told = ", ".join(f"`{code}`" for code in codes)
         why = self.mutation.harmless or self.mutation.beyond
@@ -57,7 +58,7 @@ class Row:
 
 
 def rows_of(outcomes: Iterable[Outcome]) -> list[Row]:
-    """A row a kind, in the order of the groups."""
+    """One row for each kind, in the order of the groups."""
     by_name: dict[str, list[Outcome]] = {}
     for outcome in outcomes:
         by_name.setdefault(outcome.job.name, []).append(outcome)

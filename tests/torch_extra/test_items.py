@@ -275,7 +275,7 @@ def test_labels_by_a_presets_name() -> None:
         ({"mean": 0.5}, "mean: expected a number for each of R, G and B, found 0.5"),
         ({"std": "abc"}, "std: expected a number for each of R, G and B, found 'abc'"),
         ({"mean": (0.5, 0.5, np.nan)}, "mean: expected a number for each"),
-        ({"dtype": "uint8", "mean": (0.5, 0.5, 0.5)}, "uint8 images are as decoded"),
+        ({"dtype": "uint8", "mean": (0.5, 0.5, 0.5)}, "uint8 images are not scaled"),
         ({"cameras": ("Front",)}, "cameras: expected a tuple of some of Camera_Front"),
         ({"cameras": "Camera_Front"}, "cameras: expected a tuple of some of Camera_Front"),
         ({"cameras": 6}, "cameras: expected a tuple"),

@@ -35,6 +35,32 @@ def test_integers_must_be_whole_and_in_range() -> None:
         checked("codes", [300], (1,), np.int8)
 
 
+@pytest.mark.parametrize(
+    ("shape", "found", "remedy"),
+    [
+        ((None, 3), (3, 8), r"; transpose it \(\.T\)$"),
+        ((5, 3), (3, 5), r"; transpose it \(\.T\)$"),
+        ((None, 2), (2, 7), r"; transpose it \(\.T\)$"),
+        ((None, 3), (4, 8), r"\(4, 8\)$"),
+        ((None, 3), (3,), r"\(3,\)$"),
+        ((None, 3), (3, 8, 1), r"\(3, 8, 1\)$"),
+        ((4, 4), (3, 3), r"\(3, 3\)$"),
+    ],
+)
+def test_a_transposed_array_is_named_so(shape: tuple[int | None, ...], found: tuple[int, ...], remedy: str) -> None:
+    with pytest.raises(GeometryError, match=f"points: expected shape .*, found .*{remedy}"):
+        checked("points", np.zeros(found), shape)
+
+
+def test_a_cloud_in_place_of_an_array_is_named_so() -> None:
+    cloud = LidarPointCloud(np.zeros((2, 3)), np.zeros(2, dtype=np.float32))
+    boxes = Boxes.from_arrays(np.zeros((1, 3)), np.ones((1, 3)), [0.0])
+    for call in (boxes.contains, boxes.count_points, PinholeCamera.from_field_of_view(8, 6, 1.0).project):
+        with pytest.raises(GeometryError, match=r"points: .* found LidarPointCloud .*; give its array, \.xyz$"):
+            call(cloud)
+    assert boxes.count_points(cloud.xyz).tolist() == [2]
+
+
 def test_an_array_of_the_right_type_is_not_copied() -> None:
     given = np.zeros((2, 3))
     assert checked("points", given, (None, 3)) is given

@@ -53,7 +53,7 @@ _ROWS: Final[Mapping[str, tuple[_Row, ...]]] = MappingProxyType(
     {
         "motion": (
             _Row("ranges/*/iou", "iou *", "%", "higher"),
-            _Row("ranges/*/pq", "pq *", "%", "higher"),
+            _Row("ranges/*/pq", "vpq *", "%", "higher"),
             _Row("min_ade", "min_ade", "m"),
             _Row("min_fde", "min_fde", "m"),
             _Row("miss_rate", "miss_rate", "share"),

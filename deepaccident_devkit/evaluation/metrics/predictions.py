@@ -83,7 +83,7 @@ class MotionOutput(FrozenArrays):
         """Heads as a model gives them: stacked arrays of any framework (`arrays.as_numbers`), and lists.
 
         float32 arrays in the processor's memory are not copied. A single prediction may lack the first axis, K, in all
-        four.
+        four. The arrays are of one sample: K is no batch.
 
         Args:
             segmentation: (K, T, 2, H, W) logits: background, actor.

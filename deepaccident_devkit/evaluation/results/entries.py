@@ -121,9 +121,10 @@ def detection_columns(entries: Sequence[Entry], owners: Sequence[str]) -> Column
         raise ContentError(f"sample_token: expected {owners[0]}, under which it stands, found {shown(tokens[0])}")
     rotation = numbers(entries, "rotation", (4,), "a unit quaternion [w, x, y, z]")
     with np.errstate(over="ignore"):
-        off = np.abs(np.linalg.norm(rotation, axis=1) - 1)
-    if (off > _UNIT_TOLERANCE).any():
-        raise ContentError(f"rotation: expected a unit quaternion [w, x, y, z], found {shown(rotation[0].tolist())}")
+        length = np.linalg.norm(rotation, axis=1)
+    if (np.abs(length - 1) > _UNIT_TOLERANCE).any():
+        found = f"{shown(rotation[0].tolist())}, {length[0]:.3g} long"
+        raise ContentError(f"rotation: expected a unit quaternion [w, x, y, z], found {found}")
     rows, moving = with_value(entries, "velocity")
     velocity = np.full((len(entries), 3), np.nan)
     known = numbers(

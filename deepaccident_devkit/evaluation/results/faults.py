@@ -51,6 +51,7 @@ def shown(value: object) -> str:
 
 
 _GZIP: Final = b"\x1f\x8b"
+_PICKLE: Final = b"\x80"
 _SURROGATE: Final = re.compile("[\ud800-\udfff]")
 """Half of a character: JSON can write it alone, UTF-8 cannot."""
 _WRITTEN_SURROGATE: Final = re.compile(r"\\u[dD][89a-fA-F]")
@@ -80,6 +81,8 @@ def parsed_json(content: bytes) -> Any:
 
     if content.startswith(_GZIP):
         raise ContentError("is compressed with gzip; unpack it")
+    if content.startswith(_PICKLE):
+        raise ContentError("is a pickle; write JSON")
     try:
         text = content.decode("utf-8")
         value = json.loads(text, object_pairs_hook=made, parse_constant=lambda word: noted(_Constant(word)))
@@ -108,7 +111,7 @@ def _faults(value: object, place: str) -> Iterator[str]:
         yield f"{place}{value.name}: stands there twice"
     if isinstance(value, _Constant):
         word = "NaN" if math.isnan(value) else "Infinity"
-        yield f"{place}expected a finite number, found {word}"
+        yield f"{place}expected a finite number, found {word}; write null for an optional value that is not known"
     if isinstance(value, str) and _SURROGATE.search(value):
         yield f"{place}expected characters, found half of one: {value!a}"
     if isinstance(value, dict):

@@ -198,7 +198,7 @@ def check_fields(entry: Mapping[str, object], required: Sequence[str], optional:
     known = (*required, *optional)
     unknown = [name for name in entry if name not in known]
     if unknown:
-        raise ContentError(f"{unknown[0]}: is no field of the format (expected {', '.join(known)})")
+        raise ContentError(f"{unknown[0]}: is no field of the format (expected {', '.join(known)}); remove it")
 
 
 def check_required(entry: Mapping[str, object], required: Sequence[str]) -> None:

@@ -81,13 +81,26 @@ def comparable_pair(first: Path, second: Path, *, common: bool = False) -> Compa
 
 def _check_rules(one: Bundle, other: Bundle) -> None:
     stated = [{name: bundle.summary.get(name) for name in _SETUP} for bundle in (one, other)]
+    cells = [_cells(bundle) for bundle in (one, other)]
+    if all(cells):
+        stated = [{**rules, "cells": those} for rules, those in zip(stated, cells, strict=True)]
     unlike = list(differing(*stated))
     if unlike:
         told = "; ".join(f"{where} {first!r} and {second!r}" for where, first, second in unlike[:_SHOWN])
         more = f", and {len(unlike) - _SHOWN} more" if len(unlike) > _SHOWN else ""
         raise EvaluationError(
-            f"{one.folder} and {other.folder}: were evaluated by other rules: {told}{more}; evaluate both results alike"
+            f"{one.folder} and {other.folder}: were not evaluated by the same rules: {told}{more}; evaluate both in "
+            "the same way"
         )
+
+
+def _cells(bundle: Bundle) -> dict[str, Any]:
+    """The cells of motion results, on which their labels are made, too; empty for other results.
+
+    How maps lie is not among them, since it changes no number.
+    """
+    form = (bundle.summary.get("results") or {}).get("form") or {}
+    return {name: form[name] for name in ("x", "y", "step") if name in form}
 
 
 def _check_truth(one: Bundle, other: Bundle, scenarios: Mapping[str, object]) -> None:

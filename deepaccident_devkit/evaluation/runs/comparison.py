@@ -120,12 +120,13 @@ class Comparison:
         others = [each for each in self.numbers if each.family == "other" and each.p is not None]
         low = sum(each.p is not None and each.p <= level for each in others)
         drawn = f"all {self.swaps:,}" if self.all_swaps else f"{self.swaps:,} random"
-        by_chance = f"of equal runs about {level * len(others):.1f} would be"
+        by_chance = f"between equally good runs about {level * len(others):.1f} would, by chance"
+        explored = f"for exploration: {low} of {len(others)} other numbers have a p of at most {level:.0%}; {by_chance}"
         return [
-            f"p: share of {drawn} swaps of clusters between the two after which the two differ as much",
+            f"p: share of {drawn} swaps of clusters between a and b after which they differ at least as much",
             f"tested at {level:.0%}: {main}; and the other headlines together, whose p is adjusted by Holm's rule",
             "scenarios that would decide: with a chance of 80 %, if the true difference is the observed one",
-            f"for exploration: {low} of {len(others)} other numbers have a p of at most {level:.0%}; {by_chance}",
+            *([explored] if others else []),
         ]
 
     def as_dict(self) -> dict[str, Any]:

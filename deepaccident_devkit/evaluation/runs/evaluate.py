@@ -81,7 +81,7 @@ def evaluate_results(
         setup: task and rules.
         selection: which samples; the name of a split for what `default_selection` has of it.
         allow_partial: whether to evaluate the samples that are in both where the results lack some, or have others;
-            then all output is marked as partial.
+            if some are missing, all output is marked as partial.
         workers: processes; None takes what the work is worth.
         out: the folder that the run will be saved to (`save_run`): counts are kept beside it every half minute, and a
             run that broke off goes on with them if nothing that they depend on has changed. None for no such file.
@@ -116,7 +116,7 @@ def evaluate_results(
         selection=chosen,
         evaluator=evaluator,
         result=evaluator.compute(),
-        partial=None if covered.is_complete else _partial(covered),
+        partial=_partial(covered),
         attributes=sample_attributes(dataset, tokens),
         times_to_impact={token: dataset.sample.get(token)["time_to_impact"] for token in tokens},
         breakdowns=(),
@@ -142,7 +142,7 @@ def _covered_tokens(
     if not covered.is_complete and not allow_partial:
         raise ResultsError(
             f"{results.path}: {covered.to_text()}; give results of these samples, choose the list that they are of, or "
-            "evaluate what there is with allow_partial=True (--allow-partial), which marks every number as partial"
+            f"evaluate the samples that have a prediction with allow_partial=True (--allow-partial), {_mark(covered)}"
         )
     tokens = [token for token in selection.tokens(dataset) if token in results]
     if not tokens:
@@ -165,8 +165,17 @@ def check_metas(dataset: Dataset, tokens: Sequence[str], split: str) -> None:
         )
 
 
-def _partial(covered: Coverage) -> Partial:
+def _mark(covered: Coverage) -> str:
+    if covered.missing:
+        return "which marks every number as partial"
+    return "which leaves out the other predictions; since no sample lacks one, the numbers are not partial"
+
+
+def _partial(covered: Coverage) -> Partial | None:
+    """The mark of a run; predictions of other samples alone change no number."""
     missing = len(covered.missing)
+    if not missing:
+        return None
     return Partial(
         missing=missing,
         extra=len(covered.extra) + len(covered.unknown),

@@ -144,8 +144,8 @@ class SampleLoader:
         if form is not None and (form.frames - 1) * form.step < self.setup.horizon - FRAME_PERIOD / 2:
             raise EvaluationError(
                 f"{self.results.path}: its predictions look {(form.frames - 1) * form.step:g} s ahead "
-                f"({form.frames} frames, {form.step:g} s apart); evaluate them with a horizon of no more, not "
-                f"{self.setup.horizon:g} s"
+                f"({form.frames} frames, {form.step:g} s apart, from the present on), less than the horizon of "
+                f"{self.setup.horizon:g} s; add the present frame if it is missing, or evaluate with a shorter horizon"
             )
 
     def __call__(self, token: str) -> tuple[Any, ...]:

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 from deepaccident_devkit.evaluation.results import Results
+from deepaccident_devkit.evaluation.runs.notes import reading_notes
 from deepaccident_devkit.evaluation.runs.predictors import predictors_text
 from deepaccident_devkit.evaluation.runs.selection import agent_of, scenario_of
 from deepaccident_devkit.text import columns_text
@@ -35,7 +36,7 @@ def summary_text(summary: Json, by: Sequence[str] = SHOWN_BREAKDOWNS) -> str:
         ("counts", "\n".join(_counts(summary["metrics"]))),
         *((f"by {name}", _breakdown(summary, name)) for name in by if name in summary["breakdowns"]),
     ]
-    notes = "\n".join(_notes(summary["metrics"]))
+    notes = "\n".join([*_notes(summary["metrics"]), *reading_notes(summary)])
     blocks += [("notes", notes)] if notes else []
     return "\n\n".join(f"{title}{mark}\n{_indented(text)}" for title, text in blocks)
 

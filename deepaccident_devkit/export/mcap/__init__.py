@@ -6,7 +6,7 @@
     da = DeepAccident(dataroot="data/DeepAccident")
     export_mcap(da, da.scenario[0], "accident.mcap")
 
-docs/interactive_3d.md lists the topics and says how to look at them. Only this package imports mcap, and only when
+docs/interactive_3d.md lists the topics and says how to view them. Only this package imports mcap, and only when
 `export_mcap` is called.
 """
 
@@ -34,14 +34,14 @@ def export_mcap(
 ) -> Path:
     """Write a scenario into an MCAP file: poses, images, point clouds, boxes and labels of all agents on one timeline.
 
-    Messages are Foxglove's, as protobuf. Images are the files' own bytes. The same release and choices give the same
-    bytes, with the same versions of the libraries. The file is written completely or not at all.
+    Messages are Foxglove's, as protobuf. Images have the bytes of their files. The same release and choices give the
+    same bytes, with the same versions of the libraries. The file is written completely or not at all.
 
     Args:
         dataset: the release.
         scenario: token or record.
-        path: of the file; an existing one is replaced.
-        prediction: results, or a mapping from sample token to what is predicted; rendered beside the labels.
+        path: path of the file; an existing file is replaced.
+        prediction: results, or a mapping from sample token to prediction; rendered in addition to the labels.
         progress: whether to show a bar.
         **choices: the fields of `McapConfig`: `agents`, `channels`, `frames`, `points`, `labels`, `motion_labels`,
             `on_missing`.
@@ -55,7 +55,7 @@ def export_mcap(
         ChoiceError: no such choice, agent, channel or frame, or the path is a folder.
         NotAvailableError: an agent is not in this (partial) release, or no sample in the file has a prediction.
         MissingFileError: a sensor file was not downloaded (with `on_missing="raise"`).
-        SensorFileError: one cannot be read.
+        SensorFileError: a sensor file cannot be read.
     """
     config = McapConfig.of(**choices)
     target = Path(path).expanduser()

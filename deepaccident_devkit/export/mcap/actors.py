@@ -35,7 +35,7 @@ from deepaccident_devkit.v2x.cooperation import visible_actors
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 TRAIL_FRAMES: Final = 20
-"""Frames (2 s) that an actor's trail reaches back and its path ahead."""
+"""How many frames (2 s) an actor's trail goes back, and its path goes ahead."""
 _PATH_ALPHA: Final = 0.5
 
 
@@ -43,7 +43,7 @@ class Actors:
     """Renders the boxes of moments."""
 
     def __init__(self, dataset: Dataset, scenario: str) -> None:
-        """Boxes of a scenario."""
+        """Prepare the boxes of a scenario."""
         self._dataset = dataset
         self._roles = Roles(dataset, scenario)
         tracks = scenario_tracks(dataset, scenario)
@@ -54,7 +54,7 @@ class Actors:
         }
 
     def write(self, moment: Moment, recording: Recording) -> None:
-        """Write all actors of a moment in world, and each agent's own annotations in its LiDAR frame."""
+        """Write all actors of a moment in world, and the annotations of each agent in its LiDAR frame."""
         self._write_actors(moment, recording)
         for agent, sample in moment.samples.items():
             if self._dataset.get("sample", sample)["labelled"]:
@@ -133,7 +133,7 @@ class Actors:
         }
 
     def _trail(self, actor: int, index: int) -> tuple[FloatArray, FloatArray]:
-        """Where an actor was, and where it will be, (n, 3) each in world; the present is in both."""
+        """Where an actor was and where it will be, (n, 3) each, in world; both include the present."""
         none = np.zeros((0, 3))
         frames, centers = self._paths.get(actor, (np.zeros(0, dtype=np.int64), none))
         past = (frames <= index) & (frames >= index - TRAIL_FRAMES)

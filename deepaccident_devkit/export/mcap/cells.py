@@ -1,4 +1,4 @@
-"""Instance maps, of motion labels and of predictions, as coloured points: a point for each cell of an actor."""
+"""Instance maps of motion labels and predictions, as coloured points: one point for each cell of an actor."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ CELL_POINT: Final = np.dtype(
 )
 """A point of a map: `instance` is the map's id, `frame` counts from 0, the present."""
 FRAME_HEIGHT: Final = 0.2
-"""Metres that each future frame is rendered above the one before, so that none hides another."""
+"""Metres from each future frame up to the next one, so that no frame hides another."""
 _PALETTE: Final = tuple(CATEGORY_COLORS.values())
 _FADING: Final = 0.6
-"""Share of its opacity that an instance loses until the last frame."""
+"""The share of its opacity that an instance has lost at the last frame."""
 
 
 class MotionMaps:
     """Renders the motion labels of moments in the agents' ego frames."""
 
     def __init__(self, dataset: Dataset, scenario: str, config: MotionLabelConfig) -> None:
-        """Labels of a scenario."""
+        """Prepare the labels of a scenario."""
         self._dataset, self._config = dataset, config
         self._pair = Roles(dataset, scenario).pair
 
     def write(self, moment: Moment, recording: Recording) -> None:
-        """Write the labels of those samples of a moment that have one."""
+        """Write the motion labels of the samples of a moment that have labels."""
         for agent, sample in moment.samples.items():
             record = self._dataset.get("sample", sample)
             if record["labelled"]:
@@ -62,9 +62,9 @@ def cell_points(
 
     Args:
         instance: (T, H, W) ids from 1, 0 elsewhere, all frames in the present ego frame.
-        grid: its cells.
+        grid: the cells of the maps.
         valid: (T,) which frames count; None for all.
-        colors: of some ids; the others go through a palette.
+        colors: id → colour; the other ids have the colours of a palette.
     """
     count = len(instance)
     shown = instance > 0

@@ -17,10 +17,10 @@ from deepaccident_devkit.text import possible_text
 from deepaccident_devkit.v2x import Agents
 
 EPOCH: Final = 1_704_067_200
-"""Unix seconds of every scenario's first frame: recordings have no date, and the viewers need one (2024-01-01 UTC)."""
+"""Unix seconds of every scenario's first frame: recordings have no date, but viewers need one (2024-01-01 UTC)."""
 EXPORTED_CHANNELS: Final = (*CAMERAS, LIDAR)
 Predictions = Results | Mapping[str, Prediction]
-"""What is predicted, by sample token."""
+"""Predictions by sample token."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,14 +28,15 @@ class McapConfig:
     """Which parts of a scenario go into the file; checked when made.
 
     Attributes:
-        agents: whose data: names of agents, a configuration as seen from the ego vehicle, or None for all that are
+        agents: agents to export: their names, a configuration as seen from the ego vehicle, or None for all that are
             there (`v2x.Agents`).
-        channels: whose files: cameras and `lidar01`; None for all of these.
-        frames: their numbers, from 1; None for all.
+        channels: sensors to export: cameras and `lidar01`; None for all of these.
+        frames: numbers of frames, from 1; None for all.
         points: `all`, or n for every n-th point of a cloud.
-        labels: whether the boxes go in.
-        motion_labels: what motion labels show, or the name of a preset (`motion.PRESETS`); None for none.
-        on_missing: of sensor files that are not there: `skip` leaves them out and logs how many, `raise`.
+        labels: whether to write the boxes.
+        motion_labels: configuration of motion labels, or the name of a preset (`motion.PRESETS`); None for none.
+        on_missing: what to do about missing sensor files: `skip` leaves them out and logs their number, `raise` raises
+            MissingFileError.
     """
 
     agents: Agents = None
@@ -57,7 +58,7 @@ class McapConfig:
 
     @classmethod
     def of(cls, **choices: Any) -> McapConfig:
-        """One with these fields; raises ChoiceError."""
+        """A configuration with these fields; raises ChoiceError."""
         names = [field.name for field in fields(cls)]
         for name in choices:
             if name not in names:
@@ -66,7 +67,7 @@ class McapConfig:
 
     @property
     def point_step(self) -> int:
-        """Every how many-th point is written."""
+        """The n of "every n-th point is written"."""
         if self.points == "all":
             return 1
         step = checked_whole("points", self.points, "'all', or n for every n-th point", ChoiceError)
@@ -75,7 +76,7 @@ class McapConfig:
         return step
 
     def frame_numbers(self, last: int) -> tuple[int, ...]:
-        """The frames of a scenario of `last` frames, ascending; raises ChoiceError if it has not all of them."""
+        """The wanted frames of a scenario with `last` frames, ascending; raises ChoiceError if one is not there."""
         if self.frames is None:
             return tuple(range(1, last + 1))
         chosen = tuple(self.frames)
@@ -86,7 +87,7 @@ class McapConfig:
 
 
 def _channel_names(given: object) -> tuple[str, ...]:
-    """In the order of `EXPORTED_CHANNELS`; raises ChoiceError."""
+    """Names of channels in the order of `EXPORTED_CHANNELS`; raises ChoiceError."""
     if given is None:
         return EXPORTED_CHANNELS
     if isinstance(given, str) or not isinstance(given, Iterable):
@@ -99,7 +100,7 @@ def _channel_names(given: object) -> tuple[str, ...]:
 
 
 def _frame_numbers(given: object) -> tuple[int, ...] | None:
-    """Each once, ascending; None for all; raises ChoiceError."""
+    """Frame numbers, each once, ascending; None for all; raises ChoiceError."""
     if given is None:
         return None
     if isinstance(given, str) or not isinstance(given, Iterable):

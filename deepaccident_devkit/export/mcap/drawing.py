@@ -1,6 +1,7 @@
-"""Boxes as Foxglove renders them (cubes and lines of scene entities), and as coloured points for viewers that do not.
+"""Boxes as Foxglove's scene entities (cubes and lines), and as coloured points for viewers without these.
 
-rerun shows point clouds but no SceneUpdate, so every rendering has a twin of points on a topic that ends in `/points`.
+rerun shows point clouds but no SceneUpdate, so every rendering is there again as points, on a topic that ends in
+`/points`.
 """
 
 from __future__ import annotations
@@ -35,13 +36,13 @@ POINT_SPACING: Final = 0.25
 
 
 def scene_update(entities: Sequence[Any], index: int) -> Any:
-    """A SceneUpdate that shows these entities and no others of its topic."""
+    """A SceneUpdate that shows these entities and removes all others of its topic."""
     everything = SceneEntityDeletion(timestamp=frame_timestamp(index), type=SceneEntityDeletion.ALL)
     return SceneUpdate(deletions=[everything], entities=entities)
 
 
 def entity(name: str, frame: str, index: int, facts: Mapping[str, str], **primitives: Sequence[Any]) -> Any:
-    """A SceneEntity in a frame: its primitives, and facts that the viewer shows when it is clicked."""
+    """A SceneEntity in a coordinate frame: its primitives, and facts that the viewer shows after a click on it."""
     seconds = (index - 1) * FRAME_PERIOD
     return SceneEntity(
         timestamp=frame_timestamp(index),
@@ -54,7 +55,7 @@ def entity(name: str, frame: str, index: int, facts: Mapping[str, str], **primit
 
 
 def cube(boxes: Boxes, row: int, color: str) -> Any:
-    """One of some boxes as a see-through CubePrimitive."""
+    """One of some boxes as a transparent CubePrimitive."""
     return CubePrimitive(
         pose=pose(boxes.center[row], boxes.rotation[row]),
         size=vector(boxes.size[row]),
@@ -63,7 +64,7 @@ def cube(boxes: Boxes, row: int, color: str) -> Any:
 
 
 def lines(segments: FloatArray, color: str) -> Any:
-    """Segments (N, 2, 3) as a LinePrimitive, as thick at any distance."""
+    """Segments (N, 2, 3) as a LinePrimitive, equally thick at all distances."""
     return _line(LinePrimitive.LINE_LIST, segments.reshape(-1, 3), color)
 
 
@@ -73,7 +74,7 @@ def strip(points: FloatArray, color: str) -> Any:
 
 
 def label(text: str, place: FloatArray, color: str) -> Any:
-    """Words at a place (3,) as a TextPrimitive, of one size at any distance."""
+    """Words at a place (3,) as a TextPrimitive, equally large at all distances."""
     return TextPrimitive(
         pose=pose(place, _NO_TURN),
         billboard=True,
@@ -93,7 +94,7 @@ def box_segments(boxes: Boxes) -> FloatArray:
 
 
 def above(boxes: Boxes, row: int) -> FloatArray:
-    """(3,) where the text of a box stands."""
+    """(3,) the place of a box's text."""
     height = boxes.size[row, 2] / 2 + _TEXT_ABOVE
     place: FloatArray = boxes.center[row] + np.array([0.0, 0.0, height])
     return place

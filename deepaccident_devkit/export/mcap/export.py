@@ -28,7 +28,7 @@ class _Part(Protocol):
     """Writes one kind of content."""
 
     def write(self, moment: Moment, recording: Recording) -> None:
-        """Write what a moment has of it."""
+        """Write this content of a moment."""
         ...
 
 
@@ -36,11 +36,11 @@ class Poses:
     """Writes where the agents and their sensors are."""
 
     def __init__(self, dataset: Dataset) -> None:
-        """Poses of a release."""
+        """Prepare the poses of a release."""
         self._dataset = dataset
 
     def write(self, moment: Moment, recording: Recording) -> None:
-        """Write world → agent → sensors in one message, and each agent's pose in one of its own."""
+        """Write world → agent → sensors in one message, and each agent's pose in a message of its own."""
         transforms, poses = [], []
         for agent, sample in moment.samples.items():
             own = frame_id(agent, "ego")
@@ -68,7 +68,7 @@ def write_scenario(
     prediction: Predictions | None,
     progress: bool,
 ) -> Path:
-    """What `export_mcap` does, with its arguments and errors."""
+    """The work of `export_mcap`, with the same arguments and errors."""
     record = dataset.scenario[dataset.getind("scenario", scenario)]
     token = record["token"]
     agents = exported_agents(dataset, token, config.agents)

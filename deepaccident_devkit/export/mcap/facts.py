@@ -17,7 +17,7 @@ from deepaccident_devkit.tables.tokens import frame_token
 
 METADATA: Final = "deepaccident_devkit"
 _LOG_EVERY: Final = 5
-"""Tenths of a second between two lines of the countdown."""
+"""Frames (0.1 s) between two lines of the countdown."""
 _SHOWN: Final = ("town", "weather", "time_of_day", "road_type", "split", "accident_type")
 
 
@@ -35,16 +35,16 @@ def scenario_metadata(dataset: Dataset, scenario: str) -> dict[str, str]:
 
 
 class Story:
-    """Tells in a log what happens, and counts down to the impact where there is one."""
+    """Writes into a log what happens, and, if there is an impact, a countdown to it."""
 
     def __init__(self, dataset: Dataset, scenario: str) -> None:
-        """Of a scenario."""
+        """Prepare the facts of a scenario."""
         self._dataset = dataset
         self._record: Any = dataset.get("scenario", scenario)
         self._told = False
 
     def write(self, moment: Moment, recording: Recording) -> None:
-        """Write the countdown of a moment; the scenario's facts before the first."""
+        """Write the countdown of a moment; at the first moment, the scenario's facts before it."""
         if not self._told:
             self._told = True
             _log(self._facts(), moment.index, recording)

@@ -1,4 +1,4 @@
-"""Foxglove's messages from the devkit's own types: poses, colours, point clouds. Frames are those of `frame_id`."""
+"""Foxglove's messages from the devkit's own types: poses, colours, point clouds. `frame_id` names their frames."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ _NUMERIC_TYPES: Final = {
 
 
 def frame_id(agent: str, frame: str) -> str:
-    """The name of a frame of a sample: `world` for all, an agent's own for `ego`, `agent/channel` for a sensor's."""
+    """The name of a sample's coordinate frame: `world`; for `ego` the agent's name; for a sensor `agent/channel`."""
     if frame == "world":
         return frame
     return agent if frame == "ego" else f"{agent}/{LIDAR if frame == 'lidar' else frame}"
 
 
 def transform_message(parent: str, child: str, parent_from_child: SE3, index: int) -> Any:
-    """A FrameTransform: where a frame is in another."""
+    """A FrameTransform: the pose of one coordinate frame in another."""
     return FrameTransform(
         timestamp=frame_timestamp(index),
         parent_frame_id=parent,
@@ -83,7 +83,7 @@ def color_message(color: str, alpha: float = 1.0) -> Any:
 
 
 def cloud_message(points: AnyArray, frame: str, index: int) -> Any:
-    """A PointCloud of a structured array (N,), a field of the message for each of its own, x, y and z among them."""
+    """A PointCloud of a structured array (N,), with a message field for each of its fields (x, y, z and others)."""
     columns: Mapping[str, Any] = points.dtype.fields or {}
     return PointCloud(
         timestamp=frame_timestamp(index),

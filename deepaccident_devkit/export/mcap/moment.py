@@ -13,7 +13,7 @@ from deepaccident_devkit.v2x.configurations import Agents, agents_of, cooperatin
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Moment:
-    """A frame, and what is in it.
+    """A frame and its samples.
 
     Attributes:
         scenario: token.
@@ -41,7 +41,7 @@ def exported_agents(dataset: Dataset, scenario: str, agents: Agents) -> tuple[st
     """The agents that an `agents=` argument means, in the order of `taxonomy.AGENTS`.
 
     Raises:
-        ChoiceError: no such agent or configuration, or none at all.
+        ChoiceError: no such agent or configuration, or no agent is given.
         NotAvailableError: an agent is not in this (partial) release of the scenario.
     """
     first = agents_of(dataset, scenario)[0]

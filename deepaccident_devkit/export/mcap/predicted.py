@@ -1,4 +1,4 @@
-"""A model's predictions of a scenario's samples, beside the labels."""
+"""A model's predictions for a scenario's samples, in addition to the labels."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from deepaccident_devkit.render.colors import ESTIMATE_COLOR
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 _MARK: Final = 1.0
-"""Metres across the spheres where an accident is foreseen."""
+"""Diameter of the spheres where an accident is predicted, metres."""
 _MARK_HEIGHT: Final = 1.0
 
 
@@ -41,7 +41,7 @@ class PredictedScenes:
     """Renders predictions of moments, on topics below `/<agent>/prediction`."""
 
     def __init__(self, prediction: Predictions) -> None:
-        """Predictions by sample token; raises ConfigError for other objects."""
+        """Take predictions by sample token; raises ConfigError for other objects."""
         if not isinstance(prediction, Results | Mapping):
             raise ConfigError(
                 "prediction: expected Results, or a mapping from sample token to what is predicted, "
@@ -82,7 +82,7 @@ def _write(agent: str, prediction: object, index: int, recording: Recording) -> 
 
 
 def _instances(output: MotionOutput) -> Any:
-    """(T, H, W) the instances of the last prediction, in the grid's orientation."""
+    """The instances (T, H, W) of the last prediction, in the grid's orientation."""
     if output.heads is not None:
         return predict_instances(output.heads[-1], "motion").instance
     return np.asarray(output.instances)[-1]

@@ -17,7 +17,7 @@ _SECOND_NANOSECONDS: Final = 1_000_000_000
 
 
 def frame_nanoseconds(index: int) -> int:
-    """When frame number `index`, from 1, was recorded: nanoseconds on the file's timeline."""
+    """The time of frame number `index` (from 1) on the file's timeline, nanoseconds."""
     return EPOCH * _SECOND_NANOSECONDS + (index - 1) * _FRAME_NANOSECONDS
 
 
@@ -28,7 +28,7 @@ def frame_timestamp(index: int) -> Any:
 
 
 class Recording:
-    """Writes messages frame by frame; a topic, with the schema of its messages, begins with its first message.
+    """Writes messages frame by frame; a topic and its schema are added with the first message of the topic.
 
     Chunks are compressed (zstd), and chunks, messages and metadata are indexed, so that viewers can seek.
     """
@@ -47,7 +47,7 @@ class Recording:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Write the indexes and the summary, unless something went wrong."""
+        """Write the indexes and the summary, if there was no error."""
         if error is None:
             self._writer.finish()
 
@@ -69,7 +69,7 @@ class Recording:
         )
 
     def add_metadata(self, name: str, values: dict[str, str]) -> None:
-        """Add a record of names and words."""
+        """Add a metadata record: names and their values."""
         self._writer.add_metadata(name, values)
 
     def _schema(self, message: Any) -> int:

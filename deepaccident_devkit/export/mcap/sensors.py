@@ -1,4 +1,4 @@
-"""What the agents' sensors recorded: images with their cameras, and point clouds."""
+"""The recordings of the agents' sensors: images with their cameras, and point clouds."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ LIDAR_POINT: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("inten
 
 
 class Sensors:
-    """Writes the sensor files of moments, and counts those that are not there."""
+    """Writes the sensor files of moments, and counts the missing ones."""
 
     def __init__(self, dataset: Dataset, config: McapConfig) -> None:
-        """Sensor files of a release."""
+        """Prepare the sensor files of a release."""
         self._dataset = dataset
         self._channels = tuple(config.channels or ())
         self._step = config.point_step
@@ -69,7 +69,7 @@ class Sensors:
 
 
 def _calibration(dataset: Dataset, token: str, size: tuple[int, int], frame: str, index: int) -> Any:
-    """A CameraCalibration for an image of `size`, width and height, which may be stored smaller than calib says."""
+    """A CameraCalibration for an image of `size` (width, height), which may be smaller than calib says."""
     lens, (width, height) = camera_of(dataset, token), size
     scaled = np.diag([width / lens.width, height / lens.height, 1.0]) @ lens.intrinsic
     return CameraCalibration(
@@ -97,7 +97,7 @@ def _content(path: Path) -> bytes:
 
 
 def _image_size(path: Path, content: bytes) -> tuple[int, int]:
-    """Width and height by the image's header, without decoding it; raises SensorFileError."""
+    """Width and height from the image's header, without decoding it; raises SensorFileError."""
     from PIL import Image
 
     bombs = (Image.DecompressionBombError, Image.DecompressionBombWarning)

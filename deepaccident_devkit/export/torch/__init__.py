@@ -1,4 +1,4 @@
-"""Training with PyTorch: cooperative samples as tensors, and how they become batches (the extra `torch`).
+"""Training with PyTorch: cooperative samples as tensors, and batches of them (the extra `torch`).
 
     from torch.utils.data import DataLoader
     from deepaccident_devkit import DeepAccident
@@ -9,8 +9,8 @@
     data = V2XDataset(da, da.samples("train"), config)
     loader = DataLoader(data, batch_size=2, shuffle=True, num_workers=4, collate_fn=collate)
 
-`V2XDataset` says what an item holds, `collate` and `collate_fusion` what a batch does. docs/training.md has a training
-loop. Only this package imports torch; importing it without torch raises MissingExtraError.
+`V2XDataset` describes an item, `collate` and `collate_fusion` describe a batch. docs/training.md has a training loop.
+Only this package imports torch; importing it without torch raises MissingExtraError.
 """
 
 from deepaccident_devkit.errors import MissingExtraError

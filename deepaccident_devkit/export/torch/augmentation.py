@@ -1,7 +1,8 @@
 """The bird's-eye-view transform A (rotation, scale, flip) on boxes, points and poses, and random ones for training.
 
-Every agent's ego frame is transformed alike: points become A p, a pose W between two ego frames A W A⁻¹, and transforms
-from an ego frame to a sensor undo A first, so that points hit the same pixels as before. Images stay.
+All agents' ego frames are transformed in the same way: a point p becomes A p, a pose W between two ego frames becomes
+A W A⁻¹, and transforms from an ego frame to a sensor undo A first, so that points fall on the same pixels as before.
+Images do not change.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ class RandomAugmentation:
     """Draws an `Augmentation` from a generator; the defaults are BEVerse's ranges.
 
     Attributes:
-        rotation: the largest angle either way, radians; uniform.
+        rotation: the largest angle in either direction, radians; uniform.
         scale: the smallest and the largest factor; uniform.
         flip: the probability of mirroring left and right.
     """
@@ -63,8 +64,8 @@ def augmented_boxes(boxes: Boxes, augmentation: Augmentation) -> FloatArray:
     """Boxes of an ego frame in the augmented one, (M, 9): x y z l w h yaw vx vy.
 
     Right-handed, z of the centre; metres, radians in (−π, π], m/s; NaN velocities stay NaN. As in the released code
-    sizes and velocities scale too. Its flip, though, makes yaw π − yaw, which swaps front and rear; here a mirrored
-    box heads where its mirrored velocity does.
+    sizes and velocities scale too. The released flip turns yaw into π − yaw, which swaps front and rear; here the
+    heading of a mirrored box is mirrored like its velocity.
     """
     turn = augmentation.matrix[:2, :2]
     heading = np.column_stack([np.cos(boxes.yaw), np.sin(boxes.yaw)]) @ turn.T
@@ -79,7 +80,7 @@ def augmented_boxes(boxes: Boxes, augmentation: Augmentation) -> FloatArray:
 
 
 def augmented_points(cloud: LidarPointCloud, augmentation: Augmentation) -> AnyArray:
-    """A cloud of an ego frame in the augmented one, (N, 4) float32: x y z in metres, and the intensity as it was."""
+    """A cloud of an ego frame in the augmented one, (N, 4) float32: x y z in metres, and the unchanged intensity."""
     return np.column_stack([transformed(augmentation.matrix, cloud.xyz), cloud.intensity]).astype(np.float32)
 
 
@@ -90,7 +91,7 @@ def augmented_pose(pose: ArrayLike, augmentation: Augmentation) -> FloatArray:
 
 
 def augmented_six_vectors(six: ArrayLike, augmentation: Augmentation) -> FloatArray:
-    """The same of 6-vectors (…, 6): translations are scaled; a rotation stays a rotation, also with a mirror."""
+    """The same for 6-vectors (…, 6): translations are scaled; rotations stay rotations, even with a flip."""
     return six_vectors.from_matrices(augmented_pose(six_vectors.to_matrices(six), augmentation))
 
 

@@ -12,19 +12,19 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 _OF_AGENTS: Final = ("agent_valid", "ego_from_agent", "images", "intrinsics", "ego_from_camera", "image_from_ego")
-"""Tensors whose first axis is the agents'."""
+"""Tensors whose first axis counts agents."""
 _MATRICES: Final = ("ego_from_agent", "intrinsics", "ego_from_camera", "image_from_ego")
 _OF_BOXES: Final = ("boxes", "velocity_known", "categories", "actor_ids")
 _LISTS: Final = ("token", "agents", "points", *_OF_BOXES)
-"""What stays a list with one entry for each item: texts, and tensors of different lengths."""
+"""Keys that stay lists with one entry for each item: texts, and tensors of different lengths."""
 
 
 def collate(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """B items as one dict, agents side by side: for models that know how many agents there are, or mask them.
+    """B items as one dict with an axis of agents: for models with a fixed number of agents, or with a mask for them.
 
-    Of what an item holds (`V2XDataset`), `token`, `agents`, `points` and the boxes (`boxes`, `velocity_known`,
-    `categories`, `actor_ids`) become lists of B. All else is stacked, (B, …); where items have fewer agents than
-    others, (B, A, …) is filled with agents whose `agent_valid` is False, whose images are 0 and matrices the identity.
+    `token`, `agents`, `points` and the boxes (`boxes`, `velocity_known`, `categories`, `actor_ids`) of the items
+    (`V2XDataset`) become lists of B. All other tensors are stacked, (B, …). If items have different numbers of agents,
+    (B, A, …) is filled with agents whose `agent_valid` is False, images are 0 and matrices are the identity.
 
     Raises:
         ConfigError: there are no items, or they do not fit together: other configurations, images of different sizes.
@@ -44,19 +44,19 @@ def collate(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def collate_fusion(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """B items as one dict, agents one after another: as V2X fusion models in the manner of OpenCOOD take them.
+    """B items as one dict with the agents of all items one after another: for V2X fusion models like those of OpenCOOD.
 
-    Agents of whom nothing arrived at the present are left out (of the others, `agent_valid` still says what is missing
-    of the past); the sample's own agent always is the first of its item. N is the number of those that are left in the
-    whole batch. Besides what `collate` gives, with all that is each agent's as (N, …) instead of (B, A, …), `points` a
-    list of N, and `agents` a list of B tuples of names:
+    Agents whose present data did not arrive are left out (for the others, `agent_valid` still says which past data are
+    missing); the sample's own agent is always the first of its item. N is the number of remaining agents in the whole
+    batch. The dict is that of `collate`, but tensors of agents are (N, …) instead of (B, A, …), `points` is a list of
+    N, and `agents` is a list of B tuples of names. In addition:
 
     - `record_len` (B,) int64: how many agents each item has; they add up to N.
-    - `pairwise_t_matrix` (B, L, L, 4, 4) float32, L = 5: [b, i, j] takes points of agent i's ego frame to agent j's,
-      `j_from_i` = `ego_from_j`⁻¹ · `ego_from_i`, at the present, so that [b, i, 0] leads to the sample's own agent.
-      Augmented as the points are, with the link's errors. The identity on the diagonal and beyond `record_len`.
+    - `pairwise_t_matrix` (B, L, L, 4, 4) float32, L = 5: [b, i, j] converts points of agent i's ego frame to agent j's,
+      `j_from_i` = `ego_from_j`⁻¹ · `ego_from_i`, at the present, so that [b, i, 0] gives the sample's own ego frame.
+      It is augmented like the points, with the link's errors; the identity on the diagonal and beyond `record_len`.
 
-    OpenCOOD's own frames are the LiDARs', left-handed as CARLA's are; these are ego frames, right-handed, as all here.
+    OpenCOOD's own frames are those of the LiDARs, left-handed like CARLA's; these are ego frames, right-handed.
 
     Raises:
         ConfigError: there are no items, or they do not fit together: other configurations, images of different sizes.
@@ -92,7 +92,7 @@ def _check_alike(items: Sequence[dict[str, Any]]) -> None:
 
 
 def _joined(key: str, parts: Sequence[Tensor]) -> Tensor:
-    """Parts (n, …) one after another (N, …); raises ConfigError if more than their number of rows differs."""
+    """Parts (n, …) one after another (N, …); raises ConfigError if other axes than the first differ."""
     import torch
 
     sizes = sorted({tuple(part.shape[1:]) for part in parts})
@@ -115,7 +115,7 @@ def _pairwise(ego_from_agent: Tensor) -> Tensor:
 
 
 def _with_agents(key: str, value: Tensor, count: int) -> Tensor:
-    """A tensor (A, …) with as many blank agents behind as there must be."""
+    """A tensor (A, …), filled at the end with blank agents up to `count`."""
     import torch
 
     missing = count - len(value)

@@ -1,4 +1,4 @@
-"""`V2XConfig`: what the items of a `V2XDataset` hold."""
+"""`V2XConfig`: the contents of a `V2XDataset`'s items."""
 
 from __future__ import annotations
 
@@ -20,34 +20,34 @@ from deepaccident_devkit.v2x.link import checked_link
 
 BoxSource = Literal["sample", "cooperative"]
 AugmentationSource = Augmentation | Callable[[np.random.Generator], Augmentation]
-"""The same for all items, or a draw for each (`RandomAugmentation`; a lambda does not reach spawned workers)."""
+"""One for all items, or a draw for each (`RandomAugmentation`; spawned workers cannot receive a lambda)."""
 _DEFAULT_STEP: Final = 5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class V2XConfig:
-    """What an item holds and how it is made; checked when made, raises ConfigError or ChoiceError.
+    """The contents of an item and how it is made; checked when made, raises ConfigError or ChoiceError.
 
     Attributes:
         agents: who cooperates with the sample's own agent, which is always there and first: a configuration, its name,
             agents' names, or None for all that are there (`v2x.Agents`).
-        link: what happens to the partners' sensor data and poses; boxes and labels stay the truth.
+        link: what happens to the partners' sensor data and poses; boxes and labels do not change.
         past: frames of sensor data, the present included.
-        step: recorded frames (0.1 s) between them; None for the labels' own step, else 5 (2 Hz).
+        step: recorded frames (0.1 s) between them; None for the labels' own step or, without labels, 5 (2 Hz).
         images: None for no images and cameras.
         points: whether to load point clouds.
         boxes: `sample` for those that the sample's agent annotated, `cooperative` for the union of what the
-            cooperating agents annotated (`v2x.cooperative_boxes`: the sample's own agent among them, where another one
-            annotated it), None for none.
-        visible: which of them: `released`, `camera`, or None for all, own rows among them (`DeepAccident.boxes`,
+            cooperating agents annotated (`v2x.cooperative_boxes`: with the sample's own agent, if another one annotated
+            it), None for none.
+        visible: which of them: `released`, `camera`, or None for all, with own rows (`DeepAccident.boxes`,
             `v2x.cooperative_boxes`).
-        labels: the motion labels, or the name of a preset (`motion.PRESETS`); None for none. Whose sight counts for
-            them is their own `agents`, what augments them is this configuration's `augmentation`.
-        to_present: warp the labels to the present ego frame and sample centerness this way: `nearest` as the released
-            training, `bilinear` as its evaluation. None: each frame in its own ego frame.
+        labels: the motion labels, or the name of a preset (`motion.PRESETS`); None for none. Their own `agents` says
+            whose view counts for them; this configuration's `augmentation` augments them.
+        to_present: how to warp the labels to the present ego frame and sample centerness: `nearest` as in the released
+            training, `bilinear` as in its evaluation. None: each frame in its own ego frame.
         bev_segmentation: cells of the segmentation targets from the BEV camera; None for none.
-        augmentation: A, applied to all that stands in an ego frame; None for none.
-        seed: of the augmentations drawn.
+        augmentation: A, applied to all that is in an ego frame; None for none.
+        seed: seed of the drawn augmentations.
     """
 
     agents: Agents = "single"
@@ -102,10 +102,10 @@ class V2XConfig:
             )
 
     def augmentation_of(self, epoch: int, index: int) -> Augmentation:
-        """The augmentation of an item in an epoch: it depends on these two and the seed alone.
+        """The augmentation of an item in an epoch: it depends only on these two and the seed.
 
         Raises:
-            ConfigError: the function that draws it gave something else.
+            ConfigError: the function that draws it returned something else.
         """
         if self.augmentation is None or isinstance(self.augmentation, Augmentation):
             return self.augmentation or Augmentation()
@@ -120,7 +120,7 @@ _PARTS: Final = (
     ("labels", (MotionLabelConfig, str), "a MotionLabelConfig, or the name of a preset"),
     ("bev_segmentation", BevGrid, "the BevGrid that it is resampled to, such as BevGrid()"),
 )
-"""Field, its type or types, and what the error says was expected."""
+"""Field, its type or types, and the expected value in words for the error."""
 
 
 def _count(name: str, value: object, least: int) -> int:

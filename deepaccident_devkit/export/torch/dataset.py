@@ -23,28 +23,28 @@ from deepaccident_devkit.v2x import cooperative_boxes
 if TYPE_CHECKING:
     from torch import Tensor
 
-    # without torch's types mypy would see an Any here, which strict forbids as a base
+    # without torch's types mypy would see an Any here, and strict mode forbids Any as a base class
     TorchDataset = object
 else:
     from torch.utils.data import Dataset as TorchDataset
 
 
 class V2XDataset(TorchDataset):
-    """Samples of a release with what cooperating agents add to them; an item is a dict of tensors.
+    """Samples of a release with the data of cooperating agents; an item is a dict of tensors.
 
     Everything is right-handed: x forward, y left, z up; metres, radians, seconds. With an augmentation A, each agent's
-    ego frame is the augmented one: points are A p, poses between ego frames A W A⁻¹, and so on; images stay. A is the
-    number of agents, the sample's own first, P of frames, the present last, C of cameras, T and R of label frames
-    (`motion.MotionLabels`), H × W a grid's rows and columns in its own orientation.
+    ego frame is the augmented one: points are A p, poses between ego frames A W A⁻¹, and so on; images do not change.
+    In shapes, A is the number of agents (the sample's own is first), P of frames (the present is last), C of cameras,
+    T and R of label frames (`motion.MotionLabels`), H × W a grid's rows and columns in its own orientation.
 
     Always:
 
     - `token`: str. `agents`: their names, a tuple of A.
-    - `agent_valid` (A, P) bool: False where the link lost a message, or the frame is before the recording. There
-      clouds are empty, images 0 and matrices the identity.
-    - `ego_from_agent` (A, P, 4, 4) float32: where the sample's agent, at the present, believes the sender's ego frame
-      at that frame to be, pose noise included. [0, −1] is the identity, [0, :] the agent's own motion.
-    - `world_from_ego` (4, 4) float64: of the sample's agent at the present; takes augmented coordinates.
+    - `agent_valid` (A, P) bool: False if the link lost a message, or if the frame is before the recording. Then clouds
+      are empty, images are 0 and matrices are the identity.
+    - `ego_from_agent` (A, P, 4, 4) float32: the sender's ego frame at that frame → the present ego frame of the
+      sample's agent, as this agent believes, with pose noise. [0, −1] is the identity, [0, :] the agent's own motion.
+    - `world_from_ego` (4, 4) float64: of the sample's agent at the present; for augmented coordinates.
     - `augmentation` (4, 4) float32: A.
 
     With `points`: `points`, a list of A lists of P clouds (N, 4) float32: x y z in the sender's own ego frame at that
@@ -53,44 +53,44 @@ class V2XDataset(TorchDataset):
     With `images`:
 
     - `images` (A, P, C, 3, h, w), RGB, as `ImageConfig` says.
-    - `intrinsics` (A, P, C, 3, 3) float32, of the resized and cropped image; pixel centres are at halves.
-    - `ego_from_camera` (A, P, C, 4, 4) float32: the sender's ego frame from the optical camera frame (with A before
-      it, so neither rigid nor right-handed under scale and flip).
+    - `intrinsics` (A, P, C, 3, 3) float32, of the resized and cropped image; pixel centres are at 0.5, 1.5, ….
+    - `ego_from_camera` (A, P, C, 4, 4) float32: optical camera frame → the sender's augmented ego frame (so neither
+      rigid with a scale nor right-handed with a flip).
     - `image_from_ego` (A, P, C, 4, 4) float32: point of the sender's ego frame → (u · d, v · d, d, 1), depth d.
 
     With `boxes`, M of them in the ego frame of the sample's agent at the present:
 
     - `boxes` (M, 9) float32: x y z l w h yaw vx vy; z of the centre. `velocity_known` (M,) bool: False where vx and vy
       are 0 because they are not known.
-    - `categories` (M,) int64, positions in `taxonomy.CATEGORIES`. `actor_ids` (M,) int64, as the label has them (−100
-      is the agent's own row) or, of cooperative boxes, CARLA's; −1 is untracked.
+    - `categories` (M,) int64, positions in `taxonomy.CATEGORIES`. `actor_ids` (M,) int64, as in the label (−100 is the
+      agent's own row) or, for cooperative boxes, CARLA's ids; −1 is untracked.
 
     With `labels`, all at the present or each frame in its own ego frame, as `to_present` says:
 
     - `segmentation` (T, H, W) int64, `instance` (T, H, W) int64, `centerness` (T, 1, H, W) float32, `offset` and
       `flow` (T, 2, H, W) float32.
-    - `future_egomotion` (R, 6) float32: `next_from_this` from the first past frame on, of augmented ego frames.
+    - `future_egomotion` (R, 6) float32: `next_from_this` from the first past frame on, between augmented ego frames.
     - `label_valid` (T,) bool: the frames that are in the recording.
 
     With `bev_segmentation`: `bev_segmentation` (5, H, W) bool, classes as `motion.BEV_CLASSES`, and `bev_known`
     (H, W) bool (`motion.BevSegmentation`).
 
-    Items depend on the configuration, the epoch and the index alone, not on workers. The dataset pickles cheaply and
-    may be used in forked and in spawned workers.
+    Items depend only on the configuration, the epoch and the index, not on workers. The dataset is quick to pickle and
+    works in forked and in spawned workers.
     """
 
     def __init__(self, dataset: Dataset, tokens: Iterable[RowArgument], config: V2XConfig | None = None) -> None:
-        """Choose samples, such as those of `motion.samples`, and what their items hold.
+        """Choose samples, such as those of `motion.samples`, and the contents of their items.
 
         Args:
             dataset: the release.
-            tokens: tokens or records of samples; an item each, in this order.
-            config: what an item holds; None for the agent's own points and boxes.
+            tokens: tokens or records of samples; one item for each, in this order.
+            config: the contents of an item; None for the agent's own points and boxes.
 
         Raises:
             TokenError: no such sample.
-            ChoiceError: no such agents as the configuration names.
-            NotAvailableError: labels are wanted of a sample that has none, or an agent is not in this (partial)
+            ChoiceError: the configuration names an agent that does not exist.
+            NotAvailableError: labels are wanted for a sample without a label, or an agent is not in this (partial)
                 release.
             ConfigError: the link's latency is longer than the past of a sample; `tokens` is a single sample, or
                 `config` no V2XConfig.
@@ -107,7 +107,7 @@ class V2XDataset(TorchDataset):
         self._check_agents()
         self._check_labelled()
         self._check_latency()
-        # shared, so that workers that outlive an epoch hear of the next one
+        # shared memory, so that workers that live longer than an epoch know the next one
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
 
     def __len__(self) -> int:
@@ -115,7 +115,7 @@ class V2XDataset(TorchDataset):
         return len(self._rows)
 
     def set_epoch(self, epoch: int) -> None:
-        """Say which epoch follows, counted from 0, before its loader is iterated: other augmentations are drawn.
+        """Set the number of the next epoch, from 0, before its loader is iterated: each epoch draws new augmentations.
 
         Raises:
             ConfigError: it is no whole number from 0.
@@ -126,14 +126,14 @@ class V2XDataset(TorchDataset):
         self._epoch.fill_(number)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        """The item of a sample, as the class says.
+        """The item of a sample, as described for the class.
 
         Raises:
             IndexError: no such item.
             MissingFileError: a sensor file was not downloaded.
-            SensorFileError: one cannot be read.
-            ConfigError: images of different sizes without `resize`, or smaller than the crop; or the function that
-                draws augmentations gives something else.
+            SensorFileError: a sensor file cannot be read.
+            ConfigError: images have different sizes without `resize`, or are smaller than the crop; or the function
+                that draws augmentations returns something else.
         """
         position = range(len(self))[operator.index(index)]
         sample = self._dataset.sample[int(self._rows[position])]["token"]
@@ -201,7 +201,7 @@ class V2XDataset(TorchDataset):
         }
 
     def _check_agents(self) -> None:
-        """What `agents` names is the same for all samples: a mistake shows at the first."""
+        """Check `agents` with the first sample: a mistake is the same for all samples."""
         if len(self):
             first = self._dataset.sample[int(self._rows[0])]["token"]
             sensor_data.participants(self._dataset, first, self.config.agents)
@@ -218,7 +218,7 @@ class V2XDataset(TorchDataset):
             )
 
     def _check_latency(self) -> None:
-        """Raise now, and not within an epoch, for samples whose partners' data would be from before the recording."""
+        """Raise now, and not later in an epoch, if partners' data would be from before the recording."""
         frames = 0 if self.config.link is None else self.config.link.latency_frames
         samples, scenarios = self._dataset.columns("sample"), self._dataset.columns("scenario")
         first = scenarios["first_frame_row"][samples["scenario_row"][self._rows]]
@@ -235,7 +235,7 @@ class V2XDataset(TorchDataset):
 
 
 def _tensor(values: ArrayLike, dtype: DTypeLike | None = None) -> Tensor:
-    """A tensor with memory of its own: the devkit's arrays are read-only, which torch does not know."""
+    """A tensor with memory of its own: the devkit's arrays are read-only, and torch has no read-only tensors."""
     import torch
 
     return torch.from_numpy(np.array(values, dtype=dtype, order="C"))

@@ -1,4 +1,4 @@
-"""Camera images as a model takes them: resized, cropped, scaled; with intrinsics to match."""
+"""Camera images for models: resized, cropped and scaled, with matching intrinsics."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ _NO_STD: Final = (1.0, 1.0, 1.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImageConfig:
-    """How images are made ready; checked when made, raises ConfigError.
+    """How images are prepared; checked when made, raises ConfigError.
 
     Attributes:
-        resize: height and width that a whole image is resized to; None leaves it as it is stored.
+        resize: height and width to which a whole image is resized; None keeps the stored size.
         crop: top, left, height and width of the part to keep, in pixels of the resized image; None keeps all.
         dtype: `float32` in [0, 1], or `uint8` as decoded.
         mean: subtracted from the channels R, G, B in [0, 1]; `float32` only.
-        std: what they are divided by then.
-        cameras: which ones, and in which order.
+        std: the channels are then divided by this; `float32` only.
+        cameras: the cameras, in this order.
     """
 
     resize: tuple[int, int] | None = None
@@ -42,7 +42,7 @@ class ImageConfig:
     cameras: tuple[str, ...] = CAMERAS
 
     def __post_init__(self) -> None:
-        """Check every field, and make sequences tuples."""
+        """Check every field, and convert sequences to tuples."""
         if self.resize is not None:
             self._set("resize", _pixels("resize", self.resize, "height and width", (1, 1)))
         if self.crop is not None:
@@ -56,17 +56,17 @@ class ImageConfig:
         if min(self.std) <= 0:
             raise ConfigError(f"std: expected numbers above 0, found {self.std}")
         if self.dtype == "uint8" and (self.mean, self.std) != (_NO_MEAN, _NO_STD):
-            raise ConfigError("mean and std: uint8 images are as decoded; choose dtype='float32', or leave them out")
+            raise ConfigError("mean and std: uint8 images are not scaled; choose dtype='float32', or leave them out")
         self._set("cameras", _cameras(self.cameras))
 
     def _set(self, name: str, value: object) -> None:
         object.__setattr__(self, name, value)
 
     def load(self, dataset: Dataset, camera: RowArgument) -> tuple[ByteArray, FloatArray]:
-        """An image (h, w, 3) uint8 RGB, resized and cropped, and the intrinsic (3, 3) that belongs to it.
+        """An image (h, w, 3) uint8 RGB, resized and cropped, and its intrinsic (3, 3).
 
-        The intrinsic is for pixels whose centres are at halves, as everywhere in the devkit: a point at (u, v) of the
-        whole image is at (u · width' / width − left, v · height' / height − top).
+        Pixel centres are at 0.5, 1.5, …, as everywhere in the devkit: a point at (u, v) of the whole image is at
+        (u · width' / width − left, v · height' / height − top).
 
         Raises:
             TokenError: no such image.

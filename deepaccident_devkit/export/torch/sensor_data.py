@@ -1,4 +1,4 @@
-"""What cooperating agents' sensors contribute to a sample, as arrays (agents × past frames × …)."""
+"""The sensor data of cooperating agents for a sample, as arrays (agents × past frames × …)."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from deepaccident_devkit.v2x.messages import Message, messages
 
 _NO_POINTS: Final = np.zeros((0, 4), dtype=np.float32)
 Received = Sequence[Mapping[AgentName, Message]]
-"""By past frame, the present last: the messages that are there, by sender."""
+"""For each past frame, the present last: sender → its message, for messages that arrived."""
 
 
 def participants(dataset: Dataset, sample: str, agents: Agents) -> tuple[AgentName, ...]:
-    """The sample's own agent and those that cooperate with it; errors as of `v2x.cooperating_agents`."""
+    """The sample's own agent and those that cooperate with it; the errors are those of `v2x.cooperating_agents`."""
     own = cooperating_agents(dataset, sample, "single")
     return tuple(dict.fromkeys([*own, *cooperating_agents(dataset, sample, agents)]))
 
 
 def received(dataset: Dataset, sample: str, names: tuple[AgentName, ...], config: V2XConfig) -> Received:
-    """What arrives at a sample and at the `config.past` − 1 moments before it, each as the link would have it then.
+    """The messages that arrive at a sample and at the `config.past` − 1 moments before it, each through the link.
 
-    A moment before the recording began has no messages, one that latency puts there none of partners; at the sample
-    itself that is an error.
+    A moment before the recording has no messages. If latency asks for data from before the recording, the moment has
+    no messages of partners; at the sample itself that is an error.
 
     Raises:
         ConfigError: the link's latency is longer than the scenario's past at the present.
@@ -57,14 +57,14 @@ def _reaches(link: Link | None, index: int) -> bool:
 
 
 def valid_mask(names: Sequence[AgentName], arrived: Received) -> BoolArray:
-    """(A, P) bool, which messages are there."""
+    """(A, P) bool, which messages arrived."""
     return np.array([[name in moment for moment in arrived] for name in names])
 
 
 def relative_poses(
     dataset: Dataset, sample: str, names: Sequence[AgentName], arrived: Received, augmentation: Augmentation
 ) -> AnyArray:
-    """`ego_from_agent` (A, P, 4, 4) float32: augmented, with the link's errors; the identity where nothing is there."""
+    """`ego_from_agent` (A, P, 4, 4) float32: augmented, with the link's errors; the identity without a message."""
     ego_from_world = dataset.world_from(sample, "ego").inverse()
     poses = np.tile(np.eye(4), (len(names), len(arrived), 1, 1))
     for a, name in enumerate(names):
@@ -78,7 +78,7 @@ def relative_poses(
 def point_clouds(
     dataset: Dataset, names: Sequence[AgentName], arrived: Received, augmentation: Augmentation
 ) -> list[list[AnyArray]]:
-    """By agent and moment (N, 4) float32: x y z in the sender's own augmented ego frame, intensity.
+    """For each agent and moment (N, 4) float32: x y z in the sender's own augmented ego frame, intensity.
 
     Raises:
         MissingFileError: a point cloud was not downloaded.
@@ -98,12 +98,12 @@ def camera_arrays(
     augmentation: Augmentation,
     config: ImageConfig,
 ) -> dict[str, AnyArray]:
-    """All agents' C cameras; where nothing is there images are 0 and matrices the identity.
+    """All agents' C cameras; without a message, images are 0 and matrices are the identity.
 
     Returns:
         `images` (A, P, C, 3, h, w) as the configuration says, and, all float32, `intrinsics` (A, P, C, 3, 3),
-        `ego_from_camera` (A, P, C, 4, 4) and `image_from_ego` (A, P, C, 4, 4), the ego frames being the senders' own
-        augmented ones.
+        `ego_from_camera` (A, P, C, 4, 4) and `image_from_ego` (A, P, C, 4, 4), with the senders' own augmented ego
+        frames.
 
     Raises:
         MissingFileError: an image was not downloaded.
@@ -133,7 +133,7 @@ def camera_arrays(
 
 
 def _cameras_of(dataset: Dataset, sample: str, augmentation: Augmentation, config: ImageConfig) -> dict[str, AnyArray]:
-    """One agent's cameras at one moment, as `camera_arrays` without the first two axes."""
+    """One agent's cameras at one moment: `camera_arrays` without the first two axes."""
     ego_from_world = dataset.world_from(sample, "ego").inverse()
     images, intrinsics, poses = [], [], []
     for channel in config.cameras:

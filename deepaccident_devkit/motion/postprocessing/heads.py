@@ -45,6 +45,7 @@ class MotionHeads:
         """Check and freeze; raises GeometryError, or ChoiceError for an unknown orientation."""
         if self.orientation not in ORIENTATIONS:
             raise ChoiceError(f"orientation: expected one of {', '.join(ORIENTATIONS)}, found {self.orientation!r}")
+        _check_channels(np.shape(self.segmentation))
         segmentation = checked("segmentation", self.segmentation, (None, 2, None, None), np.float32)
         frames, _, height, width = segmentation.shape
         if segmentation.size == 0:
@@ -126,6 +127,17 @@ class MotionHeads:
             orientation=orientation,
             ignore_index=self.ignore_index,
         )
+
+
+def _check_channels(shape: tuple[int, ...]) -> None:
+    if len(shape) != 4 or shape[1] == 2:
+        return
+    remedy = "; move the channels to the second axis" if shape[-1] == 2 else ""
+    if shape[1] == 1:
+        remedy = "; of a single logit x for actors, stack -x and x"
+    raise GeometryError(
+        f"segmentation: expected (T, 2, H, W), the logits of background and actor, found {shape}{remedy}"
+    )
 
 
 def _check_values(name: str, values: AnyArray, most: float) -> None:

@@ -44,7 +44,7 @@ def min_area_rects(hulls: Sequence[Sequence[Point]]) -> tuple[AnyArray, AnyArray
 
 
 def _rectangles(points: IntArray, corners: IntArray) -> tuple[AnyArray, AnyArray]:
-    """Both sides (N, 2) float32 of the smallest rectangles around hulls (N, C, 2), of which `corners` (N,) count."""
+    """Both sides (N, 2) float32 of the smallest rectangles around hulls (N, C, 2); their first `corners` (N,) count."""
     which = np.arange(len(points))
     following = (np.arange(points.shape[1]) + 1) % corners[:, None]
     edges = points[which[:, None], following] - points

@@ -197,7 +197,8 @@ def _warning(run: EvaluationRun) -> Iterator[RunFigure]:
     if isinstance(result, AnticipationResult):
         yield RunFigure(
             name="predictors",
-            caption="Accidents against other recordings: how well they are distinguished, also by simple predictors.",
+            caption="How well accidents are distinguished from other recordings, also by predictors that know nothing "
+            "or only the present.",
             alt="Chance that an accident's score is above another recording's at the same moment, by predictor.",
             draw=partial(warning.render_predictors, result),
         )

@@ -11,6 +11,7 @@ from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown, Group
 from deepaccident_devkit.evaluation.metrics.headlines import Headline, headlines, value_text
 from deepaccident_devkit.evaluation.metrics.intervals import LEAST_CLUSTERS
 from deepaccident_devkit.evaluation.runs import EvaluationRun
+from deepaccident_devkit.evaluation.runs.notes import reading_notes
 from deepaccident_devkit.evaluation.runs.predictors import predictor_tables
 from deepaccident_devkit.render.evaluation.breakdowns import UNKNOWN
 from deepaccident_devkit.render.evaluation.markup import Markup, facts, joined, scalar, table, tag, tree
@@ -84,7 +85,8 @@ def counts(run: EvaluationRun) -> Markup:
     told = run.result.as_dict()
     numbers = {name: f"{value:,}" for name, value in told.items() if isinstance(value, int)}
     named = {title: told[name] for name, title in _PARTS.items() if told.get(name)}
-    notes = [tag("p", str(note), class_="note") for note in told.get("notes") or ()]
+    said = [*(told.get("notes") or ()), *reading_notes(run.summary())]
+    notes = [tag("p", str(note), class_="note") for note in said]
     parts = [tag("div", tag("h3", title), _columns(value)) for title, value in named.items()]
     return joined([facts(numbers), *notes, *parts])
 

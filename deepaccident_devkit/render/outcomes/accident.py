@@ -43,7 +43,7 @@ def draw_accident_outcome(
 
     Args:
         compared: what a protocol compares, from `compared_accidents`.
-        truth: the actors around, as they are now, and where the pair goes; None renders the accidents alone.
+        truth: the actors around, as they are now, and where the pair goes; None renders only the accidents.
         layers: `boxes` (the actors now), `trajectories` (of the pair) and `grid` are the default; also `ids`.
         ax: axes to render on; new ones if None.
 

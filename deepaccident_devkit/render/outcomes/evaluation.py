@@ -65,7 +65,7 @@ def render_evaluation(
         prediction: motion, explicit accidents (a list, empty for none), or detected boxes in any frame of the sample.
         task: `motion`, `accident` or `detection`; None for the prediction's. Motion can be evaluated as motion or as
             accident.
-        protocol: of the task, by name, or your own; None for `released`, with explicit accidents for `boxes`.
+        protocol: of the task, by name, or your own; None for `released`, or `boxes` for explicit accidents.
         label: the motion labels that motion is compared with; None makes the labels that the protocol needs, on the
             prediction's cells and half a second apart.
         layers: for motion `labels`, `trajectories`, `ids`, `grid`; for accidents `boxes`, `trajectories`, `ids`,

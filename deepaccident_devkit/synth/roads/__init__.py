@@ -1,4 +1,4 @@
-"""Roads: junctions with lanes, smooth paths, sidewalks and a raster of the ground, and how high that lies."""
+"""Roads: junctions with lanes, smooth paths, sidewalks, and a raster of the ground with its height."""
 
 from deepaccident_devkit.synth.roads.ground import (
     FIRST_BUILDING,

@@ -1,4 +1,4 @@
-"""The ground as a raster of codes, in the ground frame: what lies where, and how a junction is painted on it."""
+"""The ground as a raster of codes, in the ground frame: roads, sidewalks and buildings, and a junction's markings."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -12,16 +12,16 @@ from deepaccident_devkit.synth.roads.layout import LANE_WIDTH, RoadSpec, slot_ed
 from deepaccident_devkit.synth.roads.terrain import EXTENT, OUTWARD, Arm
 
 MAP_EXTENT = EXTENT
-"""The raster covers ±this, metres, in x and y."""
+"""The raster covers −`MAP_EXTENT` to `MAP_EXTENT` in x and y, metres."""
 MAP_RESOLUTION = 0.1
 MAP_CELLS = 3000
 
 TERRAIN, ROAD, WHITE, YELLOW, SIDEWALK, GRASS, TREE, POLE = range(8)
 FIRST_BUILDING = 16
 ROAD_CODES = (ROAD, WHITE, YELLOW)
-"""What is driven on."""
+"""The codes of the road's surface, on which vehicles drive."""
 _TAG_BUILDING, _TAG_POLE, _TAG_VEGETATION, _TAG_GROUND, _TAG_TERRAIN = 1, 5, 9, 14, 22
-"""CARLA's semantic tags of what the reference renderer does not use."""
+"""CARLA's semantic tags that the reference renderer does not use."""
 _CODE_TAGS = {
     TERRAIN: _TAG_TERRAIN,
     ROAD: TAGS["road"],
@@ -36,7 +36,7 @@ _CODE_TAGS = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroundMap(FrozenArrays):
-    """What lies on the ground, as codes of this module; arrays are read-only.
+    """What the ground is covered with, as codes of this module; arrays are read-only.
 
     Attributes:
         codes: (3000, 3000) uint8, row = y index, column = x index: cell (i, j) has its middle at
@@ -76,11 +76,11 @@ def tag_of_code() -> ByteArray:
 
 _HALF = MAP_CELLS // 2
 _DASH = (3.0, 6.0)
-"""Metres: length of a dash, and from one to the next."""
+"""Metres: the length of a dash, and the distance from one dash to the next."""
 _TOOTH = (0.5, 0.9)
-"""The same for the teeth of a yield line."""
+"""The same two lengths for the teeth of a yield line."""
 _STRIPE = 0.5
-"""About the width of the stripes of a crosswalk and of the gaps between them, metres."""
+"""Approximate width of a crosswalk's stripes and of the gaps between them, metres."""
 
 
 @lru_cache(maxsize=4)
@@ -89,7 +89,7 @@ def paint_junction(spec: RoadSpec) -> GroundMap:
     axis = cell_axis()
     band = np.digitize(np.abs(axis), (spec.road_edge, spec.sidewalk_edge))
     kinds = np.array([ROAD, SIDEWALK, GRASS], dtype=np.uint8)[band]
-    codes = np.minimum.outer(kinds, kinds)  # where two roads' strips cross, the lower code is that nearer the traffic
+    codes = np.minimum.outer(kinds, kinds)  # where two roads cross, the lower code lies nearer to the traffic
     if spec.kind == "three-way":
         beyond = axis > spec.road_edge
         codes[beyond] = kinds[beyond, None]
@@ -103,7 +103,7 @@ def paint_junction(spec: RoadSpec) -> GroundMap:
 
 
 def _outward_view(codes: ByteArray, arm: Arm) -> ByteArray:
-    """The map seen along an arm: columns outward from the middle, rows from its right to its left; shares memory."""
+    """A view of the map along an arm: columns outward from the middle, rows from the arm's right to its left."""
     x, y = OUTWARD[arm]
     whole = codes if x else codes.T
     whole = whole if (x or -y) > 0 else whole[::-1]
@@ -117,7 +117,7 @@ def _has_left_neighbour(arm: Arm, spec: RoadSpec) -> bool:
 
 
 def _round_left_corner(view: ByteArray, axis: FloatArray, spec: RoadSpec) -> None:
-    """Cut the corner between an arm and the one to its left round, in place."""
+    """Make the corner between an arm and the one to its left round, in place."""
     along = axis[_HALF:]
     low, high = spec.road_edge, spec.road_edge + spec.kerb_radius
     rows, columns = np.flatnonzero((axis > low) & (axis < high)), np.flatnonzero((along > low) & (along < high))
@@ -127,7 +127,7 @@ def _round_left_corner(view: ByteArray, axis: FloatArray, spec: RoadSpec) -> Non
 
 
 def _paint_arm(view: ByteArray, beside: FloatArray, spec: RoadSpec, *, yields: bool) -> None:
-    """Paint the lines of one arm, in place; who comes towards the junction drives at its left, seen outward."""
+    """Paint the lines of one arm, in place; seen outward, traffic towards the junction drives on the left side."""
     along = beside[_HALF:]
     before = along > spec.stop_line[1]
     across = np.abs(beside)
@@ -154,19 +154,19 @@ def _slot_lines(along: FloatArray, spec: RoadSpec) -> BoolArray:
 
 
 def _stripes(beside: FloatArray, kerb: float) -> BoolArray:
-    """Where the stripes of a crosswalk are: one in the middle, and a gap at each kerb."""
+    """Where the stripes of a crosswalk are: a stripe in the middle, and a gap at each kerb."""
     more = round((2 * kerb / _STRIPE - 3) / 4)
     width = 2 * kerb / (4 * more + 3)
     return _every(beside, width, 2 * width) & (np.abs(beside) < kerb)
 
 
 def _every(values: FloatArray, length: float, period: float) -> BoolArray:
-    """Stretches of a length, one a period, that mirror themselves at 0, where the middle of one is."""
+    """Which values lie on stretches of a length, one in each period; the middle of one stretch is at 0."""
     return np.asarray((np.abs(values) + length / 2) % period < length)
 
 
 def _paint(view: ByteArray, rows: BoolArray, columns: BoolArray, code: int) -> None:
-    """Paint the road, and only the road, where rows and columns are both wanted, in place."""
+    """Paint the cells of chosen rows and columns in place, if they are road."""
     window = np.ix_(rows, columns)
     block = view[window]
     view[window] = np.where(block == ROAD, np.uint8(code), block)

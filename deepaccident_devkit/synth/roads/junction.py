@@ -31,12 +31,12 @@ _WALK_REACH = 110.0
 _WALK_INSET = 1.6
 """Metres from the kerb to where pedestrians walk."""
 _CLEARANCE = 1.7
-"""Metres between the path of a right turn and the kerb, where it is nearest."""
+"""The least distance between the path of a right turn and the kerb, metres."""
 _MAX_RIGHT_RADIUS = 9.0
 _LEFT_RADIUS = 10.0
 _WALK_TANGENT = 3.0
 _QUARTERS: dict[Turn, int] = {"straight": 2, "left": -1, "right": 1}
-"""How many arms further, counter-clockwise, one leaves."""
+"""Turn → how many arms further, counter-clockwise, it leaves the junction."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -45,12 +45,12 @@ class Route:
 
     Attributes:
         path: along the middle of the lane, from one end of the ground to the other.
-        stop_s: metres along it where the stop line begins; no front may pass it while it has to wait.
-        enter_s: where the junction begins.
-        exit_s: where it ends.
-        from_arm: where it comes from.
-        to_arm: where it goes.
-        turn: what it does between.
+        stop_s: metres along the path where the stop line begins; a vehicle that has to wait stops before it.
+        enter_s: metres along the path where the junction begins.
+        exit_s: metres along the path where the junction ends.
+        from_arm: the arm that it comes from.
+        to_arm: the arm by which it leaves.
+        turn: what it does between them.
         lane: its number on both arms, 0 is the rightmost.
     """
 
@@ -69,7 +69,7 @@ class Junction:
     """Straight roads that meet at the origin of the ground frame; traffic keeps right.
 
     Attributes:
-        spec: what it is like.
+        spec: its arms, lanes and edges.
     """
 
     spec: RoadSpec = field(default_factory=RoadSpec)
@@ -85,7 +85,7 @@ class Junction:
         return Terrain(self.spec.hump)
 
     def turns(self, from_arm: Arm) -> tuple[Turn, ...]:
-        """What one can do who comes from an arm."""
+        """The possible turns of those who come from an arm."""
         return tuple(turn for turn in TURNS if _leaves_by(from_arm, turn) in self.arms)
 
     def route(self, from_arm: Arm, turn: Turn, lane: int | None = None) -> Route:
@@ -93,11 +93,11 @@ class Junction:
 
         Args:
             from_arm: where it comes from.
-            turn: what it does.
-            lane: 0 is the rightmost; by default the leftmost one for a left turn, else the rightmost.
+            turn: what it does at the junction.
+            lane: 0 is the rightmost; by default the leftmost lane for a left turn, if not, the rightmost.
 
         Raises:
-            ConfigError: no such arm, turn or lane.
+            ConfigError: the junction has no such arm, turn or lane.
         """
         self._check_arm(from_arm)
         if turn not in self.turns(from_arm):
@@ -121,22 +121,22 @@ class Junction:
         )
 
     def conflicts(self, route_a: Route, route_b: Route) -> Meeting | None:
-        """Where two routes first meet, distances along each; None if they never do.
+        """Where two routes first meet, as distances along each; None if they never meet.
 
-        Routes that come by the same lane do not meet in this sense: there one follows the other.
+        Routes that come by the same lane do not count as meeting: there one vehicle follows the other.
         """
         if route_a.from_arm == route_b.from_arm and route_a.lane == route_b.lane:
             return None
         return _meeting(route_a, route_b)
 
     def stop_line(self, arm: Arm) -> FloatArray:
-        """From the middle line to the edge of the lanes, (2, 2) metres: where who comes by this arm has to stop."""
+        """The line where those who come by this arm stop, (2, 2) metres: from the middle line to the lanes' edge."""
         self._check_arm(arm)
         beside = np.array([0.0, self.spec.lanes_edge])
         return readonly(_on_arm(arm, np.full(2, self.spec.stop_line[1]), beside))
 
     def crosswalk(self, arm: Arm) -> Path:
-        """Over an arm from sidewalk to sidewalk, from its right to its left seen outward; marked or not."""
+        """The path across an arm's road, between the sidewalks: seen outward, from right to left; marked or not."""
         self._check_arm(arm)
         along, beside = float(np.mean(self.spec.crosswalk)), self.spec.road_edge + _WALK_INSET
         start, end = _on_arm(arm, np.full(2, along), np.array([-beside, beside]))
@@ -144,7 +144,7 @@ class Junction:
         return straight((float(start[0]), float(start[1])), float(np.arctan2(y, x)), 2 * beside)
 
     def sidewalk_paths(self) -> tuple[Path, ...]:
-        """Along the sidewalks: one round each corner, and one along the side where a three-way junction has no arm."""
+        """The sidewalks' paths: one round each corner, and one along the side where a three-way junction has no arm."""
         beside = self.spec.road_edge + _WALK_INSET
         corners = [
             _way(arm, beside, "right", _WALK_TANGENT, _WALK_REACH)
@@ -194,7 +194,7 @@ def _route(spec: RoadSpec, from_arm: Arm, turn: Turn, lane: int) -> Route:
 
 
 def _way(arm: Arm, offset: float, turn: Turn, tangent: float, reach: float) -> Path:
-    """From an arm over the junction, `offset` metres to the right of the middle lines, `reach` metres each way."""
+    """The path from an arm over the junction, `offset` metres right of the middle lines, `reach` metres on each arm."""
     start = _on_arm(arm, np.array([reach]), np.array([offset]))[0]
     x, y = OUTWARD[arm]
     place, yaw = (float(start[0]), float(start[1])), float(np.arctan2(-y, -x))
@@ -206,7 +206,7 @@ def _way(arm: Arm, offset: float, turn: Turn, tangent: float, reach: float) -> P
 
 
 def _tangent(spec: RoadSpec, offset: float, turn: Turn) -> float:
-    """Metres before the crossing of the lanes where a turn begins: as wide as the kerb and good custom let it be."""
+    """Metres before the crossing of the lanes where a turn begins: as wide as kerb and usual driving allow."""
     if turn == "left":
         return tangent_of_radius(_LEFT_RADIUS)
     kerb = np.sqrt(2) * (spec.road_edge - offset) + (np.sqrt(2) - 1) * spec.kerb_radius

@@ -1,4 +1,4 @@
-"""What a junction is like: its arms, lanes and edges, in metres from its middle, and where vehicles park."""
+"""The layout of a junction: its arms, lanes and edges, in metres from its middle, and where vehicles park."""
 
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -18,7 +18,7 @@ CROSSWALK_WIDTH = 3.0
 MAX_LANES = 2
 _GUTTER = 0.4
 _MOUTH = 2.0
-"""Metres by which the mouth of an arm lies before the end of the rounded kerb."""
+"""How many metres the mouth of an arm lies before the end of the rounded kerb."""
 _STOP_LINE = 0.4
 _KERB_RADII = (3.0, 10.0)
 
@@ -30,11 +30,11 @@ class RoadSpec:
     Attributes:
         kind: a three-way junction has no north arm.
         signalized: whether it has traffic lights.
-        lanes: in each direction, 1 or 2.
-        crosswalks: whether zebra crossings lie across the arms.
-        parking: whether there are strips to park on beside the lanes.
+        lanes: number of lanes in each direction, 1 or 2.
+        crosswalks: whether there are zebra crossings across the arms.
+        parking: whether there are parking strips beside the lanes.
         hump: a rise on one arm, or None.
-        kerb_radius: of the rounded corners, metres.
+        kerb_radius: radius of the rounded corners, metres.
     """
 
     kind: RoadKind = "four-way"
@@ -64,7 +64,7 @@ class RoadSpec:
 
     @property
     def yielding_arms(self) -> tuple[Arm, ...]:
-        """The arms that have a yield line: at junctions without lights those of the road from south to north."""
+        """The arms that have a yield line: at a junction without lights, those of the road from south to north."""
         if self.signalized:
             return ()
         return tuple(arm for arm in self.arms if arm in ("south", "north"))
@@ -86,22 +86,22 @@ class RoadSpec:
 
     @property
     def mouth(self) -> float:
-        """Metres from the junction's middle along an arm to where the arm begins, and its crosswalk."""
+        """Metres from the junction's middle along an arm to where the arm and its crosswalk begin."""
         return self.road_edge + self.kerb_radius - _MOUTH
 
     @property
     def crosswalk(self) -> tuple[float, float]:
-        """From, to: metres along an arm."""
+        """Where the crosswalk begins and ends, metres along an arm."""
         return self.mouth, self.mouth + CROSSWALK_WIDTH
 
     @property
     def stop_line(self) -> tuple[float, float]:
-        """From, to: metres along an arm."""
+        """Where the stop line begins and ends, metres along an arm."""
         near = self.crosswalk[1] + 0.7 if self.crosswalks else self.road_edge + self.kerb_radius + 0.4
         return near, near + _STOP_LINE
 
     def lane_center(self, lane: int) -> float:
-        """Metres from the middle line to where a lane is driven; lane 0 is the rightmost."""
+        """Metres from the middle line to where vehicles drive in a lane; lane 0 is the rightmost."""
         return (self.lanes - lane - 0.5) * LANE_WIDTH
 
     def _check_hump(self, hump: Hump) -> None:
@@ -112,20 +112,20 @@ class RoadSpec:
         least = self.stop_line[1] + hump.length / 2
         if hump.distance < least:
             raise ConfigError(
-                f"road.hump.distance: {hump.distance:g} m put the foot of the hump into the junction; choose "
+                f"road.hump.distance: {hump.distance:g} m puts the foot of the hump into the junction; choose "
                 f"{least:.1f} m or more, or a shorter hump"
             )
 
 
 SLOT_LENGTH = 5.8
-"""Metres: parked cars stand about one metre apart."""
+"""Length of a parking slot, metres: the gaps between parked cars are about one metre."""
 _KEPT_FREE = 6.0
-"""Metres before the stop line."""
+"""Metres before the stop line that have no parking slots."""
 _LAST = 110.0
 
 
 def slot_edges(spec: RoadSpec) -> FloatArray:
-    """Metres along an arm between which its slots lie, (S + 1,)."""
+    """The edges of the parking slots, metres along an arm, (S + 1,)."""
     first = spec.stop_line[1] + _KEPT_FREE
     edges: FloatArray = first + SLOT_LENGTH * np.arange(int((_LAST - first) / SLOT_LENGTH) + 1, dtype=np.float64)
     return edges

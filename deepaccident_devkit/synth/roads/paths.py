@@ -1,6 +1,6 @@
-"""Smooth paths on the ground, as dense samples: where one drives or walks, how it bends, and where two of them meet.
+"""Smooth paths to drive or walk on, as dense samples: how they bend, and where two of them meet.
 
-Turns by a right angle are clothoid, arc, clothoid, all of the same length.
+A turn by a right angle is a clothoid, an arc and a clothoid, all of the same length.
 """
 
 from dataclasses import dataclass
@@ -14,15 +14,15 @@ from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntA
 from deepaccident_devkit.errors import GeometryError
 
 SPACING = 0.1
-"""Metres between samples at most."""
+"""The largest distance between samples, metres."""
 _COARSE = 10
-"""Every so many samples are looked at first when the nearest one is sought."""
+"""The search for the nearest sample looks first at one of so many samples."""
 _STRIDE = 4
-"""Likewise when two paths are laid side by side."""
+"""The comparison of two paths looks first at one of so many samples."""
 _MEETING = 0.5
-"""Metres: paths that stay nearer than this run into one another."""
+"""Metres: paths that stay nearer than this join."""
 _LEAST_SHRINK = 0.2
-"""Of steps along a path, seen from the inner side of its bends."""
+"""The smallest factor by which steps are shorter on the inner side of a path's bends."""
 _GAUSS = np.polynomial.legendre.leggauss(3)
 
 
@@ -35,7 +35,7 @@ class Meeting(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Path(FrozenArrays):
-    """N samples of a path in the ground frame, evenly spaced by `SPACING` at most; arrays are read-only.
+    """N samples of a path in the ground frame, with equal distances of at most `SPACING`; arrays are read-only.
 
     Attributes:
         xy: (N, 2) float64, metres.
@@ -80,7 +80,7 @@ class Path(FrozenArrays):
     def project(self, xy: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """The nearest places on the path to points (N, 2): distance along it and to its left, (N,) metres each.
 
-        Points beyond its ends are told by the path going straight on.
+        For points beyond its ends the path goes straight on.
         """
         points = np.atleast_2d(np.asarray(xy, dtype=np.float64))
         sample = self._nearest(points)
@@ -93,7 +93,7 @@ class Path(FrozenArrays):
         return self.s[sample] + ahead / np.maximum(1 - bend * left, _LEAST_SHRINK), left
 
     def reversed(self) -> "Path":
-        """The same way back."""
+        """The same path in the other direction."""
         return Path(
             xy=self.xy[::-1],
             yaw=self.yaw[::-1] + np.pi,
@@ -102,7 +102,7 @@ class Path(FrozenArrays):
         )
 
     def _nearest(self, points: FloatArray) -> IntArray:
-        """Index of the nearest sample to each point (N,): the nearest of a few, then the nearest around it."""
+        """Index (N,) of the sample nearest to each point: first the nearest of a few, then the nearest around it."""
         around = _COARSE * _squares(points, self.xy[::_COARSE]).argmin(axis=1)
         window = np.clip(around[:, None] + np.arange(-_COARSE, _COARSE + 1), 0, len(self.xy) - 1)
         best = ((points[:, None] - self.xy[window]) ** 2).sum(axis=2).argmin(axis=1)
@@ -111,10 +111,10 @@ class Path(FrozenArrays):
 
 
 def crossing(path_a: Path, path_b: Path, *, within: float = _MEETING) -> Meeting | None:
-    """Where two paths first meet, None if nowhere.
+    """Where two paths first meet; None if they never meet.
 
-    Paths that cross meet at their common point; those that run together from somewhere on meet where they have come
-    nearer than `within`, metres.
+    Paths that cross meet at their common point. Paths that join meet where their distance becomes less than `within`,
+    metres.
     """
     s_a = _first_near(path_a, path_b, within)
     s_b = _first_near(path_b, path_a, within)
@@ -122,7 +122,7 @@ def crossing(path_a: Path, path_b: Path, *, within: float = _MEETING) -> Meeting
 
 
 def straight(start: tuple[float, float], yaw: float, length: float) -> Path:
-    """A straight path from a point on, metres and radians."""
+    """A straight path from a point, metres and radians."""
     return bent(start, yaw, [(length, 0.0, 0.0)])
 
 
@@ -157,7 +157,7 @@ def lane_change(path: Path, start: float, length: float, offset: float) -> Path:
     """The path shifted sideways by `offset` (metres, positive to the left) from `start + length` on.
 
     Args:
-        path: as driven without the change.
+        path: the path without the change.
         start: metres along it where the change begins.
         length: metres that it takes; position, direction and curvature have no jumps.
         offset: to the left, metres.
@@ -169,7 +169,7 @@ def lane_change(path: Path, start: float, length: float, offset: float) -> Path:
 
 
 def through(points: ArrayLike) -> Path:
-    """A path through dense points (N, 2), metres; yaw and curvature are differences, so let the points be smooth."""
+    """A path through dense points (N, 2), metres; they must be smooth: yaw and curvature are their differences."""
     raw = checked("points", points, (None, 2))
     if len(raw) < 3:
         raise GeometryError(f"points: expected three points or more, found {len(raw)}; sample the way more densely")
@@ -183,12 +183,12 @@ def through(points: ArrayLike) -> Path:
 
 
 def even_steps(length: float) -> FloatArray:
-    """Distances from 0 to `length` (metres), evenly spaced by `SPACING` at most."""
+    """Distances from 0 to `length` (metres), in equal steps of at most `SPACING`."""
     return np.linspace(0.0, length, max(int(np.ceil(length / SPACING - 1e-9)), 1) + 1)
 
 
 def _first_near(path: Path, other: Path, within: float) -> float | None:
-    """Where `path` first comes to `other`: the common point if it leaves it again, else where it has come near."""
+    """Where `path` first meets `other`: their common point if they part again, if not, where `path` comes near."""
     some = np.append(np.arange(0, len(path.s) - 1, _STRIDE), len(path.s) - 1)
     rows = some[_near(path.xy[some], other, within)]
     if not len(rows):
@@ -209,7 +209,7 @@ def _first_near(path: Path, other: Path, within: float) -> float | None:
 
 
 def _near(points: FloatArray, path: Path, within: float) -> BoolArray:
-    """Which of the points (N, 2) lie so near the path."""
+    """Which of the points (N, 2) are nearer to the path than `within`."""
     reach = within + _COARSE * SPACING
     near = np.asarray(_squares(points, path.xy[::_COARSE]).min(axis=1) < reach**2)
     near[near] = np.abs(path.project(points[near])[1]) <= within
@@ -223,12 +223,12 @@ def _squares(points: FloatArray, others: FloatArray) -> FloatArray:
 
 
 _ANGLE = np.pi / 4
-"""Of the arc at radius 1; the two clothoids together turn as much."""
+"""The angle that the arc turns, radians; the two clothoids together turn as much."""
 _REFERENCE = 100.0
 """Metres: the radius at which the shape is measured, finely sampled."""
 
 Piece = tuple[float, float, float]
-"""As `paths.bent` takes it: length, curvature at the start and at the end."""
+"""A piece for `bent`: length, curvature at the start and at the end."""
 
 
 def quarter_turn(tangent: float, *, left: bool) -> list[Piece]:

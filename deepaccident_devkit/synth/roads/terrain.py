@@ -16,12 +16,12 @@ OUTWARD: dict[Arm, tuple[int, int]] = {"west": (-1, 0), "south": (0, -1), "east"
 """Unit vectors from the middle of the junction along its arms, ground frame."""
 
 EXTENT = 150.0
-"""The ground covers ±this, metres, in x and y."""
+"""The ground covers −`EXTENT` to `EXTENT` in x and y, metres."""
 MAX_GRADE = 0.14
 _CURVED = 0.25
-"""Share of a hump's half that is curved at its crest, and the same at its foot; between them the grade is constant."""
+"""Share of each half of a hump that is curved at its crest, and as much at its foot; the grade between is constant."""
 _SHOULDERS = (22.0, 45.0)
-"""From, to: metres beside the arm's middle line over which a hump runs out."""
+"""Metres to the side of the arm's middle line where a hump begins to fall, and where it ends."""
 _STEP = 1.0
 """Metres between the corners of triangles along a hump."""
 
@@ -31,10 +31,10 @@ class Hump:
     """A rise of the road, the same on both sides of its crest; checked when made, raises ConfigError.
 
     Attributes:
-        arm: of the junction that it lies across.
-        distance: from the junction's middle to the crest, metres.
-        height: of the crest, metres.
-        length: of all the rise along the road, metres.
+        arm: the junction's arm that it lies on.
+        distance: distance from the junction's middle to the crest, metres.
+        height: height of the crest, metres.
+        length: length along the road, up and down, metres.
     """
 
     arm: Arm = "west"
@@ -53,7 +53,7 @@ class Hump:
         if self.distance + self.length / 2 > EXTENT or self.distance - self.length / 2 < 0:
             raise ConfigError(
                 f"hump: {self.length:g} m around {self.distance:g} m do not fit on an arm of {EXTENT:g} m; make it "
-                "shorter, or move its distance"
+                "shorter, or change its distance"
             )
         if self.grade > MAX_GRADE:
             raise ConfigError(
@@ -63,7 +63,7 @@ class Hump:
 
     @property
     def grade(self) -> float:
-        """The steepest slope, 1."""
+        """The steepest slope, metres of height for each metre."""
         return self.height / (self.length / 2 * (1 - _CURVED))
 
 
@@ -72,7 +72,7 @@ class Terrain:
     """The height of the ground in the ground frame.
 
     Attributes:
-        hump: None where all is flat.
+        hump: the only rise; None if all ground is flat.
     """
 
     hump: Hump | None = None
@@ -108,7 +108,7 @@ class Terrain:
         return np.asarray(normals / np.linalg.norm(normals, axis=-1, keepdims=True))
 
     def triangles(self) -> Float32Array:
-        """The surface over ±`EXTENT` as triangles (M, 3, 3), metres, their normals upwards; fine along a hump."""
+        """The surface as triangles (M, 3, 3), metres, with their normals upwards; small triangles along a hump."""
         along, beside = np.array([-EXTENT, EXTENT]), np.array([-EXTENT, EXTENT])
         arm: Arm = "east"
         if self.hump is not None and not self.is_flat:
@@ -152,7 +152,7 @@ def _profile(along: FloatArray, hump: Hump) -> tuple[FloatArray, FloatArray]:
 
 
 def _fade(beside: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """A hump's share of its height beside the road, and the slope of that share."""
+    """The share of its height that a hump has beside the road, and the slope of that share."""
     low, high = _SHOULDERS
     share = np.clip((np.abs(beside) - low) / (high - low), 0.0, 1.0)
     return 1 - share**2 * (3 - 2 * share), -np.sign(beside) * 6 * share * (1 - share) / (high - low)

@@ -1,4 +1,4 @@
-"""The five recording agents: their frames, how their sensors are mounted, and what their calib files say."""
+"""The five agents: their coordinate frames, how their sensors are mounted, and their calib files."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,19 +16,19 @@ from deepaccident_devkit.synth.stage import World
 from deepaccident_devkit.taxonomy import CAMERAS, INFRASTRUCTURE, VEHICLE_AGENTS, AgentName
 
 ABOVE_ROOF = 0.5
-"""Of a vehicle's LiDAR, metres above the height of its label box, from the ego origin on the road."""
+"""A vehicle's LiDAR is as high above the ego origin on the road as its label box is high, and so many metres more."""
 BELOW_LIDAR = 0.3
-"""Of a vehicle's cameras, metres; the pole's are as high as its LiDAR."""
+"""How much lower than the LiDAR a vehicle's cameras are, metres; the pole's cameras are as high as its LiDAR."""
 POLE_LENGTH, POLE_WIDTH = 4.9373, 8.9666
-"""Metres: the pole's cameras stand where those of a vehicle so long and wide would, its x axis being their y axis."""
+"""The pole's cameras are placed as on a vehicle of this length and width (metres) with the x and y axes exchanged."""
 _CAMERA_YAW = dict(zip(CAMERAS, np.deg2rad([0.0, 55.0, -55.0, 180.0, 110.0, -110.0]).tolist(), strict=True))
 _SIDES = dict(zip(CAMERAS, ((1, 0), (1, 1), (1, -1), (-1, 0), (-1, 1), (-1, -1)), strict=True))
-"""Of the box's faces at which a camera is: 1 front or left, −1 back or right, 0 neither."""
+"""Camera → its place on the box: 1 front or left, −1 back or right, 0 neither."""
 _FIELD_OF_VIEW = {camera: float(np.deg2rad(110.0 if camera == "Camera_Back" else 70.0)) for camera in CAMERAS}
 _CLEAR_OF_HULL = 0.001
-"""Metres by which a camera is off the face of the box, so that its rays do not begin in the hull."""
+"""Metres from the face of the box to a camera, so that its rays do not begin inside the vehicle's body."""
 _OPTICAL_FROM_FORWARD = SE3(handedness.camera_from_lidar(np.eye(4)))
-"""A frame with x forward, y left, z up → the optical one."""
+"""A coordinate frame with x forward, y left, z up → the optical frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,14 +53,14 @@ class Camera:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Agent:
-    """Who records.
+    """An agent, as the one that records.
 
     Attributes:
         name: one of `taxonomy.AGENTS`.
-        row: of its own actor, None for the pole.
-        box_from_ego: the ego frame in the frame of the own box's centre on the road; of the pole, in the ground frame.
+        row: row of its own actor; None for the pole.
+        box_from_ego: ego frame → frame of its own box, with the origin on the road; for the pole, `ground_from_ego`.
         ego_from_lidar: the LiDAR's pose on the agent.
-        cameras: all six.
+        cameras: all six cameras.
     """
 
     name: AgentName
@@ -70,7 +70,7 @@ class Agent:
     cameras: tuple[Camera, ...]
 
     def ground_from_ego(self, scene: Scene) -> SE3:
-        """The agent's pose at a moment, as the ground tilts it."""
+        """The agent's pose at a moment, with the tilt of the ground."""
         return self.box_from_ego if self.row is None else SE3(scene.frames[self.row]) @ self.box_from_ego
 
     def ground_from_lidar(self, scene: Scene) -> SE3:
@@ -78,7 +78,7 @@ class Agent:
         return self.ground_from_ego(scene) @ self.ego_from_lidar
 
     def calib(self, world_from_ego: SE3) -> Calib:
-        """What the calib file of one frame says."""
+        """The calib of one frame."""
         return Calib(
             ego_from_lidar=self.ego_from_lidar,
             world_from_ego=world_from_ego,
@@ -147,12 +147,12 @@ def _cameras(places: dict[str, tuple[float, float]], height: float, image_size: 
 
 
 def with_single_precision(calib: Calib) -> Calib:
-    """The calib of one frame as the release has it: made of world poses of single precision.
+    """The calib of one frame as in the release: made from world poses of single precision.
 
-    The simulator knows every sensor's pose in the world as numbers of single precision, which at some hundred metres
-    have steps of 0.03 mm, and the release's makers multiplied the inverse of one with another. So a transform between
-    two sensors that never move against each other differs from frame to frame by up to 0.1 mm, and its rotation is
-    rigid to some 1e-7 alone. Here the same is done: nothing is drawn. Intrinsics stay as they are.
+    The simulator has each sensor's pose in the world in single precision, which at some hundred metres has steps of
+    0.03 mm, and the release's makers multiplied the inverse of one pose with another. So a transform between two
+    sensors that never move relative to each other differs from frame to frame by up to 0.1 mm, and its rotation is
+    rigid only to about 1e-7. This function does the same, without random numbers. Intrinsics do not change.
     """
     world_from_lidar = calib.world_from_ego.matrix @ calib.ego_from_lidar.matrix
     lidar_from_camera = np.linalg.inv(np.stack([pose.matrix for pose in calib.camera_from_lidar.values()]))
@@ -174,7 +174,7 @@ def _single(matrices: FloatArray) -> FloatArray:
 
 
 def _by_quaternion(matrix: FloatArray) -> FloatArray:
-    """A pose (4, 4) whose rotation went through a quaternion of single precision: it is not the ego's to the bit."""
+    """A pose (4, 4) whose rotation was converted to a quaternion of single precision and back: it differs a little."""
     turned = matrix.copy()
     turned[:3, :3] = quaternions.to_matrix(_single(quaternions.from_matrix(matrix[:3, :3])))
     return turned

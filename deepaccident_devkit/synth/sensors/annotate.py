@@ -1,4 +1,4 @@
-"""Labels: what an agent's label file says of a scene."""
+"""Labels: the label file of an agent for a scene."""
 
 import numpy as np
 
@@ -13,13 +13,13 @@ from deepaccident_devkit.synth.shapes import BOX_CLEARANCE
 from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID, UNTRACKED_ID
 
 LABEL_RANGE = 120.0
-"""Actors up to here are annotated, metres over the ground from the LiDAR to the box's centre."""
+"""Actors up to this distance are annotated: metres over the ground from the LiDAR to the box's centre."""
 TRACKING_RANGE = 115.0
-"""Actors beyond have no id."""
+"""Actors farther away than this, in metres, have no id."""
 COUNTED_LATER = 0.003
-"""Seconds from the point cloud to the boxes that its points are counted in: others who move have gone on by then."""
+"""Points are counted in boxes of so many seconds after the point cloud, when other actors have already moved on."""
 MOST_AHEAD = 0.012
-"""Metres that they have gone on at most: with more, a fast one of whom only the back is seen would be off too much."""
+"""The most metres that they have moved on: more would be too wrong for a fast one of which only the back is seen."""
 _PEDESTRIAN = CATEGORIES.index("pedestrian")
 
 
@@ -29,9 +29,9 @@ def annotate(scene: Scene, agent: Agent, world_from_ground: SE3, scan: Scan, *, 
     Args:
         scene: the moment.
         agent: whose labels.
-        world_from_ground: of its town.
-        scan: whose points, as stored, `num_lidar_pts` counts in each box, whatever they lie on.
-        exact: whether they are counted in the boxes as annotated, and not in those of `COUNTED_LATER`.
+        world_from_ground: the place in its town.
+        scan: the point cloud; `num_lidar_pts` counts all its stored points in each box.
+        exact: whether points are counted in the annotated boxes, and not in those of `COUNTED_LATER`.
     """
     ground_from_lidar = agent.ground_from_lidar(scene)
     center, yaw, velocity = _kinematics(scene)
@@ -65,13 +65,13 @@ def annotate(scene: Scene, agent: Agent, world_from_ground: SE3, scan: Scan, *, 
 
 
 def _ahead(velocity: FloatArray) -> FloatArray:
-    """How far those with velocities (N, 3) have gone on (N, 3), metres, when points are counted."""
+    """How far (N, 3), metres, actors with velocities (N, 3) have moved on when points are counted."""
     way = COUNTED_LATER * velocity
     return np.asarray(way * np.minimum(1.0, MOST_AHEAD / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)))
 
 
 def _in_order(scene: Scene, wanted: BoolArray) -> IntArray:
-    """Rows of those who are wanted (A,) as labels list them: all agents' and frames' in the same order, not by ids."""
+    """Rows of the wanted actors (A,) in the order of label lines: the same for all agents and frames, not by ids."""
     actors = scene.actors
     parked = np.isin(np.arange(len(actors)), scene.setting.parked)
     order = np.lexsort([actors.object_id, actors.category == _PEDESTRIAN, ~parked])

@@ -19,7 +19,7 @@ _TAG_OF_CATEGORY = np.array(
 
 
 def bev_picture(scene: Scene, top: GroundMap, ground_from_ego: SE3) -> BevImage:
-    """What lies around an agent; higher road users cover lower ones."""
+    """The picture around an agent; higher road users cover lower ones."""
     x, y = ground_from_ego.translation[:2].tolist()
     semantic = tag_of_code()[_map_around(top, x, y, ground_from_ego.yaw)]
     instance = np.zeros(BEV_SHAPE, dtype=np.uint16)
@@ -52,14 +52,14 @@ def _map_around(top: GroundMap, x: float, y: float, yaw: float) -> ByteArray:
 
 
 def _relative_poses(poses: FloatArray, x: float, y: float, yaw: float) -> FloatArray:
-    """Poses (A, 3) of the ground frame in that of an agent."""
+    """Poses (A, 3) in the ground frame, converted to the frame of an agent."""
     dx, dy = poses[:, 0] - x, poses[:, 1] - y
     cos, sin = np.cos(yaw), np.sin(yaw)
     return np.column_stack([cos * dx + sin * dy, cos * dy - sin * dx, poses[:, 2] - yaw])
 
 
 def _footprint(pose: FloatArray, size: FloatArray) -> tuple[tuple[slice, slice], NDArray[np.bool_]]:
-    """The pixels whose middle lies on an upright box: a window of the picture, and a mask of it."""
+    """The pixels whose middle lies on a box, seen from above: a window of the picture, and a mask of it."""
     x, y, yaw = pose.tolist()
     length, width, _ = size.tolist()
     radius = np.hypot(length, width) / 2 / BEV_RESOLUTION

@@ -1,4 +1,4 @@
-"""Casting rays against solids and the ground: Embree where it is installed, else numpy."""
+"""Casting rays against solids and the ground: with Embree if it is installed, if not with numpy."""
 
 import importlib.util
 from functools import lru_cache
@@ -13,9 +13,9 @@ from deepaccident_devkit.synth.roads import Terrain
 from deepaccident_devkit.synth.solids import FACES, FACES_A_SOLID, face_corners, face_planes
 
 NOTHING = -1
-"""The face that a ray hits which hits none."""
+"""Stands for the face if a ray hits nothing."""
 GROUND = -2
-"""The face of the ground, which is no solid's."""
+"""Stands for the face if a ray hits the ground."""
 _FAR = 1e30
 _CORNERS_A_SOLID = 8
 _HALVES = [[0, 1, 2], [0, 2, 3]]
@@ -24,7 +24,7 @@ _PARALLEL = 1e-12
 _ROUNDING = 1e-9
 _SOLIDS_AT_ONCE = 64
 _MARCH, _MARCHES, _HALVINGS = 0.7, 250, 12
-"""Steps along a ray over a terrain: length in metres, how many, and how often the last is halved."""
+"""Steps along a ray over a terrain: their length in metres, their number, and how often the last one is halved."""
 
 
 class Caster(Protocol):
@@ -36,19 +36,19 @@ class Caster(Protocol):
         """The first face that each of many rays hits.
 
         Args:
-            origin: (3,) metres, or (N, 3), one a ray.
+            origin: (3,) metres, or (N, 3), one for each ray.
             directions: (N, 3) of any length.
-            reach: (N,) float32: how far each is followed, in lengths of the direction; None for without end.
+            reach: (N,) float32: how far each ray is followed, in lengths of its direction; None for no limit.
 
         Returns:
-            (N,) distances in lengths of the direction, infinite where nothing is hit, to single precision; and (N,)
-            the faces, six a solid in the order of `solids.FACES`, `GROUND` or `NOTHING`.
+            (N,) distances in lengths of the direction, in single precision, infinite where nothing is hit; and (N,)
+            the faces, six for each solid in the order of `solids.FACES`, or `GROUND` or `NOTHING`.
         """
         ...
 
 
 def make_caster(corners: FloatArray, terrain: Terrain | None = None) -> Caster:
-    """The best caster there is for solids (P, 8, 3), metres, and the ground, if one is given."""
+    """The fastest installed caster, for solids (P, 8, 3), metres, and the ground, if `terrain` is given."""
     return EmbreeCaster(corners, terrain) if has_embree() else NumpyCaster(corners, terrain)
 
 
@@ -82,7 +82,7 @@ class EmbreeCaster:
         self._is_empty = len(triangles) == 0
         self._scene: Any = rtcore_scene.EmbreeScene()
         if not self._is_empty:
-            # it is read number by number: Python's own numbers take half the time that numpy's take
+            # Embree reads the numbers one by one: with Python's own it takes half the time
             self._mesh: Any = mesh_construction.TriangleMesh(self._scene, vertices.astype(object), triangles)
 
     def cast(
@@ -95,7 +95,7 @@ class EmbreeCaster:
         else:
             starts = np.empty_like(rays)
             starts[:] = origin
-            ends = None if reach is None else reach.astype(np.float32)  # a copy, since Embree writes into it
+            ends = None if reach is None else reach.astype(np.float32)  # a copy, because Embree writes into it
             hits = self._scene.run(starts, rays, ends, query="INTERSECT", output=True)
             face, distance = hits["primID"] >> 1, hits["tfar"]
             missed = face < 0
@@ -110,7 +110,7 @@ class EmbreeCaster:
 
 @lru_cache(maxsize=4)
 def _triangles_of_solids(count: int) -> NDArray[np.object_]:
-    """Rows of three corners of every triangle, (count · 12,) tuples: two a face, in the order of `solids.FACES`."""
+    """The rows of each triangle's three corners, (count · 12,) tuples: two for each face, as in `solids.FACES`."""
     rows = np.arange(count)[:, None, None, None] * _CORNERS_A_SOLID + FACES[:, _HALVES]
     return _as_tuples(rows.reshape(-1, 3))
 
@@ -122,7 +122,7 @@ def _as_tuples(rows: IntArray) -> NDArray[np.object_]:
 
 
 class NumpyCaster:
-    """Rays cut with the planes of the solids near them, in double precision: slow, and needs nothing."""
+    """Rays intersected with the planes of the solids near them, in double precision: slow, but without Embree."""
 
     def __init__(self, corners: FloatArray, terrain: Terrain | None = None) -> None:
         normals, offsets = face_planes(face_corners(corners))
@@ -162,7 +162,7 @@ class NumpyCaster:
         return distance, face
 
     def _cast_in_turn(self, origins: FloatArray, rays: FloatArray) -> tuple[AnyArray, AnyArray]:
-        """Rays (N, 3) from points (N, 3) of which many are the same."""
+        """Rays (N, 3) from points (N, 3), many of which are equal."""
         distance, face = np.full(len(rays), np.inf), np.full(len(rays), NOTHING)
         places, place = np.unique(origins, axis=0, return_inverse=True)
         for number, origin in enumerate(places):
@@ -171,17 +171,17 @@ class NumpyCaster:
         return distance, face
 
     def _near(self, solids: IntArray, origin: FloatArray, units: FloatArray) -> BoolArray:
-        """Which rays (N,) pass through which solids' (S,) bounding spheres: (S, N)."""
+        """Whether each ray (N,) passes near the bounding sphere of each solid (S,): (S, N)."""
         towards = self._middle[solids] - origin
         radius = self._radius[solids] * (1 + _ROUNDING)
         along = towards @ units.T
         least = np.sqrt(np.maximum((towards**2).sum(axis=1) - radius**2, 0.0))
-        # a sphere around the origin is met by every ray, any other by those that reach its tangents' length ahead
+        # all rays meet a sphere around the origin; another one, only those that are ahead by its tangent's length
         around = (towards**2).sum(axis=1) <= radius**2
         return np.asarray((along >= least[:, None]) | around[:, None])
 
     def _entry(self, solid: int, origin: FloatArray, rays: FloatArray) -> tuple[FloatArray, IntArray]:
-        """Where rays enter a solid, infinite where they do not, and by which face."""
+        """Where rays enter a solid (infinite if they do not), and the face through which they enter."""
         towards = rays @ self._normals[solid].T
         height = self._offsets[solid] - self._normals[solid] @ origin
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -195,7 +195,7 @@ class NumpyCaster:
 
 
 def ground_distance(terrain: Terrain, origin: FloatArray, rays: FloatArray) -> FloatArray:
-    """Where rays (N, 3) from one point above the ground meet it, in lengths of the ray; infinite where they do not."""
+    """Where rays (N, 3) from a point above the ground meet it, in lengths of the ray; infinite if they do not."""
     if terrain.is_flat:
         return plane_distance(origin[2], rays[:, 2])
     step = _MARCH / np.linalg.norm(rays, axis=1)
@@ -218,7 +218,7 @@ def ground_distance(terrain: Terrain, origin: FloatArray, rays: FloatArray) -> F
 
 
 def plane_distance(height: float | FloatArray, upwards: NDArray[Any]) -> NDArray[Any]:
-    """From points above z = 0 along rays with the z components `upwards` (N,); infinite where they do not fall."""
+    """The distance from a height to z = 0 along rays with z components `upwards` (N,); infinite if they do not fall."""
     falling = upwards < 0
     return np.where(falling, height / -np.where(falling, upwards, -1.0), np.inf)
 

@@ -1,6 +1,6 @@
-"""The rotating LiDAR: 32 channels, 40° of height, 70 m, with noise, drop-outs and the weather in its way.
+"""The rotating LiDAR: 32 channels over 40° of elevation, 70 m, with noise, lost returns and the effects of weather.
 
-Of labels alone, only the rays are followed that may pass through the boxes of road users.
+If only labels are made, only the rays that may pass through the boxes of road users are followed.
 """
 
 from dataclasses import dataclass
@@ -20,14 +20,14 @@ from deepaccident_devkit.synth.solids import FACES_A_SOLID
 
 CHANNELS = 32
 ELEVATION = (-30.0, 10.0)
-"""Degrees of the lowest and the highest channel."""
+"""Elevation of the lowest and the highest channel, degrees."""
 AZIMUTHS = 1400
-"""The release's LiDAR sends out 2,750 rays a turn and channel, of which it drops 48 % by chance."""
+"""Rays a turn and channel. The release's LiDAR sends out 2,750, of which it loses 48 % at random."""
 RANGE = 70.0
 _SPARE = 0.06
-"""Metres around a box that count as in it: more than anybody goes between the cloud and the count."""
+"""Metres around a box that count as inside: more than anybody moves between the point cloud and the count."""
 _CLOSER = 0.98
-"""By this a box is taken to be nearer than it is: on a slope it leans."""
+"""The distance of a box is multiplied by this, because a box on a slope leans."""
 
 
 @cache
@@ -44,7 +44,7 @@ def ray_directions() -> FloatArray:
 
 
 def turned_rays(rotation: FloatArray, rows: IntArray | slice = slice(None)) -> Float32Array:
-    """Directions (K, 3) of some rays, or of all, turned by a rotation (3, 3); each is the same whatever others are."""
+    """Directions (K, 3) of some or all rays, turned by a rotation (3, 3); each one does not depend on the others."""
     x, y, z = _direction_columns()[:, rows]
     turn = rotation.astype(np.float32)
     turned = np.empty((len(x), 3), dtype=np.float32)
@@ -54,7 +54,7 @@ def turned_rays(rotation: FloatArray, rows: IntArray | slice = slice(None)) -> F
 
 
 def rays_to_boxes(scene: Scene, ground_from_lidar: SE3, *groups: IntArray) -> BoolArray:
-    """Which rays may pass through the box of an actor of each group of rows, (G, 32 · 1400): those in windows there."""
+    """Which rays may pass through a box of each group of actors, (G, 32 · 1400): those in a window around each box."""
     rows = np.concatenate(groups)
     frames, half = scene.frames[rows], scene.actors.size[rows, :2] / 2
     corners = ground_from_lidar.inverse().apply(scene.box_corners[rows].reshape(-1, 3)).reshape(-1, 8, 3)
@@ -64,7 +64,7 @@ def rays_to_boxes(scene: Scene, ground_from_lidar: SE3, *groups: IntArray) -> Bo
     nearest = np.hypot(gap[:, 0], gap[:, 1]) * _CLOSER
     first, last = _channels(corners[..., 2].min(axis=1), corners[..., 2].max(axis=1), nearest, reach.max(axis=1))
     start, count = _azimuths(corners, around=nearest == 0)
-    met = np.zeros((len(groups), CHANNELS, 2 * AZIMUTHS), dtype=bool)  # a turn more, for windows over the seam
+    met = np.zeros((len(groups), CHANNELS, 2 * AZIMUTHS), dtype=bool)  # 2 turns, for windows across the end
     group = np.repeat(np.arange(len(groups)), [len(each) for each in groups])
     for row in np.flatnonzero(nearest < RANGE).tolist():
         met[group[row], first[row] : last[row], start[row] : start[row] + count[row]] = True
@@ -72,9 +72,9 @@ def rays_to_boxes(scene: Scene, ground_from_lidar: SE3, *groups: IntArray) -> Bo
 
 
 def rays_through(size: tuple[float, float, float], place: FloatArray) -> IntArray:
-    """Rows of the rays that pass through a box of some size, metres, which is turned as the LiDAR is.
+    """Rows of the rays that pass through a box of a size (metres) with the same heading as the LiDAR.
 
-    `place` (3,) is the LiDAR's in the frame of the box's middle on the road, metres.
+    `place` (3,) is the LiDAR's place in the frame of the box's middle on the road, metres.
     """
     middle = np.array([0.0, 0.0, BOX_CLEARANCE + size[2] / 2]) - place
     half = np.array(size) / 2 + _SPARE
@@ -87,7 +87,7 @@ def rays_through(size: tuple[float, float, float], place: FloatArray) -> IntArra
 def _channels(
     low: FloatArray, high: FloatArray, nearest: FloatArray, farthest: FloatArray
 ) -> tuple[IntArray, IntArray]:
-    """First channel, and the one after the last, whose rays pass between heights (N,) over some distances (N,)."""
+    """First channel, and last channel plus 1, whose rays pass between two heights (N,) at a range of distances (N,)."""
     bottom, top, close = low - _SPARE, high + _SPARE, np.maximum(nearest, 1e-3)
     lowest = np.arctan2(bottom, np.where(bottom < 0, close, farthest))
     highest = np.arctan2(top, np.where(top > 0, close, farthest))
@@ -98,7 +98,7 @@ def _channels(
 
 
 def _azimuths(corners: FloatArray, *, around: BoolArray) -> tuple[IntArray, IntArray]:
-    """First azimuth, and how many, of the rays that meet boxes (N, 8, 3) from above; all where a box is `around`."""
+    """First azimuth and number of azimuths of the rays to boxes (N, 8, 3); all azimuths if a box is `around`."""
     middle = np.arctan2(*corners[..., :2].mean(axis=1).T[::-1])
     aside = np.abs((np.arctan2(corners[..., 1], corners[..., 0]) - middle[:, None] + np.pi) % (2 * np.pi) - np.pi)
     half_turn = np.where(around, np.pi, aside.max(axis=1))
@@ -110,19 +110,19 @@ def _azimuths(corners: FloatArray, *, around: BoolArray) -> tuple[IntArray, IntA
 
 @cache
 def _direction_columns() -> Float32Array:
-    """As `ray_directions`, (3, 32 · 1400)."""
+    """The same as `ray_directions`, as (3, 32 · 1400)."""
     return readonly(np.ascontiguousarray(ray_directions().T.astype(np.float32)))
 
 
 RANGE_NOISE = 0.05
-"""Standard deviation along the ray, metres: the release's."""
+"""Standard deviation along the ray, metres, as in the release."""
 _ATTENUATION = 0.03
-"""Of the intensity, a metre of dry air: the release's."""
+"""Attenuation of the intensity for each metre of dry air, as in the release."""
 _SURE, _LOST_DARK = 0.8, 0.4
-"""The intensity from which on no return gets lost, and the share that does where it is 0: CARLA's defaults."""
+"""The intensity from which on no return is lost, and the share of lost returns at intensity 0: CARLA's defaults."""
 _NUMBERS = 1 << 18
 _NEAREST_DROP, _FARTHEST_DROP = 1.5, 12.0
-"""Metres, between which raindrops send back a ray."""
+"""The least and the largest distance from which raindrops return a ray, metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,10 +130,10 @@ class Air:
     """What the weather does to a ray.
 
     Attributes:
-        lost: share of the returns from `RANGE` metres that get lost besides the weak ones, less from nearer in the
-            square of the distance.
-        attenuation: of the intensity, a metre, in addition to dry air's.
-        drops: share of all rays that come back from a raindrop.
+        lost: share of the returns from `RANGE` metres that are lost, in addition to the weak ones; from nearer, the
+            share falls with the square of the distance.
+        attenuation: attenuation of the intensity for each metre, in addition to that of dry air.
+        drops: share of all rays that return from a raindrop.
     """
 
     lost: float = 0.0
@@ -150,18 +150,18 @@ AIR_OF_WEATHER = {
     "MidRain": Air(0.25, 0.008, 0.0005),
     "HardRain": Air(0.4, 0.014, 0.0015),
 }
-"""By the weathers of `taxonomy.WEATHERS`."""
+"""Weather (of `taxonomy.WEATHERS`) → its air."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Lidar:
-    """The LiDAR of an agent, and what its rays meet of the agent itself, which is the same all the time.
+    """The LiDAR of an agent, and where its rays meet the agent's own body, which never changes.
 
     Attributes:
-        row: of the agent's own actor, None for the pole.
-        body: (K,) rows of the rays that pass through the own box.
-        distance: (K,) float32, where they meet the own body, metres; infinite where they do not.
-        face: (K,) what they meet there, as in `Scene.cast`.
+        row: row of the agent's own actor; None for the pole.
+        body: (K,) rows of the rays that pass through the agent's own box.
+        distance: (K,) float32, metres to where they meet its body; infinite if they do not.
+        face: (K,) the faces that they meet there, as in `Scene.cast`.
     """
 
     row: int | None
@@ -175,10 +175,10 @@ class Scan:
     """N points of one turn.
 
     Attributes:
-        xyz: (N, 3) float32, metres, in the LiDAR frame: as they are stored.
-        ray: (N,) int64, row of each in `ray_directions`.
-        face: (N,) what each lies on, as in `Scene.cast`; `caster.NOTHING` for a raindrop.
-        reach: (N,) float32, metres to it, without the noise.
+        xyz: (N, 3) float32, metres, in the LiDAR frame, as stored.
+        ray: (N,) int64, row of each point's ray in `ray_directions`.
+        face: (N,) the face that each lies on, as in `Scene.cast`; `caster.NOTHING` for a raindrop.
+        reach: (N,) float32, distance without the noise, metres.
     """
 
     xyz: Float32Array
@@ -208,12 +208,12 @@ def scan(
 
     Args:
         scene: the moment.
-        lidar: of which agent.
+        lidar: the LiDAR of an agent.
         ground_from_lidar: its pose.
-        air: what is between.
-        rng: of the noise; used alike whatever the rays meet.
-        boxed: whether only rays are followed that may pass through a label box: of what lies in a box all points are
-            there, the same to the bit; of what lies beside them few.
+        air: the effects of the weather.
+        rng: random numbers for the noise; the number of draws does not depend on what the rays meet.
+        boxed: whether to follow only rays that may pass through a label box. Then all points in boxes are there, equal
+            to the bit, but only few points outside the boxes.
     """
     cast = _cast_boxed if boxed else _cast_all
     rows, distance, face = cast(scene, lidar, ground_from_lidar)
@@ -233,7 +233,7 @@ def scan(
 
 
 def intensity(points: Scan, air: Air) -> Float32Array:
-    """How bright the points (N,) came back, 0 to 1: by the air on the way alone, as in the release."""
+    """The intensity of the points (N,), 0 to 1: it depends only on the air on the way, as in the release."""
     return _brightness(points.reach, air)
 
 
@@ -242,7 +242,7 @@ def _brightness(reach: AnyArray, air: Air) -> Float32Array:
 
 
 def _cast_all(scene: Scene, lidar: Lidar, ground_from_lidar: SE3) -> tuple[IntArray, AnyArray, AnyArray]:
-    """All rows of rays; how far they go, right up to `RANGE`; and what they meet."""
+    """The rows of all rays; how far they go, correct up to `RANGE`; and what they meet."""
     setting, rays = scene.setting, turned_rays(ground_from_lidar.rotation)
     pose = ground_from_lidar.matrix.tobytes()
     origin, columns = ground_from_lidar.translation, rays.reshape(CHANNELS, AZIMUTHS, 3)
@@ -255,7 +255,7 @@ def _cast_all(scene: Scene, lidar: Lidar, ground_from_lidar: SE3) -> tuple[IntAr
 
 
 def _cast_boxed(scene: Scene, lidar: Lidar, ground_from_lidar: SE3) -> tuple[IntArray, AnyArray, AnyArray]:
-    """As `_cast_all`, of the rays that may pass through a box."""
+    """The same as `_cast_all`, for only the rays that may pass through a box."""
     setting = scene.setting
     near, others = rays_to_boxes(scene, ground_from_lidar, _others(setting.moving, lidar), setting.parked)
     wanted = near | others
@@ -274,9 +274,9 @@ def _cast_boxed(scene: Scene, lidar: Lidar, ground_from_lidar: SE3) -> tuple[Int
 
 @cache
 def _random_numbers() -> tuple[Float32Array, Float32Array]:
-    """Numbers of the standard normal distribution, and even ones from 0 to 1, (2 ** 18,) each.
+    """Random numbers of the standard normal distribution, and uniform ones from 0 to 1, (2 ** 18,) each.
 
-    Each turn takes them from places of its own: drawing them again would take as long as casting the rays to the boxes.
+    Each turn takes them from another place: to draw new ones would take as long as to cast the rays to the boxes.
     """
     rng = np.random.default_rng(0)
     normal, even = rng.standard_normal(_NUMBERS, dtype=np.float32), rng.random(_NUMBERS, dtype=np.float32)
@@ -288,7 +288,7 @@ def _others(rows: IntArray, lidar: Lidar) -> IntArray:
 
 
 def _returns(reach: Float32Array, luck: Float32Array, air: Air) -> NDArray[np.bool_]:
-    """Which rays (N,) come back from where they met something, metres: of weak ones fewer."""
+    """Which rays (N,) return, by the distance in metres at which they met something: of the weak ones fewer."""
     near = np.minimum(reach, RANGE)
     lost = _LOST_DARK * np.maximum(1 - _brightness(near, air) / _SURE, 0) + air.lost * (near / RANGE) ** 2
     return np.asarray((reach <= RANGE) & (luck >= lost))

@@ -1,4 +1,4 @@
-"""All sensors of a scenario's agents: what each records at one moment after another."""
+"""All sensors of a scenario's agents, and what each of them records at a moment."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -21,17 +21,17 @@ from deepaccident_devkit.synth.stage import World
 from deepaccident_devkit.taxonomy import AGENTS, AgentName
 
 _LOOK, _LIDAR, _CAMERAS = range(3)
-"""What random numbers are for."""
+"""The purposes of random numbers."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighting:
-    """What an agent knows at a moment without its cameras.
+    """What an agent records at a moment, except its images.
 
     Attributes:
         labels: its label file.
         calib: its calib file.
-        points: its point cloud, as the labels count it; without images, only what may lie in a box, as in `lidar.scan`.
+        points: its point cloud; if the rig makes no images, only the points that may lie in a box, as in `lidar.scan`.
     """
 
     labels: Labels
@@ -45,12 +45,12 @@ class Rig:
 
     Attributes:
         setting: what stands still, and who moves.
-        agents: who records.
-        lidars: theirs.
+        agents: the agents.
+        lidars: their LiDARs.
         air: what the weather does to the LiDARs' rays.
-        studio: for images; None where none are made.
-        seed: of all noise, so that a moment's does not depend on what was recorded before it.
-        exact: whether calib files are ideal, and counts those of a recount.
+        studio: it makes the images; None if there are none.
+        seed: seed of all noise, so that the noise of a moment does not depend on what was recorded before.
+        exact: whether calib files are ideal, and numbers of points exact.
     """
 
     setting: Setting
@@ -77,22 +77,22 @@ class Rig:
         return Sighting(labels, calib if self.exact else with_single_precision(calib), points)
 
     def intensity(self, points: Scan) -> Float32Array:
-        """How bright each of the points (N,) came back, 0 to 1."""
+        """The intensity of each of the points (N,), 0 to 1."""
         return intensity(points, self.air)
 
     def bev(self, scene: Scene, agent: Agent) -> BevImage:
-        """What lies around an agent, from above."""
+        """The picture of an agent's BEV camera."""
         return bev_picture(scene, self.setting.world.top, agent.ground_from_ego(scene))
 
     def surroundings(self, scene: Scene, signals: Mapping[Arm, int]) -> Surroundings | None:
-        """What the images of all agents at a moment have in common; None where none are made.
+        """What the images of all agents at a moment have in common; None if no images are made.
 
-        `signals` are the traffic lights' states, as `images.lamplight.lit_lamps` takes them.
+        `signals` are the states of the traffic lights, as for `images.lamplight.lit_lamps`.
         """
         return self.studio.surroundings(scene, signals) if self.studio else None
 
     def images(self, scene: Scene, around: Surroundings, agent: Agent, frame: int) -> Iterator[tuple[str, ByteArray]]:
-        """Channel and picture (H, W, 3) of each of an agent's cameras, one after the other."""
+        """Channel and picture (H, W, 3) of each camera of an agent, one at a time."""
         rng = self._random(_CAMERAS, frame, agent)
         ground_from_lidar = agent.ground_from_lidar(scene)
         for camera in agent.cameras:
@@ -122,8 +122,8 @@ def make_rig(
         ids: actor ids of the four vehicle agents.
         sky: weather and time of day, as in the taxonomy.
         image_size: width and height of the images, pixels.
-        seed: of noise, clouds and the ground's grain.
-        images: whether images will be asked for; labels do not depend on it, points do as in `Sighting`.
+        seed: seed of noise, clouds and the ground's grain.
+        images: whether images are wanted; labels do not depend on it, points do, as in `Sighting`.
         exact: as in `Rig`.
     """
     weather, time_of_day = sky

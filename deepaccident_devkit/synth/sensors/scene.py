@@ -1,4 +1,4 @@
-"""One moment of a scenario, ready to be looked at: all road users where they are, and a caster over them."""
+"""One moment of a scenario, ready to be recorded: where all road users are, and a caster for rays to them."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,7 +22,7 @@ class Scene:
         snapshot: where the road users are, seen from above.
         frames: (A, 4, 4) their frames on the ground, as in `setting.placed_on`.
         movers: surfaces of those who are not parked.
-        caster: for rays against these.
+        caster: casts rays against `movers`.
     """
 
     setting: Setting
@@ -45,7 +45,7 @@ class Scene:
 
     @property
     def face_owner(self) -> IntArray:
-        """As `Setting.face_owner`."""
+        """The same as `Setting.face_owner`."""
         return self.setting.face_owner
 
     @cached_property
@@ -59,13 +59,13 @@ class Scene:
         """Where rays first meet a surface or the ground.
 
         Args:
-            origin: (3,) metres, above the ground; or (N, 3), one a ray.
+            origin: (3,) metres, above the ground; or (N, 3), one for each ray.
             directions: (N, 3), of any length.
-            near: rows of the rays that can meet someone who moves; None for all.
+            near: rows of the rays that can meet a moving road user; None for all.
 
         Returns:
-            (N,) distances in lengths of the direction, infinite where nothing is met; and (N,) the faces met,
-            `caster.GROUND` or `caster.NOTHING`.
+            (N,) distances in lengths of the direction, infinite if a ray meets nothing; and (N,) the faces met,
+            or `caster.GROUND` or `caster.NOTHING`.
         """
         rows = np.arange(len(directions)) if near is None else near
         reached, met = self._cast_at_movers(origin, directions, rows)
@@ -79,7 +79,7 @@ class Scene:
     def with_movers(
         self, origin: FloatArray, directions: AnyArray, still: tuple[AnyArray, AnyArray], near: IntArray
     ) -> tuple[AnyArray, AnyArray]:
-        """What rays meet that meet `still` where nobody moves; arguments and results as in `cast`."""
+        """What rays meet, given that they meet `still` without moving road users; all else is as in `cast`."""
         reached, met = self._cast_at_movers(origin, directions, near)
         ahead = np.flatnonzero(reached < still[0][near])
         distance, face = still[0].copy(), still[1].copy()
@@ -87,7 +87,7 @@ class Scene:
         return distance, face
 
     def _cast_at_movers(self, origin: FloatArray, directions: AnyArray, rows: IntArray) -> tuple[AnyArray, AnyArray]:
-        """How far some of the rays go until they meet someone who moves, and the faces."""
+        """How far the rays of `rows` go until they meet a moving road user, and the faces that they meet."""
         reached, met = self.caster.cast(origin if origin.ndim == 1 else origin[rows], directions[rows])
         return reached, met + self.setting.faces
 

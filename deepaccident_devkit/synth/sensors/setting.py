@@ -1,4 +1,4 @@
-"""What stands still over a scenario, made ready once, and how bodies are set on the terrain."""
+"""What stands still during a scenario, prepared once, and how bodies are placed on the terrain."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from deepaccident_devkit.synth.stage import World
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 _AXLES, _WHEELS = 0.3, 0.4
-"""Where bodies touch the ground: shares of the length ahead of and behind the middle, of the width at its sides."""
+"""Where bodies touch the ground: the share of the length ahead of and behind the middle, and of the width beside it."""
 
 
 def placed_on(terrain: Terrain, poses: FloatArray, size: FloatArray, upright: BoolArray) -> FloatArray:
@@ -26,7 +26,7 @@ def placed_on(terrain: Terrain, poses: FloatArray, size: FloatArray, upright: Bo
         terrain: the ground.
         poses: (A, 3) x, y (metres), yaw (radians) of the boxes' centres.
         size: (A, 3) length, width, height, metres.
-        upright: (A,) who keeps upright on a slope.
+        upright: (A,) whether a body stays upright on a slope.
     """
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     zero = np.zeros(len(poses))
@@ -53,19 +53,19 @@ def placed_on(terrain: Terrain, poses: FloatArray, size: FloatArray, upright: Bo
 
 
 def moved(corners: FloatArray, frames: FloatArray) -> FloatArray:
-    """Points (P, K, 3) of P bodies' own frames, set at frames (P, 4, 4)."""
+    """Points (P, K, 3) in the own frames of P bodies, moved by the bodies' frames (P, 4, 4)."""
     turned: FloatArray = corners @ np.swapaxes(frames[:, :3, :3], 1, 2)
     return turned + frames[:, None, :3, 3]
 
 
 NOBODY = -1
-"""Owner of what is no road user."""
+"""The owner of what belongs to no road user."""
 _UPRIGHT = CATEGORIES.index("pedestrian")
 _ENDLESS = 1e3
 _LEVEL, _CAREFUL = 1e-6, 1e-3
-"""Up to which angle two lines count as one; by what share of a way a ray may end sooner than it seems."""
+"""The largest angle between two lines that count as one; the share of its length that a ray may be shorter."""
 _CASTS_KEPT = 8
-"""Of rays from sensors that have not moved since: five LiDARs, and room for some that come to a halt."""
+"""How many results are kept of rays from sensors that have not moved: five LiDARs, and a reserve."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ class Surfaces:
     """Solids in the ground frame.
 
     Attributes:
-        solids: in their owners' frames: their colours.
+        solids: the solids in their owners' frames; their colours are used.
         corners: (P, 8, 3) float64, metres, ground frame.
         owner: (P,) int64, row of the actor that each solid belongs to, or `NOBODY`.
     """
@@ -104,7 +104,7 @@ class Surfaces:
 
 
 class Setting:
-    """All that stands still, and who moves on it.
+    """All that stands still, and the road users that move.
 
     Attributes:
         world: the place.
@@ -112,11 +112,11 @@ class Setting:
         terrain: the shape of the ground.
         still: surfaces of things and of parked vehicles.
         moving: (M,) rows of the actors that are not parked.
-        parked: (A − M,) rows of those that are.
-        moving_shapes: their solids, each in its owner's frame.
-        moving_owner: (Q,) row of the actor that each of these belongs to.
+        parked: (A − M,) rows of the parked actors.
+        moving_shapes: the solids of the moving actors, each in its owner's frame.
+        moving_owner: (Q,) row of the actor to which each of these solids belongs.
         props: (W,) rows of the world's solids among those of `still`.
-        caster: for rays against what stands still and the ground.
+        caster: casts rays against what stands still and the ground.
     """
 
     world: World
@@ -152,14 +152,14 @@ class Setting:
 
     @property
     def faces(self) -> int:
-        """How many faces stand still; those of what moves are numbered from here."""
+        """How many faces stand still; the numbers of moving faces begin with this one."""
         return len(self.still.corners) * FACES_A_SOLID
 
     @cached_property
     def face_owner(self) -> IntArray:
-        """Row of the actor that each face belongs to, those of who moves included, (F + 2,), or `NOBODY`.
+        """Row of the actor to which each face belongs, moving faces too, (F + 2,), or `NOBODY`.
 
-        The last two are for `caster.GROUND` and `caster.NOTHING`, so that one can index with any face.
+        The last two are for `caster.GROUND` and `caster.NOTHING`, so that every face can be used as an index.
         """
         moving = np.repeat(self.moving_owner, FACES_A_SOLID)
         return np.concatenate([self.still.face_owner, moving, [NOBODY, NOBODY]])
@@ -169,14 +169,14 @@ class Setting:
         return placed_on(self.terrain, poses, self.actors.size, self.actors.category == _UPRIGHT)
 
     def cast_columns(self, origin: FloatArray, rays: AnyArray, limit: float = np.inf) -> tuple[AnyArray, AnyArray]:
-        """As `caster.cast`, of rays that stand above each other: those that end before the first thing are not cast.
+        """Does the same as `caster.cast` for columns of rays, but skips rays that meet the ground before any thing.
 
-        That can be told on flat ground, where all rays of a column go over the same line.
+        It knows them on flat ground, where all rays of a column go over the same line.
 
         Args:
             origin: (3,) metres.
             rays: (R, C, 3) float32; if those of a column do not go over the same line, all are cast.
-            limit: how far what they meet has to be right, in lengths of the ray.
+            limit: up to where results must be correct, in lengths of the ray.
 
         Returns:
             (R · C,) distances and faces.
@@ -193,16 +193,16 @@ class Setting:
         return distance, face
 
     def _clear(self, origin: FloatArray, directions: AnyArray) -> AnyArray:
-        """Metres over the ground that rays (N, 3) go before they come above or below anything that stands still, (N,).
+        """Metres over the ground, (N,), from the origin of rays (N, 3) to the first thing above or below each of them.
 
-        No ray over the same line meets a thing sooner. Infinite where there is nothing at all.
+        No ray over the same line meets a thing before that. Infinite if there is nothing.
         """
         level = directions * np.array([1, 1, 0], dtype=np.float32)
         reached, _ = self._fence.cast(np.array([*origin[:2], 0.0]), level)
         return np.asarray(reached * np.linalg.norm(level, axis=1))
 
     def kept(self, pose: bytes, cast: Callable[[], tuple[AnyArray, AnyArray]]) -> tuple[AnyArray, AnyArray]:
-        """What `cast` gives, from memory where it was called for the same pose before; not to be written."""
+        """The result of `cast`; from memory if it was called for the same pose before. Do not change it."""
         found = self._kept.pop(pose, None) or cast()
         self._kept[pose] = found
         if len(self._kept) > _CASTS_KEPT:
@@ -218,7 +218,7 @@ def _in_columns(rays: AnyArray) -> bool:
 
 
 def _endless(corners: FloatArray) -> FloatArray:
-    """Upright boxes (P, 8, 3) around solids as seen from above, from deep below to high above."""
+    """Upright boxes (P, 8, 3) around solids, from deep below the ground to high above it."""
     low, high = corners.min(axis=1), corners.max(axis=1)
     low[:, 2], high[:, 2] = -_ENDLESS, _ENDLESS
     return np.asarray(np.where(CORNER_SIGNS > 0, high[:, None], low[:, None]))

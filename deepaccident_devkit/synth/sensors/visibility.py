@@ -1,7 +1,7 @@
-"""Which road users an agent's cameras see: by the pixels that are theirs, in pictures of a size of its own.
+"""Which road users an agent's cameras see: by the number of their pixels in pictures of a fixed size.
 
-What is seen depends neither on the size of the images nor on whether any are made: every road user is looked at with
-rays of one grid, a pixel of `WIDTH` × `HEIGHT` each, thinned out where it fills much of the picture.
+The result depends neither on the size of the images nor on whether images are made. For every road user, rays through
+the pixels of a `WIDTH` × `HEIGHT` picture are cast; if it fills much of the picture, through fewer of them.
 """
 
 from collections.abc import Sequence
@@ -17,22 +17,22 @@ from deepaccident_devkit.synth.sensors.agents import Agent, Camera
 from deepaccident_devkit.synth.sensors.scene import Scene
 
 CLOSE = 0.05
-"""Metres ahead of the camera from which on corners are projected."""
+"""Corners that are at least so many metres ahead of the camera are projected."""
 _EDGES = np.array([(a, b) for a, b in combinations(range(8), 2) if (CORNER_SIGNS[a] == CORNER_SIGNS[b]).sum() == 2])
-"""Pairs of corners between which the edges of a box run."""
+"""The pairs of corners that are the edges of a box."""
 _SPARE = 1.0
-"""Pixels around a rectangle."""
+"""Pixels that are added around a rectangle."""
 
 
 def rectangles(corners: FloatArray, slope: FloatArray, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
     """Least and greatest column and row, (A, 2) each, not rounded, of boxes (A, 8, 3) in the optical frame.
 
-    Of who is partly behind the camera, what is ahead of it counts; of who is behind it altogether they are equal.
+    Of a box that is partly behind the camera, only the part ahead counts; if all of it is behind, the two are equal.
 
     Args:
         corners: metres; x right, y down, z ahead.
-        slope: (2,) or (A, 2), of one pixel, across and down.
-        size: of the picture, width and height, pixels.
+        slope: (2,) or (A, 2), slope of one pixel, across and down.
+        size: width and height of the picture, pixels.
     """
     low, high = _spans(corners[..., :2] / np.maximum(corners[..., 2:], CLOSE), corners[..., 2] >= CLOSE)
     partly = np.flatnonzero((corners[..., 2].min(axis=1) < CLOSE) & (corners[..., 2].max(axis=1) > CLOSE))
@@ -46,7 +46,7 @@ def rectangles(corners: FloatArray, slope: FloatArray, size: tuple[int, int]) ->
 
 
 def _spans(places: FloatArray, counted: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Least and greatest of the points (A, K, 2) that are counted (A, K); 0 where none is."""
+    """Least and greatest of the points (A, K, 2) that are counted (A, K); 0 if no point is."""
     low = np.where(counted[..., None], places, np.inf).min(axis=1)
     high = np.where(counted[..., None], places, -np.inf).max(axis=1)
     none = ~counted.any(axis=1)
@@ -55,7 +55,7 @@ def _spans(places: FloatArray, counted: BoolArray) -> tuple[FloatArray, FloatArr
 
 
 def _cut_edges(corners: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Where the twelve edges of boxes (A, 8, 3) come `CLOSE` to the camera, (A, 12, 3), and which of them do."""
+    """Where the twelve edges of boxes (A, 8, 3) are `CLOSE` ahead of the camera, (A, 12, 3), and which edges are."""
     one, other = corners[:, _EDGES[:, 0]], corners[:, _EDGES[:, 1]]
     crosses = (one[..., 2] < CLOSE) != (other[..., 2] < CLOSE)
     way = np.where(crosses, other[..., 2] - one[..., 2], 1.0)
@@ -66,10 +66,10 @@ def _cut_edges(corners: FloatArray) -> tuple[FloatArray, BoolArray]:
 
 
 def nearest_movers(scene: Scene, camera: Camera, ground_from_camera: SE3) -> Float32Array:
-    """How near, metres ahead, pixels may show someone who moves; infinite where nobody is.
+    """How near (metres ahead) a moving road user may be in each pixel; infinite if there is none.
 
     Returns:
-        (H + 2, W + 2): two pixels more down and right than the picture has.
+        (H + 2, W + 2): two pixels more at the bottom and at the right than the picture has.
     """
     corners = scene.box_corners[scene.setting.moving]
     optics = camera.optics
@@ -88,11 +88,11 @@ def nearest_movers(scene: Scene, camera: Camera, ground_from_camera: SE3) -> Flo
 
 
 WIDTH, HEIGHT = 400, 225
-"""Pixels of the pictures that visibility is decided on: a sixteenth of the real ones'."""
+"""Size of the pictures that decide visibility: they have a sixteenth of the pixels of the real images."""
 LEAST_PIXELS = 2
-"""As many of its pixels make a road user visible."""
+"""A road user with this many pixels is visible."""
 _RAYS_ACROSS, _FEW_ACROSS = 14, 4
-"""Rays to a road user, across and down, at most, and at the first look."""
+"""The most rays to a road user, across and also down: in all, and in the first attempt."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,7 +101,7 @@ class _Windows:
 
     Attributes:
         camera: row of the camera.
-        actor: which road user, of those that are looked at.
+        actor: row of the road user among the wanted ones.
         first: (W, 2) column and row of the upper left pixel.
         size: (W, 2) pixels across and down.
     """
@@ -112,7 +112,7 @@ class _Windows:
     size: IntArray
 
     def select(self, rows: BoolArray) -> "_Windows":
-        """Some of them, (W,)."""
+        """Some of the rectangles; `rows` (W,) says which."""
         return _Windows(self.camera[rows], self.actor[rows], self.first[rows], self.size[rows])
 
 
@@ -122,8 +122,8 @@ class Views:
     Args:
         scene: the moment.
         cameras: C of them.
-        poses: of these, `ground_from_camera`.
-        rows: of the road users, (K,).
+        poses: their poses, `ground_from_camera`.
+        rows: rows of the road users, (K,).
     """
 
     def __init__(self, scene: Scene, cameras: Sequence[Camera], poses: Sequence[SE3], rows: IntArray) -> None:
@@ -135,11 +135,11 @@ class Views:
         self._windows = _windows(corners, self._slopes)
 
     def pixels(self, wanted: BoolArray | None = None, *, rays_across: int = _RAYS_ACROSS) -> IntArray:
-        """How many pixels of a `WIDTH` × `HEIGHT` picture the road users have; about as many where they are many.
+        """How many pixels of a `WIDTH` × `HEIGHT` picture the road users have; large numbers are approximate.
 
         Args:
-            wanted: (K,) which of them; None for all. Of the others it is 0.
-            rays_across: how many rays each is looked at with at most, across and down.
+            wanted: (K,) for which of them; None for all. The others have 0.
+            rays_across: the most rays that are cast to each, across and also down.
 
         Returns:
             (C, K) int64.
@@ -158,9 +158,9 @@ class Views:
 
 
 def camera_visible(scene: Scene, agent: Agent, ground_from_lidar: SE3, rows: IntArray) -> BoolArray:
-    """Which actors of `rows` (K,) some camera of the agent has `LEAST_PIXELS` pixels of; never the agent itself.
+    """Which actors of `rows` (K,) have `LEAST_PIXELS` pixels in any camera of the agent; never the agent itself.
 
-    Most are seen with a few rays already; only those who are not are looked at with all.
+    A few rays are enough for most; all rays are cast only to the others.
     """
     poses = [ground_from_lidar @ camera.lidar_from_camera for camera in agent.cameras]
     views = Views(scene, agent.cameras, poses, rows)
@@ -172,13 +172,13 @@ def camera_visible(scene: Scene, agent: Agent, ground_from_lidar: SE3, rows: Int
 
 
 def _slope(camera: Camera) -> FloatArray:
-    """Of one pixel of the `WIDTH` × `HEIGHT` picture, across and down, (2,)."""
+    """The slope of one pixel of the `WIDTH` × `HEIGHT` picture, across and down, (2,)."""
     optics = camera.optics
     return np.asarray(np.array([optics.width / WIDTH, optics.height / HEIGHT]) / optics.intrinsic[0, 0])
 
 
 def _windows(corners: FloatArray, slopes: FloatArray) -> _Windows:
-    """The pixels that boxes (C, K, 8, 3) in the optical frames of C cameras may cover; `slopes` (C, 2) of a pixel."""
+    """The pixels that boxes (C, K, 8, 3) in C optical frames may cover; `slopes` (C, 2) are those of a pixel."""
     count = corners.shape[1]
     low, high = rectangles(corners.reshape(-1, 8, 3), np.repeat(slopes, count, axis=0), (WIDTH, HEIGHT))
     first = np.floor(low).clip(0, (WIDTH, HEIGHT)).astype(np.int64)
@@ -189,7 +189,7 @@ def _windows(corners: FloatArray, slopes: FloatArray) -> _Windows:
 
 
 def _pixels(windows: _Windows, rays_across: int) -> tuple[IntArray, IntArray, IntArray]:
-    """Pixels (N, 2), column and row; the window (N,) of each; and how far apart they are in each window (W,)."""
+    """Pixels (N, 2), column and row; the window (N,) of each; and the distance of pixels in each window (W,)."""
     step = -(-windows.size.max(axis=1, initial=1) // rays_across)
     across, down = (-(-windows.size // step[:, None])).T
     counts = across * down

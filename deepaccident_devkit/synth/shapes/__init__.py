@@ -1,4 +1,4 @@
-"""What each category looks like: solids inside its label box, x forward, origin on the road below the box's centre."""
+"""The shapes of each category: solids inside its label box, x forward, origin on the road below the box's centre."""
 
 from collections.abc import Callable
 
@@ -15,7 +15,7 @@ MODELS: dict[str, tuple[Callable[[Frame], list[Block]], ...]] = {
     "cyclist": (riders.cyclist,),
     "pedestrian": (riders.walker, riders.stroller),
 }
-"""By categories: how their models are built."""
+"""Category → the functions that build its models."""
 
 
 def shape_of(category: str, size: tuple[float, float, float], color: Color, accent: Color, model: int = 0) -> Solids:
@@ -24,9 +24,9 @@ def shape_of(category: str, size: tuple[float, float, float], color: Color, acce
     Args:
         category: one of `taxonomy.CATEGORIES`.
         size: length, width, height of its label box, metres.
-        color: of paint or clothes.
-        accent: of a second part.
-        model: which of the category's `MODELS`; they go round.
+        color: the colour of paint or clothes.
+        accent: the colour of a second part.
+        model: which of the category's `MODELS`; after the last one, the first follows.
     """
     length, width, height = size
     frame = Frame(length / 2 - INSET, width / 2 - INSET, BOX_CLEARANCE + height - INSET, color, accent)

@@ -1,20 +1,20 @@
-"""What all shapes share: colours, clearances, wheels and lamps."""
+"""What all shapes have in common: colours, clearances, wheels and lamps."""
 
 from dataclasses import dataclass
 
 from deepaccident_devkit.synth.solids import Block, Color
 
 BOX_CLEARANCE = 0.02
-"""Metres from the road to the bottom of every label box: no point of the ground lies in a box."""
+"""Metres from the road to the bottom of every label box, so that no point of the ground lies in a box."""
 INSET = 0.01
 """Metres between a label box and what it holds, so that rounding moves no point out of its box."""
 
 TIRE: Color = (34, 34, 36)
 RIM: Color = (150, 152, 156)
 LAMP: Color = (250, 246, 215)
-"""Of headlamps."""
+"""The colour of headlamps."""
 TAIL: Color = (190, 24, 24)
-"""Of tail lamps."""
+"""The colour of tail lamps."""
 SKIN: Color = (214, 168, 138)
 DARK: Color = (48, 50, 56)
 PLATE: Color = (232, 232, 224)
@@ -22,14 +22,14 @@ PLATE: Color = (232, 232, 224)
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """The room that a shape may fill, and its two colours.
+    """The space that a shape may fill, and its two colours.
 
     Attributes:
         x: half the length, metres.
-        y: half the width.
-        top: the height above the road.
-        color: of paint or clothes.
-        accent: a second one.
+        y: half the width, metres.
+        top: the height above the road, metres.
+        color: the colour of paint or clothes.
+        accent: the second colour.
     """
 
     x: float
@@ -46,7 +46,7 @@ def wheels(axles: tuple[float, ...], y: float, radius: float, width: float = 0.2
 
 
 def wheel(axle: float, across: tuple[float, float], radius: float, *, main: bool) -> tuple[Block, Block, Block]:
-    """Two blocks that give a tyre six corners from the side, and a rim."""
+    """A wheel of three blocks: two that give the tyre six corners, seen from the side, and a rim."""
     middle, cut, rim = 0.03 + radius, 0.5 * radius, 0.52 * radius
     upper = Block(
         (axle - radius, axle + radius), across, (middle, middle + radius), TIRE, inset=(cut, cut, 0.0), main=main

@@ -54,12 +54,12 @@ def cyclist(frame: Frame) -> list[Block]:
 
 
 def walker(frame: Frame) -> list[Block]:
-    """Someone in mid stride, arms swinging."""
+    """A person in the middle of a long step, with swinging arms."""
     return _person(frame, stride=frame.x - _LIMB)
 
 
 def stroller(frame: Frame) -> list[Block]:
-    """Someone with a short step and a bag on the back."""
+    """A person with a short step and a bag on the back."""
     y, top = frame.y, frame.top
     bag = Block((-frame.x, -0.4 * frame.x), (-0.6 * y, 0.6 * y), (0.56 * top, 0.78 * top), DARK, inset=(0, 0.02, 0.02))
     return [*_person(frame, stride=0.5 * frame.x), bag]
@@ -82,7 +82,7 @@ def _person(frame: Frame, stride: float) -> list[Block]:
 
 
 def _rider(frame: Frame, seat: float, low: float, reach: float, helmet: Color) -> list[Block]:
-    """A rider who sits at `seat`, `low` metres high, with hands `reach` metres ahead of the middle."""
+    """A rider at `seat`, `low` metres above the road, with hands `reach` metres ahead of the middle."""
     top, side = frame.top, min(frame.y - 0.02, 0.24)
     neck, lean = top - 0.27, min(0.22, 0.4 * (reach - seat))
     shoulder = seat + lean

@@ -1,4 +1,4 @@
-"""Vehicles of four wheels and more: saloon, hatchback and off-roader, vans and trucks."""
+"""Vehicles with four wheels or more: saloon, hatchback and off-roader, vans and trucks."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from deepaccident_devkit.synth.solids import FRONT, LEFT, REAR, RIGHT, Block
 
 _ALL_AROUND = (FRONT, REAR, LEFT, RIGHT)
 _BODY = 0.94
-"""Of the label box's half width: mirrors take the rest."""
+"""The share of the label box's half width that the body has; mirrors have the rest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,9 +17,9 @@ class _Line:
 
     Attributes:
         waist: height of the windows' lower edge.
-        cabin: from, to: the windows' lower edge.
-        roof: from, to: the roof.
-        boot: from, to: the boot's lid behind the cabin; None where the cabin ends the car.
+        cabin: where the windows' lower edge begins and ends.
+        roof: where the roof begins and ends.
+        boot: where the boot's lid behind the cabin begins and ends; None if the cabin is the rear end of the car.
         wheel: radius of the wheels, metres.
         sill: height of the body's lower edge, metres.
     """
@@ -38,17 +38,17 @@ _OFF_ROADER = _Line(0.58, (-0.96, 0.44), (-0.86, 0.16), None, 0.36, 0.27)
 
 
 def saloon(frame: Frame) -> list[Block]:
-    """Three boxes."""
+    """A car of three boxes: bonnet, cabin, boot."""
     return _car(frame, _SALOON)
 
 
 def hatchback(frame: Frame) -> list[Block]:
-    """Two boxes."""
+    """A car of two boxes: bonnet, cabin."""
     return _car(frame, _HATCHBACK)
 
 
 def off_roader(frame: Frame) -> list[Block]:
-    """Two boxes, steep and on large wheels, with rails on the roof."""
+    """A steep car of two boxes on large wheels, with rails on the roof."""
     x, top = frame.x, frame.top
     rails = [Block((-0.7 * x, 0.05 * x), y, (top - 0.05, top), DARK, main=False) for y in ((0.5, 0.56), (-0.56, -0.5))]
     return [*_car(frame, _OFF_ROADER), *rails]
@@ -103,16 +103,16 @@ def _pillars(x: float, side: float, waist: float, roof: float, frame: Frame) -> 
 
 
 _VAN_BODY = 0.95
-"""Of the label box's half width: mirrors take the rest."""
+"""The same share for vans and trucks."""
 
 
 def delivery_van(frame: Frame) -> list[Block]:
-    """A van with panes in front alone."""
+    """A van with windows only in front."""
     return _van(frame, panes=((0.14, 0.4),))
 
 
 def minibus(frame: Frame) -> list[Block]:
-    """A van with panes all along."""
+    """A van with windows along its whole length."""
     return _van(frame, panes=((0.14, 0.4), (-0.4, 0.06), (-0.88, -0.48)))
 
 

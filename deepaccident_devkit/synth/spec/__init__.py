@@ -1,7 +1,7 @@
 """Scenario files: what they can say, how they are read, and the paper's twelve designs as such files.
 
-A file is read into a `SpecTemplate`, whose ranges and choices are still open; `draw` makes a `ScenarioSpec` of it. The
-parts, from below: `model` (the fields), `yaml_nodes`, `choices`, `reading` (types), `checks` (what types cannot say),
+A file is read into a `SpecTemplate`, whose ranges and choices are still open; `draw` makes a `ScenarioSpec` from it.
+The parts, lowest layer first: `model` (the fields), `yaml_nodes`, `choices`, `reading` (types), `checks` (the rest),
 `template`, `catalogue` (files, the designs, and the fields as text).
 """
 

@@ -1,4 +1,4 @@
-"""Scenario files from text to template: reading them, the paper's twelve designs, and what a file can hold."""
+"""Scenario files from text to template: how to read them, the paper's twelve designs, and the table of fields."""
 
 import dataclasses
 import os
@@ -20,18 +20,20 @@ from deepaccident_devkit.synth.spec.yaml_nodes import parse_yaml
 from deepaccident_devkit.text import columns_text
 
 _MOST_CHARACTERS = 200_000
-"""PyYAML reads as many in a few seconds."""
+"""PyYAML reads so many in a few seconds."""
 
 
 def read_spec(path: str | os.PathLike[str]) -> SpecTemplate:
-    """The scenario of a YAML file (docs/scenarios.md says what one can hold).
+    """The scenario of a YAML file (docs/scenarios.md has all fields).
 
     Raises:
-        ConfigError: there is no such file, or it cannot be carried out; the message names line, field and remedy.
+        ConfigError: there is no such file, or it is no possible scenario; the message names line, field and remedy.
     """
     try:
         with Path(path).open(encoding="utf-8") as file:
             text = file.read(_MOST_CHARACTERS + 1)
+    except FileNotFoundError as error:
+        raise ConfigError(f"{path}: no such file; give the path of a scenario file (docs/scenarios.md)") from error
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read ({error}); give a YAML file in UTF-8") from error
     if len(text) > _MOST_CHARACTERS:
@@ -45,11 +47,11 @@ def parse_spec(text: str, source: str = "scenario") -> SpecTemplate:
     """The scenario of a YAML text.
 
     Args:
-        text: as in a file.
-        source: what messages call it.
+        text: the contents of a scenario file.
+        source: its name in error messages.
 
     Raises:
-        ConfigError: it cannot be carried out; the message names line, field and remedy.
+        ConfigError: it is no possible scenario; the message names line, field and remedy.
     """
     root = read_part(parse_yaml(text, source), ScenarioSpec)
     check_scenario(root)
@@ -80,7 +82,7 @@ DESIGNS: Final[Mapping[int, SpecTemplate]] = _Designs()
 
 
 def design_text(number: int) -> str:
-    """The scenario file of a design, as it ships.
+    """The text of a design's scenario file.
 
     Raises:
         ConfigError: there is no such design.
@@ -98,12 +100,12 @@ def _design(number: int) -> SpecTemplate:
 
 @dataclass(frozen=True, slots=True)
 class FieldEntry:
-    """A line of the table of fields.
+    """A row of the table of fields.
 
     Attributes:
-        key: in the file.
-        values: what it can be.
-        default: if the file does not name it.
+        key: the field's key in the file.
+        values: the possible values.
+        default: the value if the file does not have the key.
         meaning: one or more sentences.
     """
 
@@ -114,7 +116,7 @@ class FieldEntry:
 
 
 def field_tables() -> dict[str, tuple[FieldEntry, ...]]:
-    """The fields of a scenario file, by where they stand, such as `road.hump`; the file itself is the empty text."""
+    """Path of a part of a scenario file, such as `road.hump`, → its fields; the path of the whole file is empty."""
     return dict(_tables(ScenarioSpec, ""))
 
 

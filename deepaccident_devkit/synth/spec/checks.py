@@ -1,4 +1,4 @@
-"""Whether a scenario file can be carried out, whatever is drawn."""
+"""Checks that a scenario file is a possible scenario with all values that can be drawn."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -7,33 +7,37 @@ from typing import Final, TypeAlias, cast
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.roads import ARMS, Arm, Junction, RoadSpec, Turn
-from deepaccident_devkit.synth.spec.choices import Items, Part
+from deepaccident_devkit.synth.spec.choices import Items, Part, default_of
 from deepaccident_devkit.synth.spec.model import Role
 
 _Way: TypeAlias = tuple[Arm, Turn, int]
 """Arm, turn and lane."""
 LEADERS: Final[Mapping[Role, Role]] = {"ego_behind": "ego", "other_behind": "other"}
-"""Those who follow → whom."""
+"""Role of a follower → role of its leader."""
 _LEADING: Final = tuple(LEADERS.values())
 _AGENTS: Final = (*_LEADING, *LEADERS)
 _AGENT_CATEGORIES: Final = ("car", "truck", "van", "motorcycle")
 _WALKING: Final = "pedestrian"
 _MOST_ACTORS: Final = 100
 _PARKED_CATEGORIES: Final = ("car", "truck", "van", "motorcycle")
+_ROLE_OF_CATEGORY: Final[Mapping[str, Role]] = {"cyclist": "background", _WALKING: _WALKING}
+"""Category that no agent can have → the role for it."""
+_FASTEST_WALK: Final = 3.0
+"""m/s: from kerb to kerb no pedestrian becomes faster."""
 _FORBIDDEN: Final[Mapping[str, tuple[str, ...]]] = {
     **dict.fromkeys(LEADERS, ("from_arm", "turn", "lane", "start_distance", "delay", "side", "lane_change")),
     **dict.fromkeys((*_LEADING, "background"), ("gap", "side")),
     _WALKING: ("turn", "lane", "gap", "ignores", "lane_change"),
     "parked": ("turn", "lane", "gap", "ignores", "max_speed", "delay", "lane_change"),
 }
-"""Role → fields that mean nothing for it."""
+"""Role → fields that it cannot have."""
 
 
 def check_scenario(root: Part) -> None:
-    """Check what the fields' types cannot say.
+    """Check what the fields' types alone cannot show.
 
     Raises:
-        ConfigError: there is something that cannot be, by at least one of its draws; the message names line and field.
+        ConfigError: at least one of its draws is impossible; the message names line and field.
     """
     actors = _actors(root)
     _check_roles(root, actors)
@@ -44,6 +48,8 @@ def check_scenario(root: Part) -> None:
         _check_category(actor)
         _check_way(actor, junctions)
         _check_lane(actor, junctions)
+        _check_speed(actor)
+        _check_parking(root, actor)
     _check_view(root, actors)
     _check_meeting(root, actors, junctions)
 
@@ -59,18 +65,21 @@ def _role(actor: Part) -> Role:
 
 def _check_roles(root: Part, actors: Sequence[Part]) -> None:
     if len(actors) > _MOST_ACTORS:
-        raise _fault(root, "actors", f"there are {len(actors)}, for which no road has room", f"keep {_MOST_ACTORS}")
+        raise _fault(root, "actors", f"there are {len(actors)}; no road has room for so many", f"keep {_MOST_ACTORS}")
     counts = Counter(_role(actor) for actor in actors)
     for role in _LEADING:
         if not counts[role]:
             raise _fault(root, "actors", f"there is no actor with role {role}", "add one")
+    seen: set[Role] = set()
     for actor in actors:
-        if _role(actor) in _AGENTS and counts[_role(actor)] > 1:
-            raise _fault(actor, "role", f"there are {counts[_role(actor)]} actors with role {_role(actor)}", "keep one")
+        role = _role(actor)
+        if role in _AGENTS and role in seen:
+            raise _fault(actor, "role", f"there are {counts[role]} actors with role {role}", "keep one")
+        seen.add(role)
 
 
 def _junctions(root: Part) -> tuple[Junction, ...]:
-    """One of each kind and number of lanes that can be drawn."""
+    """One junction of each kind and number of lanes that can be drawn."""
     pairs = {
         pair
         for road in root.values("road")
@@ -83,7 +92,7 @@ def _check_fields(actor: Part) -> None:
     role = _role(actor)
     for name in actor.fields:
         if name in _FORBIDDEN[role]:
-            raise _fault(actor, name, f"means nothing for the role {role}", "leave it out")
+            raise _fault(actor, name, f"is not possible for the role {role}", "leave it out")
     if role not in LEADERS and "from_arm" not in actor.fields:
         raise _fault(actor, "from_arm", f"is missing; the role {role} needs it", f"add one of {', '.join(ARMS)}")
 
@@ -93,7 +102,16 @@ def _check_category(actor: Part) -> None:
     possible = _possible_categories(role)
     for category in actor.values("category") if "category" in actor.fields else ():
         if category not in possible:
-            raise _fault(actor, "category", f"the role {role} cannot be a {category}", f"choose {', '.join(possible)}")
+            instead = (
+                f"; give the {category} the role {_ROLE_OF_CATEGORY[category]}" if _moves_to(role, category) else ""
+            )
+            remedy = f"choose {', '.join(possible)}{instead}"
+            raise _fault(actor, "category", f"the role {role} cannot be a {category}", remedy)
+
+
+def _moves_to(role: Role, category: str) -> bool:
+    """Whether another role is the remedy for a category that a role cannot have."""
+    return category in _ROLE_OF_CATEGORY and role in (*_AGENTS, "background")
 
 
 def _possible_categories(role: Role) -> tuple[str, ...]:
@@ -114,7 +132,7 @@ def _check_way(actor: Part, junctions: Sequence[Junction]) -> None:
             raise _fault(actor, "from_arm", f"a {kind} junction has no {arm} arm", remedy)
         if _drives(actor) and turn not in junction.turns(arm):
             remedy = f"choose {' or '.join(junction.turns(arm))}"
-            raise _fault(actor, "turn", f"a {kind} junction has no way {turn} from the {arm} arm", remedy)
+            raise _fault(actor, "turn", f"nobody can go {turn} from the {arm} arm of a {kind} junction", remedy)
 
 
 def _drives(actor: Part) -> bool:
@@ -131,11 +149,27 @@ def _check_lane(actor: Part, junctions: Sequence[Junction]) -> None:
             sentence = "there is no other lane where the road has one lane in each direction"
             raise _fault(actor, "lane_change", sentence, "leave it out, or give the road two lanes")
         if set(actor.values("turn")) != {"straight"}:
-            raise _fault(actor, "lane_change", "goes with the turn straight alone", "leave it out, or go straight on")
+            sentence = "is possible only with the turn straight"
+            raise _fault(actor, "lane_change", sentence, "leave it out, or go straight on")
+
+
+def _check_speed(actor: Part) -> None:
+    """A pedestrian walks or runs over the road, and stops at the other kerb."""
+    fastest = max((speed for speed in actor.values("max_speed") if speed is not None), default=0.0)
+    if _role(actor) == _WALKING and fastest > _FASTEST_WALK:
+        sentence = f"expected 0.5 to {_FASTEST_WALK:g} m/s for a pedestrian, found {fastest:g}"
+        raise _fault(actor, "max_speed", sentence, "walking is 1 to 2 m/s, running 3")
+
+
+def _check_parking(root: Part, actor: Part) -> None:
+    for road in root.values("road"):
+        if _role(actor) == "parked" and isinstance(road, Part) and False in road.values("parking"):
+            sentence = f"a vehicle cannot park where the road has no parking strips ({road.line('parking')})"
+            raise _fault(actor, "role", sentence, "leave it out, or set road.parking to true")
 
 
 def _check_roads(root: Part) -> None:
-    """Make every road, which checks itself."""
+    """Make every road that can be drawn; a road checks itself."""
     for road in root.values("road"):
         if isinstance(road, Part):
             for hump in road.values("hump"):
@@ -180,8 +214,19 @@ def _check_meeting(root: Part, actors: Sequence[Part], junctions: Sequence[Junct
                 raise _fault(meeting, "actors", sentence, "choose roles that one actor has")
         if first == second:
             raise _fault(meeting, "actors", f"{first} cannot meet itself", "name two roles")
+        if None not in root.values("meet"):
+            _check_timed(meeting, by_role[first])
+            _check_timed(meeting, by_role[second])
         if all(_drives(by_role[role]) and by_role[role].values("lane_change") == (None,) for role in (first, second)):
             _check_crossing(meeting, by_role[first], by_role[second], junctions)
+
+
+def _check_timed(meeting: Part, actor: Part) -> None:
+    """Start and delay of those who are timed follow from the meeting; of a pedestrian the start is its place."""
+    for name in ("delay",) if _role(actor) == _WALKING else ("start_distance", "delay"):
+        if any(value != default_of(actor.kind, name) for value in actor.values(name)):
+            sentence = f"follows from meet ({meeting.where}) for {_role(actor)}, who is timed"
+            raise _fault(actor, name, sentence, "leave it out; meet.offset says who comes later")
 
 
 def meeting_roles(meeting: Part) -> tuple[Role, Role]:
@@ -206,19 +251,19 @@ def _check_crossing(meeting: Part, first: Part, second: Part, junctions: Sequenc
 def _way_to_meet(one: _Way, other: _Way) -> str:
     """What to do about two ways that do not meet."""
     if (one[0], one[2]) == (other[0], other[2]):
-        return "who comes by the same lane follows; let one of them come by the other lane, with a lane_change"
+        return "in one lane they follow each other; let one of them come by the other lane, with a lane_change"
     return "change an arm, a turn or a lane"
 
 
 def _ways(actor: Part, junction: Junction) -> Iterator[_Way]:
-    """Arm, turn and lane of a driver, all that can be drawn."""
+    """Every arm, turn and lane of a driver that can be drawn."""
     for arm, turn in product(actor.values("from_arm"), actor.values("turn")):
         lanes = actor.values("lane") if "lane" in actor.fields else usual_lanes(turn, junction.spec.lanes)
         yield from ((arm, turn, lane) for lane in lanes)
 
 
 def usual_lanes(turn: Turn, lanes: int) -> range:
-    """From which of a road's lanes one does a turn."""
+    """The lanes of a road from which a turn is usually made."""
     return {"left": range(lanes - 1, lanes), "right": range(1), "straight": range(lanes)}[turn]
 
 

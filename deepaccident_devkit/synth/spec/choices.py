@@ -1,4 +1,4 @@
-"""What is still open in a scenario file: ranges of numbers and lists of values, from which each draw takes one."""
+"""The open choices of a scenario file: ranges of numbers and lists of values; each draw takes one value of them."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class Fixed:
 
 @dataclass(frozen=True, slots=True)
 class Range:
-    """A span of numbers, all alike; both ends are in it.
+    """A span of numbers, each equally likely, both ends included.
 
     Attributes:
-        low: the least.
-        high: the most.
+        low: the smallest.
+        high: the largest.
         whole: whether only whole numbers are drawn.
     """
 
@@ -47,13 +47,13 @@ class Range:
         return float(rng.uniform(self.low, self.high))
 
     def alternatives(self) -> Iterator[float]:
-        """The least and the most."""
+        """The smallest and the largest."""
         yield from (self.low, self.high)
 
 
 @dataclass(frozen=True, slots=True)
 class OneOf:
-    """One of several values, each as likely; one that stands there twice is twice as likely."""
+    """One of several values, each equally likely; a value that is listed twice is twice as likely."""
 
     options: tuple[Choice, ...]
 
@@ -62,14 +62,14 @@ class OneOf:
         return self.options[int(rng.integers(len(self.options)))].draw(rng)
 
     def alternatives(self) -> Iterator[Any]:
-        """The values, and both ends of those that are ranges."""
+        """The values; of a range both ends."""
         for option in self.options:
             yield from option.alternatives()
 
 
 @dataclass(frozen=True, slots=True)
 class Items:
-    """A list, all of which holds."""
+    """A list whose items are all kept."""
 
     items: tuple[Choice, ...]
 
@@ -78,7 +78,7 @@ class Items:
         return tuple(item.draw(rng) for item in self.items)
 
     def alternatives(self) -> Iterator[Items]:
-        """Itself: what is open lies within the items."""
+        """Only itself: the open choices are in its items."""
         yield self
 
 
@@ -88,10 +88,10 @@ class Part:
 
     Attributes:
         kind: its dataclass.
-        where: line of the file, such as `mine.yaml:12`.
-        path: such as `actors[1]`; empty for the whole.
-        fields: what the file says, in the order of the dataclass; the rest has its default.
-        lines: of the fields that the file names, such as `mine.yaml:13`.
+        where: its line of the file, such as `mine.yaml:12`.
+        path: such as `actors[1]`; empty for the whole file.
+        fields: those that the file names, in the order of the dataclass; the others have their defaults.
+        lines: field that the file names → its line, such as `mine.yaml:13`.
     """
 
     kind: type[Any]
@@ -105,7 +105,7 @@ class Part:
         return self.kind(**{name: choice.draw(rng) for name, choice in self.fields.items()})
 
     def alternatives(self) -> Iterator[Part]:
-        """Itself: what is open lies within the fields."""
+        """Only itself: the open choices are in its fields."""
         yield self
 
     def values(self, name: str) -> tuple[Any, ...]:
@@ -115,17 +115,17 @@ class Part:
         return (default_of(self.kind, name),)
 
     def instances(self) -> Iterator[Any]:
-        """All that it can be drawn as, of a range its ends; made as they are asked for."""
+        """Each instance that can be drawn (of a range only its ends), made one at a time."""
         options = [tuple(_instances(choice)) for choice in self.fields.values()]
         for values in itertools.product(*options):
             yield self.kind(**dict(zip(self.fields, values, strict=True)))
 
     def line(self, name: str) -> str:
-        """Where a field stands, or else the part."""
+        """The line of a field; if the file does not name the field, the line of the part."""
         return self.lines.get(name, self.where)
 
     def path_of(self, name: str) -> str:
-        """Such as `actors[1].from`."""
+        """The path of a field, such as `actors[1].from`."""
         key = key_of(name)
         return f"{self.path}.{key}" if self.path else key
 
@@ -138,12 +138,21 @@ def _instances(choice: Choice) -> Iterator[Any]:
         yield from value.instances() if isinstance(value, Part) else (value,)
 
 
+def has_list(choice: Choice) -> bool:
+    """Whether a value in it is drawn from a list of several."""
+    if isinstance(choice, Items):
+        return any(has_list(item) for item in choice.items)
+    if isinstance(choice, Part):
+        return any(has_list(inner) for inner in choice.fields.values())
+    return isinstance(choice, OneOf)
+
+
 def key_of(name: str) -> str:
-    """A field's key in a file: `from` cannot be a name in Python."""
+    """A field's key in a file: the field `from_arm` has the key `from`, which cannot be a name in Python."""
     return "from" if name == "from_arm" else name
 
 
 def default_of(kind: type[Any], name: str) -> Any:
-    """What a field is if nothing is said of it."""
+    """The default of a field."""
     field = next(field for field in dataclasses.fields(kind) if field.name == name)
     return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()

@@ -1,7 +1,7 @@
 """What a scenario file can say: the parts of a scenario to simulate, with every choice made.
 
-A file's ranges and lists of choices are drawn by `spec.draw`; what it gives has one value everywhere. A field's name is
-its key in the file, but that `from_arm` is written `from`.
+`spec.draw` draws one value from each range and from each list of choices in a file. A field's name is its key in the
+file, except that `from_arm` is written `from`.
 """
 
 from dataclasses import dataclass, field
@@ -15,8 +15,8 @@ class Bounds:
     """The span of a number, both ends included.
 
     Attributes:
-        low: the least.
-        high: the most.
+        low: the smallest.
+        high: the largest.
         unit: such as `m/s`; empty for a count.
     """
 
@@ -38,31 +38,34 @@ Weather = Literal["Clear", "Cloudy", "HardRain", "MidRain", "SoftRain", "Wet", "
 TimeOfDay = Literal["Noon", "Sunset", "Night"]
 
 _SIDES = ("same", "right", "opposite", "left")
-"""How meta names the arm that lies so many arms further, counter-clockwise."""
+"""The meta file's names for the arm itself and for those 1, 2 and 3 arms further, counter-clockwise."""
 _MEETING_ROLES: tuple[Role, Role] = ("ego", "other")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ActorSpec:
-    """One road user that the file names; the background's are drawn besides.
+    """One road user that the file names; the road users of the background are drawn in addition.
 
     Attributes:
-        role: who it is; each of the first four once at most. `ego` and `other` record, and so do those behind them.
-        category: of its body.
-        from_arm: the arm that it comes from, or stands or walks at. `ego_behind` and `other_behind` take the way of
-            those whom they follow, and have none of their own.
+        role: who it is; each of the first four at most once. `ego`, `other` and the two behind them are agents.
+        category: its kind of road user. `ego`, `other` and those behind them can be a car, truck, van or motorcycle; so
+            can `parked`. `background` can also be a cyclist. Only `pedestrian` is a pedestrian.
+        from_arm: the arm that it comes from, or where it stands or walks. Leave it out for `ego_behind` and
+            `other_behind`: they take the path of the vehicle that they follow.
         turn: what it does at the junction.
-        lane: 0 is the rightmost one. If a file does not say it, it follows from the turn: the leftmost to turn left,
-            the rightmost to turn right, any to go straight on.
-        max_speed: that it reaches on a free straight road; drawn by its category if not given.
-        start_distance: from its start to the middle of the junction, along its path; of a parked or walking one,
-            from there to the middle of the junction. If not given it follows from `meet`, or is drawn.
-        gap: from bumper to bumper to the one whom it follows, at the start; only for those behind.
-        delay: before it sets off.
-        side: of the road, seen by those who drive towards the junction: where a parked one stands, and from where a
-            pedestrian steps onto the road.
-        lane_change: from where it begins to change into the other lane of its road, to the middle of the junction;
-            only for one that goes straight on, on a road with two lanes. Who is behind it stays in the lane.
+        lane: 0 is the rightmost lane. If not given, it follows from the turn: the leftmost lane to turn left, the
+            rightmost to turn right, any lane to go straight on.
+        max_speed: the speed that it reaches on a free straight road, for a pedestrian 3 m/s at most; if not given,
+            drawn by its category.
+        start_distance: how far from the middle of the junction it starts, along its path; a parked vehicle: how far
+            from there it stands; a pedestrian: how far from there it steps onto the road. If not given, it is drawn.
+            Drivers of `meet` cannot have it: their start follows from their timing.
+        gap: distance at the start, from bumper to bumper, to the vehicle that it follows; only for those behind.
+        delay: time that it waits before it starts to move; not for those of `meet`.
+        side: side of the road, as a driver towards the junction sees it: where a parked vehicle stands, or from where
+            a pedestrian steps onto the road.
+        lane_change: how far before the middle of the junction it begins to change into the other lane of its road;
+            only with the turn `straight`, on a road with two lanes. The vehicle behind it stays in its lane.
         ignores: the rules that it breaks. In the normal twin it keeps them.
     """
 
@@ -85,8 +88,8 @@ class MeetSpec:
     """Who is timed to meet where their paths cross.
 
     Attributes:
-        actors: two roles, of which there is one actor each; not those behind, nor `parked`.
-        offset: how much later the second comes to the crossing of the paths than the first, if nobody brakes.
+        actors: two roles that one actor each has; neither those behind nor `parked`.
+        offset: how much later than the first the second comes to the crossing of the paths, if nobody brakes.
     """
 
     actors: tuple[Role, Role] = ("ego", "other")
@@ -95,14 +98,14 @@ class MeetSpec:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BackgroundSpec:
-    """How many road users are tried besides those of `actors`; one that finds no room is left out.
+    """How many more road users than those of `actors` to add; one for which there is no room is left out.
 
     Attributes:
         vehicles: cars, vans and trucks that drive.
         two_wheelers: motorcycles and cyclists.
-        parked: at the road's edge.
+        parked: vehicles at the road's edge.
         walking: pedestrians on the sidewalks.
-        crossing: pedestrians over the crosswalks.
+        crossing: pedestrians on the crosswalks.
     """
 
     vehicles: Annotated[int, Bounds(0, 40)] = 10
@@ -117,7 +120,8 @@ class EndSpec:
     """When the recording ends; a collision always ends it.
 
     Attributes:
-        time: at the latest.
+        time: time at which it ends at the latest; but at least 4 s are recorded, and never less than up to the
+            accident's collision, which is planned for 5.5 s or later.
         arrival: it also ends when ego is this far past the middle of the junction, along its path.
     """
 
@@ -130,17 +134,17 @@ class ScenarioSpec:
     """A scenario to simulate, with every choice made.
 
     Attributes:
-        name: of the file, for people.
-        design: which of the paper's twelve it is, if it is one.
+        name: name of the scenario, for readers.
+        design: number of the paper's design, if it is one of the twelve.
         road: the junction.
         view: `hidden` puts a house on the kerb of the corner between ego and other.
-        exchange: whether ego and other change places in half of the draws, and those behind them; of a draw, whether
-            they did.
+        exchange: whether ego and other (and those behind them) change places in half of the draws. In a draw that is
+            made in Python it says whether they have changed places.
         actors: the road users that matter; `ego` and `other` are among them.
         meet: who is timed to meet; nobody if not given.
-        background: everyone else.
-        weather: of the whole recording, in the release's words.
-        time_of_day: which decides the light.
+        background: all other road users.
+        weather: weather of the whole recording, in the release's words.
+        time_of_day: it decides the light.
         end: when the recording ends.
     """
 
@@ -157,7 +161,7 @@ class ScenarioSpec:
     end: EndSpec = field(default_factory=EndSpec)
 
     def actor(self, role: Role) -> ActorSpec:
-        """The first actor of a role; there is one, or KeyError."""
+        """The first actor of a role; KeyError if there is none."""
         for actor in self.actors:
             if actor.role == role:
                 return actor
@@ -165,6 +169,6 @@ class ScenarioSpec:
 
     @property
     def spawn_side(self) -> str:
-        """Where other comes from, seen from ego, as meta names it: `left`, `right`, `opposite` or `same`."""
+        """Where other comes from, seen from ego, as the meta file names it: `left`, `right`, `opposite` or `same`."""
         ego, other = (ARMS.index(self.actor(role).from_arm or "west") for role in _MEETING_ROLES)
         return _SIDES[(other - ego) % len(ARMS)]

@@ -1,4 +1,4 @@
-"""A scenario whose ranges and choices are still open, and drawing from it."""
+"""A scenario whose ranges and choices are still open, and how to draw from it."""
 
 from dataclasses import dataclass, replace
 from typing import cast
@@ -7,7 +7,7 @@ import numpy as np
 
 from deepaccident_devkit.synth.roads import ARMS, Arm
 from deepaccident_devkit.synth.spec.checks import LEADERS, meeting_roles, usual_lanes
-from deepaccident_devkit.synth.spec.choices import Items, Part
+from deepaccident_devkit.synth.spec.choices import Items, Part, has_list
 from deepaccident_devkit.synth.spec.model import ActorSpec, Role, ScenarioSpec
 
 _EXCHANGED: dict[Role, Role] = {
@@ -17,27 +17,27 @@ _EXCHANGED: dict[Role, Role] = {
 
 @dataclass(frozen=True, slots=True)
 class SpecTemplate:
-    """A scenario as a file says it.
+    """A scenario as a file describes it.
 
     Attributes:
-        root: what it says, checked.
+        root: the contents of the file, checked.
     """
 
     root: Part
 
     @property
     def name(self) -> str:
-        """The scenario's, for people."""
+        """The scenario's name, for readers."""
         return str(self.root.values("name")[0])
 
     @property
     def design(self) -> int | None:
-        """Which of the paper's twelve it is, if it is one."""
+        """Number of the paper's design, if it is one of the twelve."""
         return cast("int | None", self.root.values("design")[0])
 
     @property
     def meeting_roles(self) -> frozenset[Role]:
-        """Who is timed to meet; empty if nobody is."""
+        """The roles that are timed to meet; empty if there are none."""
         meetings = [meeting for meeting in self.root.values("meet") if isinstance(meeting, Part)]
         return frozenset(role for meeting in meetings for role in meeting_roles(meeting))
 
@@ -46,17 +46,34 @@ class SpecTemplate:
         """Whether two are timed to meet, so that there is an accident."""
         return bool(self.meeting_roles)
 
+    def place(self, field: str) -> str:
+        """Where the file names a field, for messages, such as `mine.yaml:6: meet`."""
+        return f"{self.root.line(field)}: {self.root.path_of(field)}"
+
+    @property
+    def draws_alike(self) -> bool:
+        """Whether only numbers differ between draws: nobody's way, kind or lane is drawn from several."""
+        if self.root.values("exchange")[0] or self._has_two_lanes:
+            return False
+        parts = (self.root.fields[name] for name in ("road", "view", "actors", "meet") if name in self.root.fields)
+        return not any(has_list(part) for part in parts)
+
+    @property
+    def _has_two_lanes(self) -> bool:
+        """Whether a draw can have a road with two lanes, of which a driver's lane may be drawn."""
+        return any(isinstance(road, Part) and road.values("lanes") != (1,) for road in self.root.values("road"))
+
 
 def draw(template: SpecTemplate, rng: np.random.Generator) -> ScenarioSpec:
     """Make every choice of a scenario.
 
-    The four agents are there: followers that the file does not name are cars. Where the file asks for an exchange,
-    ego and other change places in half of the draws, and a four-way junction is then turned so that ego comes from the
-    arm from which it came before.
+    It always has all four vehicle agents: followers that the file does not name are cars. If the file asks for an
+    exchange, ego and other change places in half of the draws; a four-way junction is then turned, so that ego comes
+    from the same arm as before.
 
     Args:
-        template: of `read_spec`, or one of `DESIGNS`.
-        rng: random numbers; the same give the same scenario.
+        template: from `read_spec`, or one of `DESIGNS`.
+        rng: random numbers; the same numbers give the same scenario.
     """
     spec = cast("ScenarioSpec", template.root.draw(rng))
     named = cast("Items", template.root.fields["actors"]).items
@@ -79,7 +96,7 @@ def _completed(actor: ActorSpec, part: Part, spec: ScenarioSpec, rng: np.random.
 
 
 def _exchanged(spec: ScenarioSpec) -> ScenarioSpec:
-    """Ego in the place of other, and the reverse."""
+    """The scenario with ego in the place of other, and other in the place of ego."""
     came_from = spec.actor("ego").from_arm
     actors = tuple(replace(actor, role=_EXCHANGED.get(actor.role, actor.role)) for actor in spec.actors)
     meet = spec.meet
@@ -94,7 +111,7 @@ def _exchanged(spec: ScenarioSpec) -> ScenarioSpec:
 
 
 def _turned(spec: ScenarioSpec, quarters: int) -> ScenarioSpec:
-    """All arms so many quarter turns on, counter-clockwise."""
+    """The scenario with all arms turned by so many quarter turns, counter-clockwise."""
 
     def turned(arm: Arm) -> Arm:
         return ARMS[(ARMS.index(arm) + quarters) % len(ARMS)]

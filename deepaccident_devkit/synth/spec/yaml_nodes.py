@@ -1,4 +1,4 @@
-"""A YAML text as a tree that knows its lines."""
+"""A YAML text as a tree in which each value has its line."""
 
 from __future__ import annotations
 
@@ -15,36 +15,38 @@ if TYPE_CHECKING:
 _PLAIN_TAGS: Final = tuple(
     f"tag:yaml.org,2002:{name}" for name in ("map", "seq", "str", "int", "float", "bool", "null", "timestamp")
 )
-"""Those that values have without being told so."""
+"""The tags that PyYAML gives to plain values by itself."""
 _DECIMAL: Final = re.compile(r"[-+]?(\.inf|\.nan|(0|[1-9]\d*)(\.\d*)?([eE][-+]?\d+)?|\.\d+)", re.IGNORECASE)
 """YAML 1.1 also reads 010 as eight, 1:30 as ninety and 1_0 as ten, which few expect."""
 Scalar: TypeAlias = object
-"""What a plain word of YAML is: a string, a number, a boolean, None; or something that no field takes."""
+"""The type of a plain word of YAML: a string, a number, a boolean, None; or something that fits no field."""
 
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """A value and where it stands.
+    """A value and its line.
 
     Attributes:
-        where: such as `mine.yaml:12`; of an entry the line of its key.
+        where: such as `mine.yaml:12`; for the value of a key, the line of the key.
         value: a scalar, the entries of a mapping, or the items of a list.
+        quoted: whether it is a scalar in quotes.
     """
 
     where: str
     value: Scalar | Mapping[str, Node] | tuple[Node, ...]
+    quoted: bool = False
 
 
 def parse_yaml(text: str, source: str) -> Node:
     """The tree of a YAML text.
 
     Args:
-        text: of one document, with no tags, anchors or aliases.
-        source: what messages call it, such as the file's path.
+        text: one document, without tags, anchors or aliases.
+        source: its name in messages, such as the file's path.
 
     Raises:
-        ConfigError: it is empty or no YAML, has a key twice or that is no word, an alias, a tag, or a number that is
-            not decimal; line, path and remedy are in the message.
+        ConfigError: it is empty or no YAML, or has a repeated key, a key that is no word, an alias, a tag, or a number
+            that is not decimal; line, path and remedy are in the message.
     """
     import yaml
 
@@ -61,15 +63,15 @@ def parse_yaml(text: str, source: str) -> Node:
 
 
 def _fault(error: yaml.MarkedYAMLError) -> str:
-    """What is wrong, from the line's number on; YAML often stumbles lines after the one where something began."""
+    """The message from the line's number on; PyYAML often finds a fault only some lines after the real one."""
     marks = [mark for mark in (error.problem_mark, error.context_mark) if mark]
     lines = list(dict.fromkeys(mark.line + 1 for mark in marks)) or [1]
-    began = f", or line {lines[-1]} where it begins" if len(lines) > 1 else ""
-    return f"{lines[0]}: no YAML: {error.problem}; mend that line{began}: its quotes, brackets or indent (no tabs)"
+    began = f", or line {lines[-1]}, where the faulty part begins" if len(lines) > 1 else ""
+    return f"{lines[0]}: no YAML: {error.problem}; correct that line{began}: its quotes, brackets or indent (no tabs)"
 
 
 class _Tree:
-    """Makes nodes of PyYAML's, each once: an alias would be a second time."""
+    """Makes our nodes from PyYAML's, each once; a node that comes a second time is an alias."""
 
     def __init__(self, source: str, loader: yaml.SafeLoader) -> None:
         self._source = source
@@ -77,7 +79,7 @@ class _Tree:
         self._seen: set[int] = set()
 
     def node(self, raw: yaml.Node, line: int, path: str = "") -> Node:
-        """A node and all in it; `path` is where it stands, such as `actors[1]`."""
+        """A node and all in it; `path` is its place, such as `actors[1]`."""
         import yaml
 
         where = f"{self._source}:{line + 1}"
@@ -91,16 +93,17 @@ class _Tree:
         if isinstance(raw, yaml.SequenceNode):
             items = enumerate(raw.value)
             return Node(where, tuple(self.node(item, item.start_mark.line, f"{path}[{k}]") for k, item in items))
-        return Node(where, self._scalar(raw, line, path))
+        quoted = isinstance(raw, yaml.ScalarNode) and raw.style in ("'", '"')
+        return Node(where, self._scalar(raw, line, path), quoted)
 
     def _scalar(self, raw: yaml.Node, line: int, path: str) -> Scalar:
         try:
             value = self._loader.construct_object(raw)
-        except (ValueError, LookupError, AttributeError) as error:  # what PyYAML raises where a tag does not fit
-            sentence = f"no value: {raw.value[:40]!r} ({error}); put it in quotes if it is a word"
+        except (ValueError, LookupError, AttributeError) as error:  # PyYAML raises these if a tag does not fit
+            sentence = f"{raw.value[:40]!r} cannot be read ({error}); put it in quotes if it is a word"
             raise self._error(line, path, sentence) from error
         if isinstance(value, int | float) and not isinstance(value, bool) and not _DECIMAL.fullmatch(raw.value):
-            sentence = f"{raw.value!r} is no plain decimal number; write it as one, or in quotes if it is a word"
+            sentence = f"{raw.value!r} is not a plain decimal number; write one, or put it in quotes if it is a word"
             raise self._error(line, path, sentence)
         return value
 
@@ -112,7 +115,7 @@ class _Tree:
                 raise self._error(line, path, "expected a key that is a word, found a list or mapping; write a word")
             inner = f"{path}.{key}" if path else key
             if key in entries:
-                raise self._error(line, inner, "stands twice; keep one of them")
+                raise self._error(line, inner, "is there twice; keep one of them")
             entries[key] = self.node(raw_value, line, inner)
         return entries
 

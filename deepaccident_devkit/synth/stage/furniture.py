@@ -1,4 +1,4 @@
-"""Street furniture: masts, traffic lights, signs, lanterns; and the trees along the sidewalks."""
+"""Street furniture: masts, traffic lights, signs, lanterns and the trees along the sidewalks."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,33 +11,33 @@ from deepaccident_devkit.synth.solids import Block, Color
 from deepaccident_devkit.synth.stage.props import Prop
 
 LAMP_COLORS: tuple[Color, Color, Color] = ((230, 46, 38), (240, 186, 50), (52, 210, 96))
-"""Of lit lamps: red, amber, green."""
+"""The colours of lamps that are on: red, amber, green."""
 _DARK_LAMPS: tuple[Color, Color, Color] = ((72, 22, 20), (76, 58, 20), (18, 62, 32))
 _STEEL: Color = (92, 96, 100)
 _HOUSING: Color = (38, 40, 42)
 LANTERN_COLOR: Color = (226, 222, 200)
-"""Of a lantern's head, which shines at night."""
+"""The colour of a lantern's head, which shines at night."""
 _PLATE: Color = (230, 226, 220)
 _RIM: Color = (186, 34, 36)
 KERB_INSET = 0.3
 """Metres from the kerb to the middle of a mast."""
 _BEHIND_LINE = 0.3
-"""Metres from the stop or yield line, towards the junction, to the light or sign."""
+"""Metres from the stop line or yield line, towards the junction, to the light or sign."""
 _LAMP_HEIGHTS = (3.35, 3.05, 2.75)
-"""Metres above the ground: red, amber, green."""
+"""Heights of the red, amber and green lamp above the ground, metres."""
 _LANTERN_SPACING = 28.0
 _LANTERN_HEIGHT = 6.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SignalHead:
-    """The lamps that those who come by one arm see.
+    """The lamps for the traffic that comes by one arm.
 
     Attributes:
-        arm: by which they come.
+        arm: by which the traffic comes.
         position: x, y, z of the middle lamp, metres, ground frame.
         yaw: direction in which the lamps shine, radians.
-        rows: of the red, amber and green lamp in `World.props`.
+        rows: rows of the red, amber and green lamp in `World.props`.
     """
 
     arm: Arm
@@ -47,7 +47,7 @@ class SignalHead:
 
 
 def mast(x: float, y: float, top: float) -> Prop:
-    """A mast of a height, metres."""
+    """A mast whose top is `top` metres high."""
     return Prop(POLE, (_column(x, y, (-0.1, top)),))
 
 
@@ -64,7 +64,7 @@ def traffic_light(spec: RoadSpec, arm: Arm) -> Prop:
 
 
 def yield_sign(spec: RoadSpec, arm: Arm) -> Prop:
-    """A post with a triangle that stands on its tip, red around white, at the right of a yield line."""
+    """A post with a white triangle in a red one, a corner downwards, at the right of a yield line."""
     out_x, out_y = OUTWARD[arm]
     x, y = _right_of_line(spec, arm)
     rim = _triangle(x, y, arm, (2.05, 2.75), _RIM)
@@ -73,12 +73,12 @@ def yield_sign(spec: RoadSpec, arm: Arm) -> Prop:
 
 
 def signal_head(arm: Arm, light: Prop, first_row: int) -> SignalHead:
-    """Where the lamps of a light are.
+    """Where the lamps of a traffic light are.
 
     Args:
         arm: whose light it is.
-        light: from `traffic_light`, settled on its ground.
-        first_row: of the light's first block in the world's solids.
+        light: from `traffic_light`, at the height of its ground.
+        first_row: row of the light's first block in the world's solids.
     """
     amber, red_row = light.blocks[-2], first_row + len(light.blocks) - len(LAMP_COLORS)
     out_x, out_y = OUTWARD[arm]
@@ -91,7 +91,7 @@ def signal_head(arm: Arm, light: Prop, first_row: int) -> SignalHead:
 
 
 def lanterns(spec: RoadSpec) -> Iterator[Prop]:
-    """Street lanterns along both sidewalks of each arm, by turns."""
+    """Street lanterns along each arm, on its two sidewalks by turns."""
     for arm in spec.arms:
         out_x, out_y = OUTWARD[arm]
         for number, along in enumerate(np.arange(spec.stop_line[1] + 9.0, 115.0, _LANTERN_SPACING)):
@@ -103,14 +103,14 @@ def lanterns(spec: RoadSpec) -> Iterator[Prop]:
 
 
 def _right_of_line(spec: RoadSpec, arm: Arm) -> tuple[float, float]:
-    """Where what concerns those who come by an arm stands: x and y, metres."""
+    """Where the light or sign for the traffic from an arm stands: x and y, metres."""
     along, beside = spec.stop_line[0] - _BEHIND_LINE, spec.road_edge + KERB_INSET
     out_x, out_y = OUTWARD[arm]
     return along * out_x - beside * out_y, along * out_y + beside * out_x
 
 
 def _triangle(x: float, y: float, arm: Arm, z: tuple[float, float], color: Color) -> Block:
-    """A plate across an arm, nearly a point below and as wide as it is high above."""
+    """A plate across an arm, nearly a point at the bottom, and at the top as wide as it is high."""
     tip, wide, thin = 0.02, (z[1] - z[0]) * 0.5, 0.02
     if OUTWARD[arm][0]:
         return Block((x - thin, x + thin), (y - tip, y + tip), z, color, inset=(0.0, 0.0, tip - wide))
@@ -129,9 +129,9 @@ _BARK: Color = (92, 72, 54)
 _LEAVES: tuple[Color, ...] = ((70, 116, 54), (88, 132, 62), (58, 100, 58))
 _SPACING = 13.0
 _SHARE = 0.55
-"""Of the places that have a tree."""
+"""The share of places that have a tree."""
 _INSET = 1.25
-"""Metres from the sidewalk to a trunk: crowns end at the sidewalk."""
+"""Metres from the sidewalk to a trunk, so that crowns end at the sidewalk."""
 
 
 def trees(rng: np.random.Generator, spec: RoadSpec) -> Iterator[Prop]:

@@ -1,4 +1,4 @@
-"""Buildings around a junction: corner houses, rows along the arms, and one on the kerb that hides what comes."""
+"""Buildings around a junction: corner houses, rows along the arms, and one on the kerb that hides traffic."""
 
 from collections.abc import Iterator
 
@@ -12,7 +12,7 @@ from deepaccident_devkit.synth.stage.props import BASEMENT, Prop
 Span = tuple[float, float]
 
 STOREY = 3.2
-"""Metres, of all houses."""
+"""Height of a storey, metres."""
 _WALLS: tuple[Color, ...] = (
     (176, 122, 96), (206, 190, 160), (170, 170, 166), (148, 100, 82), (220, 214, 200), (140, 150, 158), (190, 160, 128),
 )  # fmt: skip
@@ -35,9 +35,9 @@ def houses(rng: np.random.Generator, spec: RoadSpec) -> list[Prop]:
 
 
 def kerb_house(spec: RoadSpec, corner: tuple[int, int]) -> Prop:
-    """The house that stands on the kerb of a corner, given by its signs of x and y: it hides what comes round it.
+    """The house on the kerb of a corner, given by its signs of x and y: it hides the traffic behind it.
 
-    There is just room for a mast between it and the road.
+    Between it and the road there is only room for a mast.
     """
     near = spec.road_edge + KERB_INSET + _MAST_ROOM
     kept = spec.kerb_radius - KERB_INSET - _MAST_ROOM
@@ -58,14 +58,14 @@ def _quadrant(rng: np.random.Generator, spec: RoadSpec, sign_x: int, sign_y: int
 
 
 def _closed_side(rng: np.random.Generator, spec: RoadSpec) -> Iterator[Block]:
-    """A house opposite the stem of a three-way junction, between the corner houses."""
+    """A house on the side where a three-way junction has no arm, between the corner houses."""
     front = spec.sidewalk_edge + rng.uniform(*_SETBACK)
     half = spec.sidewalk_edge + _SETBACK[0] - 1.5
     yield _house(rng, (-half, half), (front, front + rng.uniform(9, 14)), (1, 1), storeys=(2, 4))
 
 
 def _row(rng: np.random.Generator, spec: RoadSpec, start: float, deepest: float) -> Iterator[tuple[Span, Span]]:
-    """Houses side by side from `start` on: extents along the road and away from it."""
+    """Houses side by side from `start`: their extents along the road and away from it."""
     position = start + rng.uniform(1.5, 6)
     while position < _LAST:
         length, front = rng.uniform(10, 20), spec.sidewalk_edge + rng.uniform(*_SETBACK)

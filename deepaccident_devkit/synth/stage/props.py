@@ -1,4 +1,4 @@
-"""Things that stand on the ground: blocks that know what they are from above."""
+"""Things that stand on the ground: blocks, with a code for the map from above."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,8 +18,8 @@ class Prop:
     """One thing, made as if the ground were flat.
 
     Attributes:
-        code: that it has on the map from above, as in `roads`.
-        blocks: that it is made of, in the ground frame.
+        code: its code on the map from above, as in `roads`.
+        blocks: its blocks, in the ground frame.
     """
 
     code: int
@@ -27,20 +27,20 @@ class Prop:
 
     @property
     def footprint(self) -> tuple[float, float, float, float]:
-        """Of all its blocks: x from, x to, y from, y to, metres."""
+        """The extent of all its blocks: x from, x to, y from, y to, metres."""
         spans = [(*block.x, *block.y) for block in self.blocks]
         x0, x1, y0, y1 = zip(*spans, strict=True)
         return min(x0), max(x1), min(y0), max(y1)
 
 
 def overlap(first: Prop, second: Prop) -> bool:
-    """Whether two things stand on the same ground."""
+    """Whether the footprints of two things overlap."""
     a, b = first.footprint, second.footprint
     return all(a[k] < b[k + 1] and b[k] < a[k + 1] for k in (0, 2))
 
 
 def settled(prop: Prop, terrain: Terrain) -> Prop:
-    """The thing on sloping ground: lifted to its lowest corner, so that no part of it floats."""
+    """The thing on sloping ground: raised to the height of its lowest corner, so that no part of it floats."""
     if terrain.is_flat:
         return prop
     lift = float(terrain.height(_corners(prop)).min())
@@ -55,7 +55,7 @@ def solids_of(props: Sequence[Prop]) -> Solids:
 
 
 def top_map(ground: GroundMap, props: Sequence[Prop]) -> GroundMap:
-    """The map from above: lower things first, so that higher ones cover them."""
+    """The map from above: lower things are painted first, so that higher things cover them."""
     flat = [(block.z[1], prop.code, (*block.x, *block.y)) for prop in props for block in prop.blocks]
     flat.sort(key=lambda entry: entry[0])
     return ground.with_rectangles(

@@ -1,4 +1,4 @@
-"""What stands still: the ground with its roads, buildings that hide what comes, trees, lights and the pole."""
+"""What stands still: the ground with its roads, buildings, trees, lights and the infrastructure's pole."""
 
 from dataclasses import dataclass
 
@@ -23,29 +23,30 @@ from deepaccident_devkit.synth.stage.houses import houses, kerb_house
 from deepaccident_devkit.synth.stage.props import Prop, overlap, settled, solids_of, top_map
 
 Corner = tuple[int, int]
-"""By its signs of x and y."""
+"""A corner, given by its signs of x and y."""
 
 _MAX_SLOPE = np.deg2rad(3.0)
 _POLE_HEIGHTS = (4.1, 4.6)
-"""Metres between which the infrastructure's sensors are above the ground: its cameras, some of which are above the
-road, are higher than any truck."""
+"""The least and the greatest height of the infrastructure's sensors above the ground, metres: its cameras, some of
+them above the road, are higher than any truck."""
 _POLE_INSET = 0.15
-"""Metres from the sidewalk's outer edges to the middle of the pole: as far from the lanes as one can see along them."""
+"""Metres from the sidewalk's outer edges to the middle of the pole: the farthest place from which it sees along the
+lanes."""
 _POLE_UNDER_SENSOR = 0.4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class World:
-    """Everything that stays as it is over a scenario, in the ground frame.
+    """Everything that does not change during a scenario, in the ground frame.
 
     Attributes:
         world_from_ground: where the junction lies in the town, and how it slopes.
-        ground: the roads; what images and points on the ground see.
-        top: the ground with all that stands on it: what the BEV camera sees.
-        props: buildings, trees, poles; the first are the lamps of `signals`.
+        ground: the map of the roads, as cameras and LiDAR see them.
+        top: the map of the ground with all that stands on it, as the BEV camera sees it.
+        props: buildings, trees, poles; the first solids are the lamps of `signals`.
         terrain: how high the ground lies.
-        lidar_pole: the pole's sensor frame: `ground_from_lidar` of the infrastructure agent.
-        signals: the traffic lights, one an arm; none at an unsignalised junction.
+        lidar_pole: `ground_from_lidar` of the infrastructure agent.
+        signals: the traffic lights, one for each arm; none at an unsignalised junction.
     """
 
     world_from_ground: SE3
@@ -67,10 +68,11 @@ def random_world(
     """A town around a junction.
 
     Args:
-        rng: random numbers; what does not concern a hidden view is the same with it and without.
+        rng: random numbers; except for the house and the pole, both views give the same world.
         junction: its roads.
-        view: `hidden` puts a house on the kerb of a corner, and the pole on the one across, which looks past it.
-        between: the arms that the pole is to see best; in a hidden view, the two neighbours whose corner it is.
+        view: `hidden` puts a house on the kerb of a corner, and the pole on the opposite corner, where it sees both
+            arms.
+        between: the two arms that the pole sees best; in a hidden view, the two arms beside the house.
 
     Raises:
         ConfigError: `view` is hidden, and the arms have no corner in common.
@@ -113,7 +115,7 @@ def _signals(junction: Junction, lights: list[Prop]) -> list[SignalHead]:
 
 
 def _pole_corner(rng: np.random.Generator, junction: Junction, between: tuple[Arm, Arm]) -> Corner:
-    """One of the corners nearest to two arms; a three-way junction has corners to the south alone."""
+    """One of the corners nearest to two arms; a three-way junction has corners only in the south."""
     north = (1, -1) if "north" in junction.arms else (-1,)
     toward = np.sum([OUTWARD[arm] for arm in between], axis=0)
     nearness = {(x, y): int(toward @ (x, y)) for x in (1, -1) for y in north}
@@ -133,7 +135,7 @@ def _corner_between(junction: Junction, arms: tuple[Arm, Arm]) -> Corner:
 
 
 def _random_place(rng: np.random.Generator, terrain: Terrain) -> SE3:
-    """Some hundred metres off the town's origin, turned any way; on a gentle slope if the ground has no hump."""
+    """Some hundred metres from the town's origin, in any direction; on a gentle slope if the ground has no hump."""
     slope, uphill, yaw = rng.uniform(0, _MAX_SLOPE), rng.uniform(-np.pi, np.pi), rng.uniform(-np.pi, np.pi)
     if not terrain.is_flat:
         slope = 0.0

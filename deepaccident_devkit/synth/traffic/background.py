@@ -1,4 +1,4 @@
-"""Everyone else: traffic on all arms, two-wheelers, people on sidewalks and crosswalks, and parked vehicles."""
+"""All road users that a file does not name: vehicles, two-wheelers, pedestrians; and all parked vehicles."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -19,13 +19,13 @@ _REACH = 75.0
 """Metres from the junction's middle within which background traffic starts."""
 _TRIES = 8
 _START_GAP = (3.0, 1.2)
-"""Metres, and seconds of driving, between two who start in one lane."""
+"""The gap between two who start in one lane: metres, and seconds of driving that are added to them."""
 _QUEUE_BRAKING = 1.5
-"""m/s² at which those who start before a red light or a yield line are slowing down already."""
+"""m/s² with which those who start before a red light or a yield line already brake."""
 _HOUSE_REACH = 32.0
 """Metres from the junction's middle within which a house that hides the view stands."""
 _SIDEWALK_OFFSETS = (0.2, 0.4)
-"""Metres to the right of a sidewalk's middle; people pass each other on the left."""
+"""Least and most metres from a sidewalk's middle to the right, so that people pass each other on the left."""
 _CROSSWALK_OFFSETS = (0.3, 0.9)
 
 
@@ -37,13 +37,13 @@ def background_users(
     signals: SignalPlan | None,
     begin: float,
 ) -> list[RoadUser]:
-    """The moving background, as at the beginning; who finds no room is left out.
+    """The moving background at the beginning; those for whom there is no room are left out.
 
     Args:
         rng: random numbers.
-        spec: how many there are.
+        spec: says how many there are.
         junction: its roads.
-        named: those who are there already; the lanes before them are left free up to the junction.
+        named: the named road users; the lanes in front of them stay free up to the junction.
         signals: the traffic lights.
         begin: seconds, when the simulation starts.
     """
@@ -62,11 +62,11 @@ def background_users(
 
 
 class _Lanes:
-    """Who starts where, lane by lane."""
+    """The parts of each lane where nobody else can start."""
 
     def __init__(self, named: Sequence[RoadUser]) -> None:
         self._taken: list[tuple[Route, float, float]] = []
-        """Route, from, to: metres along it that are not free."""
+        """A route, and the metres along it where the part that is not free begins and ends."""
         for user in named:
             if user.route is not None:
                 reach = user.body.size[0] / 2 + _START_GAP[0] + _START_GAP[1] * user.max_speed
@@ -77,13 +77,13 @@ class _Lanes:
         return not any(low < place < high and _share_lane(route, other, place) for other, low, high in self._taken)
 
     def take(self, user: RoadUser, route: Route) -> None:
-        """Keep others away from one who starts."""
+        """Mark the place around a road user's start as not free."""
         reach = user.body.size[0] / 2 + _START_GAP[0] + _START_GAP[1] * user.start_speed
         self._taken.append((route, user.start - reach - 3.0, user.start + reach + 3.0))
 
 
 def _share_lane(route: Route, other: Route, place: float) -> bool:
-    """Whether two routes are one lane at `place` metres along the first."""
+    """Whether two routes are in the same lane at `place` metres along the first."""
     if place < route.enter_s:
         return route.from_arm == other.from_arm and route.lane == other.lane
     return route.to_arm == other.to_arm and route.lane == other.lane
@@ -140,7 +140,7 @@ def _random_route(rng: np.random.Generator, junction: Junction, category: str) -
 
 
 def _built_over(spec: ScenarioSpec, sidewalk: Path) -> bool:
-    """Whether a house stands on a sidewalk: that between ego and other, where the view is hidden."""
+    """Whether the house of a hidden view, between ego and other, stands on a sidewalk."""
     if spec.view != "hidden":
         return False
     out = np.array([OUTWARD[spec.actor(role).from_arm or "west"] for role in ("ego", "other")], dtype=np.float64)
@@ -150,7 +150,7 @@ def _built_over(spec: ScenarioSpec, sidewalk: Path) -> bool:
 
 
 def _walker(rng: np.random.Generator, sidewalks: Sequence[Path]) -> RoadUser:
-    """One on a sidewalk, either way."""
+    """A pedestrian on a sidewalk, in either direction."""
     path = sidewalks[int(rng.integers(len(sidewalks)))]
     path = shifted(path if rng.random() < 0.5 else path.reversed(), float(-rng.uniform(*_SIDEWALK_OFFSETS)))
     body, manner = random_body(rng, "pedestrian"), MANNERS["pedestrian"]
@@ -166,7 +166,7 @@ def _crosser(
     signals: SignalPlan | None,
     begin: float,
 ) -> RoadUser | None:
-    """One over a crosswalk that no named road user drives over, while its arm has red."""
+    """A pedestrian on a crosswalk that no named road user drives over, while its arm has red."""
     used = {arm for user in named if user.route for arm in (user.route.from_arm, user.route.to_arm)}
     arms = [arm for arm in junction.arms if arm not in used]
     if not arms or not junction.spec.crosswalks:
@@ -196,13 +196,13 @@ def _crosser(
 
 _CATEGORIES = ("car", "car", "car", "van")
 _SHIFT = 0.15
-"""Metres by which one stands off the middle of its slot, along it."""
+"""The most metres, along its slot, from the middle of the slot to a parked vehicle."""
 _HALF_LENGTH = 2.4
-"""Metres, about half the length of one that parks."""
+"""About half the length of a parked vehicle, metres."""
 _FREE_PATH = 2.2
-"""Metres along the road that are left free for someone who walks over it."""
+"""Metres along the road that stay free for a pedestrian who crosses it."""
 _DISTANCES = (18.0, 60.0)
-"""Metres from the junction's middle where one stands whose place is not given."""
+"""Least and most metres from the junction's middle to a parked vehicle whose place is not given."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -221,13 +221,13 @@ class ParkedVehicle:
 def parked_vehicles(
     rng: np.random.Generator, spec: ScenarioSpec, junction: Junction, walking: Sequence[RoadUser]
 ) -> list[ParkedVehicle]:
-    """Those that the file names, each on the slot nearest to its place, then as many of the others as find room.
+    """The named parked vehicles, each on the slot nearest to its place, then as many others as there is room for.
 
     Args:
         rng: random numbers.
         spec: what the file says.
         junction: its roads.
-        walking: those who walk over a road, between whose ways and a parked vehicle there is some room.
+        walking: the pedestrians who cross a road; parked vehicles keep some distance from their paths.
     """
     places = junction.parking_places()
     free = [row for row, place in enumerate(places) if not any(_in_the_way(place, user) for user in walking)]
@@ -250,7 +250,7 @@ def _in_the_way(place: FloatArray, user: RoadUser) -> bool:
 
 
 def _nearest(rng: np.random.Generator, actor: ActorSpec, places: FloatArray) -> int:
-    """The row of the slot (N, 3) nearest to where a file wants a vehicle."""
+    """The row of the slot (N, 3) that is nearest to the place that a file gives for a vehicle."""
     out = np.array(OUTWARD[actor.from_arm or "west"], dtype=np.float64)
     distance = actor.start_distance if actor.start_distance is not None else float(rng.uniform(*_DISTANCES))
     left = np.array([-out[1], out[0]])

@@ -1,4 +1,4 @@
-"""Who takes part: the road users of a scenario file, set so that those who are to meet do so."""
+"""The moving road users of a scenario file, placed so that those who are timed to meet do meet."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,8 +23,10 @@ from deepaccident_devkit.synth.traffic.users import (
     temper_of,
 )
 
-_LONGEST = 24.0
-"""Seconds that a drive lasts."""
+_USUAL_DRIVE = 24.0
+"""Seconds that are driven at least."""
+_LONGEST_DRIVE = 300.0
+"""Seconds that are driven at most; the slowest cyclist needs about 210 to the junction."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,7 +35,7 @@ class Approach:
 
     Attributes:
         user: who drives, as at the start of the drive.
-        along: (S,) metres of its box's centre along its path, `kinematics.PERIOD` apart.
+        along: (S,) metres of its box's centre along its path, one value every `kinematics.PERIOD`.
         speed: (S,) m/s.
     """
 
@@ -42,14 +44,14 @@ class Approach:
     speed: FloatArray
 
     def time_to(self, place: float) -> float:
-        """Seconds until the centre is `place` metres along the path; the last moment if it never gets there."""
+        """Seconds until the centre is `place` metres along the path; if it never is, the end of the drive."""
         row = min(int(np.searchsorted(self.along, place)), len(self.along) - 1)
         return row * PERIOD
 
     def at(self, time: float) -> RoadUser:
         """The road user as it is `time` seconds into the drive.
 
-        Before its beginning one that starts from standing waits, another comes from farther back.
+        Before the start of the drive, a road user that starts from standing waits; another one is farther back.
         """
         if time < 0 and self.user.start_speed == 0:
             return replace(self.user, delay=-time)
@@ -59,14 +61,22 @@ class Approach:
         return replace(self.user, start=float(self.along[row]), start_speed=float(self.speed[row]), delay=0.0)
 
 
-def drive_alone(user: RoadUser) -> Approach:
-    """The drive of one who is alone on its path: as in a simulation, but that it never leaves its path."""
+def drive_alone(user: RoadUser, to: float = 0.0) -> Approach:
+    """The drive of a road user that is alone on its path: as in a simulation, except that it never leaves its path.
+
+    Args:
+        user: as at the start of the drive.
+        to: the drive goes on at least until the box's centre is so many metres along the path.
+    """
     tracks = Tracks([user.path], np.array([user.manner.lateral]), np.array([user.walks]))
     temper, back = temper_of([user]), user.wheelbase / 2
     along, speed = np.array([user.start - back]), np.array([user.start_speed])
     steps = PERIOD * np.arange(1, DECISION_STEPS + 1)
     places, speeds = [along], [speed]
-    for _ in range(round(_LONGEST / (PERIOD * DECISION_STEPS))):
+    usual, longest = (round(seconds / (PERIOD * DECISION_STEPS)) for seconds in (_USUAL_DRIVE, _LONGEST_DRIVE))
+    for count in range(longest):
+        if count >= usual and along[0] + back >= to:
+            break
         acceleration = free_acceleration(temper, speed, tracks.allowed_speed(along))
         moving = np.maximum(speed + acceleration * steps, 0.0)
         before = np.append(speed, moving[:-1])
@@ -80,17 +90,17 @@ def drive_alone(user: RoadUser) -> Approach:
 WARM_UP = 1.0
 """Seconds that are simulated before the first recorded frame."""
 _GAPS = (8.0, 16.0)
-"""Metres, bumper to bumper, where the file does not say."""
+"""Least and most metres, bumper to bumper, between leader and follower if the file does not give the gap."""
 _ALERTS = (-0.3, 0.3)
-"""Seconds before a contact at which one who is timed to meet another notices it; who would do so later, never does."""
+"""Least and most seconds before a contact at which one of the pair notices it; with less than 0 it never does."""
 _STARTS = (35.0, 75.0)
-"""Metres before the junction's middle where one starts whose start is not given."""
+"""Least and most metres from the start to the junction's middle if the start is not given."""
 _LANE_CHANGE = 28.0
 """Metres that a change of lanes takes."""
 _KEEPING_UP = 1.3
-"""Times its leader's, the speed that one behind would like: it closes up."""
+"""A follower's wanted speed as a multiple of its leader's, so that the gap does not grow."""
 _FIRST_PLACE = 8.0
-"""Metres from the path's beginning to where the last one of a queue starts."""
+"""Metres from the path's beginning to where the last vehicle of a queue starts."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -98,8 +108,8 @@ class Cast:
     """The named road users of a scenario at its beginning.
 
     Attributes:
-        users: leaders come before those behind them.
-        begin: seconds, when the simulation starts; time 0 is when the first of the pair is where the paths cross.
+        users: the road users; leaders are before their followers.
+        begin: seconds, when the simulation starts; at time 0 the first of the pair is where the paths cross.
         pair: rows of the two who are timed to meet; None if nobody is.
     """
 
@@ -108,7 +118,7 @@ class Cast:
     pair: tuple[int, int] | None
 
     def row_of(self, role: Role) -> int:
-        """The first row of a role."""
+        """The row of the first road user of a role."""
         return next(row for row, user in enumerate(self.users) if user.role == role)
 
 
@@ -131,20 +141,20 @@ def cast_actors(rng: np.random.Generator, spec: ScenarioSpec, junction: Junction
         if meeting is None:
             pair = None
         else:
-            approaches = [drive_alone(users[row]) for row in pair]
+            approaches = [drive_alone(users[row], to=place) for row, place in zip(pair, meeting, strict=True)]
             for row, place, late, approach in zip(pair, meeting, (0.0, spec.meet.offset), approaches, strict=True):
                 users[row] = approach.at(approach.time_to(place) + begin - late)
     for actor in named:
         if actor.role in LEADERS:
             leader = next(user for user in users if user.role == LEADERS[actor.role])
-            stays = spec.actor(leader.role).lane_change is not None  # or it would drive into who is beside it
+            stays = spec.actor(leader.role).lane_change is not None  # or it would collide with a vehicle beside it
             path = leader.route.path if stays and leader.route else leader.path
             users.append(_follower(rng, actor, leader, path))
     return Cast(users=tuple(users), begin=begin, pair=pair)
 
 
 def _pair_rows(spec: ScenarioSpec, actors: Sequence[ActorSpec]) -> tuple[int, int] | None:
-    """Rows of those who are to meet; None if nobody is."""
+    """Rows of the two who are timed to meet; None if there are none."""
     if spec.meet is None:
         return None
     roles = [actor.role for actor in actors]
@@ -153,7 +163,7 @@ def _pair_rows(spec: ScenarioSpec, actors: Sequence[ActorSpec]) -> tuple[int, in
 
 
 def _drawn(rng: np.random.Generator, actor: ActorSpec, junction: Junction, *, timed: bool) -> RoadUser:
-    """One who follows nobody; one who is timed starts from far away, standing, unless the file says where."""
+    """A road user that follows nobody; if `timed`, it starts far away and standing, if the file gives no start."""
     body, manner = random_body(rng, actor.category), MANNERS[actor.category]
     max_speed = actor.max_speed if actor.max_speed is not None else float(rng.uniform(*manner.max_speed))
     arm = actor.from_arm or "west"
@@ -193,7 +203,7 @@ def _drawn(rng: np.random.Generator, actor: ActorSpec, junction: Junction, *, ti
 
 
 def _way(junction: Junction, route: Route, actor: ActorSpec) -> Path:
-    """Its path, with the change of lanes if it makes one."""
+    """The actor's path, with its change of lanes if it makes one."""
     path = lane_way(junction, route, actor.category)
     if actor.lane_change is None:
         return path
@@ -202,7 +212,7 @@ def _way(junction: Junction, route: Route, actor: ActorSpec) -> Path:
 
 
 def _follower(rng: np.random.Generator, actor: ActorSpec, leader: RoadUser, path: Path) -> RoadUser:
-    """One behind its leader, as fast as it, on a path that begins as its leader's."""
+    """A road user behind its leader, as fast as the leader, on a path that begins like the leader's."""
     body, manner = random_body(rng, actor.category), MANNERS[actor.category]
     gap = actor.gap if actor.gap is not None else float(rng.uniform(*_GAPS))
     own_speed = actor.max_speed if actor.max_speed is not None else float(rng.uniform(*manner.max_speed))

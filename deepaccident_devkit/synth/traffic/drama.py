@@ -1,4 +1,4 @@
-"""A scenario on stage: all who take part at its beginning, and what happens with broken and with kept rules.
+"""A scenario's road users at its beginning, and what happens when rules are broken and when they are obeyed.
 
 A part of that is recorded: it ends with the impact, or when ego has arrived, or when time is over.
 """
@@ -15,6 +15,7 @@ from deepaccident_devkit.synth.spec.model import Role
 from deepaccident_devkit.synth.traffic.background import ParkedVehicle, background_users, parked_vehicles
 from deepaccident_devkit.synth.traffic.casting import WARM_UP, Cast, cast_actors
 from deepaccident_devkit.synth.traffic.impact import Impact, impact_of, least_gap, touching_pairs
+from deepaccident_devkit.synth.traffic.misses import Miss, measured_miss
 from deepaccident_devkit.synth.traffic.rights import find_rights
 from deepaccident_devkit.synth.traffic.signals import AXIS_OF_ARM, SignalPlan, plan_with_green
 from deepaccident_devkit.synth.traffic.simulate import Simulation, simulate
@@ -23,31 +24,31 @@ from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 _GREEN_TIMES = (14.0, 20.0)
 _GREEN_SHARE = (0.35, 0.75)
-"""How much of the green is over when the pair meets."""
+"""Least and largest share of the green that is over when the pair meets."""
 _LATEST = 1.5
-"""Seconds after the time at which the pair should meet, when a simulation of their accident ends."""
+"""A simulated accident ends so many seconds after the planned meeting, if the pair does not touch before."""
 _ROUNDS = 5
-"""How often a simulation is made again without those of the background who touch someone."""
+"""The most runs of a simulation; each leaves out those of the background who touched somebody in the run before."""
 _LONGEST_DRIVE = 11.0
-"""Seconds before a meeting for which the background drives; in a longer scenario it stands until then."""
+"""How many seconds before the meeting the background starts to drive; in a longer scenario it stands until then."""
 _MARGIN = 0.1
-"""Metres: who comes nearer than this touches."""
+"""Metres: two that come nearer than this count as touching."""
 _CLEAR = 1.0
-"""Metres that the named ones keep from each other in a normal twin."""
+"""The least distance between named road users in a normal twin, metres."""
 _DELAYS = (0.0, 1.5, 3.0, 5.0, 8.0, 1000.0)
-"""Seconds by which one of the pair comes later, one after the other, where keeping the rules is not enough."""
+"""Seconds by which one of the pair comes later if rules alone do not prevent a collision; tried in this order."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Stage:
-    """All who take part, as at the beginning.
+    """All road users of a scenario at its beginning.
 
     Attributes:
-        spec: what was asked for.
+        spec: the draw.
         junction: its roads.
         cast: the named road users.
         background: the others that move.
-        parked: those that do not.
+        parked: the parked vehicles.
         signals: the traffic lights, None if there are none.
     """
 
@@ -60,7 +61,7 @@ class Stage:
 
     @property
     def users(self) -> tuple[RoadUser, ...]:
-        """All that move, the named ones first."""
+        """All that move; the named road users are first."""
         return (*self.cast.users, *self.background)
 
 
@@ -69,9 +70,9 @@ class Performance:
     """What happened.
 
     Attributes:
-        simulation: of those in `present`.
-        present: rows of the stage's users who took part: all but those of the background who would have touched
-            someone.
+        simulation: the simulation of those in `present`.
+        present: rows of the stage's users who took part: all except those of the background who would have touched
+            somebody.
     """
 
     simulation: Simulation
@@ -83,7 +84,7 @@ def set_stage(rng: np.random.Generator, spec: ScenarioSpec, junction: Junction, 
 
     Args:
         rng: random numbers.
-        spec: what is asked for.
+        spec: the draw.
         junction: its roads.
         duration: seconds from the first recorded frame to when the pair meets.
     """
@@ -102,44 +103,58 @@ def set_stage(rng: np.random.Generator, spec: ScenarioSpec, junction: Junction, 
 
 
 def _held(user: RoadUser, seconds: float) -> RoadUser:
-    """The same one, that stands so long first."""
+    """The same road user, which first stands for some seconds."""
     return user if seconds == 0 else replace(user, start_speed=0.0, delay=user.delay + seconds)
 
 
 def perform_accident(stage: Stage) -> Performance | None:
-    """What happens where the pair breaks its rules, up to its contact; None if it has none, or others touch before."""
+    """What happens up to the contact of a pair that breaks its rules; None if they do not touch, or others do first."""
+    tried = try_accident(stage)
+    return tried if isinstance(tried, Performance) else None
+
+
+def try_accident(stage: Stage) -> Performance | Miss:
+    """As `perform_accident`, but it says how the two missed each other."""
     pair = stage.cast.pair
     if pair is None:
-        return None
+        return Miss()
     unruly = [replace(user, ignores=("signal", "priority")) for user in stage.cast.users]
     users = [unruly[row] if row in pair else user for row, user in enumerate(stage.users)]
     performance = _perform(stage, users, _LATEST, watched=pair)
-    return performance if performance is not None and performance.simulation.contact is not None else None
+    if isinstance(performance, _Touching):
+        return Miss(gap=0.0, touched=performance.roles)
+    if performance.simulation.contact is not None:
+        return performance
+    offset = stage.spec.meet.offset if stage.spec.meet else 0.0
+    return measured_miss(performance.simulation, pair, stage.cast.users, planned=(0.0, offset))
 
 
 def perform_twin(stage: Stage, end: float) -> Performance | None:
-    """What happens where everyone keeps the rules, up to `end`, seconds; None if named ones touch all the same.
+    """What happens up to `end` (seconds) when all obey the rules; None if named road users touch all the same.
 
-    Of all delays the first is taken with which the named ones keep `_CLEAR` of each other, or else nobody touches.
+    It has the first delay with which the named road users stay `_CLEAR` from each other. If there is none, it has the
+    first delay with which nobody touches.
     """
     roles, narrow = _later_roles(stage.cast), None
     for late in _DELAYS:
         users = [_later(user.obeying(), late) if user.role in roles else user.obeying() for user in stage.users]
         performance = _perform(stage, users, end)
-        if performance is not None and _keep_clear(stage, performance):
+        if isinstance(performance, _Touching):
+            continue
+        if _keep_clear(stage, performance):
             return performance
         narrow = narrow or performance
     return narrow
 
 
 def _later_roles(cast: Cast) -> tuple[Role, ...]:
-    """Who comes later where keeping the rules is not enough: a stranger of the pair, else other with its follower."""
+    """The roles that come later in a delay: those of the pair except ego and other; if none, other and its follower."""
     strangers = [cast.users[row].role for row in cast.pair or () if cast.users[row].role not in ("ego", "other")]
     return tuple(strangers) or ("other", "other_behind")
 
 
 def _later(user: RoadUser, seconds: float) -> RoadUser:
-    """The same one so much later."""
+    """The same road user, some seconds later."""
     if seconds == 0:
         return user
     back = user.start - user.start_speed * seconds
@@ -154,12 +169,24 @@ def _keep_clear(stage: Stage, performance: Performance) -> bool:
     return least_gap(performance.simulation.poses, size, rows, _CLEAR) >= _CLEAR
 
 
+@dataclass(frozen=True, slots=True)
+class _Touching:
+    """Why a run is no performance: two touch, and none of the two can be left out.
+
+    Attributes:
+        roles: of the two.
+    """
+
+    roles: tuple[Role, Role]
+
+
 def _perform(
     stage: Stage, users: Sequence[RoadUser], end: float, watched: tuple[int, int] | None = None
-) -> Performance | None:
-    """Simulate, again and again without those of the background who touch someone; None if named ones touch."""
+) -> Performance | _Touching:
+    """Simulate until nobody touches, each time without those of the background who did."""
     present = list(range(len(users)))
     named = len(stage.cast.users)
+    touching: tuple[Role, Role] = ("background", "background")
     for _ in range(_ROUNDS):
         there = [users[row] for row in present]
         rights = find_rights(there, minor=stage.spec.road.yielding_arms, blind=watched)
@@ -169,11 +196,13 @@ def _perform(
         pairs = set(_touching(stage, there, simulation)) - {tuple(sorted(watched or ()))}
         if not pairs:
             return Performance(simulation=simulation, present=tuple(present))
-        leaving = {max(i, j) if max(i, j) < len(there) else min(i, j) for i, j in pairs}
+        leaving = {max(i, j) if max(i, j) < len(there) else min(i, j): (i, j) for i, j in sorted(pairs)}
+        first, second = leaving[min(leaving)]
+        touching = (there[first].role, there[second].role if second < len(there) else "parked")
         if min(leaving) < named:
-            return None
+            break
         present = [row for place, row in enumerate(present) if place not in leaving]
-    return None
+    return _Touching(touching)
 
 
 def _touching(stage: Stage, users: Sequence[RoadUser], simulation: Simulation) -> list[tuple[int, int]]:
@@ -191,7 +220,7 @@ def _sizes(users: Sequence[RoadUser]) -> FloatArray:
 
 
 def _signal_plan(rng: np.random.Generator, cast: Cast) -> SignalPlan:
-    """Green for the one of the pair who keeps to the lights when they meet, for ego if nobody is to meet."""
+    """Lights that are green at the meeting for the one of the pair that obeys them; without a pair, for ego."""
     rows = [*(cast.pair or ()), cast.row_of("ego")]
     lawful = [cast.users[row] for row in rows if "signal" not in cast.users[row].ignores]
     arms = [user.route.from_arm for user in lawful if user.route is not None]
@@ -200,9 +229,9 @@ def _signal_plan(rng: np.random.Generator, cast: Cast) -> SignalPlan:
 
 
 _LEAST_FRAMES, _MOST_FRAMES = 40, 100
-"""Of a recording of natural length, as in the release."""
+"""The fewest and the most frames of a recording if no number is given, as in the release."""
 _EARLIEST = 5.5
-"""Seconds from the beginning until the pair meets, at least."""
+"""The least time from the beginning until the pair meets, seconds."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -213,7 +242,7 @@ class Recorded:
         performance: what happens.
         start: time of the first recorded frame, in the simulation's time, seconds.
         frames: how many are recorded.
-        impact: with which it ends, if it does.
+        impact: the impact at its end; None if there is none.
     """
 
     performance: Performance
@@ -223,7 +252,7 @@ class Recorded:
 
 
 def usual_duration(rng: np.random.Generator, spec: ScenarioSpec, frames: int | None) -> float:
-    """Seconds from the beginning until the pair meets: as is natural, or as long as the frames asked for need."""
+    """Seconds from the beginning until the pair meets: drawn, or as many as the wanted number of frames needs."""
     natural = float(rng.uniform(_EARLIEST, max(spec.end.time, _EARLIEST) + 0.3))
     return natural if frames is None else max(natural, frames * FRAME_PERIOD + 1.5)
 
@@ -240,7 +269,7 @@ def recorded_accident(stage: Stage, performance: Performance, frames: int | None
     Args:
         stage: who took part.
         performance: with a contact of the pair.
-        frames: how many are recorded; None for as many as there are, within limits.
+        frames: how many are recorded; None for all that there are, within limits.
     """
     pair = stage.cast.pair or (0, 0)
     size = np.array([stage.users[row].body.size[:2] for row in pair])
@@ -269,7 +298,7 @@ def _natural_frames(stage: Stage, end: float, most: int) -> int:
 
 
 def _arrival_time(stage: Stage, performance: Performance) -> float:
-    """When ego is far enough past the junction, infinite if it never is."""
+    """The time when ego is far enough past the junction; infinite if it never is."""
     row = stage.cast.row_of("ego")
     ego, simulation = stage.users[row], performance.simulation
     if ego.route is None:

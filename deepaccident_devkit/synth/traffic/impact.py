@@ -1,4 +1,4 @@
-"""The impact: who touches whom and when exactly, with which sides and how hard."""
+"""The impact: who touches whom, when exactly, with which sides and how hard."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -10,13 +10,13 @@ from deepaccident_devkit.synth.collision import gap, separation
 from deepaccident_devkit.synth.traffic.simulate import Simulation
 
 _LOOK_STEP = 5
-"""Steps between the moments at which it is looked who is near whom."""
+"""Which road users are near each other is computed once in so many steps."""
 _NEAR = 2.0
-"""Metres that two may come nearer between these moments."""
+"""How much nearer two can come between these steps, metres."""
 
 
 def touching_pairs(poses: FloatArray, size: FloatArray, margin: float) -> list[tuple[int, int]]:
-    """Pairs of rows, the first one lower, that come nearer to each other than `margin`, along any side's normal.
+    """Pairs of rows, the lower one first, that come nearer to each other than `margin`, along any side's normal.
 
     Args:
         poses: (S, A, 3) x, y (metres), yaw (radians) of the boxes' centres.
@@ -31,9 +31,9 @@ def touching_pairs(poses: FloatArray, size: FloatArray, margin: float) -> list[t
 
 
 def least_gap(poses: FloatArray, size: FloatArray, rows: list[int], enough: float) -> float:
-    """The least distance in metres between any two of some rows; arguments as in `touching_pairs`.
+    """The least distance in metres between any two of `rows`; arguments as in `touching_pairs`.
 
-    Pairs that never come nearer than `enough` are not looked at; it is returned if there is no other.
+    Pairs that never come nearer than `enough` do not count; if there are no other pairs, the result is `enough`.
     """
     pairs = _near_pairs(poses[:, rows], size[rows], enough)
     gaps = [float(gap(poses[:, rows[i]], size[rows[i]], poses[:, rows[j]], size[rows[j]]).min()) for i, j in pairs]
@@ -53,7 +53,7 @@ def _near_pairs(poses: FloatArray, size: FloatArray, margin: float) -> list[tupl
 
 ContactSide = Literal["front", "back", "left", "right"]
 _AREA_MASS = 60.0
-"""Impact a square metre of the first one's box and m/s; the real release's numbers are of this size."""
+"""Impact for each m² of the first box and m/s; so the numbers are about as large as in the real release."""
 _HALVINGS = 40
 
 
@@ -63,9 +63,9 @@ class Impact:
 
     Attributes:
         time: seconds, when the boxes first touch.
-        side: of the first one's box that is hit.
-        strength: as meta's impact.
-        angle: between their headings, from 0 to π.
+        side: the side of the first one's box that is hit.
+        strength: the impact in the meta file.
+        angle: angle between their headings, from 0 to π.
     """
 
     time: float
@@ -78,9 +78,9 @@ def impact_of(simulation: Simulation, pair: tuple[int, int], size: FloatArray) -
     """The impact that ends a simulation.
 
     Args:
-        simulation: with a contact.
+        simulation: one with a contact.
         pair: rows of the two who touch.
-        size: (2, 2) length and width of theirs, metres.
+        size: (2, 2) length and width of the two, metres.
     """
     rows = list(pair)
     last = simulation.poses[-1][rows]
@@ -92,14 +92,14 @@ def impact_of(simulation: Simulation, pair: tuple[int, int], size: FloatArray) -
     turn = poses[1, 2] - poses[0, 2]
     return Impact(
         time=float(simulation.time[-1]) - (1.0 - share) * period,
-        side=_side(poses, size),
+        side=contact_side(poses, size),
         strength=float(_AREA_MASS * size[0].prod() * np.hypot(*(velocity[0] - velocity[1]))),
         angle=float(abs(np.arctan2(np.sin(turn), np.cos(turn)))),
     )
 
 
 def _touching_share(before: FloatArray, after: FloatArray, size: FloatArray) -> float:
-    """How much of a step (2, 3) → (2, 3) is over when the boxes touch, by halving; they do at the result."""
+    """The share of a step (2, 3) → (2, 3) that is over when the boxes touch, by halving; at the result they touch."""
     apart, touching = 0.0, 1.0
     for _ in range(_HALVINGS):
         middle = (apart + touching) / 2
@@ -111,8 +111,13 @@ def _touching_share(before: FloatArray, after: FloatArray, size: FloatArray) -> 
     return touching
 
 
-def _side(poses: FloatArray, size: FloatArray) -> ContactSide:
-    """The side of the first box that faces the second across the widest gap along any side's normal."""
+def contact_side(poses: FloatArray, size: FloatArray) -> ContactSide:
+    """The side of the first of two boxes that faces the second across the widest gap along any side's normal.
+
+    Args:
+        poses: (2, 3) x, y (metres), yaw (radians) of the boxes' centres.
+        size: (2, 2) length and width of the two, metres.
+    """
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     axes = np.stack([np.stack([cos, sin], axis=1), np.stack([-sin, cos], axis=1)], axis=1)  # box, axis, xy
     normals = axes.reshape(4, 2)

@@ -1,6 +1,6 @@
-"""How wheels move a body: the kinematic bicycle, and the steering that keeps it on its path.
+"""How wheels move a body: the kinematic bicycle model, and the steering that keeps it on its path.
 
-The paths of all road users are one table, so that all are looked up at once.
+The paths of all road users are in one table, so that one look-up serves all of them.
 """
 
 from collections.abc import Sequence
@@ -12,19 +12,19 @@ from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.synth.roads.paths import Path
 
 PERIOD = 0.02
-"""Seconds of a simulated step."""
+"""Length of a simulated step, seconds."""
 DECISION_STEPS = 5
-"""Drivers look and decide every tenth of a second."""
+"""Drivers look and decide once in so many steps: every tenth of a second."""
 WHEELBASE = 0.6
-"""Of a body's length."""
+"""Distance of the axles as a share of the body's length."""
 MAX_STEER = np.deg2rad(38.0)
 _MAX_TANGENT = np.tan(MAX_STEER)
 MAX_STEER_RATE = 0.6
-"""Radians a second, of the front wheels."""
+"""How fast the front wheels can turn, radians a second."""
 HARDEST_BRAKING = 8.0
-"""m/s², which dry asphalt gives."""
+"""The hardest braking on dry asphalt, m/s²."""
 _LOOK_AHEAD = (2.5, 0.25)
-"""Metres, and seconds of driving: how far the steering looks ahead for where it shall be on its path again."""
+"""How far ahead the steering aims to be on the path again: metres, and seconds of driving that are added to them."""
 
 
 @dataclass(slots=True, eq=False)
@@ -32,11 +32,11 @@ class Wheels:
     """Where the road users are, one row each; the state that the simulation steps.
 
     Attributes:
-        x: (A,) of the middle of the rear axle, metres.
-        y: (A,) likewise.
+        x: (A,) x of the middle of the rear axle, metres.
+        y: (A,) y of the same point, metres.
         yaw: (A,) radians.
-        speed: (A,) of the rear axle, m/s, at least 0.
-        steer: (A,) of the front wheels, radians, positive to the left.
+        speed: (A,) speed of the rear axle, m/s, at least 0.
+        steer: (A,) angle of the front wheels, radians, positive to the left.
         along: (A,) how far the rear axle is along its path, metres.
     """
 
@@ -49,13 +49,13 @@ class Wheels:
 
 
 def step(wheels: Wheels, acceleration: FloatArray, on_path: FloatArray, wheelbase: FloatArray) -> None:
-    """Move everyone by one period, in place; one without wheels only gets faster and farther along its path.
+    """Move all road users by one period, in place; for those without wheels only `speed` and `along` are valid.
 
     Args:
         wheels: the state.
         acceleration: (A,) m/s².
         on_path: (4, A) x, y, yaw, curvature of the paths at `wheels.along`.
-        wheelbase: (A,) metres; infinite for one without wheels.
+        wheelbase: (A,) metres; infinite for those without wheels.
     """
     distance = np.maximum(wheels.speed + acceleration * (PERIOD / 2), 0.0) * PERIOD
     wheels.speed = np.maximum(wheels.speed + acceleration * PERIOD, 0.0)
@@ -72,7 +72,7 @@ def step(wheels: Wheels, acceleration: FloatArray, on_path: FloatArray, wheelbas
 
 
 def _off_path(wheels: Wheels, on_path: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """How far left of its path each is, metres, and how far it is turned to the left of it, radians."""
+    """How far each is to the left of its path, metres, and by how much it is turned to the left of it, radians."""
     x, y, yaw, _ = on_path
     lateral = np.cos(yaw) * (wheels.y - y) - np.sin(yaw) * (wheels.x - x)
     turned = (wheels.yaw - yaw + np.pi) % (2 * np.pi) - np.pi
@@ -82,7 +82,7 @@ def _off_path(wheels: Wheels, on_path: FloatArray) -> tuple[FloatArray, FloatArr
 def _wanted_steer(
     speed: FloatArray, lateral: FloatArray, turned: FloatArray, curvature: FloatArray, wheelbase: FloatArray
 ) -> FloatArray:
-    """The angle that follows the path and brings back to it, critically damped over the distance looked ahead."""
+    """The steering angle that follows the path and returns to it, critically damped over the distance ahead."""
     ahead = _LOOK_AHEAD[0] + _LOOK_AHEAD[1] * speed
     wanted = curvature - lateral / ahead**2 - 2 * turned / ahead
     most = _MAX_TANGENT / wheelbase
@@ -95,18 +95,18 @@ def _wanted_steer(
 SPACING = 0.25
 """Metres between the table's points."""
 _BEYOND = 80.0
-"""Metres for which a path goes straight on past its end."""
+"""Metres that the table goes straight on after a path's end."""
 _BEND_BRAKING = 1.8
-"""m/s² at which drivers slow down before a bend."""
+"""m/s² with which drivers brake before a bend."""
 
 
 class Tracks:
-    """Points along each path, and how fast its bends allow to drive; one row a road user.
+    """Points along each path, and the speed that its bends allow; one row for each road user.
 
     Args:
-        paths: of the road users.
-        lateral: (A,) m/s² that each takes across itself in a bend.
-        stops: (A,) bool, whether it stops at its path's end; else it goes straight on.
+        paths: the paths of the road users.
+        lateral: (A,) m/s², the most sideways acceleration that each accepts in a bend.
+        stops: (A,) bool, whether it stops at its path's end; if not, it goes straight on.
     """
 
     def __init__(self, paths: Sequence[Path], lateral: FloatArray, stops: BoolArray) -> None:
@@ -125,7 +125,7 @@ class Tracks:
         self._last = len(along) - 2
 
     def at(self, along: FloatArray) -> FloatArray:
-        """(4, A) x, y, yaw, curvature where each is, `along` (A,) metres from its path's start."""
+        """(4, A) x, y, yaw, curvature of the paths at `along` (A,) metres from their starts."""
         low, share = self._cell(along)
         flat = self._first + low
         before = self._flat[:, flat]
@@ -141,7 +141,7 @@ class Tracks:
         return np.asarray(self._points[self._distinct[rows, None], cells]), cells * SPACING
 
     def allowed_speed(self, along: FloatArray) -> FloatArray:
-        """(A,) m/s from which the bends ahead can be reached comfortably."""
+        """The highest speed (A,) m/s from which drivers can brake comfortably for the bends ahead."""
         low, _ = self._cell(along)
         return np.asarray(self._allowed[self._row, low])
 
@@ -152,7 +152,7 @@ class Tracks:
 
 
 def _allowed_speed(along: FloatArray, curvature: FloatArray, lateral: FloatArray, ends: FloatArray) -> FloatArray:
-    """(A, K) m/s, so slow that each bend ahead is entered as slowly as it asks, and nobody passes its end."""
+    """(A, K) m/s: so slow that each enters the bends ahead slowly enough, and stops at its path's end if it must."""
     bend = lateral[:, None] / np.maximum(np.abs(curvature), 1e-4)
     bend[along >= ends[:, None]] = 0.0
     lead = bend + 2 * _BEND_BRAKING * along

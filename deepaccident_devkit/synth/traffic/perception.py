@@ -1,4 +1,4 @@
-"""Who notices whom: the nearest road user on the way ahead, and, at the last moment, the one whom one will meet."""
+"""Who notices whom: the nearest road user ahead on the path and, at the last moment, the other one of the pair."""
 
 from dataclasses import dataclass
 
@@ -10,11 +10,11 @@ from deepaccident_devkit.synth.traffic.kinematics import Tracks
 
 _SPACING = 2.0
 _POINTS = np.arange(0.0, 44.0, _SPACING)
-"""Metres ahead along one's own path."""
+"""Metres ahead along a road user's own path."""
 _MARGIN = 0.25
-"""Metres at the sides that drivers want free."""
+"""The free space at each side that drivers want, metres."""
 _BEHIND = 2.0
-"""Metres: who is farther back than this is not ahead."""
+"""Metres: a road user that is farther back than this does not count as ahead."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,13 +35,13 @@ class Bodies:
 
 
 def leaders(bodies: Bodies, tracks: Tracks, centers: FloatArray, sees: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Gap (A,) in metres to the nearest one ahead on each one's path, infinite if there is none, and its speed (A,).
+    """Gap (A,) in metres to the nearest one ahead on each path, infinite if there is none, and that one's speed (A,).
 
     Args:
         bodies: where they are.
         tracks: their paths.
         centers: (A,) how far along its path the centre of each is, metres.
-        sees: (A, A) bool, whether the row's minds the column's.
+        sees: (A, A) bool, whether the road user of the row reacts to that of the column.
     """
     rows, others = _candidates(bodies, sees)
     gaps, speeds = np.full(len(centers), np.inf), np.zeros(len(centers))
@@ -62,7 +62,7 @@ def leaders(bodies: Bodies, tracks: Tracks, centers: FloatArray, sees: BoolArray
 
 
 def _candidates(bodies: Bodies, sees: BoolArray) -> tuple[IntArray, IntArray]:
-    """Pairs of rows: one that looks, and one that is near and not behind it."""
+    """Pairs of rows: one that looks, and another that is near and not behind it."""
     delta = bodies.poses[None, :, :2] - bodies.poses[:, None, :2]
     heading = bodies.poses[:, 2]
     forward = np.cos(heading)[:, None] * delta[..., 0] + np.sin(heading)[:, None] * delta[..., 1]
@@ -75,7 +75,7 @@ def _candidates(bodies: Bodies, sees: BoolArray) -> tuple[IntArray, IntArray]:
 def _in_path_frame(
     bodies: Bodies, tracks: Tracks, centers: FloatArray, rows: IntArray, others: IntArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """How far ahead, how far to the left (metres) and how much turned (radians) others are, seen along rows' paths."""
+    """How far ahead, how far to the left (metres) and how much turned (radians) others are, along the rows' paths."""
     points, along = tracks.near(rows, centers[rows, None] + _POINTS)
     delta = bodies.poses[others, None, :2] - points[..., :2]
     nearest = (delta**2).sum(axis=-1).argmin(axis=1)
@@ -87,17 +87,17 @@ def _in_path_frame(
 
 
 _STEP = 0.05
-"""Seconds between the moments ahead at which it is looked whether they touch."""
+"""Seconds between the future moments that are checked for a contact."""
 _FIELD_OF_VIEW = np.deg2rad(80.0)
-"""To each side of straight ahead, within which a driver looks."""
+"""How far to each side of straight ahead a driver looks, radians."""
 
 
 class Alarm:
-    """Who of a pair that minds nobody has seen the contact coming; who has once, brakes until the end.
+    """Which of a pair has noticed its coming contact; from then on it brakes until the end.
 
     Args:
-        rows: (2,) of the pair.
-        size: (2, 2) length and width of theirs, metres.
+        rows: (2,) rows of the pair.
+        size: (2, 2) length and width of the two, metres.
         alert: (2,) seconds before the contact at which each notices it; 0 for never.
     """
 
@@ -107,11 +107,11 @@ class Alarm:
         self._noticed = np.zeros(2, dtype=bool)
 
     def rows(self, poses: FloatArray, velocities: FloatArray) -> IntArray:
-        """Rows of those who brake, 0 to 2 of them; to be asked at one moment after the other.
+        """Rows of those who brake, 0 to 2 of them; call it with one moment after the other.
 
         Args:
             poses: (A, 3) x, y (metres), yaw (radians) of all boxes' centres.
-            velocities: (A, 2) m/s, with which they are expected to go on.
+            velocities: (A, 2) m/s; they are assumed to stay the same.
         """
         two, moving = poses[self._rows], velocities[self._rows]
         expected = np.repeat(two[:, None], len(self._ahead), axis=1)
@@ -123,7 +123,7 @@ class Alarm:
 
 
 def _looks_at(poses: FloatArray) -> BoolArray:
-    """(2,) bool, whether each of two (2, 3) has the other before it."""
+    """(2,) bool, whether each of two (2, 3) has the other in its field of view."""
     delta = poses[::-1, :2] - poses[:, :2]
     bearing = np.arctan2(delta[:, 1], delta[:, 0]) - poses[:, 2]
     return np.asarray(np.cos(bearing) > np.cos(_FIELD_OF_VIEW))

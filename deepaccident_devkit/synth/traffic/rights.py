@@ -1,4 +1,4 @@
-"""The rules of the road between all pairs of road users: where their ways cross or join, and who has to wait."""
+"""The traffic rules between all pairs of road users: where their paths cross or join, and who has to wait."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,12 +17,12 @@ _MARGIN = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Zones:
-    """For each ordered pair of road users, the stretch of the first one's path on which it meets the second's.
+    """For each ordered pair of road users, the part of the first one's path on which it meets the second's path.
 
     Attributes:
-        enter: (A, A) metres along the path of the row's, where its front comes too near to the column's way; infinite
-            where the two never meet.
-        leave: (A, A) where its rear is clear of it.
+        enter: (A, A) metres along the path of the row's road user where its front comes too near to the path of the
+            column's road user; infinite if the paths never meet.
+        leave: (A, A) metres along the same path where its rear is far enough from the other path again.
     """
 
     enter: FloatArray
@@ -38,10 +38,10 @@ def find_zones(
     """The zones of all pairs.
 
     Args:
-        paths: of the road users.
-        spans: from, to: the stretch of each path on which it can meet others, metres.
-        widths: (A,) of their bodies, metres.
-        together: (A, A) bool, pairs that follow each other, or never mind each other, and so have no zone.
+        paths: the paths of the road users.
+        spans: where the part of each path that can meet others begins and ends, metres.
+        widths: (A,) widths of their bodies, metres.
+        together: (A, A) bool, pairs without a zone: they follow each other, or do not react to each other.
     """
     count = len(paths)
     enter, leave = np.full((count, count), np.inf), np.full((count, count), np.inf)
@@ -62,7 +62,7 @@ def find_zones(
 
 
 def _points(path: Path, span: tuple[float, float]) -> FloatArray:
-    """(K, 3) x, y and how far along, metres."""
+    """(K, 3) x, y and distance along the path, metres."""
     along = np.arange(max(span[0], 0.0), min(span[1], path.length), _SPACING)
     x, y, _, _ = path.at(along)
     return np.stack([x, y, along], axis=-1)
@@ -71,7 +71,7 @@ def _points(path: Path, span: tuple[float, float]) -> FloatArray:
 def _meeting(
     first: FloatArray, second: FloatArray, reach: float
 ) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """From, to on each of two lines of points (K, 3) where they are within reach of each other; None if nowhere."""
+    """Where two lines of points (K, 3) are within `reach`: begin and end on each line; None if they never are."""
     if not len(first) or not len(second):
         return None
     square = (first[:, None, 0] - second[None, :, 0]) ** 2 + (first[:, None, 1] - second[None, :, 1]) ** 2
@@ -85,12 +85,12 @@ def _meeting(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rights:
-    """What holds between all ordered pairs of road users during a whole simulation.
+    """The rules between all ordered pairs of road users, valid for a whole simulation.
 
     Attributes:
-        zones: where their ways meet.
-        waits: (A, A) bool, whether the row's has to let the column's go first.
-        sees: (A, A) bool, whether the row's brakes for the column's where that is in its way.
+        zones: where their paths meet.
+        waits: (A, A) bool, whether the road user of the row has to let that of the column go first.
+        sees: (A, A) bool, whether the road user of the row brakes if that of the column is in its way.
     """
 
     zones: Zones
@@ -108,9 +108,9 @@ def find_rights(
 
     Args:
         users: the road users.
-        minor: arms that give way to the others; none where lights keep them apart.
-        blind: rows of a pair that see nobody but the others on their own arm; everyone else lets them go first, so
-            that they meet.
+        minor: arms that give way to the others; none at a junction with lights.
+        blind: rows of a pair that see only the others on their own arm; all others let them go first, so that they
+            meet.
     """
     count = len(users)
     together, waits = np.zeros((count, count), dtype=bool), np.zeros((count, count), dtype=bool)
@@ -154,28 +154,28 @@ def _waits(one: RoadUser, other: RoadUser, minor: Sequence[Arm]) -> bool:
 
 
 _ACCELERATION = (1.5, 1.0)
-"""m/s²: how others may speed up towards a zone, and how one speeds up oneself to leave it."""
+"""m/s²: the acceleration that a road user expects of others towards a zone, and its own to leave the zone."""
 _GAP_BEFORE, _GAP_AFTER = 1.2, 0.6
-"""Seconds that must pass between one's leaving a zone and the other's coming, and the other way round."""
+"""Least seconds from leaving a zone until the other comes, and from the other's leaving until it comes itself."""
 _CREEPING = 0.5
-"""m/s: who is slower counts as so fast."""
+"""m/s: a road user that is slower counts as so fast."""
 _HARD_BRAKING = 4.5
-"""m/s²: who would have to brake harder than this before a zone drives on."""
+"""m/s²: who would have to brake harder than this before a zone does not stop."""
 _BEFORE_ZONE = 1.0
-"""Metres before a zone at which one waits."""
+"""Metres from a waiting road user to the zone."""
 
 
 def waiting_gap(
     rights: Rights, front: FloatArray, rear: FloatArray, speed: FloatArray, top_speed: FloatArray, held: BoolArray
 ) -> FloatArray:
-    """(A,) metres to where each has to stop for others, infinite for those who may go.
+    """Distance (A,) in metres to where each has to stop for others; infinite for those who may go.
 
     Args:
-        rights: of all pairs.
+        rights: the rights of all pairs.
         front: (A,) how far along its path the front of each is, metres.
-        rear: (A,) and its rear.
+        rear: (A,) how far along its path the rear of each is, metres.
         speed: (A,) m/s.
-        top_speed: (A,) m/s, which each does not exceed.
+        top_speed: (A,) m/s; nobody becomes faster than this.
         held: (A,) bool, whether it stands or will stand before a red light.
     """
     to_enter = rights.zones.enter - front[:, None]
@@ -197,6 +197,6 @@ def waiting_gap(
 
 
 def _earliest(distance: FloatArray, speed: FloatArray, top_speed: FloatArray, acceleration: float) -> FloatArray:
-    """Seconds until someone is so many metres on, who speeds up as much as is likely, up to a top speed."""
+    """The least seconds that somebody needs for a distance (metres) with this acceleration, up to a top speed."""
     speeding_up = (np.sqrt(speed**2 + 2 * acceleration * distance) - speed) / acceleration
     return np.asarray(np.maximum(speeding_up, distance / top_speed))

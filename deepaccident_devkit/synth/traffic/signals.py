@@ -1,4 +1,4 @@
-"""Traffic lights: which arm has which colour at what time."""
+"""Traffic lights: the colour that each arm has at a time."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -19,16 +19,16 @@ AXIS_OF_ARM: dict[Arm, Axis] = {
 }
 AMBER_TIME = 3.0
 CLEARANCE_TIME = 1.5
-"""Seconds of red for everyone between one axis' amber and the other's green."""
+"""Seconds of red for all between one axis' amber and the other's green."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SignalPlan:
-    """Two phases that follow each other for ever: one axis has green, then the other.
+    """Two phases that alternate without end: one axis has green, then the other.
 
     Attributes:
-        first: the axis that has green from `start` on.
-        start: when it gets it, seconds since the first recorded frame.
+        first: the axis that gets green at `start`.
+        start: when it gets green, seconds since the first recorded frame.
         green: how long each axis has green, seconds.
     """
 
@@ -45,7 +45,7 @@ class SignalPlan:
         return np.asarray(colors, dtype=np.int64)
 
     def shifted(self, seconds: float) -> "SignalPlan":
-        """The same plan, later."""
+        """The same plan, some seconds later."""
         return replace(self, start=self.start + seconds)
 
 
@@ -53,9 +53,9 @@ def plan_with_green(axis: Axis, time: float, green: float, share: float) -> Sign
     """A plan in which an axis has green at a time.
 
     Args:
-        axis: which.
-        time: seconds.
+        axis: the axis with green.
+        time: when it has green, seconds.
         green: how long each axis has green, seconds.
-        share: how much of this green is over at `time`, from 0 to 1.
+        share: the share of this green that is over at `time`, from 0 to 1.
     """
     return SignalPlan(first=axis, start=time - share * green, green=green)

@@ -27,11 +27,11 @@ class Simulation(FrozenArrays):
     """Where everyone was; arrays are read-only.
 
     Attributes:
-        time: (S,) seconds, `kinematics.PERIOD` apart.
+        time: (S,) seconds, in steps of `kinematics.PERIOD`.
         states: (S, A, 5) x, y (metres), yaw (radians), speed (m/s) and steering angle (radians); x and y are of the
             box's centre, speed and yaw of the rear axle, which does not slide.
-        velocities: (S, A, 2) of the box's centre, m/s.
-        contact: row of the first step at which the watched pair touches, None if it never does.
+        velocities: (S, A, 2) velocities of the box's centre, m/s.
+        contact: row of the first step at which the watched pair touches; None if it never touches.
     """
 
     time: FloatArray
@@ -59,10 +59,10 @@ def simulate(
     Args:
         users: who they are and how they start.
         begin: time of the first step, seconds.
-        end: time of the last one, unless the watched pair touches before.
-        rights: what holds between them; None if nobody minds anybody.
+        end: time of the last step, if the watched pair does not touch before.
+        rights: the rules between them; None if nobody reacts to anybody.
         signals: the traffic lights; None if there are none.
-        watched: rows of two whose contact ends the simulation, and who brake for each other at the last moment at most.
+        watched: rows of two whose contact ends the simulation; they brake for each other at the last moment, or not.
     """
     run = _Run(users, rights, signals, watched)
     count = round((end - begin) / PERIOD) + 1
@@ -140,7 +140,7 @@ class _Run:
         wheels.x[walkers], wheels.y[walkers], wheels.yaw[walkers] = self._on_path[:3, walkers]
 
     def _for_others(self, rights: Rights, states: FloatArray, time: float) -> FloatArray:
-        """(A,) m/s², at most 0, for who is ahead, for red lights and for who goes first."""
+        """(A,) m/s², 0 or less: braking for those ahead, for red lights and for those who go first."""
         wheels, temper = self._wheels, self._temper
         speed, centers = wheels.speed, wheels.along + self._ahead
         front, rear = centers + self.size[:, 0] / 2, centers - self.size[:, 0] / 2
@@ -154,7 +154,7 @@ class _Run:
 
 
 class _Lights:
-    """The stop lines of all road users and what their lights show."""
+    """The stop lines of all road users and the colours of their lights."""
 
     def __init__(self, users: Sequence[RoadUser], signals: SignalPlan | None) -> None:
         self._signals = signals
@@ -164,7 +164,7 @@ class _Lights:
         )
 
     def gap(self, time: float, front: FloatArray, speed: FloatArray, temper: Temper) -> FloatArray:
-        """(A,) metres to the stop line of each one that has to stop there, else infinite."""
+        """(A,) metres to the stop line; infinite for those who need not stop there."""
         if self._signals is None:
             return np.full(len(front), np.inf)
         colors = {arm: int(self._signals.state(arm, time)) for arm in set(self._arms) - {None} if arm}
@@ -181,7 +181,7 @@ def _alarm(users: Sequence[RoadUser], pair: tuple[int, int], size: FloatArray) -
 
 
 def _first_contact(states: FloatArray, size: FloatArray, pair: tuple[int, int], low: int, high: int) -> int | None:
-    """The first row from `low` up to before `high` at which the boxes of a pair touch."""
+    """The first row at which the boxes of a pair touch, `low` included and `high` excluded; None if there is none."""
     first, second = pair
     apart = separation(states[low:high, first, :3], size[first], states[low:high, second, :3], size[second])
     touching: BoolArray = apart <= 0

@@ -1,4 +1,4 @@
-"""Accidents that no design foresees: with a pedestrian, a third vehicle, or one that changes lanes."""
+"""Accidents that are in no design: with a pedestrian, a third vehicle, or a vehicle that changes lanes."""
 
 from dataclasses import replace
 
@@ -9,22 +9,22 @@ from deepaccident_devkit.synth.spec import ActorSpec, MeetSpec, ScenarioSpec
 from deepaccident_devkit.synth.spec.model import Role, Side
 
 _PEDESTRIANS = 0.6
-"""Share of the accidents with one; the others are with a third vehicle."""
+"""Share of accidents with a pedestrian; the others are with a third vehicle."""
 _STEP_OUT_SPEEDS = (1.2, 2.2)
 _STEP_OUT = (24.0, 45.0)
-"""Metres from the junction's middle where a pedestrian steps onto the road."""
+"""Least and most metres from the junction's middle to where a pedestrian steps onto the road."""
 _BEHIND_CREST = (15.0, 22.0)
-"""Metres past the crest of a hump: it hides a pedestrian there until who comes is some 40 m away."""
+"""Metres from a hump's crest to a pedestrian behind it; the hump hides it until the victim is about 40 m away."""
 _CUTTING_IN = 0.5
-"""Share of the third vehicles that come by the victim's arm and change into its lane, where it has two."""
+"""Share of third vehicles that come by the victim's arm and change into its lane, if the arm has two lanes."""
 _CUT_IN = (45.0, 75.0)
-"""Metres from the junction's middle where that begins."""
+"""Least and most metres from the junction's middle to where that change of lanes begins."""
 _THIRD_SPEEDS = (8.0, 12.0)
 _OFFSETS = (-0.2, 0.2)
 
 
 def unplanned(rng: np.random.Generator, spec: ScenarioSpec, junction: Junction) -> ScenarioSpec:
-    """The scenario with another accident: ego or other meets a pedestrian or a third vehicle, and its pair obeys.
+    """The scenario with another accident: ego and other obey, and one of them meets a pedestrian or a third vehicle.
 
     Args:
         rng: random numbers.
@@ -54,7 +54,7 @@ def unplanned(rng: np.random.Generator, spec: ScenarioSpec, junction: Junction) 
 
 
 def _pedestrian(rng: np.random.Generator, victim: ActorSpec, spec: ScenarioSpec) -> ActorSpec:
-    """One who steps onto the road before the victim, behind the rise if there is one on its arm."""
+    """A pedestrian who steps onto the road in front of the victim, behind the hump if there is one on its arm."""
     arm, hump = victim.from_arm or "west", spec.road.hump
     distance = float(rng.uniform(*_STEP_OUT))
     if hump is not None and hump.arm == arm:
@@ -71,7 +71,7 @@ def _pedestrian(rng: np.random.Generator, victim: ActorSpec, spec: ScenarioSpec)
 
 
 def _third_vehicle(rng: np.random.Generator, junction: Junction, free: list[Arm]) -> ActorSpec:
-    """One that comes by an arm by which neither of the pair comes, and minds nobody."""
+    """A vehicle that comes by an arm by which neither ego nor other comes, and reacts to nobody."""
     arm = free[int(rng.integers(len(free)))]
     turns = junction.turns(arm)
     turn: Turn = "straight" if "straight" in turns else "left"
@@ -87,7 +87,7 @@ def _third_vehicle(rng: np.random.Generator, junction: Junction, free: list[Arm]
 
 
 def _cutting_in(rng: np.random.Generator, victim: ActorSpec) -> ActorSpec:
-    """One in the lane beside the victim's that changes into it and does not look."""
+    """A vehicle in the lane beside the victim's that changes into the victim's lane without looking."""
     return ActorSpec(
         role="background",
         category=rng.choice(["car", "car", "van"]).item(),

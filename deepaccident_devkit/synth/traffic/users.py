@@ -1,4 +1,4 @@
-"""One road user before the simulation: what it is, its way over the junction, and how it drives."""
+"""A road user before the simulation: what it is, its path over the junction, and how it drives."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -17,9 +17,9 @@ from deepaccident_devkit.synth.traffic.following import Temper
 from deepaccident_devkit.synth.traffic.kinematics import WHEELBASE
 
 _SPAN = (4.0, 10.0)
-"""Metres before the stop line, and past the junction, between which ways can cross."""
+"""Metres before the stop line, and metres past the junction, between which paths can cross."""
 _CYCLIST_OFFSET = 1.1
-"""Metres to the right of the lane's middle."""
+"""Metres from the lane's middle to the right, where cyclists ride."""
 _KERB_ROOM = 0.7
 """Metres from the kerb to where a pedestrian waits to step onto the road."""
 
@@ -32,7 +32,7 @@ def lane_way(junction: Junction, route: Route, category: str) -> Path:
 
 
 def lane_span(route: Route) -> tuple[float, float]:
-    """From, to: metres along a route where its way may cross others'."""
+    """Where the part of a route that may cross others begins and ends, metres along it."""
     return route.stop_s - _SPAN[0], route.exit_s + _SPAN[1]
 
 
@@ -42,17 +42,17 @@ def middle_of(route: Route) -> float:
 
 
 def road_crossing(spec: RoadSpec, arm: Arm, along: float, side: Side) -> Path:
-    """Straight over an arm's road, from kerb to kerb.
+    """The straight path over an arm's road, from kerb to kerb.
 
     Args:
-        spec: of the junction.
-        arm: which.
+        spec: the junction's layout.
+        arm: which arm.
         along: metres from the junction's middle.
-        side: from where, seen by those who drive towards the junction.
+        side: where it begins, as a driver towards the junction sees it.
     """
     out_x, out_y = OUTWARD[arm]
     beside = spec.road_edge + _KERB_ROOM
-    sign = 1.0 if side == "right" else -1.0  # who drives inward has his right on the outward direction's left
+    sign = 1.0 if side == "right" else -1.0  # the right of a driver inward is the left, seen outward
     left = np.array([-out_y, out_x], dtype=np.float64)
     start = along * np.array([out_x, out_y]) + sign * beside * left
     yaw = float(np.arctan2(-sign * left[1], -sign * left[0]))
@@ -60,7 +60,7 @@ def road_crossing(spec: RoadSpec, arm: Arm, along: float, side: Side) -> Path:
 
 
 def shifted(path: Path, offset: float) -> Path:
-    """The same way, `offset` metres to the left."""
+    """The same path, `offset` metres further to the left."""
     left = np.stack([-np.sin(path.yaw), np.cos(path.yaw)], axis=1)
     return through(path.xy + offset * left)
 
@@ -78,12 +78,12 @@ class Manner:
     """How the drivers of a category drive.
 
     Attributes:
-        acceleration: from standstill, m/s².
-        braking: that they find comfortable, m/s².
-        time_gap: seconds to the one ahead.
+        acceleration: acceleration from standstill, m/s².
+        braking: comfortable braking, m/s².
+        time_gap: seconds to the road user ahead.
         min_gap: metres, bumper to bumper, when standing.
-        lateral: across themselves in a bend, m/s².
-        max_speed: from, to: m/s on a free straight road.
+        lateral: the most sideways acceleration in a bend, m/s².
+        max_speed: least and most speed on a free straight road, m/s.
     """
 
     acceleration: float
@@ -107,21 +107,21 @@ MANNERS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RoadUser:
-    """One who moves.
+    """A road user that moves.
 
     Attributes:
-        role: who it is in the scenario.
+        role: its role in the scenario.
         body: its size and shape.
-        path: of its middle axis.
+        path: the path of its middle axis.
         start: how far along its path its box's centre starts, metres.
-        start_speed: m/s.
-        max_speed: that it reaches on a free straight road, m/s.
-        delay: seconds that it stands before it sets off.
-        route: its way over the junction; None for one that walks.
-        span: from, to: the stretch of its path on which its way may cross others', metres; empty for one that stays
-            on the sidewalk.
+        start_speed: its speed at the start, m/s.
+        max_speed: the speed that it reaches on a free straight road, m/s.
+        delay: seconds that it stands before it starts to move.
+        route: its route over the junction; None for a pedestrian.
+        span: where the part of its path that may cross others begins and ends, metres; empty for a pedestrian who
+            stays on the sidewalk.
         ignores: the rules that it breaks.
-        alert: seconds before a contact at which it notices the one whom it is timed to meet; 0 for never.
+        alert: seconds before a contact at which it notices the other one of the pair; 0 for never.
     """
 
     role: Role
@@ -152,7 +152,7 @@ class RoadUser:
         return 0.0 if self.walks else WHEELBASE * self.body.size[0]
 
     def obeying(self) -> "RoadUser":
-        """The same one, that breaks no rule."""
+        """The same road user, which obeys all rules."""
         return replace(self, ignores=())
 
 

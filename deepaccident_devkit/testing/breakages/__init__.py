@@ -1,4 +1,4 @@
-"""`BREAKAGES`: every named way to break a release, and what the devkit says of each."""
+"""`BREAKAGES`: every named way to break a release, and the devkit's findings for each."""
 
 from collections.abc import Mapping
 from hashlib import sha256
@@ -32,16 +32,17 @@ BREAKAGES: Mapping[str, Breakage] = {breakage.name: breakage for group in _GROUP
 
 
 def break_release(root: Path, name: str, *, scenario: str | None = None) -> BrokenRelease:
-    """Break a release in place: one that this kit made, or any copy that may be lost. Hard links are safe.
+    """Break a release in place: one that this kit made, or any copy that you can lose. Hard links are safe.
 
     Args:
         root: the release's folder.
         name: one of `BREAKAGES`.
-        scenario: token of the scenario to break; the first labelled one if None, an accident if there is any.
+        scenario: token of the scenario to break; None for the first labelled accident, or, if there is none, the first
+            labelled scenario.
 
     Raises:
         ChoiceError: there is no such breakage.
-        ConfigError: the release has no such scenario, or lacks what this breaks.
+        ConfigError: the release has no such scenario, or lacks a part that this breaks.
     """
     breakage = checked_breakage(name)
     editor = _Watched(root, _chosen(root, scenario))
@@ -52,13 +53,13 @@ def break_release(root: Path, name: str, *, scenario: str | None = None) -> Brok
         path = breakage.apply(victim)
     except (FileNotFoundError, LookupError, ValueError) as error:
         raise ConfigError(
-            f"{root}: breaking {name!r} in {editor.token} needs what is not there: {error}; choose a scenario that has "
-            "it whole, or a release as SmallRelease() is"
+            f"{root}: {name!r} cannot break {editor.token}, which lacks a part: {error}; choose a complete scenario, "
+            "or a release such as SmallRelease()"
         ) from error
     if not editor.has_changed():
         raise ConfigError(
-            f"{root}: breaking {name!r} in {editor.token} changes nothing there; choose a scenario that has what it "
-            "breaks, or a release as SmallRelease() is"
+            f"{root}: {name!r} changes nothing in {editor.token}; choose a scenario that has the part that it breaks, "
+            "or a release such as SmallRelease()"
         )
     return BrokenRelease(
         root=root,
@@ -75,20 +76,20 @@ def broken_release(out: Path, name: str, config: SmallRelease | None = None) -> 
     """Write a small release and break its first accident.
 
     Args:
-        out: the folder to make; must not exist or be empty.
+        out: the folder to make; it must be empty, or not exist yet.
         name: one of `BREAKAGES`.
-        config: what the release is like; `SmallRelease()` if None.
+        config: the options of the release; `SmallRelease()` if None.
 
     Raises:
         ChoiceError: there is no such breakage.
-        ConfigError: `out` is a file or holds something, or the wanted release lacks what this breaks.
+        ConfigError: `out` is a file or is not empty, or the wanted release lacks a part that this breaks.
     """
     checked_breakage(name)
     return break_release(write_small_release(out, config), name)
 
 
 def checked_breakage(name: str) -> Breakage:
-    """The breakage of a name. Raises ChoiceError if there is none."""
+    """The breakage with a name. Raises ChoiceError if there is none."""
     if name not in BREAKAGES:
         raise ChoiceError(f"breakage: expected one of {', '.join(BREAKAGES)}, found {name!r}")
     return BREAKAGES[name]
@@ -102,7 +103,7 @@ class _Watched(ScenarioEditor):
         self._before: dict[Path, bytes | None] = {}
 
     def changing(self, path: Path) -> None:
-        """Note what a file holds, the first time."""
+        """Note what a file contains, the first time."""
         if path not in self._before:
             self._before[path] = _digest(path)
 

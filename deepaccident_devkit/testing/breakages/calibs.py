@@ -1,4 +1,4 @@
-"""Calib files that cannot be read, must not be run, or place sensors where they are not."""
+"""Calib files that cannot be read, must not be run, or give sensors wrong places."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ def calib_empty(victim: Victim) -> Path:
 
 @FORM.enter("calib-unreadable")
 def calib_cut(victim: Victim) -> Path:
-    """A calib file ends half-way."""
+    """A calib file ends in the middle."""
     return victim.replace("calib", lambda content: content[: len(content) // 2])
 
 
@@ -48,7 +48,7 @@ def calib_wrong_shape(victim: Victim) -> Path:
 
 @FORM.enter("calib-unreadable")
 def calib_nan(victim: Victim) -> Path:
-    """A pose holds NaN."""
+    """A pose contains NaN."""
     victim.editor.edit_calib(victim.agent, [victim.frame], "ego_to_world", lambda pose: pose * np.nan)
     return victim.file("calib")
 
@@ -63,7 +63,7 @@ def calib_mirrored(victim: Victim) -> Path:
 
 @MEANING.enter("intrinsic-form")
 def calib_wrong_k(victim: Victim) -> Path:
-    """A camera's raw K is in the ordinary order of axes, which is not the release's."""
+    """A camera's raw K has the usual order of axes, not that of the release."""
 
     def ordinary(raw: np.ndarray) -> np.ndarray:
         return np.array([[raw[0, 1], 0, raw[0, 0]], [0, raw[0, 1], raw[1, 0]], [0, 0, 1]])
@@ -74,14 +74,14 @@ def calib_wrong_k(victim: Victim) -> Path:
 
 @MEANING.enter("headings-differ", "own-box-apart", "positions-differ", "speed-off", "velocity-off")
 def calib_inverse(victim: Victim) -> Path:
-    """An agent's poses are the inverse ones: ego from world."""
+    """An agent's poses are inverted: `ego_from_world`."""
     victim.editor.edit_calib(victim.agent, victim.editor.frames, "ego_to_world", np.linalg.inv)
     return victim.editor.folder(victim.agent, "calib")
 
 
 @MEANING.enter("camera-misplaced")
 def calib_cameras_swapped(victim: Victim) -> Path:
-    """Two cameras' extrinsics are swapped in one agent."""
+    """The extrinsics of two cameras of one agent are swapped."""
     keys = ("lidar_to_Camera_FrontLeft", "lidar_to_Camera_BackRight")
     for frame in victim.editor.frames:
         calib = victim.editor.calib(victim.agent, frame)

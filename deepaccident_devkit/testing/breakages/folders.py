@@ -1,4 +1,4 @@
-"""Files and folders that are missing, doubled or misplaced, and split files."""
+"""Files and folders that are missing, there twice or in a wrong place, and split files."""
 
 from pathlib import Path
 
@@ -45,7 +45,7 @@ def frame_number_short(victim: Victim) -> Path:
 
 @BROKEN.enter("agent-unlabelled", "folder-unreadable")
 def folder_is_a_file(victim: Victim) -> Path:
-    """A file stands where an agent's folder of labels belongs."""
+    """A file is where an agent's folder of labels must be."""
     folder = victim.editor.folder(victim.agent, "label")
     victim.editor.remove_folder(folder)
     victim.editor.write(folder, b"")
@@ -54,7 +54,7 @@ def folder_is_a_file(victim: Victim) -> Path:
 
 @BROKEN.enter("two-places")
 def scenario_twice(victim: Victim) -> Path:
-    """A scenario lies in a second split's folder too."""
+    """A scenario is also in the folder of a second split."""
     scenario = victim.editor.scenario
     start = scenario.root / scenario.folder
     copy = scenario.root / ("val" if scenario.folder != "val" else "train")
@@ -74,7 +74,7 @@ def agent_half_unpacked(victim: Victim) -> Path:
 
 @ODD.enter("agent-unlabelled")
 def agent_unlabelled(victim: Victim) -> Path:
-    """An agent has no labels, the others have."""
+    """An agent has no labels, but the others have."""
     folder = victim.editor.folder(victim.agent, "label")
     victim.editor.remove_folder(folder)
     return folder
@@ -82,7 +82,7 @@ def agent_unlabelled(victim: Victim) -> Path:
 
 @ODD.enter("ids-differ", "meta-pair", "own-box-apart", "sizes-differ")
 def agents_swapped(victim: Victim) -> Path:
-    """Two vehicles' folders are swapped wholly."""
+    """All folders of two vehicles are swapped."""
     for kind in ENDINGS:
         for frame in victim.editor.frames:
             files = [victim.editor.file(agent, kind, frame) for agent in (victim.agent, victim.other)]
@@ -111,6 +111,6 @@ def split_file_garbled(victim: Victim) -> Path:
 def split_line_twice(victim: Victim) -> Path:
     """A split file lists a scenario twice."""
     files = (victim.editor.root / f"{split}.txt" for split in SPLITS)
-    path = max(files, key=lambda path: path.stat().st_size)  # those of splits that were not made are empty
+    path = max(files, key=lambda path: path.stat().st_size)  # files of splits that were not made are empty
     victim.editor.write(path, path.read_bytes() * 2)
     return path

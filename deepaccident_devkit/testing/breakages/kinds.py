@@ -13,19 +13,19 @@ Apply = Callable[["Victim"], Path]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Breakage:
-    """One named way in which a release can be broken, or odd though its format allows it.
+    """One named way in which a release can be broken, or unusual though its format allows it.
 
     Attributes:
         name: such as `label-cut`.
-        group: what is broken: `label`, `calib`, `meta`, `sensor`, `release`; `legal` for what a loader must take.
+        group: what is broken: `label`, `calib`, `meta`, `sensor`, `release`; `legal` for what a loader must accept.
         description: one sentence.
-        codes: what `deepaccident validate` says of a small release that is broken so, and not of a healthy one,
-            sorted; none where there is nothing to say.
-        deep: whether it needs `--deep` for that.
+        codes: the codes that `deepaccident validate` finds in a small release with this breakage and not in a healthy
+            one, sorted; empty if it finds none.
+        deep: whether it needs `--deep` to find them.
         opening: the error of `DeepAccident(...)`; None if the release can be opened.
         reading: the error of the reader of the broken file; None if there is no such file, or it can be read.
-        channel: the sensor whose files it needs, None for those that need labels, calib and meta alone.
-        apply: breaks it; returns the file or folder that is broken.
+        channel: the sensor whose files it needs; None if it needs only labels, calib and meta.
+        apply: breaks a scenario; returns the broken file or folder.
     """
 
     name: str
@@ -46,11 +46,11 @@ class BrokenRelease:
     Attributes:
         root: its folder.
         breakage: how it is broken.
-        scenario: token of the scenario that is broken; the others are as they were.
-        agent: the agent whose files are broken, where it is one's.
-        frame: the frame whose files are broken, where it is one's.
-        path: the file or folder that is broken, missing or odd.
-        marker: a folder that a program hidden in the release makes if somebody runs it; must never be there.
+        scenario: token of the broken scenario; the others are unchanged.
+        agent: the agent whose files are broken, if only one agent's are.
+        frame: the frame whose files are broken, if only one frame's are.
+        path: the file or folder that is broken, missing or unusual.
+        marker: a folder that a program hidden in the release makes if somebody runs it; it must never exist.
     """
 
     root: Path
@@ -69,7 +69,7 @@ class Victim:
     Attributes:
         editor: the scenario.
         agent: a vehicle.
-        frame: one amid the scenario.
+        frame: a frame in the middle of the scenario.
         marker: see `BrokenRelease`.
     """
 
@@ -99,7 +99,7 @@ class Victim:
 
 @dataclass(slots=True)
 class Group:
-    """Gathers the breakages of one module, each a function named as the breakage, with its description as docstring."""
+    """Collects the breakages of a module: a function's name is that of the breakage, its docstring the description."""
 
     name: str
     opening: type[ReleaseError] | None = None
@@ -108,7 +108,7 @@ class Group:
     breakages: list[Breakage] = field(default_factory=list)
 
     def enter(self, *codes: str, channel: str | None = None) -> Callable[[Apply], Apply]:
-        """Enter the decorated function, with what `validate` says and the sensor whose files it needs."""
+        """Add the decorated function, with the codes that `validate` finds and the sensor whose files it needs."""
 
         def entered(apply: Apply) -> Apply:
             self.breakages.append(

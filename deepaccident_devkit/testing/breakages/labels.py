@@ -1,4 +1,4 @@
-"""Label files that cannot be read, or say what cannot be."""
+"""Label files that cannot be read, or contain what is impossible."""
 
 from pathlib import Path
 
@@ -27,19 +27,19 @@ def label_empty(victim: Victim) -> Path:
 
 @FORM.enter("label-unreadable")
 def label_garbage(victim: Victim) -> Path:
-    """A label file holds a picture's bytes."""
+    """A label file contains a picture's bytes."""
     return victim.replace("label", lambda _: b"\xff\xd8\xff\xe0\x00\x10JFIF\x00\x01" * 20)
 
 
 @FORM.enter("label-unreadable")
 def label_cut(victim: Victim) -> Path:
-    """A label file ends amid a line."""
+    """A label file ends within a line."""
     return victim.replace("label", lambda content: content[:-25])
 
 
 @FORM.enter("label-unreadable")
 def label_zeros(victim: Victim) -> Path:
-    """The second half of a label file is zero bytes, as a full disk leaves it."""
+    """The second half of a label file is zero bytes, as after a write to a full disk."""
     return victim.replace("label", lambda content: content[: len(content) // 2] + bytes(len(content) // 2))
 
 
@@ -87,7 +87,7 @@ def label_own_row_missing(victim: Victim) -> Path:
 
 @MEANING.enter("duplicate-box", "duplicate-id")
 def label_line_twice(victim: Victim) -> Path:
-    """A box line of a tracked actor stands twice."""
+    """The box line of a tracked actor is there twice."""
     rows = victim.editor.rows(victim.agent, victim.frame)
     victim.editor.write_rows(victim.agent, victim.frame, [*rows, rows[2]])
     return victim.file("label")

@@ -1,4 +1,4 @@
-"""Odd files without a fault: the format allows them, real releases have them, and a loader must read them."""
+"""Unusual files without a fault: the format allows them, real releases have them, and a loader must read them."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ GROUP = Group("legal")
 
 @GROUP.enter()
 def label_windows_lines(victim: Victim) -> Path:
-    """A label file has Windows line ends and blanks at them."""
+    """A label file has Windows line ends, with blanks before them."""
     return victim.replace("label", lambda content: content.replace(b"\n", b" \r\n"))
 
 
@@ -50,7 +50,7 @@ def meta_short(victim: Victim) -> Path:
 
 @GROUP.enter("no-collision-in-accident")
 def meta_no_collision(victim: Victim) -> Path:
-    """The meta file of an accident's folder tells of no collision."""
+    """The meta file in an accident's folder names no collision."""
     first, _, *rest = victim.editor.meta_lines()
     words = first.split()
     victim.editor.write_meta_lines([" ".join([words[0], *["-1"] * 7, words[8]]), " colliding agents: none none", *rest])
@@ -59,7 +59,7 @@ def meta_no_collision(victim: Victim) -> Path:
 
 @GROUP.enter("agent-missing")
 def infrastructure_absent(victim: Victim) -> Path:
-    """A scenario has no infrastructure agent, as one mirror of the release."""
+    """A scenario has no infrastructure agent, like those of one mirror of the release."""
     for kind in ENDINGS:
         victim.editor.remove_folder(victim.editor.folder(INFRASTRUCTURE, kind))
     return victim.editor.folder(INFRASTRUCTURE, "calib")
@@ -67,7 +67,7 @@ def infrastructure_absent(victim: Victim) -> Path:
 
 @GROUP.enter("unlabelled")
 def labels_absent(victim: Victim) -> Path:
-    """A scenario has no labels, BEV arrays and meta, as those of the test split."""
+    """A scenario has no labels, BEV arrays and meta, like those of the test split."""
     for agent in AGENTS:
         for kind in ("label", BEV_CAMERA):
             victim.editor.remove_folder(victim.editor.folder(agent, kind))
@@ -95,7 +95,7 @@ def split_lists_more(victim: Victim) -> Path:
 
 @GROUP.enter()
 def files_stray(victim: Victim) -> Path:
-    """A folder of labels holds what operating systems leave behind."""
+    """A folder of labels has files that operating systems make."""
     folder = victim.editor.folder(victim.agent, "label")
     for name in (".DS_Store", "Thumbs.db", "README"):
         victim.editor.write(folder / name, b"stray")
@@ -104,7 +104,7 @@ def files_stray(victim: Victim) -> Path:
 
 @GROUP.enter(channel=LIDAR)
 def lidar_other_key(victim: Victim) -> Path:
-    """The array of a point cloud has another name than `data`, and is the only one."""
+    """The only array of a point cloud has another name than `data`."""
     points = victim.editor.array(victim.agent, LIDAR, victim.frame)
     victim.editor.write_array(victim.agent, LIDAR, victim.frame, points, key="arr_0")
     return victim.file(LIDAR)
@@ -112,7 +112,7 @@ def lidar_other_key(victim: Victim) -> Path:
 
 @GROUP.enter(channel=LIDAR)
 def lidar_single(victim: Victim) -> Path:
-    """A point cloud is of single precision."""
+    """A point cloud has single precision."""
     points = victim.editor.array(victim.agent, LIDAR, victim.frame)
     victim.editor.write_array(victim.agent, LIDAR, victim.frame, points.astype(np.float32))
     return victim.file(LIDAR)

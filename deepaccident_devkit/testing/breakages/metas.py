@@ -1,4 +1,4 @@
-"""Meta files that cannot be read, or tell another story."""
+"""Meta files that cannot be read, or do not agree with the scenario."""
 
 from pathlib import Path
 
@@ -26,7 +26,7 @@ def meta_empty(victim: Victim) -> Path:
 
 @FORM.enter("meta-unreadable")
 def meta_cut(victim: Victim) -> Path:
-    """A meta file ends amid its first line."""
+    """A meta file ends within its first line."""
     victim.editor.write_meta_lines([victim.editor.meta_lines()[0][:20]])
     return victim.editor.scenario.meta_path
 
@@ -46,11 +46,11 @@ def meta_missing(victim: Victim) -> Path:
 
 @MEANING.enter("meta-frames")
 def meta_frames_wrong(victim: Victim) -> Path:
-    """Meta counts other frames than were recorded."""
+    """The number of frames in meta is not that of the recorded frames."""
     return _edit_first_line(victim, 8, "99")
 
 
 @MEANING.enter("meta-pair", "pair-not-seen")
 def meta_pair_wrong(victim: Victim) -> Path:
-    """Meta names an actor as collider whom no label has."""
+    """Meta names a colliding actor that is in no label."""
     return _edit_first_line(victim, 1, "7777")

@@ -1,4 +1,4 @@
-"""Images, point clouds and BEV arrays that cannot be read, or show something else."""
+"""Images, point clouds and BEV arrays that cannot be read, or show something wrong."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ def _half(content: bytes) -> bytes:
 
 @FORM.enter("sensor-unreadable", channel=CAMERA)
 def image_cut(victim: Victim) -> Path:
-    """An image file ends half-way."""
+    """An image file ends in the middle."""
     return victim.replace(CAMERA, _half)
 
 
@@ -50,7 +50,7 @@ def image_wrong_size(victim: Victim) -> Path:
 
 @FORM.enter("sensor-unreadable", channel=LIDAR)
 def lidar_cut(victim: Victim) -> Path:
-    """An npz file of points ends half-way."""
+    """An npz file of points ends in the middle."""
     return victim.replace(LIDAR, _half)
 
 
@@ -80,13 +80,13 @@ def lidar_right_handed(victim: Victim) -> Path:
 
 @FORM.enter("sensor-unreadable", channel=BEV_CAMERA)
 def bev_cut(victim: Victim) -> Path:
-    """An npz file of the BEV camera ends half-way."""
+    """An npz file of the BEV camera ends in the middle."""
     return victim.replace(BEV_CAMERA, _half)
 
 
 @FORM.enter("sensor-unreadable", channel=BEV_CAMERA)
 def bev_half_size(victim: Victim) -> Path:
-    """A BEV array is of 600 rows and columns."""
+    """A BEV array has 600 rows and columns."""
     picture = victim.editor.array(victim.agent, BEV_CAMERA, victim.frame)
     victim.editor.write_array(victim.agent, BEV_CAMERA, victim.frame, picture[::2, ::2])
     return victim.file(BEV_CAMERA)

@@ -89,7 +89,7 @@ def calib_wrong_shape(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def calib_nan(place: Place, rng: np.random.Generator) -> str:
-    """NaN stands in a matrix."""
+    """A matrix contains NaN."""
 
     def edit(array: np.ndarray) -> np.ndarray:
         broken = array.copy()
@@ -138,7 +138,7 @@ def poses_right_handed(place: Place, rng: np.random.Generator) -> str:
 
 @POSES.kind()
 def all_poses_right_handed(place: Place, rng: np.random.Generator) -> str:
-    """All poses of all agents are right-handed, the labels are not."""
+    """All poses of all agents are right-handed, but the labels are not."""
     for agent in place.agents:
         place.edit_calib(agent, place.frames, "ego_to_world", lambda pose: _LEFT_TO_RIGHT @ pose @ _LEFT_TO_RIGHT)
     return "all agents"
@@ -170,7 +170,7 @@ def rotation_scaled(place: Place, rng: np.random.Generator) -> str:
 
 @POSES.kind()
 def pose_moved(place: Place, rng: np.random.Generator) -> str:
-    """A pose lies 1 m aside at one frame."""
+    """A pose is 1 m too far to one side at one frame."""
     agent, frame = _any_file(place, rng)
     angle = rng.uniform(0, 2 * np.pi)
     place.edit_calib(agent, [frame], "ego_to_world", lambda pose: _shift(np.cos(angle), np.sin(angle)) @ pose)
@@ -188,7 +188,7 @@ def pose_rolled(place: Place, rng: np.random.Generator) -> str:
 
 @POSES.kind()
 def poses_moved(place: Place, rng: np.random.Generator) -> str:
-    """All poses of an agent lie 1 m aside."""
+    """All poses of an agent are 1 m too far to one side."""
     agent, angle = place.any_agent(rng), rng.uniform(0, 2 * np.pi)
     place.edit_calib(agent, place.frames, "ego_to_world", lambda pose: _shift(np.cos(angle), np.sin(angle)) @ pose)
     return agent
@@ -204,7 +204,7 @@ def poses_turned(place: Place, rng: np.random.Generator) -> str:
 
 @POSES.kind(harmless="the world's origin is arbitrary: nothing else in a release says where it is")
 def world_moved(place: Place, rng: np.random.Generator) -> str:
-    """All poses of all agents lie 100 m aside."""
+    """All poses of all agents are 100 m too far to one side."""
     for agent in place.agents:
         place.edit_calib(agent, place.frames, "ego_to_world", lambda pose: _shift(100.0, -50.0) @ pose)
     return "all agents"
@@ -237,7 +237,7 @@ def calib_of_next_frame(place: Place, rng: np.random.Generator) -> str:
 
 @POSES.kind()
 def calibs_shifted(place: Place, rng: np.random.Generator) -> str:
-    """All calib files of a moving agent are one frame early; the last one stands twice."""
+    """All calib files of a moving agent are one frame early; the last one is there twice."""
     agent = place.moving_agent(rng)
     for frame in place.frames[:-1]:
         place.write(place.file(agent, "calib", frame), place.file(agent, "calib", frame + 1).read_bytes())

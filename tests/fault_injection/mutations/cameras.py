@@ -45,7 +45,7 @@ def extrinsic_inverted(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def camera_turned(place: Place, rng: np.random.Generator) -> str:
-    """A camera of an agent looks 10° aside."""
+    """A camera of an agent is turned by 10° to one side."""
     agent, camera = place.any_agent(rng), _camera(rng)
     angle = np.deg2rad(float(rng.choice([-10.0, 10.0])))
     turn = np.eye(4)
@@ -56,7 +56,7 @@ def camera_turned(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def camera_moved_in_a_frame(place: Place, rng: np.random.Generator) -> str:
-    """A camera of an agent is elsewhere by 0.5 m at one frame."""
+    """A camera of an agent is 0.5 m away from its place at one frame."""
     agent, frame, camera = place.any_agent(rng), place.any_frame(rng), _camera(rng)
     move = np.zeros((4, 4))
     move[:3, 3] = rng.permutation([0.5, 0.0, 0.0])
@@ -84,7 +84,7 @@ def focal_scaled_in_a_frame(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def intrinsic_ordinary(place: Place, rng: np.random.Generator) -> str:
-    """A camera's intrinsic has the ordinary order of axes in an agent."""
+    """A camera's intrinsic has the usual order of axes in an agent."""
     agent, camera = place.any_agent(rng), _camera(rng)
 
     def edit(intrinsic: np.ndarray) -> np.ndarray:

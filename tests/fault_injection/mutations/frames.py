@@ -35,13 +35,13 @@ def first_frame_removed(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def middle_frame_removed(place: Place, rng: np.random.Generator) -> str:
-    """A frame amid the scenario is missing in all agents."""
+    """A frame in the middle of the scenario is missing in all agents."""
     return _remove_frame(place, place.agents, place.middle_frame(rng))
 
 
 @GROUP.kind()
 def middle_frame_of_agent_removed(place: Place, rng: np.random.Generator) -> str:
-    """A frame amid the scenario is missing in one agent."""
+    """A frame in the middle of the scenario is missing in one agent."""
     return _remove_frame(place, (place.any_agent(rng),), place.middle_frame(rng))
 
 
@@ -71,7 +71,7 @@ def sensor_file_removed(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def labels_of_agent_removed(place: Place, rng: np.random.Generator) -> str:
-    """One agent has no labels, the others have."""
+    """One agent has no labels, but the others have."""
     agent = place.any_agent(rng)
     place.remove_folder(place.folder(agent, "label"))
     return agent
@@ -87,7 +87,7 @@ def calibs_of_agent_removed(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def file_for_folder(place: Place, rng: np.random.Generator) -> str:
-    """A file stands where an agent's folder of labels belongs."""
+    """A file is where an agent's folder of labels must be."""
     folder = place.folder(place.any_agent(rng), "label")
     place.remove_folder(folder)
     place.write(folder, b"")
@@ -115,7 +115,7 @@ def extra_frame_of_all(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def extra_label(place: Place, rng: np.random.Generator) -> str:
-    """An agent has a label file of a frame that nobody recorded."""
+    """An agent has a label file of a frame that no agent recorded."""
     agent, last = place.any_agent(rng), place.frames[-1]
     place.write(place.file(agent, "label", last + 3), place.file(agent, "label", last).read_bytes())
     return f"{agent} {last + 3}"
@@ -123,7 +123,7 @@ def extra_label(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def extra_image(place: Place, rng: np.random.Generator) -> str:
-    """An agent has an image of a frame that nobody recorded."""
+    """An agent has an image of a frame that no agent recorded."""
     agent, last = place.any_agent(rng), place.frames[-1]
     path = place.file(agent, "Camera_Front", last)
     place.write(place.file(agent, "Camera_Front", last + 1), path.read_bytes())
@@ -141,16 +141,16 @@ def file_renamed(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def file_of_another_scenario(place: Place, rng: np.random.Generator) -> str:
-    """A folder holds a file that bears another scenario's name."""
+    """A folder has a file with another scenario's name."""
     agent, kind, frame = place.any_agent(rng), str(rng.choice(list(ENDINGS))), place.any_frame(rng)
     path = place.file(agent, kind, frame)
     place.write(path.with_name(path.name.replace("scenario0", "scenario9")), path.read_bytes())
     return f"{agent} {kind} {frame}"
 
 
-@GROUP.kind(harmless="operating systems leave such files behind; no reader looks at them")
+@GROUP.kind(harmless="operating systems make such files; no reader opens them")
 def stray_files(place: Place, rng: np.random.Generator) -> str:
-    """Folders hold .DS_Store, Thumbs.db and a note."""
+    """Folders have .DS_Store, Thumbs.db and a note."""
     folder = place.folder(place.any_agent(rng), "label")
     for name in (".DS_Store", "Thumbs.db", "README"):
         place.write(folder / name, b"stray")

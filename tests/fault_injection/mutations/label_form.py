@@ -36,13 +36,13 @@ def label_cut(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def label_cut_between_lines(place: Place, rng: np.random.Generator) -> str:
-    """A label file ends after a line, amid the boxes; each line left is sound."""
+    """A label file ends after one of the box lines; the remaining lines are sound."""
     return _cut_after(place, rng, letters=0)
 
 
 @GROUP.kind()
 def label_cut_in_a_class(place: Place, rng: np.random.Generator) -> str:
-    """A label file ends within a line's first word, and lines of one word are skipped."""
+    """A label file ends within a line's first word; readers skip lines of one word."""
     return _cut_after(place, rng, letters=2)
 
 
@@ -69,7 +69,7 @@ def label_garbage(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def label_zeros(place: Place, rng: np.random.Generator) -> str:
-    """A label file's second half is zero bytes, as a full disk leaves it."""
+    """A label file's second half is zero bytes, as after a write to a full disk."""
     return _replace_file(
         place, rng, lambda content: content[: len(content) // 2] + bytes(len(content) - len(content) // 2)
     )
@@ -83,19 +83,19 @@ def label_field_dropped(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def label_field_added(place: Place, rng: np.random.Generator) -> str:
-    """A line has a field too many."""
+    """A line has one field too many."""
     return _edit_a_line(place, rng, lambda row: row.insert(int(rng.integers(1, len(row))), "0.5"))
 
 
 @GROUP.kind()
 def label_nan(place: Place, rng: np.random.Generator) -> str:
-    """NaN stands in a position, size or yaw."""
+    """A position, size or yaw is NaN."""
     return _edit_a_line(place, rng, lambda row: row.__setitem__(FIELD[str(rng.choice(_NUMBERS))], "nan"))
 
 
 @GROUP.kind()
 def label_infinite(place: Place, rng: np.random.Generator) -> str:
-    """Infinity stands in a position."""
+    """A position is infinite."""
     word = str(rng.choice(["inf", "-inf"]))
     return _edit_a_line(place, rng, lambda row: row.__setitem__(FIELD[str(rng.choice(_NUMBERS[:3]))], word))
 

@@ -83,7 +83,7 @@ def labels_right_handed(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def all_labels_right_handed(place: Place, rng: np.random.Generator) -> str:
-    """All agents' labels are right-handed, the poses are not."""
+    """All agents' labels are right-handed, but the poses are not."""
     for agent in place.agents:
         place.edit_rows(agent, place.frames, _scale("y", "yaw", "vy"))
     return "all agents"
@@ -152,7 +152,7 @@ def size_scaled(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def size_halved_in_a_frame(place: Place, rng: np.random.Generator) -> str:
-    """A box has half its size (as if the file held half lengths) at one frame."""
+    """A box has half its size (as if the file had half lengths) at one frame."""
     (agent, actor), frame = place.shared_actor(rng), place.any_frame(rng)
     place.edit_rows(agent, [frame], _scale("l", "w", "h", by=0.5), actor=actor)
     return f"{agent} {frame}: {actor}"
@@ -168,7 +168,7 @@ def all_sizes_halved(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def positions_offset(place: Place, rng: np.random.Generator) -> str:
-    """All boxes of an agent lie 0.3 m aside."""
+    """All boxes of an agent are 0.3 m too far to one side."""
     agent, way = place.any_agent(rng), _way(rng, 0.3)
     place.edit_rows(agent, place.frames, _add("xy", way))
     return f"{agent}: {way[0]:.2f} {way[1]:.2f}"
@@ -176,7 +176,7 @@ def positions_offset(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def positions_offset_by_a_metre(place: Place, rng: np.random.Generator) -> str:
-    """All boxes of an agent lie 1 m aside."""
+    """All boxes of an agent are 1 m too far to one side."""
     agent, way = place.any_agent(rng), _way(rng, 1.0)
     place.edit_rows(agent, place.frames, _add("xy", way))
     return f"{agent}: {way[0]:.2f} {way[1]:.2f}"
@@ -184,7 +184,7 @@ def positions_offset_by_a_metre(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def heights_of_the_ground(place: Place, rng: np.random.Generator) -> str:
-    """z of an agent's boxes is that of their bottom, not of their centre."""
+    """z of an agent's boxes is at their bottom, not at their centre."""
 
     def edit(row: list[str]) -> None:
         row[FIELD["z"]] = repr(float(row[FIELD["z"]]) - float(row[FIELD["h"]]) / 2)
@@ -196,7 +196,7 @@ def heights_of_the_ground(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def box_moved(place: Place, rng: np.random.Generator) -> str:
-    """A box lies 2 m aside at one frame."""
+    """A box is 2 m too far to one side at one frame."""
     (agent, actor), frame = place.shared_actor(rng), place.any_frame(rng)
     way = _way(rng, 2.0)
     place.edit_rows(agent, [frame], _add("xy", way), actor=actor)
@@ -205,13 +205,13 @@ def box_moved(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def box_moved_lone(place: Place, rng: np.random.Generator) -> str:
-    """A box lies 2 m aside at one frame amid the scenario, and no other agent is there."""
+    """A box is 2 m too far to one side at one frame in the middle of the scenario, and no other agent is there."""
     return _move_lone(place, rng, place.middle_frame(rng))
 
 
-@GROUP.kind(beyond="a collision may throw actors about in the last frames, and nobody else saw them")
+@GROUP.kind(beyond="a collision may move actors suddenly in the last frames, and no other agent saw them")
 def box_moved_lone_at_the_end(place: Place, rng: np.random.Generator) -> str:
-    """A box lies 2 m aside at the last frame, and no other agent is there."""
+    """A box is 2 m too far to one side at the last frame, and no other agent is there."""
     return _move_lone(place, rng, place.frames[-1])
 
 
@@ -223,7 +223,7 @@ def _move_lone(place: Place, rng: np.random.Generator, frame: int) -> str:
 
 @GROUP.kind()
 def box_lifted(place: Place, rng: np.random.Generator) -> str:
-    """A box floats 1.5 m above its place at one frame."""
+    """A box is 1.5 m too high at one frame."""
     (agent, actor), frame = place.shared_actor(rng), place.any_frame(rng)
     place.edit_rows(agent, [frame], _add("z", [1.5]), actor=actor)
     return f"{agent} {frame}: {actor}"
@@ -231,7 +231,7 @@ def box_lifted(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def own_row_moved(place: Place, rng: np.random.Generator) -> str:
-    """The recording agent's own box lies 3 m off at all frames."""
+    """The recording agent's own box is 3 m away from its place at all frames."""
     agent, way = place.vehicle(rng), _way(rng, 3.0)
     place.edit_rows(agent, place.frames, _add("xy", way), actor=OWN_ACTOR_ID)
     return f"{agent}: {way[0]:.2f} {way[1]:.2f}"
@@ -239,7 +239,7 @@ def own_row_moved(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def speed_changed(place: Place, rng: np.random.Generator) -> str:
-    """The header's speed is 5 m/s off at one frame."""
+    """The header's speed is wrong by 5 m/s at one frame."""
     agent, frame = place.vehicle(rng), place.any_frame(rng)
     way = _way(rng, 5.0)
     _change_speeds(place, agent, [frame], way, own_row=False)
@@ -248,7 +248,7 @@ def speed_changed(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def speeds_changed(place: Place, rng: np.random.Generator) -> str:
-    """The speed in header and own line of an agent is 5 m/s off at all frames."""
+    """The speed in header and own line of an agent is wrong by 5 m/s at all frames."""
     agent, way = place.vehicle(rng), _way(rng, 5.0)
     _change_speeds(place, agent, place.frames, way, own_row=True)
     return f"{agent}: {way[0]:.2f} {way[1]:.2f}"

@@ -20,7 +20,7 @@ def _new_id(place: Place) -> int:
 
 @GROUP.kind()
 def line_removed(place: Place, rng: np.random.Generator) -> str:
-    """A near actor that others see too is missing from one agent's label at one frame amid the scenario."""
+    """A near actor that others see too is missing from one agent's label at one frame in the middle of the scenario."""
     (agent, actor), frame = place.shared_actor(rng, within=NEAR), place.middle_frame(rng)
     return _remove_line(place, agent, frame, actor)
 
@@ -34,7 +34,7 @@ def line_removed_at_an_end(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def line_removed_lone(place: Place, rng: np.random.Generator) -> str:
-    """A near actor is missing at one frame amid the scenario, and no other agent is there."""
+    """A near actor is missing at one frame in the middle of the scenario, and no other agent is there."""
     (agent, actor), frame = place.lone_actor(rng), place.middle_frame(rng)
     return _remove_line(place, agent, frame, actor)
 
@@ -57,7 +57,7 @@ def actor_removed(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def line_duplicated(place: Place, rng: np.random.Generator) -> str:
-    """A line stands twice."""
+    """A line is there twice."""
     agent, frame = place.any_agent(rng), place.any_frame(rng)
     rows = place.rows(agent, frame)
     tracked = [row for row in rows[1:] if int(row[_ID]) > 0]
@@ -68,7 +68,7 @@ def line_duplicated(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def boxes_removed(place: Place, rng: np.random.Generator) -> str:
-    """All boxes of one label file are gone, the header stays."""
+    """One label file has lost all boxes, but not its header."""
     agent, frame = place.any_agent(rng), place.middle_frame(rng)
     place.write_rows(agent, frame, place.rows(agent, frame)[:1])
     return f"{agent} {frame}"
@@ -111,7 +111,7 @@ def id_changed_in_a_frame(place: Place, rng: np.random.Generator) -> str:
     return f"{agent} {frame}: {actor} is {new}"
 
 
-@GROUP.kind(harmless="nothing else names that actor, so the new id is as good as the old one")
+@GROUP.kind(harmless="nothing else names that actor, so nothing contradicts the new id")
 def id_changed_lone(place: Place, rng: np.random.Generator) -> str:
     """An actor has a new id at all frames, and no other agent is there."""
     agent, actor = place.lone_actor(rng)
@@ -122,7 +122,7 @@ def id_changed_lone(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def id_twice(place: Place, rng: np.random.Generator) -> str:
-    """Two boxes of one label file carry the same id."""
+    """Two boxes of one label file have the same id."""
     (agent, (one, other)), frame = place.steady_ones(rng, 2), place.any_frame(rng)
     place.edit_rows(agent, [frame], lambda row: _set_id(row, one), actor=other)
     return f"{agent} {frame}: {other} is {one} too"
@@ -130,14 +130,14 @@ def id_twice(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def id_odd(place: Place, rng: np.random.Generator) -> str:
-    """An actor's id is one that the format does not know, in all labels of all agents."""
+    """An actor's id is impossible in the format, in all labels of all agents."""
     (_, actor), new = place.shared_actor(rng), int(rng.choice([-7, 0x7FFFFFFF]))
     for agent in place.agents:
         place.edit_rows(agent, place.frames, lambda row: _set_id(row, new), actor=actor)
     return f"{actor} is {new}"
 
 
-@GROUP.kind(harmless="tracking comes and goes in real labels too: one has an untracked row at 22 m")
+@GROUP.kind(harmless="real labels are not always tracked either: one has an untracked row at 22 m")
 def id_lost(place: Place, rng: np.random.Generator) -> str:
     """A near actor that others track has the id of an untracked one (−1) at one frame."""
     (agent, actor), frame = place.shared_actor(rng, within=NEAR), place.middle_frame(rng)
@@ -147,13 +147,13 @@ def id_lost(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def ids_lost(place: Place, rng: np.random.Generator) -> str:
-    """All ids of others in one agent's labels are those of untracked ones (−1)."""
+    """All other actors are untracked (−1) in one agent's labels."""
     return _lose_ids(place, place.any_agent(rng), list(place.frames))
 
 
 @GROUP.kind()
 def ids_lost_at_one_frame(place: Place, rng: np.random.Generator) -> str:
-    """All ids of others in one label are those of untracked ones (−1)."""
+    """All other actors are untracked (−1) in one label."""
     return _lose_ids(place, place.any_agent(rng), [place.middle_frame(rng)])
 
 
@@ -184,7 +184,7 @@ def own_row_removed_always(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def own_row_duplicated(place: Place, rng: np.random.Generator) -> str:
-    """The recording agent's own line stands twice."""
+    """The recording agent's own line is there twice."""
     agent, frame = place.vehicle(rng), place.any_frame(rng)
     rows = place.rows(agent, frame)
     place.write_rows(agent, frame, [*rows, place.row_of(rows, OWN_ACTOR_ID)])
@@ -193,7 +193,7 @@ def own_row_duplicated(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def own_row_under_true_id(place: Place, rng: np.random.Generator) -> str:
-    """The recording agent's own line carries its actor id instead of −100, at all frames."""
+    """The recording agent's own line has its actor id instead of −100, at all frames."""
     agent = place.vehicle(rng)
     actor = place.agent_ids()[place.agents.index(agent)]
     place.edit_rows(agent, place.frames, lambda row: _set_id(row, actor), actor=OWN_ACTOR_ID)
@@ -211,7 +211,7 @@ def own_row_on_the_pole(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def class_exchanged(place: Place, rng: np.random.Generator) -> str:
-    """A car is a truck, or the like, on one line."""
+    """One line has another class of the same kind, such as truck for car."""
     (agent, actor), frame = place.shared_actor(rng), place.any_frame(rng)
     rows = place.rows(agent, frame)
     row = place.row_of(rows, actor)
@@ -233,7 +233,7 @@ def class_exchanged_lone(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def class_against_size(place: Place, rng: np.random.Generator) -> str:
-    """A car is a pedestrian and a pedestrian a car in all labels of all agents; the sizes stay."""
+    """Cars are pedestrians and pedestrians are cars in all labels of all agents; sizes do not change."""
     _, actor = place.shared_actor(rng)
     old = next(
         row[0] for agent in place.agents for row in place.rows(agent, place.frames[0])[1:] if int(row[_ID]) == actor
@@ -255,7 +255,7 @@ def label_of_next_frame(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def labels_shifted(place: Place, rng: np.random.Generator) -> str:
-    """All labels of a moving agent are one frame early; the last one stands twice."""
+    """All labels of a moving agent are one frame early; the last one is there twice."""
     agent = place.moving_agent(rng)
     for frame in place.frames[:-1]:
         place.write(place.file(agent, "label", frame), place.file(agent, "label", frame + 1).read_bytes())
@@ -264,7 +264,7 @@ def labels_shifted(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def labels_shifted_on_the_pole(place: Place, rng: np.random.Generator) -> str:
-    """All labels of the standing infrastructure are one frame early; the last one stands twice."""
+    """All labels of the standing infrastructure are one frame early; the last one is there twice."""
     for frame in place.frames[:-1]:
         content = place.file("infrastructure", "label", frame + 1).read_bytes()
         place.write(place.file("infrastructure", "label", frame), content)
@@ -299,7 +299,7 @@ def labels_of_two_agents_exchanged_always(place: Place, rng: np.random.Generator
 
 @GROUP.kind(deep=True)
 def points_changed(place: Place, rng: np.random.Generator) -> str:
-    """A box's number of LiDAR points is another one."""
+    """A box's number of LiDAR points is wrong."""
     agent, frame = place.any_agent(rng), place.any_frame(rng)
     rows = place.rows(agent, frame)
     row = place.any_row(rng, rows)
@@ -319,9 +319,9 @@ def points_negative(place: Place, rng: np.random.Generator) -> str:
     return f"{agent} {frame}"
 
 
-@GROUP.kind(harmless="no other file says what a camera sees; telling it needs a renderer")
+@GROUP.kind(harmless="no other file says what a camera sees; only a renderer could find it")
 def visible_flipped(place: Place, rng: np.random.Generator) -> str:
-    """A box's camera_visible is the other one."""
+    """A box's camera_visible is wrong."""
     agent, frame = place.any_agent(rng), place.any_frame(rng)
     rows = place.rows(agent, frame)
     row = place.any_row(rng, rows)

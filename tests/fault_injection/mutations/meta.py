@@ -48,7 +48,7 @@ def meta_cut(place: Place, rng: np.random.Generator) -> str:
     return f"ends in {shorter[-20:]!r}"
 
 
-@GROUP.kind(harmless="real meta files too can lack their last four lines (docs/format.md, Meta)")
+@GROUP.kind(harmless="real meta files can lack their last four lines too (docs/format.md, Meta)")
 def meta_last_lines_removed(place: Place, rng: np.random.Generator) -> str:
     """The meta file ends after its third line."""
     _write(place, place.meta_lines()[:3])
@@ -78,7 +78,7 @@ def meta_frames_changed(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind(only="accident")
 def meta_pair_unknown(place: Place, rng: np.random.Generator) -> str:
-    """A colliding actor's id is one that no label has."""
+    """A colliding actor's id is in no label."""
     return _set_word(place, int(rng.choice([1, 3])), "19876")
 
 
@@ -98,7 +98,7 @@ def meta_pair_far_away(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind(only="accident")
 def meta_colliding_agents(place: Place, rng: np.random.Generator) -> str:
-    """The colliding agents are other ones than the colliding ids."""
+    """The colliding agents are not those of the colliding ids."""
     line = next(line for line in place.meta_lines() if "colliding agents:" in line)
     pairs = ["ego other", "ego_behind other_behind", "ego other_behind", "ego_behind other"]
     others = [pair for pair in pairs if set(pair.split()) != set(line.split(":")[1].split())]
@@ -125,9 +125,9 @@ def meta_impact_nan(place: Place, rng: np.random.Generator) -> str:
     return _set_word(place, 5, "nan")
 
 
-@GROUP.kind(only="accident", harmless="an accident folder can hold one without a collision (docs/format.md, Meta)")
+@GROUP.kind(only="accident", harmless="a scenario in an accident folder can have no collision (docs/format.md, Meta)")
 def meta_collision_dropped(place: Place, rng: np.random.Generator) -> str:
-    """The meta file of an accident tells of no collision."""
+    """The meta file of an accident names no collision."""
     words = place.meta_lines()[0].split()
     _write(
         place, [" ".join([words[0], *["-1"] * 7, words[8]]), " colliding agents: none none", *place.meta_lines()[2:]]
@@ -137,7 +137,7 @@ def meta_collision_dropped(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind(only="normal")
 def meta_of_twin(place: Place, rng: np.random.Generator) -> str:
-    """A normal scenario has its accident twin's meta file."""
+    """A normal scenario has the meta file of its accident twin."""
     twin = place.root / "type1_subtype1_accident" / "meta" / place.scenario.meta_path.name
     place.write(place.scenario.meta_path, twin.read_bytes())
     return "the twin's"
@@ -145,7 +145,7 @@ def meta_of_twin(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def meta_agent_ids_permuted(place: Place, rng: np.random.Generator) -> str:
-    """The agents' ids stand in another order."""
+    """The agents' ids are in another order."""
     ids = place.agent_ids()
     one, other = rng.choice(4, size=2, replace=False)
     ids[one], ids[other] = ids[other], ids[one]
@@ -154,7 +154,7 @@ def meta_agent_ids_permuted(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def meta_agent_id_changed(place: Place, rng: np.random.Generator) -> str:
-    """An agent's id is another number."""
+    """An agent's id is a wrong number."""
     ids = place.agent_ids()
     ids[rng.integers(4)] += 700
     return _set_entry(place, "agents id", " ".join(map(str, ids)))

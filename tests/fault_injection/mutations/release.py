@@ -61,7 +61,7 @@ def scenario_in_no_split(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def scenario_in_two_folders(place: Place, rng: np.random.Generator) -> str:
-    """The scenario lies in a split folder too (layout B)."""
+    """The scenario is in a split folder too (layout B)."""
     for path in _files(place):
         place.write(place.root / "val" / path.relative_to(place.root), path.read_bytes())
     return "copied to val/"
@@ -95,7 +95,7 @@ def split_lists_absent_scenario(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind()
 def agents_exchanged(place: Place, rng: np.random.Generator) -> str:
-    """Two vehicles' folders are exchanged wholly."""
+    """All folders of two vehicles are exchanged."""
     one, other = (str(agent) for agent in rng.choice(place.agents[:4], size=2, replace=False))
     for kind in ENDINGS:
         for frame in place.frames:
@@ -103,9 +103,9 @@ def agents_exchanged(place: Place, rng: np.random.Generator) -> str:
     return f"{one} and {other}"
 
 
-@GROUP.kind(harmless="a partial download: a scenario with an agent wholly absent is good (docs/format.md, Tree)")
+@GROUP.kind(harmless="a partial download: a scenario without one of the agents is valid (docs/format.md, Tree)")
 def agent_removed(place: Place, rng: np.random.Generator) -> str:
-    """An agent is wholly absent."""
+    """All files of an agent are absent."""
     agent = place.any_agent(rng)
     for kind in ENDINGS:
         place.remove_folder(place.folder(agent, kind))
@@ -114,7 +114,7 @@ def agent_removed(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind(harmless="a partial download: users unpack some sensors only (docs/format.md, Tree)")
 def sensor_removed(place: Place, rng: np.random.Generator) -> str:
-    """A sensor of all agents is wholly absent."""
+    """All files of one sensor are absent in all agents."""
     channel = str(rng.choice(CHANNELS))
     for agent in place.agents:
         place.remove_folder(place.folder(agent, channel))
@@ -123,14 +123,14 @@ def sensor_removed(place: Place, rng: np.random.Generator) -> str:
 
 @GROUP.kind(harmless="a partial download: users unpack some sensors only (docs/format.md, Tree)")
 def all_sensors_removed(place: Place, rng: np.random.Generator) -> str:
-    """All sensors of all agents are absent: labels and calib alone."""
+    """All sensors of all agents are absent; only labels and calib are there."""
     for agent in place.agents:
         for channel in CHANNELS:
             place.remove_folder(place.folder(agent, channel))
     return "labels and calib stay"
 
 
-@GROUP.kind(harmless="the real test split ships without labels, BEV arrays and sometimes meta (docs/format.md, Tree)")
+@GROUP.kind(harmless="the real test split has no labels, no BEV arrays and sometimes no meta (docs/format.md, Tree)")
 def test_labels_removed(place: Place, rng: np.random.Generator) -> str:
     """The scenario is of the test split, as its twin is, and has no labels, no BEV arrays and no meta."""
     line = _line(place)
@@ -145,9 +145,9 @@ def test_labels_removed(place: Place, rng: np.random.Generator) -> str:
     return "moved to test.txt"
 
 
-@GROUP.kind(harmless="split files can lie in their own folder (docs/format.md, Tree)")
+@GROUP.kind(harmless="split files can be in their own folder (docs/format.md, Tree)")
 def split_files_moved(place: Place, rng: np.random.Generator) -> str:
-    """The split files lie under split_txt_files/."""
+    """The split files are under split_txt_files/."""
     for path in sorted(place.root.glob("*.txt")):
         place.write(place.root / "split_txt_files" / path.name, path.read_bytes())
         place.remove(path)

@@ -14,8 +14,8 @@ LIDARS = Group("lidar", deep=True)
 BEVS = Group("bev camera", deep=True)
 _FAR_APART = 3
 """Frames between two pictures that are to differ visibly."""
-_LOOK = "it takes somebody who looks at the pictures: each is sound, and none stands twice in the scenario"
-_WALL = "a wall or a lorry that fills the view looks the same"
+_LOOK = "only a person who looks at the pictures can find it: each file is sound, and no two in the scenario are equal"
+_WALL = "a wall or a truck that fills the view looks the same"
 
 
 def _camera(rng: np.random.Generator) -> str:
@@ -99,7 +99,7 @@ def image_emptied(place: Place, rng: np.random.Generator) -> str:
 
 @IMAGES.kind()
 def image_zeros(place: Place, rng: np.random.Generator) -> str:
-    """A stretch of an image's coded data is zero bytes, which decoders pass over."""
+    """A part of an image's coded data is zero bytes; decoders do not report this."""
 
     def change(content: bytes) -> bytes:
         start = content.index(b"\xff\xda") + 14
@@ -124,7 +124,7 @@ def image_size(place: Place, rng: np.random.Generator) -> str:
 
 @IMAGES.kind(beyond=_WALL)
 def image_grey(place: Place, rng: np.random.Generator) -> str:
-    """An image is one grey."""
+    """All of an image has one grey."""
     return _replace_file(place, rng, _camera(rng), lambda content: _jpeg(np.full_like(_pixels(content), 128)))
 
 
@@ -151,7 +151,7 @@ def image_of_frame(place: Place, rng: np.random.Generator) -> str:
 
 @IMAGES.kind(beyond=_LOOK)
 def image_of_twin(place: Place, rng: np.random.Generator) -> str:
-    """An image is that of another agent and frame of the scenario's twin."""
+    """An image is replaced by one of another agent and frame from the scenario's twin."""
     twins = {"accident": "normal", "normal": "accident"}
     kind = place.scenario.scenario_type.rsplit("_", 1)[1]
     (agent, other), (frame, other_frame), camera = place.two_agents(rng), _two_frames(place, rng), _camera(rng)
@@ -207,7 +207,7 @@ def lidar_emptied(place: Place, rng: np.random.Generator) -> str:
 
 @LIDARS.kind()
 def lidar_bit_flipped(place: Place, rng: np.random.Generator) -> str:
-    """A byte amid a point cloud's file is another one."""
+    """A byte in the middle of a point cloud's file is wrong."""
 
     def change(content: bytes) -> bytes:
         middle = int(rng.integers(len(content) // 4, 3 * len(content) // 4))
@@ -242,7 +242,7 @@ def lidar_without_points(place: Place, rng: np.random.Generator) -> str:
 
 @LIDARS.kind()
 def lidar_halved(place: Place, rng: np.random.Generator) -> str:
-    """Half of a cloud's points are gone."""
+    """Half of a cloud's points are missing."""
     return _replace_array(place, rng, LIDAR, lambda points: points[: len(points) // 2])
 
 
@@ -260,7 +260,7 @@ def lidar_of_frame(place: Place, rng: np.random.Generator) -> str:
 
 @LIDARS.kind()
 def lidars_shifted(place: Place, rng: np.random.Generator) -> str:
-    """All point clouds of a moving agent are one frame early; the last one stands twice."""
+    """All point clouds of a moving agent are one frame early; the last one is there twice."""
     agent = place.moving_agent(rng)
     for frame in place.frames[:-1]:
         place.write(place.file(agent, LIDAR, frame), place.file(agent, LIDAR, frame + 1).read_bytes())

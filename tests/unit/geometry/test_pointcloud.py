@@ -71,7 +71,7 @@ def test_remove_close_cuts_a_circle_around_the_sensor(cloud: LidarPointCloud) ->
     assert rows(cloud.remove_close(1, sensor=(10, -2, -7))) == [0, 1, 2, 3]
     in_world = cloud.transform(SE3.from_yaw(0, (100, 0, 0)), "world")
     assert rows(in_world.remove_close(1.5, sensor=(100, 0, 2))) == [2, 3, 4]
-    with pytest.raises(GeometryError, match=r"does not know its sensor; give sensor=\(x, y, z\)"):
+    with pytest.raises(GeometryError, match=r"does not know its sensor; give sensor=\(x, y, z\), or .* frame='lidar'"):
         in_world.remove_close(1.5)
     with pytest.raises(GeometryError, match="radius: expected metres from 0 on, found -1"):
         cloud.remove_close(-1)

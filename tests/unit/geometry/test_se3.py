@@ -150,6 +150,8 @@ def test_what_cannot_be_moved_is_refused(points: object) -> None:
 
 def test_other_misuse_says_what_to_give(boxes: Boxes) -> None:
     pose = SE3.identity()
+    with pytest.raises(GeometryError, match=r"points: .*, found \(3, 8\); transpose it \(\.T\)$"):
+        SE3.identity().apply(np.zeros((3, 8)))
     with pytest.raises(GeometryError, match=r"found \(4, 4\); of a matrix \(4, 4\) make SE3"):
         pose @ np.eye(4)
     with pytest.raises(GeometryError, match=r"vectors: expected shape \(…, 3\), found \(3, 2\)"):

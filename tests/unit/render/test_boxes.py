@@ -9,6 +9,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.quiver import Quiver
 from numpy.testing import assert_allclose
 
+from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import SE3, Box, Boxes, PinholeCamera
 from deepaccident_devkit.render import draw_box
 from deepaccident_devkit.render.boxes import (
@@ -90,6 +91,8 @@ def test_a_line_leads_to_the_front_and_each_box_has_its_colour() -> None:
 def test_one_box_is_drawn_in_its_category_s_colour_or_the_one_given() -> None:
     box, ax = Box(boxes().select([1])), new_axes()
     assert draw_box(box, ax) is ax
+    with pytest.raises(GeometryError, match=r"box: expected a Box, found Axes; .*: draw_box\(box, ax\)"):
+        draw_box(ax, box)  # type: ignore[arg-type]
     draw_box(box, ax, RED)
     first, second = ax.collections[0], ax.collections[2]
     assert_allclose(first.get_paths()[0].vertices[:4], box.bottom_corners()[:2].T)

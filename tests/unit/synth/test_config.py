@@ -19,7 +19,7 @@ from deepaccident_devkit.synth import SynthConfig
         ("layout", "C", "layout: expected one of A, B, found 'C'"),
         ("view", "close", "view: expected one of open, hidden, found 'close'"),
         ("designs", (1, 13), "designs: 13 is not possible; choose a number from 1 to 12"),
-        ("unplanned", 1.5, "unplanned: 1.5 is no share; choose a number from 0 to 1"),
+        ("unplanned", 1.5, "unplanned: 1.5 is not a share; choose a number from 0 to 1"),
     ],
 )
 def test_what_cannot_be_made_is_refused(field, value, sentence):
@@ -49,12 +49,12 @@ def test_a_release_for_the_released_code_has_its_images_and_its_layout():
 @pytest.mark.parametrize(
     ("field", "value", "sentence"),
     [
-        ("image_size", (480, 270), "takes every image for one of 1600x900, found 480x270; leave one of the two out"),
+        ("image_size", (480, 270), "expects images of 1600x900, found 480x270; leave one of the two out"),
         ("layout", "B", "looks for all splits in one folder, layout A, found B; leave one of the two out"),
         (
             "unlabelled_test",
             True,
-            "finds the frames of each split, test too, by their labels; leave one of the two out",
+            "finds the frames of each split by their labels, those of test too; leave one of the two out",
         ),
     ],
 )

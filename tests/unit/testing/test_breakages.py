@@ -113,9 +113,9 @@ def test_what_cannot_be_broken(make_deepaccident_release, tmp_path: Path) -> Non
     with pytest.raises(ChoiceError, match=r"breakage: expected one of label-empty, .*found 'label-purple'"):
         broken_release(tmp_path / "release", "label-purple")
     assert not (tmp_path / "release").exists()
-    with pytest.raises(ConfigError, match=r"breaking 'lidar-cut' in .* needs what is not there: .*npz"):
+    with pytest.raises(ConfigError, match=r"'lidar-cut' cannot break .*, which lacks a part: .*npz"):
         broken_release(tmp_path / "release", "lidar-cut", BARE)
-    with pytest.raises(ConfigError, match="needs what is not there: a second vehicle that records; choose a scenario"):
+    with pytest.raises(ConfigError, match="which lacks a part: a second vehicle that records; choose a complete"):
         broken_release(tmp_path / "one", "agents-swapped", SmallRelease(agents=("ego_vehicle",), channels=()))
     with pytest.raises(ConfigError, match="has no labelled scenario to break"):
         broken_release(tmp_path / "test", "lidar-cut", SmallRelease(splits=("test",), frames=1, channels=()))
@@ -132,7 +132,7 @@ def test_what_cannot_be_broken(make_deepaccident_release, tmp_path: Path) -> Non
 )
 def test_a_release_that_would_stay_whole_is_not_called_broken(tmp_path: Path, name: str, options) -> None:
     config = SmallRelease(splits=("val",), channels=(), **options)
-    with pytest.raises(ConfigError, match=f"breaking '{name}' in .*_accident/.* changes nothing there; choose"):
+    with pytest.raises(ConfigError, match=f"'{name}' changes nothing in .*_accident/.*; choose"):
         broken_release(tmp_path / "release", name, config)
 
 
@@ -142,7 +142,7 @@ def test_a_release_that_would_stay_whole_is_not_called_broken(tmp_path: Path, na
 )
 def test_what_is_broken_already_may_be_too_broken_for_more(tmp_path: Path, first: str, then: str) -> None:
     root = broken_release(tmp_path / "release", first, BARE).root
-    with pytest.raises(ConfigError, match=f"breaking '{then}' in .* needs what is not there"):
+    with pytest.raises(ConfigError, match=f"'{then}' cannot break .*, which lacks a part"):
         break_release(root, then)
 
 

@@ -1,7 +1,7 @@
 """What each pixel shows: rays to every second pixel, and to all pixels where neighbours show different surfaces.
 
-Between two pixels that show the same flat face lies that face, and the inverse of its depth changes evenly. Where an
-outline runs, two rays a pixel are cast, and the picture's colour is their mean.
+The pixels between two that show the same flat face show this face too, and the inverse of its depth changes linearly.
+On outlines, two rays are cast for each pixel, and its colour is their mean.
 """
 
 from dataclasses import dataclass
@@ -22,11 +22,11 @@ _COLUMNS = 256
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rays:
-    """Pixels of any arrangement (R, C) and what they show.
+    """Pixels in any arrangement (R, C) and what they show.
 
     Attributes:
-        right: how far their rays go right, a metre ahead; broadcasts to (R, C).
-        down: likewise down.
+        right: how far to the right their rays are one metre ahead, metres; broadcasts to (R, C).
+        down: how far down they are there, in the same way.
         face: (R, C) as in `Scene.cast`.
         depth: (R, C) float32, metres along the camera's axis; infinite for the sky.
     """
@@ -42,9 +42,9 @@ class Buffers:
     """What a camera sees.
 
     Attributes:
-        all: every pixel, (H, W); on outlines, what the first of its rays meets.
-        outline: (E,) rows of the pixels on outlines, of H · W.
-        fine: the rays of these, two of a pixel after each other, (R, 256), filled up at the end.
+        all: every pixel, (H, W); a pixel on an outline shows what the first of its rays meets.
+        outline: (E,) rows, of H · W, of the pixels on outlines.
+        fine: the two rays of each of these pixels, next to each other, (R, 256), padded at the end.
     """
 
     all: Rays
@@ -76,14 +76,14 @@ def look(scene: Scene, camera: Camera, ground_from_camera: SE3) -> Buffers:
 
 
 def slopes(camera: Camera, column: AnyArray, row: AnyArray) -> tuple[Float32Array, Float32Array]:
-    """How far the rays through pixels' middles go right and down, a metre ahead, for columns and for rows."""
+    """How far right and down the rays through pixels' middles are one metre ahead, for columns and for rows."""
     (focal, _, cx), (_, _, cy) = camera.optics.intrinsic[0], camera.optics.intrinsic[1]
     right, down = (column + 0.5 - cx) / focal, (row + 0.5 - cy) / focal
     return right.astype(np.float32), down.astype(np.float32)
 
 
 def ray_directions(ground_from_camera: SE3, right: Float32Array, down: Float32Array) -> Float32Array:
-    """Directions (…, 3) float32 in the ground frame, a metre ahead; distances along them are depths."""
+    """Directions (…, 3) float32 in the ground frame, of one metre ahead, so that distances along them are depths."""
     axes = ground_from_camera.rotation.astype(np.float32)
     rays = np.empty((*np.broadcast_shapes(right.shape, down.shape), 3), dtype=np.float32)
     for axis in range(3):
@@ -92,7 +92,7 @@ def ray_directions(ground_from_camera: SE3, right: Float32Array, down: Float32Ar
 
 
 def _spread(coarse: IntArray, height: int, width: int) -> tuple[IntArray, NDArray[np.bool_]]:
-    """The faces of all pixels (H, W), and where they are not sure: the corners of a square of 2 × 2 differ."""
+    """The faces of all pixels (H, W), and where they are not certain: the corners of a square of 2 × 2 differ."""
     same = coarse[:-1, :-1] == coarse[1:, :-1]
     same &= coarse[:-1, :-1] == coarse[:-1, 1:]
     same &= coarse[:-1, :-1] == coarse[1:, 1:]
@@ -101,7 +101,7 @@ def _spread(coarse: IntArray, height: int, width: int) -> tuple[IntArray, NDArra
 
 
 def _interpolated(depth: Float32Array, height: int, width: int) -> Float32Array:
-    """Depths of all pixels (H, W) from those of every second: the inverse of a plane's depth is linear."""
+    """Depths of all pixels (H, W) from those of every second pixel: the inverse of a plane's depth is linear."""
     inverse = 1 / depth
     full = np.empty((2 * (len(inverse) - 1), 2 * (inverse.shape[1] - 1)), dtype=np.float32)
     full[::2, ::2] = inverse[:-1, :-1]
@@ -114,7 +114,7 @@ def _interpolated(depth: Float32Array, height: int, width: int) -> Float32Array:
 
 
 def _fine(scene: Scene, camera: Camera, ground_from_camera: SE3, outline: IntArray, movers: Float32Array) -> Rays:
-    """Two rays to each pixel of `outline`; `movers` as `nearest_movers` gives them."""
+    """Two rays for each pixel of `outline`; `movers` comes from `nearest_movers`."""
     row, column = np.divmod(outline, camera.optics.width)
     offsets = np.array(_SUBPIXELS)
     right, down = slopes(camera, column[:, None] + offsets[:, 0], row[:, None] + offsets[:, 1])

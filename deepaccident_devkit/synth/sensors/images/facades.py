@@ -11,9 +11,9 @@ from deepaccident_devkit.synth.sensors.setting import Surfaces
 from deepaccident_devkit.synth.stage import STOREY
 
 _BAY = 2.6
-"""About as many metres between columns of windows: a façade has a whole number of these."""
+"""Approximate distance between columns of windows, metres: each façade has a whole number of columns."""
 _BAY_SPAN, _STOREY_SPAN = (0.25, 0.75), (0.32, 0.8)
-"""From, to: the shares of a bay and of a storey that its window takes."""
+"""Where a window begins and ends, as shares of its column and of its storey."""
 _FLOOR = 0.6
 """Metres from a façade's lower edge, which is in the ground, to its lowest storey."""
 _LIT = (236, 206, 132)
@@ -22,7 +22,7 @@ _LIT_OF_FIVE = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Facades:
-    """Where the façades among F faces are; they are parallel to an axis, and x + y runs along them.
+    """Where the façades among F faces are; they are parallel to an axis, so x + y grows along them.
 
     Attributes:
         start: (F,) float32, x + y where each begins, metres; 0 for other faces.
@@ -40,7 +40,7 @@ class OnFacades(NamedTuple):
 
     Attributes:
         pixel: (N,) rows of the pixels, of R · C.
-        face: (N,) what they show.
+        face: (N,) the faces that they show.
         across: (N,) metres along the façade from its beginning.
         up: (N,) metres above its lower edge.
     """
@@ -63,13 +63,13 @@ def facades_of(surfaces: Surfaces) -> Facades:
 def on_facades(
     shown: BoolArray, face: IntArray, xyz: tuple[Float32Array, Float32Array, Float32Array], facades: Facades
 ) -> OnFacades:
-    """Where on which façade pixels are.
+    """The façade of each pixel, and its place on the façade.
 
     Args:
         shown: (R, C) whether pixels show a façade.
-        face: (R, C) what they show.
-        xyz: of what they show, (R, C) metres each.
-        facades: where these begin.
+        face: (R, C) the faces that they show.
+        xyz: x, y and z of the points that they show, (R, C) metres each.
+        facades: where façades begin.
     """
     x, y, z = xyz
     pixel = np.flatnonzero(shown)
@@ -84,8 +84,8 @@ def windows_on(picture: ByteArray, places: OnFacades, facades: Facades, colors: 
     Args:
         picture: (R, C, 3).
         places: the pixels that show façades.
-        facades: where these begin.
-        colors: of the faces.
+        facades: where façades begin.
+        colors: the colours of the faces.
         lit: whether two of five windows shine.
     """
     if not len(places.pixel):

@@ -1,4 +1,4 @@
-"""The ground as pictures of falling resolution, with the shadows on it, and looked up at points."""
+"""The ground with its shadows, as pictures of lower and lower resolution, and its colours at points."""
 
 from dataclasses import dataclass
 
@@ -23,22 +23,22 @@ _COLORS = {
 _GRAIN = 5.0
 """Standard deviation of the ground's brightness from cell to cell."""
 _PATCHES = 5.0
-"""Likewise over some metres."""
+"""Standard deviation of the ground's brightness over some metres."""
 _TILE = 500
 LEVELS, SHRINK = 3, 4
 """How many pictures there are, and how much coarser each is than the one before."""
 _CLOSE_BY = ((0.35, 0.8), (0.1, 0.65))
-"""Shadow of the sky below and around a vehicle: metres beyond its box, and the brightness that is left."""
+"""Shadows of the sky's light below and around a vehicle: metres beyond its box, and the remaining brightness."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ground:
-    """Pictures of all the map, fine to coarse, (3000, 3000, 3), (750, 750, 3), … uint8, cells as in `GroundMap`."""
+    """Pictures of the whole map, fine to coarse, (3000, 3000, 3), (750, 750, 3), … uint8, cells as in `GroundMap`."""
 
     levels: tuple[ByteArray, ...]
 
     def at(self, x: Float32Array, y: Float32Array, level: int) -> ByteArray:
-        """Colours (R, C, 3) at points (R, C) each, metres; beyond the map as at its corner."""
+        """Colours (R, C, 3) at points `x` and `y`, (R, C) metres; beyond the map, the colour of its corner."""
         import cv2
 
         picture = self.levels[level]
@@ -57,7 +57,7 @@ class Ground:
 
 
 def still_ground(setting: Setting, light: Light, rng: np.random.Generator) -> ByteArray:
-    """The ground with the shadows of all that stands still, (3000, 3000, 3) uint8; `rng` grains it."""
+    """The ground with the shadows of all that stands still, (3000, 3000, 3) uint8; `rng` draws its grain."""
     lit = light.sky + light.sun * light.to_sun[2]
     plain = _picture(setting.world.ground, lit, light.wet_ground, rng)
     corners = above_ground(setting.still.corners, setting.terrain)
@@ -65,7 +65,7 @@ def still_ground(setting: Setting, light: Light, rng: np.random.Generator) -> By
 
 
 def ground_of(still: ByteArray, scene: Scene, light: Light) -> Ground:
-    """The ground at a moment: with the shadows of those who move, and a dark rim around every vehicle."""
+    """The ground at a moment: with the shadows of moving road users, and a dark edge around every vehicle."""
     import cv2
 
     corners = above_ground(scene.movers.corners[scene.movers.solids.main], scene.setting.terrain)

@@ -1,4 +1,4 @@
-"""Lamps: light of headlamps on the ground and on what is low above it, and which lamps of the traffic lights shine."""
+"""Lamps: the light of headlamps on the ground and on low things, and which lamps of the traffic lights shine."""
 
 from collections.abc import Mapping
 
@@ -14,7 +14,7 @@ from deepaccident_devkit.taxonomy import CATEGORIES
 _CELLS = 600
 _CELL = 2 * MAP_EXTENT / _CELLS
 _BEAM, _SPREAD = 32.0, 0.3
-"""Metres that a beam reaches ahead of a vehicle, and its half width a metre ahead."""
+"""How far a beam reaches ahead of a vehicle, metres, and half its width for each metre ahead."""
 _BEAM_LIGHT, _LANTERN_LIGHT, _LANTERN_REACH = 0.55, 0.22, 16.0
 _WITH_LAMPS = tuple(CATEGORIES.index(name) for name in ("car", "van", "truck", "motorcycle"))
 
@@ -22,7 +22,7 @@ _WITH_LAMPS = tuple(CATEGORIES.index(name) for name in ("car", "van", "truck", "
 def lamplight(scene: Scene) -> Float32Array:
     """Light on the ground, (600, 600), cells of 0.5 m, row = y, column = x; 1 is as bright as noon.
 
-    All moving vehicles have a wide beam ahead and a little light behind them; lanterns stand in a pool of light.
+    All moving vehicles have a wide beam ahead and a little light behind them; lanterns have light around them.
     """
     import cv2
 
@@ -37,7 +37,7 @@ def lamplight(scene: Scene) -> Float32Array:
 
 
 def light_at(lit: Float32Array, x: Float32Array, y: Float32Array) -> Float32Array:
-    """The light (R, C) at points (R, C) each, metres; none beyond the map."""
+    """The light (R, C) at points `x` and `y`, (R, C) metres; 0 beyond the map."""
     import cv2
 
     scale, shift = np.float32(1 / _CELL), np.float32(MAP_EXTENT / _CELL - 0.5)
@@ -64,7 +64,7 @@ def _add_pool(lit: Float32Array, x: float, y: float) -> None:
 
 
 def _around(x: float, y: float, reach: float) -> tuple[slice, slice, AnyArray, AnyArray]:
-    """Cells within `reach` metres of a point: rows, columns, and how far east (1, C) and north (R, 1) they lie."""
+    """Cells up to `reach` metres from a point: rows, columns, and how far east (1, C) and north (R, 1) they lie."""
     spans = []
     for middle in (y, x):
         first, last = ((middle + side * reach + MAP_EXTENT) / _CELL for side in (-1, 1))
@@ -82,7 +82,7 @@ def lit_lamps(world: World, signals: Mapping[Arm, int]) -> dict[int, Color]:
 
     Args:
         world: where the lights stand.
-        signals: of each arm: 0 red, 1 amber, 2 green, as in `traffic.signals`; arms that are not there are dark.
+        signals: arm → 0 red, 1 amber, 2 green, as in `traffic.signals`; the lights of other arms are dark.
     """
     states = {head: signals[head.arm] for head in world.signals if head.arm in signals}
     return {head.rows[state]: LAMP_COLORS[state] for head, state in states.items()}

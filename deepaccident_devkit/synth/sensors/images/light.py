@@ -1,4 +1,4 @@
-"""Light and air: what time of day and weather do to an image, the sky all around, and rain before the camera."""
+"""Light and air: what time of day and weather do to an image, the sky all around, and rain in front of the camera."""
 
 from dataclasses import dataclass
 
@@ -15,8 +15,8 @@ class _Sky:
         tint: colour of the light, 1 is white.
         zenith: colour of the sky overhead.
         horizon: colour of the sky at the horizon.
-        elevation: of the sun, degrees.
-        sun: its share of the light.
+        elevation: elevation of the sun, degrees.
+        sun: the sun's share of the light.
     """
 
     tint: tuple[float, float, float]
@@ -28,7 +28,7 @@ class _Sky:
 
 @dataclass(frozen=True, slots=True)
 class _Air:
-    """Sun that comes through, how far grey replaces the sky's blue, haze a kilometre, wetness of the ground, rain."""
+    """The share of sunlight, how much grey replaces the sky's blue, haze a kilometre, wetness of the ground, rain."""
 
     sun: float
     cover: float
@@ -63,15 +63,15 @@ class Light:
 
     Attributes:
         to_sun: (3,) unit vector to the sun, or to the moon.
-        tint: (3,) of the light, 1 is white.
+        tint: (3,) colour of the light, 1 is white.
         ambient: share of the light that comes from everywhere; the sun gives the rest.
         zenith: (3,) the sky overhead.
         horizon: (3,) the sky at the horizon, and the haze.
         cover: share of the sky under clouds.
-        haze: share of the light that haze takes, a metre.
+        haze: share of the light that haze takes for each metre.
         wet: how wet the ground is, 0 to 1.
         rain: how hard it rains, 0 to 1.
-        lamps: how far lamps outshine the light, 0 (by day) to 1 (at night).
+        lamps: how visible the light of lamps is, 0 (by day) to 1 (at night).
     """
 
     to_sun: FloatArray
@@ -87,12 +87,12 @@ class Light:
 
     @property
     def sun(self) -> FloatArray:
-        """What the sun adds to a surface that faces it, (3,), as a share of the surface's colour."""
+        """What the sun adds to a surface that points to it, (3,), as a share of the surface's colour."""
         return np.asarray(self.tint * ((1 - self.ambient) * _SUN_GAIN))
 
     @property
     def sky(self) -> FloatArray:
-        """What the whole sky adds to a level surface, (3,), likewise."""
+        """What the whole sky adds to a level surface, (3,), as a share of the surface's colour."""
         return np.asarray(self.tint * self.ambient)
 
     @property
@@ -134,19 +134,19 @@ def _mixed(color: tuple[int, int, int], other: FloatArray, share: float) -> Floa
 
 _COLUMNS, _ROWS = 1024, 192
 _STEEPEST = 1.2
-"""Rise over run of the picture's upper edge; what is higher looks as it does."""
+"""Slope (height over distance) at the picture's upper edge; higher directions have the colours of this edge."""
 _DRIFT = 2.5
-"""Clouds in the run of a cloud layer at a height of 1."""
+"""How many clouds there are over a distance equal to the height of the cloud layer."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sky:
-    """A picture (192, 1024, 3) uint8, RGB: columns by azimuth from x counter-clockwise, rows by rise over run."""
+    """A picture (192, 1024, 3) uint8, RGB: columns by azimuth from x counter-clockwise, rows by slope."""
 
     picture: ByteArray
 
     def toward(self, x: Float32Array, y: Float32Array, z: Float32Array) -> ByteArray:
-        """Colours (R, C, 3) of the sky in directions (R, C) each, of any length; below the horizon, the horizon's."""
+        """Colours (R, C, 3) of the sky in directions x, y, z, (R, C) each; below the horizon, those of the horizon."""
         import cv2
 
         run, azimuth = cv2.cartToPolar(x, y)
@@ -158,7 +158,7 @@ class Sky:
 
 
 def make_sky(light: Light, rng: np.random.Generator) -> Sky:
-    """The sky in some light; `rng` draws the clouds."""
+    """The sky in a light; `rng` draws the clouds."""
     azimuth = (np.arange(_COLUMNS) + 0.5) / _COLUMNS * 2 * np.pi
     rise = np.arange(_ROWS) / (_ROWS - 1) * _STEEPEST
     up = (np.minimum(rise / 0.6, 1.0) ** 0.7)[:, None, None]
@@ -186,7 +186,7 @@ def _clouds(azimuth: FloatArray, rise: FloatArray, cover: float, rng: np.random.
 
 
 def _seamless_noise(side: int, rng: np.random.Generator) -> Float32Array:
-    """Noise (side, side) that goes on over the edges, rough and fine alike."""
+    """Rough and fine noise (side, side) that continues from each edge to the opposite edge."""
     frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(side), np.fft.fftfreq(side)))
     spectrum = np.fft.fft2(rng.standard_normal((side, side))) / np.maximum(frequency, 1 / side) ** 1.6
     spectrum[0, 0] = 0
@@ -194,13 +194,13 @@ def _seamless_noise(side: int, rng: np.random.Generator) -> Float32Array:
 
 
 _STREAKS = 520
-"""Streaks of hard rain in a picture of any size."""
+"""Number of streaks of hard rain in a picture of any size."""
 _SUBPIXEL = 16
-"""Steps of a pixel in which OpenCV takes places, a power of 2."""
+"""Steps of a pixel for OpenCV's coordinates, a power of 2."""
 
 
 def rain_streaks(size: tuple[int, int], rain: float, rng: np.random.Generator) -> ByteArray:
-    """Light to add to a picture of width, height pixels, (H, W, 3) uint8: streaks, longer and brighter near by."""
+    """Light to add to a picture of `size` (width, height), (H, W, 3) uint8: streaks, near ones longer and brighter."""
     import cv2
 
     width, height = size

@@ -21,12 +21,12 @@ _HEADLIGHT: Color = (255, 250, 226)
 _TAILLIGHT: Color = (255, 40, 30)
 _LANTERN_LIGHT: Color = (255, 232, 190)
 _LAMPS_ON = 0.2
-"""Of `Light.lamps`, from which on vehicles have their lamps on; in hard rain they have them on by day."""
+"""From this value of `Light.lamps` on, vehicles have their lamps on; in hard rain they have them on by day too."""
 _ABOVE = 0.05
 _ALIKE, _DARKER = 32.0, 0.65
-"""Where a wall's colour is as near as this to that of its windows, these are so much darker."""
+"""If the colours of a wall and its windows differ by less than the first number, windows are darkened by the second."""
 FACADE, SHINES = 1, 2
-"""Kinds of faces: those with windows, and those with a light of their own."""
+"""Kinds of faces: those with windows, and those that shine themselves."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,10 +34,10 @@ class Palette:
     """Colours of faces (F, 3) float64, RGB 0 to 255, in the light and before haze.
 
     Attributes:
-        wall: of the faces.
-        shaded: of the faces where something takes the sun from them.
-        window: of the windows on them.
-        shining: of their own light; 0 where they have none.
+        wall: colours of the faces.
+        shaded: colours of the faces where they are in a shadow.
+        window: colours of the windows on them.
+        shining: colours of their own light; 0 if they do not shine.
         facade: (F,) whether they carry windows.
     """
 
@@ -50,7 +50,7 @@ class Palette:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Colors:
-    """As `Palette`, of all faces of a moment and two more, `GROUND` and `NOTHING`, packed for looking up.
+    """The same as `Palette` for all faces of a moment, and for `GROUND` and `NOTHING`, as tables for a quick look-up.
 
     Attributes:
         wall: (F + 2,) uint32: red, green, blue and kind (`FACADE`, `SHINES` or 0), one byte each.
@@ -68,7 +68,7 @@ class Colors:
 def still_palette(setting: Setting, light: Light) -> Palette:
     """The colours of what stands still: things, lanterns that shine at night, and parked vehicles without lights.
 
-    Walls of houses are in the sun here, wherever they are.
+    Walls of houses have their colours in the sun here, even if they are in a shadow.
     """
     tops = setting.still.corners.mean(axis=1)
     tops[:, 2] = setting.still.corners[:, :, 2].max(axis=1) + _ABOVE
@@ -78,7 +78,7 @@ def still_palette(setting: Setting, light: Light) -> Palette:
 
 
 def moving_palette(scene: Scene, light: Light) -> Palette:
-    """The colours of those who move; one in the shadow of a thing is so all over."""
+    """The colours of moving road users; one in the shadow of a thing is wholly in the shadow."""
     heads = scene.frames[:, :3, 3] + (0, 0, 1.0) * (scene.actors.size[:, 2:] + _ABOVE)
     in_sun = _in_sun(scene.setting, heads, light)[scene.movers.owner]
     lamps_on = light.lamps > _LAMPS_ON or light.rain > 0.5
@@ -86,7 +86,7 @@ def moving_palette(scene: Scene, light: Light) -> Palette:
 
 
 def packed(still: Palette, moving: Palette, lamps: Mapping[int, Color]) -> Colors:
-    """All colours of a moment in one table each; `lamps` are rows of solids that stand still, and their light."""
+    """All colours of a moment, each kind in one table; `lamps`: row of a solid that stands still → its light."""
     wall, shaded, window, shining = (
         np.concatenate([getattr(still, name), getattr(moving, name), np.zeros((2, 3))]).clip(0, 255).astype(np.uint8)
         for name in ("wall", "shaded", "window", "shining")
@@ -107,7 +107,7 @@ def is_facade(surfaces: Surfaces) -> BoolArray:
 
 
 def _in_sun(setting: Setting, points: FloatArray, light: Light) -> BoolArray:
-    """Which points (N, 3) nothing that stands still takes the sun from, (N,)."""
+    """Which points (N, 3) are in the sun, (N,): not in the shadow of anything that stands still."""
     ray = light.to_sun[None]
     return np.array([setting.caster.cast(point, ray)[1][0] == NOTHING for point in points], dtype=bool)
 
@@ -137,7 +137,7 @@ def _palette(surfaces: Surfaces, light: Light, in_sun: BoolArray, shining: Mappi
 
 
 def _shining(colors: FloatArray, lights: Mapping[Color, Color]) -> FloatArray:
-    """The light of lamps among faces with colours (F, 3); `lights` are of lamps by the colours that they have."""
+    """The light of the lamps among faces with colours (F, 3); `lights`: a lamp's colour → its light."""
     shining = np.zeros_like(colors)
     for lamp, color in lights.items():
         shining[(colors == lamp).all(axis=1)] = color

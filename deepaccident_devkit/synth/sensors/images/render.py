@@ -1,4 +1,4 @@
-"""The cameras' pictures: the nearest surface in every pixel, in the light of the scenario."""
+"""The cameras' pictures: the nearest surface at every pixel, in the light of the scenario."""
 
 from collections.abc import Mapping
 
@@ -22,12 +22,12 @@ from deepaccident_devkit.synth.sensors.setting import Setting
 
 _GLOW = 0.9
 _REFLECTION_STEP = 4
-"""Pixels across and down for each ray of a reflection on wet ground, which is blurred anyway."""
+"""Pixels across and down for each ray of a reflection on wet ground, which is blurred in any case."""
 _MIRRORING = (0.05, 0.6)
-"""Share of the light that wet ground mirrors straight from above, and at grazing angles."""
+"""Share of the light that wet ground mirrors, seen from straight above and seen at a very small angle."""
 
 _CLEAR_OF_GROUND = 0.05
-"""Metres off a slope at which mirrored rays begin, so that they do not meet its own triangles."""
+"""Metres above a slope where mirrored rays begin, so that they do not meet the slope's own triangles."""
 _FAR = 1000.0
 
 
@@ -47,7 +47,7 @@ class Studio:
         self._shadows = wall_shadows(setting, self._facades, self.light)
 
     def surroundings(self, scene: Scene, signals: Mapping[Arm, int]) -> Surroundings:
-        """The colours of a moment, for the cameras of all agents; `signals` as in `signals.lit_lamps`."""
+        """The colours of a moment, for the cameras of all agents; `signals` as in `lamplight.lit_lamps`."""
         lamps = lit_lamps(scene.setting.world, signals)
         rows = scene.setting.props
         return Surroundings(
@@ -68,7 +68,7 @@ class Studio:
 def render(
     scene: Scene, around: Surroundings, camera: Camera, ground_from_camera: SE3, rng: np.random.Generator
 ) -> ByteArray:
-    """The picture (H, W, 3) uint8, RGB; `rng` draws what falls through it."""
+    """The picture (H, W, 3) uint8, RGB; `rng` draws the rain."""
     import cv2
 
     buffers = look(scene, camera, ground_from_camera)
@@ -94,7 +94,7 @@ def _with_reflections(
     camera: Camera,
     ground_from_camera: SE3,
 ) -> ByteArray:
-    """The picture with what wet ground mirrors, by rays to every fourth pixel."""
+    """The picture with the reflections of wet ground, from rays to every fourth pixel."""
     import cv2
 
     width, height = camera.optics.width, camera.optics.height
@@ -129,10 +129,10 @@ def _with_reflections(
 
 
 def _below_level_ground(eye: FloatArray, rays: Float32Array) -> tuple[FloatArray, Float32Array, AnyArray]:
-    """Level ground mirrors what the camera's mirror image sees from below it.
+    """The mirrored rays of level ground: those of the camera's mirror image below it.
 
     Returns:
-        where mirrored rays begin (3,), where they go (R, C, 3), and how much the rays fall towards the ground (R, C).
+        where mirrored rays begin (3,), their directions (R, C, 3), and how much the rays fall to the ground (R, C).
     """
     mirror = np.array([1, 1, -1], dtype=np.float32)
     return eye * mirror, rays * mirror, -rays[..., 2]
@@ -141,7 +141,7 @@ def _below_level_ground(eye: FloatArray, rays: Float32Array) -> tuple[FloatArray
 def _off_slopes(
     eye: FloatArray, rays: Float32Array, depth: Float32Array, terrain: Terrain
 ) -> tuple[FloatArray, Float32Array, AnyArray]:
-    """As `_below_level_ground`, but each ray is mirrored where it ends, at `depth` (R, C): (R · C, 3) begin."""
+    """The same for slopes: each ray is mirrored where it ends, at `depth` (R, C); so they begin at (R · C, 3)."""
     met = eye + rays * depth[..., None]
     normal = terrain.normal(met[..., :2])
     falling = -(rays * normal).sum(axis=-1)

@@ -1,4 +1,4 @@
-"""From what pixels show to their colours."""
+"""The colours of pixels, from what they show."""
 
 from dataclasses import dataclass
 
@@ -16,11 +16,11 @@ from deepaccident_devkit.synth.sensors.images.paint import FACADE, SHINES, Color
 from deepaccident_devkit.synth.sensors.images.shadows import WallShadows, shadows_on
 
 _COARSER = (1.0, 4.0)
-"""Metres of ground that a pixel spans, from which on the coarser pictures of the ground are looked up."""
+"""If a pixel spans so many metres of ground or more, its colour comes from the first, or second, coarser picture."""
 _FAR = np.float32(1000.0)
 _LAMP_TINT = (1.0, 0.95, 0.84)
 _ON_THINGS = 0.4
-"""Of the light on the ground, what upright surfaces show of it."""
+"""The share of the light on the ground that upright surfaces show."""
 _LAMPS_REACH = np.float32(2.5)
 """Metres above the ground up to which headlamps light things."""
 
@@ -34,9 +34,9 @@ class Surroundings:
         sky: the sky.
         ground: pictures of the ground.
         facades: where there are windows.
-        shadows: on façades.
-        colors: of all faces.
-        lamplight: as `lamplight.lamplight` gives it; None by day.
+        shadows: the shadows on façades.
+        colors: the colours of all faces.
+        lamplight: from `lamplight.lamplight`; None by day.
     """
 
     light: Light
@@ -50,7 +50,7 @@ class Surroundings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Points:
-    """Where rays (R, C) meet something, and where they go, ground frame, metres."""
+    """Where rays (R, C) meet something, and their directions, ground frame, metres."""
 
     x: Float32Array
     y: Float32Array
@@ -90,7 +90,7 @@ def _points(rays: Rays, ground_from_camera: SE3) -> Points:
 
 
 def _add_ground(picture: ByteArray, rays: Rays, points: Points, ground: Ground, height: float) -> None:
-    """Paint the pixels that show the ground, in place, each from the picture as coarse as it is."""
+    """Paint the pixels that show the ground, in place, each from the picture with the matching resolution."""
     import cv2
 
     shown = rays.face == GROUND
@@ -111,7 +111,7 @@ def _add_sky(picture: ByteArray, shown: BoolArray, points: Points, sky: Sky) -> 
 
 
 def _rows_of(mask: BoolArray) -> list[tuple[slice, ByteArray]]:
-    """The rows, as one slice, that a mask (R, C) has something in, and the mask of these; nothing if it is empty."""
+    """One slice with all rows in which a mask (R, C) is true, and the mask of these rows; empty if it is never true."""
     rows = np.flatnonzero(mask.any(axis=1))
     if not len(rows):
         return []
@@ -120,7 +120,7 @@ def _rows_of(mask: BoolArray) -> list[tuple[slice, ByteArray]]:
 
 
 def _lamplit(picture: ByteArray, share: Float32Array, points: Points, around: Surroundings) -> ByteArray:
-    """The picture with the light of lamps added to what they reach, by the `share` (R, C) of it that shows."""
+    """The picture with the light of lamps, multiplied by `share` (R, C), where it reaches."""
     import cv2
 
     if around.lamplight is None:
@@ -133,7 +133,7 @@ def _lamplit(picture: ByteArray, share: Float32Array, points: Points, around: Su
 
 
 def _hazed(picture: ByteArray, rays: Rays, light: Light) -> ByteArray:
-    """The picture as seen through the air between."""
+    """The picture with the haze of the air."""
     import cv2
 
     seen = np.minimum(rays.depth, _FAR)

@@ -1,4 +1,4 @@
-"""Shadows on the ground, and on façades that face the sun."""
+"""Shadows on the ground, and on façades at the side of the sun."""
 
 from dataclasses import dataclass
 
@@ -14,13 +14,13 @@ from deepaccident_devkit.synth.sensors.setting import Setting
 
 
 def with_shadows(picture: ByteArray, corners: FloatArray, to_sun: FloatArray, brightness: float) -> ByteArray:
-    """A new picture of the ground with the shadows of some solids.
+    """A new picture of the ground with the shadows of solids.
 
     Args:
         picture: (3000, 3000, 3) uint8, cells as in `roads.GroundMap`.
-        corners: (P, 8, 3) of convex solids, metres, ground frame, z above the ground below them.
-        to_sun: (3,) direction of the sun.
-        brightness: of the ground in the shadow, as a share of what it is in the light.
+        corners: (P, 8, 3) corners of convex solids, metres, ground frame, z above the ground below them.
+        to_sun: (3,) direction to the sun.
+        brightness: brightness of the ground in the shadow, as a share of that in the sun.
     """
     import cv2
 
@@ -33,13 +33,13 @@ def with_shadows(picture: ByteArray, corners: FloatArray, to_sun: FloatArray, br
         mask = np.zeros(high[::-1] - low[::-1], dtype=np.uint8)
         cv2.fillConvexPoly(mask, cv2.convexHull((outline - low).astype(np.int32)), 1)
         rows, columns = np.nonzero(mask)
-        # dimmed from the picture given, so that where two shadows overlap it is no darker
+        # always darker than the given picture, so that two shadows together are not darker than one
         shadowed[rows + low[1], columns + low[0]] = dimmed[picture[rows + low[1], columns + low[0]]]
     return shadowed
 
 
 def above_ground(corners: FloatArray, terrain: Terrain) -> FloatArray:
-    """Corners (P, 8, 3) with z counted from the ground below each solid's middle."""
+    """Corners (P, 8, 3) with z above the ground below each solid's middle."""
     if terrain.is_flat:
         return corners
     lowered = corners.copy()
@@ -55,13 +55,13 @@ def _outlines(corners: FloatArray, to_sun: FloatArray) -> IntArray:
 
 
 _CELL = 0.4
-"""Metres of a façade from ray to ray to the sun."""
+"""Distance on a façade between two rays to the sun, metres."""
 _OFF = 0.05
-"""Metres before the wall where these begin."""
+"""Distance from the wall to where these rays begin, metres."""
 _AT_ONCE = 32000
-"""Points to look up in one call: OpenCV takes no wider picture."""
+"""Points to look up in one call: OpenCV accepts no wider picture."""
 _GRAZING = 0.02
-"""Cosine of the angle at which the sun has to meet a façade to be looked for."""
+"""Least cosine of the angle from a façade's normal to the sun; for façades with a smaller one no rays are cast."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,9 +69,9 @@ class WallShadows:
     """How much sun reaches the façades.
 
     Attributes:
-        lit: (R, C) uint8, 0 in the shadow to 255 in the sun; a first column in the sun, then those of one façade after
-            another, with a further one at either end; rows upwards.
-        column: (F,) float32, where among these each face begins; 0 for those that are not looked at.
+        lit: (R, C) uint8, 0 in the shadow to 255 in the sun; first one column in the sun, then the columns of each
+            façade, with one more column at each end; rows upwards.
+        column: (F,) float32, the column where each face begins; 0 for faces without columns.
         density: (F,) float32, columns a metre.
     """
 
@@ -96,7 +96,7 @@ def wall_shadows(setting: Setting, facades: Facades, light: Light) -> WallShadow
 
 
 def _sun_on(setting: Setting, light: Light, faces: IntArray, counts: IntArray) -> ByteArray:
-    """Which cells of façades the sun reaches, (R, all of `counts` and two more each) uint8, 0 or 255."""
+    """Which cells of façades the sun reaches, (R, sum of `counts`, and two more for each façade) uint8, 0 or 255."""
     quads, normals = setting.still.quads[faces], setting.still.planes[0][faces]
     along, foot, top = quads[..., :2].sum(axis=2), quads[..., 2].min(axis=1), quads[..., 2].max(axis=1)
     every = np.arange(len(faces))
@@ -120,8 +120,8 @@ def shadows_on(picture: ByteArray, places: OnFacades, shadows: WallShadows, colo
     Args:
         picture: (R, C, 3).
         places: the pixels that show façades.
-        shadows: on these.
-        colors: of the faces.
+        shadows: the shadows on façades.
+        colors: the colours of the faces.
     """
     import cv2
 

@@ -29,7 +29,7 @@ def test_each_headline_is_a_number_of_the_result_by_its_path(task: str, protocol
 
 def test_names() -> None:
     result = MotionEvaluator().compute()
-    names = ["iou 30x30", "iou 100x100", "pq 30x30", "pq 100x100", "min_ade", "min_fde", "miss_rate"]
+    names = ["iou 30x30", "iou 100x100", "vpq 30x30", "vpq 100x100", "min_ade", "min_fde", "miss_rate"]
     assert headline_numbers("motion", result) == dict(zip(names, [0.0] * 4 + [None] * 3, strict=True))
     assert [each.higher_is_better for each in headlines("motion", result)] == [True] * 4 + [False] * 3
 

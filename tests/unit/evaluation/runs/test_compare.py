@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from shutil import copytree
 from typing import Any
 
 import numpy as np
@@ -172,7 +173,7 @@ class TestForms:
         assert text.startswith(f"{head}\na: {motion_bundles[0]}\n")
         (line,) = (line for line in text.splitlines() if line.startswith("iou 100x100"))
         assert line.endswith("no decision is possible with 1 cluster; at least 8 are needed")
-        assert "p: share of all 1 swaps of clusters between the two" in text
+        assert "p: share of all 1 swaps of clusters between a and b" in text
         assert "tested at 5%: iou 30x30; and the other headlines together" in text
 
     def test_text_of_a_decision(self, generated: Callable[..., Comparison]) -> None:
@@ -226,7 +227,7 @@ class TestRefused:
     def test_other_tasks_and_rules(self, saved: Save, motion_bundles: tuple[Path, Path], run: EvaluationRun) -> None:
         a = saved("a")
         with pytest.raises(
-            EvaluationError, match=r"by other rules: task 'accident' and 'motion'; protocol .*, and \d+"
+            EvaluationError, match=r"by the same rules: task 'accident' and 'motion'; protocol .*, and \d+"
         ):
             compare_bundles(a, motion_bundles[0], FEW)
         other = saved("b", setup=replace(run.setup, switches={"min_score": 0.5}))
@@ -234,6 +235,16 @@ class TestRefused:
             EvaluationError, match=r"switches/min_score 'absent' and 0.5; settings/choices/min_score 0.0 and 0.5; eval"
         ):
             compare_bundles(a, other, FEW)
+
+    def test_other_cells(self, motion_bundles: tuple[Path, Path], tmp_path: Path) -> None:
+        """Labels are made on the predictions' own cells: other cells are another truth."""
+        small = copytree(motion_bundles[1], tmp_path / "small")
+        path = small / "metrics_summary.json"
+        summary = json.loads(path.read_text())
+        summary["results"]["form"]["x"] = [-25.0, 25.0, 0.5]
+        path.write_text(json.dumps(summary))
+        with pytest.raises(EvaluationError, match=r"by the same rules: cells/x/0 -50.0 and -25.0; cells/x/1"):
+            compare_bundles(motion_bundles[0], small, FEW)
 
     def test_other_labels(self, saved: Save) -> None:
         a, b = saved("a"), saved("b")

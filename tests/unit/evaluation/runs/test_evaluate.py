@@ -102,7 +102,7 @@ class TestRefused:
         self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_motion: Write
     ) -> None:
         results = write_motion(tmp_path / "motion", selection.tokens(da_b))
-        with pytest.raises(EvaluationError, match=r"its predictions look 2 s ahead \(5 frames, 0.5 s apart\)"):
+        with pytest.raises(EvaluationError, match=r"its predictions look 2 s ahead \(5 frames, 0.5 s apart, from the"):
             evaluate_results(da_b, results, EvaluationSetup(task="motion", horizon=3.0), selection)
 
     @pytest.mark.parametrize("task", ["accident", "warning"])
@@ -166,6 +166,18 @@ class TestPartial:
             "evaluated": 4,
             "mark": run.partial.text(),
         }
+
+    def test_other_predictions_alone_do_not_mark(
+        self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_accidents: Write
+    ) -> None:
+        tokens = selection.tokens(da_b)
+        extra = replace(selection, agents=("other_vehicle_behind",)).tokens(da_b)
+        results = write_accidents(tmp_path / "more.json", [*tokens, *extra])
+        with pytest.raises(ResultsError, match=r"--allow-partial\), which leaves out the other predictions; since no"):
+            evaluate_results(da_b, results, SETUP, selection)
+        run = evaluate_results(da_b, results, SETUP, selection, allow_partial=True, workers=1)
+        assert run.evaluator.tokens == set(tokens)
+        assert run.partial is None
 
     def test_complete_results_are_not_partial(
         self, da_b: DeepAccident, results: Results, selection: SampleSelection

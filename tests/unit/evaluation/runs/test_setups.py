@@ -146,5 +146,7 @@ class TestLoader:
             EvaluationError, match=r"holds motion results; detection is evaluated from detection results"
         ):
             SampleLoader(da_motion, motion, EvaluationSetup(task="detection"))
-        with pytest.raises(EvaluationError, match=r"look 2 s ahead \(3 frames, 1 s apart\); .*, not 2.5 s"):
+        with pytest.raises(
+            EvaluationError, match=r"look 2 s ahead \(3 frames, 1 s apart, .*, less than the horizon of 2.5 s; add"
+        ):
             SampleLoader(da_motion, motion, EvaluationSetup(task="motion", horizon=2.5))

@@ -20,7 +20,7 @@ from deepaccident_devkit.synth.roads.layout import SLOT_LENGTH
         ),
         (
             {"hump": Hump(distance=36.0)},
-            r"road.hump.distance: 36 m put the foot of the hump into the junction; choose 48.0 m or more",
+            r"road.hump.distance: 36 m puts the foot of the hump into the junction; choose 48.0 m or more",
         ),
     ],
 )

@@ -103,7 +103,7 @@ def test_labels_are_a_choice(da_motion: DeepAccident, tokens: list[str]) -> None
     alone = evaluated(
         evaluator, lambda token: (results.prediction(token), da_motion.motion_labels(token, config)), tokens
     )
-    assert value(found, "labels.half_cell_shift=False", "pq 30x30") == alone["pq 30x30"] != found.chosen["pq 30x30"]
+    assert value(found, "labels.half_cell_shift=False", "vpq 30x30") == alone["vpq 30x30"] != found.chosen["vpq 30x30"]
     assert not [each for each in found.numbers if "ids_kept_between_samples" in each.choice]
 
 
