@@ -60,11 +60,15 @@ class Coverage:
             _named(self.extra, "predictions are of samples that are not evaluated"),
             _named(self.unknown, "predictions are of no sample of this release"),
         ]
-        told = "; ".join(part for part in parts if part)
-        if self.guess is None:
-            return told
-        shared = "they have just its samples" if self.guess_share == 1 else f"{self.guess_share:.0%} in common"
-        return f"{told}; the results were probably made for {self.guess.text()} ({shared}); {_again(self.guess)}"
+        if self.extra and not (self.missing or self.unknown):
+            parts.append(
+                "leave them out with --allow-partial (allow_partial=True); no sample lacks a prediction, so the "
+                "numbers are not partial then"
+            )
+        if self.guess is not None:
+            shared = "they have just its samples" if self.guess_share == 1 else f"{self.guess_share:.0%} in common"
+            parts += [f"the results were probably made for {self.guess.text()} ({shared})", _again(self.guess)]
+        return "; ".join(part for part in parts if part)
 
 
 def _again(guess: SampleSelection) -> str:

@@ -117,6 +117,7 @@ def evaluate_results(
         evaluator=evaluator,
         result=evaluator.compute(),
         partial=_partial(covered),
+        left_out=len(covered.extra) + len(covered.unknown),
         attributes=sample_attributes(dataset, tokens),
         times_to_impact={token: dataset.sample.get(token)["time_to_impact"] for token in tokens},
         breakdowns=(),
@@ -140,10 +141,11 @@ def _covered_tokens(
     dataset: Dataset, results: Results, selection: SampleSelection, covered: Coverage, *, allow_partial: bool
 ) -> list[str]:
     if not covered.is_complete and not allow_partial:
-        raise ResultsError(
-            f"{results.path}: {covered.to_text()}; give results of these samples, choose the list that they are of, or "
-            f"evaluate the samples that have a prediction with allow_partial=True (--allow-partial), {_mark(covered)}"
+        remedy = (
+            "; give results of these samples, choose the list that they are of, or evaluate the samples that have a "
+            "prediction with allow_partial=True (--allow-partial), which marks every number as partial"
         )
+        raise ResultsError(f"{results.path}: {covered.to_text()}{remedy if covered.missing or covered.unknown else ''}")
     tokens = [token for token in selection.tokens(dataset) if token in results]
     if not tokens:
         raise ResultsError(f"{results.path}: {covered.to_text()}; nothing is left to evaluate")
@@ -163,12 +165,6 @@ def check_metas(dataset: Dataset, tokens: Sequence[str], split: str) -> None:
             f"{shlex.quote(os.fspath(dataset.dataroot))}{of_split} --where 'weather!=unknown' --save mine.txt, then "
             "--split mine.txt"
         )
-
-
-def _mark(covered: Coverage) -> str:
-    if covered.missing:
-        return "which marks every number as partial"
-    return "which leaves out the other predictions; since no sample lacks one, the numbers are not partial"
 
 
 def _partial(covered: Coverage) -> Partial | None:

@@ -50,7 +50,9 @@ class SanityReport(FrozenMappings):
             texts = [value_text(each, self.units[name]) for each in (self.empty[name], value, self.perfect[name])]
             rows.append([name, *texts])
         head = f"Sanity check of {self.samples} samples. Scores of an empty prediction, of yours, of the truth itself:"
-        looked = f"{len(self.candidates)} mistakes were looked for: mirrored, turned, shifted, scaled and others."
+        suspected = sum(each.suspected for each in self.candidates)
+        count = f"{suspected} suspected" if suspected else "none found"
+        looked = f"{len(self.candidates)} mistakes looked for (mirrored, turned, shifted, scaled and others): {count}."
         unchecked = [f"Not looked at: {each}" for each in self.unchecked]
         found = [f"WARNING: {each}" for each in self.warnings]
         return "\n".join([head, columns_text(rows), looked, *unchecked, *found, *([self.verdict] * bool(self.verdict))])

@@ -173,7 +173,7 @@ class TestPartial:
         tokens = selection.tokens(da_b)
         extra = replace(selection, agents=("other_vehicle_behind",)).tokens(da_b)
         results = write_accidents(tmp_path / "more.json", [*tokens, *extra])
-        with pytest.raises(ResultsError, match=r"--allow-partial\), which leaves out the other predictions; since no"):
+        with pytest.raises(ResultsError, match=r"\); leave them out with --allow-partial .*; no sample"):
             evaluate_results(da_b, results, SETUP, selection)
         run = evaluate_results(da_b, results, SETUP, selection, allow_partial=True, workers=1)
         assert run.evaluator.tokens == set(tokens)
