@@ -6,14 +6,17 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.release.layout import ScenarioFolder
+from deepaccident_devkit.errors import ReleaseError
+from deepaccident_devkit.release.layout import ScenarioFolder, frame_numbers
 from deepaccident_devkit.taxonomy import (
     AGENTS,
+    CHANNEL_FORMAT,
     CHANNELS,
     EXPECTED_MINI_SCENARIOS,
     EXPECTED_SCENARIOS,
@@ -44,8 +47,10 @@ class Overview:
         expected: split (or the version, for mini) → scenarios of the whole release; empty for a selection.
         agents: agent → scenarios that have it.
         labelled: agent → scenarios in which it has labels.
-        channels: channel → recordings (scenario and agent) that have a folder of it.
+        channels: channel → recordings (scenario and agent) that have files of it.
+        files: channel → files of these recordings.
         recordings: all recordings.
+        samples: their moments: as many files has a channel of a whole release.
         attributes: field → value → scenarios.
         left_out: broken scenarios that were skipped, by token.
     """
@@ -62,7 +67,9 @@ class Overview:
     agents: Mapping[str, int]
     labelled: Mapping[str, int]
     channels: Mapping[str, int]
+    files: Mapping[str, int]
     recordings: int
+    samples: int
     attributes: Mapping[str, Mapping[str, int]]
     left_out: Sequence[str]
 
@@ -74,7 +81,10 @@ class Overview:
         """Some aligned blocks for a terminal."""
         scenarios = self.tables["scenario"]
         head = f"DeepAccident {self.version} at {self.dataroot} (layout {self.layout})\nindex: {self.index}"
-        splits = [(name, f"{count} of {self.expected.get(name, 0)}") for name, count in self.splits.items()]
+        splits = [
+            (name, f"{count} of {self.expected[name]}" if name in self.expected else str(count))
+            for name, count in self.splits.items()
+        ]
         if self.selected:
             head += f"\nselected: {scenarios} of {self.scenarios} scenarios; all counts are of these"
         if set(self.expected) != set(SPLITS):
@@ -89,10 +99,14 @@ class Overview:
                 "scenarios (labelled)",
                 [(name, f"{count} ({self.labelled[name]})") for name, count in self.agents.items()],
             ),
-            table_text(
-                "sensor",
-                f"recordings of {self.recordings}",
-                [(name, str(count)) for name, count in self.channels.items()],
+            columns_text(
+                [
+                    ("sensor", f"recordings of {self.recordings}", "files"),
+                    *(
+                        (name, str(count), f"{self.files[name]:,} of {self.samples:,}")
+                        for name, count in self.channels.items()
+                    ),
+                ]
             ),
             *(
                 table_text(field, "scenarios", [(value, str(count)) for value, count in counts.items()])
@@ -118,6 +132,8 @@ def overview(dataset: Dataset, scenarios: Sequence[ScenarioRecord] | None = None
     samples = {agent["token"]: dataset.get("sample", agent["first_sample_token"]) for agent in agents}
     split_counts = Counter(scenario["split"] or _UNKNOWN for scenario in scenarios)
     mini = dataset.version == "v1-mini"
+    tables = _table_rows(dataset, tokens)
+    files = _channel_files(dataset, scenarios, agents)
     return Overview(
         dataroot=str(dataset.dataroot),
         version=dataset.version,
@@ -125,7 +141,7 @@ def overview(dataset: Dataset, scenarios: Sequence[ScenarioRecord] | None = None
         index=str(dataset.tables_folder),
         scenarios=len(dataset.scenario),
         selected=selected,
-        tables=_table_rows(dataset, tokens),
+        tables=tables,
         splits={name: split_counts[name] for name in (*SPLITS, _UNKNOWN) if split_counts[name] or name in SPLITS},
         expected={} if selected else {dataset.version: EXPECTED_MINI_SCENARIOS} if mini else EXPECTED_SCENARIOS,
         agents={name: sum(agent["name"] == name for agent in agents) for name in AGENTS},
@@ -133,8 +149,10 @@ def overview(dataset: Dataset, scenarios: Sequence[ScenarioRecord] | None = None
             name: sum(agent["name"] == name and samples[agent["token"]]["labelled"] for agent in agents)
             for name in AGENTS
         },
-        channels=_channel_counts(dataset, scenarios, agents),
+        channels={channel: sum(count > 0 for count in counts) for channel, counts in files.items()},
+        files={channel: sum(counts) for channel, counts in files.items()},
         recordings=len(agents),
+        samples=tables["sample"],
         attributes={field: _counts(scenario[field] for scenario in scenarios) for field in SCENARIO_ATTRIBUTES},
         left_out=[problem.scenario for problem in dataset.problems],
     )
@@ -215,11 +233,11 @@ def _table_rows(dataset: Dataset, scenarios: set[str]) -> dict[str, int]:
     }
 
 
-def _channel_counts(
+def _channel_files(
     dataset: Dataset, scenarios: Sequence[ScenarioRecord], agents: Sequence[AgentRecord]
-) -> dict[str, int]:
-    """Recordings that have a folder of each channel; tells nothing of the files in it (`validate` does)."""
-    counts = dict.fromkeys(CHANNELS, 0)
+) -> dict[str, list[int]]:
+    """Channel → number of files of each recording, by their names; what is in them `validate` tells."""
+    counts: dict[str, list[int]] = {channel: [] for channel in CHANNELS}
     folders = {
         scenario["token"]: ScenarioFolder(
             dataset.dataroot, scenario["folder"], scenario["scenario_type"], scenario["name"], AGENTS
@@ -229,5 +247,13 @@ def _channel_counts(
     for agent in agents:
         folder = folders[agent["scenario_token"]]
         for channel in CHANNELS:
-            counts[channel] += folder.kind_folder(agent["name"], channel).is_dir()
+            counts[channel].append(_file_count(folder.kind_folder(agent["name"], channel), CHANNEL_FORMAT[channel]))
     return counts
+
+
+def _file_count(folder: Path, suffix: str) -> int:
+    """How many frames a sensor's folder has; 0 if it is not there or cannot be listed."""
+    try:
+        return len(frame_numbers(folder, suffix)[0])
+    except ReleaseError:
+        return 0

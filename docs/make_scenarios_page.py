@@ -9,7 +9,7 @@ PAGE = Path(__file__).parent / "scenarios.md"
 _HEAD = """# Scenario files: your own accidents
 
 For everybody who writes their own synthetic scenarios: the fields of a scenario file, and the twelve designs as files.
-10 minutes.
+13 minutes.
 
 `deepaccident synth` makes the paper's twelve accidents. Each is a small YAML file; you can write your own:
 
@@ -22,6 +22,7 @@ meet: {actors: [ego, other]}
 weather: [SoftRain, HardRain]
 ```
 
+    deepaccident synth --spec mine.yaml --check               # what happens in it; a few seconds, nothing is written
     deepaccident synth OUT --spec mine.yaml --scenarios 8     # four accidents and their normal twins
 
 Each pair is another draw from the file. In Python:
@@ -39,31 +40,62 @@ print(scenario.weather, scenario.actor("ego").max_speed)
 
 - A number can be a range: `max_speed: [8, 12]`. Every number in the range is equally likely; both ends are possible.
 - A word, a `true` or `false`, or a group such as `hump` can be a list: `from: [north, south]`. One item is drawn;
-  an item that is listed twice is twice as likely. Only `name`, `design`, `exchange` and `role` must have one value.
+  an item that is listed twice is twice as likely. Four fields must have one value: `name`, `design`, `exchange` and
+  `role`.
 - Fields that a file does not name have their defaults. Of the lists `actors` and `ignores` all items are kept.
 - Ego and other are required. The two behind them are in every scenario, named or not, because they are agents too.
 
+## Arms, lanes and sides
+
+![A junction from above: arms, the lanes' numbers, the sides of the south arm, distances](images/scenario_sketch.png)
+
+- A vehicle `from: south` comes by the south arm and drives north. Traffic keeps right; lane 0 is the rightmost lane.
+- `side` is as a driver towards the junction sees it. So on the south arm `right` is in the east; on the west arm,
+  `right` is in the south.
+- A `start_distance` ends at the middle of the junction. That of a vehicle is measured along its path.
+- A parked vehicle stands in the free slot nearest to its `start_distance`. Slots are 5.8 m long, from about 20 m to
+  110 m. So of two vehicles at 30 and 31 m the second one stands in another slot, a few metres away.
+
 ## What happens
 
-- The junction lies in the middle. Its arms are `west`, `south`, `east` and, at a four-way junction, `north`. Traffic
-  keeps right. With traffic lights the two roads have green by turns. Without lights, vehicles from the right go first;
-  at a three-way junction, those on the road that does not end there.
+- A three-way junction has no north arm. With traffic lights, the two roads have green by turns. Without lights, the
+  vehicles from the south and the north give way to those on the road from west to east. A vehicle that turns left gives
+  way to oncoming traffic.
 - The actors of `meet` are timed so that both come to the crossing of their paths, the second `offset` seconds later.
-  In the accident they see each other too late, obey neither lights nor priority, and all others let them go first. If
-  the two miss each other, all values are drawn again. The one of the two that does not ignore `signal` has green.
+  In the accident they see each other too late, obey neither lights nor priority, and all others let them go first. The
+  one of the two that does not ignore `signal` has green.
+- If the two miss each other, all values are drawn again. After 100 draws the command stops. Its message says how near
+  they came, when, and which field to change. If draws differ only in numbers and all miss by far, it stops after 25.
 - All others obey the rules, except those in their `ignores`. Who ignores `signal` drives at red; `priority`, gives way
   to nobody; `crosswalk`, does not wait for pedestrians.
-- The recording ends with the collision; without one, when ego arrives or at `end.time`. `--frames N` keeps the last N.
+- Cyclists and pedestrians are no agents: give them the role `background` or `pedestrian`, and write for example
+  `meet: {actors: [ego, background]}`. `other` must still be there: it is one of the five that record.
+- The recording ends with the collision; without one, when ego arrives or at `end.time`. It has 40 frames (4 s) or more.
+  `--frames N` keeps the last N.
 - The normal twin has the same scene and the same road users, but all of them pay attention and obey all rules.
 - A file without `meet` gives only normal scenarios.
 
 The message for a mistake names file, line and field:
 
-    mine.yaml:4: actors[1].turn: expected one of left, straight, right, found 'lef'
+    mine.yaml:4: actors[1].turn: did you mean left? Expected one of straight, left, right, found 'lef'
 
 Files are read with PyYAML's safe loader, without tags and aliases. Numbers are decimal.
 
-## Three to begin with
+## Look at it
+
+`--check` prints who hits whom, when, how fast and with which sides, for the first pair that `synth` would make. Its
+exit status is 1 if the file gives no scenario. To see it:
+
+    deepaccident synth OUT --spec mine.yaml --scenarios 2 --no-sensors
+    deepaccident render accident OUT --layers boxes --out countdown.png
+
+The picture shows the boxes at four moments, in the agents' cameras and from above. Both commands together take about 20
+seconds on two cores. With camera images it takes about a minute for the last 25 frames of one accident:
+
+    deepaccident synth OUT --spec mine.yaml --scenarios 1 --frames 25
+    deepaccident render accident OUT --out countdown.png
+
+## Four to begin with
 
 A pedestrian steps onto the road between parked cars, in front of ego:
 
@@ -92,6 +124,19 @@ actors:
   - {role: ego, from: west, lane: 1, max_speed: [12, 14]}
   - {role: other, category: van, from: west, lane: 0, lane_change: 60, max_speed: [5, 6]}
 meet: {actors: [other, ego], offset: 0.7}
+```
+
+A right hook: ego turns right across the path of a cyclist in the lane beside it. Ego turns from the left lane here,
+because vehicles in one lane only follow each other:
+
+```yaml
+# right_hook.yaml
+road: {signalized: false, lanes: 2}
+actors:
+  - {role: ego, from: west, lane: 1, turn: right, max_speed: [8, 10]}
+  - {role: other, from: east, max_speed: [7, 10]}
+  - {role: background, category: cyclist, from: west, lane: 0, max_speed: [3, 6]}
+meet: {actors: [ego, background]}
 ```
 
 A normal scenario, in which nobody is timed to meet:

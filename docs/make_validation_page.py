@@ -13,6 +13,7 @@ minutes.
 
     deepaccident validate DATAROOT            # labels, calib, meta and the names of all files: a minute or two
     deepaccident validate DATAROOT --deep     # also decodes every image and array: hours for the whole release
+    deepaccident validate DATAROOT --all      # lists all findings of a scenario, not only the first eight
     deepaccident validate DATAROOT --json     # one JSON document
 
 ```python
@@ -33,8 +34,8 @@ cannot be looked at.
 What keeps a scenario from being indexed is found by the same code that indexes it; its meaning is only looked at if
 there is nothing of that kind. Findings marked *known* are the real release's own, not your download's.
 
-A file that is wholly absent is no fault, since most downloads are partial: what is still to download stands at the
-end of the report.
+A sensor's folder or an agent that is completely absent is no fault, since most downloads are partial. The end of the
+report lists what is still to download.
 
 [fault_table.md](fault_table.md) tells which of 200 planted faults it finds.
 

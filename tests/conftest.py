@@ -67,6 +67,16 @@ def da(release_root: Path) -> DeepAccident:
 
 
 @pytest.fixture(scope="session")
+def da_partial(release_root: Path, tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
+    """`da` as a partial download: no front camera of the ego, no LiDAR of the pole, no other_vehicle_behind."""
+    root = tmp_path_factory.mktemp("synthetic") / "partial"
+    shutil.copytree(release_root, root, ignore=shutil.ignore_patterns(".deepaccident", "other_vehicle_behind"))
+    for folder in (*root.glob("*/ego_vehicle/Camera_Front"), *root.glob("*/infrastructure/lidar01")):
+        shutil.rmtree(folder)
+    return DeepAccident("v1", root, verbose=False)
+
+
+@pytest.fixture(scope="session")
 def da_b(release_root_b: Path) -> DeepAccident:
     """The release of `release_root_b`, opened."""
     return DeepAccident("v1", release_root_b, verbose=False)

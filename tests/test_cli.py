@@ -178,7 +178,11 @@ def test_split_saves_a_selection(own_release: Path, tmp_path: Path) -> None:
     found = DeepAccident(dataroot=own_release).find(collision=True, split="train")
     assert read_split_file(tmp_path / "a.txt") == [scenario["token"] for scenario in found]
     assert f"scenarios {len(found)}" in " ".join(saved.stdout.split())
-    assert run("split", own_release, "--save", tmp_path / "b.txt").returncode == 2
+    assert run("split", own_release, "--save", tmp_path / "b.txt").returncode == 0
+    everything = [scenario["token"] for scenario in DeepAccident(dataroot=own_release).scenario]
+    assert read_split_file(tmp_path / "b.txt") == everything
+    assert run("split", own_release, "--save", tmp_path / "d.txt", "--out", tmp_path / "d").returncode == 2
+    assert run("split", own_release, "--save", tmp_path / "d.txt", "--seed", 1).returncode == 2
     assert run("split", own_release, "--where", "split=train", "--out", tmp_path / "b").returncode == 2
     for options in (("--seed", 3), ("--seed", 17), ("--released-skip",)):
         refused = run("split", own_release, "--where", "split=train", "--save", tmp_path / "c.txt", *options)
@@ -275,7 +279,10 @@ def test_labels_writes_a_split_and_goes_on_where_it_stopped(own_release: Path, t
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        (("--agents", "ego_vehicle,pole"), "--agents: expected all or some of ego_vehicle, ego_vehicle_behind,"),
+        (
+            ("--agents", "ego_vehicle,pole"),
+            "--agents: expected all, available or some of ego_vehicle, ego_vehicle_behind,",
+        ),
         (("--agents", ""), "found ''"),
         (("--agents", "ego_vehicle,"), "found ''"),
         (("--switch", "half_cell_shift"), "--switch: expected NAME=yes or NAME=no, NAME one of own_box_moved_twice,"),
@@ -329,3 +336,11 @@ def test_labels_of_what_has_none(tmp_path: Path) -> None:
         assert (failed.returncode, told in failed.stderr) == (2, True), failed.stderr
     assert not (tmp_path / "labels").exists()
     assert run(*verb, "--seen-by", "single").returncode == 0
+
+
+def test_a_verb_that_is_nearly_written_is_named() -> None:
+    result = CliRunner().invoke(deepaccident, ["rendr", "out"])
+    assert result.exit_code == 2
+    assert "No such command 'rendr'. Did you mean 'render'?" in result.output
+    result = CliRunner().invoke(deepaccident, ["xyz"])
+    assert (result.exit_code, "No such command 'xyz'.\n" in result.output) == (2, True)

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,9 @@ from click.testing import CliRunner
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import Baseline, conditions
 from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation.results import read_results
+from deepaccident_devkit.splits import save_selection
 from deepaccident_devkit.v2x import Link
 
 pytestmark = pytest.mark.slow
@@ -42,6 +45,27 @@ def test_predict_takes_a_link_a_model_a_horizon_and_a_scope(da_motion: DeepAccid
     link = Link(latency=0.2, pose_noise=0.3, seed=4)
     assert results.meta == Baseline(model="constant_turn_rate", link=link, horizon=1.5).meta()
     assert list(results.tokens) == da_motion.evaluation_samples("train", "paper", horizon=1.5, scope="all")
+
+
+def test_predict_takes_names_and_the_agents_that_are_there(da_motion: DeepAccident, tmp_path: Path) -> None:
+    root = tmp_path / "release"
+    shutil.copytree(da_motion.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident", "infrastructure"))
+    words = ("predict", root, "--split", "train", "--task", "accident", "--workers", 1)
+    for agents, meta in (("available", "available"), ("ego_vehicle,other_vehicle", ["ego_vehicle", "other_vehicle"])):
+        run(*words, "--agents", agents, "--out", tmp_path / agents)
+        assert read_results(tmp_path / agents / "accident.json").meta["agents"] == meta
+    with pytest.raises(NotAvailableError, match="use agents='available'"):
+        run(*words, "--agents", "all", "--out", tmp_path / "all")
+
+
+def test_predict_of_scenarios_without_an_accident_names_the_scope(da_motion: DeepAccident, tmp_path: Path) -> None:
+    normal = tmp_path / "normal.txt"
+    save_selection(da_motion.find(designed_accident=False), normal)
+    words = ("predict", da_motion.dataroot, "--split", normal, "--task", "accident", "--workers", 1)
+    told = r"has no samples to predict; the scope accident, .* leaves out all 1 of its scenarios, .* \(--scope all\)$"
+    with pytest.raises(NotAvailableError, match=told):
+        run(*words, "--out", tmp_path / "out")
+    run(*words, "--scope", "all", "--out", tmp_path / "out")
 
 
 def test_predict_takes_every_half_second_of_all_scenarios(da_motion: DeepAccident, tmp_path: Path) -> None:

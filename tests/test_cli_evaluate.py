@@ -272,7 +272,7 @@ class TestRefused:
         ("options", "sentence"),
         [
             (("--switch", "min_score"), "--switch: expected NAME=VALUE, found 'min_score'"),
-            (("--agents", "ego"), "--agents: expected all or some of ego_vehicle"),
+            (("--agents", "ego"), "--agents: expected all, available or some of ego_vehicle"),
             (("--by", "wether"), "Invalid value for '--by'"),
             (("--protocol", "boxy"), "Invalid value for '--protocol'"),
         ],

@@ -1,6 +1,7 @@
 """`deepaccident render`: a verb a view, and what it draws when nobody says what."""
 
 import re
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -122,8 +123,8 @@ def test_a_scenario_without_a_collision_has_rows_too(da_motion: DeepAccident) ->
 
 def test_no_accident_at_all_is_said() -> None:
     release: Any = SimpleNamespace(dataroot="data", scenario=[{"token": "type1/a", "collision": None}])
-    with pytest.raises(NotAvailableError, match=r"data: no scenario ends in an accident .* names; name one"):
-        rows_to_draw(release, "frame", [], None)
+    with pytest.raises(NotAvailableError, match=r"data: no scenario ends in an accident .* such as type1/a$"):
+        rows_to_draw(release, "scenario", [], None)
 
 
 def test_evaluation_draws_a_sample_of_the_results(da_motion: DeepAccident, tmp_path: Path) -> None:
@@ -178,6 +179,27 @@ def test_usage_errors(da: DeepAccident, tmp_path: Path, arguments: list[str], se
     text = run(verb, da.dataroot, *others, "--out", tmp_path / "a.png", status=2)
     assert sentence in " ".join(text.split())
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_a_release_without_an_accident_shows_its_first_scenario(da: DeepAccident, tmp_path: Path) -> None:
+    root = tmp_path / "normal"
+    shutil.copytree(da.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident", "*_accident"))
+    first = DeepAccident(dataroot=root, verbose=False).scenario[0]["token"]
+    for verb in ("frame", "sample", "bev", "sample-data", "instance"):
+        assert f"rendered: {first}" in run(verb, root, "--out", tmp_path / "a.png", "--size", "480x480")
+    run("video", root, "--out", tmp_path / "a.gif", "--frame-range", "1", "--size", "320x180", "--workers", 1)
+    with pytest.raises(NotAvailableError, match=f"no scenario ends in an accident .*, such as {first}$"):
+        run("accident", root, "--out", tmp_path / "a.png")
+
+
+def test_what_a_picture_lacks_is_logged(
+    da_partial: DeepAccident, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    run("bev", da_partial.dataroot, "--agents", "available", "--out", tmp_path / "a.png")
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{tmp_path / 'a.png'}: no LiDAR file of infrastructure"
+    ]
 
 
 @pytest.mark.parametrize(

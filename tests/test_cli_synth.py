@@ -1,5 +1,6 @@
 """`deepaccident synth`: from the words of the command line to a release."""
 
+import re
 import sys
 from pathlib import Path
 
@@ -101,7 +102,9 @@ def test_labels_without_embree_are_said_to_take_long(tmp_path, made, monkeypatch
     assert made == [SynthConfig(frames=None, sensors=False)]
 
 
-def test_a_scenario_file_and_designs_exclude_each_other(tmp_path, made):
+def test_a_scenario_file_and_designs_exclude_each_other(tmp_path, made, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("mine.yaml").write_text(design_text(1), encoding="utf-8")
     CliRunner().invoke(synth, [str(tmp_path), "--spec", "mine.yaml"])
     assert made == [SynthConfig(frames=None, spec=Path("mine.yaml"))]
     result = CliRunner().invoke(synth, [str(tmp_path), "--spec", "mine.yaml", "--design", "1"])
@@ -120,6 +123,76 @@ def test_designs_are_listed_without_a_folder():
     assert "3  unprotected left turn" in result.output
 
 
+MINE = """\
+road: {signalized: false}
+actors:
+  - {role: ego, from: west, max_speed: 9}
+  - {role: other, category: van, from: south, max_speed: 9}
+meet: {offset: 0}
+background: {vehicles: 0, two_wheelers: 0, parked: 2, walking: 1, crossing: 0}
+"""
+
+
+@pytest.fixture
+def mine(tmp_path, monkeypatch) -> Path:
+    """A scenario file in the working folder."""
+    monkeypatch.chdir(tmp_path)
+    path = Path("mine.yaml")
+    path.write_text(MINE, encoding="utf-8")
+    return path
+
+
+@pytest.mark.slow
+def test_a_file_is_checked_and_nothing_is_written(mine):
+    result = CliRunner().invoke(synth, ["--spec", "mine.yaml", "--check"])
+    assert result.exit_code == 0, result.output
+    assert re.search(
+        r"mine.yaml: can be simulated; one draw of it, with seed 0:\n"
+        r"  accident: ego \(car, \d+\.\d m/s, \w+( side)?\) and other \(van, \d+\.\d m/s, \w+( side)?\) collide at "
+        r"(\d+\.\d) s; found in draw \d+\n"
+        r"    \d+ frames \(\3 s\), 5 road users that move, 2 parked; Clear, Noon\n"
+        r"  normal: nobody collides\n"
+        r"    \d+ frames \(\d+\.\d s\), 5 road users that move, 2 parked; Clear, Noon\n"
+        r"checked in \d+\.\d s; nothing is written\n",
+        result.stdout,
+    ), result.stdout
+    assert [path.name for path in Path.cwd().iterdir()] == ["mine.yaml"]
+
+
+def test_a_file_that_is_no_scenario_has_exit_status_1(mine):
+    mine.write_text(MINE.replace("van", "cyclist"), encoding="utf-8")
+    result = CliRunner().invoke(synth, ["--spec", "mine.yaml", "--check"])
+    assert result.exit_code == 1
+    assert "error: mine.yaml:4: actors[1].category: the role other cannot be a cyclist" in result.stderr
+    result = CliRunner().invoke(synth, ["--spec", "your.yaml", "--check"])
+    assert (result.exit_code, "your.yaml: no such file" in result.stderr) == (1, True)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ([], "Missing argument 'OUT'"),
+        (["--check"], "--check needs the scenario file: --spec FILE"),
+        (["out", "--spec", "mine.yaml", "--check"], "--check writes nothing; leave out out"),
+    ],
+)
+def test_words_that_are_missing_or_too_many_are_usage_errors(mine, words, sentence):
+    result = CliRunner().invoke(synth, words)
+    assert result.exit_code == 2
+    assert sentence in result.output
+
+
+def test_how_to_see_an_accident_is_the_last_line(mine, made):
+    def last(*words: str) -> str:
+        return CliRunner().invoke(synth, ["out", *words]).stdout.splitlines()[-1]
+
+    picture = "deepaccident render accident out{} --out countdown.png"
+    assert last() == "or:   " + picture.format("")
+    assert last("--spec", "mine.yaml", "--no-sensors") == "or:   " + picture.format(" --layers boxes")
+    mine.write_text(MINE.replace("meet: {offset: 0}", ""), encoding="utf-8")
+    assert last("--spec", "mine.yaml") == "next: deepaccident info out"
+
+
 def test_a_design_is_shown_as_a_file_to_begin_with():
     result = CliRunner().invoke(synth, ["--show-design", "9"])
     assert result.exit_code == 0
@@ -130,5 +203,5 @@ def test_a_design_is_shown_as_a_file_to_begin_with():
 def test_help_names_every_option():
     text = CliRunner().invoke(synth, ["--help"]).output
     named = {option for parameter in synth.params for option in parameter.opts if option.startswith("--")}
-    assert len(named) == 16
+    assert len(named) == 17
     assert all(option in text for option in named)

@@ -71,6 +71,7 @@ STAND_FOR = {
 """What the words in capitals of a command line may be."""
 NOT_RUN = {
     "synth ": "tests/test_cli_synth.py has them; some take minutes",
+    "render accident OUT": "tests/unit/synth/test_own_files.py has it, on a release of a scenario file",
     "baseline v2x": "tests/test_cli_baseline.py has it, on smaller releases",
     "export mcap": "tests/unit/export has it, which has the extra",
 }

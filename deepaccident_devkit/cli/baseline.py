@@ -7,17 +7,19 @@ import click
 from deepaccident_devkit.baselines import MOTION_MODELS, Baseline, StudyConfig, predict_results, v2x_study
 from deepaccident_devkit.baselines.figures import save_study
 from deepaccident_devkit.cli.evaluate_options import resamples_parameter
-from deepaccident_devkit.cli.options import release_parameters
+from deepaccident_devkit.cli.options import cooperating_parameter, names_or_configuration, release_parameters
 from deepaccident_devkit.deepaccident import DeepAccident
+from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS
 from deepaccident_devkit.evaluation.results import ResultsTask
 from deepaccident_devkit.files import write_bytes
-from deepaccident_devkit.motion.sample_lists import Scope
+from deepaccident_devkit.motion.sample_lists import Scope, no_samples_text
 from deepaccident_devkit.statistics import writable_folder
 from deepaccident_devkit.taxonomy import AGENTS
-from deepaccident_devkit.v2x import AGENT_CONFIGS, Link
+from deepaccident_devkit.v2x import Link
 
+_ALONE = "single"
 _RELEASED_HORIZON = Baseline().horizon
 _FILES: dict[str, str] = {"motion": "motion", "accident": "accident.json", "detection": "detection.json"}
 _SPLIT = click.option("--split", default="val", show_default=True, help="Name of a split, or a split file (.txt).")
@@ -56,13 +58,7 @@ def baseline() -> None:
     show_default=True,
     help="Task to write results for; you can repeat this option.",
 )
-@click.option(
-    "--agents",
-    type=click.Choice(list(AGENT_CONFIGS)),
-    default="single",
-    show_default=True,
-    help="Which agents share what they see.",
-)
+@cooperating_parameter("Agents that share what they see", _ALONE)
 @_MODEL
 @click.option(
     "--latency", default=0.0, show_default=True, help="Delay of the partners' data, in seconds, in steps of 0.1."
@@ -94,11 +90,14 @@ def predict(split: str, tasks: tuple[str, ...], purpose: Any, scope: Scope, out:
     """
     noise, latency, seed = options.pop("pose_noise"), options.pop("latency"), options.pop("seed")
     link = Link(latency=latency, pose_noise=noise or None, seed=seed) if noise or latency else None
+    options["agents"] = names_or_configuration(options["agents"]) or _ALONE
     chosen = Baseline(link=link, **{name: options.pop(name) for name in ("agents", "model", "horizon")})
     folder = writable_folder(out)
     dataset = DeepAccident(**options)
     released = chosen.horizon == _RELEASED_HORIZON and scope == "accident"
     tokens = dataset.samples(split, purpose, "released" if released else "paper", horizon=chosen.horizon, scope=scope)
+    if not tokens:
+        raise NotAvailableError(f"{split}: has no samples to predict; {no_samples_text(dataset, split, scope)}")
     for task in get_args(ResultsTask):
         if task in tasks or "all" in tasks:
             path = folder / _FILES[task]

@@ -102,7 +102,8 @@ def _task_verb(task: TaskName) -> click.Command:
     @click.option(
         "--allow-partial",
         is_flag=True,
-        help="Accept results that lack some samples; every number is then marked as partial.",
+        help="Accept results that lack some samples (which marks every number as partial), or leave out predictions of "
+        "other samples.",
     )
     @click.option(
         "--by",

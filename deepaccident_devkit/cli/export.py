@@ -11,7 +11,7 @@ from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.export.mcap import McapConfig, export_mcap
 from deepaccident_devkit.motion import PRESETS
 from deepaccident_devkit.taxonomy import AGENTS, OnError
-from deepaccident_devkit.v2x.collisions import first_accident
+from deepaccident_devkit.v2x.collisions import default_scenario
 
 
 @click.group()
@@ -78,7 +78,7 @@ def mcap(
     """Write one scenario of the release in DATAROOT as an MCAP file for Foxglove or rerun.
 
     SCENARIO is a token, such as type1_subtype1_accident/Town03_type001_subtype0001_scenario00024. Without SCENARIO the
-    command takes the first scenario with a collision.
+    command takes the first scenario with a collision, or if there is none, the first scenario.
     """
     names = agent_names(agents)
     choices = {name: options.pop(name) for name in ("frames", "points", "labels", "motion_labels", "on_missing")}
@@ -87,6 +87,6 @@ def mcap(
     McapConfig.of(**choices)  # before the release is indexed
     prediction = None if results is None else read_results(results)
     dataset = DeepAccident(**options)
-    token = scenario or first_accident(dataset)
+    token = scenario or default_scenario(dataset)
     made = export_mcap(dataset, token, out, prediction=prediction, progress=True, **choices)
     click.echo(f"{made}: {token}, {made.stat().st_size / 1e6:.1f} MB; open it in Foxglove, or with: rerun {made}")

@@ -1,6 +1,7 @@
 """Groups of verbs: one imports a verb only when it is needed, the other is a verb with further verbs below it."""
 
 from collections.abc import Sequence
+from difflib import get_close_matches
 from importlib import import_module
 from typing import Any
 
@@ -26,6 +27,15 @@ class ModuleVerbs(click.Group):
             return None
         verb: click.Command = getattr(import_module(f"{self._package}.{cmd_name}"), cmd_name)
         return verb
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """The verb that the first word names; for a word that is nearly one, the error names the verb."""
+        meant = get_close_matches(args[0], self._verbs, n=1)
+        if meant and args[0] not in self._verbs and not ctx.resilient_parsing:
+            ctx.fail(f"No such command '{args[0]}'. Did you mean '{meant[0]}'?")
+        return super().resolve_command(ctx, args)
 
 
 class VerbGroup(click.Group):

@@ -13,7 +13,7 @@ from deepaccident_devkit.motion import LABEL_PROTOCOLS, PRESETS, LabelProtocol, 
 from deepaccident_devkit.motion.label_folder import Manifest, folder_path
 from deepaccident_devkit.motion.protocols import slip_names
 from deepaccident_devkit.motion.sample_lists import Purpose
-from deepaccident_devkit.v2x import AGENT_CONFIGS
+from deepaccident_devkit.v2x import AGENT_SETS
 
 _CONFIG_OPTIONS = ("preset", "protocol", "switches", "orientation", "seen_by", "only_vehicle")
 
@@ -54,7 +54,7 @@ _CONFIG_OPTIONS = ("preset", "protocol", "switches", "orientation", "seen_by", "
 )
 @click.option(
     "--seen-by",
-    type=click.Choice(list(AGENT_CONFIGS)),
+    type=click.Choice(AGENT_SETS),
     help="Only actors that these agents see.  [default: all actors]",
 )
 @click.option("--only-vehicle", is_flag=True, help="Leave out pedestrians.")

@@ -8,8 +8,9 @@ from typing import Any, TypeVar
 import click
 
 from deepaccident_devkit.taxonomy import AGENTS, VERSIONS
-from deepaccident_devkit.v2x import AGENT_CONFIGS
+from deepaccident_devkit.v2x import AGENT_SETS, AVAILABLE
 
+_ALL = ("all", AVAILABLE)
 Verb = TypeVar("Verb", bound=Callable[..., Any])
 
 on_error_parameter = click.option(
@@ -61,20 +62,34 @@ def agents_parameter(verb: Verb) -> Verb:
 
 
 def agent_names(given: tuple[str, ...]) -> tuple[str, ...]:
-    """The agents of repeated --agents, each text one name or several with commas; `all` or no text means all."""
+    """The agents of repeated --agents, each text one name or several with commas; no text means all.
+
+    `all` and `available` do too: this only chooses among the samples that are there.
+    """
     names = [name for text in given for name in text.split(",")]
-    unknown = [name for name in names if name not in (*AGENTS, "all")]
+    unknown = [name for name in names if name not in (*AGENTS, *_ALL)]
     if unknown:
         raise click.BadParameter(
-            f"--agents: expected all or some of {', '.join(AGENTS)}, whose samples are taken; found {unknown[0]!r}"
+            f"--agents: expected {', '.join(_ALL)} or some of {', '.join(AGENTS)}, whose samples are taken; "
+            f"found {unknown[0]!r}"
         )
-    return AGENTS if not names or "all" in names else tuple(names)
+    return AGENTS if not names or set(names) & set(_ALL) else tuple(names)
+
+
+def cooperating_parameter(whose: str, default: str) -> Callable[[Verb], Verb]:
+    """An option --agents for agents that cooperate (`names_or_configuration` reads it)."""
+    return click.option(
+        "--agents",
+        multiple=True,
+        metavar="NAME[,NAME…]",
+        help=f"{whose}: names, or one of {', '.join(AGENT_SETS)} (those that are there).  [default: {default}]",
+    )
 
 
 def names_or_configuration(given: tuple[str, ...]) -> str | list[str] | None:
     """Repeated --agents for agents that cooperate: one configuration, names, or None if it was not given."""
     names = [name for text in given for name in text.split(",")]
-    return names[0] if len(names) == 1 and names[0] in AGENT_CONFIGS else names or None
+    return names[0] if len(names) == 1 and names[0] in AGENT_SETS else names or None
 
 
 def pixel_size(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[int, int] | None:

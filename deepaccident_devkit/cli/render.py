@@ -1,5 +1,6 @@
 """`deepaccident render`: pictures and videos of a release, one verb for each view."""
 
+import logging
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -8,7 +9,13 @@ from typing import Any, cast, get_args
 
 import click
 
-from deepaccident_devkit.cli.options import frame_range, names_or_configuration, pixel_size, release_parameters
+from deepaccident_devkit.cli.options import (
+    cooperating_parameter,
+    frame_range,
+    names_or_configuration,
+    pixel_size,
+    release_parameters,
+)
 from deepaccident_devkit.cli.render_targets import picture_paths, rows_to_draw
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.deepaccident import DeepAccident
@@ -21,6 +28,7 @@ from deepaccident_devkit.render.camera import ColorBy, render_pointcloud_in_imag
 from deepaccident_devkit.render.instance import render_instance
 from deepaccident_devkit.render.layers import LAYERS, Layer
 from deepaccident_devkit.render.link import render_link
+from deepaccident_devkit.render.missing import missing_words
 from deepaccident_devkit.render.moments import render_frame, render_sample
 from deepaccident_devkit.render.motion import MotionStyle, render_motion_labels
 from deepaccident_devkit.render.outcomes import render_evaluation
@@ -29,10 +37,11 @@ from deepaccident_devkit.render.video import SUFFIXES, VIEWS, render_scenario_vi
 from deepaccident_devkit.render.video.writers import check_target
 from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix
 from deepaccident_devkit.taxonomy import Frame
-from deepaccident_devkit.v2x import AGENT_CONFIGS, Link
-from deepaccident_devkit.v2x.collisions import first_accident
+from deepaccident_devkit.v2x import Link
+from deepaccident_devkit.v2x.collisions import default_scenario
 
 _RELEASE = ("dataroot", "version", "index_dir", "workers", "on_error")
+_logger = logging.getLogger(__name__)
 _DPI = 100.0
 _OUT = f"File to write ({', '.join(PICTURE_SUFFIXES)}), or a folder for several pictures."
 
@@ -77,12 +86,7 @@ def _link_options(latency: float, pose_noise: float) -> tuple[Any, ...]:
     )
 
 
-_AGENTS = click.option(
-    "--agents",
-    multiple=True,
-    metavar="NAME[,NAME…]",
-    help=f"Agents, or one of {', '.join(AGENT_CONFIGS)}.  [default: chosen by the view]",
-)
+_AGENTS = cooperating_parameter("Agents to show", "chosen by the view")
 _VIEW_RANGE = click.option("--view-range", type=float, metavar="M", help="Metres to show on each side.")
 _COORDINATES = click.option(
     "--frame", type=click.Choice(get_args(Frame)), help="Coordinate frame of the axes.  [default: ego]"
@@ -116,7 +120,7 @@ class _Picture:
     help: str
     canvas: str = "fig"
     options: tuple[Any, ...] = (_LAYERS,)
-    default: str = "the first accident"
+    default: str = "the first accident, or if there is none, the first scenario"
 
     def drawn(
         self, dataset: Dataset, row: str, size: tuple[int, int] | None, dpi: float, choices: dict[str, Any]
@@ -213,6 +217,7 @@ _PICTURES = {
     ),
     "accident": _Picture(
         draw=render_accident,
+        default="the first accident",
         of="scenario",
         help="Render the countdown to an accident: one column per moment, one row per agent.",
         options=(
@@ -302,7 +307,10 @@ def _verb(name: str, picture: _Picture) -> click.Command:
         dataset = DeepAccident(**release)
         rows = rows_to_draw(dataset, picture.of, tokens, frames)
         for row, path in zip(rows, picture_paths(out, name, rows), strict=True):
-            save_picture(picture.drawn(dataset, row, size, dpi, choices), path, dpi=dpi)
+            drawn = picture.drawn(dataset, row, size, dpi, choices)
+            save_picture(drawn, path, dpi=dpi)
+            if words := missing_words(drawn):
+                _logger.warning("%s: %s", path, "; ".join(words))
             click.echo(f"rendered: {row} in {path}")
 
     for option in picture.options:  # on a command they come last, on a function they would come first
@@ -347,15 +355,15 @@ def video(
 ) -> None:
     """Write one scenario of the release in DATAROOT as a video.
 
-    Without SCENARIO the command takes the first accident. An MP4 file plays in browsers if the extra `video` is
-    installed; in a checkout: pip install '.[video]'.
+    Without SCENARIO the command takes the first accident, or if there is none, the first scenario. An MP4 file plays in
+    browsers if the extra `video` is installed; in a checkout: pip install '.[video]'.
     """
     release = {option: options.pop(option) for option in _RELEASE}
     check_target(out, size=options["size"], fps=options["fps"])  # before the release is indexed
     dataset = DeepAccident(**release)
     path = render_scenario_video(
         dataset,
-        scenario or first_accident(dataset),
+        scenario or default_scenario(dataset),
         out,
         what=_words(what) or "frame",
         agents=names_or_configuration(agents),

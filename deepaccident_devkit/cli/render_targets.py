@@ -12,7 +12,7 @@ from deepaccident_devkit.render.pictures import PICTURE_SUFFIXES
 from deepaccident_devkit.render.roles import collider_ids
 from deepaccident_devkit.tables.tokens import annotation_token, frame_token, instance_token, sample_token
 from deepaccident_devkit.taxonomy import FRAME_PERIOD, OWN_ACTOR_ID
-from deepaccident_devkit.v2x.collisions import first_accident
+from deepaccident_devkit.v2x.collisions import default_scenario, first_accident
 from deepaccident_devkit.v2x.configurations import agents_of
 
 _SECONDS_BEFORE = 1.0
@@ -26,19 +26,21 @@ def rows_to_draw(dataset: Dataset, table: str, tokens: Sequence[str], frames: ra
         dataset: the release.
         table: the table whose rows the verb renders.
         tokens: of rows of this table or of scenarios. A scenario stands for its first agent at `frames`, and for the
-            actor that this agent collides with. No tokens stand for the first accident.
+            actor that this agent collides with. No tokens stand for the first accident; if
+            there is none, for the first scenario, except where a whole scenario is rendered.
         frames: frame numbers of the scenarios; None for one second before their end.
 
     Raises:
         TokenError: no such scenario.
         ChoiceError: a scenario does not have such frames.
-        NotAvailableError: there is no accident, or the moment has no boxes.
+        NotAvailableError: there is no accident, and a whole scenario is to be rendered; or the moment has no boxes.
         click.UsageError: `frames` are given, but the table or a token has no frames to choose from.
     """
     if frames is not None and table in ("scenario", "instance"):
         raise click.UsageError(f"--frame-range is for moments; a whole {table} is rendered, leave it out")
     rows: list[str] = []
-    for token in tokens or [first_accident(dataset)]:
+    first = first_accident if table == "scenario" else default_scenario  # a whole scenario is counted down
+    for token in tokens or [first(dataset)]:
         if token.count("/") == 1:
             rows += _of_scenario(dataset, table, token, frames)
         elif frames is not None:

@@ -4,11 +4,10 @@ from typing import Any
 
 import click
 
-from deepaccident_devkit.cli.options import names_or_configuration, release_parameters
+from deepaccident_devkit.cli.options import cooperating_parameter, names_or_configuration, release_parameters
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.render.replay import render_replay
-from deepaccident_devkit.v2x import AGENT_CONFIGS
 
 
 @click.command()
@@ -16,12 +15,7 @@ from deepaccident_devkit.v2x import AGENT_CONFIGS
 @click.argument("scenario", required=False)
 @click.option("--out", required=True, type=click.Path(), help="File to write, such as replay.html.")
 @click.option("--results", type=click.Path(), help="Results file of motion or accidents, shown with its verdicts.")
-@click.option(
-    "--agents",
-    multiple=True,
-    metavar="NAME[,NAME…]",
-    help=f"Agents to show, or one of {', '.join(AGENT_CONFIGS)} (from the ego vehicle).  [default: all]",
-)
+@cooperating_parameter("Agents to show", "available")
 @click.option(
     "--image-width", type=int, metavar="N", help="Image width in pixels.  [default: so that the file has at most 15 MB]"
 )
@@ -39,7 +33,8 @@ def replay(
 ) -> None:
     """Write one scenario of the release in DATAROOT as one HTML file that plays in any browser, without a network.
 
-    SCENARIO is a token of the form TYPE/NAME. Without SCENARIO the command takes the first accident.
+    SCENARIO is a token of the form TYPE/NAME. Without SCENARIO the command takes the first
+    accident, or if there is none, the first scenario.
     """
     prediction = None if results is None else read_results(results)  # before the release is indexed
     path = render_replay(

@@ -21,7 +21,11 @@ from deepaccident_devkit.splits import OFFICIAL_SEED, official_split, save_selec
     help="Folder to write train.txt, val.txt, test.txt, train_mini.txt and val_mini.txt into.",
 )
 @where_parameter
-@click.option("--save", type=click.Path(path_type=Path), help="With --where: split file to write.")
+@click.option(
+    "--save",
+    type=click.Path(path_type=Path),
+    help="Split file to write: of the scenarios that match --where, or of all.",
+)
 @click.option("--overwrite", is_flag=True, help="Replace files that already exist.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
 def split(
@@ -36,16 +40,17 @@ def split(
 ) -> None:
     """Split the release in DATAROOT by the official procedure, and print how the scenarios are distributed.
 
-    With --where, report only the scenarios that match all filters. --save writes them into a split file.
+    With --where, report only the scenarios that match all filters. --save writes them into a split file; without
+    --where it writes all scenarios.
     """
     if where and out:
         raise click.UsageError("--out is for the official split; with --where give --save FILE")
-    if save and not where:
-        raise click.UsageError("--save is for a selection; give --where too, or --out FOLDER for the official split")
-    if where:
+    if save and out:
+        raise click.UsageError("--out is for the official split, --save for a selection; give one of them")
+    if where or save:
         _refuse("seed", "released_skip")
     dataset = DeepAccident(**release)
-    if where:
+    if where or save:
         chosen = [scenario["token"] for scenario in dataset.find(*where)]
         written = [save_selection(chosen, save, overwrite=overwrite)] if save else []
         report = split_report(dataset, {"selection": chosen})
@@ -65,5 +70,5 @@ def _refuse(*parameters: str) -> None:
         if context.get_parameter_source(name) is not ParameterSource.DEFAULT:
             option = f"--{name.replace('_', '-')}"
             raise click.UsageError(
-                f"{option} is for the official split and has no effect with --where; leave one of them out"
+                f"{option} is for the official split and has no effect with --where or --save; leave one of them out"
             )

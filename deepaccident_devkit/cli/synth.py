@@ -1,22 +1,28 @@
 """`deepaccident synth`: make a synthetic release."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_args
 
 import click
 
 from deepaccident_devkit.cli.options import pixel_size
+from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.synth.checking import checked_text
 from deepaccident_devkit.synth.config import IMAGE_SIZE, RELEASED_IMAGE_SIZE
 from deepaccident_devkit.synth.sensors.caster import has_embree
-from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, View, design_text, designs_text
+from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, View, design_text, designs_text, read_spec
 from deepaccident_devkit.taxonomy import Layout
 
 _DEFAULTS = SynthConfig()
+_FAULTY = 1
+"""Exit status if a checked file gives no scenario."""
 _EXAMPLES = """\b
 Examples:
   deepaccident synth OUT --scenarios 24 --no-sensors     only labels, all twelve designs
   deepaccident synth --show-design 3 > mine.yaml         print a scenario file to edit
+  deepaccident synth --spec mine.yaml --check            say what happens in your file, and write nothing
   deepaccident synth OUT --spec mine.yaml                make accidents from your file
   deepaccident synth OUT --for-released-code             for the released DeepAccident code"""
 
@@ -34,7 +40,7 @@ def _show_design(context: click.Context, _parameter: click.Parameter, number: in
 
 
 @click.command(epilog=_EXAMPLES)
-@click.argument("out", type=click.Path(path_type=Path))
+@click.argument("out", required=False, type=click.Path(path_type=Path))
 @click.option(
     "--scenarios",
     default=_DEFAULTS.scenarios,
@@ -86,6 +92,12 @@ def _show_design(context: click.Context, _parameter: click.Parameter, number: in
     help="Your own scenario file, in place of the designs; docs/scenarios.md describes its fields.",
 )
 @click.option(
+    "--check",
+    is_flag=True,
+    help="Draw one accident and its normal twin from the file of --spec, print who hits whom, and write nothing; "
+    "without OUT. Exit status 1 if the file gives no scenario.",
+)
+@click.option(
     "--unplanned",
     default=_DEFAULTS.unplanned,
     show_default=True,
@@ -118,11 +130,19 @@ def _show_design(context: click.Context, _parameter: click.Parameter, number: in
     callback=_show_design,
     help="Print the scenario file of a design, as a start for your own, and stop.",
 )
-def synth(out: Path, *, no_sensors: bool, workers: int | None, **options: Any) -> None:
+@click.pass_context
+def synth(
+    context: click.Context, /, out: Path | None, *, no_sensors: bool, check: bool, workers: int | None, **options: Any
+) -> None:
     """Make a complete synthetic release in the new folder OUT.
 
     If a run is interrupted, the same command continues it.
     """
+    if check:
+        _check(context, out, options)
+        return
+    if out is None:
+        raise click.UsageError("Missing argument 'OUT': the folder to make.", context)
     config = SynthConfig(sensors=not no_sensors, **options)
     if no_sensors and not has_embree():
         click.echo("slow without the package embreex; in a checkout: pip install '.[synth]'", err=True)
@@ -131,3 +151,19 @@ def synth(out: Path, *, no_sensors: bool, workers: int | None, **options: Any) -
     frames = "" if config.frames is None else f" of {config.frames} frame{'s' if config.frames > 1 else ''}"
     click.echo(f"{made}: {scenarios}{frames} with five agents, layout {config.layout}")
     click.echo(f"next: deepaccident info {made}")
+    if config.spec is None or read_spec(config.spec).meets:
+        layers = " --layers boxes" if no_sensors else ""
+        click.echo(f"or:   deepaccident render accident {made}{layers} --out countdown.png")
+
+
+def _check(context: click.Context, out: Path | None, options: Mapping[str, Any]) -> None:
+    """Print what a scenario file gives; exit status 1 with the error if it gives nothing."""
+    if options["spec"] is None:
+        raise click.UsageError("--check needs the scenario file: --spec FILE.", context)
+    if out is not None:
+        raise click.UsageError(f"--check writes nothing; leave {out} out.", context)
+    try:
+        click.echo(checked_text(SynthConfig(**options), progress=True))
+    except ConfigError as error:
+        click.echo(f"error: {error}", err=True)
+        context.exit(_FAULTY)

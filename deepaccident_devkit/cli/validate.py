@@ -19,9 +19,17 @@ _FINDINGS_STATUS = 1
     "--scenario", "scenarios", multiple=True, metavar="TOKEN", help="Only this scenario; you can repeat this option."
 )
 @click.option("--notes", is_flag=True, help="Also list notes, which are no errors and no warnings.")
+@click.option("--all", "whole", is_flag=True, help="List all findings of each scenario, not only the first eight.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document, for programs.")
 def validate(
-    dataroot: Path, version: str, deep: bool, scenarios: tuple[str, ...], notes: bool, as_json: bool, **release: Any
+    dataroot: Path,
+    version: str,
+    deep: bool,
+    scenarios: tuple[str, ...],
+    notes: bool,
+    whole: bool,
+    as_json: bool,
+    **release: Any,
 ) -> None:
     """Print what is wrong, unusual or missing in the release in DATAROOT, worst scenario first.
 
@@ -37,6 +45,6 @@ def validate(
         scenarios=scenarios or None,
         progress=sys.stderr.isatty(),
     )
-    click.echo(report.to_json() if as_json else report.to_text(notes=notes))
+    click.echo(report.to_json() if as_json else report.to_text(notes=notes, whole=whole))
     if not report.is_good:
         sys.exit(_FINDINGS_STATUS)

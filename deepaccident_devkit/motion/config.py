@@ -16,7 +16,8 @@ from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS, LabelProtocol, label_protocol
 from deepaccident_devkit.motion.settings import choice, count, flag, number
 from deepaccident_devkit.taxonomy import AGENTS
-from deepaccident_devkit.v2x import AGENT_CONFIGS, AgentConfig, Agents
+from deepaccident_devkit.v2x import AGENT_SETS, AgentConfig, Agents
+from deepaccident_devkit.v2x.configurations import is_available
 
 _STEPS_PER_SECOND: Final = 2
 _BYTE: Final = 255
@@ -42,7 +43,7 @@ class MotionLabelConfig:
         filter_invisible: rasterise only what the cooperating agents see by the released rule (docs/released_code.md,
             Visibility and attributes).
         agents: the agents whose sight counts; None for all that are there, as in the released code. Names are
-            kept as a tuple.
+            kept as a tuple, and `available` as None.
         draw_ego: rasterise the ego's own box (the infrastructure has none).
         ignore_index: the value of offset and flow outside instances, and of missing frames that are ignored: 255, or a
             number of at least the grid's longer side in cells, which no vector can have.
@@ -208,17 +209,19 @@ def _checked_mark(ignore_index: object, grid: BevGrid) -> int:
 
 
 def _checked_agents(agents: object) -> AgentConfig | str | tuple[str, ...] | None:
+    if is_available(agents):
+        return None  # one digest for both
     if agents is None or isinstance(agents, AgentConfig):
         return agents
     if isinstance(agents, str):
         if agents in AGENTS:
             raise ChoiceError(f"agents: expected a configuration, found {agents!r}; for one agent give [{agents!r}]")
-        return choice("agents", agents, AGENT_CONFIGS)
+        return choice("agents", agents, AGENT_SETS)
     if not isinstance(agents, Iterable):
         raise ChoiceError(f"agents: expected agents' names or a configuration, found {agents!r}")
     names = tuple(choice("agents", agent, AGENTS) for agent in agents)
     if not names:
-        raise ChoiceError("agents: expected at least one agent, found none; None stands for all agents")
+        raise ChoiceError("agents: expected at least one agent, found none; None or 'available' stands for all agents")
     return names
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from typing import Final, Literal, get_args
 
 import numpy as np
@@ -77,7 +78,7 @@ def samples(
     if not scenario_tokens:
         raise NotAvailableError(
             f"{split}: no scenario of this split is in {dataset.dataroot}; unpack that part of the release, or choose "
-            "another split"
+            f"another split: it has {_splits_text(dataset)}"
         )
     wanted = np.isin(np.arange(len(dataset.scenario)), [dataset.getind("scenario", one) for one in scenario_tokens])
     columns, scenarios = dataset.columns("sample"), dataset.columns("scenario")
@@ -92,6 +93,23 @@ def samples(
         if scope == "accident":
             chosen &= scenarios["designed_accident"][:][row]
     return [dataset.sample[index]["token"] for index in np.flatnonzero(in_split & chosen).tolist()]
+
+
+def no_samples_text(dataset: Dataset, split: str | os.PathLike[str], scope: Scope) -> str:
+    """What to do where a split of a release has labelled samples, but a list has none of them."""
+    scenarios = [dataset.get("scenario", token) for token in sorted(dataset.split_scenarios(split))]
+    if scope == "accident" and not any(scenario["designed_accident"] for scenario in scenarios):
+        return (
+            f"the scope accident, which is the default, leaves out all {len(scenarios)} of its scenarios, since none "
+            "was designed to end in an accident; use scope='all' (--scope all)"
+        )
+    return "choose others"
+
+
+def _splits_text(dataset: Dataset) -> str:
+    """`train: 2 scenarios, split unknown: 1 scenario`."""
+    counts = Counter(scenario["split"] or "split unknown" for scenario in dataset.scenario)
+    return ", ".join(f"{name}: {count} scenario{'s' * (count != 1)}" for name, count in counts.items())
 
 
 def evaluation_samples(

@@ -9,7 +9,7 @@ from typing import Literal, overload
 from deepaccident_devkit.errors import MetaError
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.release._content import read_lines
-from deepaccident_devkit.taxonomy import META_AGENTS, TIMES_OF_DAY, UNTRACKED_ID, AgentName
+from deepaccident_devkit.taxonomy import META_AGENTS, TIMES_OF_DAY, UNTRACKED_ID, WARM_UP_FRAMES, AgentName
 
 _FIRST_LINE = "<weather+time> <id1> <class1> <id2> <class2> <impact> <spawn relation> <contact side> <frames>"
 _REMEDY = "restore the file from its archive"
@@ -65,6 +65,11 @@ class Meta:
     ego_direction: str | None = None
     other_direction: str | None = None
     planned_agents: tuple[AgentName | None, AgentName | None] | None = None
+
+    @property
+    def recorded_frames(self) -> int:
+        """How many frames a whole recording has."""
+        return self.simulated_frames - WARM_UP_FRAMES
 
 
 @overload

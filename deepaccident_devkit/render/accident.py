@@ -10,10 +10,10 @@ import numpy as np
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
 from deepaccident_devkit.geometry import SE3, Boxes
-from deepaccident_devkit.render.axes import axis_words, figure_or_new, settled, with_light_grid
+from deepaccident_devkit.render.axes import axis_words, figure_or_new, set_title, settled, with_light_grid
 from deepaccident_devkit.render.best_view import best_camera
 from deepaccident_devkit.render.boxes import SMALLEST_TEXT, draw_actors_from_above, write_beside
-from deepaccident_devkit.render.camera import CAMERA_LAYERS, render_sample_data
+from deepaccident_devkit.render.camera import CAMERA_LAYERS, draw_camera
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, GRID_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.roles import in_drawing_order, role_colors, short_name
@@ -21,6 +21,7 @@ from deepaccident_devkit.render.trails import draw_trails
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD
 from deepaccident_devkit.v2x import Agents, Contact, collision, cooperating_agents
+from deepaccident_devkit.v2x.collisions import CONTACT_GAP
 from deepaccident_devkit.v2x.configurations import agents_of
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
@@ -55,7 +56,8 @@ def render_accident(
 ) -> Figure:
     """Render the countdown to an accident: a column for each moment, a row for each agent, and one from above.
 
-    Each agent has the image of the camera that sees the colliding pair best (the front one if no camera does). The view
+    Each agent has the image of the camera that sees the colliding pair best (the front one if no camera does), of those
+    that were downloaded; if none was, a grey panel. The view
     from above has the place of contact (a cross), the pair's speeds, and the pair's paths up to the contact.
 
     Args:
@@ -68,18 +70,19 @@ def render_accident(
         fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure; its title says who hits whom, how fast and at which angle.
+        The figure; its title says who hits whom, how fast and at which angle, and whether the recording ends before
+        the pair are near enough to touch.
 
     Raises:
         TokenError: no such scenario.
         NotAvailableError: nobody collides in it (the nearest approach of a normal scenario is no accident), it has no
             meta, or an agent is not in this release.
         ChoiceError: no such agent, configuration or layer, or none of the moments was recorded.
-        MissingFileError: an image was not downloaded.
     """
     shown = layers_of(layers, _SHOWN, COUNTDOWN_LAYERS)
     contact = _contact(dataset, scenario, "look at moments of this one with render_frame")
     record = dataset.get("scenario", scenario)
+    cut = _cut_words(contact, record["num_frames"])
     moments = _moments(seconds, record["num_frames"])
     there = agents_of(dataset, scenario)
     first = sample_token(record["token"], there[0], record["num_frames"])
@@ -94,12 +97,13 @@ def render_accident(
             _draw_image(dataset, sample, _pair_at(tracks, contact, index), shown, axes[row, column])
         moment = sample_token(record["token"], there[0], index)
         _draw_contact(dataset, moment, contact, tracks, shown, axes[-1, column])
-        axes[0, column].set_title("the impact" if left == 0 else f"{left:g} s before")
+        end = "the last frame" if cut else "the impact"
+        axes[0, column].set_title(end if left == 0 else f"{left:g} s before")
     for row, agent in enumerate(names):
         _write_row(short_name(agent), AGENT_COLORS[agent], axes[row, 0])
     for ax in axes[-1, 1:]:
         ax.set_ylabel("")
-    fig.suptitle(accident_words(dataset, contact), fontsize=11)
+    set_title(fig, "\n".join(filter(None, [accident_words(dataset, contact), cut])), fontsize=11)
     return settled(fig)
 
 
@@ -120,7 +124,6 @@ def draw_countdown(
     Raises:
         NotAvailableError: nobody collides in the scenario, or it has no meta.
         ChoiceError: no such layer.
-        MissingFileError: an image was not downloaded.
     """
     shown = layers_of(layers, _SHOWN, COUNTDOWN_LAYERS)
     record = dataset.get("frame", frame)
@@ -170,6 +173,14 @@ def accident_words(dataset: Dataset, contact: Contact) -> str:
     )
 
 
+def _cut_words(contact: Contact, frames: int) -> str:
+    """Says that a recording of so many frames does not end with its accident; empty if it does."""
+    last = int(contact.frame.rsplit("/", 1)[1])
+    if last == frames and contact.gap <= CONTACT_GAP:
+        return ""
+    return f"cut short? the pair are {contact.gap:.1f} m apart at frame {last} of {frames}, the last that shows both"
+
+
 def _contact(dataset: Dataset, scenario: RowArgument, instead: str) -> Contact:
     """How the accident of a scenario happened; raises NotAvailableError, with a remedy, if there is none."""
     contact = collision(dataset, scenario)
@@ -201,7 +212,7 @@ def _pair_at(tracks: ScenarioTracks, contact: Contact, index: int) -> Boxes:
 
 def _draw_image(dataset: Dataset, sample: str, pair: Boxes, shown: frozenset[Layer], ax: Axes) -> None:
     channel = best_camera(dataset, sample, pair)
-    render_sample_data(dataset, f"{sample}/{channel}", layers=[*shown.intersection(CAMERA_LAYERS)], ax=ax)
+    draw_camera(dataset, dataset.get("sample_data", f"{sample}/{channel}"), shown.intersection(CAMERA_LAYERS), ax)
     ax.set_title("")
     write_beside(ax, channel, (ax.get_xlim()[0], ax.get_ylim()[0]), "black")
 
@@ -252,8 +263,7 @@ def _number(value: float, unit: str) -> str:
 
 
 def _draw_camera(dataset: Dataset, camera: str, shown: Collection[Layer], ax: Axes) -> None:
-    in_camera: list[Layer] = [layer for layer in CAMERA_LAYERS if layer in shown]
-    render_sample_data(dataset, camera, layers=in_camera, ax=ax)
+    draw_camera(dataset, dataset.get("sample_data", camera), shown, ax)
     agent, _, channel = camera.rsplit("/", 3)[1:]
     ax.set_title(f"{short_name(agent)}: {channel}", fontsize="medium", color=AGENT_COLORS[agent])
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.render.axes import figure_or_new
+from deepaccident_devkit.render.axes import figure_or_new, set_title
 from deepaccident_devkit.render.best_view import BestView, best_view, crop_about
 from deepaccident_devkit.render.bev import BEV_LAYERS, BevView, draw_bev
 from deepaccident_devkit.render.boxes import draw_boxes_from_above, draw_boxes_in_image
@@ -36,6 +36,8 @@ def render_annotation(
 ) -> Figure:
     """Render a box in the camera of its agent that shows it largest, from above, and in words.
 
+    Of the cameras, those whose images were downloaded come first; if there is none, the image's place is grey.
+
     Args:
         dataset: the release.
         annotation: token or record.
@@ -51,7 +53,6 @@ def render_annotation(
     Raises:
         TokenError: no such annotation.
         ChoiceError: no such layer.
-        MissingFileError: the image was not downloaded.
     """
     chosen = layers_of(layers, _DEFAULT, _POSSIBLE)
     record = dataset.get("annotation", annotation)
@@ -75,7 +76,7 @@ def render_annotation(
     for column, lines in enumerate(columns):
         place = column / len(columns)
         axes["words"].text(place, 1, "\n".join(lines), va="top", fontsize=8.5, transform=axes["words"].transAxes)
-    fig.suptitle(record["token"])
+    set_title(fig, record["token"])
     return fig
 
 

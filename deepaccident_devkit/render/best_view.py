@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.camera import IN_FRONT_DEPTH
+from deepaccident_devkit.render.missing import is_there
 from deepaccident_devkit.taxonomy import CAMERAS, UNTRACKED_ID
 from deepaccident_devkit.v2x.projection import camera_of
 
@@ -32,6 +33,8 @@ class BestView:
 def best_view(dataset: Dataset, samples: Iterable[str], boxes: Boxes) -> BestView | None:
     """The view of boxes, in world, that shows most of them; of equal views, the one that shows them largest.
 
+    A view whose image was not downloaded only counts if there is no other.
+
     Args:
         dataset: the release.
         samples: tokens of the samples whose cameras are compared, at the moment of the boxes.
@@ -45,7 +48,7 @@ def best_view(dataset: Dataset, samples: Iterable[str], boxes: Boxes) -> BestVie
     """
     views = [_view(dataset, f"{sample}/{channel}", boxes) for sample in samples for channel in CAMERAS]
     there = [view for view in views if view is not None]
-    return max(there, key=lambda view: (view.shown, view.area), default=None)
+    return max(there, key=lambda view: (is_there(dataset, view.camera), view.shown, view.area), default=None)
 
 
 def best_camera(dataset: Dataset, sample: str, boxes: Boxes) -> str:

@@ -11,17 +11,18 @@ import numpy as np
 from deepaccident_devkit.arrays import ByteArray, FloatArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.geometry import SE3, Boxes
+from deepaccident_devkit.geometry import SE3, Boxes, LidarPointCloud
 from deepaccident_devkit.release import BevImage
 from deepaccident_devkit.release.bev_camera import TAGS
-from deepaccident_devkit.render.axes import axes_or_new, axis_words, check_view_range
+from deepaccident_devkit.render.axes import axes_or_new, axis_words, check_view_range, set_title
 from deepaccident_devkit.render.boxes import draw_actors_from_above, write_beside
 from deepaccident_devkit.render.colors import AGENT_COLORS, BEV_COLORS, GRID_COLOR, OWN_COLOR, POINT_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import agent_handles, box_handles, draw_legend
+from deepaccident_devkit.render.missing import has_cloud, is_there, missing_clouds_text, write_missing
 from deepaccident_devkit.render.roles import at_once, role_colors, short_name
 from deepaccident_devkit.render.trails import draw_trails
-from deepaccident_devkit.taxonomy import BEV_CAMERA, LIDAR, AgentName, Frame
+from deepaccident_devkit.taxonomy import BEV_CAMERA, AgentName, Frame
 from deepaccident_devkit.v2x import (
     Agents,
     Link,
@@ -30,6 +31,7 @@ from deepaccident_devkit.v2x import (
     cooperative_boxes,
     transform,
 )
+from deepaccident_devkit.v2x.messages import messages
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -76,6 +78,19 @@ class BevView:
             raise ChoiceError(f"frame: expected one of {', '.join(get_args(Frame))}, found {self.frame!r}")
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DrawnBev:
+    """What a view from above shows, for its legend.
+
+    Attributes:
+        colors: of its boxes.
+        clouds: the agents whose points it has.
+    """
+
+    colors: frozenset[str]
+    clouds: tuple[AgentName, ...]
+
+
 def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a notebook
     dataset: Dataset,
     sample: RowArgument,
@@ -104,7 +119,8 @@ def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a 
         frame: of the axes: `ego` or `lidar` (forward to the right, left up), or `world`.
         layers: some of `bev` (the agent's BEV camera, in pale colours), `points`, `boxes`, `ids`, `velocities` (arrows
             for one second), `trajectories` (past thin, future thick, fading) and `grid`; by default bev, points, boxes,
-            grid. Points and the BEV camera are left out if their files are missing.
+            grid. Points and the BEV camera are left out if their files are missing; words in a corner say so (of the
+            BEV camera only if there are no points).
         link: what happens to the partners' data; None for nothing.
         sweeps: how many frames of points, the present included.
         seconds: how far trajectories reach back and ahead.
@@ -124,18 +140,16 @@ def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a 
     view = BevView(view_range=view_range, frame=frame, agents=agents, link=link, sweeps=sweeps, seconds=seconds)
     names = cooperating_agents(dataset, sample, agents)
     ax = axes_or_new(ax, (6, 6.6))
-    colors = draw_bev(dataset, sample, view, chosen, ax)
-    handles = box_handles(colors)
-    if "points" in chosen and len(names) > 1:
-        handles += agent_handles(names)
+    drawn = draw_bev(dataset, sample, view, chosen, ax)
+    handles = box_handles(drawn.colors)
+    if len(names) > 1:
+        handles += agent_handles(drawn.clouds)
     draw_legend(ax, handles, columns=5, loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=5)
     return ax
 
 
-def draw_bev(
-    dataset: Dataset, sample: RowArgument, view: BevView, layers: frozenset[Layer], ax: Axes
-) -> frozenset[str]:
-    """Render a panel of `render_bev`, with its arguments and errors; returns the colours of the boxes rendered."""
+def draw_bev(dataset: Dataset, sample: RowArgument, view: BevView, layers: frozenset[Layer], ax: Axes) -> DrawnBev:
+    """Render a panel of `render_bev`, with its arguments and errors."""
     record = dataset.sample[dataset.getind("sample", sample)]
     names = cooperating_agents(dataset, record, view.agents)
     target_from_world = dataset.world_from(record, view.frame).inverse()
@@ -147,13 +161,14 @@ def draw_bev(
         aspect="equal",
         anchor="N",
     )
-    if "bev" in layers and dataset.get_sample_data_path(f"{record['token']}/{BEV_CAMERA}").is_file():
+    has_ground = "bev" in layers and is_there(dataset, f"{record['token']}/{BEV_CAMERA}")
+    if has_ground:
         image = dataset.load_bev(record)
         reach = view.view_range + float(np.abs(center - target_from_ego.translation[:2]).max())
         draw_underlay(image, ax, target_from_ego=target_from_ego, view_range=reach)
-    if "points" in layers:
-        _draw_clouds(dataset, record, view, names, center, ax)
-    drawn: frozenset[str] = frozenset()
+    clouds = _draw_clouds(dataset, record, view, names, center, ax) if "points" in layers else {}
+    absent = [missing_clouds_text([agent for agent, cloud in clouds.items() if cloud is None])]
+    colored: frozenset[str] = frozenset()
     if not layers.isdisjoint(_OF_BOXES):
         boxes = _boxes(dataset, record, view, names)
         boxes = boxes.select((np.abs(boxes.center[:, :2] - center) < view.view_range + _BEYOND).all(axis=1))
@@ -163,10 +178,14 @@ def draw_bev(
                 dataset, record, boxes, colors, target_from_world=target_from_world, seconds=view.seconds, ax=ax
             )
         draw_actors_from_above(boxes, ax, colors, layers)
-        drawn = frozenset(colors)
+        colored = frozenset(colors)
+    shown = tuple(agent for agent, cloud in clouds.items() if cloud is not None and len(cloud))
+    if "bev" in layers and not (has_ground or shown):
+        absent.append(f"{BEV_CAMERA}: not downloaded")
     _draw_marks(dataset, record, view.frame, names, ax)
     _finish(record, view.frame, grid="grid" in layers, ax=ax)
-    return drawn
+    write_missing(ax, "; ".join(filter(None, absent)))
+    return DrawnBev(colors=colored, clouds=shown)
 
 
 def _boxes(dataset: Dataset, record: SampleRecord, view: BevView, names: Sequence[AgentName]) -> Boxes:
@@ -183,17 +202,25 @@ def _draw_clouds(
     names: Sequence[AgentName],
     center: FloatArray,
     ax: Axes,
-) -> None:
-    """The points of each agent, in its colour if there are several agents."""
-    for agent in names:
-        there = at_once(record, agent)
-        if not dataset.get_sample_data_path(f"{there}/{LIDAR}").is_file():
+) -> dict[AgentName, LidarPointCloud | None]:
+    """The points of each agent, in its colour if there are several agents; returns them, None where no file is."""
+    clouds = {agent: _cloud(dataset, record, view, agent) for agent in names}
+    for agent, cloud in clouds.items():
+        if cloud is None:
             continue
-        cloud = aggregate_point_cloud(
-            dataset, record, agents=[agent], sweeps=view.sweeps, frame=view.frame, link=view.link
-        )
         color = AGENT_COLORS[agent] if len(names) > 1 else POINT_COLOR
         draw_points_from_above(cloud.xyz, ax, center=center, view_range=view.view_range, color=color)
+    return clouds
+
+
+def _cloud(dataset: Dataset, record: SampleRecord, view: BevView, agent: AgentName) -> LidarPointCloud | None:
+    """What arrives of an agent's points; None if it would arrive, and none of the files is there."""
+    sent = [message.sample for message in messages(dataset, record, [agent], view.link, sweeps=view.sweeps)]
+    if sent and not any(has_cloud(dataset, sample) for sample in sent):
+        return None
+    return aggregate_point_cloud(
+        dataset, record, agents=[agent], sweeps=view.sweeps, frame=view.frame, link=view.link, on_missing="skip"
+    )
 
 
 def _draw_marks(dataset: Dataset, record: SampleRecord, frame: str, names: Sequence[AgentName], ax: Axes) -> None:
@@ -215,7 +242,7 @@ def _finish(record: SampleRecord, frame: str, *, grid: bool, ax: Axes) -> None:
     countdown = "" if record["time_to_impact"] is None else f", {record['time_to_impact']:.1f} s to the impact"
     words = axis_words(frame)
     ax.set(xlabel=words[0], ylabel=words[1])
-    ax.set_title(f"{record['agent']}, t = {record['timestamp']:.1f} s{countdown}", fontsize="medium")
+    set_title(ax, f"{record['agent']}, t = {record['timestamp']:.1f} s{countdown}", fontsize="medium")
     ax.set_axisbelow(True)
     if grid:
         ax.grid(color=GRID_COLOR, linewidth=0.4)

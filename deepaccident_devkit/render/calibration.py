@@ -10,11 +10,12 @@ import numpy as np
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import TokenError
 from deepaccident_devkit.geometry import Boxes, LidarPointCloud
-from deepaccident_devkit.render.axes import figure_or_new
+from deepaccident_devkit.render.axes import figure_or_new, set_title
 from deepaccident_devkit.render.camera import draw_camera_boxes, draw_image, draw_points_in_image
 from deepaccident_devkit.render.colors import AGENT_COLORS
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import agent_handles, draw_legend
+from deepaccident_devkit.render.missing import has_cloud, missing_clouds_text, write_missing
 from deepaccident_devkit.render.moments import CAMERA_GRID
 from deepaccident_devkit.render.roles import at_once, in_drawing_order
 from deepaccident_devkit.v2x import Agents, cooperating_agents, cooperative_boxes, project_to_image
@@ -52,13 +53,13 @@ def render_calibration(
         fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure, three panels in a row.
+        The figure, three panels in a row. An image that was not downloaded is a grey panel; words in the first panel
+        name the agents whose points were not.
 
     Raises:
         TokenError: no such sample or frame.
         ChoiceError: no such layer, agent or configuration.
         NotAvailableError: an agent is not in this (partial) release.
-        MissingFileError: an image or a cloud was not downloaded.
     """
     chosen = layers_of(layers, _DEFAULT, CALIBRATION_LAYERS)
     sample, is_frame = _present(dataset, frame_or_sample)
@@ -67,7 +68,12 @@ def render_calibration(
     cameras = [f"{sample}/{channel}" for row in CAMERA_GRID for channel in row]
     if is_frame:
         cameras = [f"{at_once(record, agent)}/Camera_Front" for agent in names]
-    clouds = {agent: dataset.load_point_cloud(at_once(record, agent)) for agent in names if "points" in chosen}
+    lookers = names if "points" in chosen else []
+    clouds = {
+        agent: dataset.load_point_cloud(at_once(record, agent))
+        for agent in lookers
+        if has_cloud(dataset, at_once(record, agent))
+    }
     boxes = cooperative_boxes(dataset, sample, agents=names)
     rows = -(-len(cameras) // _COLUMNS)
     fig = figure_or_new(fig, (15, 3.1 * rows + 0.8))
@@ -79,10 +85,11 @@ def render_calibration(
         if is_frame:
             ax.set_title(f"{camera.rsplit('/', 3)[1]}, Camera_Front")
     if clouds:
-        draw_legend(fig, agent_handles(names), columns=len(names), loc="outside lower center", fontsize=9)
+        draw_legend(fig, agent_handles(clouds), columns=len(clouds), loc="outside lower center", fontsize=9)
     whose = "each agent" if len(names) > 1 else names[0]
     where = record["frame_token"] if is_frame else record["token"]
-    fig.suptitle(f"LiDAR of {whose} in the cameras of\n{where}", fontsize="medium")
+    set_title(fig, f"LiDAR of {whose} in the cameras of\n{where}", fontsize="medium")
+    write_missing(axes[0, 0], missing_clouds_text([agent for agent in lookers if agent not in clouds]))
     return fig
 
 

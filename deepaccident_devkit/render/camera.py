@@ -9,14 +9,21 @@ import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.errors import ChoiceError, MissingFileError
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.render.axes import axes_or_new
+from deepaccident_devkit.render.axes import axes_or_new, set_title
 from deepaccident_devkit.render.bev import BEV_LAYERS, BevView, draw_bev
 from deepaccident_devkit.render.boxes import draw_boxes_in_image, draw_ids_in_image, draw_velocities_in_image
 from deepaccident_devkit.render.colors import AGENT_COLORS, DEPTH_COLORMAP, HEIGHT_COLORMAP
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import agent_handles, draw_legend
+from deepaccident_devkit.render.missing import (
+    draw_missing_image,
+    has_cloud,
+    is_there,
+    missing_clouds_text,
+    write_missing,
+)
 from deepaccident_devkit.render.roles import role_colors
 from deepaccident_devkit.taxonomy import LIDAR, OWN_ACTOR_ID
 from deepaccident_devkit.v2x import map_pointcloud_to_image, project_to_image
@@ -59,42 +66,61 @@ def render_sample_data(
     Raises:
         TokenError: no such sensor file.
         ChoiceError: the sensor has no such layer.
-        MissingFileError: the image, or the points to render in it, were not downloaded.
+        MissingFileError: there is nothing to render: of the layers only files could be, and none was downloaded.
+            Beside other layers, a grey panel takes the place of a missing image, and words that of points.
     """
     record = dataset.get("sample_data", sample_data)
-    if record["modality"] != "camera":
-        lidar = record["channel"] == LIDAR
-        default: tuple[Layer, ...] = ("points" if lidar else "bev", "boxes", "grid")
-        chosen = layers_of(layers, default, BEV_LAYERS)
-        ax = axes_or_new(ax, (6, 6))
-        draw_bev(dataset, record["sample_token"], BevView(frame="lidar" if lidar else "ego"), chosen, ax)
-        ax.title.set_text(f"{record['channel']}, {ax.get_title()}")
-        return ax
-    chosen = layers_of(layers, CAMERA_DEFAULT, CAMERA_LAYERS)
-    ax = axes_or_new(ax, (8, 4.6))
-    draw_image(dataset, record, ax, image="image" in chosen)
-    if "points" in chosen:
+    if record["modality"] == "camera":
+        chosen = layers_of(layers, CAMERA_DEFAULT, CAMERA_LAYERS)
+        there = {"image": is_there(dataset, record["token"]), "points": has_cloud(dataset, record["sample_token"])}
+        if chosen and not any(there.get(layer, True) for layer in chosen):
+            raise MissingFileError(
+                f"{dataset.get_sample_data_path(record)}: no such file, and nothing else to render; unpack the archive "
+                "that holds it, or choose other layers, such as boxes"
+            )
+        return draw_camera(dataset, record, chosen, axes_or_new(ax, (8, 4.6)))
+    return _draw_from_above(dataset, record, layers, axes_or_new(ax, (6, 6)))
+
+
+def _draw_from_above(dataset: Dataset, record: Any, layers: Iterable[Layer] | None, ax: Axes) -> Axes:
+    """A LiDAR's or a BEV camera's record of `render_sample_data`."""
+    lidar = record["channel"] == LIDAR
+    default: tuple[Layer, ...] = ("points" if lidar else "bev", "boxes", "grid")
+    chosen = layers_of(layers, default, BEV_LAYERS)
+    draw_bev(dataset, record["sample_token"], BevView(frame="lidar" if lidar else "ego"), chosen, ax)
+    set_title(ax, f"{record['channel']}, {ax.get_title()}", fontsize="medium")
+    return ax
+
+
+def draw_camera(dataset: Dataset, record: Any, layers: Collection[Layer], ax: Axes) -> Axes:
+    """Render a camera's panel of `render_sample_data`; what is not there is named in its place."""
+    sample = record["sample_token"]
+    draw_image(dataset, record, ax, image="image" in layers)
+    if "points" in layers and has_cloud(dataset, sample):
         points = map_pointcloud_to_image(dataset, record, colors=False)
         _draw_numbers(points, points.depth, _DEPTHS, DEPTH_COLORMAP, ax)
-    boxes = dataset.boxes(record["sample_token"], frame=record["channel"], visible="camera")
-    draw_camera_boxes(dataset, record, boxes.select(boxes.actor_id != OWN_ACTOR_ID), chosen, ax)
+    elif "points" in layers:
+        write_missing(ax, missing_clouds_text([sample.rsplit("/", 2)[1]]))
+    boxes = dataset.boxes(sample, frame=record["channel"], visible="camera")
+    draw_camera_boxes(dataset, record, boxes.select(boxes.actor_id != OWN_ACTOR_ID), layers, ax)
     return ax
 
 
 def draw_image(dataset: Dataset, camera: Any, ax: Axes, *, image: bool = True) -> None:
     """Render a camera's image, or an empty place for it, in pixels of its calib, without ticks.
 
+    If the image was not downloaded, its place is grey and says so. Every camera image of a picture is rendered here.
+
     Args:
         dataset: the release.
         camera: record of its sensor file.
         ax: axes to render on.
         image: whether to render it.
-
-    Raises:
-        MissingFileError: the image was not downloaded.
     """
     lens = camera_of(dataset, camera)
-    if image:
+    if image and not is_there(dataset, camera["token"]):
+        draw_missing_image(ax, camera["token"])
+    elif image:
         ax.imshow(dataset.load_image(camera), extent=(0, lens.width, lens.height, 0))
     ax.set(xlim=(0, lens.width), ylim=(lens.height, 0), aspect="equal", anchor="N", title=camera["channel"])
     ax.set(xticks=(), yticks=())
@@ -153,26 +179,34 @@ def render_pointcloud_in_image(
     Raises:
         TokenError: no such sample or sensor file.
         ChoiceError: the sensor is no camera, the two are of different scenarios, or there is no such way to colour.
-        MissingFileError: the image or a cloud was not downloaded.
+        MissingFileError: neither the image nor a cloud was downloaded. If one of them is there, words name the other.
     """
     if color_by not in get_args(ColorBy):
         raise ChoiceError(f"color_by: expected one of {', '.join(get_args(ColorBy))}, found {color_by!r}")
     record = dataset.get("sample_data", camera)
     own = dataset.sample.get(record["sample_token"])
+    whose = own["token"] if sample is None else dataset.get("sample", sample)["token"]
     sources = [own if sample is None else dataset.sample[dataset.getind("sample", sample)]]
     if color_by == "agent" and sample is None:
-        sources = dataset.samples_of(own["frame_token"])
+        sources, whose = dataset.samples_of(own["frame_token"]), "all agents"
+    absent = [source["agent"] for source in sources if not has_cloud(dataset, source["token"])]
+    sources = [source for source in sources if source["agent"] not in absent]
+    if not (sources or is_there(dataset, record["token"])):
+        raise MissingFileError(
+            f"{dataset.get_sample_data_path(record)}: no such file, and {missing_clouds_text(absent)}; unpack the "
+            "archives of the camera or of the LiDAR"
+        )
     ax = axes_or_new(ax, (8, 5))
     draw_image(dataset, record, ax)
+    write_missing(ax, missing_clouds_text(absent))
     if color_by == "agent":
         for source in sources:
             _draw_agent(dataset, source, record, ax)
         handles = agent_handles([source["agent"] for source in sources])
         draw_legend(ax, handles, columns=len(handles), loc="upper center", bbox_to_anchor=(0.5, 0))
-    else:
+    elif sources:
         _draw_metres(dataset, sources[0], record, color_by, ax)
-    whose = sources[0]["token"] if len(sources) == 1 else "all agents"
-    ax.set_title(f"{own['agent']}, {record['channel']}\nLiDAR of {whose}", fontsize="medium")
+    set_title(ax, f"{own['agent']}, {record['channel']}\nLiDAR of {whose}", fontsize="medium")
     return ax
 
 

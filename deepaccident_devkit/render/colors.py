@@ -38,6 +38,8 @@ BEV_COLORS: Mapping[str, str] = {
 }
 """CARLA's tags in the BEV camera, in pale colours: boxes are rendered over them."""
 GRID_COLOR = "#d0d0d0"
+MISSING_COLOR = "#dddddd"
+"""The place of an image that is not there."""
 MUTED_COLOR = "#666666"
 """Less important words."""
 TRUE_PLACE_COLOR = "#8a8a8a"

@@ -12,7 +12,7 @@ from deepaccident_devkit.arrays import IntArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.render.annotation import draw_view
-from deepaccident_devkit.render.axes import axis_words, figure_or_new, with_light_grid
+from deepaccident_devkit.render.axes import axis_words, figure_or_new, set_title, with_light_grid
 from deepaccident_devkit.render.best_view import best_view
 from deepaccident_devkit.render.bev import draw_underlay
 from deepaccident_devkit.render.boxes import draw_boxes_from_above, write_beside
@@ -79,7 +79,7 @@ def render_instance(
     _draw_seen(actor, known, axes["seen"])
     for name in ("speed", "points", "seen"):
         _finish_time(actor, axes[name])
-    fig.suptitle(f"{instance_token(actor.scenario, actor.actor_id)}: {actor.boxes.category_names[0]}")
+    set_title(fig, f"{instance_token(actor.scenario, actor.actor_id)}: {actor.boxes.category_names[0]}")
     return fig
 
 
@@ -179,7 +179,7 @@ def _draw_crops(
         box = actor.boxes.select(actor.index == index)
         there = [one.agent for one in known if index in one.index[one.camera]]
         view = best_view(dataset, [sample_token(actor.scenario, agent, int(index)) for agent in there], box)
-        if view is None or not dataset.get_sample_data_path(view.camera).is_file():
+        if view is None:
             ax.set_axis_off()
             continue
         colors = [actor.color] if "boxes" in layers else []

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.render.axes import figure_or_new
+from deepaccident_devkit.render.axes import figure_or_new, set_title
 from deepaccident_devkit.render.bev import BEV_DEFAULT, BEV_LAYERS, BevView, draw_bev
-from deepaccident_devkit.render.camera import CAMERA_DEFAULT, CAMERA_LAYERS, render_sample_data
+from deepaccident_devkit.render.camera import CAMERA_DEFAULT, CAMERA_LAYERS, draw_camera
 from deepaccident_devkit.render.colors import CATEGORY_COLORS
 from deepaccident_devkit.render.layers import LAYERS, Layer, layers_of
 from deepaccident_devkit.render.legends import agent_handles, box_handles, draw_legend
@@ -36,6 +36,8 @@ _WIDE: Final = 2.1
 _VIEW_RANGE: Final = 50.0
 """Metres to each side of an agent if there are several; in a tall figure more to its left and right."""
 _TALLEST: Final = 2.0
+_LEGEND_ENTRY: Final = 1.1
+"""Inches of an entry of the legend, about."""
 _BESIDE, _ABOUT = 0.9, 1.6
 """Inches of room for words beside panels, and above and below them."""
 MOMENT_LAYERS: Final = tuple(layer for layer in LAYERS if layer in {*CAMERA_LAYERS, *BEV_LAYERS})
@@ -62,14 +64,13 @@ def render_sample(
         fig: an empty figure to render on; a new one if None.
 
     Returns:
-        The figure.
+        The figure. An image that was not downloaded is a grey panel.
 
     Raises:
         TokenError: no such sample.
         ChoiceError: no such layer, agent or configuration.
         NotAvailableError: an agent is not in this (partial) release.
         ConfigError: `link` is no Link, or its latency is longer than the scenario's past.
-        MissingFileError: an image was not downloaded.
     """
     in_cameras, from_above = panel_layers(layers)
     record = dataset.get("sample", sample)
@@ -79,14 +80,14 @@ def render_sample(
     grid, ratios = (CAMERA_GRID, (4, 4, 4, 4.5)) if wide else (_TALL_GRID, (4, 4, 8))
     axes = fig.subplot_mosaic([[*row, "bev"] for row in grid], width_ratios=ratios)
     for channel in CAMERAS:
-        render_sample_data(dataset, f"{record['token']}/{channel}", layers=in_cameras, ax=axes[channel])
+        draw_camera(dataset, dataset.get("sample_data", f"{record['token']}/{channel}"), in_cameras, axes[channel])
     drawn = draw_bev(dataset, record, BevView(agents=names, link=link), from_above, axes["bev"])
     axes["bev"].set_title("")
-    handles = box_handles(drawn)
-    if "points" in from_above and len(names) > 1:
-        handles += agent_handles(names)
+    handles = box_handles(drawn.colors)
+    if len(names) > 1:
+        handles += agent_handles(drawn.clouds)
     draw_legend(fig, handles, columns=len(handles), loc="outside lower center")
-    fig.suptitle(_heading(record["token"], record))
+    set_title(fig, _heading(record["token"], record))
     return fig
 
 
@@ -113,13 +114,12 @@ def render_frame(
             agent, and in a tall figure more to its left and right.
 
     Returns:
-        The figure, one column for each agent.
+        The figure, one column for each agent. An image that was not downloaded is a grey panel.
 
     Raises:
         TokenError: no such frame.
         ChoiceError: no such layer, agent or configuration.
         NotAvailableError: an agent is not in this (partial) release.
-        MissingFileError: an image was not downloaded.
     """
     in_cameras, from_above = panel_layers(layers)
     record = dataset.get("frame", frame)
@@ -132,16 +132,17 @@ def render_frame(
     drawn: set[str] = set()
     for column, agent in enumerate(names):
         sample = at_once(first, agent)
-        camera = render_sample_data(dataset, f"{sample}/Camera_Front", layers=in_cameras, ax=axes[0, column])
-        camera.set_title(agent)
+        draw_camera(dataset, dataset.get("sample_data", f"{sample}/Camera_Front"), in_cameras, axes[0, column])
+        axes[0, column].set_title(agent)
         above = axes[1, column]
-        drawn |= draw_bev(dataset, sample, view, from_above, above)
+        drawn |= draw_bev(dataset, sample, view, from_above, above).colors
         above.set_xlim(-_VIEW_RANGE, _VIEW_RANGE)
         _plain(above, labelled=column == 0)
     if fig.figure is fig:  # a part of a figure is laid out with it
         fig.set_layout_engine("compressed")
-    draw_legend(fig, box_handles(drawn), columns=2 + len(CATEGORY_COLORS), loc="outside lower center")
-    fig.suptitle(_heading(f"{record['token']}, t = {record['timestamp']:.1f} s", record))
+    columns = min(2 + len(CATEGORY_COLORS), max(1, int(fig.bbox.width / fig.dpi / _LEGEND_ENTRY)))
+    draw_legend(fig, box_handles(drawn), columns=columns, loc="outside lower center")
+    set_title(fig, _heading(f"{record['token']}, t = {record['timestamp']:.1f} s", record))
     return fig
 
 

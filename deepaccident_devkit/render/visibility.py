@@ -10,7 +10,7 @@ import numpy as np
 from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.render.axes import axes_or_new, axis_words, check_view_range, with_light_grid
+from deepaccident_devkit.render.axes import axes_or_new, axis_words, check_view_range, set_title, with_light_grid
 from deepaccident_devkit.render.bev import draw_points_from_above
 from deepaccident_devkit.render.boxes import (
     SMALLEST_TEXT,
@@ -22,6 +22,7 @@ from deepaccident_devkit.render.boxes import (
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, COMPANION_COLOR, GRID_COLOR, MUTED_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import agent_handles, draw_legend
+from deepaccident_devkit.render.missing import has_cloud, missing_clouds_text, write_missing
 from deepaccident_devkit.render.roles import in_drawing_order, role_colors, short_name
 from deepaccident_devkit.render.sights import Sights, sights
 from deepaccident_devkit.taxonomy import Frame
@@ -79,7 +80,6 @@ def render_visibility(
         TokenError: no such sample or frame.
         ChoiceError: no such agent, configuration, frame or layer, or `view_range` is not above 0.
         NotAvailableError: an agent is not in this (partial) release.
-        MissingFileError: `layers` have points, and a cloud was not downloaded.
     """
     shown = layers_of(layers, _SHOWN, VISIBILITY_LAYERS)
     if frame not in get_args(Frame):
@@ -92,7 +92,7 @@ def render_visibility(
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", anchor="N")
     words = axis_words(frame)
     ax.set(xlabel=words[0], ylabel=words[1])
-    ax.set_title(_title(dataset, known), fontsize="medium")
+    set_title(ax, _title(dataset, known), fontsize="medium")
     if "points" in shown:
         _draw_points(dataset, known, frame, ax)
     colors = role_colors(dataset, known.sample, known.boxes)
@@ -183,7 +183,12 @@ def _view(known: Sights, view_range: float | None) -> tuple[FloatArray, FloatArr
 def _draw_points(dataset: Dataset, known: Sights, frame: str, ax: Axes) -> None:
     (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
     middle, half = np.array([left + right, low + high]) / 2, (right - left) / 2
+    scenario, _, number = known.sample.rsplit("/", 2)
+    absent = [agent for agent in known.agents if not has_cloud(dataset, f"{scenario}/{agent}/{number}")]
+    write_missing(ax, missing_clouds_text(absent))
     for agent in known.agents:
+        if agent in absent:
+            continue
         cloud = aggregate_point_cloud(dataset, known.sample, agents=[agent], frame=frame)
         draw_points_from_above(cloud.xyz, ax, center=middle, view_range=half, color=AGENT_COLORS[agent])
 

@@ -4,7 +4,8 @@ The world is simulated in its own right-handed coordinate frame, `ground`: the j
 rigid transform, `world_from_ground`, places it in a town. The parts, lowest layer first: `solids`, `shapes`, `bodies`
 (what things are made of), `roads` and `stage` (what stands still), `actors`, `collision` and `traffic` (what moves),
 `spec` (scenario files, with the twelve designs), `config` and `plan` (which scenarios a release has), `scenario`
-(all that happens in one), `sensors` (what the agents record), `recording`, `unfinished` and `generate` (the files).
+(all that happens in one), `checking`
+(that as text), `sensors` (what the agents record), `recording`, `unfinished` and `generate` (the files).
 """
 
 from deepaccident_devkit.synth.config import SynthConfig

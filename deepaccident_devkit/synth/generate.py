@@ -48,8 +48,9 @@ def make_release(
     if not is_writable_folder(out.parent):
         raise ConfigError(f"{out.parent}: cannot be written; choose another folder")
     with unfinished_release(out, wanted) as unfinished:
-        jobs = [_jobs(unfinished, wanted, plan) for plan in plans]
-        _record_all(unfinished, jobs, workers or _worker_count(wanted, len(plans)), progress=progress)
+        count = workers or _worker_count(wanted, len(plans))
+        jobs = [_jobs(unfinished, wanted, plan, progress=progress and count == 1) for plan in plans]
+        _record_all(unfinished, jobs, count, progress=progress)
         splits = plan_splits(plans)
         splits.save(unfinished.release, overwrite=True)
         if wanted.for_released_code:
@@ -57,11 +58,15 @@ def make_release(
     return out
 
 
-def _jobs(unfinished: Unfinished, config: SynthConfig, plan: ScenarioPlan) -> dict[str, RecordingJob]:
-    """The parts of a scenario by their names."""
+def _jobs(
+    unfinished: Unfinished, config: SynthConfig, plan: ScenarioPlan, *, progress: bool = False
+) -> dict[str, RecordingJob]:
+    """The parts of a scenario by their names; `progress` shows the draws, where no other process writes too."""
     parts = parts_of(config)
     names = {first: f"{plan.scenario_type}_{plan.name}_{first}of{parts}" for first in range(1, parts + 1)}
-    return {name: RecordingJob(unfinished.part(name), config, plan, first, parts) for first, name in names.items()}
+    return {
+        name: RecordingJob(unfinished.part(name), config, plan, first, parts, progress) for first, name in names.items()
+    }
 
 
 def _record_all(

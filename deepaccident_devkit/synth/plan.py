@@ -161,9 +161,11 @@ def _plan(config: SynthConfig, pair: int, template: SpecTemplate, *, accident: b
     unplanned = bool(rng.random() < config.unplanned) and config.spec is None and config.view != "hidden"
     traits = Traits.of(draw(template, rng))
     if config.view == "hidden" and traits.spawn_side not in ("left", "right"):
+        place = "" if config.spec is None else f"{template.place('actors')}: "
+        others = "designs" if config.spec is None else "arms"
         raise ConfigError(
-            f"view: hidden needs the other vehicle to come from ego's left or right, but in '{template.name}' it is on "
-            f"the side '{traits.spawn_side}'; choose other designs, or the view open"
+            f"{place}view: hidden needs the other vehicle to come from ego's left or right, but in '{template.name}' "
+            f"it is on the side '{traits.spawn_side}'; choose other {others}, or the view open"
         )
     return ScenarioPlan(
         pair=pair,

@@ -42,6 +42,7 @@ class RecordingJob:
         plan: which scenario it is.
         first: the first frame, counted from 1.
         step: from each frame to the next one.
+        progress: whether to show the number of draws.
     """
 
     root: Path
@@ -49,6 +50,7 @@ class RecordingJob:
     plan: ScenarioPlan
     first: int = 1
     step: int = 1
+    progress: bool = False
 
     @property
     def folder(self) -> ScenarioFolder:
@@ -65,7 +67,7 @@ def parts_of(config: SynthConfig) -> int:
 def record_scenario(job: RecordingJob) -> None:
     """Make a scenario and write all its files, or those of a part of it."""
     _share_cores()
-    scenario, rig = _made_ready(_Task(job.config, job.plan))
+    scenario, rig = _made_ready(_Task(job.config, job.plan, job.progress))
     labelled = job.plan.split != "test" or not job.config.unlabelled_test
     recorder = _Recorder(folder=job.folder, scenario=scenario, rig=rig, labelled=labelled)
     if labelled and job.first == 1:
@@ -93,13 +95,14 @@ class _Task:
 
     config: SynthConfig
     plan: ScenarioPlan = field(hash=False)
+    progress: bool = field(compare=False)
 
 
 @lru_cache(maxsize=1)
 def _made_ready(task: _Task) -> tuple[Scenario, Rig]:
     """A scenario and its sensors; the last one is kept for the next part of it."""
     config, plan = task.config, task.plan
-    scenario = build_scenario(config, plan)
+    scenario = build_scenario(config, plan, progress=task.progress)
     rig = make_rig(
         scenario.world,
         scenario.actors,

@@ -1,6 +1,7 @@
 """All that one scenario holds, made so that it happens as its plan says."""
 
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -21,14 +22,15 @@ from deepaccident_devkit.synth.traffic.drama import (
     Recorded,
     Stage,
     latest_end,
-    perform_accident,
     perform_twin,
     recorded_accident,
     recorded_normal,
     set_stage,
+    try_accident,
     usual_duration,
 )
 from deepaccident_devkit.synth.traffic.kinematics import PERIOD
+from deepaccident_devkit.synth.traffic.misses import Miss, by_far, misses_text
 from deepaccident_devkit.synth.traffic.signals import SignalPlan
 from deepaccident_devkit.synth.traffic.unplanned import unplanned
 from deepaccident_devkit.taxonomy import STATIC_ACTOR_ID, VEHICLE_AGENTS, WARM_UP_FRAMES, AgentName
@@ -41,6 +43,10 @@ AGENT_OF_ROLE: Mapping[Role, AgentName] = {
 }
 MAX_DRAWS = 100
 """After this many draws without a collision a scenario is given up."""
+FAR_DRAWS = 25
+"""After this many it is given up if all missed by far and a draw differs from another one only in its numbers."""
+_SHOWN_AFTER = 1.0
+"""Seconds after which the number of draws is shown."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -88,16 +94,22 @@ class RandomStreams(NamedTuple):
         return cls(*map(np.random.default_rng, spawned))
 
 
-def build_scenario(config: SynthConfig, plan: ScenarioPlan) -> Scenario:
+def build_scenario(config: SynthConfig, plan: ScenarioPlan, *, progress: bool = False) -> Scenario:
     """Make a scenario; the same seed and pair give the same scene, for the accident and for its twin.
 
     If two actors are timed to meet, the scene is drawn again until they touch.
 
+    Args:
+        config: the settings of the release.
+        plan: which scenario it is.
+        progress: whether to show the number of draws if they take long.
+
     Raises:
-        ConfigError: they do not touch in `MAX_DRAWS` draws.
+        ConfigError: they do not touch in `MAX_DRAWS` draws, or miss each other by far in the first `FAR_DRAWS`; the
+            message says how near they came, and what to change.
     """
     random = RandomStreams.of(config.seed, plan.pair)
-    stage, accident, draws = _first_good_draw(random.traffic, config, plan)
+    stage, accident, draws = _first_good_draw(random.traffic, config, plan, progress=progress)
     if plan.accident and accident is not None:
         recorded = recorded_accident(stage, accident, config.frames)
     else:
@@ -121,32 +133,39 @@ def build_scenario(config: SynthConfig, plan: ScenarioPlan) -> Scenario:
 
 
 def _first_good_draw(
-    rng: np.random.Generator, config: SynthConfig, plan: ScenarioPlan
+    rng: np.random.Generator, config: SynthConfig, plan: ScenarioPlan, *, progress: bool
 ) -> tuple[Stage, Performance | None, int]:
     """The first draw in which the pair touches, what happens in it, and how many draws were needed."""
-    for draws in range(1, MAX_DRAWS + 1):
-        spec = plan.draw(rng)
-        junction = Junction(spec.road)
-        if plan.unplanned:
-            spec = unplanned(rng, spec, junction)
-        stage = set_stage(rng, spec, junction, usual_duration(rng, spec, config.frames))
-        if spec.meet is None:
-            return stage, None, draws
-        accident = perform_accident(stage)
-        if accident is not None:
-            return stage, accident, draws
-    raise ConfigError(
-        f"{plan.template.name}: the two of meet.actors did not collide in {MAX_DRAWS} draws; choose paths that cross, "
-        "or a smaller meet.offset"
-    )
+    from tqdm.auto import tqdm
+
+    misses: list[Miss] = []
+    roles: tuple[Role, Role] = ("ego", "other")
+    counted = tqdm(range(1, MAX_DRAWS + 1), "draws", leave=False, disable=not progress, delay=_SHOWN_AFTER)
+    with closing(counted):
+        for draws in counted:
+            spec = plan.draw(rng)
+            junction = Junction(spec.road)
+            if plan.unplanned:
+                spec = unplanned(rng, spec, junction)
+            stage = set_stage(rng, spec, junction, usual_duration(rng, spec, config.frames))
+            if spec.meet is None:
+                return stage, None, draws
+            tried, roles = try_accident(stage), spec.meet.actors
+            if isinstance(tried, Performance):
+                return stage, tried, draws
+            misses.append(tried)
+            if draws == FAR_DRAWS and plan.template.draws_alike and by_far(misses):
+                break
+    raise ConfigError(f"{plan.template.place('meet')}: {misses_text(misses, roles)}")
 
 
 def _twin(stage: Stage, config: SynthConfig, plan: ScenarioPlan) -> Recorded:
     normal = perform_twin(stage, latest_end(stage, config.frames))
     if normal is None:
+        where = "in the normal twin too" if stage.spec.meet else "although all obey the rules"
         raise ConfigError(
-            f"{plan.template.name}: the road users collide in the normal twin too, even if one of them comes later; "
-            "let them start farther from each other"
+            f"{plan.template.place('actors')}: the road users collide {where}, even if one of them comes later; let "
+            "them start farther from each other"
         )
     return recorded_normal(stage, normal, config.frames)
 

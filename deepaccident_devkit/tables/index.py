@@ -205,8 +205,20 @@ def _accept(layout: ReleaseLayout, index: Index, on_error: OnError) -> None:
         raise DatarootError(f"{layout.root}: its scenarios hold no calib files; unpack the calib archives")
     for problem in problems:
         logger.warning("left out %s: %s", problem.scenario, " | ".join(problem.messages))
-    for notice in index.manifest.notices:
+    for notice in summed_notices(index.manifest.notices):
         logger.warning("%s", notice)
+
+
+def summed_notices(notices: Sequence[str]) -> list[str]:
+    """Notices, with one sentence in place of several that say the same of different files."""
+    places: dict[str, list[str]] = {}
+    for notice in notices:
+        place, _, words = notice.partition(": ")
+        places.setdefault(words, []).append(place)
+    return [
+        f"{found[0]}: {words}" if len(found) == 1 else f"{len(found)} scenarios, such as {found[0]}: {words}"
+        for words, found in places.items()
+    ]
 
 
 def _report(layout: ReleaseLayout, problems: Sequence[Problem]) -> str:

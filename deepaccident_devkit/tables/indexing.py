@@ -12,7 +12,7 @@ from pathlib import Path
 from deepaccident_devkit.errors import DeepAccidentError, IndexStoreError
 from deepaccident_devkit.files import file_checksum, replacing_folder
 from deepaccident_devkit.parallel import run_batch
-from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder
+from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, read_meta
 from deepaccident_devkit.tables.build import read_scenario, scenario_rows
 from deepaccident_devkit.tables.findings import Finding
 from deepaccident_devkit.tables.manifest import (
@@ -108,7 +108,18 @@ def index_scenario(shards: Path, scenario: ScenarioFolder) -> Outcome:
         if files is None:
             return _broken(scenario, digest, scan, faults)
         write_shard(path, scenario_rows(files), digest)
-    return Outcome(token=scenario.token, digest=digest, indexed=True, notices=scan.notices)
+    notices = (*scan.notices, *_end_notices(scenario, scan))
+    return Outcome(token=scenario.token, digest=digest, indexed=True, notices=notices)
+
+
+def _end_notices(scenario: ScenarioFolder, scan: ScenarioScan) -> Iterator[str]:
+    """What is odd about the end of an accident: by meta (validation's `meta-frames`) it is at another frame."""
+    meta = read_meta(scenario.meta_path) if scan.has_meta else None
+    if meta and meta.collision and meta.recorded_frames != scan.num_frames:
+        yield (
+            f"{scenario.meta_path}: the recording does not end with the accident: times to the impact are wrong; see: "
+            "deepaccident validate"
+        )
 
 
 def _broken(scenario: ScenarioFolder, digest: str, scan: ScenarioScan, faults: Sequence[Finding]) -> Outcome:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -201,7 +202,10 @@ class OpenTables:
             return self._listed_scenarios(Path(split).expanduser(), missing)
         if split in MINI_SPLITS:
             if split not in self._split_files:
-                raise NotAvailableError(f"{self.dataroot}: has no {split}.txt; put the release's split files there")
+                raise NotAvailableError(
+                    f"{self.dataroot}: has no {split}.txt; put the release's split files there, "
+                    f"{self._own_split_text()}"
+                )
             return set(read_split_file(self._split_files[split])) & set(self._tables.resolver.scenario_tokens)
         if split not in SPLITS:
             raise ChoiceError(f"split: expected one of {', '.join((*SPLITS, *MINI_SPLITS))}, found {split!r}")
@@ -209,9 +213,13 @@ class OpenTables:
         if (known < 0).all():
             raise NotAvailableError(
                 f"{self.dataroot}: the split of its scenarios is unknown: it has neither split files ({split}.txt) nor "
-                f"split folders ({split}/); put the release's split files into it"
+                f"split folders ({split}/); put the release's split files into it, {self._own_split_text()}"
             )
         return set(self.scenario.tokens_where("split", split))
+
+    def _own_split_text(self) -> str:
+        place = shlex.quote(os.fspath(self.dataroot))
+        return f"or make a split file of your own: deepaccident split {place} --save mine.txt, then --split mine.txt"
 
     def _listed_scenarios(self, path: Path, missing: OnError) -> set[str]:
         listed = read_split_file(path, unique=True)

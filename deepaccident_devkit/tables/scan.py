@@ -55,7 +55,9 @@ def scan_scenario(scenario: ScenarioFolder) -> ScenarioScan:
     labelled = tuple(agent for agent in agents if frames[agent, "label"])
     has_meta = os.path.exists(scenario.meta_path)  # noqa: PTH110 - Path.exists raises where the folder is closed
     if labelled and not has_meta:
-        notices.append(f"{scenario.meta_path}: missing or closed: weather and collision of this scenario are unknown")
+        notices.append(
+            f"{scenario.meta_path}: missing or not readable: weather and collision of this scenario are unknown"
+        )
     num_frames = max((found[-1] for (agent, _), found in frames.items() if found and agent in agents), default=0)
     for agent in agents:
         for kind in ("calib", "label") if agent in labelled else ("calib",):

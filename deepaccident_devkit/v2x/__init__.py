@@ -8,7 +8,14 @@ from deepaccident_devkit.selection import (
 )
 from deepaccident_devkit.v2x.clouds import aggregate_point_cloud
 from deepaccident_devkit.v2x.collisions import Contact, collision
-from deepaccident_devkit.v2x.configurations import AGENT_CONFIGS, AgentConfig, Agents, cooperating_agents
+from deepaccident_devkit.v2x.configurations import (
+    AGENT_CONFIGS,
+    AGENT_SETS,
+    AVAILABLE,
+    AgentConfig,
+    Agents,
+    cooperating_agents,
+)
 from deepaccident_devkit.v2x.cooperation import (
     CooperativeView,
     cooperative_boxes,
@@ -24,6 +31,8 @@ from deepaccident_devkit.v2x.transforms import transform
 
 __all__ = [
     "AGENT_CONFIGS",
+    "AGENT_SETS",
+    "AVAILABLE",
     "AgentConfig",
     "Agents",
     "Contact",

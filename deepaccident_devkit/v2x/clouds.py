@@ -9,6 +9,8 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import SE3, Boxes, LidarPointCloud, quaternions
 from deepaccident_devkit.geometry.pointcloud import concatenate
+from deepaccident_devkit.release.missing_files import MissingFiles
+from deepaccident_devkit.taxonomy import LIDAR, OnError
 from deepaccident_devkit.v2x.configurations import Agents
 from deepaccident_devkit.v2x.link import Link
 from deepaccident_devkit.v2x.messages import Message, messages
@@ -24,6 +26,7 @@ def aggregate_point_cloud(
     frame: str = "world",
     compensate: bool = False,
     link: Link | None = None,
+    on_missing: OnError = "raise",
 ) -> LidarPointCloud:
     """The LiDAR points of some agents at a sample's moment and the frames before it, in one coordinate frame.
 
@@ -37,17 +40,18 @@ def aggregate_point_cloud(
             track table (all agents' labels); points of actors that are not annotated at both moments stay.
         link: what happens to the partners' data; None for nothing. Each sweep is a message of its own, with its own
             loss, pose error and delay. `compensate` corrects latency, not wrong poses.
+        on_missing: of point clouds that were not downloaded: `raise`, or `skip` leaves them out and logs how many.
 
     Returns:
         The points by frame, the present first and then backwards, and for each frame by agent, the ego first; no
-        points if all were lost.
+        points if all were lost or left out.
 
     Raises:
         TokenError: no such sample.
-        ChoiceError: no such agent, configuration or frame, or `sweeps` is no whole number from 1.
+        ChoiceError: no such agent, configuration, frame or `on_missing`, or `sweeps` is no whole number from 1.
         NotAvailableError: an agent is not in this (partial) release.
         ConfigError: `link` is no Link, or its latency is longer than the scenario's past.
-        MissingFileError: a point cloud was not downloaded.
+        MissingFileError: a point cloud was not downloaded, and `on_missing` is `raise`.
         SensorFileError: a point cloud cannot be read.
     """
     sweeps = checked_whole("sweeps", sweeps, "a whole number of frames from 1", ChoiceError)
@@ -57,12 +61,16 @@ def aggregate_point_cloud(
     target_from_world = dataset.world_from(sample, frame).inverse()
     scenario, _, present = dataset.get("sample", sample)["token"].rsplit("/", 2)
     tracks = scenario_tracks(dataset, scenario) if compensate else None
+    files = MissingFiles(dataset.dataroot, on_missing)
     parts = []
     for message in messages(dataset, sample, agents, link, sweeps=sweeps):
+        if not files.has(dataset.get_sample_data_path(f"{message.sample}/{LIDAR}"), LIDAR):
+            continue
         cloud = dataset.load_point_cloud(message.sample, "lidar")
         if tracks is not None:
             cloud = _compensated(cloud, dataset.world_from(message.sample, "lidar"), tracks, message, int(present))
         parts.append(cloud.transform(message.target_from(dataset, "lidar", target_from_world), frame))
+    files.tell()
     if not parts:
         return LidarPointCloud(np.zeros((0, 3)), np.zeros(0, dtype=np.float32), frame)
     return concatenate(parts, frame)

@@ -72,7 +72,25 @@ def first_accident(dataset: Dataset) -> str:
     for record in dataset.scenario:
         if record["collision"] is not None:
             return record["token"]
-    raise NotAvailableError(f"{dataset.dataroot}: no scenario ends in an accident that a meta file names; name one")
+    others = f", or show another view of a scenario that is there, such as {dataset.scenario[0]['token']}"
+    raise NotAvailableError(
+        f"{dataset.dataroot}: no scenario ends in an accident that a meta file names; unpack an accident and its meta"
+        f"{others if len(dataset.scenario) else ''}"
+    )
+
+
+def default_scenario(dataset: Dataset) -> str:
+    """The token of the first scenario that ends in an accident, or if none does, of the first one.
+
+    Raises:
+        NotAvailableError: there is no scenario at all.
+    """
+    try:
+        return first_accident(dataset)
+    except NotAvailableError:
+        if not len(dataset.scenario):
+            raise
+        return dataset.scenario[0]["token"]
 
 
 def collision(dataset: Dataset, scenario: RowArgument) -> Contact | None:

@@ -110,10 +110,14 @@ AGENT_CONFIGS: Final[dict[str, AgentConfig]] = {
     )
 }
 """The paper's seven configurations, by name."""
+AVAILABLE: Final = "available"
+"""The name of all agents that a (partial) release has of a scenario, as text for None."""
+AGENT_SETS: Final = (*AGENT_CONFIGS, AVAILABLE)
+"""The names that `agents=` takes beside agents' own."""
 
 Agents = AgentConfig | str | Sequence[str] | None
-"""What `agents=` can be: names of agents, a configuration or its name as seen from the sample's agent, or None for all
-agents that are there."""
+"""What `agents=` can be: names of agents, a configuration or its name as seen from the sample's agent, or None or
+`available` for all agents that are there."""
 
 
 def cooperating_agents(dataset: Dataset, sample: RowArgument, agents: Agents = None) -> tuple[AgentName, ...]:
@@ -122,7 +126,7 @@ def cooperating_agents(dataset: Dataset, sample: RowArgument, agents: Agents = N
     Args:
         dataset: the release.
         sample: token or record: its agent is the ego.
-        agents: names of agents, a configuration or its name, or None for all that are there.
+        agents: names of agents, a configuration or its name, or None or `available` for all that are there.
 
     Raises:
         TokenError: no such sample.
@@ -131,16 +135,22 @@ def cooperating_agents(dataset: Dataset, sample: RowArgument, agents: Agents = N
     """
     scenario, ego, _ = dataset.get("sample", sample)["token"].rsplit("/", 2)
     there = agents_of(dataset, scenario)
-    wanted = there if agents is None else _named(agents, ego)
+    wanted = there if agents is None or is_available(agents) else _named(agents, ego)
     if not wanted:
         raise ChoiceError("agents: expected at least one agent, found none")
     for agent in wanted:
         if agent not in there:
             raise NotAvailableError(
                 f"agents: {agent} is not in this release of {scenario}, which has {', '.join(there)}; "
-                "unpack the agent's archive, or name others"
+                "unpack its archive, name the agents that are there, or use "
+                f"agents='{AVAILABLE}' (--agents {AVAILABLE}) for all that are there"
             )
     return tuple(sorted(dict.fromkeys(wanted), key=lambda agent: agent != ego))
+
+
+def is_available(agents: object) -> bool:
+    """Whether an `agents=` argument is the text that stands for None, `available`."""
+    return isinstance(agents, str) and agents == AVAILABLE
 
 
 def agents_of(dataset: Dataset, scenario: RowArgument) -> tuple[AgentName, ...]:
@@ -156,7 +166,7 @@ def _named(agents: AgentConfig | str | Sequence[str], ego: str) -> tuple[AgentNa
     if isinstance(agents, str):
         if agents not in AGENT_CONFIGS:
             hint = f"; for that agent alone give [{agents!r}]" if agents in AGENTS else ""
-            raise ChoiceError(f"agents: expected one of {', '.join(AGENT_CONFIGS)}, found {agents!r}{hint}")
+            raise ChoiceError(f"agents: expected one of {', '.join(AGENT_SETS)}, found {agents!r}{hint}")
         return AGENT_CONFIGS[agents].agents_for(ego)
     return tuple(_agent_name(agent) for agent in _names("agents", "agents' names or a configuration", agents))
 

@@ -13,7 +13,8 @@ from numpy.typing import DTypeLike
 from deepaccident_devkit.arrays import checked_whole
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.taxonomy import CAMERAS
+from deepaccident_devkit.release.missing_files import MissingFiles
+from deepaccident_devkit.taxonomy import CAMERAS, LIDAR, OnError
 from deepaccident_devkit.v2x.configurations import Agents
 from deepaccident_devkit.v2x.link import Link
 from deepaccident_devkit.v2x.messages import messages
@@ -32,7 +33,7 @@ class MessageSize:
 
     Attributes:
         images: the six cameras' pixels, 3 bytes each, in the size that calib gives.
-        cloud: the LiDAR's points, 16 bytes each; None if points were not counted.
+        cloud: the LiDAR's points, 16 bytes each; None if points were not counted, or the file is not there.
         boxes: the boxes that it annotated, its own included, 45 bytes each.
         bev: a BEV feature map of the given shape and type.
     """
@@ -52,6 +53,7 @@ def message_sizes(
     bev_dtype: DTypeLike = np.float32,
     clouds: bool = True,
     link: Link | None = None,
+    on_missing: OnError = "raise",
 ) -> dict[str, MessageSize]:
     """Bytes that each agent sends for a sample's moment, for each kind of data.
 
@@ -64,6 +66,8 @@ def message_sizes(
         clouds: whether to read the point clouds, to count their points.
         link: what happens to the partners' data; None for nothing. With latency, sizes are those of the earlier frame
             that arrives; pose noise does not change the size of a message.
+        on_missing: of point clouds that were not downloaded: `raise`, or `skip` leaves their size out (`cloud` is None)
+            and logs how many.
 
     Returns:
         Agent → sizes of what arrives. The sample's own agent (which sends nothing to itself) is first, if it is among
@@ -71,23 +75,27 @@ def message_sizes(
 
     Raises:
         TokenError: no such sample.
-        ChoiceError: no such agent or configuration, or `bev_shape` is no shape or `bev_dtype` no type.
+        ChoiceError: no such agent, configuration or `on_missing`, or `bev_shape` is no shape or `bev_dtype` no type.
         NotAvailableError: an agent is not in this (partial) release.
         ConfigError: `link` is no Link, or its latency is longer than the scenario's past.
-        MissingFileError: `clouds` is true and a point cloud was not downloaded.
+        MissingFileError: `clouds` is true, `on_missing` is `raise`, and a point cloud was not downloaded.
         SensorFileError: `clouds` is true and a point cloud cannot be read.
     """
     bev = _bev_bytes(bev_shape, bev_dtype)
+    files = MissingFiles(dataset.dataroot, on_missing)
     sizes: dict[str, MessageSize] = {}
     for message in messages(dataset, sample, agents, link):
         images = [dataset.get("sample_data", f"{message.sample}/{camera}") for camera in CAMERAS]
-        points = len(dataset.load_point_cloud(message.sample, "lidar")) if clouds else None
+        path = dataset.get_sample_data_path(f"{message.sample}/{LIDAR}")
+        counted = clouds and files.has(path, LIDAR)
+        points = len(dataset.load_point_cloud(message.sample, "lidar")) if counted else None
         sizes[message.agent] = MessageSize(
             images=POSE_BYTES + sum(3 * image["width"] * image["height"] for image in images),
             cloud=None if points is None else POSE_BYTES + POINT_BYTES * points,
             boxes=POSE_BYTES + BOX_BYTES * len(dataset.boxes(message.sample, "lidar")),
             bev=POSE_BYTES + bev,
         )
+    files.tell()
     return sizes
 
 

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.release import ScenarioFolder
@@ -13,6 +13,8 @@ from deepaccident_devkit.tables.scan import ScenarioScan, frame_ranges
 from deepaccident_devkit.taxonomy import AGENTS, CHANNEL_FORMAT, CHANNELS
 from deepaccident_devkit.validation.subject import frames_text, make_finding
 
+_FEW = 10
+"""Frames that are listed if a folder has no more."""
 Recording = tuple[str, str]
 """Agent and kind of file: `label`, `calib` or a channel."""
 
@@ -65,7 +67,7 @@ def absences(scenario: ScenarioFolder, scan: ScenarioScan) -> Iterator[Finding]:
         code = "agent-unlabelled" if scan.labelled else "unlabelled"
         yield make_finding(code, token, token, f"no labels of {', '.join(unlabelled)}")
     if scan.labelled and not scan.has_meta:
-        yield make_finding("meta-missing", token, str(scenario.meta_path), "missing or closed")
+        yield make_finding("meta-missing", token, str(scenario.meta_path), "missing or not readable")
 
 
 def _frame_findings(
@@ -74,7 +76,13 @@ def _frame_findings(
     folder = scenario.kind_folder(agent, channel)
     expected = set(range(1, scan.num_frames + 1))
     missing, extra = sorted(expected - set(found)), sorted(set(found) - expected)
-    if missing:
+    there = expected & set(found)
+    if missing and len(there) <= _FEW and len(there) < len(expected) / 2:
+        listed = ", ".join(map(str, sorted(there)))
+        what = f"has {len(there)} of {scan.num_frames} frames ({listed})"
+        finding = make_finding("sensor-frames-missing", scenario.token, str(folder), what)
+        yield replace(finding, remedy=f"{finding.remedy}, if you want all")
+    elif missing:
         what = f"lacks {frames_text(missing)} of 1 to {scan.num_frames}"
         yield make_finding("sensor-frames-missing", scenario.token, str(folder), what)
     if extra:

@@ -1,6 +1,7 @@
 """What `validate` found: findings, counts against a whole release, and what is still to download."""
 
 import json
+import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -13,7 +14,9 @@ KINDS = ("calib", "label", *CHANNELS)
 """The kinds of files that an agent has."""
 NOT_IN_TEST = ("label", BEV_CAMERA)
 """Kinds that the test split ships without."""
+UNKNOWN_SPLIT = "unknown"
 _LINES_A_SCENARIO = 8
+_ALL_LISTED = "(--all lists all)"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,7 +59,8 @@ class Coverage:
                 continue
             everywhere = len(lacking) == len(agents) and all(count == scenarios for _, count in lacking)
             places = ", ".join(f"{agent} in {count} of {scenarios} scenarios" for agent, count in lacking)
-            yield f"{split}: {', '.join(kinds)} of {'all agents' if everywhere else places}"
+            name = f"split {split}" if split == UNKNOWN_SPLIT else split
+            yield f"{name}: {', '.join(kinds)} of {'all agents' if everywhere else places}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,9 +108,15 @@ class ValidationReport:
         content["to_download"] = list(self.coverage.to_download())
         return json.dumps(content, indent=2, ensure_ascii=False)
 
-    def to_text(self, *, notes: bool = False) -> str:
-        """A table for a terminal, worst scenario first; `notes` also lists what is only worth knowing."""
-        blocks = [self._head(), *self._scenario_blocks(notes=notes), *self._closing(notes=notes)]
+    def to_text(self, *, notes: bool = False, whole: bool = False) -> str:
+        """A table for a terminal, worst scenario first.
+
+        Args:
+            notes: whether to list what is only worth knowing, too.
+            whole: whether to list all that was found of a scenario, and all that is to download.
+        """
+        most = sys.maxsize if whole else _LINES_A_SCENARIO
+        blocks = [self._head(), *self._scenario_blocks(most, notes=notes), *self._closing(most, notes=notes)]
         return "\n\n".join(blocks)
 
     def _head(self) -> str:
@@ -116,7 +126,7 @@ class ValidationReport:
             f"{self.scenarios} scenarios, {self.samples:,} samples: {depth}"
         )
 
-    def _scenario_blocks(self, *, notes: bool) -> Iterator[str]:
+    def _scenario_blocks(self, most: int, *, notes: bool) -> Iterator[str]:
         by_scenario: dict[str | None, list[Finding]] = {}
         for finding in self.findings:
             if notes or finding.severity != "note":
@@ -125,12 +135,12 @@ class ValidationReport:
             counts = Counter(finding.severity for finding in findings)
             head = ", ".join(_counted(counts[severity], severity) for severity in SEVERITIES if counts[severity])
             lines = [f"{scenario or 'the release'}  ({head})"]
-            lines += [_line(finding) for finding in findings[:_LINES_A_SCENARIO]]
-            if len(findings) > _LINES_A_SCENARIO:
-                lines.append(f"  … and {len(findings) - _LINES_A_SCENARIO} more (--json lists all)")
+            lines += [_line(finding) for finding in findings[:most]]
+            if len(findings) > most:
+                lines.append(f"  … and {len(findings) - most} more {_ALL_LISTED}")
             yield "\n".join(lines)
 
-    def _closing(self, *, notes: bool) -> Iterator[str]:
+    def _closing(self, most: int, *, notes: bool) -> Iterator[str]:
         by_code = Counter((finding.severity, finding.code, finding.known) for finding in self.findings)
         if by_code:
             rank = {severity: place for place, severity in enumerate(SEVERITIES)}
@@ -152,8 +162,8 @@ class ValidationReport:
             )
         missing = list(self.coverage.to_download())
         if missing:
-            shown = missing[:_LINES_A_SCENARIO]
-            more = [f"  … and {len(missing) - len(shown)} more (--json lists all)"] if len(missing) > len(shown) else []
+            shown = missing[:most]
+            more = [f"  … and {len(missing) - len(shown)} more {_ALL_LISTED}"] if len(missing) > len(shown) else []
             yield "still to download, for a whole release:\n" + "\n".join([*(f"  {line}" for line in shown), *more])
         hidden = self.counts["note"] and not notes
         verdict = ", ".join(_counted(self.counts[severity], severity) for severity in SEVERITIES)

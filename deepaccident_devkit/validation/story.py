@@ -13,7 +13,6 @@ from deepaccident_devkit.taxonomy import (
     META_AGENTS,
     UNTRACKED_ID,
     VEHICLE_AGENTS,
-    WARM_UP_FRAMES,
 )
 from deepaccident_devkit.v2x.collisions import CONTACT_GAP
 from deepaccident_devkit.validation.subject import Subject
@@ -67,7 +66,7 @@ def _words(subject: Subject, meta: Meta) -> Iterator[Finding]:
 
 
 def _counts(subject: Subject, meta: Meta) -> Iterator[Finding]:
-    expected = meta.simulated_frames - WARM_UP_FRAMES
+    expected = meta.recorded_frames
     if expected != subject.num_frames:
         what = (
             f"counts {meta.simulated_frames} simulated frames, so {expected} recorded ones, found {subject.num_frames}"

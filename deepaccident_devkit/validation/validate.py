@@ -22,7 +22,13 @@ from deepaccident_devkit.validation.agreement import check_agreement
 from deepaccident_devkit.validation.inventory import Recording, absences, take_inventory
 from deepaccident_devkit.validation.labels import check_labels
 from deepaccident_devkit.validation.poses import check_poses
-from deepaccident_devkit.validation.report import Coverage, ValidationReport, empty_recordings, worst_first
+from deepaccident_devkit.validation.report import (
+    UNKNOWN_SPLIT,
+    Coverage,
+    ValidationReport,
+    empty_recordings,
+    worst_first,
+)
 from deepaccident_devkit.validation.sensors import check_sensors
 from deepaccident_devkit.validation.split_files import check_splits
 from deepaccident_devkit.validation.story import check_story
@@ -30,7 +36,6 @@ from deepaccident_devkit.validation.subject import make_finding, subject_of
 from deepaccident_devkit.validation.untracked import check_untracked
 from deepaccident_devkit.validation.velocities import check_velocities
 
-_UNKNOWN_SPLIT = "unknown"
 _NO_FIT = total_fit([])
 
 
@@ -170,7 +175,7 @@ def _coverage(version: str, checks: Sequence[ScenarioCheck], splits: SplitAssign
     scenarios: dict[str, int] = {}
     recordings: dict[str, dict[str, dict[str, int]]] = {}
     for check in checks:
-        split = version if mini else splits.split_of.get(check.token, _UNKNOWN_SPLIT)
+        split = version if mini else splits.split_of.get(check.token, UNKNOWN_SPLIT)
         scenarios[split] = scenarios.get(split, 0) + 1
         counts = recordings.setdefault(split, empty_recordings())
         for agent, kind in check.recordings:

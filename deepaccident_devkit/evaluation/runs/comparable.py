@@ -100,7 +100,7 @@ def _cells(bundle: Bundle) -> dict[str, Any]:
     How maps lie is not among them, since it changes no number.
     """
     form = (bundle.summary.get("results") or {}).get("form") or {}
-    return {name: form[name] for name in ("x", "y", "step") if name in form}
+    return {name: str(form[name]) for name in ("x", "y", "step") if name in form}
 
 
 def _check_truth(one: Bundle, other: Bundle, scenarios: Mapping[str, object]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -59,11 +60,24 @@ class Coverage:
             _named(self.extra, "predictions are of samples that are not evaluated"),
             _named(self.unknown, "predictions are of no sample of this release"),
         ]
-        told = "; ".join(part for part in parts if part)
-        if self.guess is None:
-            return told
-        shared = "they have just its samples" if self.guess_share == 1 else f"{self.guess_share:.0%} in common"
-        return f"{told}; the results were probably made for {self.guess.text()} ({shared})"
+        if self.extra and not (self.missing or self.unknown):
+            parts.append(
+                "leave them out with --allow-partial (allow_partial=True); no sample lacks a prediction, so the "
+                "numbers are not partial then"
+            )
+        if self.guess is not None:
+            shared = "they have just its samples" if self.guess_share == 1 else f"{self.guess_share:.0%} in common"
+            parts += [f"the results were probably made for {self.guess.text()} ({shared})", _again(self.guess)]
+        return "; ".join(part for part in parts if part)
+
+
+def _again(guess: SampleSelection) -> str:
+    """How to evaluate another list, with options of the command line and in Python."""
+    choices = guess.choices()
+    words = {name: ",".join(value) if name == "agents" else str(value) for name, value in choices.items()}
+    options = " ".join(f"--{name} {shlex.quote(value)}" for name, value in words.items())
+    arguments = ", ".join(f"{name}={value!r}" for name, value in choices.items())
+    return f"repeat with {options}, in Python with SampleSelection({arguments})"
 
 
 def coverage(dataset: Dataset, results: Collection[str], selection: SampleSelection) -> Coverage:
@@ -99,7 +113,8 @@ def _probably_meant(
 ) -> tuple[SampleSelection | None, float]:
     """The list with the largest share of common samples, the first of equal ones; none if the asked one is no worse."""
     present = {agent_of(token) for token in given}
-    agents = None if present.issuperset(AGENTS) else tuple(name for name in AGENTS if name in present)
+    here = {agent["name"] for agent in dataset.agent}  # a partial release may lack some
+    agents = None if present.issuperset(here) else tuple(name for name in AGENTS if name in present)
     best, most = None, _overlap(given, selection.tokens(dataset))
     for candidate in _candidates(selection, agents):
         try:

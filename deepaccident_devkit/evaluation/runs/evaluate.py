@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.errors import ResultsError
+from deepaccident_devkit.errors import EvaluationError, ResultsError
 from deepaccident_devkit.evaluation.metrics.attributes import sample_attributes
 from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
 from deepaccident_devkit.evaluation.results import Results, read_results
@@ -25,6 +26,10 @@ from deepaccident_devkit.evaluation.runs.many_samples import evaluate_samples
 from deepaccident_devkit.evaluation.runs.selection import SampleList, SampleSelection, ScopeName, scenario_of
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
 from deepaccident_devkit.release.fingerprints import scenario_hashes
+from deepaccident_devkit.taxonomy import SPLITS
+
+_OF_ACCIDENTS: Final = ("accident", "warning")
+"""Tasks whose truth is in meta."""
 
 
 def default_selection(
@@ -87,8 +92,8 @@ def evaluate_results(
 
     Raises:
         ResultsError: the results cannot be read, an entry is wrong, or they do not have the samples of the selection.
-        EvaluationError: they are of another kind than the task is evaluated from or look less far ahead, or a sample
-            cannot be evaluated.
+        EvaluationError: they are of another kind than the task is evaluated from or look less far ahead, scenarios lack
+            the meta that the task needs, or a sample cannot be evaluated.
         ChoiceError: no such split.
         NotAvailableError: the release has no such samples.
     """
@@ -98,6 +103,8 @@ def evaluate_results(
     opened.check(workers=workers, progress=progress)
     covered = coverage(dataset, opened.tokens, chosen)
     tokens = _covered_tokens(dataset, opened, chosen, covered, allow_partial=allow_partial)
+    if setup.task in _OF_ACCIDENTS:
+        check_metas(dataset, tokens, chosen.split)
     release = ReleaseInfo(
         dataroot=os.fspath(dataset.dataroot),
         version=dataset.version,
@@ -110,6 +117,7 @@ def evaluate_results(
         evaluator=evaluator,
         result=evaluator.compute(),
         partial=_partial(covered),
+        left_out=len(covered.extra) + len(covered.unknown),
         attributes=sample_attributes(dataset, tokens),
         times_to_impact={token: dataset.sample.get(token)["time_to_impact"] for token in tokens},
         breakdowns=(),
@@ -133,20 +141,30 @@ def _covered_tokens(
     dataset: Dataset, results: Results, selection: SampleSelection, covered: Coverage, *, allow_partial: bool
 ) -> list[str]:
     if not covered.is_complete and not allow_partial:
-        raise ResultsError(
-            f"{results.path}: {covered.to_text()}; give results of these samples, choose the list that they are of, or "
-            f"evaluate the samples that have a prediction with allow_partial=True (--allow-partial), {_mark(covered)}"
+        remedy = (
+            "; give results of these samples, choose the list that they are of, or evaluate the samples that have a "
+            "prediction with allow_partial=True (--allow-partial), which marks every number as partial"
         )
+        raise ResultsError(f"{results.path}: {covered.to_text()}{remedy if covered.missing or covered.unknown else ''}")
     tokens = [token for token in selection.tokens(dataset) if token in results]
     if not tokens:
         raise ResultsError(f"{results.path}: {covered.to_text()}; nothing is left to evaluate")
     return tokens
 
 
-def _mark(covered: Coverage) -> str:
-    if covered.missing:
-        return "which marks every number as partial"
-    return "which leaves out the other predictions; since no sample lacks one, the numbers are not partial"
+def check_metas(dataset: Dataset, tokens: Sequence[str], split: str) -> None:
+    """Raise EvaluationError, which counts them, if scenarios of samples have no meta file: it names the pair."""
+    scenarios = list(dict.fromkeys(map(scenario_of, tokens)))
+    silent = [token for token in scenarios if dataset.get("scenario", token)["weather"] is None]
+    if silent:
+        of_split = f" --where split={split}" if split in SPLITS else ""
+        raise EvaluationError(
+            f"{len(silent)} of {len(scenarios)} scenarios have no meta file, which names the colliding pair, so that "
+            f"accidents cannot be evaluated there: {', '.join(silent[:3])}{', …' if len(silent) > 3 else ''}; unpack "
+            f"their meta folders, or leave them out with a split file of your own: deepaccident split "
+            f"{shlex.quote(os.fspath(dataset.dataroot))}{of_split} --where 'weather!=unknown' --save mine.txt, then "
+            "--split mine.txt"
+        )
 
 
 def _partial(covered: Coverage) -> Partial | None:

@@ -133,6 +133,7 @@ class EvaluationRun:
         evaluator: with the counts of each sample.
         result: of all samples, as the task's evaluator computes it.
         partial: what is missing; None for nothing.
+        left_out: how many predictions of other samples the results have.
         attributes: of each sample evaluated, by token.
         times_to_impact: seconds from each of them to the recorded impact; None where there is none, or none is known.
         breakdowns: results by attribute; `all` has the intervals of the result itself.
@@ -154,6 +155,7 @@ class EvaluationRun:
     results: ResultsInfo
     sanity: Mapping[str, Any] | None = None
     explanation: Mapping[str, Any] | None = None
+    left_out: int = 0
 
     @property
     def stamp(self) -> dict[str, Any]:
@@ -195,6 +197,7 @@ class EvaluationRun:
             "counts": {
                 "samples": len(self.evaluator),
                 "scenarios": len({each.scenario for each in self.attributes.values()}),
+                "left_out": self.left_out,
             },
             "release": {
                 "version": self.release.version,

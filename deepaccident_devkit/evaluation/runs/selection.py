@@ -10,10 +10,12 @@ from typing import Any, Final, Literal, get_args
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
 from deepaccident_devkit.motion import samples
+from deepaccident_devkit.motion.sample_lists import no_samples_text
 from deepaccident_devkit.taxonomy import AGENTS
 
 SampleList = Literal["evaluate", "all"]
 ScopeName = Literal["accident", "all"]
+_DEFAULT_HORIZON: Final = 2.0
 LIST_STEP: Final = 0.5
 """Seconds from one sample of a list to the next."""
 
@@ -34,7 +36,7 @@ class SampleSelection:
     samples: SampleList = "evaluate"
     scope: ScopeName = "accident"
     agents: tuple[str, ...] | None = None
-    horizon: float = 2.0
+    horizon: float = _DEFAULT_HORIZON
 
     def __post_init__(self) -> None:
         """Check and put the agents in order; raises ChoiceError."""
@@ -70,7 +72,8 @@ class SampleSelection:
         if not chosen:
             whose = "" if self.agents is None else f" of {', '.join(self.agents)}"
             raise NotAvailableError(
-                f"{self.split}: this release has no labelled samples{whose} there ({self.text()}); choose others"
+                f"{self.split}: this release has no labelled samples{whose} there ({self.text()}); "
+                f"{no_samples_text(dataset, self.split, self.scope)}"
             )
         return chosen
 
@@ -83,6 +86,15 @@ class SampleSelection:
         within = f" (the last {self.horizon:g} s)" if self.samples == "evaluate" else ""
         whose = "all agents" if self.agents is None else f"agents {', '.join(self.agents)}"
         return f"split {self.split}, samples {self.samples}{within}, scope {self.scope}, {whose}"
+
+    def choices(self) -> dict[str, Any]:
+        """The fields that say which list it is: all but agents and a horizon that are the default."""
+        named: dict[str, Any] = {"split": self.split, "samples": self.samples, "scope": self.scope}
+        if self.agents is not None:
+            named["agents"] = self.agents
+        if self.samples == "evaluate" and self.horizon != _DEFAULT_HORIZON:
+            named["horizon"] = self.horizon
+        return named
 
 
 def scenario_of(token: str) -> str:

@@ -45,11 +45,12 @@ def _head(summary: Json) -> str:
     switches = ", ".join(f"{name}={value!r}" for name, value in summary["switches"].items())
     agents = "all agents" if summary["agents"] is None else ", ".join(summary["agents"])
     release, results, counts = summary["release"], summary["results"], summary["counts"]
+    others = f"; {counts['left_out']} predictions of other samples left out" if counts.get("left_out") else ""
     lines = {
         "task": f"{summary['task']}, protocol {summary['protocol']}{f' with {switches}' if switches else ''}",
         "samples": f"{counts['samples']} of {counts['scenarios']} scenarios: split {summary['split']}, list "
         f"{summary['samples']}, scope {summary['scope']}, {agents}, horizon {summary['horizon']:g} s",
-        "predictions": f"{results['path']} ({results['fingerprint']})",
+        "predictions": f"{results['path']} ({results['fingerprint']}){others}",
         "release": f"{release['dataroot']} ({release['version']}, {release['fingerprint']})",
         "devkit": summary["devkit_version"],
     }

@@ -133,12 +133,14 @@ def verify_bundle(
 
 
 def _again(bundle: Bundle, dataset: Dataset, results: Results, *, workers: int | None, progress: bool) -> EvaluationRun:
+    counts = bundle.summary.get("counts")
+    left_out = isinstance(counts, Mapping) and bool(counts.get("left_out"))
     run = evaluate_results(
         dataset,
         results,
         bundle.setup,
         bundle.selection,
-        allow_partial=bundle.summary.get("partial") is not None,
+        allow_partial=bundle.summary.get("partial") is not None or left_out,
         workers=workers,
         progress=progress,
     )

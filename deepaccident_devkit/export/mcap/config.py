@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, Literal
 
 from deepaccident_devkit.arrays import checked_whole
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.results import Prediction, Results
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.motion.config import label_config
+from deepaccident_devkit.release.missing_files import checked_on_missing
 from deepaccident_devkit.taxonomy import CAMERAS, LIDAR, OnError
 from deepaccident_devkit.text import possible_text
 from deepaccident_devkit.v2x import Agents
@@ -50,8 +51,7 @@ class McapConfig:
         """Check; raises ChoiceError."""
         object.__setattr__(self, "channels", _channel_names(self.channels))
         object.__setattr__(self, "frames", _frame_numbers(self.frames))
-        if self.on_missing not in get_args(OnError):
-            raise ChoiceError(f"on_missing: expected one of {', '.join(get_args(OnError))}, found {self.on_missing!r}")
+        checked_on_missing(self.on_missing)
         if self.motion_labels is not None:
             object.__setattr__(self, "motion_labels", label_config(self.motion_labels))
         _ = self.point_step

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-from collections import Counter
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
@@ -13,17 +11,17 @@ from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.errors import MissingFileError, SensorFileError
+from deepaccident_devkit.errors import SensorFileError
 from deepaccident_devkit.export.mcap.config import McapConfig
 from deepaccident_devkit.export.mcap.messages import cloud_message, frame_id
 from deepaccident_devkit.export.mcap.moment import Moment
 from deepaccident_devkit.export.mcap.recording import Recording, frame_timestamp
 from deepaccident_devkit.files import irregular_text
+from deepaccident_devkit.release.missing_files import MissingFiles
 from deepaccident_devkit.taxonomy import LIDAR
 from deepaccident_devkit.v2x.projection import camera_of
 
 LIDAR_POINT: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
-_logger = logging.getLogger(__name__)
 
 
 class Sensors:
@@ -34,28 +32,23 @@ class Sensors:
         self._dataset = dataset
         self._channels = tuple(config.channels or ())
         self._step = config.point_step
-        self._skips = config.on_missing == "skip"
-        self._missing: Counter[str] = Counter()
-        self._asked: Counter[str] = Counter()
+        self._files = MissingFiles(dataset.dataroot, config.on_missing)
 
     def write(self, moment: Moment, recording: Recording) -> None:
         """Write the files of a moment, agent by agent; raises MissingFileError or SensorFileError."""
         for agent, sample in moment.samples.items():
             for channel in self._channels:
                 path = self._dataset.get_sample_data_path(f"{sample}/{channel}")
-                self._asked[channel] += 1
-                if self._skips and not path.is_file():
-                    self._missing[channel] += 1
-                elif channel == LIDAR:
+                if not self._files.has(path, channel):
+                    continue
+                if channel == LIDAR:
                     self._write_cloud(agent, sample, moment.index, recording)
                 else:
                     self._write_image(agent, f"{sample}/{channel}", path, moment.index, recording)
 
     def tell_missing(self) -> None:
         """Log how many files were left out, if any."""
-        if self._missing:
-            counts = ", ".join(f"{self._missing[name]} of {self._asked[name]} of {name}" for name in self._missing)
-            _logger.warning("left out files that are not in %s: %s", self._dataset.dataroot, counts)
+        self._files.tell()
 
     def _write_image(self, agent: str, token: str, path: Path, index: int, recording: Recording) -> None:
         content, channel = _content(path), token.rsplit("/", 1)[1]
@@ -93,16 +86,12 @@ def _calibration(dataset: Dataset, token: str, size: tuple[int, int], frame: str
 
 
 def _content(path: Path) -> bytes:
-    """An image file's bytes; raises MissingFileError or SensorFileError."""
+    """An image file's bytes; raises SensorFileError."""
     try:
         irregular = irregular_text(path.stat().st_mode)
         if irregular:
             raise SensorFileError(f"{path}: {irregular}; restore the file from its archive")
         return path.read_bytes()
-    except FileNotFoundError:
-        raise MissingFileError(
-            f"{path}: no such file; unpack the archive that holds this camera, or pass on_missing='skip'"
-        ) from None
     except OSError as error:
         raise SensorFileError(f"{path}: cannot be read ({error}); restore the file from its archive") from error
 

@@ -166,7 +166,7 @@ def predict_instances(heads: MotionHeads, settings: PostProcessing | str = "moti
     turn = _Turn(heads.segmentation.shape[-2:], heads.orientation, rules.scan)
     centerness = turn.maps(heads.centerness[:, 0])
     peaks = [find_peaks(frame, rules.center_threshold, rules.max_centers) for frame in centerness]
-    foreground = turn.maps(_foreground(heads.segmentation, rules))
+    foreground = turn.maps(foreground_cells(heads.segmentation, rules))
     positions = [np.stack(np.nonzero(here & (len(found) > 0))) for here, found in zip(foreground, peaks, strict=True)]
     groups = [
         group_cells(
@@ -198,6 +198,20 @@ def predict_instances(heads: MotionHeads, settings: PostProcessing | str = "moti
             for identity, (points, cells) in enumerate(zip(turn.points(centers), counts, strict=True), start=1)
         },
     )
+
+
+def foreground_cells(segmentation: AnyArray, rules: PostProcessing) -> BoolArray:
+    """(T, H, W) which cells are actors by the settings, of logits (T, 2, H, W) of one prediction: background, actor."""
+    background, actor = segmentation[:, 0], segmentation[:, 1]
+    if rules.foreground == "argmax":
+        return np.asarray(actor > background)
+    threshold = np.float32(rules.foreground_threshold)
+    if rules.labels_bypass_sigmoid and segmentation.max() == LABEL_LOGIT and segmentation.min() == 0:
+        return np.asarray(actor > threshold)
+    # A float32 sigmoid exceeds the threshold from half-way to the next float32 on. That point's own logit is compared
+    # with instead, which needs no exponential of every cell.
+    beyond = (float(threshold) + float(np.nextafter(threshold, np.float32(1)))) / 2
+    return np.asarray(actor > np.float32(np.log(beyond / (1 - beyond))))
 
 
 def post_processing(settings: PostProcessing | str) -> PostProcessing:
@@ -244,20 +258,6 @@ def trajectories(
         name: low + (_points_in(points, shape, linked.orientation, "devkit")[:, ::-1] + within) * size
         for name, points in linked.centers.items()
     }
-
-
-def _foreground(segmentation: AnyArray, rules: PostProcessing) -> BoolArray:
-    """(T, H, W) the cells that are actors, of logits (T, 2, H, W)."""
-    background, actor = segmentation[:, 0], segmentation[:, 1]
-    if rules.foreground == "argmax":
-        return np.asarray(actor > background)
-    threshold = np.float32(rules.foreground_threshold)
-    if rules.labels_bypass_sigmoid and segmentation.max() == LABEL_LOGIT and segmentation.min() == 0:
-        return np.asarray(actor > threshold)
-    # A sigmoid in float32 exceeds the threshold if it is beyond the middle between the threshold and the next float32.
-    # Logits are compared with the logit of that middle, which needs no exponential of every cell.
-    beyond = (float(threshold) + float(np.nextafter(threshold, np.float32(1)))) / 2
-    return np.asarray(actor > np.float32(np.log(beyond / (1 - beyond))))
 
 
 def _paths(groups: Sequence[FrameGroups], names: Sequence[IntArray]) -> tuple[FloatArray, IntArray]:

@@ -41,7 +41,7 @@ def _ending(meta: Meta) -> str:
 
 def _first_line(meta: Meta, words: Sequence[str]) -> list[tuple[str, str, str]]:
     time = "" if meta.time_of_day is None else f"; time of day: {meta.time_of_day}"
-    recorded = meta.simulated_frames - WARM_UP_FRAMES
+    recorded = meta.recorded_frames
     none = "none: there was no collision"
     meanings = [
         ("weather and time", f"weather: {meta.weather}{time}"),

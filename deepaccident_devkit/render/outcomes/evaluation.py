@@ -24,7 +24,7 @@ from deepaccident_devkit.evaluation.metrics.detection import (
 from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput, Prediction, checked_prediction
 from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels, motion_labels
-from deepaccident_devkit.render.axes import figure_or_new, settled, titled_from_above
+from deepaccident_devkit.render.axes import figure_or_new, set_title, settled, titled_from_above
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.outcomes.accident import ACCIDENT_LAYERS, draw_accident_outcome, verdict_words
 from deepaccident_devkit.render.outcomes.detection import DETECTION_LAYERS, WINDOW, draw_detection_outcome, draw_true
@@ -96,7 +96,7 @@ def render_evaluation(
         default = "released" if isinstance(given, MotionOutput) else "boxes"
         judge = AccidentEvaluator(protocol or default)
         fig, words = _draw_accident(dataset, token, given, label, judge, shown, fig)
-    fig.suptitle(f"{token}\n{words}", fontsize=11)
+    set_title(fig, f"{token}\n{words}", fontsize=11)
     return settled(fig)
 
 

@@ -15,7 +15,7 @@ from deepaccident_devkit.render.roles import agent_actors
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, AgentName
 from deepaccident_devkit.v2x import Agents, Contact, collision, cooperating_agents
-from deepaccident_devkit.v2x.collisions import first_accident
+from deepaccident_devkit.v2x.collisions import default_scenario
 from deepaccident_devkit.v2x.configurations import agents_of
 
 if TYPE_CHECKING:
@@ -79,15 +79,16 @@ def recording_of(dataset: Dataset, scenario: RowArgument | None, agents: Agents)
 
     Args:
         dataset: the release.
-        scenario: token or record; None for the first that ends in an accident.
+        scenario: token or record; None for the first that ends in an accident, or if there is no accident, for the
+            first one.
         agents: whose view is shown, as `cooperating_agents` takes them, seen from the first agent that is there.
 
     Raises:
         TokenError: no such scenario.
-        NotAvailableError: the release has no accident, or lacks one of the agents.
+        NotAvailableError: the release has no scenario, or lacks one of the agents.
         ChoiceError: no such agent or configuration.
     """
-    record = dataset.scenario[dataset.getind("scenario", first_accident(dataset) if scenario is None else scenario)]
+    record = dataset.scenario[dataset.getind("scenario", default_scenario(dataset) if scenario is None else scenario)]
     first = sample_token(record["token"], agents_of(dataset, record)[0], 1)
     chosen = cooperating_agents(dataset, first, agents)
     contact, unknown = _contact(dataset, record)

@@ -58,7 +58,8 @@ def render_replay(
 
     Args:
         dataset: the release.
-        scenario: token or record; None for the first that ends in an accident.
+        scenario: token or record; None for the first that ends in an accident, or if there is no accident, for the
+            first one.
         path: the file to write.
         prediction: a model's results of motion or accidents, or predictions by sample token: the page shows what they
             foresee and whether it is right by the accident protocol `boxes`. None for none.
@@ -75,7 +76,7 @@ def render_replay(
         TokenError: no such scenario.
         ChoiceError: no such agent, or `path` is a folder.
         ConfigError: the width or quality is not possible.
-        NotAvailableError: the release has no accident, lacks one of the agents, or the prediction is of other samples.
+        NotAvailableError: the release has no scenario, lacks one of the agents, or the prediction is of other samples.
         EvaluationError: the prediction is neither of motion nor of accidents.
         SensorFileError: an image or a point cloud cannot be read.
     """

@@ -63,7 +63,6 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
         ChoiceError: no such view, layer, agent, frame or kind of file, or the file cannot have this size or rate.
         NotAvailableError: an agent is not in this release, the sample has no label, or nobody collides and the view
             is `accident`.
-        MissingFileError: an image was not downloaded.
         MissingExtraError: nothing here can write MP4.
     """
     target, (width, height) = Path(path).expanduser(), size

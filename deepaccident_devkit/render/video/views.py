@@ -14,7 +14,7 @@ from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render.accident import COUNTDOWN_LAYERS, draw_countdown
 from deepaccident_devkit.render.bev import BEV_LAYERS, render_bev
 from deepaccident_devkit.render.calibration import CALIBRATION_LAYERS, render_calibration
-from deepaccident_devkit.render.camera import CAMERA_LAYERS, render_sample_data
+from deepaccident_devkit.render.camera import CAMERA_DEFAULT, CAMERA_LAYERS, draw_camera
 from deepaccident_devkit.render.layers import LAYERS, Layer, layers_of
 from deepaccident_devkit.render.moments import MOMENT_LAYERS, render_frame, render_sample
 from deepaccident_devkit.render.motion import TRAIL_LAYERS, render_motion_labels
@@ -122,7 +122,8 @@ class _Camera:
 
     def __call__(self, moment: Moment, fig: Figure) -> object:
         camera = f"{moment.sample}/{self.channel}"
-        return render_sample_data(moment.dataset, camera, layers=moment.layers, ax=fig.add_subplot())
+        layers = CAMERA_DEFAULT if moment.layers is None else moment.layers
+        return draw_camera(moment.dataset, moment.dataset.get("sample_data", camera), layers, fig.add_subplot())
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,6 +32,8 @@ def read_spec(path: str | os.PathLike[str]) -> SpecTemplate:
     try:
         with Path(path).open(encoding="utf-8") as file:
             text = file.read(_MOST_CHARACTERS + 1)
+    except FileNotFoundError as error:
+        raise ConfigError(f"{path}: no such file; give the path of a scenario file (docs/scenarios.md)") from error
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read ({error}); give a YAML file in UTF-8") from error
     if len(text) > _MOST_CHARACTERS:

@@ -7,7 +7,7 @@ from typing import Final, TypeAlias, cast
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.roads import ARMS, Arm, Junction, RoadSpec, Turn
-from deepaccident_devkit.synth.spec.choices import Items, Part
+from deepaccident_devkit.synth.spec.choices import Items, Part, default_of
 from deepaccident_devkit.synth.spec.model import Role
 
 _Way: TypeAlias = tuple[Arm, Turn, int]
@@ -20,6 +20,10 @@ _AGENT_CATEGORIES: Final = ("car", "truck", "van", "motorcycle")
 _WALKING: Final = "pedestrian"
 _MOST_ACTORS: Final = 100
 _PARKED_CATEGORIES: Final = ("car", "truck", "van", "motorcycle")
+_ROLE_OF_CATEGORY: Final[Mapping[str, Role]] = {"cyclist": "background", _WALKING: _WALKING}
+"""Category that no agent can have → the role for it."""
+_FASTEST_WALK: Final = 3.0
+"""m/s: from kerb to kerb no pedestrian becomes faster."""
 _FORBIDDEN: Final[Mapping[str, tuple[str, ...]]] = {
     **dict.fromkeys(LEADERS, ("from_arm", "turn", "lane", "start_distance", "delay", "side", "lane_change")),
     **dict.fromkeys((*_LEADING, "background"), ("gap", "side")),
@@ -44,6 +48,8 @@ def check_scenario(root: Part) -> None:
         _check_category(actor)
         _check_way(actor, junctions)
         _check_lane(actor, junctions)
+        _check_speed(actor)
+        _check_parking(root, actor)
     _check_view(root, actors)
     _check_meeting(root, actors, junctions)
 
@@ -64,9 +70,12 @@ def _check_roles(root: Part, actors: Sequence[Part]) -> None:
     for role in _LEADING:
         if not counts[role]:
             raise _fault(root, "actors", f"there is no actor with role {role}", "add one")
+    seen: set[Role] = set()
     for actor in actors:
-        if _role(actor) in _AGENTS and counts[_role(actor)] > 1:
-            raise _fault(actor, "role", f"there are {counts[_role(actor)]} actors with role {_role(actor)}", "keep one")
+        role = _role(actor)
+        if role in _AGENTS and role in seen:
+            raise _fault(actor, "role", f"there are {counts[role]} actors with role {role}", "keep one")
+        seen.add(role)
 
 
 def _junctions(root: Part) -> tuple[Junction, ...]:
@@ -93,7 +102,16 @@ def _check_category(actor: Part) -> None:
     possible = _possible_categories(role)
     for category in actor.values("category") if "category" in actor.fields else ():
         if category not in possible:
-            raise _fault(actor, "category", f"the role {role} cannot be a {category}", f"choose {', '.join(possible)}")
+            instead = (
+                f"; give the {category} the role {_ROLE_OF_CATEGORY[category]}" if _moves_to(role, category) else ""
+            )
+            remedy = f"choose {', '.join(possible)}{instead}"
+            raise _fault(actor, "category", f"the role {role} cannot be a {category}", remedy)
+
+
+def _moves_to(role: Role, category: str) -> bool:
+    """Whether another role is the remedy for a category that a role cannot have."""
+    return category in _ROLE_OF_CATEGORY and role in (*_AGENTS, "background")
 
 
 def _possible_categories(role: Role) -> tuple[str, ...]:
@@ -133,6 +151,21 @@ def _check_lane(actor: Part, junctions: Sequence[Junction]) -> None:
         if set(actor.values("turn")) != {"straight"}:
             sentence = "is possible only with the turn straight"
             raise _fault(actor, "lane_change", sentence, "leave it out, or go straight on")
+
+
+def _check_speed(actor: Part) -> None:
+    """A pedestrian walks or runs over the road, and stops at the other kerb."""
+    fastest = max((speed for speed in actor.values("max_speed") if speed is not None), default=0.0)
+    if _role(actor) == _WALKING and fastest > _FASTEST_WALK:
+        sentence = f"expected 0.5 to {_FASTEST_WALK:g} m/s for a pedestrian, found {fastest:g}"
+        raise _fault(actor, "max_speed", sentence, "walking is 1 to 2 m/s, running 3")
+
+
+def _check_parking(root: Part, actor: Part) -> None:
+    for road in root.values("road"):
+        if _role(actor) == "parked" and isinstance(road, Part) and False in road.values("parking"):
+            sentence = f"a vehicle cannot park where the road has no parking strips ({road.line('parking')})"
+            raise _fault(actor, "role", sentence, "leave it out, or set road.parking to true")
 
 
 def _check_roads(root: Part) -> None:
@@ -181,8 +214,19 @@ def _check_meeting(root: Part, actors: Sequence[Part], junctions: Sequence[Junct
                 raise _fault(meeting, "actors", sentence, "choose roles that one actor has")
         if first == second:
             raise _fault(meeting, "actors", f"{first} cannot meet itself", "name two roles")
+        if None not in root.values("meet"):
+            _check_timed(meeting, by_role[first])
+            _check_timed(meeting, by_role[second])
         if all(_drives(by_role[role]) and by_role[role].values("lane_change") == (None,) for role in (first, second)):
             _check_crossing(meeting, by_role[first], by_role[second], junctions)
+
+
+def _check_timed(meeting: Part, actor: Part) -> None:
+    """Start and delay of those who are timed follow from the meeting; of a pedestrian the start is its place."""
+    for name in ("delay",) if _role(actor) == _WALKING else ("start_distance", "delay"):
+        if any(value != default_of(actor.kind, name) for value in actor.values(name)):
+            sentence = f"follows from meet ({meeting.where}) for {_role(actor)}, who is timed"
+            raise _fault(actor, name, sentence, "leave it out; meet.offset says who comes later")
 
 
 def meeting_roles(meeting: Part) -> tuple[Role, Role]:

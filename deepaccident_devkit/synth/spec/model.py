@@ -48,18 +48,20 @@ class ActorSpec:
 
     Attributes:
         role: who it is; each of the first four at most once. `ego`, `other` and the two behind them are agents.
-        category: its kind of road user.
+        category: its kind of road user. `ego`, `other` and those behind them can be a car, truck, van or motorcycle; so
+            can `parked`. `background` can also be a cyclist. Only `pedestrian` is a pedestrian.
         from_arm: the arm that it comes from, or where it stands or walks. Leave it out for `ego_behind` and
             `other_behind`: they take the path of the vehicle that they follow.
         turn: what it does at the junction.
         lane: 0 is the rightmost lane. If not given, it follows from the turn: the leftmost lane to turn left, the
             rightmost to turn right, any lane to go straight on.
-        max_speed: the speed that it reaches on a free straight road; if not given, drawn by its category.
-        start_distance: distance from its start to the middle of the junction, along its path; for a parked vehicle
-            or a pedestrian, its distance from the middle of the junction. If not given, it follows from `meet`, or
-            is drawn.
+        max_speed: the speed that it reaches on a free straight road, for a pedestrian 3 m/s at most; if not given,
+            drawn by its category.
+        start_distance: how far from the middle of the junction it starts, along its path; a parked vehicle: how far
+            from there it stands; a pedestrian: how far from there it steps onto the road. If not given, it is drawn.
+            Drivers of `meet` cannot have it: their start follows from their timing.
         gap: distance at the start, from bumper to bumper, to the vehicle that it follows; only for those behind.
-        delay: time that it waits before it starts to move.
+        delay: time that it waits before it starts to move; not for those of `meet`.
         side: side of the road, as a driver towards the junction sees it: where a parked vehicle stands, or from where
             a pedestrian steps onto the road.
         lane_change: how far before the middle of the junction it begins to change into the other lane of its road;
@@ -118,7 +120,8 @@ class EndSpec:
     """When the recording ends; a collision always ends it.
 
     Attributes:
-        time: time at which it ends at the latest.
+        time: time at which it ends at the latest; but at least 4 s are recorded, and never less than up to the
+            accident's collision, which is planned for 5.5 s or later.
         arrival: it also ends when ego is this far past the middle of the junction, along its path.
     """
 
@@ -135,8 +138,8 @@ class ScenarioSpec:
         design: number of the paper's design, if it is one of the twelve.
         road: the junction.
         view: `hidden` puts a house on the kerb of the corner between ego and other.
-        exchange: whether ego and other (and those behind them) change places in half of the draws; after the draw,
-            whether they did.
+        exchange: whether ego and other (and those behind them) change places in half of the draws. In a draw that is
+            made in Python it says whether they have changed places.
         actors: the road users that matter; `ego` and `other` are among them.
         meet: who is timed to meet; nobody if not given.
         background: all other road users.

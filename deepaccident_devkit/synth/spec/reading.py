@@ -3,15 +3,15 @@
 import dataclasses
 import math
 import types
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.spec.choices import Choice, Fixed, Items, OneOf, Part, Range, key_of
 from deepaccident_devkit.synth.spec.model import Bounds
 from deepaccident_devkit.synth.spec.yaml_nodes import Node
-from deepaccident_devkit.text import possible_text
 
 _SETTLED = {"name", "design", "exchange", "role"}
 """Fields with one value, no range or list of choices: they decide which other fields the file needs."""
@@ -19,6 +19,7 @@ _MOST = 1e9
 """All numbers of a scenario are smaller."""
 _SHOWN_LENGTH = 80
 """The most characters of a found value that a message shows."""
+_KMH_OF_MS = 3.6
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +70,8 @@ def read_part(node: Node, kind: type[Any], path: str = "") -> Part:
     prefix = f"{path}." if path else ""
     for key, entry in entries.items():
         if key not in names:
-            raise ConfigError(f"{entry.where}: {prefix}{key}: no such field; possible: {possible_text(key, names)}")
+            sentence = _after(_did_you_mean(key, names), f"possible: {', '.join(names)}")
+            raise ConfigError(f"{entry.where}: {prefix}{key}: no such field; {sentence}")
     for name in required_fields(kind):
         if key_of(name) not in entries:
             raise ConfigError(f"{node.where}: {prefix}{key_of(name)}: is missing; add it")
@@ -138,7 +140,8 @@ def _read_one(node: Node, wanted: FieldType, path: str) -> Choice:
         return Fixed(_number(node, wanted, path))
     fits = value in wanted.words if wanted.words else isinstance(value, wanted.base)
     if not fits:
-        raise _wrong(node, path, _described(wanted, value), node, _meant(wanted, value))
+        meant = _did_you_mean(value, wanted.words) if isinstance(value, str) else ""
+        raise _wrong(node, path, _described(wanted), node, _remedy(wanted, node), meant=meant)
     return Fixed(value)
 
 
@@ -146,25 +149,60 @@ def _number(node: Node, wanted: FieldType, path: str) -> float:
     value, bounds = node.value, wanted.bounds
     possible = (int,) if wanted.base is int else (int, float)
     if isinstance(value, bool) or not isinstance(value, possible) or not abs(value) < _MOST:
-        raise _wrong(node, path, _described(wanted), node, _meant(wanted, value))
+        raise _wrong(node, path, _described(wanted), node, _remedy(wanted, node))
     if bounds is not None and not bounds.low <= value <= bounds.high:
-        raise _wrong(node, path, _described(wanted), node)
+        raise _wrong(node, path, _described(wanted), node, _converted(bounds, value))
     return wanted.base(value)  # type: ignore[no-any-return]
 
 
-def _wrong(node: Node, path: str, expected: str, found: Node, remedy: str = "") -> ConfigError:
+def _wrong(node: Node, path: str, expected: str, found: Node, remedy: str = "", *, meant: str = "") -> ConfigError:
     shown = _shown(found)
     clipped = shown if len(shown) <= _SHOWN_LENGTH else f"{shown[: _SHOWN_LENGTH - 1]}…"
-    return ConfigError(f"{node.where}: {path}: expected {expected}, found {clipped}{remedy}")
+    return ConfigError(f"{node.where}: {path}: {_after(meant, f'expected {expected}')}, found {clipped}{remedy}")
 
 
-def _meant(wanted: FieldType, value: object) -> str:
-    """The remedy if only quotes are wrong or missing."""
+def _remedy(wanted: FieldType, node: Node) -> str:
+    """The remedy if only quotes are wrong or missing, or if YAML reads a number as a text."""
+    value = node.value
     if wanted.base is str and not wanted.words and not isinstance(value, Mapping | tuple) and value is not None:
         return "; put it in quotes"
     if wanted.base in (int, float) and isinstance(value, str) and _is_number(value):
-        return f"; write {float(value):g}, without quotes"
+        return f"; write {_decimal(value)}, without quotes" if node.quoted else f"; {_as_yaml_number(value)}"
     return "; leave the quotes out" if wanted.base is bool and value in ("true", "false") else ""
+
+
+def _did_you_mean(wrong: str, possible: Iterable[str]) -> str:
+    """Such as `did you mean left?`; empty if no possible word is like the wrong one."""
+    of_lowered = {word.lower(): word for word in possible}
+    close = get_close_matches(wrong.lower(), of_lowered, n=1)
+    return f"did you mean {of_lowered[close[0]]}?" if close else ""
+
+
+def _after(question: str, sentence: str) -> str:
+    """A sentence, after a question if there is one."""
+    return f"{question} {sentence[0].upper()}{sentence[1:]}" if question else sentence
+
+
+def _converted(bounds: Bounds, value: float) -> str:
+    """The hint for a speed that is possible in km/h."""
+    speed = value / _KMH_OF_MS
+    fits = bounds.unit == "m/s" and bounds.low <= speed <= bounds.high
+    return f"; {value:g} km/h are {speed:.1f} m/s" if fits else ""
+
+
+def _decimal(text: str) -> str:
+    """A number without an exponent."""
+    digits = f"{float(text):.9f}"
+    return digits.rstrip("0").rstrip(".")
+
+
+def _as_yaml_number(text: str) -> str:
+    """How to write a number that YAML reads as a text: `1e1` lacks the point, and the sign of the exponent."""
+    mantissa, _, exponent = text.lower().partition("e")
+    if not exponent:
+        return f"write {_decimal(text)}"
+    point, sign = "" if "." in mantissa else ".0", "" if exponent[0] in "+-" else "+"
+    return f"YAML reads it as a text: write {_decimal(text)}, or {mantissa}{point}e{sign}{exponent}"
 
 
 def _is_number(text: str) -> bool:
@@ -174,10 +212,10 @@ def _is_number(text: str) -> bool:
         return False
 
 
-def _described(wanted: FieldType, found: object = None) -> str:
-    """A type in words; for a choice of words, those similar to the found one come first."""
+def _described(wanted: FieldType) -> str:
+    """A type in words."""
     if wanted.words:
-        return f"one of {possible_text(str(found), wanted.words)}"
+        return f"one of {', '.join(wanted.words)}"
     if wanted.base is tuple and wanted.items is not None:
         return f"a list, as [{', '.join(wanted.items.words[:2])}]" if wanted.items.words else "a list"
     names = {str: "a text", bool: "true or false", int: "a whole number", float: "a number"}

@@ -7,7 +7,7 @@ import numpy as np
 
 from deepaccident_devkit.synth.roads import ARMS, Arm
 from deepaccident_devkit.synth.spec.checks import LEADERS, meeting_roles, usual_lanes
-from deepaccident_devkit.synth.spec.choices import Items, Part
+from deepaccident_devkit.synth.spec.choices import Items, Part, has_list
 from deepaccident_devkit.synth.spec.model import ActorSpec, Role, ScenarioSpec
 
 _EXCHANGED: dict[Role, Role] = {
@@ -45,6 +45,23 @@ class SpecTemplate:
     def meets(self) -> bool:
         """Whether two are timed to meet, so that there is an accident."""
         return bool(self.meeting_roles)
+
+    def place(self, field: str) -> str:
+        """Where the file names a field, for messages, such as `mine.yaml:6: meet`."""
+        return f"{self.root.line(field)}: {self.root.path_of(field)}"
+
+    @property
+    def draws_alike(self) -> bool:
+        """Whether only numbers differ between draws: nobody's way, kind or lane is drawn from several."""
+        if self.root.values("exchange")[0] or self._has_two_lanes:
+            return False
+        parts = (self.root.fields[name] for name in ("road", "view", "actors", "meet") if name in self.root.fields)
+        return not any(has_list(part) for part in parts)
+
+    @property
+    def _has_two_lanes(self) -> bool:
+        """Whether a draw can have a road with two lanes, of which a driver's lane may be drawn."""
+        return any(isinstance(road, Part) and road.values("lanes") != (1,) for road in self.root.values("road"))
 
 
 def draw(template: SpecTemplate, rng: np.random.Generator) -> ScenarioSpec:

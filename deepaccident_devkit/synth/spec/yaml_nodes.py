@@ -29,10 +29,12 @@ class Node:
     Attributes:
         where: such as `mine.yaml:12`; for the value of a key, the line of the key.
         value: a scalar, the entries of a mapping, or the items of a list.
+        quoted: whether it is a scalar in quotes.
     """
 
     where: str
     value: Scalar | Mapping[str, Node] | tuple[Node, ...]
+    quoted: bool = False
 
 
 def parse_yaml(text: str, source: str) -> Node:
@@ -91,7 +93,8 @@ class _Tree:
         if isinstance(raw, yaml.SequenceNode):
             items = enumerate(raw.value)
             return Node(where, tuple(self.node(item, item.start_mark.line, f"{path}[{k}]") for k, item in items))
-        return Node(where, self._scalar(raw, line, path))
+        quoted = isinstance(raw, yaml.ScalarNode) and raw.style in ("'", '"')
+        return Node(where, self._scalar(raw, line, path), quoted)
 
     def _scalar(self, raw: yaml.Node, line: int, path: str) -> Scalar:
         try:

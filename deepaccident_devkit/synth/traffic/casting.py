@@ -23,8 +23,10 @@ from deepaccident_devkit.synth.traffic.users import (
     temper_of,
 )
 
-_LONGEST = 24.0
-"""The longest drive, seconds."""
+_USUAL_DRIVE = 24.0
+"""Seconds that are driven at least."""
+_LONGEST_DRIVE = 300.0
+"""Seconds that are driven at most; the slowest cyclist needs about 210 to the junction."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,14 +61,22 @@ class Approach:
         return replace(self.user, start=float(self.along[row]), start_speed=float(self.speed[row]), delay=0.0)
 
 
-def drive_alone(user: RoadUser) -> Approach:
-    """The drive of a road user that is alone on its path: as in a simulation, except that it never leaves its path."""
+def drive_alone(user: RoadUser, to: float = 0.0) -> Approach:
+    """The drive of a road user that is alone on its path: as in a simulation, except that it never leaves its path.
+
+    Args:
+        user: as at the start of the drive.
+        to: the drive goes on at least until the box's centre is so many metres along the path.
+    """
     tracks = Tracks([user.path], np.array([user.manner.lateral]), np.array([user.walks]))
     temper, back = temper_of([user]), user.wheelbase / 2
     along, speed = np.array([user.start - back]), np.array([user.start_speed])
     steps = PERIOD * np.arange(1, DECISION_STEPS + 1)
     places, speeds = [along], [speed]
-    for _ in range(round(_LONGEST / (PERIOD * DECISION_STEPS))):
+    usual, longest = (round(seconds / (PERIOD * DECISION_STEPS)) for seconds in (_USUAL_DRIVE, _LONGEST_DRIVE))
+    for count in range(longest):
+        if count >= usual and along[0] + back >= to:
+            break
         acceleration = free_acceleration(temper, speed, tracks.allowed_speed(along))
         moving = np.maximum(speed + acceleration * steps, 0.0)
         before = np.append(speed, moving[:-1])
@@ -131,7 +141,7 @@ def cast_actors(rng: np.random.Generator, spec: ScenarioSpec, junction: Junction
         if meeting is None:
             pair = None
         else:
-            approaches = [drive_alone(users[row]) for row in pair]
+            approaches = [drive_alone(users[row], to=place) for row, place in zip(pair, meeting, strict=True)]
             for row, place, late, approach in zip(pair, meeting, (0.0, spec.meet.offset), approaches, strict=True):
                 users[row] = approach.at(approach.time_to(place) + begin - late)
     for actor in named:

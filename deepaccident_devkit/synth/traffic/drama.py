@@ -15,6 +15,7 @@ from deepaccident_devkit.synth.spec.model import Role
 from deepaccident_devkit.synth.traffic.background import ParkedVehicle, background_users, parked_vehicles
 from deepaccident_devkit.synth.traffic.casting import WARM_UP, Cast, cast_actors
 from deepaccident_devkit.synth.traffic.impact import Impact, impact_of, least_gap, touching_pairs
+from deepaccident_devkit.synth.traffic.misses import Miss, measured_miss
 from deepaccident_devkit.synth.traffic.rights import find_rights
 from deepaccident_devkit.synth.traffic.signals import AXIS_OF_ARM, SignalPlan, plan_with_green
 from deepaccident_devkit.synth.traffic.simulate import Simulation, simulate
@@ -108,13 +109,24 @@ def _held(user: RoadUser, seconds: float) -> RoadUser:
 
 def perform_accident(stage: Stage) -> Performance | None:
     """What happens up to the contact of a pair that breaks its rules; None if they do not touch, or others do first."""
+    tried = try_accident(stage)
+    return tried if isinstance(tried, Performance) else None
+
+
+def try_accident(stage: Stage) -> Performance | Miss:
+    """As `perform_accident`, but it says how the two missed each other."""
     pair = stage.cast.pair
     if pair is None:
-        return None
+        return Miss()
     unruly = [replace(user, ignores=("signal", "priority")) for user in stage.cast.users]
     users = [unruly[row] if row in pair else user for row, user in enumerate(stage.users)]
     performance = _perform(stage, users, _LATEST, watched=pair)
-    return performance if performance is not None and performance.simulation.contact is not None else None
+    if isinstance(performance, _Touching):
+        return Miss(gap=0.0, touched=performance.roles)
+    if performance.simulation.contact is not None:
+        return performance
+    offset = stage.spec.meet.offset if stage.spec.meet else 0.0
+    return measured_miss(performance.simulation, pair, stage.cast.users, planned=(0.0, offset))
 
 
 def perform_twin(stage: Stage, end: float) -> Performance | None:
@@ -127,7 +139,9 @@ def perform_twin(stage: Stage, end: float) -> Performance | None:
     for late in _DELAYS:
         users = [_later(user.obeying(), late) if user.role in roles else user.obeying() for user in stage.users]
         performance = _perform(stage, users, end)
-        if performance is not None and _keep_clear(stage, performance):
+        if isinstance(performance, _Touching):
+            continue
+        if _keep_clear(stage, performance):
             return performance
         narrow = narrow or performance
     return narrow
@@ -155,12 +169,24 @@ def _keep_clear(stage: Stage, performance: Performance) -> bool:
     return least_gap(performance.simulation.poses, size, rows, _CLEAR) >= _CLEAR
 
 
+@dataclass(frozen=True, slots=True)
+class _Touching:
+    """Why a run is no performance: two touch, and none of the two can be left out.
+
+    Attributes:
+        roles: of the two.
+    """
+
+    roles: tuple[Role, Role]
+
+
 def _perform(
     stage: Stage, users: Sequence[RoadUser], end: float, watched: tuple[int, int] | None = None
-) -> Performance | None:
-    """Simulate until nobody touches, each time without those of the background who did; None if named users touch."""
+) -> Performance | _Touching:
+    """Simulate until nobody touches, each time without those of the background who did."""
     present = list(range(len(users)))
     named = len(stage.cast.users)
+    touching: tuple[Role, Role] = ("background", "background")
     for _ in range(_ROUNDS):
         there = [users[row] for row in present]
         rights = find_rights(there, minor=stage.spec.road.yielding_arms, blind=watched)
@@ -170,11 +196,13 @@ def _perform(
         pairs = set(_touching(stage, there, simulation)) - {tuple(sorted(watched or ()))}
         if not pairs:
             return Performance(simulation=simulation, present=tuple(present))
-        leaving = {max(i, j) if max(i, j) < len(there) else min(i, j) for i, j in pairs}
+        leaving = {max(i, j) if max(i, j) < len(there) else min(i, j): (i, j) for i, j in sorted(pairs)}
+        first, second = leaving[min(leaving)]
+        touching = (there[first].role, there[second].role if second < len(there) else "parked")
         if min(leaving) < named:
-            return None
+            break
         present = [row for place, row in enumerate(present) if place not in leaving]
-    return None
+    return _Touching(touching)
 
 
 def _touching(stage: Stage, users: Sequence[RoadUser], simulation: Simulation) -> list[tuple[int, int]]:

@@ -92,7 +92,7 @@ def impact_of(simulation: Simulation, pair: tuple[int, int], size: FloatArray) -
     turn = poses[1, 2] - poses[0, 2]
     return Impact(
         time=float(simulation.time[-1]) - (1.0 - share) * period,
-        side=_side(poses, size),
+        side=contact_side(poses, size),
         strength=float(_AREA_MASS * size[0].prod() * np.hypot(*(velocity[0] - velocity[1]))),
         angle=float(abs(np.arctan2(np.sin(turn), np.cos(turn)))),
     )
@@ -111,8 +111,13 @@ def _touching_share(before: FloatArray, after: FloatArray, size: FloatArray) -> 
     return touching
 
 
-def _side(poses: FloatArray, size: FloatArray) -> ContactSide:
-    """The side of the first box that faces the second across the widest gap along any side's normal."""
+def contact_side(poses: FloatArray, size: FloatArray) -> ContactSide:
+    """The side of the first of two boxes that faces the second across the widest gap along any side's normal.
+
+    Args:
+        poses: (2, 3) x, y (metres), yaw (radians) of the boxes' centres.
+        size: (2, 2) length and width of the two, metres.
+    """
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     axes = np.stack([np.stack([cos, sin], axis=1), np.stack([-sin, cos], axis=1)], axis=1)  # box, axis, xy
     normals = axes.reshape(4, 2)

@@ -249,8 +249,12 @@ def test_heads_that_cannot_be() -> None:
         MotionHeads.from_arrays(good, heat, good, Tensor(good, RuntimeError("Can't call numpy() on Tensor that …")))
     with pytest.raises(GeometryError, match=r"offset: expected numbers, found ndarray \(no numbers: <U1\)"):
         MotionHeads.from_arrays(good, heat, good.astype("U1"), good)
-    with pytest.raises(GeometryError, match=r"segmentation: expected shape \(N, 2, N, N\), found \(2, 3, 3, 4\)"):
+    with pytest.raises(GeometryError, match=r"segmentation: expected \(T, 2, H, W\), .*, found \(2, 3, 3, 4\)$"):
         MotionHeads.from_arrays(np.zeros((2, 3, 3, 4)), heat, good, good)
+    with pytest.raises(GeometryError, match=r"found \(2, 3, 4, 2\); move the channels to the second axis"):
+        MotionHeads.from_arrays(np.moveaxis(good, 1, -1), heat, good, good)
+    with pytest.raises(GeometryError, match=r"found \(2, 1, 3, 4\); of a single logit x for actors, stack -x and x"):
+        MotionHeads.from_arrays(heat, heat, good, good)
     with pytest.raises(GeometryError, match=r"centerness: expected shape \(2, 1, 3, 4\), found \(2, 2, 3, 4\)"):
         MotionHeads.from_arrays(good, good, good, good)
     with pytest.raises(GeometryError, match=r"flow: expected shape \(2, 2, 3, 4\), found \(1, 2, 3, 4\)"):

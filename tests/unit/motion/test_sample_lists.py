@@ -66,8 +66,11 @@ def test_evaluation_samples_are_those_of_the_purpose_to_evaluate(da_motion: Deep
 def test_a_split_that_was_not_unpacked_says_so(da_motion: DeepAccident) -> None:
     here = {record["split"] for record in da_motion.scenario}
     [absent] = {"train", "val"} - here
-    with pytest.raises(NotAvailableError, match=rf"{absent}: no scenario of this split is in .*; unpack that part"):
+    with pytest.raises(
+        NotAvailableError, match=rf"{absent}: no scenario of this split is in .*; unpack that part.*"
+    ) as told:
         samples(da_motion, absent)
+    assert str(told.value).endswith(f"or choose another split: it has {here.pop()}: 2 scenarios")
 
 
 @pytest.mark.parametrize("horizon", ["2", None, [2.0]])

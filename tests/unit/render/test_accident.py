@@ -1,5 +1,6 @@
 """The countdown to an impact: which cameras, which moments, what is at which place, and the words."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,17 @@ def test_a_column_a_moment_and_a_row_an_agent(da: DeepAccident) -> None:
     assert figure.get_suptitle() == accident_words(da, da.collision(scenario))
     plain = drawn(da, scenario, seconds=[0.0], layers=["boxes", "ids"])
     assert not any(ax.images for ax in plain.axes)
+
+
+def test_the_title_says_that_a_recording_is_cut_short(da_motion: DeepAccident, tmp_path: Path) -> None:
+    root, token = tmp_path / "cut", accident_of(da_motion)["token"]
+    shutil.copytree(da_motion.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident", "*_02?.*", "*_03?.*"))
+    cut = DeepAccident(dataroot=root, verbose=False)
+    contact = cut.collision(token)
+    assert contact is not None
+    figure = drawn(cut, token, seconds=[0.5, 0.0], agents=[])
+    assert f"\ncut short? the pair are {contact.gap:.1f} m apart at frame 19 of 19" in figure.get_suptitle()
+    assert [ax.get_title() for ax in figure.axes] == ["0.5 s before", "the last frame"]
 
 
 def test_the_pair_is_where_it_is_and_red(da_motion: DeepAccident) -> None:

@@ -179,9 +179,10 @@ def test_the_bev_camera_lies_under_the_picture_the_right_way_round(x: float, y: 
 
 def test_a_picture_can_be_centred_elsewhere(da: DeepAccident, approach: str) -> None:
     ax = new_axes()
-    colors = draw_bev(da, approach, BevView(view_range=8, center=(20.0, 5.0)), frozenset(("bev", "boxes")), ax)
+    drawn = draw_bev(da, approach, BevView(view_range=8, center=(20.0, 5.0)), frozenset(("bev", "boxes")), ax)
     assert (ax.get_xlim(), ax.get_ylim()) == ((12, 28), (-3, 13))
-    assert colors == set(outlines(ax).values())
+    assert drawn.colors == set(outlines(ax).values())
+    assert drawn.clouds == ()
 
 
 def test_a_release_without_sensor_files_is_drawn_from_its_labels(da_b: DeepAccident) -> None:

@@ -5,8 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.synth import SynthConfig, make_release
 
 PAGE = (Path(__file__).parents[3] / "docs" / "scenarios.md").read_text(encoding="utf-8")
@@ -26,8 +28,29 @@ def made(tmp_path):
     return make
 
 
-def test_the_page_has_four_files():
-    assert list(EXAMPLES) == ["mine", "pedestrian", "rear_end", "quiet"]
+def test_the_page_has_five_files():
+    assert list(EXAMPLES) == ["mine", "pedestrian", "rear_end", "right_hook", "quiet"]
+
+
+@pytest.mark.slow
+def test_ego_turns_into_the_cyclist_beside_it(made):
+    da = made("right_hook")
+    (accident,) = da.find(collision=True)
+    assert da.get("scenario", accident["token"])["collision"]["classes"] == ["car", "cyclist"]
+    assert da.collision(accident).sides[0] == "right"
+
+
+@pytest.mark.slow
+def test_the_accident_is_rendered_without_sensors(made, tmp_path, monkeypatch):
+    """The page's section 'Look at it'."""
+    monkeypatch.chdir(tmp_path)
+    line = "deepaccident render accident OUT --layers boxes --out countdown.png"
+    assert f"    {line}\n" in PAGE
+    root = made("mine").dataroot
+    words = [str(root) if word == "OUT" else word for word in line.split()[1:]]
+    result = CliRunner().invoke(deepaccident, words, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "countdown.png").is_file()
 
 
 @pytest.mark.slow

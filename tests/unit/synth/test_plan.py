@@ -143,7 +143,7 @@ def test_a_hidden_view_has_designs_that_a_house_can_hide_and_faster_cars():
     spec = plans[0].draw(np.random.default_rng(0))
     assert spec.view == "hidden"
     assert all(12 <= spec.actor(role).max_speed <= 14 for role in ("ego", "other"))
-    with pytest.raises(ConfigError, match=r"view: hidden needs .* in 'unprotected left turn' it is on the side 'opp"):
+    with pytest.raises(ConfigError, match=r"^view: hidden needs .* in 'unprotected left turn' it is on the side 'o"):
         plans_of(view="hidden", designs=(3,))
 
 
@@ -154,6 +154,15 @@ actors:
   - {role: ego, from: west, turn: right}
   - {role: other, from: south, turn: [left, right]}
 """
+
+
+def test_a_file_that_cannot_have_the_hidden_view_is_named_with_its_line(tmp_path):
+    path = tmp_path / "own.yaml"
+    path.write_text(OWN.replace("view: hidden\n", "").replace("from: south, turn: [left, right]", "from: east"))
+    with pytest.raises(
+        ConfigError, match=r"own.yaml:2: actors: view: hidden needs .*; choose other arms, or the view open"
+    ):
+        plans_of(spec=path, view="hidden")
 
 
 def test_an_own_file_takes_the_designs_place(tmp_path):

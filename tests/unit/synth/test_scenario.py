@@ -112,15 +112,75 @@ def test_unplanned_accidents_are_with_someone_who_records_nothing():
         assert not set(meta.collision.ids) <= set(meta.agent_ids)
 
 
-def test_a_scenario_in_which_nobody_meets_is_given_up(tmp_path, monkeypatch):
+LATE = """\
+name: late
+road: {signalized: false}
+actors:
+  - {role: ego, from: west, max_speed: 9}
+  - {role: other, from: south, max_speed: 9}
+meet: {actors: [ego, other], offset: 3}
+background: {vehicles: 0, two_wheelers: 0, parked: 0, walking: 0, crossing: 0}
+"""
+
+
+@pytest.fixture
+def build_own(tmp_path):
+    """A function: text of a scenario file → its first scenario, or the twin of it."""
+
+    def build(text, *, progress=False, twin=False):
+        path = tmp_path / "own.yaml"
+        path.write_text(text, encoding="utf-8")
+        config = SynthConfig(scenarios=2, spec=path, frames=None)
+        return build_scenario(config, plan_scenarios(config)[int(twin)], progress=progress)
+
+    return build
+
+
+def test_a_scenario_in_which_nobody_meets_is_given_up(build_own, monkeypatch, capsys):
+    """The message names the line and says how near the two came; the draws are shown meanwhile."""
     monkeypatch.setattr("deepaccident_devkit.synth.scenario.MAX_DRAWS", 2)
-    file = tmp_path / "late.yaml"
-    file.write_text(
-        "name: late\nroad: {signalized: false}\nactors:\n"
-        "  - {role: ego, from: west, max_speed: 9}\n  - {role: other, from: south, max_speed: 9}\n"
-        "meet: {actors: [ego, other], offset: 3}\n"
-        "background: {vehicles: 0, two_wheelers: 0, parked: 0, walking: 0, crossing: 0}\n"
+    monkeypatch.setattr("deepaccident_devkit.synth.scenario._SHOWN_AFTER", 0.0)
+    message = (
+        r"own.yaml:6: meet: ego and other did not collide in 2 draws; the least distance was 1\d\.\d m, where they "
+        r"came to the crossing of their paths: ego at \d+\.\d s and other not before \d+\.\d s; choose a meet.offset"
     )
-    config = SynthConfig(scenarios=1, spec=file)
-    with pytest.raises(ConfigError, match=r"late: the two of meet.actors did not collide in 2 draws; choose paths"):
-        build_scenario(config, plan_scenarios(config)[0])
+    with pytest.raises(ConfigError, match=message):
+        build_own(LATE, progress=True)
+    assert "draws:" in capsys.readouterr().err
+
+
+def test_draws_that_all_miss_by_far_are_given_up_early(build_own, monkeypatch):
+    monkeypatch.setattr("deepaccident_devkit.synth.scenario.FAR_DRAWS", 3)
+    monkeypatch.setattr("deepaccident_devkit.synth.scenario.MAX_DRAWS", 4)
+    with pytest.raises(ConfigError, match="in 3 draws"):
+        build_own(LATE)
+    with pytest.raises(ConfigError, match="in 4 draws"):
+        build_own(LATE.replace("from: south", "from: [south, north]"))
+
+
+def test_paths_that_do_not_cross_are_named(build_own, monkeypatch):
+    monkeypatch.setattr("deepaccident_devkit.synth.scenario.MAX_DRAWS", 1)
+    walker = "  - {role: pedestrian, from: north}\nmeet: {actors: [ego, pedestrian]"
+    with pytest.raises(ConfigError, match="in 1 draw; their paths do not cross: change from, turn or side of one"):
+        build_own(LATE.replace("meet: {actors: [ego, other]", walker))
+
+
+def test_a_twin_that_cannot_be_made_is_named_by_its_file(build_own, monkeypatch):
+    monkeypatch.setattr("deepaccident_devkit.synth.scenario.perform_twin", lambda *_: None)
+    with pytest.raises(ConfigError, match=r"own.yaml:3: actors: the road users collide although all obey the rules"):
+        build_own(LATE.partition("meet:")[0])
+    with pytest.raises(
+        ConfigError, match=r"own.yaml:3: actors: the road users collide in the normal twin too, even if"
+    ):
+        build_own(LATE.replace("offset: 3", "offset: 0"), twin=True)
+
+
+def test_a_slow_cyclist_is_hit(build_own):
+    """It needs more than 24 s from its usual start to the crossing, and once never came there."""
+    cyclist = "  - {role: background, category: cyclist, from: west, max_speed: 3}\nmeet: {actors: [background, ego]"
+    text = LATE.replace("ego, from: west", "ego, from: south, turn: right").replace(
+        "other, from: south", "other, from: east"
+    )
+    scenario = build_own(text.replace("meet: {actors: [ego, other], offset: 3", f"{cyclist}, offset: 0.5"))
+    assert scenario.draws == 1
+    assert scenario.meta.collision.classes == ("cyclist", "car")

@@ -2,6 +2,7 @@
 
 import logging
 import pickle
+import re
 import shutil
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import tiny
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import BrokenReleaseError, IndexStoreError, NotAvailableError, SplitFileError
+from deepaccident_devkit.overview import overview
 from deepaccident_devkit.tables import index as index_module
 from deepaccident_devkit.tables import indexing
 
@@ -166,8 +168,10 @@ def test_splits_come_from_files_else_folders_else_are_unknown(own_release: Path)
         shutil.copytree(own_release / split, flat, dirs_exist_ok=True)
     unknown = opened(flat)
     assert {scenario["split"] for scenario in unknown.scenario} == {None}
-    with pytest.raises(NotAvailableError, match="the split of its scenarios is unknown"):
+    own = f"or make a split file of your own: deepaccident split {flat} --save mine.txt, then --split mine.txt"
+    with pytest.raises(NotAvailableError, match=f"the split of its scenarios is unknown: .*, {re.escape(own)}$"):
         unknown.split_scenarios("train")
+    assert re.search(r"^unknown +6$", overview(unknown).to_text(), re.MULTILINE)
 
 
 def test_split_files_win_over_folders(own_release: Path) -> None:

@@ -182,9 +182,32 @@ def test_a_process_waits_for_another_that_indexes(root: Path, caplog: pytest.Log
 
 def test_a_scenario_without_meta_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: object) -> None:
     release = opened(tiny.write_tiny_release(tmp_path, meta=None))
-    assert f"meta/{tiny.NAME}.txt: missing or closed: weather and collision" in caplog.text
+    assert f"meta/{tiny.NAME}.txt: missing or not readable: weather and collision" in caplog.text
     release.list_scenarios()
     assert "collision unknown" in capsys.readouterr().out  # type: ignore[attr-defined]
+
+
+def test_scenarios_that_lack_the_same_are_told_in_one_line(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for meta in root.glob("*/meta/*.txt"):
+        meta.unlink()
+    opened(root)
+    (told,) = [record.getMessage() for record in caplog.records]
+    assert told.startswith(f"2 scenarios, such as {root / tiny.TYPE}/meta/")
+    assert told.endswith(": missing or not readable: weather and collision of this scenario are unknown")
+
+
+@pytest.mark.parametrize("frames", [3, 6])
+def test_an_accident_that_does_not_end_where_meta_says_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, frames: int
+) -> None:
+    root = tiny.write_tiny_release(tmp_path, frames=frames)
+    for _ in range(2):  # indexed, and opened again
+        opened(root)
+        assert "times to the impact are wrong; see: deepaccident validate" in caplog.text
+        caplog.clear()
+    whole = tiny.write_tiny_release(tmp_path / "whole")
+    opened(whole)
+    assert not caplog.records
 
 
 def test_workers_below_one_are_refused(root: Path) -> None:

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ChoiceError, ConfigError, TokenError
+from deepaccident_devkit.errors import ChoiceError, ConfigError, MissingFileError, TokenError
 from deepaccident_devkit.geometry import Boxes, LidarPointCloud, PinholeCamera
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 from deepaccident_devkit.v2x import Link
@@ -36,6 +36,29 @@ def test_agents_and_sweeps_come_one_after_another(da: DeepAccident, sample: str)
     )
     with pytest.raises(ChoiceError, match="sweeps: expected a whole number of frames from 1, found 0"):
         da.aggregate_point_cloud(sample, sweeps=0)
+
+
+def test_missing_clouds_are_an_error_or_left_out(
+    da: DeepAccident, da_partial: DeepAccident, sample: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    names = list(AGENTS[:3])
+    for call in (da_partial.aggregate_point_cloud, da_partial.message_sizes):
+        with pytest.raises(MissingFileError, match=r"no such file; .*, or leave out .* with on_missing='skip'"):
+            call(sample)
+        with pytest.raises(ChoiceError, match="on_missing: expected one of raise, skip, found 'ignore'"):
+            call(sample, on_missing="ignore")
+    assert not caplog.records
+    cloud = da_partial.aggregate_point_cloud(sample, sweeps=2, on_missing="skip")
+    assert len(cloud) == len(da.aggregate_point_cloud(sample, agents=names, sweeps=2))
+    sizes = da_partial.message_sizes(sample, on_missing="skip")
+    assert sizes["infrastructure"].cloud is None
+    assert {name: sizes[name] for name in names} == da.message_sizes(sample, agents=names)
+    told = [record.getMessage() for record in caplog.records]
+    assert told == [
+        f"left out files that are not in {da_partial.dataroot}: {count} of lidar01" for count in ("2 of 8", "1 of 4")
+    ]
+    only = da_partial.aggregate_point_cloud(sample, agents=["infrastructure"], on_missing="skip")
+    assert (len(only), only.frame) == (0, "world")
 
 
 def test_compensated_points_lie_on_the_actors_of_the_present(da: DeepAccident, sample: str) -> None:

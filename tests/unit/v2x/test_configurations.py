@@ -6,6 +6,7 @@ import tiny
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
+from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x import AGENT_CONFIGS, AgentConfig, cooperating_agents
 
@@ -58,6 +59,7 @@ def test_what_an_agents_argument_means(da_b: DeepAccident) -> None:
     assert cooperating_agents(da_b, sample, AGENT_CONFIGS["+other"]) == (OTHER, EGO)
     assert cooperating_agents(da_b, sample, [POLE, OTHER, POLE]) == (OTHER, POLE)
     assert cooperating_agents(da_b, sample, [POLE]) == (POLE,)
+    assert cooperating_agents(da_b, sample, "available") == cooperating_agents(da_b, sample, None)
     with pytest.raises(ChoiceError, match=r"expected one of single, .*found 'infrastructure'; .*\['infrastructure'\]"):
         cooperating_agents(da_b, sample, POLE)
     with pytest.raises(ChoiceError, match="at least one agent"):
@@ -76,6 +78,15 @@ def test_an_agent_that_was_not_downloaded_is_named(tmp_path: Path) -> None:
         ):
             call(sample, agents="+other")
     assert len(da.cooperative_boxes(sample)) > 0
+    with pytest.raises(
+        NotAvailableError,
+        match=r"; unpack its archive, name the agents that are there, or use agents='available' \(--agents available\) "
+        "for all that are there$",
+    ):
+        cooperating_agents(da, sample, "all")
+    assert cooperating_agents(da, sample, "available") == (EGO, POLE)
+    assert len(da.cooperative_boxes(sample, agents="available")) == len(da.cooperative_boxes(sample))
+    assert MotionLabelConfig(agents="available").digest == MotionLabelConfig().digest
 
 
 @pytest.mark.parametrize("agents", [3, 2.5, object()])

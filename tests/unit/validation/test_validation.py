@@ -18,6 +18,7 @@ from scripts import loaded_script
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import DatarootError, TokenError
+from deepaccident_devkit.overview import overview
 from deepaccident_devkit.release.npz import read_npz
 from deepaccident_devkit.validation import CODES, ValidationReport, validate_release
 from deepaccident_devkit.validation.sensors import ORIENTATIONS, out_of_sequence
@@ -70,6 +71,40 @@ def test_partial_downloads_are_notes(own_release: Path) -> None:
     missing = list(report.coverage.to_download())
     assert any(line.startswith("train: calib, label of infrastructure in ") for line in missing)
     assert not any(line.startswith("test: ") and "label" in line for line in missing)
+
+
+def test_a_few_frames_of_a_sensor_are_listed(release_root: Path, tmp_path: Path) -> None:
+    root = tmp_path / "release"
+    shutil.copytree(release_root, root, ignore=shutil.ignore_patterns(".deepaccident", "Camera_*", "*_BEV_*"))
+    scenario = DeepAccident(dataroot=root, verbose=False).scenario[0]
+    for agent, kept in (("ego_vehicle", (2, 5)), ("other_vehicle", (1, 2, 3, 4))):
+        for path in (root / scenario["scenario_type"] / agent / "lidar01" / scenario["name"]).iterdir():
+            if int(path.stem[-3:]) not in kept:
+                path.unlink()
+    report = validate_release(root, scenarios=[scenario["token"]])
+    few, many = report.findings
+    assert (few.what, few.remedy) == ("has 2 of 6 frames (2, 5)", "unpack the sensor's archive again, if you want all")
+    assert (many.what, many.remedy) == ("lacks frames 5–6 of 1 to 6", "unpack the sensor's archive again")
+    counted = overview(DeepAccident(dataroot=root, verbose=False), [scenario])
+    assert (counted.files["lidar01"], counted.samples, counted.channels["lidar01"]) == (24, 30, 5)
+    assert "lidar01                            5  24 of 30\n" in counted.to_text()
+
+
+def test_all_findings_are_listed_if_asked_for(own_release: Path) -> None:
+    scenario = DeepAccident(dataroot=own_release, verbose=False).scenario[0]["token"]
+    for path in own_release.glob(f"*/{scenario.replace('/', '/*/label/')}/*_00[13].txt"):
+        path.write_text("nothing")
+    runner = CliRunner()
+    short, whole = (runner.invoke(deepaccident, ["validate", str(own_release), *more]) for more in ([], ["--all"]))
+    assert "  … and 2 more (--all lists all)" in short.stdout
+    assert whole.stdout.count("label-unreadable: ") == 10
+    assert "lists all)" not in whole.stdout
+
+
+def test_what_is_to_download_where_the_split_is_unknown(own_release: Path, tmp_path: Path) -> None:
+    shutil.copytree(own_release / "train", tmp_path / "flat")
+    missing = list(validate_release(tmp_path / "flat").coverage.to_download())
+    assert any(line.startswith("split unknown: Camera_Front, ") for line in missing)
 
 
 def write_velocities(root: Path, angle: Callable[[float, float], float]) -> dict[str, np.ndarray]:

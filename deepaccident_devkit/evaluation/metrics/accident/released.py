@@ -150,14 +150,16 @@ class ReleasedAccidents:
         """The sum of all counts, which has the same result."""
         return [_united(counts)]
 
-    def _post_processing(self) -> PostProcessing:
+    @property
+    def post_processing(self) -> PostProcessing:
+        """How instances are read off heads."""
         return replace(POST_PROCESSING["accident"], redraw=self.redraw)
 
     def truth_paths(self, label: MotionLabels, frames: int) -> tuple[DrawnPaths, AnyArray]:
         """What predictions are compared with, and (H, W) its ids at the present."""
         grid = label.config.grid
         if self.truth_through_heads:
-            return paths_of_heads(first_frames(MotionHeads.from_labels(label), frames), grid, self._post_processing())
+            return paths_of_heads(first_frames(MotionHeads.from_labels(label), frames), grid, self.post_processing)
         return paths_of_instances(label.instance[:frames], grid, redraw=self.redraw), label.instance[0]
 
     def prediction_paths(self, output: MotionOutput, frames: int) -> list[DrawnPaths]:
@@ -165,7 +167,7 @@ class ReleasedAccidents:
         if output.instances is not None:
             return [paths_of_instances(maps[:frames], output.grid, redraw=self.redraw) for maps in output.instances]
         cut = [first_frames(heads, frames) for heads in output.heads or ()]
-        return [paths_of_heads(heads, output.grid, self._post_processing())[0] for heads in cut]
+        return [paths_of_heads(heads, output.grid, self.post_processing)[0] for heads in cut]
 
     def padded_paths(self, given: DrawnPaths, length: int) -> DrawnPaths:
         """The same with paths of so many points."""

@@ -68,7 +68,7 @@ _POSITIONS: Final = "positions are x forward, y to the left, in metres from the 
 _TIMES: Final = "times are seconds after the present, which is 0"
 _FRAMES: Final = {
     "world frame": "positions are given in the world frame",
-    "left-handed world": "positions are given in the world frame with y of the other sign, as in CARLA",
+    "left-handed world": "positions are given in the world frame with the wrong sign of y, as in CARLA",
     "lidar frame": "positions are given in the agent's LiDAR frame",
 }
 
@@ -104,21 +104,21 @@ def accident_suspicions() -> list[Suspicion]:
     """What is looked for in lists of accidents."""
     places = {each.name: f"{each.says} in the positions" for each in SYMMETRIES}
     places |= {name: scale_says(scale) for name, scale in SCALES.items()}
-    places |= {name: f"there are a {order} of the grid, not metres, in the positions" for name, order in _CELLS.items()}
+    places |= {name: f"positions are a {order} of the grid, not metres" for name, order in _CELLS.items()}
     times = {
-        name: f"accidents are foretold for 0.5 s {'later' if lag > 0 else 'earlier'} than they come"
+        name: f"accidents are predicted 0.5 s {'later' if lag > 0 else 'earlier'} than they happen"
         for name, lag in _LAGS.items()
     }
     times |= {name: f"times are numbers of {unit}" for name, (_, unit) in _UNITS.items()}
     times[_BACKWARDS] = "times run from the horizon back to the present, or frames of the prediction are reversed"
-    times[_OF_RECORDING] = "times are those of the recording, from its first frame on"
+    times[_OF_RECORDING] = "times are counted from the first frame of the recording"
     return [
         Suspicion(
             name=name,
             group="place",
             says=says,
             remedy=_POSITIONS,
-            measure="how near the positions are, from 0 to 1,",
+            measure="how near the positions are to the true ones, from 0 to 1",
             least=_LEAST,
             evidence=_SAMPLES * _WEIGHTIEST,
             also=(_mostly(name), _close(name)) if name in SCALES else (_mostly(name),),

@@ -23,6 +23,7 @@ from deepaccident_devkit.evaluation.runs.sanity.accidents import (
     accident_suspicions,
     accident_tallies,
 )
+from deepaccident_devkit.evaluation.runs.sanity.box_facts import box_counts, box_warnings
 from deepaccident_devkit.evaluation.runs.sanity.classes import class_candidate, class_warning
 from deepaccident_devkit.evaluation.runs.sanity.detection import (
     DetectionMoments,
@@ -30,7 +31,14 @@ from deepaccident_devkit.evaluation.runs.sanity.detection import (
     detection_suspicions,
     detection_tallies,
 )
-from deepaccident_devkit.evaluation.runs.sanity.facts import all_empty, facts_of, is_ranked, plain_warnings
+from deepaccident_devkit.evaluation.runs.sanity.facts import (
+    all_empty,
+    facts_of,
+    is_ranked,
+    path_warnings,
+    plain_warnings,
+)
+from deepaccident_devkit.evaluation.runs.sanity.foregrounds import foreground_warnings, post_processing_of
 from deepaccident_devkit.evaluation.runs.sanity.motion import motion_suspicions, motion_tallies
 from deepaccident_devkit.evaluation.runs.sanity.perfect import Arguments, empty, perfect
 from deepaccident_devkit.evaluation.runs.sanity.probes import Suspicion, candidates_of, warning_of
@@ -42,8 +50,8 @@ _SAMPLES: Final = 20
 _LISTS: Final = 60
 """Samples that are looked at, of maps and boxes, and of accident lists."""
 _NOT_IN_MAPS: Final = (
-    "offset, flow and the heads' channels, which instance maps do not hold; write results with "
-    "ResultsWriter(path, 'motion', store='heads'), of a few samples at 34 MB each, to have them looked at, too"
+    "offset, flow and the heads' channels, which instance maps do not hold; to have them checked, write heads of a few "
+    "samples (34 MB each) with ResultsWriter(path, 'motion', store='heads')"
 )
 
 
@@ -117,7 +125,7 @@ class _SanityEvaluator(Evaluator[SanityReport]):
         """Start without samples."""
         super().__init__()
         self._setup, self._suspicions, self._unchecked = setup, suspicions, unchecked
-        self._rules = setup.evaluator()
+        self._rules, self._heads_rule = setup.evaluator(), post_processing_of(setup.rules)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -133,7 +141,7 @@ class _SanityEvaluator(Evaluator[SanityReport]):
             {
                 **{name: self._counted(token, arguments) for name, arguments in sides.items()},
                 "tallies": _tallies(sample),
-                "facts": facts_of(given[0], given[1]),
+                "facts": self._facts(sample),
             },
         )
 
@@ -153,7 +161,9 @@ class _SanityEvaluator(Evaluator[SanityReport]):
             classes = replace(classes, suspected=classes.suspected and not misplaced)
             candidates = (*candidates, classes)
             suspected += [class_warning(classes)] * classes.suspected
-        plain = plain_warnings(facts, ranked=is_ranked(task, results["given"]))
+        misread = foreground_warnings(facts, self._heads_rule)
+        plain = plain_warnings(facts, ranked=is_ranked(task, results["given"])) + misread + box_warnings(facts)
+        plain += path_warnings(results["given"], results["perfect"])
         numbers = {side: headline_numbers(task, result) for side, result in results.items()}
         return SanityReport(
             samples=len(counts),
@@ -166,11 +176,16 @@ class _SanityEvaluator(Evaluator[SanityReport]):
                 headlines(task, results["given"]),
                 numbers["empty"],
                 numbers["perfect"],
-                explained=bool(suspected) or all_empty(facts),
+                explained=bool(suspected or (misread and task != "motion")) or all_empty(facts),
                 warned=bool(plain),
                 checks=len(candidates),
             ),
         )
+
+    def _facts(self, sample: _Sample) -> dict[str, Any]:
+        prediction, truth, *_ = sample.arguments
+        facts = facts_of(prediction, truth, self._heads_rule)
+        return facts if sample.raw is None else facts | {"boxes": box_counts(sample.raw)}
 
     def _counted(self, token: str, arguments: Arguments) -> Counts:
         one = self._rules.fresh()

@@ -9,7 +9,7 @@ import numpy as np
 from deepaccident_devkit.arrays import IntArray
 from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.runs.sanity.pairs import NEAR
-from deepaccident_devkit.evaluation.runs.sanity.probes import MARGIN, Candidate
+from deepaccident_devkit.evaluation.runs.sanity.probes import MARGIN, Candidate, percent
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID
 
@@ -59,7 +59,7 @@ def class_candidate(names: IntArray) -> Candidate:
     order = f"the classes are, in this order, {', '.join(CATEGORIES)}, counted from 0"
     return Candidate(
         name=_NAME,
-        description=f"{mapping or 'classes have changed places'}; {order}",
+        description=f"{mapping or 'classes are swapped'}; {order}",
         score=named / whole if whole else None,
         given=given / whole if whole else None,
         suspected=bool(whole and telling and mostly and named >= MARGIN * given),
@@ -69,6 +69,6 @@ def class_candidate(names: IntArray) -> Candidate:
 def class_warning(candidate: Candidate) -> str:
     """A sentence for the candidate if it is suspected."""
     return (
-        f"{candidate.name}: {candidate.description} ({candidate.score or 0.0:.0%} of these boxes have that name, "
-        f"{candidate.given or 0.0:.0%} their own)"
+        f"{candidate.name}: {candidate.description} ({percent(candidate.score or 0.0)} of these boxes have that name, "
+        f"{percent(candidate.given or 0.0)} their own)"
     )

@@ -86,12 +86,15 @@ def detection_suspicions() -> list[Suspicion]:
         **{each.name: f"{each.says} around the agent" for each in SYMMETRIES},
         **{name: scale_says(scale) for name, scale in SCALES.items()},
         **{f"{name} frame": f"boxes are given in the agent's {name} frame" for name in _FRAMES},
-        **{f"left-handed {name} frame": f"boxes are given in the agent's {name} frame, y right" for name in _FRAMES},
-        _LEFT_HANDED: "y has the other sign in the world frame, as in CARLA",
-        _OWN_ORIGIN: "boxes are given from the agent on, along x and y of the world",
-        **{name: f"translations are those of the boxes' {name}" for name in _EDGES},
+        **{
+            f"left-handed {name} frame": f"boxes are given in the agent's {name} frame, with y to the right"
+            for name in _FRAMES
+        },
+        _LEFT_HANDED: "y has the wrong sign in the world frame, as in CARLA",
+        _OWN_ORIGIN: "translations are counted from the agent, along x and y of the world",
+        **{name: f"translations are those of the boxes' {name}, not of their centres" for name in _EDGES},
     }
-    remedy = "translations are those of the boxes' centres, in the right-handed world frame, metres"
+    remedy = "translations are the boxes' centres in the right-handed world frame, in metres"
     result = [
         _suspicion(name, "place", says, remedy, "share of the true boxes that are found", _LEAST)
         for name, says in places.items()
@@ -102,7 +105,7 @@ def detection_suspicions() -> list[Suspicion]:
             name,
             "time",
             f"boxes are where the actors are 0.5 s {'before' if lag < 0 else 'after'} the sample",
-            "give what is there at the sample itself",
+            "give the boxes of the sample's own moment",
             "share of the moving actors that are found there",
             _LEAST_MOVING,
         )
@@ -141,7 +144,10 @@ def detection_tallies(raw: DetectedBoxes, found: DetectedBoxes, moments: Detecti
     for name, lag in _LAGS.items():
         result[name] = _time(in_world, moments.moved[lag])
     raw_boxes, scores = raw.boxes.select(surest), found.scores[surest]
-    return result | pair_tallies(boxes, raw_boxes, scores, truth, moments.in_world, moments.velocity)
+    ego_from_lidar = moments.own_frames["ego"].inverse() @ moments.own_frames["lidar"]
+    return result | pair_tallies(
+        *(boxes, raw_boxes, scores, truth, moments.in_world, moments.velocity), float(ego_from_lidar.translation[2])
+    )
 
 
 def _suspicion(name: str, group: Group, says: str, remedy: str, measure: str, least: float) -> Suspicion:

@@ -1,4 +1,4 @@
-"""Facts that show without a suspicion: empty predictions, ids that are not linked, equal scores."""
+"""Facts that show without a suspicion: empty predictions, ids that are not linked, equal scores, lost paths."""
 
 from __future__ import annotations
 
@@ -12,10 +12,12 @@ from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.metrics.frames import frames_there, labels_at_present
 from deepaccident_devkit.evaluation.metrics.headlines import headlines
+from deepaccident_devkit.evaluation.metrics.motion import MotionResult
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
 from deepaccident_devkit.evaluation.runs.sanity.classes import class_names
+from deepaccident_devkit.evaluation.runs.sanity.foregrounds import NOT_COUNTED, foreground_counts
 from deepaccident_devkit.evaluation.runs.sanity.motion import actor_cells
-from deepaccident_devkit.motion import MotionLabels
+from deepaccident_devkit.motion import MotionLabels, PostProcessing
 
 _FEWEST_KEPT: Final = 0.2
 """Share of ids that stay from frame to frame below which nobody has linked them."""
@@ -23,16 +25,34 @@ _RANKED: Final = {"mAP", "average_precision"}
 """Headlines that are of the order of scores."""
 _PAIRS: Final = 10
 """Instances found in two frames on end that say something of it."""
+_PATHS: Final = 10
+"""True paths that say something of how many have a match."""
+_HIGH_IOU: Final = 0.4
+"""Share of the truth's IoU from which on predictions show where the actors are."""
+_FEW_PATHS: Final = 0.5
+"""Of that share, the part that the paths with a match have to be."""
 
 
-def facts_of(prediction: Any, truth: Any) -> dict[str, Any]:
-    """What shows without a suspicion: whether nothing is predicted, which ids stay, scores, and names of classes."""
+def facts_of(prediction: Any, truth: Any, settings: PostProcessing | None = None) -> dict[str, Any]:
+    """What shows without a suspicion: whether nothing is predicted, which ids stay, scores, and names of classes.
+
+    Args:
+        prediction: of a sample, as its evaluator takes it.
+        truth: likewise.
+        settings: how the protocol reads accidents or paths off heads (`foregrounds.post_processing_of`).
+    """
     if isinstance(prediction, MotionOutput):
-        return {"empty": is_empty(prediction, frames_there(truth)), "ids": ids_kept(prediction, truth), "scores": []}
+        frames = frames_there(truth)
+        return {
+            "empty": is_empty(prediction, frames),
+            "ids": ids_kept(prediction, truth),
+            "scores": [],
+            "foreground": foreground_counts(prediction, frames, settings),
+        }
     boxes = isinstance(prediction, DetectedBoxes)
     scores = prediction.scores.tolist() if boxes else [each.score for each in prediction]
     classes = {"classes": class_names(prediction, truth).tolist()} if boxes else {}
-    return {"empty": not scores, "ids": [0, 0], "scores": scores, **classes}
+    return {"empty": not scores, "ids": [0, 0], "scores": scores, "foreground": [*NOT_COUNTED], **classes}
 
 
 def is_ranked(task: str, result: object) -> bool:
@@ -58,16 +78,37 @@ def plain_warnings(facts: Collection[Mapping[str, Any]], *, ranked: bool) -> lis
     kept, pairs = (sum(each["ids"][index] for each in facts) for index in (0, 1))
     if pairs >= _PAIRS and kept < _FEWEST_KEPT * pairs:
         warnings.append(
-            f"ids are not linked over time: of {pairs} instances found in two frames on end {kept} keep their id; VPQ "
-            "counts the others as missed, so give an instance the same id in all frames"
+            f"ids are not linked over time: {kept} of {pairs} instances that are found in two frames in a row keep "
+            "their id. VPQ counts the others as missed: give an instance the same id in all frames"
         )
     scores = [score for each in facts for score in each["scores"]]
     if ranked and len(scores) > 1 and len(set(scores)) == 1:
         warnings.append(
-            f"all {len(scores)} scores are {scores[0]:g}: what is taken in the order of scores, such as an average "
-            "precision, says little then; give the surer ones higher scores"
+            f"all {len(scores)} scores are {scores[0]:g}: numbers that depend on the order of scores, such as an "
+            "average precision, then say little; give surer predictions higher scores"
         )
     return warnings
+
+
+def path_warnings(given: object, perfect: object) -> list[str]:
+    """A sentence if a motion prediction shows where the actors are, but few of their paths have a match.
+
+    Args:
+        given: the result of the predictions.
+        perfect: that of the truth itself.
+    """
+    if not isinstance(given, MotionResult) or not isinstance(perfect, MotionResult) or perfect.paths < _PATHS:
+        return []
+    overlaps = [list(each.ranges.values())[-1].iou for each in (given, perfect)]
+    share = overlaps[0] / overlaps[1] if overlaps[1] > 0 else 0.0
+    if not share >= _HIGH_IOU or given.paths >= _FEW_PATHS * share * perfect.paths:
+        return []
+    every = perfect.path_true_positive + perfect.path_false_negative
+    warning = (
+        f"only {given.paths} of {every} true paths have a match ({perfect.paths} if the truth is predicted): minADE, "
+        "minFDE and the miss rate are of these alone"
+    )
+    return [warning]
 
 
 def ids_kept(prediction: MotionOutput, label: MotionLabels) -> list[int]:

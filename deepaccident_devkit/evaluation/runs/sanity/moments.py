@@ -15,35 +15,48 @@ from deepaccident_devkit.evaluation.runs.sanity.probes import Suspicion, overlap
 
 LAGS: Final = {"one step late": -1, "one step early": 1}
 """Which of the true frames is found in the place of a frame."""
+TWO_LATE: Final = "two steps late"
 REVERSED: Final = "frames reversed"
 UNWARPED: Final = "frames not warped"
 _LEAST: Final = 0.2
 _LEAST_OTHERWISE: Final = 0.12
+_LEAST_TWO: Final = 0.3
+"""In a queue, fast predictions reach the places of those ahead, whose past they then seem to show."""
 _CELLS: Final = 100
 _LONG: Final = 4
 """Frames in which a slow prediction and a late one have become different."""
+_LONGER: Final = 5
+"""Frames in which a slow prediction and one that is two steps late have."""
 
 
 def moment_suspicions() -> list[Suspicion]:
     """What is looked for in the frames of maps."""
-    order = "the first frame of a prediction is the present, the next one a step later"
+    order = "the first frame of a prediction is the present, the next one is a step later"
+    no_past = "the first frame must be the present: leave out the past frames"
     result = [
         _suspicion(
             name,
-            f"each frame shows what is {'before' if lag < 0 else 'after'} it by one step",
+            f"each frame shows the moment one step {'before' if lag < 0 else 'after'} it",
             order,
             least=_LEAST,
-            also=("not two", "everywhere"),
+            also=("not two", "everywhere", *(("at first",) if lag < 0 else ())),
         )
         for name, lag in LAGS.items()
     ]
     return [
         *result,
+        _suspicion(
+            TWO_LATE,
+            "each frame shows the moment two steps before it",
+            no_past,
+            least=_LEAST_TWO,
+            also=("not one", "not three"),
+        ),
         _suspicion(REVERSED, "the frames are in the reverse order, the last one first", order, also=("everywhere",)),
         _suspicion(
             UNWARPED,
-            "each frame shows what is around the agent where it will be then",
-            "all frames are seen from where the agent is at the present; warp labels with `to_present` before training",
+            "each frame is seen from where the agent will be at that moment",
+            "all frames are seen from where the agent is at the present: warp labels with `to_present` before training",
             also=("not still",),
         ),
     ]
@@ -69,6 +82,7 @@ def moment_tallies(
     }
     for name, lag in LAGS.items():
         result |= _lag_tallies(name, lag, predicted, true)
+    result |= _two_late_tallies(predicted, true)
     if unwarped is not None:
         result[UNWARPED] = _decided(predicted, unwarped, true, every)
         result[f"{UNWARPED}: not still"] = _decided(predicted, unwarped, true[:1].repeat(len(true), axis=0), every)
@@ -83,7 +97,7 @@ def _suspicion(
         group="time",
         says=says,
         remedy=remedy,
-        measure="IoU in the cells that tell the moments apart",
+        measure="IoU in the cells where the two moments differ",
         least=least,
         evidence=_CELLS,
         also=tuple(f"{name}: {each}" for each in also),
@@ -95,7 +109,7 @@ def _lag_tallies(name: str, lag: int, predicted: BoolArray, true: BoolArray) -> 
 
     A model that predicts no or slow motion is later from frame to frame, one that overestimates speeds is earlier: so a
     prediction that is off by one step as a whole is not off by two, least of all in the last frame, and not right in
-    the first one.
+    the first one that tells.
     """
     late = lag < 0
     known = range(-lag, len(true)) if late else range(len(true) - lag)
@@ -104,11 +118,29 @@ def _lag_tallies(name: str, lag: int, predicted: BoolArray, true: BoolArray) -> 
     extreme = _decided(predicted, once, two, twice[-1:]) if late else _decided(predicted, once, true, known[:1])
     if len(true) < _LONG:
         extreme = tally(0, 0, 0)
+    at_first = {f"{name}: at first": _decided(predicted, once, true, known[:1])} if late else {}
     return {
+        **at_first,
         name: _decided(predicted, once, true, known),
         f"{name}: not two": _decided(predicted, once, two, twice),
         f"{name}: everywhere": extreme,
     }
+
+
+def _two_late_tallies(predicted: BoolArray, true: BoolArray) -> dict[str, list[float]]:
+    """Whether frames show the true ones two steps before.
+
+    A model that predicts slow motion is less late in the first of these frames, or later in the last one; a model that
+    predicts no motion is later in the last one.
+    """
+    known = range(2, len(true))
+    one, two, three = (np.roll(true, lag, axis=0) for lag in (1, 2, 3))
+    result = {
+        TWO_LATE: _decided(predicted, two, true, known),
+        f"{TWO_LATE}: not one": _decided(predicted, two, one, known[:1]),
+        f"{TWO_LATE}: not three": _decided(predicted, two, three, known[-1:]),
+    }
+    return result if len(true) >= _LONGER else {name: tally(0, 0, 0) for name in result}
 
 
 def _decided(predicted: BoolArray, one: BoolArray, other: BoolArray, frames: Sequence[int]) -> list[float]:

@@ -38,9 +38,11 @@ _CELLS: Final = 100
 
 def motion_suspicions(stated: Orientation, *, heads: bool) -> list[Suspicion]:
     """What is looked for in maps that are said to lie in an orientation."""
-    channels = "segmentation's channel 0 is the background, 1 the actors" if heads else "0 is nobody, ids are from 1 on"
-    unscaled = "state the cell size that the maps have: metres and cells may be mixed up, or their number halved"
-    result = [_place(INVERTED, "channels", "actors are where nobody is, and nobody where they are", channels)]
+    channels = (
+        "channel 0 is the background, channel 1 the actors" if heads else "0 is the background, ids are 1 and more"
+    )
+    unscaled = "state the cell size that the maps have: metres and cells may be mixed up, or the number of cells halved"
+    result = [_place(INVERTED, "channels", "actors are given as background, and background as actors", channels)]
     result += [
         _place(each.name, "place", f"{each.says} in the maps", _orientation_remedy(each, stated)) for each in SYMMETRIES
     ]
@@ -132,7 +134,7 @@ def _scaled_cells(axis: Axis, scale: float) -> tuple[IntArray, BoolArray]:
 def _orientation_remedy(symmetry: Symmetry, stated: Orientation) -> str:
     mistaken = orientation_mistaken(symmetry, stated)
     if mistaken is None:
-        return "no orientation of the devkit's explains that: mirror or turn the maps back before writing them"
+        return "no orientation of the devkit explains this: mirror or turn the maps back before writing them"
     return (
         f"maps in the orientation {mistaken!r} look so where {stated!r} is stated: state orientation {mistaken!r}, or "
         "mirror or turn the maps back before writing them"

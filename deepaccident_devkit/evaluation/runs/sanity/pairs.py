@@ -37,20 +37,25 @@ _ORDERS: Final = {
 _FACTORS: Final = {"sizes halved": 0.5, "sizes doubled": 2.0}
 _LEVELS: Final = {"center at the bottom": -0.5, "center at the top": 0.5}
 """Name → heights from the centre up to where it is found."""
+_OFFSETS: Final[dict[str, tuple[float, str]]] = {
+    "lidar frame by the ego pose": (-1.0, "boxes in the LiDAR frame were placed by the ego pose"),
+    "ego frame by the lidar pose": (1.0, "boxes in the ego frame were placed by the LiDAR pose"),
+}
+"""Name → LiDAR's heights above the ego frame from the centre up to where it is found, and what is wrong then."""
 _TURNS: Final[dict[str, tuple[str, Callable[[FloatArray], FloatArray]]]] = {
     "heading turned by 90°": ("headings are a quarter of a turn too far to the left", lambda yaw: yaw + _QUARTER),
-    "heading turned by 180°": ("front and rear have changed places", lambda yaw: yaw + np.pi),
+    "heading turned by 180°": ("front and rear are swapped", lambda yaw: yaw + np.pi),
     "heading turned by 270°": ("headings are a quarter of a turn too far to the right", lambda yaw: yaw - _QUARTER),
 }
 _FLIPS: Final[dict[str, tuple[str, Callable[[FloatArray], FloatArray]]]] = {
-    "heading negated": ("headings have the other sign", lambda yaw: -yaw),
+    "heading negated": ("headings have the wrong sign", lambda yaw: -yaw),
     "heading clockwise from y": (
         "headings are counted clockwise from y, as by a compass,",
         lambda yaw: _QUARTER - yaw,
     ),
     "heading clockwise from -y": ("headings are counted clockwise from the negative y", lambda yaw: -_QUARTER - yaw),
     "heading clockwise from -x": ("headings are counted clockwise from the negative x", lambda yaw: np.pi - yaw),
-    "heading in degrees": ("degrees were taken for radians", np.rad2deg),
+    "heading in degrees": ("headings in degrees were taken for radians", np.rad2deg),
 }
 """What is another thing in the agent's own frame than in the world."""
 _IN_WORLD: Final = " in the world"
@@ -62,6 +67,8 @@ _HEADINGS: Final = {
 """Name → what is wrong then, and from true to found."""
 _OWN_HEADING: Final = "heading of the agent's frame"
 _CROOKED_NAME: Final = "heading in degrees, or at random"
+_CROOKED: Final = "share of the headings that are wrong"
+_BY_CHANCE: Final = 0.5
 _OWN_VELOCITY: Final = "velocity of the agent's frame"
 _KMH: Final = "velocity in km/h"
 _KMH_FACTOR: Final = 3.6
@@ -72,10 +79,15 @@ def pair_suspicions() -> list[Suspicion]:
     """What is looked for in the boxes that are found."""
     order = "in results files sizes are width, length, height, as in nuScenes; in Boxes they are length, width, height"
     result = [
-        _suspicion(name, "size", f"length, width and height hold {', '.join(_AXES[axis] for axis in axes)}", order)
+        _suspicion(
+            name,
+            "size",
+            f"length, width and height hold the values of {', '.join(_AXES[axis] for axis in axes)}",
+            order,
+        )
         for name, axes in _ORDERS.items()
     ]
-    whole = "sizes are from end to end, metres"
+    whole = "sizes are whole lengths, widths and heights in metres, not halves"
     result += [
         _suspicion(name, "size", f"sizes are {factor:g} times what they should be", whole)
         for name, factor in _FACTORS.items()
@@ -84,23 +96,31 @@ def pair_suspicions() -> list[Suspicion]:
         _suspicion(name, "height", f"z is that of the {name.split()[-1]} face", "z is that of the box's middle")
         for name in _LEVELS
     ]
-    upright = "a heading is counter-clockwise from x of the world, seen from above, radians"
+    poses = 'the pose of LiDAR boxes is da.world_from(token, "lidar"), that of ego boxes da.world_from(token, "ego")'
+    result += [_suspicion(name, "height", says, poses) for name, (_, says) in _OFFSETS.items()]
+    upright = "a heading is counted counter-clockwise from x of the world, seen from above, in radians"
     headings = {name: says for name, (says, _) in _HEADINGS.items()}
     headings[_OWN_HEADING] = "headings are those of the agent's own frame, not of the world"
-    headings[_CROOKED_NAME] = "headings are at random, as degrees are that were taken for radians,"
+    headings[_CROOKED_NAME] = "headings are at random, which is also so if degrees were taken for radians"
     result += [_suspicion(name, "heading", says, upright) for name, says in headings.items()]
-    result[-1] = replace(result[-1], least=_LEAST_CROOKED, margin=_MARGIN_CROOKED)
+    result[-1] = replace(result[-1], measure=_CROOKED, least=_LEAST_CROOKED, margin=_MARGIN_CROOKED, chance=_BY_CHANCE)
     moving = "velocities are over the ground, along x and y of the world, m/s"
     velocities = {_velocity_name(each.name): f"{each.says} in the velocities" for each in SYMMETRIES}
     velocities[_OWN_VELOCITY] = "velocities are along the axes of the agent's own frame"
     velocities[_KMH] = "velocities are in km/h"
     result += [_suspicion(name, "velocity", says, moving) for name, says in velocities.items()]
-    surer = "the surer a detection, the higher its score: negate distances, costs and losses"
+    surer = "a surer detection must have a higher score: negate distances, costs and losses"
     return [*result, _suspicion(_RANKED, "score", "wrong detections have higher scores than right ones", surer)]
 
 
 def pair_tallies(
-    found: Boxes, raw: Boxes, scores: FloatArray, truth: Boxes, in_world: Boxes, velocity: FloatArray
+    found: Boxes,
+    raw: Boxes,
+    scores: FloatArray,
+    truth: Boxes,
+    in_world: Boxes,
+    velocity: FloatArray,
+    lidar_height: float,
 ) -> dict[str, list[float]]:
     """What the boxes that are found say of each suspicion.
 
@@ -111,6 +131,7 @@ def pair_tallies(
         truth: M true boxes in the frame of the metrics.
         in_world: the same in the world frame.
         velocity: (M, 2) m/s along x and y of the world; NaN where unknown.
+        lidar_height: metres from the ego frame up to the LiDAR.
     """
     if not len(found) or not len(truth):
         return {}
@@ -120,7 +141,7 @@ def pair_tallies(
     own_axes = truth.yaw[true] - in_world.yaw[true]
     return {
         **_size_tallies(found.size[which], truth.size[true]),
-        **_height_tallies(found.center[which, 2], truth.center[true, 2], truth.size[true, 2]),
+        **_height_tallies(found.center[which, 2], truth.center[true, 2], truth.size[true, 2], lidar_height),
         **_heading_tallies(found.yaw[which], raw.yaw[which], truth.yaw[true], in_world.yaw[true]),
         **_velocity_tallies(raw.velocity[which, :2], velocity[true], own_axes),
         _RANKED: _rank_tally(scores, apart.min(axis=0) < NEAR),
@@ -128,10 +149,10 @@ def pair_tallies(
 
 
 _MEASURES: Final[dict[Group, tuple[str, float, float]]] = {
-    "size": ("how near the sizes are, from 0 to 1,", 0.65, 60.0),
-    "height": ("how near the heights are, from 0 to 1,", 0.65, 15.0),
+    "size": ("how near the sizes are to the true ones, from 0 to 1", 0.65, 60.0),
+    "height": ("how near the heights are to the true ones, from 0 to 1", 0.65, 15.0),
     "heading": ("share of the boxes found whose heading is right", 0.65, 20.0),
-    "velocity": ("how near the velocities are, from 0 to 1,", 0.65, 60.0),
+    "velocity": ("how near the velocities are to the true ones, from 0 to 1", 0.65, 60.0),
     "score": ("share of the pairs of a right and a wrong detection in order", 0.65, 200.0),
 }
 """Group → what its scores are, what they have to reach, and evidence: metres, boxes, m/s or pairs."""
@@ -155,11 +176,12 @@ def _size_tallies(found: FloatArray, true: FloatArray) -> dict[str, list[float]]
     return result | {name: _nearer(found, true, true * factor, order=1) for name, factor in _FACTORS.items()}
 
 
-def _height_tallies(found: FloatArray, true: FloatArray, height: FloatArray) -> dict[str, list[float]]:
-    return {
-        name: _nearer(found[:, None], true[:, None], (true + share * height)[:, None])
-        for name, share in _LEVELS.items()
-    }
+def _height_tallies(
+    found: FloatArray, true: FloatArray, height: FloatArray, lidar_height: float
+) -> dict[str, list[float]]:
+    off = {name: share * height for name, share in _LEVELS.items()}
+    off |= {name: np.full(len(true), sign * lidar_height) for name, (sign, _) in _OFFSETS.items()}
+    return {name: _nearer(found[:, None], true[:, None], (true + each)[:, None]) for name, each in off.items()}
 
 
 def _heading_tallies(

@@ -58,6 +58,7 @@ class Suspicion:
         also: names of further tallies in which it has to fit better than as given.
         margin: by how much it has to fit better than as given.
         deviations: by how many standard deviations of a coin's tosses it fits more often than as given; 0 for any.
+        chance: the score that predictions at random have, told in place of the one as given; None to tell that one.
     """
 
     name: str
@@ -70,6 +71,7 @@ class Suspicion:
     also: tuple[str, ...] = ()
     margin: float = MARGIN
     deviations: float = 0.0
+    chance: float | None = None
 
 
 def tally(
@@ -143,7 +145,7 @@ def candidates_of(suspicions: Iterable[Suspicion], samples: Iterable[Mapping[str
     return tuple(
         Candidate(
             name=each.name,
-            description=f"{each.says}; {each.remedy}",
+            description=f"{each.says}; remedy: {each.remedy}",
             score=_share(*sums[each.name][:2]),
             given=_share(*sums[each.name][2:4]),
             suspected=best.get(each.group) == each.name,
@@ -154,15 +156,22 @@ def candidates_of(suspicions: Iterable[Suspicion], samples: Iterable[Mapping[str
 
 def scale_says(scale: float) -> str:
     """What is wrong if all is so many times as far away: a clause."""
-    return f"all is {scale:g} times as far from the agent as it should be"
+    return f"everything is {scale:g} times as far from the agent as it should be"
+
+
+def percent(share: float) -> str:
+    """A share in percent for people: `99 %`, `0.3 %`."""
+    return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.0f} %"
 
 
 def warning_of(suspicion: Suspicion, candidate: Candidate) -> str:
     """A sentence for a candidate that is suspected."""
-    return (
-        f"{suspicion.name}: it looks as if {candidate.description} ({suspicion.measure} "
-        f"{candidate.score or 0.0:.2f} if so, {candidate.given or 0.0:.2f} as given)"
-    )
+    score = f"{candidate.score or 0.0:.2f}"
+    if suspicion.chance is None:
+        scores = f"{score} if this is corrected, {candidate.given or 0.0:.2f} as given"
+    else:
+        scores = f"{score}, and {suspicion.chance:.2f} is chance"
+    return f"{suspicion.name}: it looks as if {candidate.description} ({suspicion.measure}: {scores})"
 
 
 def _sum(name: str, samples: Iterable[Counts]) -> list[float]:
@@ -230,8 +239,8 @@ IDENTITY: Final = Symmetry("as given", "", swapped=False, x_sign=1, y_sign=1)
 SYMMETRIES: Final = (
     Symmetry("mirrored x", "what is ahead is behind", swapped=False, x_sign=-1, y_sign=1),
     Symmetry("mirrored y", "what is on the left is on the right", swapped=False, x_sign=1, y_sign=-1),
-    Symmetry("transposed", "x and y have changed places", swapped=True, x_sign=1, y_sign=1),
-    Symmetry("anti-transposed", "x and y have changed places, both negated", swapped=True, x_sign=-1, y_sign=-1),
+    Symmetry("transposed", "x and y are swapped", swapped=True, x_sign=1, y_sign=1),
+    Symmetry("anti-transposed", "x and y are swapped and negated", swapped=True, x_sign=-1, y_sign=-1),
     Symmetry("turned by 90°", "what is ahead is on the left", swapped=True, x_sign=-1, y_sign=1),
     Symmetry("turned by 180°", "what is ahead on the left is behind on the right", swapped=False, x_sign=-1, y_sign=-1),
     Symmetry("turned by 270°", "what is ahead is on the right", swapped=True, x_sign=1, y_sign=-1),

@@ -8,7 +8,7 @@ from typing import Final
 
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
 from deepaccident_devkit.evaluation.metrics.headlines import Headline, Unit, value_text
-from deepaccident_devkit.evaluation.runs.sanity.probes import Candidate
+from deepaccident_devkit.evaluation.runs.sanity.probes import Candidate, percent
 from deepaccident_devkit.text import columns_text
 
 NEAR_NOTHING: Final = 0.05
@@ -49,8 +49,10 @@ class SanityReport(FrozenMappings):
         for name, value in self.given.items():
             texts = [value_text(each, self.units[name]) for each in (self.empty[name], value, self.perfect[name])]
             rows.append([name, *texts])
-        head = f"Sanity, of {self.samples} samples; what the protocol gives to nothing and to the truth itself:"
-        looked = f"{len(self.candidates)} mistakes were looked for: mirrored, turned, shifted, scaled and others."
+        head = f"Sanity check of {self.samples} samples. Scores of an empty prediction, of yours, of the truth itself:"
+        suspected = sum(each.suspected for each in self.candidates)
+        count = f"{suspected} suspected" if suspected else "none found"
+        looked = f"{len(self.candidates)} mistakes looked for (mirrored, turned, shifted, scaled and others): {count}."
         unchecked = [f"Not looked at: {each}" for each in self.unchecked]
         found = [f"WARNING: {each}" for each in self.warnings]
         return "\n".join([head, columns_text(rows), looked, *unchecked, *found, *([self.verdict] * bool(self.verdict))])
@@ -86,8 +88,8 @@ def verdict_of(
         share = ((each.value or 0.0) - low) / (high - low)
         if share < NEAR_NOTHING:
             return (
-                f"Near nothing: {each.name} is {max(share, 0.0):.1%} of the way from an empty prediction to the truth; "
-                f"none of the {checks} checks explains it."
+                f"Near nothing: {each.name} is {percent(max(share, 0.0))} of the way from an empty prediction to the "
+                f"truth; none of the {checks} checks explains it."
             )
         break
     return "" if warned else NOTHING_WRONG

@@ -22,7 +22,7 @@ _CHANGE: Final = 400.0
 _HEADS: Final[tuple[Group, ...]] = ("offset", "flow")
 _MEANING: Final = {
     "offset": "channel 0 is down the rows, channel 1 along the columns, from a cell to its instance's centre",
-    "flow": "channel 0 is down the rows, channel 1 along the columns, from an instance's centre to its next one",
+    "flow": "channel 0 is down the rows, channel 1 along the columns, from an instance's centre to its next centre",
 }
 _TELLING: Final = 3.0
 """Cells by which a vector has to change for its cell to tell."""
@@ -34,9 +34,9 @@ _LEAST: Final = 0.6
 def vector_suspicions() -> list[Suspicion]:
     """What is looked for in heads."""
     both = "; ".join(f"of the {head}, {meaning}" for head, meaning in _MEANING.items())
-    result = [_suspicion(EXCHANGED, "exchange", "the offset stands in place of the flow, the flow in its", both)]
+    result = [_suspicion(EXCHANGED, "exchange", "the offset is given as flow, and the flow as offset", both)]
     result += [
-        _suspicion(_vector_name(head, each), head, f"the {head} has {_channels_text(each)}", _MEANING[head])
+        _suspicion(_vector_name(head, each), head, _vector_says(head, each), _MEANING[head])
         for head in _HEADS
         for each in SYMMETRIES
     ]
@@ -71,7 +71,7 @@ def _suspicion(name: str, group: Group, says: str, remedy: str) -> Suspicion:
         group=group,
         says=says,
         remedy=remedy,
-        measure="how near the vectors are, from 0 to 1,",
+        measure="how near the vectors are to the true ones, from 0 to 1",
         least=_LEAST,
         evidence=_CHANGE,
     )
@@ -108,6 +108,13 @@ def _nearer(before: FloatArray, after: FloatArray, change: FloatArray) -> list[f
 
 def _vector_name(head: str, symmetry: Symmetry) -> str:
     return f"{head}: {_channels_text(symmetry)}"
+
+
+def _vector_says(head: str, symmetry: Symmetry) -> str:
+    """What is wrong then: a clause."""
+    if head == "flow" and symmetry.matrix.tolist() == [[-1.0, 0.0], [0.0, -1.0]]:
+        return "the flow leads to the instance's centre in the previous frame, or both its channels have the wrong sign"
+    return f"the {head} has {_channels_text(symmetry)}"
 
 
 def _channels_text(symmetry: Symmetry) -> str:

@@ -61,7 +61,7 @@ def test_the_summary_says_every_choice(run: EvaluationRun) -> None:
     summary = switched.summary()
     assert summary["switches"] == {"scoring.limit_counts": True}
     assert summary["settings"]["choices"]["scoring"]["limit_counts"] is True
-    assert summary["counts"] == {"samples": 6, "scenarios": 2}
+    assert summary["counts"] == {"samples": 6, "scenarios": 2, "left_out": 0}
     assert summary["metrics"]["positives"] == 3
     assert {"python", "numpy"} <= summary["environment"].keys()
     assert summary["headlines"][0]["name"] == "apa"

@@ -243,7 +243,9 @@ class TestRefused:
         summary = json.loads(path.read_text())
         summary["results"]["form"]["x"] = [-25.0, 25.0, 0.5]
         path.write_text(json.dumps(summary))
-        with pytest.raises(EvaluationError, match=r"by the same rules: cells/x/0 -50.0 and -25.0; cells/x/1"):
+        with pytest.raises(
+            EvaluationError, match=r"rules: cells/x '\[-50.0, 50.0, 0.5\]' and '\[-25.0, 25.0, 0.5\]'; eval"
+        ):
             compare_bundles(motion_bundles[0], small, FEW)
 
     def test_other_labels(self, saved: Save) -> None:

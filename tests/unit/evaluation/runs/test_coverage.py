@@ -44,7 +44,21 @@ def test_missing_extra_and_unknown_three_of_each(
 def test_what_was_meant(da_b: DeepAccident, selection: SampleSelection, meant: SampleSelection) -> None:
     found = coverage(da_b, meant.tokens(da_b), selection)
     assert (found.guess, found.guess_share) == (meant, 1.0)
-    assert f"the results were probably made for {meant.text()} (they have just its samples)" in found.to_text()
+    assert (
+        f"the results were probably made for {meant.text()} (they have just its samples); repeat with "
+        in found.to_text()
+    )
+
+
+def test_the_options_that_choose_what_was_meant(da_motion: DeepAccident) -> None:
+    """The text ends with them, for the command line and for Python; made with them, the selection is the meant one."""
+    meant = SampleSelection(split="train", scope="all", agents=("infrastructure", "ego_vehicle"), horizon=3.0)
+    text = coverage(da_motion, meant.tokens(da_motion), SampleSelection(split="train")).to_text()
+    options, python = text.rsplit("; repeat with ", 1)[1].split(", in Python with ")
+    assert options == "--split train --samples evaluate --scope all --agents ego_vehicle,infrastructure --horizon 3.0"
+    assert eval(python, {"SampleSelection": SampleSelection}) == meant  # noqa: S307 - our own text
+    usual = SampleSelection(split="train", samples="all", scope="all")
+    assert usual.choices() == {"split": "train", "samples": "all", "scope": "all"}
 
 
 def test_a_list_that_is_nearly_meant(da_b: DeepAccident, selection: SampleSelection) -> None:

@@ -21,9 +21,10 @@ from deepaccident_devkit.evaluation.runs import (
     scenario_hashes,
 )
 from deepaccident_devkit.evaluation.runs.coverage import Coverage
-from deepaccident_devkit.evaluation.runs.evaluate import _partial
+from deepaccident_devkit.evaluation.runs.evaluate import _partial, check_metas
 from deepaccident_devkit.evaluation.runs.evaluation_run import breakdowns_of, checkpoint_path, remove_checkpoints
-from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, TaskName
+from deepaccident_devkit.splits import save_selection
 
 SETUP = EvaluationSetup(task="accident", protocol="boxes")
 Write = Callable[..., Results]
@@ -104,6 +105,24 @@ class TestRefused:
         with pytest.raises(EvaluationError, match=r"its predictions look 2 s ahead \(5 frames, 0.5 s apart, from the"):
             evaluate_results(da_b, results, EvaluationSetup(task="motion", horizon=3.0), selection)
 
+    @pytest.mark.parametrize("task", ["accident", "warning"])
+    def test_scenarios_without_meta_are_counted_before_the_start(
+        self, da_b: DeepAccident, own_release: Path, tmp_path: Path, task: TaskName
+    ) -> None:
+        every = SampleSelection(split="train", samples="all", scope="all")
+        silent = [scenario["token"] for scenario in da_b.find(split="train")][:1]
+        for token in silent:
+            (own_release / "train" / token.replace("/", "/meta/")).with_suffix(".txt").unlink()
+        partial = DeepAccident(dataroot=own_release, verbose=False)
+        with ResultsWriter(tmp_path / "none.json", "accident") as writer:
+            for sample in every.tokens(partial):
+                writer.add(sample, [])
+        with pytest.raises(EvaluationError, match=r"1 of 2 scenarios have no meta file, .*--where 'weather!=unknown'"):
+            evaluate_results(partial, tmp_path / "none.json", EvaluationSetup(task=task, protocol="boxes"), every)
+        save_selection(partial.find("weather!=unknown", split="train"), tmp_path / "mine.txt")
+        chosen = replace(every, split=str(tmp_path / "mine.txt"))
+        check_metas(partial, chosen.tokens(partial), chosen.split)
+
     def test_a_damaged_shard(
         self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_motion: Write
     ) -> None:
@@ -154,7 +173,7 @@ class TestPartial:
         tokens = selection.tokens(da_b)
         extra = replace(selection, agents=("other_vehicle_behind",)).tokens(da_b)
         results = write_accidents(tmp_path / "more.json", [*tokens, *extra])
-        with pytest.raises(ResultsError, match=r"--allow-partial\), which leaves out the other predictions; since no"):
+        with pytest.raises(ResultsError, match=r"\); leave them out with --allow-partial .*; no sample"):
             evaluate_results(da_b, results, SETUP, selection)
         run = evaluate_results(da_b, results, SETUP, selection, allow_partial=True, workers=1)
         assert run.evaluator.tokens == set(tokens)

@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from deepaccident_devkit.evaluation.runs import (
     Verification,
     evaluate_results,
     save_run,
+    summary_text,
     verify_bundle,
 )
 from deepaccident_devkit.evaluation.runs.differences import ABSENT, Difference, differing
@@ -64,6 +66,15 @@ class TestSame:
     ) -> None:
         results = write_accidents(tmp_path / "some.json", selection.tokens(da_b)[1:])
         part = evaluate_results(da_b, results, run.setup, selection, allow_partial=True, workers=1)
+        assert verify(save_run(part, tmp_path / "bundle"), da_b).is_same
+
+    def test_one_whose_results_have_other_samples_too(
+        self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, results: Results, run: EvaluationRun
+    ) -> None:
+        fewer = replace(selection, agents=("ego_vehicle",))
+        part = evaluate_results(da_b, results, run.setup, fewer, allow_partial=True, workers=1)
+        assert (part.partial, part.left_out) == (None, 4)
+        assert "; 4 predictions of other samples left out" in summary_text(part.summary())
         assert verify(save_run(part, tmp_path / "bundle"), da_b).is_same
 
 

@@ -14,7 +14,7 @@ from replay_page import accident, data_of
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli.replay import replay
-from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError, TokenError
+from deepaccident_devkit.errors import ChoiceError, ConfigError, TokenError
 from deepaccident_devkit.evaluation import Accident
 from deepaccident_devkit.evaluation.results import ResultsWriter
 from deepaccident_devkit.render.replay import render_replay
@@ -76,12 +76,12 @@ def test_what_cannot_be_is_refused(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_release_without_an_accident_needs_a_name(own_release: Path, tmp_path: Path) -> None:
+def test_a_release_without_an_accident_shows_its_first_scenario(own_release: Path, tmp_path: Path) -> None:
     for folder in sorted(own_release.rglob("*_accident")):
         shutil.rmtree(folder)
     dataset = DeepAccident("v1", own_release, verbose=False)
-    with pytest.raises(NotAvailableError, match="no scenario ends in an accident that a meta file names; name one"):
-        render_replay(dataset, None, tmp_path / "no.html")
+    page = render_replay(dataset, None, tmp_path / "first.html")
+    assert page.read_bytes() == render_replay(dataset, dataset.scenario[0], tmp_path / "named.html").read_bytes()
 
 
 def test_the_command_writes_the_page(

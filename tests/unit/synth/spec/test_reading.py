@@ -9,8 +9,16 @@ FIELDS = "name, design, road, view, exchange, actors, meet, background, weather,
 @pytest.mark.parametrize(
     ("entries", "sentence"),
     [
-        ("turn: lef", r"f.yaml:4: actors\[1\].turn: expected one of left, straight, right, found 'lef'"),
-        ("trun: left", r"f.yaml:4: actors\[1\].trun: no such field; possible: turn, "),
+        (
+            "turn: lef",
+            r"f.yaml:4: actors\[1\].turn: did you mean left\? Expected one of straight, left, right, found 'lef'$",
+        ),
+        ("turn: back", r"actors\[1\].turn: expected one of straight, left, right, found 'back'$"),
+        (
+            "trun: left",
+            r"f.yaml:4: actors\[1\].trun: no such field; did you mean turn\? Possible: role, category, from, turn, ",
+        ),
+        ("colour: red", r"f.yaml:4: actors\[1\].colour: no such field; possible: role, category, from, "),
         ("max_speed: fast", r"actors\[1\].max_speed: expected a number, 0.5 to 20 m/s, found 'fast'"),
         ("max_speed: true", "expected a number, 0.5 to 20 m/s, found True"),
         ("max_speed: .nan", "expected a number, 0.5 to 20 m/s, found nan"),
@@ -19,13 +27,22 @@ FIELDS = "name, design, road, view, exchange, actors, meet, background, weather,
         ("max_speed: [5, 40]", r"max_speed\[1\]: expected a number, 0.5 to 20 m/s, found 40"),
         ("max_speed: [9, 3]", r"expected \[low, high\], found \[9, 3\]; exchange the two"),
         ("max_speed: '8'", "expected a number, 0.5 to 20 m/s, found '8'; write 8, without quotes"),
-        ("max_speed: 1e1", "found '1e1'; write 10, without quotes"),
+        ("max_speed: 30", "expected a number, 0.5 to 20 m/s, found 30; 30 km/h are 8.3 m/s$"),
+        ("max_speed: [5, 50]", r"max_speed\[1\]: .*, found 50; 50 km/h are 13.9 m/s$"),
+        ("max_speed: 100", "found 100$"),
+        ("start_distance: 130", "expected a number, 0 to 120 m, found 130$"),
+        ("max_speed: 1e1", r"found '1e1'; YAML reads it as a text: write 10, or 1.0e\+1$"),
+        ("max_speed: 125E-2", r"found '125E-2'; YAML reads it as a text: write 1.25, or 125.0e-2$"),
+        ("max_speed: '1e1'", "found '1e1'; write 10, without quotes$"),
         (f"max_speed: {'9' * 400}", "expected a number, 0.5 to 20 m/s, found 9{79}…$"),
         (f"turn: {'x' * 5000}", "found 'x{78}…$"),
         ("delay: null", r"delay: expected a number, 0 to 10 s, found nothing"),
         ("lane: 0.5", "lane: expected a whole number, 0 to 1, found 0.5"),
         ("ignores: signal", r"ignores: expected a list, as \[signal, priority\], found 'signal'"),
-        ("ignores: [signals]", r"ignores\[0\]: expected one of signal, priority, crosswalk, found 'signals'"),
+        (
+            "ignores: [signals]",
+            r"ignores\[0\]: did you mean signal\? Expected one of signal, priority, crosswalk, found",
+        ),
         ("turn: []", r"turn: expected one of straight, left, right, found \[\]"),
         ("turn: [left, [right]]", r"turn\[1\]: expected one of .*, found \['right'\]"),
         ("turn: {left: 1}", "turn: expected one of .*, found the keys left"),
@@ -39,7 +56,7 @@ def test_a_wrong_value_is_refused_with_line_and_field(with_other, entries, sente
 @pytest.mark.parametrize(
     ("line", "sentence"),
     [
-        ("actor: []", f"f.yaml:7: actor: no such field; possible: actors, {FIELDS.replace('actors, ', '')}"),
+        ("actor: []", rf"f.yaml:7: actor: no such field; did you mean actors\? Possible: {FIELDS}"),
         ("design: 13", "design: expected a whole number, 1 to 12, found 13"),
         ("exchange: [true, false]", "exchange: expected true or false, one value and not several"),
         ("background: none", "f.yaml:7: background: expected keys and values, found 'none'"),
@@ -80,7 +97,7 @@ def test_a_file_is_read_in_utf8_and_named_in_its_errors(tmp_path, small):
     path.write_bytes(b"\xff")
     with pytest.raises(ConfigError, match=r"mein.yaml: cannot be read .*; give a YAML file in UTF-8"):
         read_spec(path)
-    with pytest.raises(ConfigError, match=r"other.yaml: cannot be read"):
+    with pytest.raises(ConfigError, match=r"other.yaml: no such file; give the path of a scenario file"):
         read_spec(tmp_path / "other.yaml")
 
 

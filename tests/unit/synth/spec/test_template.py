@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepaccident_devkit.synth.roads import ARMS
-from deepaccident_devkit.synth.spec import ActorSpec, ScenarioSpec, draw, parse_spec
+from deepaccident_devkit.synth.spec import DESIGNS, ActorSpec, ScenarioSpec, draw, parse_spec
 
 EXCHANGING = """
 exchange: true
@@ -99,3 +99,28 @@ def test_spawn_sides_are_seen_from_ego(ego, other):
 def test_an_actor_that_is_not_there_is_a_key_error(small):
     with pytest.raises(KeyError, match="parked"):
         draws(small, 1)[0].actor("parked")
+
+
+@pytest.mark.parametrize(
+    ("more", "alike"),
+    [
+        ("", True),
+        ("weather: [Clear, Wet]", True),
+        ("background: {parked: [3, 5]}", True),
+        ("exchange: true", False),
+        ("road: {lanes: [1, 2]}", False),
+        ("view: [open, hidden]", False),
+    ],
+)
+def test_whether_draws_differ_in_more_than_numbers(small, more, alike):
+    assert parse_spec(f"{small}{more}").draws_alike is alike
+
+
+def test_a_list_of_an_actor_makes_draws_differ(with_other):
+    assert parse_spec(with_other("max_speed: [8, 9], ignores: [signal, priority]")).draws_alike
+    assert not parse_spec(with_other("turn: [left, straight]")).draws_alike
+    assert not any(template.draws_alike for template in DESIGNS.values())
+
+
+def test_a_field_is_named_by_its_line(small):
+    assert parse_spec(small, "f.yaml").place("meet") == "f.yaml:5: meet"

@@ -37,6 +37,17 @@ def test_before_its_start_it_waits_or_comes_from_farther_back(driver):
     assert drive_alone(moving).at(-2.0).start == pytest.approx(moving.start - 10.0)
 
 
+def test_a_slow_one_is_driven_on_until_it_is_at_the_place(driver):
+    slow = driver(before=90.0, speed=0.0, max_speed=3.0)
+    place = slow.route.enter_s
+    assert drive_alone(slow).along[-1] < place
+    approach = drive_alone(slow, to=place)
+    assert 30.0 < approach.time_to(place) < 40.0
+    assert approach.along[-1] == pytest.approx(place, abs=0.5)
+    quick = driver(before=20.0)
+    assert len(drive_alone(quick, to=quick.route.enter_s).along) == len(drive_alone(quick).along)
+
+
 SPEC = ScenarioSpec(
     road=RoadSpec(signalized=False),
     actors=(

@@ -1,6 +1,7 @@
 """`check_sanity`: what is scored, what is said, of each task and each form of results."""
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -109,7 +110,10 @@ def test_equal_scores_are_told(da_motion: DeepAccident, tokens: list[str]) -> No
     setup = EvaluationSetup(task="detection", protocol="paper")
     assert sanity(da_motion, detections(da_motion, tokens), setup, tokens).warnings == ()
     (warning,) = sanity(da_motion, detections(da_motion, tokens, 0.5), setup, tokens).warnings
-    assert "scores are 0.5: what is taken in the order of scores, such as an average precision, says little" in warning
+    assert (
+        "scores are 0.5: numbers that depend on the order of scores, such as an average precision, then say little"
+        in warning
+    )
 
 
 def test_a_mistake_of_detections_is_told_with_its_remedy(da_motion: DeepAccident, tokens: list[str]) -> None:
@@ -121,8 +125,64 @@ def test_a_mistake_of_detections_is_told_with_its_remedy(da_motion: DeepAccident
         )
     report = sanity(da_motion, MemoryResults("detection", found), EvaluationSetup(task="detection"), tokens)
     (warning,) = report.warnings
-    assert warning.startswith("ego frame: it looks as if boxes are given in the agent's ego frame; translations are")
+    assert warning.startswith(
+        "ego frame: it looks as if boxes are given in the agent's ego frame; remedy: translations"
+    )
     assert report.to_text().endswith(f"WARNING: {warning}")
+
+
+def test_random_headings_are_told_with_what_chance_gives(da_motion: DeepAccident, tokens: list[str]) -> None:
+    found, source = {}, np.random.default_rng(0)
+    for token, right in detections(da_motion, tokens).predictions.items():
+        boxes = right.boxes
+        turned = DetectedBoxes.from_arrays(
+            *(boxes.center, boxes.size, source.uniform(-3, 3, len(boxes)), right.scores),
+            category=boxes.category,
+            frame="world",
+        )
+        found[token] = turned
+    setup = EvaluationSetup(task="detection", protocol="paper")
+    (warning,) = sanity(da_motion, MemoryResults("detection", found), setup, tokens).warnings
+    assert warning.startswith(
+        "heading in degrees, or at random: it looks as if headings are at random, which is also so"
+    )
+    assert re.search(r"in radians \(share of the headings that are wrong: 0\.\d\d, and 0\.50 is chance\)$", warning)
+
+
+def changed_boxes(results: MemoryResults, change: Callable[[DetectedBoxes], DetectedBoxes]) -> MemoryResults:
+    return MemoryResults("detection", {token: change(each) for token, each in results.predictions.items()})
+
+
+def test_boxes_that_come_twice_are_told(da_motion: DeepAccident, tokens: list[str]) -> None:
+    source = np.random.default_rng(0)
+
+    def twice(found: DetectedBoxes, share: float) -> DetectedBoxes:
+        again = np.flatnonzero(source.uniform(size=len(found)) < share)
+        boxes = found.boxes.select(np.concatenate([np.arange(len(found)), again]))
+        off = source.uniform(-0.05, 0.05, (len(boxes), 3))
+        return DetectedBoxes(
+            boxes=replace(boxes, center=boxes.center + off, size=boxes.size * (1 + off)),
+            scores=np.linspace(0.1, 0.9, len(boxes)),
+        )
+
+    setup, right = EvaluationSetup(task="detection", protocol="paper"), detections(da_motion, tokens)
+    (warning,) = sanity(da_motion, changed_boxes(right, lambda found: twice(found, 1.0)), setup, tokens).warnings
+    twins, every = re.match(r"(\d+) of (\d+) boxes have a twin, ", warning).groups()  # type: ignore[union-attr]
+    assert twins == every
+    assert warning.endswith("(centres within 0.25 m): apply non-maximum suppression")
+    assert sanity(da_motion, changed_boxes(right, lambda found: twice(found, 0.05)), setup, tokens).warnings == ()
+
+
+def test_quaternions_in_scipys_order_are_told(da_motion: DeepAccident, tokens: list[str]) -> None:
+    def shuffled(found: DetectedBoxes) -> DetectedBoxes:
+        return replace(found, boxes=replace(found.boxes, rotation=found.boxes.rotation[:, [1, 2, 3, 0]]))
+
+    setup = EvaluationSetup(task="detection", protocol="paper")
+    warnings = sanity(da_motion, changed_boxes(detections(da_motion, tokens), shuffled), setup, tokens).warnings
+    assert re.match(
+        r"\d+ of \d+ boxes lie on their side or upside down: rotation is a quaternion w, x, y, z,", warnings[-1]
+    )
+    assert len(warnings) == 1
 
 
 def test_swapped_classes_are_told_unless_the_boxes_are_elsewhere(da_motion: DeepAccident, tokens: list[str]) -> None:
@@ -156,7 +216,7 @@ def test_explicit_accidents(da_motion: DeepAccident, tokens: list[str], task: An
     assert (report.perfect[name], report.empty[name]) == (1.0, 0.0)
     late = {token: [delayed(each) for each in alarms] for token, alarms in right.items()}
     (warning,) = sanity(da_motion, MemoryResults("accident", late), setup, tokens, samples=10).warnings
-    assert warning.startswith("0.5 s late: it looks as if accidents are foretold for 0.5 s later than they come")
+    assert warning.startswith("0.5 s late: it looks as if accidents are predicted 0.5 s later than they happen")
 
 
 @pytest.mark.parametrize(("protocol", "told"), [("boxes", 1), ("paper", 0)])
@@ -169,7 +229,7 @@ def test_equal_scores_of_accidents_are_told_where_they_count(
     }
     setup = EvaluationSetup(task="accident", protocol=protocol)
     warnings = sanity(da_motion, MemoryResults("accident", right), setup, tokens).warnings
-    assert ["scores are 1: what is taken" in warning for warning in warnings] == [True] * told
+    assert ["scores are 1: numbers that depend on" in warning for warning in warnings] == [True] * told
 
 
 def scored(accident: Accident, number: int) -> Accident:
@@ -198,6 +258,63 @@ def test_near_nothing_is_told_where_no_check_explains_it(da_motion: DeepAccident
     assert report.to_text().endswith(report.verdict)
 
 
+def as_probabilities(label: MotionLabels) -> MotionOutput:
+    heads = MotionHeads.from_labels(label)
+    return MotionOutput(grid=label.config.grid, heads=(replace(heads, segmentation=heads.segmentation * 0.098 + 0.01),))
+
+
+def as_low_logits(label: MotionLabels) -> MotionOutput:
+    heads = MotionHeads.from_labels(label)
+    return MotionOutput(grid=label.config.grid, heads=(replace(heads, segmentation=heads.segmentation - 11),))
+
+
+def as_logits(label: MotionLabels) -> MotionOutput:
+    heads = MotionHeads.from_labels(label)
+    return MotionOutput(grid=label.config.grid, heads=(replace(heads, segmentation=heads.segmentation - 5),))
+
+
+def test_probabilities_in_heads_are_told_where_sigmoid_is_taken(da_motion: DeepAccident, tokens: list[str]) -> None:
+    wrong, right = (motion(da_motion, tokens[::5], predict) for predict in (as_probabilities, as_logits))
+    accident = EvaluationSetup(task="accident")
+    (warning,) = sanity(da_motion, wrong, accident, tokens[::5]).warnings
+    assert warning.startswith("the rule by which accidents and paths are read off heads takes 100 % of the cells for")
+    assert sanity(da_motion, wrong, MOTION, tokens[::5]).warnings == (warning,)
+    for setup, predicted in (
+        (accident, right),
+        (MOTION, right),
+        (EvaluationSetup(task="accident", protocol="paper"), wrong),
+    ):
+        assert sanity(da_motion, predicted, setup, tokens[::5]).warnings == ()
+
+
+def test_a_score_of_0_is_explained_by_heads_that_sigmoid_reads_in_another_way(
+    da_motion: DeepAccident, tokens: list[str]
+) -> None:
+    low = motion(da_motion, tokens[::5], as_low_logits)
+    report = sanity(da_motion, low, EvaluationSetup(task="accident"), tokens[::5])
+    assert report.given["apa"] == 0.0 < (report.perfect["apa"] or 0.0)
+    (warning,) = report.warnings
+    assert "off heads takes 0 % of the cells for actors, argmax " in warning
+    assert report.verdict == ""
+    told, lost = sanity(da_motion, low, MOTION, tokens[::5]).warnings
+    assert told == warning
+    assert lost.startswith("only 0 of ")
+
+
+def test_past_frames_at_the_beginning_are_told(da_motion: DeepAccident, tokens: list[str]) -> None:
+    """Of the infrastructure, which stands still: labels of 1 s earlier are the same with two frames before."""
+    config, found = MotionLabelConfig(future_frames=6), {}
+    for token in (each for each in tokens if "/infrastructure/" in each):
+        recording, frame = token.rsplit("/", 1)
+        label = da_motion.motion_labels(f"{recording}/{int(frame) - 10:03d}", config).to_present("bilinear")
+        found[token] = instances_of(label.instance, label.config.grid)
+    (warning,) = sanity(da_motion, MemoryResults("motion", found), MOTION, [*found]).warnings
+    assert warning.startswith(
+        "two steps late: it looks as if each frame shows the moment two steps before it; remedy: "
+    )
+    assert "the first frame must be the present: leave out the past frames (IoU in the cells" in warning
+
+
 def test_what_maps_do_not_hold_is_said(da_motion: DeepAccident, tokens: list[str]) -> None:
     maps, heads = (
         sanity(da_motion, motion(da_motion, tokens[::5], predict), MOTION, tokens[::5])
@@ -218,7 +335,7 @@ def test_ids_that_are_not_linked_are_told(da_motion: DeepAccident, tokens: list[
 
     report = sanity(da_motion, motion(da_motion, tokens[::5], unlinked), MOTION, tokens[::5])
     (warning,) = report.warnings
-    assert warning.startswith("ids are not linked over time: of ")
+    assert warning.startswith("ids are not linked over time: 0 of ")
     assert report.given["iou 100x100"] == 100.0
 
 

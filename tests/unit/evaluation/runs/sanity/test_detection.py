@@ -10,6 +10,7 @@ import pytest
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.baselines import predict_detections
 from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes, detection_truth
+from deepaccident_devkit.evaluation.runs.sanity.box_facts import box_counts, box_warnings
 from deepaccident_devkit.evaluation.runs.sanity.classes import class_candidate, class_names
 from deepaccident_devkit.evaluation.runs.sanity.detection import (
     DetectionMoments,
@@ -29,9 +30,10 @@ LAGS = {"0.5 s late": -5, "0.5 s early": 5}
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Boxes in the world frame and the agent's pose."""
+    """Boxes in the world frame and the agent's poses."""
 
     world_from_ego: SE3
+    world_from_lidar: SE3
     center: np.ndarray
     size: np.ndarray
     yaw: np.ndarray
@@ -63,6 +65,7 @@ def actors(dataset: DeepAccident, token: str, later: int = 0) -> Found:
     boxes = boxes.select(boxes.actor_id >= 0)
     return Found(
         world_from_ego=dataset.world_from(token, "ego"),
+        world_from_lidar=dataset.world_from(token, "lidar"),
         center=boxes.center,
         size=boxes.size,
         yaw=boxes.yaw,
@@ -82,6 +85,7 @@ def noisy(found: Found, metres: float = 0.4, missing: float = 0.25, false: float
     scores = np.concatenate([kept.scores, source.uniform(0, 0.7, more)])
     return Found(
         world_from_ego=kept.world_from_ego,
+        world_from_lidar=kept.world_from_lidar,
         center=np.concatenate([kept.center + source.normal(0, metres, (number, 3)) * (1, 1, 0.3), around]),
         size=np.concatenate([kept.size * np.exp(source.normal(0, 0.1, (number, 3))), source.uniform(1, 5, (more, 3))]),
         yaw=np.concatenate([kept.yaw + source.normal(0, 0.1, number), source.uniform(-3, 3, more)]),
@@ -127,6 +131,17 @@ def at_edge(along: int, across: int) -> Change:
 
 def raised(share: float) -> Change:
     return lambda found: replace(found, center=found.center + found.size[:, 2:] * (0, 0, share))
+
+
+def lifted(sign: int) -> Change:
+    """Boxes of the LiDAR frame placed by the ego pose, with -1, or of the ego frame placed by the LiDAR's, with 1."""
+
+    def changed(found: Found) -> Found:
+        poses = found.world_from_lidar, found.world_from_ego
+        own, other = poses if sign < 0 else poses[::-1]
+        return replace(found, center=other.apply(own.inverse().apply(found.center)))
+
+    return changed
 
 
 def headed(change: Callable[[np.ndarray], np.ndarray], *, own: bool = False) -> Change:
@@ -190,6 +205,8 @@ MISTAKES: dict[str, Change] = {
     "sizes doubled": of_sizes(lambda size: size * 2),
     "center at the bottom": raised(-0.5),
     "center at the top": raised(0.5),
+    "lidar frame by the ego pose": lifted(-1),
+    "ego frame by the lidar pose": lifted(1),
     "heading turned by 90°": headed(lambda yaw: yaw + np.pi / 2),
     "heading turned by 180°": headed(lambda yaw: yaw + np.pi),
     "heading turned by 270°": headed(lambda yaw: yaw - np.pi / 2),
@@ -331,6 +348,12 @@ FINE: dict[str, Detect] = {
 @pytest.mark.parametrize("detections", FINE)
 def test_nothing_else_is_suspected(crossing: DeepAccident, moments: Moments, detections: str) -> None:
     assert suspected(crossing, moments, FINE[detections]) == []
+
+
+@pytest.mark.parametrize("detections", FINE)
+def test_boxes_without_twins_that_stand_are_fine(crossing: DeepAccident, moments: Moments, detections: str) -> None:
+    warnings = box_warnings([{"boxes": box_counts(FINE[detections](crossing, token))} for token in moments])
+    assert ["have a twin" in each for each in warnings] == [True] * (detections == "each one thrice")
 
 
 def test_every_suspicion_is_tried() -> None:

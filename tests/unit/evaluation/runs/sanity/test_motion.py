@@ -1,6 +1,7 @@
 """Maps and heads with a mistake are named as exactly that, noisy ones too; good and bad ones without one are not."""
 
 import functools
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -9,8 +10,12 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.arrays import AnyArray
+from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS, AccidentReading
+from deepaccident_devkit.evaluation.metrics.motion import MOTION_PROTOCOLS, MotionEvaluator
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput, instances_of
-from deepaccident_devkit.evaluation.runs.sanity.facts import ids_kept
+from deepaccident_devkit.evaluation.metrics.warning import WARNING_PROTOCOLS
+from deepaccident_devkit.evaluation.runs.sanity.facts import facts_of, ids_kept, path_warnings
+from deepaccident_devkit.evaluation.runs.sanity.foregrounds import foreground_warnings, post_processing_of
 from deepaccident_devkit.evaluation.runs.sanity.motion import motion_suspicions, motion_tallies
 from deepaccident_devkit.evaluation.runs.sanity.probes import SCALES, candidates_of
 from deepaccident_devkit.geometry import BevGrid
@@ -47,6 +52,7 @@ MISTAKES: dict[str, Change] = {
     "turned by 270°": lambda maps: np.rot90(maps, 1, axes=(-2, -1)),
     "one step late": lambda maps: np.concatenate([maps[:1], maps[:-1]]),
     "one step early": lambda maps: np.concatenate([maps[1:], maps[-1:]]),
+    "two steps late": lambda maps: np.concatenate([maps[:1], maps[:1], maps[:-2]]),
     "frames reversed": lambda maps: maps[::-1],
     "actors and background swapped": lambda maps: np.where(maps > 0, 0, 1).astype(np.int32),
     **{name: lambda maps, scale=scale: scaled(maps, scale) for name, scale in SCALES.items()},
@@ -54,15 +60,15 @@ MISTAKES: dict[str, Change] = {
 
 
 @functools.lru_cache(maxsize=64)
-def rolled_out(label: MotionLabels) -> AnyArray:
-    """(T, H, W) where everybody would be who goes on as from the first frame to the second."""
+def rolled_out(label: MotionLabels, speed: float = 1.0) -> AnyArray:
+    """(T, H, W) where everybody would be who goes on as from the first frame to the second, so many times as fast."""
     result = np.zeros_like(label.instance)
     for name in np.unique(label.instance[0][label.instance[0] > 0]):
         cells = np.argwhere(label.instance[0] == name)
         then = np.argwhere(label.instance[1] == name)
         step = then.mean(axis=0) - cells.mean(axis=0) if len(then) else np.zeros(2)
         for frame in range(len(result)):
-            row, column = (cells + np.round(frame * step).astype(int)).T
+            row, column = (cells + np.round(frame * speed * step).astype(int)).T
             inside = (row >= 0) & (row < result.shape[1]) & (column >= 0) & (column < result.shape[2])
             result[frame, row[inside], column[inside]] = name
     return result
@@ -112,11 +118,17 @@ GOOD: dict[str, Callable[[MotionLabels], AnyArray]] = {
     "in parts": lambda label: uncertain(label.instance, 4, 0.5, 0.1, 0.1, parts=2),
     "false ones": lambda label: uncertain(label.instance, 5, 0.5, 0.0, 1.0),
 }
+SPEEDS = (0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.65, 0.7, 0.75, 0.8, 1.25, 1.5)
 BAD: dict[str, Callable[[MotionLabels], AnyArray]] = {
     "empty": lambda label: np.zeros_like(label.instance),
     "nobody moves": lambda label: label.instance[:1].repeat(5, axis=0),
     "nobody moves, uncertain": lambda label: uncertain(label.instance[:1].repeat(5, axis=0), 6),
     "half as fast": lambda label: rolled_out(label)[[0, 0, 1, 1, 2]],
+    "a quarter as fast": lambda label: rolled_out(label)[[0, 0, 1, 1, 1]],
+    "a quarter as fast, rounded down": lambda label: rolled_out(label)[[0, 0, 0, 0, 1]],
+    "slow at first": lambda label: rolled_out(label)[[0, 0, 1, 2, 2]],
+    "half as fast, uncertain": lambda label: uncertain(rolled_out(label)[[0, 0, 1, 1, 2]], 7),
+    **{f"{speed:g} times as fast": lambda label, speed=speed: rolled_out(label, speed) for speed in SPEEDS},
     "twice as fast": lambda label: rolled_out(label)[[0, 2, 4, 4, 4]],
     **{f"random {seed}": lambda label, seed=seed: noisy(np.zeros_like(label.instance) + 1, seed) for seed in (1, 2)},
     **{
@@ -163,10 +175,39 @@ def test_nothing_else_is_suspected(crossing_labels: Labels, prediction: str) -> 
     assert suspected(crossing_labels, (GOOD | BAD)[prediction]) == []
 
 
+def backward_flow(instance: AnyArray) -> AnyArray:
+    """(T - 1, 2, H, W) from each instance's centre to its centre in the frame before, from the second frame on."""
+    flow = np.zeros((len(instance) - 1, 2, *instance.shape[1:]), dtype=np.float32)
+    for vectors, before, now in zip(flow, instance, instance[1:], strict=False):
+        for name in np.intersect1d(before[before > 0], now[now > 0]):
+            centers = [np.argwhere(maps == name).mean(axis=0) for maps in (before, now)]
+            vectors[:, now == name] = (centers[0] - centers[1])[:, None]
+    return flow
+
+
+def test_a_flow_to_the_previous_frame_is_named(da_motion: DeepAccident) -> None:
+    """Seen from the infrastructure, which stands still: labels of 0.5 s earlier begin with the previous frame."""
+    tallies = []
+    tokens = [
+        token for token in da_motion.samples("train", "evaluate", "paper", scope="all") if "/infrastructure/" in token
+    ]
+    for token in tokens[::3]:
+        recording, frame = token.rsplit("/", 1)
+        earlier = da_motion.motion_labels(f"{recording}/{int(frame) - 5:03d}", MotionLabelConfig(future_frames=5))
+        label = da_motion.motion_labels(token).to_present("bilinear")
+        flow = backward_flow(earlier.to_present("bilinear").instance)
+        heads = replace(MotionHeads.from_labels(label), ignore_index=None, flow=flow)
+        tallies.append(motion_tallies(MotionOutput(grid=label.config.grid, heads=(heads,)), label))
+    (found,) = (each for each in candidates_of(motion_suspicions("devkit", heads=True), tallies) if each.suspected)
+    assert found.name == "flow: both channels negated"
+    assert found.description.startswith("the flow leads to the instance's centre in the previous frame, or both its")
+
+
 def channels(heads: MotionHeads, head: str, change: Change) -> MotionHeads:
     return replace(heads, **{head: change(getattr(heads, head))})
 
 
+HEADS = ("segmentation", "centerness", "offset", "flow")
 SIGNS = np.array([-1, 1])[:, None, None]
 VECTORS: dict[str, Callable[[MotionHeads], MotionHeads]] = {
     "offset: its channels swapped": lambda heads: channels(heads, "offset", lambda maps: maps[:, ::-1]),
@@ -180,9 +221,11 @@ VECTORS: dict[str, Callable[[MotionHeads], MotionHeads]] = {
     ),
     "offset and flow swapped": lambda heads: replace(heads, offset=heads.flow, flow=heads.offset),
     "actors and background swapped": lambda heads: channels(heads, "segmentation", lambda maps: maps[:, ::-1]),
-    "frames reversed": lambda heads: replace(
-        heads, **{name: getattr(heads, name)[::-1] for name in ("segmentation", "centerness", "offset", "flow")}
+    "two steps late": lambda heads: replace(
+        heads,
+        **{name: np.concatenate([getattr(heads, name)[:1]] * 2 + [getattr(heads, name)[:-2]]) for name in HEADS},
     ),
+    "frames reversed": lambda heads: replace(heads, **{name: getattr(heads, name)[::-1] for name in HEADS}),
 }
 
 
@@ -221,6 +264,109 @@ def test_heads_with_a_mistake_are_named(few_labels: Labels, mistake: str, base: 
 @pytest.mark.parametrize("heads", RIGHT_VECTORS)
 def test_other_heads_are_not_suspected(few_labels: Labels, heads: str) -> None:
     assert suspected_heads(few_labels, RIGHT_VECTORS[heads]) == []
+
+
+def path_sentences(labels: Labels, predict: Callable[[MotionLabels], MotionOutput]) -> list[str]:
+    given, perfect = MotionEvaluator(), MotionEvaluator()
+    for token, label in labels.items():
+        output = predict(label)
+        given.update(token, output, label)
+        truth = instances_of(label.instance, label.config.grid)
+        heads = MotionOutput(grid=label.config.grid, heads=(MotionHeads.from_labels(label),))
+        perfect.update(token, truth if output.heads is None else heads, label)
+    return path_warnings(given.compute(), perfect.compute())
+
+
+@pytest.mark.parametrize("prediction", [*GOOD, *BAD])
+def test_paths_are_not_told_to_be_lost_where_few_are(crossing_labels: Labels, prediction: str) -> None:
+    predict = (GOOD | BAD)[prediction]
+    assert path_sentences(crossing_labels, lambda label: instances_of(predict(label), label.config.grid)) == []
+
+
+def test_lost_paths_are_told(few_labels: Labels) -> None:
+    def without_centers(label: MotionLabels) -> MotionOutput:
+        heads = MotionHeads.from_labels(label)
+        near = abs(np.arange(200) - 100) < 15
+        heads = replace(heads, centerness=heads.centerness * near)
+        return MotionOutput(grid=label.config.grid, heads=(heads,))
+
+    (warning,) = path_sentences(few_labels, without_centers)
+    matched, every, perfect = (int(number) for number in re.findall(r"\d+", warning))
+    assert 0 < 2 * matched < perfect <= every
+    assert warning == (
+        f"only {matched} of {every} true paths have a match ({perfect} if the truth is predicted): minADE, minFDE and "
+        "the miss rate are of these alone"
+    )
+
+
+def soft(heads: MotionHeads, turn: Callable[[AnyArray], AnyArray], spread: float = 1.0) -> MotionHeads:
+    """Heads of an uncertain model; `turn` makes the two channels of the logit of an actor (T, H, W)."""
+    source = np.random.default_rng(int(heads.segmentation.sum()))
+    actor = heads.segmentation[:, 1] > heads.segmentation[:, 0]
+    logit = np.where(actor, 3.0, -6.0) + source.normal(0, spread, actor.shape)
+    return replace(heads, segmentation=turn(logit).astype(np.float32))
+
+
+def both_sides(logit: AnyArray) -> AnyArray:
+    return np.stack([-logit / 2, logit / 2], axis=1)
+
+
+def probabilities(logit: AnyArray) -> AnyArray:
+    actor = 1 / (1 + np.exp(-logit))
+    return np.stack([1 - actor, actor], axis=1)
+
+
+RIGHT_LOGITS: dict[str, Callable[[MotionHeads], MotionHeads]] = {
+    **RIGHT_VECTORS,
+    "logits": lambda heads: soft(heads, both_sides),
+    "uncertain logits": lambda heads: soft(heads, both_sides, 2.0),
+    "no actor": lambda heads: soft(heads, lambda logit: both_sides(-abs(logit) - 3)),
+    "a single actor": lambda heads: channels(heads, "segmentation", lambda maps: maps * (np.arange(200) < 1) - 5),
+}
+WRONG_LOGITS: dict[str, Callable[[MotionHeads], MotionHeads]] = {
+    "probabilities": lambda heads: soft(heads, probabilities),
+    "actor's logit 0 in the background": lambda heads: soft(
+        heads, lambda logit: np.stack([np.maximum(-logit, 0), np.maximum(logit, 0)], axis=1)
+    ),
+    "both low": lambda heads: soft(heads, lambda logit: both_sides(logit) - 6),
+}
+
+
+def foreground_sentences(
+    labels: Labels, change: Callable[[MotionHeads], MotionHeads], rules: object = MOTION_PROTOCOLS["released"]
+) -> list[str]:
+    facts, settings = [], post_processing_of(rules)
+    for label in labels.values():
+        heads = change(replace(MotionHeads.from_labels(label), ignore_index=None))
+        facts.append(facts_of(MotionOutput(grid=label.config.grid, heads=(heads,)), label, settings))
+    return foreground_warnings(facts, settings)
+
+
+@pytest.mark.parametrize("heads", RIGHT_LOGITS)
+def test_logits_of_both_sides_are_read_alike(few_labels: Labels, heads: str) -> None:
+    assert foreground_sentences(few_labels, RIGHT_LOGITS[heads]) == []
+
+
+@pytest.mark.parametrize("heads", WRONG_LOGITS)
+def test_heads_that_the_rule_of_accidents_reads_in_another_way_are_told(few_labels: Labels, heads: str) -> None:
+    (warning,) = foreground_sentences(few_labels, WRONG_LOGITS[heads])
+    by_rule, by_argmax = (float(share) for share in re.findall(r"([\d.]+) %", warning))
+    assert by_argmax < 3
+    assert by_rule == 0 if heads == "both low" else by_rule > 90
+    assert "where sigmoid(actor's logit) is above 0.4, whatever the background's logit is. Write logits" in warning
+
+
+def test_only_rules_that_take_sigmoid_read_heads_in_another_way(few_labels: Labels) -> None:
+    def told(rules: object) -> bool:
+        return bool(foreground_sentences(few_labels, WRONG_LOGITS["probabilities"], rules))
+
+    by_sigmoid = AccidentReading(foreground="sigmoid")
+    paper, boxes = PROTOCOLS["paper"], PROTOCOLS["boxes"]
+    assert [told(rules) for rules in (PROTOCOLS["released"], *MOTION_PROTOCOLS.values())] == [True, True, True]
+    assert [told(rules) for rules in (paper, boxes, WARNING_PROTOCOLS["clean"], None)] == [False] * 4
+    assert [told(replace(rules, reading=by_sigmoid)) for rules in (paper, boxes)] == [True, True]
+    paths = replace(MOTION_PROTOCOLS["released"].paths, foreground="argmax")
+    assert not told(replace(MOTION_PROTOCOLS["released"], paths=paths))
 
 
 def test_maps_longer_than_wide_cannot_be_turned_by_90_degrees(da_motion: DeepAccident) -> None:

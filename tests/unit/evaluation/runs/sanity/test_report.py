@@ -29,5 +29,5 @@ def test_a_warning_that_explains_it_is_enough() -> None:
 
 
 def test_a_warning_that_does_not_explain_it_is_not() -> None:
-    assert verdict(headline("far", 10.0), warned=True).startswith("Near nothing: far is 0.0% of the way")
+    assert verdict(headline("far", 10.0), warned=True).startswith("Near nothing: far is 0 % of the way")
     assert verdict(headline("far", 60.0), warned=True) == ""

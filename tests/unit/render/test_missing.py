@@ -1,0 +1,172 @@
+"""What pictures of a partial download show, and what they say is not there."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import MissingFileError
+from deepaccident_devkit.render import detached_figure
+from deepaccident_devkit.render.axes import set_title
+from deepaccident_devkit.render.best_view import best_view
+from deepaccident_devkit.render.colors import MISSING_COLOR
+from deepaccident_devkit.render.missing import missing_words
+
+FRONT = "ego_vehicle Camera_Front: not downloaded"
+POLE = "no LiDAR file of infrastructure"
+
+
+def grey_panels(figure: Figure) -> int:
+    return sum(to_hex(ax.get_facecolor()) == MISSING_COLOR for ax in figure.axes)
+
+
+def legend_words(ax: Axes) -> list[str]:
+    return [text.get_text() for text in ax.get_legend().get_texts()]
+
+
+VIEWS: list[tuple[Callable[[DeepAccident, str], Any], int, list[str]]] = [
+    (lambda da, scenario: da.render_sample(f"{scenario}/ego_vehicle/003"), 1, [FRONT]),
+    (lambda da, scenario: da.render_sample(f"{scenario}/ego_vehicle/003", agents="available"), 1, [FRONT, POLE]),
+    (lambda da, scenario: da.render_sample(f"{scenario}/infrastructure/003"), 0, [POLE]),
+    (lambda da, scenario: da.render_frame(f"{scenario}/003"), 1, [FRONT, POLE]),
+    (lambda da, scenario: da.render_calibration(f"{scenario}/003"), 1, [FRONT, POLE]),
+    (
+        lambda da, scenario: da.render_calibration(f"{scenario}/ego_vehicle/003", agents=["infrastructure"]),
+        1,
+        [POLE, FRONT],
+    ),
+    (lambda da, scenario: da.render_visibility(f"{scenario}/003", layers=["points"]), 0, [POLE]),
+    (lambda da, scenario: da.render_sample_data(f"{scenario}/ego_vehicle/003/Camera_Front"), 1, [FRONT]),
+    (lambda da, scenario: da.render_sample_data(f"{scenario}/infrastructure/003/lidar01"), 0, [POLE]),
+    (
+        lambda da, scenario: da.render_sample_data(
+            f"{scenario}/infrastructure/003/Camera_Front", layers=["image", "points"]
+        ),
+        0,
+        [POLE],
+    ),
+    (lambda da, scenario: da.render_pointcloud_in_image(f"{scenario}/ego_vehicle/003/Camera_Front"), 1, [FRONT]),
+    (lambda da, scenario: da.render_pointcloud_in_image(f"{scenario}/infrastructure/003/Camera_Front"), 0, [POLE]),
+    (
+        lambda da, scenario: da.render_pointcloud_in_image(
+            f"{scenario}/ego_vehicle_behind/003/Camera_Front", color_by="agent"
+        ),
+        0,
+        [POLE],
+    ),
+]
+
+
+@pytest.fixture(scope="module")
+def scenario(da_partial: DeepAccident) -> str:
+    return next(record["token"] for record in da_partial.scenario if record["collision"])
+
+
+@pytest.mark.parametrize(("view", "grey", "words"), VIEWS)
+def test_a_picture_names_what_is_not_there(
+    da_partial: DeepAccident,
+    scenario: str,
+    view: Callable[[DeepAccident, str], Any],
+    grey: int,
+    words: list[str],
+) -> None:
+    figure = view(da_partial, scenario).figure
+    assert grey_panels(figure) == grey
+    assert missing_words(figure) == words
+
+
+def test_a_whole_release_lacks_nothing(da: DeepAccident, scenario: str) -> None:
+    for figure in (da.render_sample(f"{scenario}/ego_vehicle/003", agents="all"), da.render_frame(f"{scenario}/003")):
+        assert (grey_panels(figure), missing_words(figure)) == (0, [])
+
+
+def test_the_legend_has_only_the_agents_whose_points_are_rendered(da_partial: DeepAccident, scenario: str) -> None:
+    sample = f"{scenario}/ego_vehicle/003"
+    ax = da_partial.render_bev(sample, agents="available")
+    assert missing_words(ax) == [POLE]
+    assert {"ego", "ego behind", "other"} <= set(legend_words(ax))
+    assert "infrastructure" not in legend_words(ax)
+    ax = da_partial.render_bev(sample, agents="available", layers=["boxes"])
+    assert missing_words(ax) == []
+    assert "ego" not in legend_words(ax)
+
+
+def test_points_of_the_sweeps_that_are_there(da: DeepAccident, own_sweeps: DeepAccident, scenario: str) -> None:
+    sample = f"{scenario}/ego_vehicle/003"
+    points = [len(one.render_bev(sample, sweeps=3).collections[0].get_offsets()) for one in (own_sweeps, da)]
+    assert 0 < points[0] < points[1]
+    assert missing_words(own_sweeps.render_bev(f"{scenario}/ego_vehicle/002")) == ["no LiDAR file of ego_vehicle"]
+
+
+@pytest.fixture
+def own_sweeps(da: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> DeepAccident:
+    """`da`, opened again, without the ego's second point cloud."""
+    opened = DeepAccident("v1", da.dataroot, verbose=False)
+    path = opened.get_sample_data_path
+
+    def without_second(sample_data: Any) -> Path:
+        found: Path = path(sample_data)
+        return found.with_name("gone.npz") if "ego_vehicle/lidar01" in str(found) and "_002" in found.name else found
+
+    monkeypatch.setattr(opened, "get_sample_data_path", without_second)
+    return opened
+
+
+def test_only_nothing_at_all_is_an_error(da_b: DeepAccident, da_partial: DeepAccident, scenario: str) -> None:
+    with pytest.raises(MissingFileError, match=r"nothing else to render; unpack .*, or choose other layers"):
+        da_partial.render_sample_data(f"{scenario}/ego_vehicle/003/Camera_Front", layers=["image"])
+    camera = f"{da_b.sample[0]['token']}/Camera_Front"
+    with pytest.raises(MissingFileError, match="no such file, and no LiDAR file of ego_vehicle; unpack the archives"):
+        da_b.render_pointcloud_in_image(camera)
+    figure = da_b.render_sample(da_b.sample[0])
+    assert grey_panels(figure) == 6
+    assert {"no LiDAR file of ego_vehicle", "BEV_instance_camera: not downloaded"} <= set(missing_words(figure))
+
+
+def test_a_box_is_shown_by_a_camera_that_is_there(da: DeepAccident, da_partial: DeepAccident, scenario: str) -> None:
+    sample = f"{scenario}/ego_vehicle/003"
+    others = []
+    for row, box in enumerate(da.get_boxes(sample, "world")):
+        if box.actor_id < 0:
+            continue
+        chosen = [best_view(one, [sample], one.boxes(sample, "world").select([row])) for one in (da, da_partial)]
+        if chosen[0] is not None and chosen[0].camera.endswith("Camera_Front"):
+            others.append(chosen[1])
+            figure = da_partial.render_annotation(f"{sample}/{row}")
+            assert grey_panels(figure) == (chosen[1] is not None and chosen[1].camera.endswith("Camera_Front"))
+    assert others
+
+
+@pytest.mark.slow
+def test_accident_instance_and_video_are_rendered(da_partial: DeepAccident, scenario: str, tmp_path: Path) -> None:
+    figure = da_partial.render_accident(scenario)
+    assert set(missing_words(figure)) <= {FRONT}
+    other = da_partial.get("agent", f"{scenario}/other_vehicle")["actor_id"]
+    assert set(missing_words(da_partial.render_instance(f"{scenario}/actor/{other}"))) <= {FRONT}
+    for what in ("accident", ["sample", "Camera_Front"], ["frame", "calibration"]):
+        path = tmp_path / "video.gif"
+        da_partial.render_scenario_video(scenario, path, what=what, frames=[3], size=(320, 180), workers=1)
+        assert path.stat().st_size > 0
+    page = da_partial.render_replay(scenario, tmp_path / "replay.html")
+    assert page.stat().st_size > 0
+
+
+@pytest.mark.parametrize("fontsize", [None, "medium", 14])
+def test_a_title_is_as_wide_as_its_figure(fontsize: float | str | None) -> None:
+    words = "type1_subtype1_accident/Town10HD_type001_subtype0001_scenario00001/ego_vehicle/030, t = 2.9 s"
+    for width in (2.0, 4.0, 30.0):
+        figure = detached_figure((width, 4.0))
+        ax = figure.add_subplot()
+        for where, title in ((figure, figure.get_suptitle), (ax, ax.get_title)):
+            set_title(where, words, fontsize=fontsize)
+            assert title().replace("\n", "") in (words, words.replace(", ", ","))
+            assert ("\n" in title()) == (width < 30)
+        text: Any = figure._suptitle
+        figure.draw_without_rendering()
+        assert text.get_window_extent().width <= figure.bbox.width
+        assert ax.title.get_window_extent().width <= figure.bbox.width
