@@ -1,4 +1,4 @@
-"""The repository's furniture says what is so: citation, hooks, workflow, templates, and what a wheel and an sdist hold."""
+"""Citation, hooks, workflow and templates say what is so; a wheel and an sdist hold what they should."""
 
 import re
 import shutil
@@ -134,7 +134,8 @@ def test_a_strangers_type_checker_reads_the_types(distributions: Path, tmp_path:
     [installed] = environment.glob("lib/python*/site-packages")
     [wheel] = distributions.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(installed)
+        for name in archive.namelist():
+            archive.extract(name, installed)
     (installed / "libraries.pth").write_text(sysconfig.get_path("purelib"), encoding="utf-8")
     (tmp_path / "stranger.py").write_text(STRANGER, encoding="utf-8")
     command = [sys.executable, "-m", "mypy", "--strict", "--python-executable", environment / "bin" / "python"]
