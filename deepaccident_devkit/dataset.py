@@ -219,7 +219,7 @@ class Dataset(OpenTables):
         name = CHANNELS[row % len(CHANNELS)]
         if name not in CAMERAS:
             raise ChoiceError(f"{name} holds no images; the cameras are {', '.join(CAMERAS)}")
-        return read_image(self.dataroot / self._tables.resolver.filename(row))
+        return read_image(self.get_sample_data_path(sample_data, channel))
 
     def load_point_cloud(self, sample: RowArgument, frame: Frame = "world") -> LidarPointCloud:
         """A sample's LiDAR points in `world`, `ego` or `lidar`.

@@ -19,7 +19,7 @@ from deepaccident_devkit.render.boxes import draw_actors_from_above, write_besid
 from deepaccident_devkit.render.colors import AGENT_COLORS, BEV_COLORS, GRID_COLOR, OWN_COLOR, POINT_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import agent_handles, box_handles, draw_legend
-from deepaccident_devkit.render.missing import has_cloud, is_there, missing_clouds_text, write_missing
+from deepaccident_devkit.render.missing import absence_text, has_cloud, is_there, missing_clouds_text, write_missing
 from deepaccident_devkit.render.roles import at_once, role_colors, short_name
 from deepaccident_devkit.render.trails import draw_trails
 from deepaccident_devkit.taxonomy import BEV_CAMERA, AgentName, Frame
@@ -161,7 +161,8 @@ def draw_bev(dataset: Dataset, sample: RowArgument, view: BevView, layers: froze
         aspect="equal",
         anchor="N",
     )
-    has_ground = "bev" in layers and is_there(dataset, f"{record['token']}/{BEV_CAMERA}")
+    ground = f"{record['token']}/{BEV_CAMERA}"
+    has_ground = "bev" in layers and is_there(dataset, ground)
     if has_ground:
         image = dataset.load_bev(record)
         reach = view.view_range + float(np.abs(center - target_from_ego.translation[:2]).max())
@@ -181,7 +182,7 @@ def draw_bev(dataset: Dataset, sample: RowArgument, view: BevView, layers: froze
         colored = frozenset(colors)
     shown = tuple(agent for agent, cloud in clouds.items() if cloud is not None and len(cloud))
     if "bev" in layers and not (has_ground or shown):
-        absent.append(f"{BEV_CAMERA}: not downloaded")
+        absent.append(f"{BEV_CAMERA}: {absence_text(dataset, ground)}")
     _draw_marks(dataset, record, view.frame, names, ax)
     _finish(record, view.frame, grid="grid" in layers, ax=ax)
     write_missing(ax, "; ".join(filter(None, absent)))

@@ -119,7 +119,7 @@ def draw_image(dataset: Dataset, camera: Any, ax: Axes, *, image: bool = True) -
     """
     lens = camera_of(dataset, camera)
     if image and not is_there(dataset, camera["token"]):
-        draw_missing_image(ax, camera["token"])
+        draw_missing_image(dataset, camera["token"], ax)
     elif image:
         ax.imshow(dataset.load_image(camera), extent=(0, lens.width, lens.height, 0))
     ax.set(xlim=(0, lens.width), ylim=(lens.height, 0), aspect="equal", anchor="N", title=camera["channel"])

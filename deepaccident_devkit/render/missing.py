@@ -31,12 +31,18 @@ def has_cloud(dataset: Dataset, sample: str) -> bool:
     return is_there(dataset, f"{sample}/{LIDAR}")
 
 
-def draw_missing_image(ax: Axes, sample_data: str) -> None:
+def draw_missing_image(dataset: Dataset, sample_data: str, ax: Axes) -> None:
     """Make axes a grey panel that names the agent and the camera of an image (a token) that is not there."""
     agent, _, channel = sample_data.rsplit("/", 3)[1:]
     ax.set_facecolor(MISSING_COLOR)
-    words = f"{agent}\n{channel}: not downloaded"
+    words = f"{agent}\n{channel}: {absence_text(dataset, sample_data)}"
     ax.text(0.5, 0.95, words, ha="center", va="top", fontsize=8, transform=ax.transAxes, gid=_GID)
+
+
+def absence_text(dataset: Dataset, sample_data: str) -> str:
+    """Why a sensor's file, by its token, is not there: the folder has files of other frames, or none at all."""
+    folder = dataset.get_sample_data_path(sample_data).parent
+    return "no file of this frame" if folder.is_dir() and any(folder.iterdir()) else "not downloaded"
 
 
 def write_missing(ax: Axes, words: str) -> None:

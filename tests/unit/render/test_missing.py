@@ -1,5 +1,6 @@
 """What pictures of a partial download show, and what they say is not there."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,15 @@ VIEWS: list[tuple[Callable[[DeepAccident, str], Any], int, list[str]]] = [
 @pytest.fixture(scope="module")
 def scenario(da_partial: DeepAccident) -> str:
     return next(record["token"] for record in da_partial.scenario if record["collision"])
+
+
+def test_one_frame_that_is_missing_is_not_called_a_missing_download(release_root: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(release_root, tmp_path / "release", ignore=shutil.ignore_patterns(".deepaccident"))
+    da = DeepAccident(dataroot=root, verbose=False)
+    sample = da.get_sample(da.scenario[0], "ego_vehicle", 3)
+    da.get_sample_data_path(sample, "Camera_Front").unlink()
+    figure = da.render_sample(sample)
+    assert missing_words(figure) == ["ego_vehicle Camera_Front: no file of this frame"]
 
 
 @pytest.mark.parametrize(("view", "grey", "words"), VIEWS)
