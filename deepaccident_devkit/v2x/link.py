@@ -17,6 +17,8 @@ from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 NoiseLaw = Literal["paper", "zero-mean"]
 _NORMAL: Final = NormalDist()
+_LONGEST: Final = 20.0
+"""Seconds: no scenario is longer, so a longer latency is in milliseconds."""
 _FRAME_TOLERANCE: Final = 1e-6
 """The largest distance of a latency from a whole number of frames, in frames."""
 
@@ -49,6 +51,12 @@ class PoseNoise:
             if not 0 <= value < math.inf:
                 raise ConfigError(f"pose noise: {name} is {value:g}; choose a finite number of at least 0")
             object.__setattr__(self, name, value)
+        if self.heading_std > math.pi:
+            radians = math.radians(self.heading_std)
+            raise ConfigError(
+                f"pose noise: heading_std is {self.heading_std:g} radians, over half a turn; if these are degrees, "
+                f"give {radians:.4g}"
+            )
         if self.law not in get_args(NoiseLaw):
             raise ConfigError(f"pose noise: expected a law of {', '.join(get_args(NoiseLaw))}, found {self.law!r}")
         if self.law == "zero-mean" and self.mean:
@@ -153,6 +161,10 @@ def _whole_frames(latency: object) -> float:
     seconds = checked_number("latency", latency, "seconds from 0", ConfigError)
     if not 0 <= seconds < math.inf:
         raise ConfigError(f"latency: {seconds} is not possible; choose a finite number of seconds from 0")
+    if seconds > _LONGEST:
+        raise ConfigError(
+            f"latency: {seconds:g} s is longer than any scenario; if these are milliseconds, give {seconds / 1000:g}"
+        )
     frames = seconds / FRAME_PERIOD
     if abs(frames - round(frames)) > _FRAME_TOLERANCE:
         below, above = math.floor(frames) / 10, math.ceil(frames) / 10

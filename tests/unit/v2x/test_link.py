@@ -200,3 +200,11 @@ def test_every_call_that_takes_agents_takes_a_link() -> None:
     taking = {name for name, parameters in takers.items() if "agents" in parameters}
     assert taking - {"cooperating_agents"} == {name for name, parameters in takers.items() if "link" in parameters}
     assert "message_sizes" in taking
+
+
+def test_likely_mistakes_of_units_are_named() -> None:
+    with pytest.raises(ConfigError, match=r"latency: 200 s is longer than any scenario; if .* milliseconds, give 0\.2"):
+        Link(latency=200)
+    with pytest.raises(ConfigError, match=r"heading_std is 5 radians, .*; if these are degrees, give 0\.08727"):
+        PoseNoise(heading_std=5.0)
+    assert Link(latency=20).latency_frames == 200
