@@ -171,6 +171,8 @@ def _remedy(values: object) -> str:
     """The remedy for a point cloud, or another framework's array that numpy does not read; empty for the rest."""
     if hasattr(values, "xyz"):
         return "; give its array, .xyz"
+    if hasattr(values, "corners"):  # boxes, whose own error has the remedy
+        return ""
     if isinstance(values, np.ndarray) or not (hasattr(values, "__array__") or hasattr(values, "__dlpack__")):
         return ""
     return "; pass a torch tensor as tensor.detach().cpu().float(), another framework's as a float32 numpy array"

@@ -20,7 +20,7 @@ from deepaccident_devkit.arrays import (
     checked_whole,
 )
 from deepaccident_devkit.errors import EvaluationError, GeometryError
-from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.geometry import BevGrid, Boxes
 from deepaccident_devkit.geometry.bev_grid import Orientation
 from deepaccident_devkit.motion import MotionHeads
 
@@ -169,7 +169,8 @@ def checked_prediction(prediction: object) -> MotionOutput | list[Accident]:
     if isinstance(prediction, MotionOutput):
         return prediction
     alarms: list[Accident] = []
-    for each in prediction if isinstance(prediction, Iterable) else [prediction]:
+    # empty Boxes are no alarm only by mistake
+    for each in prediction if isinstance(prediction, Iterable) and not isinstance(prediction, Boxes) else [prediction]:
         if each is prediction or not isinstance(each, Accident):
             raise EvaluationError(
                 f"prediction: expected a MotionOutput or a list of Accidents, found {type(prediction).__name__} with "
