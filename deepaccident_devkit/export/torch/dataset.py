@@ -80,7 +80,7 @@ class V2XDataset(TorchDataset):
     """
 
     def __init__(self, dataset: Dataset, tokens: Iterable[RowArgument], config: V2XConfig | None = None) -> None:
-        """Choose samples, such as those of `motion.samples`, and the contents of their items.
+        """Choose samples, such as those of `motion.training_samples`, and the contents of their items.
 
         Args:
             dataset: the release.
