@@ -117,6 +117,13 @@ class MotionOutput(FrozenArrays):
         """Number of predictions, K."""
         return len(self.heads) if self.heads is not None else len(self.instances if self.instances is not None else ())
 
+    def __repr__(self) -> str:
+        """Predictions, frames, cells, and which of the two forms."""
+        maps = self.instances[0] if self.instances is not None else (self.heads or ())[0].segmentation
+        form = "heads" if self.instances is None else "instances"
+        plural = "s" * (len(self) != 1)
+        return f"MotionOutput({len(self)} prediction{plural} of {len(maps)} frames, {self.grid.text}, {form})"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Accident(FrozenArrays):
