@@ -22,9 +22,39 @@ AnyArray = NDArray[Any]
 _FLOAT64: Final = np.dtype(np.float64)
 _NUMBERS: Final = "biuf"
 """Kinds of element types."""
+_LONGEST_FIELDS: Final = 160
+_LONGEST_VALUE: Final = 80
+_FEW: Final = 4
+"""In texts of records: characters of all fields and of one, and entries of a collection that are shown."""
 
 
-class FrozenArrays:
+class ShortRepr:
+    """Base of dataclasses that hold arrays: their text is one line of fewer than 200 characters, with shapes of arrays.
+
+    The text that a dataclass makes would have the arrays' numbers. A subclass may have a `__repr__` of its own.
+    """
+
+    __slots__ = ()
+
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        inherited = cls.__repr__
+        cls.__repr__ = inherited  # type: ignore[method-assign]  # a dataclass replaces one that is not the class's own
+
+    def __repr__(self) -> str:
+        """The class and its fields, as far as they fit."""
+        kind: type[Any] = type(self)
+        text = ""
+        for number, name in enumerate(_field_names(kind)):
+            part = f"{', ' * (number > 0)}{name}={_value_text(getattr(self, name))}"
+            if len(text) + len(part) > _LONGEST_FIELDS:
+                text += ", …"
+                break
+            text += part
+        return f"{kind.__name__}({text})"
+
+
+class FrozenArrays(ShortRepr):
     """Base of frozen dataclasses that hold arrays: these are read-only, from the start and in every copy.
 
     numpy forgets on pickling and on `copy.deepcopy` that an array was read-only.
@@ -171,6 +201,8 @@ def _remedy(values: object) -> str:
     """The remedy for a point cloud, or another framework's array that numpy does not read; empty for the rest."""
     if hasattr(values, "xyz"):
         return "; give its array, .xyz"
+    if hasattr(values, "corners"):  # boxes, whose own error has the remedy
+        return ""
     if isinstance(values, np.ndarray) or not (hasattr(values, "__array__") or hasattr(values, "__dlpack__")):
         return ""
     return "; pass a torch tensor as tensor.detach().cpu().float(), another framework's as a float32 numpy array"
@@ -186,6 +218,23 @@ def _restored(kind: type[FrozenArrays], values: Mapping[str, Any]) -> FrozenArra
 def _put(record: FrozenArrays, values: Mapping[str, Any]) -> None:
     for name, value in values.items():
         object.__setattr__(record, name, readonly(value) if isinstance(value, np.ndarray) else value)
+
+
+def _value_text(value: object) -> str:
+    """An array's shape and type; of what is long, only its type, and how many it holds."""
+    if isinstance(value, np.ndarray):
+        return f"{value.shape} {value.dtype}"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, Mapping | list | tuple) and (len(value) > _FEW or _holds_arrays(value)):
+        return f"<{len(value)} in a {type(value).__name__}>"
+    text = repr(value)
+    return text if len(text) <= _LONGEST_VALUE else f"{type(value).__name__}(…)"
+
+
+def _holds_arrays(values: Mapping[Any, Any] | Sequence[Any]) -> bool:
+    each = values.values() if isinstance(values, Mapping) else values
+    return any(isinstance(one, np.ndarray | Mapping | list | tuple) for one in each)
 
 
 def _field_names(kind: type[Any]) -> Iterable[str]:

@@ -106,8 +106,9 @@ class Dataset(OpenTables):
             TokenError: no such sample.
             ChoiceError: no such frame, visibility or velocity.
         """
-        row, frame = self._sample_row(sample), self.frame_name(frame)
-        lidar_boxes = self._lidar_boxes(row, velocity)
+        token, frame = token_of(sample), self.frame_name(frame)
+        row = self._tables.resolver.row("sample", token)
+        lidar_boxes = self._lidar_boxes(row, velocity, token)
         if visible is not None:
             lidar_boxes = lidar_boxes.select(self._visible(row, lidar_boxes, visible))
         if frame == "lidar":
@@ -124,17 +125,17 @@ class Dataset(OpenTables):
         visible: Visible | None = None,
         velocity: VelocitySource = "decoded",
     ) -> list[Box]:
-        """The annotated boxes of a sample, one object each, with their tokens; arguments as of `boxes`."""
+        """The annotated boxes of a sample, one object each, with their tokens; arguments as of `boxes`.
+
+        Those of `boxes(sample)[i]` are the same except `instance_token`, which only these know.
+        """
         row = self._sample_row(sample)
         boxes = self.boxes(sample, frame, visible, velocity)
-        first = self._annotation_slice(row).start
-        annotations = self._tables.views["annotation"]["instance_row"]
-        tokens = self._tables.resolver.token_makers
-        result = []
-        for index, label_row in enumerate(boxes.row.tolist()):
-            instance = annotations.item(first + label_row)
-            instance_token = tokens["instance"](instance) if instance >= 0 else None
-            result.append(Box(boxes.select([index]), tokens["annotation"](first + label_row), instance_token))
+        instances = self._tables.views["annotation"]["instance_row"][self._annotation_slice(row)][boxes.row].tolist()
+        token_of_instance = self._tables.resolver.token_makers["instance"]
+        result = list(boxes)
+        for box, instance in zip(result, instances, strict=True):
+            box.instance_token = token_of_instance(instance) if instance >= 0 else None
         return result
 
     def actor_ids(self, sample: RowArgument) -> IntArray:
@@ -272,7 +273,7 @@ class Dataset(OpenTables):
         first, count = view["first_annotation_row"].item(sample_row), view["num_annotations"].item(sample_row)
         return slice(max(first, 0), max(first, 0) + count)
 
-    def _lidar_boxes(self, sample_row: int, velocity: VelocitySource) -> Boxes:
+    def _lidar_boxes(self, sample_row: int, velocity: VelocitySource, token: str | None = None) -> Boxes:
         view, rows = self._tables.views["annotation"], self._annotation_slice(sample_row)
         columns: dict[str, AnyArray] = {
             "center": view["translation"][rows],
@@ -291,7 +292,7 @@ class Dataset(OpenTables):
             columns["velocity"] = self._derived_velocity(sample_row)
         elif velocity != "decoded":
             raise ChoiceError(f"velocity: expected 'decoded', 'derived' or 'label', found {velocity!r}")
-        return trusted_boxes("lidar", columns)
+        return trusted_boxes("lidar", columns, token)
 
     def _derived_velocity(self, sample_row: int) -> FloatArray:
         """(N, 3) in the sample's LiDAR frame, by the samples around it."""

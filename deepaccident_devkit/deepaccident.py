@@ -133,6 +133,7 @@ class DeepAccident(Dataset):
     motion_labels = motion.motion_labels
     bev_segmentation = motion.bev_segmentation
     samples = motion.samples
+    training_samples = motion.training_samples
     evaluation_samples = motion.evaluation_samples
     findings = validation.findings
     render_sample = render.render_sample

@@ -142,6 +142,19 @@ def test_unknown_tables_fields_channels_and_frames(da: DeepAccident) -> None:
         _ = da.sensor[8]
 
 
+def test_boxes_know_their_tokens(da: DeepAccident) -> None:
+    for sample in da.samples_of(da.scenario[0]["first_frame_token"]):
+        for frame, visible in (("world", None), ("lidar", None), ("Camera_Front", "camera"), ("ego", "released")):
+            objects, boxes = da.get_boxes(sample, frame, visible), da.boxes(sample, frame, visible)
+            assert boxes.token == [box.token for box in objects] == [box.token for box in boxes]
+            assert [repr(box) for box in boxes] == [repr(box) for box in objects]
+            for box in objects:
+                record = da.get("annotation", box.token)
+                assert (record["sample_token"], record["actor_id"]) == (sample["token"], box.actor_id)
+                assert record["instance_token"] == box.instance_token
+    assert da.cooperative_boxes(sample).token is None
+
+
 def test_missing_and_broken_sensor_files_are_named(own_release: Path) -> None:
     release = DeepAccident(dataroot=own_release, verbose=False)
     sample = release.sample[0]["token"]

@@ -12,7 +12,19 @@ import deepaccident_devkit
 
 DOCS = Path(__file__).parents[1] / "docs"
 NOT_FOR_USERS = {
-    *("arrays", "cli", "dataset", "deepaccident", "files", "nuscenes_names", "overview", "parallel", "tables", "text"),
+    *(
+        "arrays",
+        "cli",
+        "dataset",
+        "deepaccident",
+        "deprecations",
+        "files",
+        "nuscenes_names",
+        "overview",
+        "parallel",
+        "tables",
+        "text",
+    ),
 }
 """Command line, base of the facade, and what only the devkit itself calls."""
 

@@ -1,8 +1,7 @@
 """Geometry in one right-handed convention: x forward, y left, z up, yaw counter-clockwise; metres, radians."""
 
 from deepaccident_devkit.geometry.bev_grid import BevGrid
-from deepaccident_devkit.geometry.box import Box
-from deepaccident_devkit.geometry.boxes import Boxes
+from deepaccident_devkit.geometry.boxes import Box, Boxes
 from deepaccident_devkit.geometry.camera import BoxVisibility, PinholeCamera
 from deepaccident_devkit.geometry.conflicts import time_to_collision
 from deepaccident_devkit.geometry.pointcloud import LidarPointCloud

@@ -64,6 +64,12 @@ class BevGrid:
         """Number of cells."""
         return math.prod(self._counts)
 
+    @property
+    def text(self) -> str:
+        """`200 × 200 cells of 0.5 m`: rows, columns and the size of a cell along x and y."""
+        sizes = dict.fromkeys(f"{axis[2]:g}" for axis in (self.x, self.y))
+        return f"{' × '.join(map(str, self.shape))} cells of {' × '.join(sizes)} m"
+
     def with_orientation(self, orientation: Orientation) -> BevGrid:
         """The same cells with another order in an array. Raises ChoiceError."""
         if orientation in ORIENTATIONS:

@@ -1,9 +1,12 @@
-"""`Boxes`: the oriented boxes of a sample as a struct of arrays; `Box` is a view of one row."""
+"""`Boxes`: the oriented boxes of a sample as a struct of arrays; `Box`: a view of one row, with nuScenes' names."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any
+import operator
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NoReturn, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,11 +23,16 @@ from deepaccident_devkit.arrays import (
 )
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import quaternions
+from deepaccident_devkit.geometry.box_columns import COLUMNS, category_codes, check_numbers, unit
 from deepaccident_devkit.geometry.footprints import gaps, intersection_areas
 from deepaccident_devkit.geometry.frames import checked_frame
 from deepaccident_devkit.geometry.points_in_boxes import points_in_boxes
 from deepaccident_devkit.geometry.se3 import SE3, checked_transform
+from deepaccident_devkit.nuscenes_names import BOX, without_names
 from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES
+
+if TYPE_CHECKING:
+    from pyquaternion import Quaternion
 
 CORNER_SIGNS = np.array(
     [[1, 1, 1], [1, -1, 1], [1, -1, -1], [1, 1, -1], [-1, 1, 1], [-1, -1, 1], [-1, -1, -1], [-1, 1, -1]],
@@ -33,21 +41,6 @@ CORNER_SIGNS = np.array(
 """Signs of (length, width, height) of the eight corners: four in front, then four behind, each four clockwise from the
 upper left, for a viewer inside who looks forward (the nuScenes devkit's order, with y left)."""
 BOTTOM_CORNERS = (2, 3, 7, 6)
-
-_COLUMNS: dict[str, tuple[tuple[int | None, ...], type]] = {
-    "center": ((None, 3), np.float64),
-    "size": ((None, 3), np.float64),
-    "rotation": ((None, 4), np.float64),
-    "velocity": ((None, 3), np.float64),
-    "category": ((None,), np.int8),
-    "actor_id": ((None,), np.int64),
-    "num_lidar_pts": ((None,), np.int64),
-    "camera_visible": ((None,), np.bool_),
-    "row": ((None,), np.int64),
-}
-_FINITE = ("center", "size", "rotation")
-_UNIT_TOLERANCE = 1e-3
-"""How far the norm of a quaternion may be from 1; it is then scaled to 1."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -65,6 +58,7 @@ class Boxes(FrozenArrays):
         num_lidar_pts: (N,) int64, LiDAR points of the recording agent in the box.
         camera_visible: (N,) bool, whether any of the recording agent's cameras sees it.
         row: (N,) int64, row of each box among those of its label file, counted from 0.
+        sample: token of the sample in whose label all of them are; None if they are of several or of none.
     """
 
     frame: str
@@ -77,17 +71,20 @@ class Boxes(FrozenArrays):
     num_lidar_pts: IntArray
     camera_visible: BoolArray
     row: IntArray
+    sample: str | None = None
 
     def __post_init__(self) -> None:
         """Check shapes and numbers; raises GeometryError."""
         checked_frame("Boxes.frame", self.frame)
+        if not (self.sample is None or isinstance(self.sample, str)):
+            raise GeometryError(f"Boxes.sample: expected a token or None, found {self.sample!r}")
         count = len(checked("Boxes.center", self.center, (None, 3)))
         columns: dict[str, AnyArray] = {}
-        for name, (shape, dtype) in _COLUMNS.items():
-            given = _category_codes(self.category) if name == "category" else getattr(self, name)
+        for name, (shape, dtype) in COLUMNS.items():
+            given = category_codes(self.category) if name == "category" else getattr(self, name)
             columns[name] = checked(f"Boxes.{name}", given, (count, *shape[1:]), dtype).copy()
-        _check_numbers(columns)
-        columns["rotation"] = _unit(columns["rotation"])
+        check_numbers(columns)
+        columns["rotation"] = unit(columns["rotation"])
         for name, array in columns.items():
             object.__setattr__(self, name, readonly(array))
 
@@ -118,9 +115,9 @@ class Boxes(FrozenArrays):
             "row": np.arange(count),
             **columns,
         }
-        unknown = set(given) - set(_COLUMNS)
+        unknown = set(given) - set(COLUMNS)
         if unknown:
-            raise GeometryError(f"Boxes has no column {sorted(unknown)}; it has {list(_COLUMNS)}")
+            raise GeometryError(f"Boxes has no column {sorted(unknown)}; it has {list(COLUMNS)}")
         return cls(
             frame=frame,
             center=center,  # type: ignore[arg-type]  # checked in __post_init__
@@ -132,6 +129,46 @@ class Boxes(FrozenArrays):
     def __len__(self) -> int:
         """Number of boxes."""
         return len(self.center)
+
+    @overload
+    def __getitem__(self, which: int | np.integer[Any]) -> Box: ...
+    @overload
+    def __getitem__(self, which: slice | Sequence[int] | Sequence[bool] | AnyArray) -> Boxes: ...
+    def __getitem__(self, which: Any) -> Box | Boxes:
+        """One box by its number (negative: from the end), or the boxes of a slice, a mask (N,) or an array of numbers.
+
+        Raises:
+            IndexError: there are not so many boxes.
+            GeometryError: `which` is none of these, or picks from more boxes than there are (see `select`).
+        """
+        if isinstance(which, slice):
+            return self._picked(which)
+        number = _number_of(which)
+        if number is None:
+            return self.select(which)
+        if not -len(self) <= number < len(self):
+            raise IndexError(f"there are {len(self)} boxes, asked for box {number}")
+        first = number % len(self)
+        token = None if self.sample is None else f"{self.sample}/{self.row.item(first)}"
+        return Box(self._picked(slice(first, first + 1)), token)
+
+    def __iter__(self) -> Iterator[Box]:
+        """Each box by itself, which takes some microseconds: for many boxes the arrays are faster."""
+        return (self[number] for number in range(len(self)))
+
+    def __array__(self, dtype: object = None, copy: object = None) -> NoReturn:
+        """Boxes are several arrays: without this, numpy would make an array of objects. Raises GeometryError."""
+        raise GeometryError("Boxes are several arrays; give one of them, such as boxes.center")
+
+    def __repr__(self) -> str:
+        """Their number, frame and categories."""
+        counts = ", ".join(f"{count} {name}" for name, count in Counter(self.category_names).most_common())
+        return f"Boxes({len(self)} in {self.frame}{': ' if counts else ''}{counts})"
+
+    @property
+    def token(self) -> list[str] | None:
+        """The tokens of the N annotations; None if the boxes are of several samples, or not of a release."""
+        return None if self.sample is None else [f"{self.sample}/{row}" for row in self.row.tolist()]
 
     @property
     def yaw(self) -> FloatArray:
@@ -153,10 +190,9 @@ class Boxes(FrozenArrays):
         if picked.ndim != 1:
             raise GeometryError(f"expected a mask ({len(self)},) or an array of rows, found {which!r}")
         try:
-            columns = {name: getattr(self, name)[picked if picked.size else []] for name in _COLUMNS}
+            return self._picked(picked if picked.size else np.zeros(0, dtype=np.int64))
         except IndexError as error:
             raise GeometryError(f"{which!r} does not pick from {len(self)} boxes: {error}") from error
-        return trusted_boxes(self.frame, columns)
 
     def transform(self, target_from_source: SE3, frame: str) -> Boxes:
         """The same boxes in another coordinate frame, with the same sizes. Raises GeometryError."""
@@ -177,6 +213,7 @@ class Boxes(FrozenArrays):
                 "camera_visible": self.camera_visible,
                 "row": self.row,
             },
+            self.sample,
         )
 
     def corners(self) -> FloatArray:
@@ -256,6 +293,10 @@ class Boxes(FrozenArrays):
         axes = 3 if in_3d else 2
         return as_floats(np.linalg.norm(self.center[:, None, :axes] - other.center[:, :axes], axis=-1))
 
+    def _picked(self, which: slice | AnyArray) -> Boxes:
+        """The boxes of a slice, a mask or an array of rows; raises numpy's IndexError."""
+        return trusted_boxes(self.frame, {name: getattr(self, name)[which] for name in COLUMNS}, self.sample)
+
     def _points_within(self, points: FloatArray) -> tuple[IntArray, IntArray]:
         """Rows of boxes and rows of points (P, 3), one pair for each point in a box."""
         return points_in_boxes(points, self.center, self.size / 2, quaternions.to_matrix(self.rotation))
@@ -282,7 +323,7 @@ class Boxes(FrozenArrays):
             )
 
 
-def trusted_boxes(frame: str, columns: dict[str, AnyArray]) -> Boxes:
+def trusted_boxes(frame: str, columns: dict[str, AnyArray], sample: str | None = None) -> Boxes:
     """Boxes with columns that are surely correct: fast, without checks.
 
     `columns` holds every column of `Boxes`; the arrays must be fresh or read-only, and become read-only.
@@ -290,6 +331,7 @@ def trusted_boxes(frame: str, columns: dict[str, AnyArray]) -> Boxes:
     result = object.__new__(Boxes)
     put = object.__setattr__
     put(result, "frame", frame)
+    put(result, "sample", sample)
     for name, array in columns.items():
         array.setflags(write=False)
         put(result, name, array)
@@ -301,8 +343,20 @@ def concatenate(parts: list[Boxes], frame: str) -> Boxes:
     for part in parts:
         if part.frame != frame:
             raise GeometryError(f"boxes of frame {part.frame!r} cannot join those of {frame!r}; transform them first")
-    names = [field.name for field in fields(Boxes) if field.name != "frame"]
-    return trusted_boxes(frame, {name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+    samples = {part.sample for part in parts}
+    return trusted_boxes(
+        frame,
+        {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS},
+        samples.pop() if len(samples) == 1 else None,
+    )
+
+
+def _number_of(which: object) -> int | None:
+    """A single whole number, numpy's among them; None of all else."""
+    try:
+        return None if isinstance(which, bool) else operator.index(which)  # type: ignore[arg-type]  # all else: TypeError
+    except TypeError:
+        return None
 
 
 def _over_union(common: FloatArray, mine: FloatArray, theirs: FloatArray) -> FloatArray:
@@ -324,45 +378,112 @@ def checked_boxes(name: str, boxes: object) -> Boxes:
     return boxes
 
 
-def _check_numbers(columns: dict[str, AnyArray]) -> None:
-    for name in _FINITE:
-        bad = ~np.isfinite(columns[name]).all(axis=1)
-        if bad.any():
-            raise GeometryError(
-                f"Boxes.{name}: expected finite numbers, found {columns[name][bad][0].tolist()} in row "
-                f"{np.argmax(bad)}; leave such boxes out"
-            )
-    negative = (columns["size"] < 0).any(axis=1)
-    if negative.any():
-        raise GeometryError(
-            f"Boxes.size: expected lengths, widths and heights from 0, found {columns['size'][negative][0].tolist()} "
-            f"in row {np.argmax(negative)}"
+@without_names(BOX)
+class Box:
+    """One oriented box in a right-handed coordinate frame: a view of one row of `Boxes`.
+
+    Two differences from the nuScenes devkit's box: `translate` and `rotate` return a new box and change nothing in
+    place, and `size` is length, width, height (`wlh` gives the nuScenes order).
+    """
+
+    __slots__ = ("_boxes", "instance_token", "token")
+
+    def __init__(self, boxes: Boxes, token: str | None = None, instance_token: str | None = None) -> None:
+        """Wrap the only row of `boxes`; raises GeometryError if there are none or several."""
+        if len(checked_boxes("boxes", boxes)) != 1:
+            raise GeometryError(f"a Box is one row of Boxes, found {len(boxes)}; pick one with boxes[i]")
+        self._boxes = boxes
+        self.token = token
+        self.instance_token = instance_token
+
+    @property
+    def frame(self) -> str:
+        """The coordinate frame of centre, orientation and velocity."""
+        return self._boxes.frame
+
+    @property
+    def center(self) -> FloatArray:
+        """(3,) metres, read-only."""
+        return as_floats(self._boxes.center[0])
+
+    @property
+    def size(self) -> FloatArray:
+        """(3,) full length, width, height, metres, read-only."""
+        return as_floats(self._boxes.size[0])
+
+    @property
+    def wlh(self) -> FloatArray:
+        """(3,) width, length, height, metres: the nuScenes order."""
+        return as_floats(self._boxes.size[0][[1, 0, 2]])
+
+    @property
+    def orientation(self) -> Quaternion:
+        """The box's axes in `frame`, as a pyquaternion unit quaternion."""
+        from pyquaternion import Quaternion
+
+        return Quaternion(self._boxes.rotation[0].copy())
+
+    @property
+    def rotation_matrix(self) -> FloatArray:
+        """The box's axes in `frame` (3, 3)."""
+        return quaternions.to_matrix(self._boxes.rotation[0])
+
+    @property
+    def yaw(self) -> float:
+        """Heading about z of `frame`, radians in (−π, π]."""
+        return float(self._boxes.yaw[0])
+
+    @property
+    def velocity(self) -> FloatArray:
+        """(3,) m/s over the ground, NaN if unknown, read-only."""
+        return as_floats(self._boxes.velocity[0])
+
+    @property
+    def category(self) -> str:
+        """The category's name."""
+        return CATEGORIES[int(self._boxes.category[0])]
+
+    @property
+    def actor_id(self) -> int:
+        """The label's id: −100 is the recording agent, −1 an untracked actor."""
+        return int(self._boxes.actor_id[0])
+
+    @property
+    def num_lidar_pts(self) -> int:
+        """Points of the recording agent's LiDAR in the box."""
+        return int(self._boxes.num_lidar_pts[0])
+
+    @property
+    def camera_visible(self) -> bool:
+        """Whether any camera of the recording agent sees it."""
+        return bool(self._boxes.camera_visible[0])
+
+    def corners(self) -> FloatArray:
+        """The eight corners (3, 8) metres: four in front, then four behind (nuScenes order)."""
+        return as_floats(self._boxes.corners()[0].T)
+
+    def bottom_corners(self) -> FloatArray:
+        """The lower face's corners (3, 4): front right, front left, rear left, rear right."""
+        return as_floats(self._boxes.bottom_corners()[0].T)
+
+    def translate(self, translation: ArrayLike) -> Box:
+        """A new box moved by (3,) metres in its frame."""
+        moved = SE3.from_rotation(np.eye(3), checked("translation", translation, (3,)))
+        return self.transform(moved, self.frame)
+
+    def rotate(self, quaternion: Quaternion) -> Box:
+        """A new box turned about its frame's origin: centre, orientation and velocity."""
+        return self.transform(SE3.from_quaternion(quaternion), self.frame)
+
+    def transform(self, target_from_source: SE3, frame: str) -> Box:
+        """The same box in another frame. Raises GeometryError."""
+        return Box(self._boxes.transform(target_from_source, frame), self.token, self.instance_token)
+
+    def __repr__(self) -> str:
+        """Category, id, frame and pose on one line."""
+        x, y, z = self.center.tolist()
+        length, width, height = self.size.tolist()
+        return (
+            f"Box({self.category} {self.actor_id}, {self.frame} [{x:.2f}, {y:.2f}, {z:.2f}], "
+            f"size [{length:.2f}, {width:.2f}, {height:.2f}], yaw {self.yaw:.3f}, points {self.num_lidar_pts})"
         )
-
-
-def _unit(rotation: FloatArray) -> FloatArray:
-    """The quaternions (N, 4) scaled to norm 1; before, they must have it up to `_UNIT_TOLERANCE`."""
-    norm = np.linalg.norm(rotation, axis=1)
-    off = np.abs(norm - 1)
-    if (off > _UNIT_TOLERANCE).any():
-        row = int(np.argmax(off))
-        raise GeometryError(
-            f"Boxes.rotation: expected unit quaternions w, x, y, z, found {rotation[row].tolist()} in row {row}"
-        )
-    return rotation / norm[:, None] if (off > 1e-12).any() else rotation
-
-
-def _category_codes(category: ArrayLike) -> AnyArray:
-    """The codes of categories that are given as codes or names."""
-    given = np.asarray(category)
-    if given.dtype.kind not in "US":
-        if not np.isin(given, range(len(CATEGORIES))).all():
-            raise GeometryError(
-                f"category codes are 0 to {len(CATEGORIES) - 1} ({', '.join(CATEGORIES)}), found {given}"
-            )
-        return given.astype(np.int8)
-    names = [str(name) for name in given.ravel()]
-    unknown = sorted(set(names) - set(CATEGORIES))
-    if unknown:
-        raise GeometryError(f"unknown category {unknown}; known are {', '.join(CATEGORIES)}")
-    return np.array([CATEGORIES.index(name) for name in names], dtype=np.int8).reshape(given.shape)

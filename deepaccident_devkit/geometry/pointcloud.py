@@ -62,6 +62,13 @@ class LidarPointCloud(FrozenArrays):
         """Number of points."""
         return len(self.xyz)
 
+    def __repr__(self) -> str:
+        """Their number, frame and ranges."""
+        known = self.xyz[np.isfinite(self.xyz).all(axis=1)]
+        ranges = zip("xyz", known.min(axis=0), known.max(axis=0), strict=True) if len(known) else ()
+        text = ", ".join(f"{axis} {low:.1f} to {high:.1f} m" for axis, low, high in ranges)
+        return f"LidarPointCloud({len(self):,} points in {self.frame}{': ' if text else ''}{text})"
+
     @property
     def points(self) -> FloatArray:
         """x, y, z and intensity in one new array (N, 4) float64."""

@@ -49,7 +49,7 @@ from deepaccident_devkit.motion.postprocessing.predict import (
 )
 from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS, LabelProtocol
 from deepaccident_devkit.motion.sample_labels import motion_labels
-from deepaccident_devkit.motion.sample_lists import evaluation_samples, samples
+from deepaccident_devkit.motion.sample_lists import evaluation_samples, samples, training_samples
 from deepaccident_devkit.motion.warps.feature_warps import agents_to_ego, past_to_present
 
 __all__ = [
@@ -82,6 +82,7 @@ __all__ = [
     "predict_instances",
     "samples",
     "segmentation_of",
+    "training_samples",
     "trajectories",
     "write_label_files",
 ]

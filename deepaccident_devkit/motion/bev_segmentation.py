@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, IntArray, readonly
+from deepaccident_devkit.arrays import BoolArray, IntArray, ShortRepr, readonly
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.geometry import BevGrid
@@ -33,7 +33,7 @@ COVERAGE: Final[Mapping[str, float]] = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class BevSegmentation:
+class BevSegmentation(ShortRepr):
     """The classes that cover each cell around an agent; arrays are read-only.
 
     Attributes:

@@ -69,6 +69,15 @@ class MotionLabels(FrozenArrays):
             {field.name: getattr(self, field.name) for field in fields(self)} | {"id_map": dict(self.id_map)},
         )
 
+    def __repr__(self) -> str:
+        """Frames, cells, actors, protocol and coordinate frame."""
+        protocol = self.config.protocol if isinstance(self.config.protocol, str) else "own protocol"
+        where = "all at the present" if self.at_present else "each frame in its own ego frame"
+        return (
+            f"MotionLabels({len(self.segmentation)} frames of {self.config.grid.text}, {len(self.id_map)} actors in "
+            f"id_map, {protocol}, {where})"
+        )
+
     @property
     def label_valid(self) -> BoolArray:
         """(T,) bool: which label frames, from the present on, are in the recording."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from deepaccident_devkit.arrays import checked_number
 from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.deprecations import warn_deprecated
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
@@ -25,7 +26,7 @@ _RELEASED_HORIZON: Final = 2.0
 def samples(
     dataset: Dataset,
     split: str | os.PathLike[str],
-    purpose: Purpose = "train",
+    purpose: Purpose | None = None,
     protocol: SampleProtocol = "released",
     *,
     horizon: float = _RELEASED_HORIZON,
@@ -46,7 +47,7 @@ def samples(
     Args:
         dataset: the release.
         split: `train`, `val`, … or a split file, as `Dataset.split_scenarios` takes it.
-        purpose: `train`, `evaluate`, `all` or `every`.
+        purpose: `train`, `evaluate`, `all` or `every`. None means `train`, and is deprecated: a DeprecationWarning.
         protocol: `released` has only a horizon of 2 s and accident scenarios; `paper` allows others.
         horizon: seconds before the end, a multiple of 0.5; only for `evaluate`.
         scope: `accident` or `all`; only for `evaluate`.
@@ -60,6 +61,10 @@ def samples(
         NotAvailableError: the split is unknown, this release has no scenario of it, or none of its samples has labels
             (the test split has none).
     """
+    if purpose is None:
+        what = "samples(split) without a purpose, which names the training list,"
+        warn_deprecated(what, 'training_samples(split) or samples(split, "train")', since="0.1", gone_in="0.2")
+        purpose = "train"
     for name, value, choices in (
         ("purpose", purpose, Purpose),
         ("protocol", protocol, SampleProtocol),
@@ -110,6 +115,11 @@ def _splits_text(dataset: Dataset) -> str:
     """`train: 2 scenarios, split unknown: 1 scenario`."""
     counts = Counter(scenario["split"] or "split unknown" for scenario in dataset.scenario)
     return ", ".join(f"{name}: {count} scenario{'s' * (count != 1)}" for name, count in counts.items())
+
+
+def training_samples(dataset: Dataset, split: str | os.PathLike[str]) -> list[str]:
+    """The samples that a model is trained on, one a second: `samples` for the purpose `train`; see there."""
+    return samples(dataset, split, "train")
 
 
 def evaluation_samples(

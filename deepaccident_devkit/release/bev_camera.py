@@ -7,7 +7,7 @@ from typing import Literal, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from deepaccident_devkit.arrays import ByteArray, readonly
+from deepaccident_devkit.arrays import ByteArray, ShortRepr, readonly
 from deepaccident_devkit.errors import SensorFileError
 from deepaccident_devkit.release.npz import FAST, read_npz, write_npz
 from deepaccident_devkit.taxonomy import BEV_RESOLUTION, BEV_SHAPE
@@ -17,7 +17,7 @@ TAGS: dict[str, int] = {"pedestrian": 4, "road_line": 6, "road": 7, "sidewalk": 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class BevImage:
+class BevImage(ShortRepr):
     """What lies around an agent, seen from above; as stored, forward is up and left is left.
 
     A point x forward, y left of the agent, metres, is at row 599.5 − x / resolution, column 599.5 − y / resolution.

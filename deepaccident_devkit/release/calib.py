@@ -8,7 +8,7 @@ from typing import Any, Literal, overload
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, readonly
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, ShortRepr, readonly
 from deepaccident_devkit.errors import CalibError
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.geometry import SE3, handedness
@@ -31,7 +31,7 @@ _REMEDY = "restore the file from its archive"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Calibs:
+class Calibs(ShortRepr):
     """The calibration of F frames, right-handed, cameras optical; arrays are read-only.
 
     Attributes:
@@ -57,7 +57,7 @@ class Calibs:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Calib:
+class Calib(ShortRepr):
     """The calibration of one agent at one frame, right-handed.
 
     Attributes:

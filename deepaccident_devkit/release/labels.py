@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, readonly
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, ShortRepr, readonly
 from deepaccident_devkit.errors import LabelError
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.geometry import Boxes, handedness, quaternions
@@ -36,7 +36,7 @@ _REMEDY = "restore the file from its archive, or leave the scenario out with on_
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Labels:
+class Labels(ShortRepr):
     """The N boxes of F label files, file after file; arrays are read-only.
 
     Right-handed (x forward, y left, yaw counter-clockwise) unless read with `raw=True`, then as the files say

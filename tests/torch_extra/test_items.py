@@ -310,3 +310,12 @@ def projected(image_from_ego: torch.Tensor, points: np.ndarray) -> tuple[np.ndar
     scaled = points @ matrix[:3, :3].T + matrix[:3, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
         return scaled[:, :2] / scaled[:, 2:], scaled[:, 2]
+
+
+def test_its_text_says_what_an_item_has(da: DeepAccident, tokens: list[str]) -> None:
+    assert repr(V2XDataset(da, tokens[:2])) == "V2XDataset(2 samples, agents 'single', points, boxes)"
+    config = V2XConfig(agents="all", points=False, labels="deepaccident", bev_segmentation=BevGrid())
+    assert (
+        repr(V2XDataset(da, tokens[:1], config))
+        == "V2XDataset(1 sample, agents 'all', boxes, labels, bev_segmentation)"
+    )

@@ -39,6 +39,10 @@ class Evaluator(ABC, Generic[Result]):
         self._counts: dict[str, Counts] = {}
         self.repeated: set[str] = set()
 
+    def __repr__(self) -> str:
+        """Its kind, and how many samples it has counted."""
+        return f"{type(self).__name__}({len(self._counts):,} sample{'s' * (len(self._counts) != 1)})"
+
     @property
     @abstractmethod
     def settings(self) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from deepaccident_devkit.arrays import (
     checked_whole,
 )
 from deepaccident_devkit.errors import EvaluationError, GeometryError
-from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.geometry import BevGrid, Boxes
 from deepaccident_devkit.geometry.bev_grid import Orientation
 from deepaccident_devkit.motion import MotionHeads
 
@@ -117,6 +117,13 @@ class MotionOutput(FrozenArrays):
         """Number of predictions, K."""
         return len(self.heads) if self.heads is not None else len(self.instances if self.instances is not None else ())
 
+    def __repr__(self) -> str:
+        """Predictions, frames, cells, and which of the two forms."""
+        maps = self.instances[0] if self.instances is not None else (self.heads or ())[0].segmentation
+        form = "heads" if self.instances is None else "instances"
+        plural = "s" * (len(self) != 1)
+        return f"MotionOutput({len(self)} prediction{plural} of {len(maps)} frames, {self.grid.text}, {form})"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Accident(FrozenArrays):
@@ -169,7 +176,8 @@ def checked_prediction(prediction: object) -> MotionOutput | list[Accident]:
     if isinstance(prediction, MotionOutput):
         return prediction
     alarms: list[Accident] = []
-    for each in prediction if isinstance(prediction, Iterable) else [prediction]:
+    # empty Boxes are no alarm only by mistake
+    for each in prediction if isinstance(prediction, Iterable) and not isinstance(prediction, Boxes) else [prediction]:
         if each is prediction or not isinstance(each, Accident):
             raise EvaluationError(
                 f"prediction: expected a MotionOutput or a list of Accidents, found {type(prediction).__name__} with "

@@ -68,7 +68,7 @@ def accident_columns(entries: Sequence[Entry], owners: Sequence[str]) -> Columns
 
 def accidents_at(entries: Entries, token: str) -> list[Accident]:
     """The accidents of a sample; KeyError for one that is not here."""
-    columns = entries.of(token)
+    columns: dict[str, Any] = entries.of(token)
     identified, ids = columns["identified"].tolist(), columns["ids"].tolist()
     return [
         Accident(
@@ -146,7 +146,7 @@ def detection_columns(entries: Sequence[Entry], owners: Sequence[str]) -> Column
 
 def boxes_at(entries: Entries, token: str) -> DetectedBoxes:
     """The boxes of a sample, in the world; KeyError for one that is not here."""
-    columns = entries.of(token)
+    columns: dict[str, Any] = entries.of(token)
     scores = columns.pop("score")
     count = len(scores)
     boxes = Boxes(

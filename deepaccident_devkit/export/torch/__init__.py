@@ -6,7 +6,7 @@
 
     da = DeepAccident(dataroot="data/DeepAccident")
     config = V2XConfig(agents="all", images=ImageConfig(resize=(224, 400)), labels="deepaccident")
-    data = V2XDataset(da, da.samples("train"), config)
+    data = V2XDataset(da, da.training_samples("train"), config)
     loader = DataLoader(data, batch_size=2, shuffle=True, num_workers=4, collate_fn=collate)
 
 `V2XDataset` describes an item, `collate` and `collate_fusion` describe a batch. docs/training.md has a training loop.

@@ -80,7 +80,7 @@ class V2XDataset(TorchDataset):
     """
 
     def __init__(self, dataset: Dataset, tokens: Iterable[RowArgument], config: V2XConfig | None = None) -> None:
-        """Choose samples, such as those of `motion.samples`, and the contents of their items.
+        """Choose samples, such as those of `motion.training_samples`, and the contents of their items.
 
         Args:
             dataset: the release.
@@ -113,6 +113,13 @@ class V2XDataset(TorchDataset):
     def __len__(self) -> int:
         """Number of samples."""
         return len(self._rows)
+
+    def __repr__(self) -> str:
+        """The number of samples, who cooperates, and what an item has."""
+        config = self.config
+        wanted = {name: getattr(config, name) for name in ("points", "images", "boxes", "labels", "bev_segmentation")}
+        contents = "".join(f", {name}" for name, value in wanted.items() if value)
+        return f"V2XDataset({len(self):,} sample{'s' * (len(self) != 1)}, agents {config.agents!r}{contents})"
 
     def set_epoch(self, epoch: int) -> None:
         """Set the number of the next epoch, from 0, before its loader is iterated: each epoch draws new augmentations.

@@ -13,7 +13,16 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, Float32Array, FloatArray, IntArray, checked, readonly
+from deepaccident_devkit.arrays import (
+    AnyArray,
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    IntArray,
+    ShortRepr,
+    checked,
+    readonly,
+)
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry.handedness import flip_pose
 from deepaccident_devkit.motion.augmentation import Augmentation
@@ -31,7 +40,7 @@ _PEDESTRIAN: Final = CATEGORIES.index("pedestrian")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FrameBoxes:
+class FrameBoxes(ShortRepr):
     """The boxes that an agent annotated at one moment, in its LiDAR frame, right-handed; arrays are read-only.
 
     Attributes:
@@ -75,7 +84,7 @@ class FrameBoxes:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FramePolygons:
+class FramePolygons(ShortRepr):
     """The polygons of one moment, in the order in which they are rasterised; arrays are read-only.
 
     Attributes:

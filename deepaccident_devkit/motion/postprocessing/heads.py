@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, as_numbers, checked, readonly
+from deepaccident_devkit.arrays import AnyArray, ShortRepr, as_numbers, checked, readonly
 from deepaccident_devkit.errors import ChoiceError, GeometryError
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
 from deepaccident_devkit.motion.labels import MotionLabels
@@ -21,7 +21,7 @@ _LARGEST: Final = 1e15
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MotionHeads:
+class MotionHeads(ShortRepr):
     """The maps of one prediction, T frames from the present on, H × W cells; arrays are read-only.
 
     Attributes:
@@ -64,6 +64,11 @@ class MotionHeads:
         for name, values in maps.items():
             _check_values(name, values, np.inf if name in {"segmentation", "centerness"} else _LARGEST)
             object.__setattr__(self, name, readonly(values))
+
+    def __repr__(self) -> str:
+        """Frames, cells and orientation."""
+        frames, _, height, width = self.segmentation.shape
+        return f"MotionHeads({frames} frames of {height} × {width} cells, {self.orientation})"
 
     @classmethod
     def from_arrays(

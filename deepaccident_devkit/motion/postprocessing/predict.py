@@ -10,7 +10,7 @@ from typing import Final, Literal, get_args
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, readonly
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, ShortRepr, readonly
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
@@ -88,7 +88,7 @@ POST_PROCESSING: Final[Mapping[str, PostProcessing]] = MappingProxyType(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class InstancePath:
+class InstancePath(ShortRepr):
     """One instance of the first frame; arrays are read-only.
 
     Attributes:
@@ -108,7 +108,7 @@ class InstancePath:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LinkedInstances:
+class LinkedInstances(ShortRepr):
     """The instances of one prediction over T frames of H × W cells in `orientation`; arrays are read-only.
 
     Attributes:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, IntArray
+from deepaccident_devkit.arrays import AnyArray, IntArray, ShortRepr
 from deepaccident_devkit.evaluation.metrics.frames import cells_within, frames_there, labels_at_present
 from deepaccident_devkit.evaluation.metrics.motion import MotionProtocol
 from deepaccident_devkit.evaluation.metrics.motion.overlaps import vpq_matches
@@ -33,7 +33,7 @@ _WORDS: Final[dict[Side, tuple[str, str]]] = {"true": ("found", "missed"), "pred
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MotionOutcome:
+class MotionOutcome(ShortRepr):
     """The true and the predicted instances of the evaluated frames, and which of them match.
 
     Attributes:

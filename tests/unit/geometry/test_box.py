@@ -71,7 +71,7 @@ def test_editing_what_it_returns_changes_nothing(box: Box) -> None:
 
 def test_refuses_other_than_one_row_and_other_than_three_numbers(box: Box) -> None:
     none = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [])
-    with pytest.raises(GeometryError, match=r"one row of Boxes, found 0; pick one with Boxes.select"):
+    with pytest.raises(GeometryError, match=r"one row of Boxes, found 0; pick one with boxes\[i\]"):
         Box(none)
     with pytest.raises(GeometryError, match=r"translation: expected shape \(3\)"):
         box.translate((1, 2))

@@ -1,10 +1,13 @@
+import pickle
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import SE3, Box, Boxes, footprints, points_in_boxes
-from deepaccident_devkit.geometry.boxes import _COLUMNS, concatenate, trusted_boxes
+from deepaccident_devkit.geometry.box_columns import COLUMNS
+from deepaccident_devkit.geometry.boxes import concatenate, trusted_boxes
 
 
 @pytest.fixture
@@ -59,6 +62,65 @@ def test_select_by_mask_and_by_index(two: Boxes) -> None:
 def test_select_says_what_it_cannot_pick(two: Boxes, which: object) -> None:
     with pytest.raises(GeometryError, match=r"does not pick from 2 boxes|expected a mask \(2,\)"):
         two.select(which)  # type: ignore[arg-type]
+
+
+def test_a_number_picks_a_box_and_all_else_picks_boxes(two: Boxes) -> None:
+    for number in (1, -1, np.int64(1), np.array(1)):
+        box = two[number]
+        assert isinstance(box, Box)
+        assert (box.actor_id, box.category, box.frame, box.token) == (7, "pedestrian", "lidar", None)
+    assert repr(list(two)) == repr([two[0], two[1]])
+    for which in (slice(1, None), [False, True], [1], np.array([-1]), two.actor_id == 7):
+        some = two[which]
+        assert isinstance(some, Boxes)
+        assert (some.actor_id.tolist(), some.row.tolist()) == ([7], [1])
+    assert two[::-1].actor_id.tolist() == [7, -100]
+    assert (len(two[:0]), len(two[[]]), list(two[:0])) == (0, 0, [])
+    for part in (two[1:], two[[1]]):
+        with pytest.raises(ValueError, match="read-only"):
+            part.center[0] = 0
+    with pytest.raises(ValueError, match="read-only"):
+        two[0].center[0] = 0
+
+
+@pytest.mark.parametrize("number", [2, -3, np.int64(2)])
+def test_a_box_that_is_not_there_is_an_index_error(two: Boxes, number: int) -> None:
+    with pytest.raises(IndexError, match=f"there are 2 boxes, asked for box {number}"):
+        two[number]
+
+
+@pytest.mark.parametrize("which", [True, 1.0, "car", None, [2], [True], [0.5], (0, slice(None)), [[0], [1]]])
+def test_an_index_says_what_it_cannot_pick(two: Boxes, which: object) -> None:
+    with pytest.raises(GeometryError, match=r"does not pick from 2 boxes|expected a mask \(2,\)"):
+        two[which]  # type: ignore[call-overload]
+
+
+def test_numpy_takes_boxes_for_no_array(two: Boxes) -> None:
+    for boxes in (two, two[:0]):
+        for call in (np.asarray, np.array, two.contains, two.select):
+            with pytest.raises(GeometryError, match=r"several arrays; give one of them, such as boxes\.center\)?$"):
+                call(boxes)
+
+
+def test_tokens_follow_the_sample(two: Boxes) -> None:
+    columns = {name: getattr(two, name) for name in COLUMNS}
+    known = Boxes(frame="lidar", sample="type/name/ego_vehicle/003", **columns)
+    tokens = ["type/name/ego_vehicle/003/0", "type/name/ego_vehicle/003/1"]
+    moved = known.transform(SE3.identity(), "ego")
+    for boxes in (known, moved, pickle.loads(pickle.dumps(known)), concatenate([moved[:1], moved[1:]], "ego")):
+        assert boxes.token == tokens
+        assert [box.token for box in boxes] == tokens
+        assert boxes[::-1].token == tokens[::-1]
+    for boxes in (two, concatenate([known, two], "lidar"), concatenate([known, two][::-1], "lidar")):
+        assert boxes.token is None
+    with pytest.raises(GeometryError, match=r"Boxes\.sample: expected a token or None, found 3"):
+        Boxes(frame="lidar", sample=3, **columns)  # type: ignore[arg-type]
+
+
+def test_the_repr_counts_categories(two: Boxes) -> None:
+    assert repr(two) == "Boxes(2 in lidar: 1 car, 1 pedestrian)"
+    assert repr(two[[1, 0, 1]]) == "Boxes(3 in lidar: 2 pedestrian, 1 car)"
+    assert repr(two[:0]) == "Boxes(0 in lidar)"
 
 
 def test_contains_takes_faces_in(two: Boxes) -> None:
@@ -159,7 +221,7 @@ def test_boxes_without_area_overlap_nothing(square: Boxes) -> None:
 
 @pytest.mark.parametrize("column", ["center", "size", "rotation"])
 def test_boxes_that_are_nowhere_have_no_gap_and_hold_nothing(square: Boxes, column: str) -> None:
-    columns = {name: getattr(square, name).copy() for name in _COLUMNS}
+    columns = {name: getattr(square, name).copy() for name in COLUMNS}
     columns[column][0, 0] = np.nan
     nowhere = trusted_boxes("lidar", columns)  # the constructor takes none
     assert_array_equal(nowhere.distance_bev(square), [[np.nan]])
@@ -225,13 +287,13 @@ def test_many_pairs_are_worked_off_in_pieces(monkeypatch: pytest.MonkeyPatch) ->
     ],
 )
 def test_numbers_that_are_no_boxes_are_refused(two: Boxes, columns: dict[str, object], message: str) -> None:
-    good = {name: getattr(two, name) for name in ("frame", *_COLUMNS)}
+    good = {name: getattr(two, name) for name in ("frame", *COLUMNS)}
     with pytest.raises(GeometryError, match=message):
         Boxes(**{**good, **columns})
 
 
 def test_names_and_nearly_unit_quaternions_are_taken(two: Boxes) -> None:
-    good = {name: getattr(two, name) for name in ("frame", *_COLUMNS)}
+    good = {name: getattr(two, name) for name in ("frame", *COLUMNS)}
     made = Boxes(**{**good, "category": ["van", "car"], "rotation": two.rotation * 1.0005})
     assert_array_equal(made.category, [2, 0])
     assert_allclose(made.rotation, two.rotation, atol=1e-15)

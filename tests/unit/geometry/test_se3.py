@@ -126,7 +126,7 @@ def test_boxes_a_box_and_a_cloud_are_carried_along(boxes: Boxes) -> None:
         assert moved.frame == frame
         assert_array_equal(moved.corners(), want.corners())
         assert_array_equal(moved.velocity, want.velocity)
-    box = Box(boxes.select([0]), "a/b")
+    box = Box(boxes[:1], "a/b")
     for one, frame in ((pose @ box, "lidar"), (pose.apply(box, frame="ego"), "ego")):
         assert (one.frame, one.token) == (frame, "a/b")
         assert_array_equal(one.center, want.center[0])

@@ -7,7 +7,7 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
-from deepaccident_devkit.motion import evaluation_samples, samples
+from deepaccident_devkit.motion import evaluation_samples, samples, training_samples
 from deepaccident_devkit.taxonomy import AGENTS
 
 
@@ -63,13 +63,26 @@ def test_evaluation_samples_are_those_of_the_purpose_to_evaluate(da_motion: Deep
         evaluation_samples(da_motion, every_scenario, horizon=3.0)
 
 
+def test_training_samples_are_those_of_the_purpose_to_train(da_motion: DeepAccident, every_scenario: Path) -> None:
+    tokens = samples(da_motion, every_scenario, "train")
+    assert tokens
+    assert training_samples(da_motion, every_scenario) == da_motion.training_samples(every_scenario) == tokens
+    advice = (
+        r"without a purpose.* since 0\.1 and gone in 0\.2; use training_samples\(split\) or samples\(split, \"train\"\)"
+    )
+    for call in (lambda: samples(da_motion, every_scenario), lambda: da_motion.samples(every_scenario)):
+        with pytest.warns(DeprecationWarning, match=advice) as told:
+            assert call() == tokens
+        assert told[0].filename == __file__
+
+
 def test_a_split_that_was_not_unpacked_says_so(da_motion: DeepAccident) -> None:
     here = {record["split"] for record in da_motion.scenario}
     [absent] = {"train", "val"} - here
     with pytest.raises(
         NotAvailableError, match=rf"{absent}: no scenario of this split is in .*; unpack that part.*"
     ) as told:
-        samples(da_motion, absent)
+        training_samples(da_motion, absent)
     assert str(told.value).endswith(f"or choose another split: it has {here.pop()}: 2 scenarios")
 
 
@@ -89,7 +102,7 @@ def test_a_horizon_is_a_number(da_motion: DeepAccident, horizon: object) -> None
 )
 def test_unknown_choices_name_those_there_are(da_motion: DeepAccident, arguments: dict[str, str], told: str) -> None:
     with pytest.raises(ChoiceError, match=re.escape(told)):
-        samples(da_motion, "train", **arguments)  # type: ignore[arg-type]
+        samples(da_motion, "train", **{"purpose": "train", **arguments})  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("horizon", [0.0, 0.7, -1.0, float("nan")])
@@ -111,4 +124,4 @@ def test_a_split_without_labels_says_so(own_release: Path) -> None:
     split = own_release / "mine.txt"
     split.write_text(unlabelled.scenario[0]["token"].replace("/", " ") + "\n")
     with pytest.raises(NotAvailableError, match="none of its samples here has labels"):
-        samples(unlabelled, split)
+        samples(unlabelled, split, "train")

@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deepaccident_devkit.errors import ChoiceError, GeometryError
+from deepaccident_devkit.errors import ChoiceError, EvaluationError, GeometryError
 from deepaccident_devkit.evaluation import Accident, MotionOutput, instances_of
-from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.evaluation.metrics.predictions import checked_prediction
+from deepaccident_devkit.geometry import BevGrid, Boxes
 from deepaccident_devkit.motion import MotionHeads
 
 GRID = BevGrid((-4.0, 4.0, 0.5), (-3.0, 3.0, 0.5))
@@ -69,6 +70,12 @@ class TestMotionOutput:
     def test_arrays_are_no_heads(self, heads: Any) -> None:
         with pytest.raises(GeometryError, match=r"heads: expected MotionHeads, found .*MotionOutput\.from_arrays\("):
             MotionOutput(grid=GRID, heads=heads)
+
+    def test_boxes_are_no_prediction_and_none_of_them_no_quiet_one(self) -> None:
+        none = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [])
+        for given in (none, [none]):
+            with pytest.raises(EvaluationError, match=r"expected a MotionOutput or a list of Accidents, found .*Boxes"):
+                checked_prediction(given)
 
     def test_what_is_no_output(self) -> None:
         segmentation, centerness, offset, flow = stacked()

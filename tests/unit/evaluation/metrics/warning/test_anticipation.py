@@ -384,7 +384,7 @@ def test_the_context_tells_involvement_twins_and_what_constant_velocities_lead_t
 
 
 def test_constant_velocity_alarms_by_hand(da_motion: DeepAccident) -> None:
-    boxes = da_motion.boxes(da_motion.samples("train")[0], "ego").select(np.arange(3))
+    boxes = da_motion.boxes(da_motion.training_samples("train")[0], "ego").select(np.arange(3))
     placed = replace(
         boxes,
         center=np.array([[0.0, 0, 0], [24, 0, 0], [0, 50, 0]]),
