@@ -301,6 +301,8 @@ KINDS = {
 
 def named(expression: ast.expr) -> Any:
     """What a dotted name on the page stands for: of `da`, `box` and others the member of their class."""
+    if isinstance(expression, ast.Subscript):
+        return named(expression.value).__getitem__
     if isinstance(expression, ast.Attribute):
         if isinstance(expression.value, ast.Name) and expression.value.id not in KINDS:
             return getattr(import_module(f"deepaccident_devkit.{expression.value.id}"), expression.attr)
