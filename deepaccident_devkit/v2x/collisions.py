@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
@@ -65,6 +66,16 @@ class Contact(FrozenArrays):
     def agrees(self) -> bool:
         """Whether the meta file agrees with the recording."""
         return not self.disagreements
+
+    def __repr__(self) -> str:
+        """Who, where, how fast: in one line."""
+        who = " and ".join(f"{actor} ({side})" for actor, side in zip(self.actor_ids, self.sides, strict=True))
+        speeds = " and ".join(f"{speed:.1f}" for speed in self.speeds)
+        x, y = self.point[:2].tolist()
+        return (
+            f"Contact(actors {who} at x {x:.1f}, y {y:.1f} m in world: gap {self.gap:.2f} m, {speeds} m/s, closing at "
+            f"{self.closing_speed:.1f} m/s, {math.degrees(self.impact_angle):.0f}° between their headings)"
+        )
 
 
 def first_accident(dataset: Dataset) -> str:

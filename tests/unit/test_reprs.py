@@ -16,6 +16,7 @@ from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.evaluation import Accident, AccidentEvaluator, DetectedBoxes, MotionOutput
 from deepaccident_devkit.geometry import SE3, BevGrid, Boxes, LidarPointCloud
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionHeads, MotionLabelConfig, MotionLabels
+from deepaccident_devkit.v2x import Contact
 
 GRID = BevGrid((-4.0, 4.0, 0.5), (-3.0, 3.0, 0.25))
 
@@ -51,8 +52,24 @@ def boxes() -> Boxes:
     )
 
 
+def contact() -> Contact:
+    return Contact(
+        instances=("a", "b"),
+        actor_ids=(20001, 20002),
+        frame="f",
+        point=np.full(3, -1234.56),
+        gap=0.123456789,
+        speeds=(12.3, 12.3),
+        closing_speed=-12.3,
+        impact_angle=3.1,
+        sides=("front", "right"),
+        disagreements=("a gap of 3.1 m",),
+    )
+
+
 OWN = {
     "Boxes": boxes,
+    "Contact": contact,
     "LidarPointCloud": cloud,
     "MotionHeads": heads,
     "MotionLabels": labels,

@@ -109,6 +109,10 @@ def test_a_car_that_drives_into_anothers_left_side(tmp_path: Path) -> None:
     assert found.impact_angle == pytest.approx(np.pi / 2)
     assert found.sides == ("front", "left")
     assert found.agrees
+    assert repr(found) == (
+        "Contact(actors 1223 (front) and 1212 (left) at x 20.0, y 1.2 m in world: gap 0.50 m, 10.0 and 2.0 m/s, "
+        "closing at 10.0 m/s, 90° between their headings)"
+    )
 
 
 @pytest.mark.usefixtures("origin")
