@@ -162,7 +162,7 @@ class Dataset(OpenTables):
 
     def get_sample_data_path(self, sample_data: RowArgument, channel: str | None = None) -> Path:
         """The path of a sensor file, which need not exist; arguments as of `get_sample_data`. Raises TokenError."""
-        return self.dataroot / self._tables.resolver.filename(self._sample_data_row(sample_data, channel))
+        return self._path(self._sensor(sample_data, channel)[0])
 
     def get_sample_data(
         self, sample_data: RowArgument, channel: str | None = None
@@ -178,12 +178,10 @@ class Dataset(OpenTables):
         Raises:
             TokenError: no such sensor file.
         """
-        row = self._sample_data_row(sample_data, channel)
-        sample_row, channel_code = divmod(row, len(CHANNELS))
-        name = CHANNELS[channel_code]
+        row, name = self._sensor(sample_data, channel)
         intrinsic = self._intrinsic(row) if name in CAMERAS else None
-        boxes = self.get_boxes(self._tables.resolver.token("sample", sample_row), name)
-        return self.dataroot / self._tables.resolver.filename(row), boxes, intrinsic
+        boxes = self.get_boxes(self._tables.resolver.token("sample", row // len(CHANNELS)), name)
+        return self._path(row), boxes, intrinsic
 
     def camera(self, sample_data: RowArgument, channel: str | None = None) -> PinholeCamera:
         """A camera's K and image size as its calib file gives them, which projects points and finds visible boxes.
@@ -196,8 +194,7 @@ class Dataset(OpenTables):
             TokenError: no such sensor file.
             ChoiceError: the sensor is no camera.
         """
-        row = self._sample_data_row(sample_data, channel)
-        name = CHANNELS[row % len(CHANNELS)]
+        row, name = self._sensor(sample_data, channel)
         if name not in CAMERAS:
             raise ChoiceError(f"camera: expected one of {', '.join(CAMERAS)}, found {name}")
         view = self._tables.views["sample_data"]
@@ -216,8 +213,7 @@ class Dataset(OpenTables):
             MissingFileError: the image was not downloaded.
             SensorFileError: it cannot be read.
         """
-        row = self._sample_data_row(sample_data, channel)
-        name = CHANNELS[row % len(CHANNELS)]
+        _, name = self._sensor(sample_data, channel)
         if name not in CAMERAS:
             raise ChoiceError(f"{name} holds no images; the cameras are {', '.join(CAMERAS)}")
         return read_image(self.get_sample_data_path(sample_data, channel))
@@ -254,9 +250,14 @@ class Dataset(OpenTables):
     def _sample_row(self, sample: RowArgument) -> int:
         return self._tables.resolver.row("sample", token_of(sample))
 
-    def _sample_data_row(self, sample_data: RowArgument, channel: str | None) -> int:
+    def _sensor(self, sample_data: RowArgument, channel: str | None) -> tuple[int, str]:
+        """The row and the channel of a sensor file; arguments as of `get_sample_data`. Raises TokenError."""
         token = token_of(sample_data)
-        return self.sample_data.row(token if channel is None else f"{token}/{channel}")
+        row = self.sample_data.row(token if channel is None else f"{token}/{channel}")
+        return row, CHANNELS[row % len(CHANNELS)]
+
+    def _path(self, sample_data_row: int) -> Path:
+        return self.dataroot / self._tables.resolver.filename(sample_data_row)
 
     def _intrinsic(self, sample_data_row: int) -> FloatArray:
         """K (3, 3) of a camera, the caller's own."""
@@ -265,8 +266,7 @@ class Dataset(OpenTables):
         return intrinsic.reshape(3, 3).copy()
 
     def _channel_path(self, sample_row: int, channel: str) -> Path:
-        row = sample_row * len(CHANNELS) + CHANNELS.index(channel)
-        return self.dataroot / self._tables.resolver.filename(row)
+        return self._path(sample_row * len(CHANNELS) + CHANNELS.index(channel))
 
     def _annotation_slice(self, sample_row: int) -> slice:
         view = self._tables.views["sample"]

@@ -15,6 +15,7 @@ from deepaccident_devkit.evaluation.metrics.accident import AccidentReading, Rel
 from deepaccident_devkit.evaluation.metrics.frames import first_frames
 from deepaccident_devkit.evaluation.metrics.motion import MotionProtocol
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
+from deepaccident_devkit.evaluation.runs.sanity.motion import actor_cells
 from deepaccident_devkit.evaluation.runs.sanity.probes import percent
 from deepaccident_devkit.motion import PostProcessing
 from deepaccident_devkit.motion.postprocessing.predict import foreground_cells
@@ -42,11 +43,9 @@ def foreground_counts(prediction: MotionOutput, frames: int, settings: PostProce
     """Cells of the last prediction that are actors by the settings' rule, those by argmax, and all; 0 of no heads."""
     if prediction.heads is None or settings is None or settings.foreground == "argmax":
         return [*NOT_COUNTED]
-    logits = first_frames(prediction.heads[-1], frames).segmentation
-    by_rule, by_argmax = (
-        int(np.count_nonzero(foreground_cells(logits, each))) for each in (settings, PostProcessing())
-    )
-    return [by_rule, by_argmax, logits[:, 1].size]
+    by_rule = foreground_cells(first_frames(prediction.heads[-1], frames).segmentation, settings)
+    by_argmax = actor_cells(prediction, frames)
+    return [int(np.count_nonzero(by_rule)), int(np.count_nonzero(by_argmax)), by_argmax.size]
 
 
 def foreground_warnings(facts: Collection[Mapping[str, Any]], settings: PostProcessing | None) -> list[str]:
