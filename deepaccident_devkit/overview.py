@@ -23,7 +23,7 @@ from deepaccident_devkit.taxonomy import (
     SCENARIO_ATTRIBUTES,
     SPLITS,
 )
-from deepaccident_devkit.text import columns_text
+from deepaccident_devkit.text import columns_text, natural_order
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import AgentRecord, ScenarioRecord
@@ -207,7 +207,7 @@ def table_text(left: str, right: str, rows: Sequence[tuple[str, str]]) -> str:
 
 def _counts(values: Iterable[object]) -> dict[str, int]:
     counts = Counter("none" if value is None else str(value) for value in values)
-    return dict(sorted(counts.items()))
+    return dict(sorted(counts.items(), key=lambda item: natural_order(item[0])))
 
 
 def _table_rows(dataset: Dataset, scenarios: set[str]) -> dict[str, int]:

@@ -17,7 +17,7 @@ from deepaccident_devkit.errors import ConfigError, TokenError
 from deepaccident_devkit.files import replacing
 from deepaccident_devkit.release import write_split_file
 from deepaccident_devkit.taxonomy import MINI_SPLITS, SCENARIO_ATTRIBUTES, SPLITS, VEHICLE_AGENTS
-from deepaccident_devkit.text import columns_text
+from deepaccident_devkit.text import columns_text, natural_order
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
@@ -354,7 +354,7 @@ def _check_line(path: Path, token: str) -> None:
 
 def _distribution(records: Mapping[str, Sequence[ScenarioRecord]], field: str) -> dict[str, dict[str, int]]:
     counts = {name: Counter(_shown(scenario, field) for scenario in scenarios) for name, scenarios in records.items()}
-    values = sorted({value for counter in counts.values() for value in counter}, key=_natural)
+    values = sorted({value for counter in counts.values() for value in counter}, key=natural_order)
     return {value: {name: counter[value] for name, counter in counts.items()} for value in values}
 
 
@@ -363,8 +363,3 @@ def _shown(scenario: ScenarioRecord, field: str) -> str:
         return "no" if scenario["collision"] is None else "yes"
     value = scenario[field]  # type: ignore[literal-required]
     return "none" if value is None else str(value)
-
-
-def _natural(word: str) -> tuple[bool, int, str]:
-    """Numbers by size, before words; `none` last."""
-    return word == "none", int(word) if word.isdecimal() else 0, word

@@ -1,5 +1,6 @@
 """Text for people: aligned columns for a terminal, and messages that name what was probably meant."""
 
+import math
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 
@@ -16,6 +17,15 @@ def columns_text(rows: Sequence[Sequence[str]], *, left: int = 1) -> str:
         cells += [f"{word:>{width}}" for word, width in zip(row[left:], widths[left:], strict=True)]
         lines.append("  ".join(cells).rstrip())
     return "\n".join(lines)
+
+
+def natural_order(value: str | None) -> tuple[bool, float, str]:
+    """A key that sorts words: numbers and those that begin with one (`2 s`) by size, then others; unknown ones last."""
+    text = "none" if value is None else value
+    try:
+        return text == "none", float(text.split(" ")[0]), text
+    except ValueError:
+        return text == "none", math.inf, text
 
 
 def fixed_text(value: float, digits: int) -> str:

@@ -17,7 +17,6 @@ import numpy as np
 import synth_beside
 
 from deepaccident_devkit.release import Labels
-from deepaccident_devkit.selection import accident_visible_mask, pair_in_view
 from deepaccident_devkit.synth import SynthConfig
 from deepaccident_devkit.synth.collision import gap, separation
 from deepaccident_devkit.synth.plan import plan_scenarios
@@ -27,6 +26,7 @@ from deepaccident_devkit.synth.spec import DESIGNS
 from deepaccident_devkit.tables import visible_mask
 from deepaccident_devkit.tables.accidents import accident_type
 from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE, VEHICLE_AGENTS, frame_timestamp
+from deepaccident_devkit.v2x import accident_visible_mask, pair_in_view
 
 HERE = Path(__file__).parent
 PAGE, MEASURED = HERE / "synth.md", HERE / "synth_statistics.json"

@@ -4,12 +4,16 @@ A verb parses, makes one library call and prints. Exit status: 0 good, 1 finding
 """
 
 import logging
+import re
 import sys
+import warnings
+from typing import Any
 
 import click
 
 from deepaccident_devkit.cli.groups import ModuleVerbs
 from deepaccident_devkit.cli.versions import version_text
+from deepaccident_devkit.deprecations import DEPRECATED
 from deepaccident_devkit.errors import DeepAccidentError
 
 _ERROR_STATUS = 2
@@ -56,8 +60,23 @@ def deepaccident(context: click.Context, version: bool, every: bool) -> None:
 def main() -> None:
     """Run the command line; errors that the user can mend become one message and exit status 2."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    _show_deprecations()
     try:
         deepaccident()
     except (DeepAccidentError, OSError) as error:  # an OSError: a full disk, a folder without permission
         click.echo(f"error: {error}", err=True)
         sys.exit(_ERROR_STATUS)
+
+
+def _show_deprecations() -> None:
+    """Show our own deprecations as plain lines; Python hides them outside scripts."""
+    others = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+        if category is DeprecationWarning and re.match(DEPRECATED, str(message)):
+            click.echo(f"warning: {message}", err=True)
+        else:
+            others(message, category, *where, **more)
+
+    warnings.filterwarnings("always", DEPRECATED, DeprecationWarning)
+    warnings.showwarning = show

@@ -19,7 +19,7 @@ from deepaccident_devkit.cli.evaluate_options import (
 from deepaccident_devkit.cli.options import release_parameters
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation import Resampling
-from deepaccident_devkit.evaluation.metrics.attributes import ATTRIBUTES, EVERYTHING
+from deepaccident_devkit.evaluation.metrics.attributes import ATTRIBUTES, EVERYTHING, attribute_name
 from deepaccident_devkit.evaluation.results import Results, read_results
 from deepaccident_devkit.evaluation.runs import (
     EvaluationRun,
@@ -108,8 +108,10 @@ def _task_verb(task: TaskName) -> click.Command:
     @click.option(
         "--by",
         multiple=True,
-        type=click.Choice(ATTRIBUTES),
-        help="Also give the numbers for each value of this attribute; you can repeat this option.",
+        callback=lambda _context, _parameter, names: tuple(map(attribute_name, names)),
+        metavar="NAME",
+        help="Also give the numbers for each value of this attribute; you can repeat this option. One of "
+        f"{', '.join(ATTRIBUTES)}.",
     )
     @resamples_parameter
     @click.option(

@@ -5,7 +5,13 @@ from typing import Any, get_args
 
 import click
 
-from deepaccident_devkit.cli.options import agent_names, agents_parameter, frame_range, release_parameters
+from deepaccident_devkit.cli.options import (
+    agent_names,
+    agents_parameter,
+    frame_range_parameter,
+    old_frames_parameter,
+    release_parameters,
+)
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.export.mcap import McapConfig, export_mcap
@@ -43,7 +49,8 @@ def _points(context: click.Context, parameter: click.Parameter, value: str) -> s
     metavar="NAME[,NAME…]",
     help="Sensors, such as Camera_Front or lidar01.  [default: all]",
 )
-@click.option("--frames", callback=frame_range, metavar="FIRST..LAST", help="Frame numbers, from 1.  [default: all]")
+@frame_range_parameter
+@old_frames_parameter
 @click.option(
     "--points",
     callback=_points,
@@ -73,6 +80,7 @@ def mcap(
     agents: tuple[str, ...],
     channels: tuple[str, ...],
     results: Path | None,
+    old_frames: range | None,
     **options: Any,
 ) -> None:
     """Write one scenario of the release in DATAROOT as an MCAP file for Foxglove or rerun.
@@ -82,6 +90,7 @@ def mcap(
     """
     names = agent_names(agents)
     choices = {name: options.pop(name) for name in ("frames", "points", "labels", "motion_labels", "on_missing")}
+    choices["frames"] = choices["frames"] or old_frames
     choices["agents"] = None if names == AGENTS else names
     choices["channels"] = [name for text in channels for name in text.split(",")] if channels else None
     McapConfig.of(**choices)  # before the release is indexed

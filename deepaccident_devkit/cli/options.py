@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 import click
 
+from deepaccident_devkit.deprecations import warn_deprecated
 from deepaccident_devkit.taxonomy import AGENTS, VERSIONS
 from deepaccident_devkit.v2x import AGENT_SETS, AVAILABLE
 
@@ -102,7 +103,30 @@ def pixel_size(context: click.Context, parameter: click.Parameter, value: str | 
     return int(match[1]), int(match[2])
 
 
-def frame_range(context: click.Context, parameter: click.Parameter, value: str | None) -> range | None:
+def frame_range_parameter(verb: Verb) -> Verb:
+    """Give a verb `frames`, the numbers that --frame-range stands for, or None."""
+    option = click.option(
+        "--frame-range",
+        "frames",
+        callback=_frame_range,
+        metavar="FIRST..LAST",
+        help="Only these frames of a scenario, counted from 1.  [default: all]",
+    )
+    return option(verb)
+
+
+def old_frames_parameter(verb: Verb) -> Verb:
+    """Give a verb `old_frames`: --frames, which --frame-range replaces."""
+    return click.option("--frames", "old_frames", callback=_old_frames, hidden=True)(verb)
+
+
+def _old_frames(context: click.Context, parameter: click.Parameter, value: str | None) -> range | None:
+    if value is not None:
+        warn_deprecated("--frames FIRST..LAST", "--frame-range FIRST..LAST", since="0.1", gone_in="0.2")
+    return _frame_range(context, parameter, value)
+
+
+def _frame_range(context: click.Context, parameter: click.Parameter, value: str | None) -> range | None:
     """Parse `FIRST..LAST`, or one number; None stays."""
     if value is None:
         return None

@@ -11,7 +11,7 @@ import click
 
 from deepaccident_devkit.cli.options import (
     cooperating_parameter,
-    frame_range,
+    frame_range_parameter,
     names_or_configuration,
     pixel_size,
     release_parameters,
@@ -96,9 +96,6 @@ _LAYERS = click.option(
     multiple=True,
     metavar="NAME[,NAME…]",
     help=f"Only these layers. A view has some of {', '.join(LAYERS)}.",
-)
-_FRAMES = click.option(
-    "--frame-range", "frames", callback=frame_range, metavar="FIRST..LAST", help="Frames of a scenario."
 )
 
 
@@ -289,7 +286,7 @@ def _verb(name: str, picture: _Picture) -> click.Command:
         show_default=True,
         help="Pixels per inch; the text grows with it.",
     )
-    @_FRAMES
+    @frame_range_parameter
     def verb(
         tokens: tuple[str, ...],
         out: Path,
@@ -340,7 +337,7 @@ for _name, _picture in _PICTURES.items():
 )
 @_AGENTS
 @_LAYERS
-@_FRAMES
+@frame_range_parameter
 @click.option(
     "--size", callback=pixel_size, metavar="WxH", default="1280x720", show_default=True, help="Size in pixels."
 )

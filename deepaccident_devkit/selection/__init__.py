@@ -1,24 +1,33 @@
-"""Finding scenarios by their attributes: `da.find(...)`, the texts of `--where`, and whether an accident can be seen.
+"""Finding scenarios by their attributes: `da.find(...)`, the texts of `--where`, and the groups of `--by`.
 
-**Fields.** A filter names a field of the scenario table, or one that is derived from it:
+**Fields.** A filter names a column of the scenario table, or something that is derived from the table. `--by` of
+`deepaccident evaluate` takes the names marked ∗, with the same values; and `accident_visibility` of each sample.
 
 | field | values |
 |---|---|
-| `name`, `scenario_type` (short: `type`) | as the release names them |
-| `town`, `weather`, `time_of_day` | `Town03`; `HardRain`; `Noon`, `Sunset`, `Night` |
-| `road_type`, `spawn_side` | `four-way junction`, `three-way junction`; `left`, `right`, `opposite` |
-| `ego_direction`, `other_direction` | `straight`, `left`, `right` |
-| `split` | `train`, `val`, `test` |
-| `signalized`, `designed_accident` | true, false: traffic lights; an `_accident` folder |
-| `collision` | true, false: whether meta names a collision; unknown without meta |
-| `accident_type` | 1 to 12, the paper's design that the accident realises; unknown (none) for any other end |
+| `token`, `name`, `folder`, `scenario_type`∗ (short: `type`) | as the release names them |
+| `town`∗, `weather`∗, `time_of_day`∗ | `Town03`; `HardRain`; `Noon`, `Sunset`, `Night` |
+| `weather_group`∗, `time_of_day_group`∗ | `Clear`, `Cloudy`, `Rainy`; `Daytime`, `Night` (the released evaluation's) |
+| `road_type`∗, `spawn_side`∗ | `four-way junction`, `three-way junction`; `left`, `right`, `opposite` |
+| `ego_direction`∗, `other_direction`∗ | `straight`, `left`, `right` |
+| `trajectory_type`∗ | `straight_straight` (at four-way junctions alone), else `one_of_the_agents_turning` |
+| `split`∗ | `train`, `val`, `test` |
+| `signalized`∗, `designed_accident`∗ | true, false: traffic lights; an `_accident` folder |
+| `collision`∗ | true, false: whether meta names a collision; unknown without meta |
+| `collision_status`∗ | `no_collision`, `collides_with_pedestrian`, `collides_between_vehicles` |
+| `collision_ids`, `collision_classes`, `collision_agents` | of the colliding pair, one of which must match |
+| `contact_side`∗, `spawn_relation`∗, `impact` | as meta names them: `front_side` (or `front`); `same`; a number |
+| `closing_speed` | m/s with which the pair approaches at the last frame (`da.collision`) |
+| `accident_type`∗ | 1 to 12, the paper's design that the accident realises; unknown (none) for any other end |
 | `num_frames` (short: `length`) | recorded frames |
-| `visibility` | `visible`, `partial`, `invisible`: whether ego sees the accident coming (see `accident_visibility`) |
+| `accident_visibility` | `visible`, `partial`, `invisible`: whether ego sees it coming (`v2x.accident_visibility`) |
+| `velocity_frame`∗, `first_frame_token`, `last_frame_token` | as in the table |
 
 **Values.** One value, or a list, tuple or set of values, one of which must match; numpy's scalars count as Python's, an
-array is given as a list (`array.tolist()`). Numbers also as texts: `"40..60"` (both
-ends count; one may be left out), `">=50"`, `">50"`, `"<=50"`, `"<50"`. None, or the text `unknown` or `none`, stands
-for a value that is not known; no other value or range matches those. All filters of a call must hold.
+array is given as a list (`array.tolist()`). In words, case, `_`, `-` and blanks do not count. Numbers also as texts:
+`"40..60"` (both ends count; one may be left out), `">=50"`, `">50"`, `"<=50"`, `"<50"`. None, or the text `unknown` or
+`none`, stands for a value that is not known; no other value or range matches those. A function of the value stands for
+any test: `closing_speed=lambda speed: speed and speed > 10`. All filters of a call must hold.
 
 **Texts.** A filter may also be written as one text, which is what `--where` takes: `town=Town03,Town05` (any of),
 `weather!=Clear` (all that `weather=Clear` leaves out, unknown ones too), `length=40..60,80`, `length>=50`. Blanks
@@ -28,22 +37,12 @@ A field that does not exist is a FieldError, a value that the field cannot have 
 possible. A value that the whole release knows, but not the part that is here, is not an error: it matches nothing.
 """
 
-from deepaccident_devkit.selection.accident_visibility import (
-    accident_visibility,
-    accident_visible,
-    accident_visible_mask,
-    pair_in_view,
-)
 from deepaccident_devkit.selection.conditions import Filter, FilterValue, parse_where
 from deepaccident_devkit.selection.query import find
 
 __all__ = [
     "Filter",
     "FilterValue",
-    "accident_visibility",
-    "accident_visible",
-    "accident_visible_mask",
     "find",
-    "pair_in_view",
     "parse_where",
 ]

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import operator
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,12 +15,13 @@ from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.selection.fields import Field, Value
 from deepaccident_devkit.text import possible_text
 
-FilterValue = Value | Collection[Value]
-"""What a keyword of `find` takes: a value, or several values, one of which must match."""
+FilterValue = Value | Collection[Value] | Callable[[Any], object]
+"""What a keyword of `find` takes: a value; several values, one of which must match; or a test of the value."""
 
 _TEXT = re.compile(r"\s*(\w+)\s*(!=|>=|<=|=|>|<)(.*)", re.DOTALL)
-_RANGE = re.compile(r"(-?\d+)?\s*\.\.\s*(-?\d+)?")
-_BOUND = re.compile(r"(>=|<=|>|<)\s*(-?\d+)")
+_NUMBER = r"-?\d+(?:\.\d+)?"
+_RANGE = re.compile(rf"({_NUMBER})?\s*\.\.\s*({_NUMBER})?")
+_BOUND = re.compile(rf"(>=|<=|>|<)\s*({_NUMBER})")
 _UNKNOWN = ("unknown", "none")
 _FLAGS = {"true": True, "yes": True, "false": False, "no": False}
 _SINGLE = (str, bytes, bytearray, Mapping, np.ndarray)
@@ -57,12 +59,16 @@ class Condition:
 
     field: Field
     values: frozenset[Value]
-    ranges: tuple[tuple[int | None, int | None], ...]
+    ranges: tuple[tuple[float | None, float | None], ...]
     negated: bool
 
-    def holds(self, value: Value) -> bool:
-        """Whether a scenario with this value of the field is wanted."""
-        return (value in self.values or any(_within(value, *bounds) for bounds in self.ranges)) != self.negated
+    def holds(self, value: Value | tuple[Value, ...]) -> bool:
+        """Whether a scenario with this value of the field, or with these, is wanted."""
+        several = value if isinstance(value, tuple) else (value,)
+        return any(map(self._has, several)) != self.negated
+
+    def _has(self, value: Value) -> bool:
+        return value in self.values or any(_within(value, *bounds) for bounds in self.ranges)
 
 
 def parse_where(text: str) -> Filter:
@@ -93,7 +99,7 @@ def parse_where(text: str) -> Filter:
     return Filter(name, (f"{sign}{values[0]}",))
 
 
-def keyword_filter(name: str, value: FilterValue) -> Filter:
+def keyword_filter(name: str, value: Value | Collection[Value]) -> Filter:
     """The filter that a keyword of `find` stands for."""
     several = isinstance(value, Collection) and not isinstance(value, _SINGLE)
     return Filter(name, tuple(value) if several else (value,))  # type: ignore[arg-type]
@@ -137,19 +143,31 @@ def _single(field: Field, value: object, possible: list[str]) -> Value:
         if isinstance(flag, bool):
             return flag
         raise ChoiceError(f"{field.name}: expected true, false or unknown, found {_shown(value)}")
-    if field.kind == "number":
+    if field.kind in {"number", "measure"}:
         return _number(field, value)
-    if isinstance(value, str) and value in possible:
-        return value
+    if isinstance(value, str) and (word := _spelt(value, possible)) is not None:
+        return word
     meant = value if isinstance(value, str) and len(value) <= _LONGEST else ""
     raise ChoiceError(f"{field.name}: found {_shown(value)}; possible are {possible_text(meant, possible)}")
 
 
-def _number(field: Field, value: object) -> int:
-    number = None
+def _spelt(value: str, possible: Iterable[str]) -> str | None:
+    """The possible word that a value is; case, `_`, `-` and blanks do not count."""
+    words = {_bare(word): word for word in possible}
+    return value if value in words.values() else words.get(_bare(value))
+
+
+def _bare(word: str) -> str:
+    return re.sub(r"[\s_-]", "", word.casefold()).removesuffix("side")  # meta's front_side is also front
+
+
+def _number(field: Field, value: object) -> float:
+    number: float | None = None
     if isinstance(value, str):
-        if re.fullmatch(r"-?\d+", value) is not None:
-            number = _whole(field, value)
+        if re.fullmatch(_NUMBER, value) is not None:
+            number = _read_number(field, value)
+    elif field.kind == "measure" and isinstance(value, float) and math.isfinite(value):
+        number = value
     elif not isinstance(value, bool):
         try:
             number = operator.index(value)  # type: ignore[arg-type]
@@ -164,13 +182,17 @@ def _number(field: Field, value: object) -> int:
     return number
 
 
-def _whole(field: Field, digits: str) -> int:
+def _read_number(field: Field, digits: str) -> float:
     """The number that a sign and digits stand for; Python itself reads no more than 4300 digits."""
     if len(digits) > _MOST_DIGITS:
         raise ChoiceError(
             f"{field.name}: found a number of {len(digits)} characters, {_shown(digits)}; expected one of at most "
             f"{_MOST_DIGITS}"
         )
+    if field.kind == "measure":
+        return float(digits)
+    if "." in digits:
+        raise ChoiceError(f"{field.name}: expected a whole number, found {digits}")
     return int(digits)
 
 
@@ -183,20 +205,19 @@ def _shown(value: object) -> str:
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
 
 
-def _bounds(field: Field, text: str) -> tuple[int | None, int | None] | None:
+def _bounds(field: Field, text: str) -> tuple[float | None, float | None] | None:
     """The lowest and highest number that a text allows; None if it is no range."""
     text = text.strip()
     if (bound := _BOUND.fullmatch(text)) is not None:
-        number = _whole(field, bound[2])
-        ends = {">=": (number, None), ">": (number + 1, None), "<=": (None, number), "<": (None, number - 1)}[bound[1]]
+        ends = _ends(bound[1], _read_number(field, bound[2]))
     elif (between := _RANGE.fullmatch(text)) is not None:
         ends = (
-            _whole(field, between[1]) if between[1] else None,
-            _whole(field, between[2]) if between[2] else None,
+            _read_number(field, between[1]) if between[1] else None,
+            _read_number(field, between[2]) if between[2] else None,
         )
     else:
         return None
-    if field.kind != "number":
+    if field.kind not in {"number", "measure"}:
         raise ChoiceError(f"{field.name}: {_shown(text)} is a range, which only numbers have")
     lowest, highest = ends
     if lowest is not None and highest is not None and lowest > highest:
@@ -204,7 +225,15 @@ def _bounds(field: Field, text: str) -> tuple[int | None, int | None] | None:
     return ends
 
 
-def _within(value: Value, lowest: int | None, highest: int | None) -> bool:
-    if not isinstance(value, int):
+def _ends(sign: str, number: float) -> tuple[float | None, float | None]:
+    """The lowest and highest number, both allowed, that a bound stands for."""
+    if sign in {">", "<"}:
+        aside = math.inf if sign == ">" else -math.inf
+        number = number + int(math.copysign(1, aside)) if isinstance(number, int) else math.nextafter(number, aside)
+    return (number, None) if sign.startswith(">") else (None, number)
+
+
+def _within(value: Value, lowest: float | None, highest: float | None) -> bool:
+    if not isinstance(value, int | float):
         return False
     return (lowest is None or lowest <= value) and (highest is None or value <= highest)

@@ -1,22 +1,32 @@
-"""The fields that a scenario can be found by: where each value comes from and which values it can have."""
+"""The fields that a scenario can be found by and results be grouped by: one name and one set of values each."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from deepaccident_devkit import taxonomy
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.errors import FieldError
-from deepaccident_devkit.selection.accident_visibility import VISIBILITIES, accident_visibility
+from deepaccident_devkit.deprecations import warn_deprecated
+from deepaccident_devkit.errors import FieldError, NotAvailableError
+from deepaccident_devkit.tables.columns import Choice, Column, Number, Struct
+from deepaccident_devkit.tables.specs import table_spec
 from deepaccident_devkit.text import possible_text
+from deepaccident_devkit.v2x import accident_visibility, collision
+from deepaccident_devkit.v2x.accident_visibility import VISIBILITIES
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
 
-Value = str | int | bool | None
-_Read = Callable[[Dataset, "ScenarioRecord"], Value]
+Value = str | int | float | bool | None
+_Read = Callable[[Dataset, "ScenarioRecord"], Value | tuple[Value, ...]]
+Kind = Literal["word", "number", "measure", "flag"]
+
+STRAIGHT: Final = "straight_straight"
+TURNING: Final = "one_of_the_agents_turning"
+_WEATHER_GROUPS: Final = {"Rain": "Rainy", "Cloudy": "Cloudy", "Clear": "Clear"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,63 +35,158 @@ class Field:
 
     Attributes:
         name: as a filter names it.
-        kind: of its values.
-        read: its value of a scenario, None where unknown.
+        kind: of its values; a number is whole, a measure is a float.
+        read: its value of a scenario, None where unknown; several in a tuple, of which a filter wants one.
         known: the values it can have in the whole release; empty where that is not known or not limited.
         costly: whether reading it opens more than the scenario's record.
+        groups: whether it has so few values that results can be grouped by it.
     """
 
     name: str
-    kind: Literal["word", "number", "flag"]
+    kind: Kind
     read: _Read
     known: Sequence[str | int] = ()
     costly: bool = False
+    groups: bool = False
 
 
 def field_of(name: str) -> Field:
-    """The field that a filter names; raises FieldError."""
-    field = _FIELDS.get(_ALIASES.get(name, name))
+    """The field that a filter names; raises FieldError. An old name warns."""
+    field = FIELDS.get(current_name(name))
     if field is None:
-        possible = possible_text(name, [*_FIELDS, *_ALIASES])
+        possible = possible_text(name, [*FIELDS, *_SHORT])
         raise FieldError(f"scenarios cannot be found by '{name}'; the fields are {possible}")
     return field
 
 
-def _collision(_: Dataset, scenario: ScenarioRecord) -> bool | None:
-    return None if scenario["weather"] is None else scenario["collision"] is not None  # no weather: no meta
+def current_name(name: str) -> str:
+    """The full name of a field or attribute today, whatever the case of a given one; an old name warns."""
+    name = _SHORT.get(name.lower(), name.lower())
+    if name in _RENAMED:
+        warn_deprecated(f"the name '{name}'", f"'{_RENAMED[name]}'", since="0.1", gone_in="0.2")
+    return _RENAMED.get(name, name)
 
 
-def _visibility(dataset: Dataset, scenario: ScenarioRecord) -> str | None:
-    return accident_visibility(dataset, scenario)
+def group_texts(dataset: Dataset, scenario: ScenarioRecord) -> dict[str, str | None]:
+    """The values of a scenario for all fields that results can be grouped by, as texts; None unknown."""
+    return {name: _text(field.read(dataset, scenario)) for name, field in FIELDS.items() if field.groups}
 
 
-def _column(name: str) -> _Read:
+def _text(value: Any) -> str | None:
+    return None if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _column(column: Column) -> Field:
+    """The field that is a column of the scenario table."""
+    kind: Kind = "word"
+    if isinstance(column.kind, Number):
+        kind = "flag" if column.kind.dtype == "bool" else "number"
+    known = _KNOWN.get(column.field, column.kind.values if isinstance(column.kind, Choice) else ())
+
     def read(_: Dataset, scenario: ScenarioRecord) -> Any:
-        return scenario[name]  # type: ignore[literal-required]
+        return scenario[column.field]  # type: ignore[literal-required]
+
+    return Field(column.field, kind, read, known, groups=column.field in _FEW or bool(known) or kind == "flag")
+
+
+def _of_collision(name: str) -> _Read:
+    """What meta says of the collision; None without one."""
+
+    def read(_: Dataset, scenario: ScenarioRecord) -> Any:
+        told = scenario["collision"]
+        value = told and told[name]  # type: ignore[literal-required]
+        return tuple(value) if isinstance(value, list) else value
 
     return read
 
 
-_ALIASES = {"type": "scenario_type", "length": "num_frames"}
-_WORDS: dict[str, Sequence[str]] = {
-    "name": (),
-    "scenario_type": (),
+def _ended_in_collision(_: Dataset, scenario: ScenarioRecord) -> bool | None:
+    return None if scenario["weather"] is None else scenario["collision"] is not None  # no weather: no meta
+
+
+def _collision_status(_: Dataset, scenario: ScenarioRecord) -> str | None:
+    told = scenario["collision"]
+    if told is None:
+        return None if scenario["weather"] is None else "no_collision"
+    return "collides_with_pedestrian" if "pedestrian" in told["classes"] else "collides_between_vehicles"
+
+
+def _weather_group(_: Dataset, scenario: ScenarioRecord) -> str | None:
+    weather = scenario["weather"]
+    return weather and next((name for word, name in _WEATHER_GROUPS.items() if word in weather), weather)
+
+
+def _time_of_day_group(_: Dataset, scenario: ScenarioRecord) -> str | None:
+    time_of_day = scenario["time_of_day"]
+    return time_of_day and ("Night" if time_of_day == "Night" else "Daytime")
+
+
+def _trajectory_type(_: Dataset, scenario: ScenarioRecord) -> str | None:
+    road, directions = scenario["road_type"], (scenario["ego_direction"], scenario["other_direction"])
+    if road is None or None in directions:
+        return None
+    return STRAIGHT if road.startswith("four") and directions == ("straight", "straight") else TURNING
+
+
+def _accident_visibility(dataset: Dataset, scenario: ScenarioRecord) -> str | None:
+    return accident_visibility(dataset, scenario)
+
+
+def _closing_speed(dataset: Dataset, scenario: ScenarioRecord) -> float | None:
+    if scenario["collision"] is None:
+        return None
+    try:
+        contact = collision(dataset, scenario)
+    except NotAvailableError:  # no label shows the pair
+        return None
+    return None if contact is None or math.isnan(contact.closing_speed) else contact.closing_speed
+
+
+_SHORT = {"type": "scenario_type", "length": "num_frames"}
+_RENAMED = {"visibility": "accident_visibility", "junction": "road_type"}
+_FEW: Final = ("scenario_type", "town")
+"""Columns of words that are not limited, yet few."""
+_KNOWN: dict[str, Sequence[str | int]] = {
     "town": taxonomy.TOWNS,
     "weather": taxonomy.WEATHERS,
-    "time_of_day": taxonomy.TIMES_OF_DAY,
     "road_type": taxonomy.ROAD_TYPES,
     "spawn_side": taxonomy.SPAWN_SIDES,
     "ego_direction": taxonomy.DIRECTIONS,
     "other_direction": taxonomy.DIRECTIONS,
-    "split": taxonomy.SPLITS,
+    "accident_type": range(1, 13),
 }
-_ALL = (
-    *(Field(name, "word", _column(name), known) for name, known in _WORDS.items()),
-    Field("signalized", "flag", _column("signalized")),
-    Field("designed_accident", "flag", _column("designed_accident")),
-    Field("collision", "flag", _collision),
-    Field("accident_type", "number", _column("accident_type"), range(1, 13)),
-    Field("num_frames", "number", _column("num_frames")),
-    Field("visibility", "word", _visibility, VISIBILITIES, costly=True),
+_DERIVED = (
+    Field("weather_group", "word", _weather_group, tuple(_WEATHER_GROUPS.values()), groups=True),
+    Field("time_of_day_group", "word", _time_of_day_group, ("Daytime", "Night"), groups=True),
+    Field("trajectory_type", "word", _trajectory_type, (STRAIGHT, TURNING), groups=True),
+    Field("collision", "flag", _ended_in_collision, groups=True),
+    Field(
+        "collision_status",
+        "word",
+        _collision_status,
+        ("no_collision", "collides_with_pedestrian", "collides_between_vehicles"),
+        groups=True,
+    ),
+    Field("collision_ids", "number", _of_collision("ids")),
+    Field("collision_classes", "word", _of_collision("classes"), taxonomy.CATEGORIES),
+    Field("collision_agents", "word", _of_collision("agents"), taxonomy.VEHICLE_AGENTS),
+    Field("spawn_relation", "word", _of_collision("spawn_relation"), groups=True),
+    Field(
+        "contact_side",
+        "word",
+        _of_collision("contact_side"),
+        ("front_side", "rear_side", "left_side", "right_side"),
+        groups=True,
+    ),
+    Field("impact", "measure", _of_collision("impact")),
+    Field("closing_speed", "measure", _closing_speed, costly=True),
+    Field("accident_visibility", "word", _accident_visibility, VISIBILITIES, costly=True),
 )
-_FIELDS = {field.name: field for field in _ALL}
+FIELDS: Final = {
+    field.name: field
+    for field in (
+        *(_column(column) for column in table_spec("scenario").columns if not isinstance(column.kind, Struct)),
+        *_DERIVED,
+    )
+}
+"""All fields by name: the columns of the scenario table, and what is derived from them."""

@@ -2,36 +2,33 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from operator import itemgetter
+from typing import TYPE_CHECKING, Any
 
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.selection.conditions import (
-    Condition,
-    Filter,
-    FilterValue,
-    condition_of,
-    keyword_filter,
-    parse_where,
-)
-from deepaccident_devkit.selection.fields import field_of
+from deepaccident_devkit.selection.conditions import Filter, FilterValue, condition_of, keyword_filter, parse_where
+from deepaccident_devkit.selection.fields import Field, field_of
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
 
+_Test = Callable[["ScenarioRecord"], object]
 
-def find(dataset: Dataset, *where: str, **filters: FilterValue) -> list[ScenarioRecord]:
+
+def find(dataset: Dataset, *where: str | _Test, **filters: FilterValue) -> list[ScenarioRecord]:
     """The scenarios that meet all filters, in the order of the table; without filters all of them.
 
-    Fields: `name`, `scenario_type` (short `type`), `town`, `weather`, `time_of_day`, `road_type`, `spawn_side`,
-    `ego_direction`, `other_direction`, `split`, `signalized`, `designed_accident`, `collision` (bool), `accident_type`
-    (1 to 12), `num_frames` (short `length`) and `visibility` (`visible`, `partial`, `invisible`: whether ego sees the
-    accident coming). `deepaccident_devkit.selection` explains fields, values and texts in full.
+    Fields: every column of the scenario table (`town`, `weather`, `num_frames`, …); `collision` and what meta says of
+    it (`contact_side`, `impact`, `collision_classes`, …); the groups of `--by` (`weather_group`, …); `closing_speed` in
+    m/s; and `accident_visibility`. `deepaccident_devkit.selection` explains fields, values and texts in full.
 
     Args:
         dataset: the release.
-        where: filters as texts, as `--where` takes them: `town=Town03,Town05`, `weather!=Clear`, `length>=50`.
+        where: filters as texts, as `--where` takes them: `town=Town03,Town05`, `weather!=Clear`, `length>=50`; or as
+            functions of a scenario's record.
         filters: filters as keywords: field=value; a list, tuple or set for any of several; for numbers also `"40..60"`
-            and `">=50"`; None for unknown.
+            and `">=50"`; None for unknown; or a function of the field's value, which is None where unknown.
 
     Returns:
         Fresh records, the caller's own.
@@ -42,17 +39,32 @@ def find(dataset: Dataset, *where: str, **filters: FilterValue) -> list[Scenario
 
     Examples:
         >>> da.find(town=["Town03", "Town05"], collision=True, length="50..")  # doctest: +SKIP
-        >>> da.find("weather!=Clear", time_of_day="Night", visibility="invisible")  # doctest: +SKIP
+        >>> da.find("closing_speed>=10", time_of_day="Night", accident_visibility="invisible")  # doctest: +SKIP
+        >>> da.find(lambda scenario: scenario["ego_direction"] == scenario["other_direction"])  # doctest: +SKIP
     """
-    wanted = [*map(parse_where, where), *(keyword_filter(name, value) for name, value in filters.items())]
     scenarios = dataset.scenario[:]
-    conditions = [_condition(dataset, scenarios, one) for one in wanted]
-    for condition in sorted(conditions, key=lambda condition: condition.field.costly):
-        scenarios = [record for record in scenarios if condition.holds(condition.field.read(dataset, record))]
+    tests = [(False, each) if callable(each) else _test(dataset, scenarios, parse_where(each)) for each in where]
+    tests += [
+        _reading(dataset, field_of(name), value)
+        if callable(value)
+        else _test(dataset, scenarios, keyword_filter(name, value))
+        for name, value in filters.items()
+    ]
+    for _, holds in sorted(tests, key=itemgetter(0)):  # costly ones last, on the few that are left
+        scenarios = [record for record in scenarios if holds(record)]
     return scenarios
 
 
-def _condition(dataset: Dataset, scenarios: list[ScenarioRecord], wanted: Filter) -> Condition:
+def _test(dataset: Dataset, scenarios: list[ScenarioRecord], wanted: Filter) -> tuple[bool, _Test]:
+    """Whether a filter is costly, and the test of a record that it comes to."""
     field = field_of(wanted.name)
-    known_are_all = field.costly or field.kind != "word"
-    return condition_of(wanted, field, () if known_are_all else (field.read(dataset, one) for one in scenarios))
+    here: set[Any] = set()
+    if field.kind == "word" and not field.costly:
+        for scenario in scenarios:
+            value = field.read(dataset, scenario)
+            here.update(value if isinstance(value, tuple) else (value,))
+    return _reading(dataset, field, condition_of(wanted, field, here).holds)
+
+
+def _reading(dataset: Dataset, field: Field, holds: Callable[[Any], object]) -> tuple[bool, _Test]:
+    return field.costly, lambda scenario: holds(field.read(dataset, scenario))

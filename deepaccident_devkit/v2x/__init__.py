@@ -1,6 +1,6 @@
 """Agents and their links: who cooperates, what they see together, and where everything is."""
 
-from deepaccident_devkit.selection import (
+from deepaccident_devkit.v2x.accident_visibility import (
     accident_visibility,
     accident_visible,
     accident_visible_mask,

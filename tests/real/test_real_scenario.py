@@ -269,7 +269,7 @@ def test_it_can_be_exported_to_mcap(real: DeepAccident, tmp_path: Path) -> None:
     """Of frame 51 all clouds and the pole's images are there; what is not there is left out and told."""
     mcap_reading = pytest.importorskip("mcap_reading")
     out, index = tmp_path / "real.mcap", str(real.tables_folder.parents[1])
-    arguments = ["export", "mcap", str(real.dataroot), TOKEN, "--index-dir", index, "--frames", "50..52"]
+    arguments = ["export", "mcap", str(real.dataroot), TOKEN, "--index-dir", index, "--frame-range", "50..52"]
     result = CliRunner().invoke(deepaccident, [*arguments, "--out", str(out)], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     messages = mcap_reading.read_mcap(out).messages

@@ -8,9 +8,13 @@ from tiny import META, NAME, TYPE, label_lines, write_tiny_release
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, DeepAccidentError, FieldError
-from deepaccident_devkit.overview import overview
-from deepaccident_devkit.selection import Filter, accident_visibility, accident_visible, parse_where
-from deepaccident_devkit.selection.accident_visibility import SHEER_CURTAINS
+from deepaccident_devkit.evaluation.metrics.attributes import ATTRIBUTES
+from deepaccident_devkit.overview import _counts, overview
+from deepaccident_devkit.selection import Filter, parse_where
+from deepaccident_devkit.selection.fields import FIELDS, group_texts
+from deepaccident_devkit.tables.records import CollisionRecord, ScenarioRecord
+from deepaccident_devkit.v2x import accident_visibility, accident_visible
+from deepaccident_devkit.v2x.accident_visibility import SHEER_CURTAINS
 
 QUIET = "ClearNight -1 -1 -1 -1 -1 -1 -1 15\n"
 NORMAL = "type1_subtype2_normal"
@@ -79,10 +83,105 @@ def numbers(da: DeepAccident, *where: str, **filters) -> list[int]:
         (("town=Town07",), {"town": "Town07"}, []),
         (("town=Town03", "town=Town05"), {"town": []}, []),
         ((f"name={named('Town05', 4)}",), {"name": named("Town05", 4)}, [4]),
+        (("TOWN=town05",), {"Town": "TOWN05"}, [4]),
+        (("weather=hard_rain",), {"weather": "hardrain"}, [1]),
+        (("road_type=Four_Way_Junction",), {"road_type": "four way junction"}, [1, 4]),
+        (("weather_group=Clear,Rainy",), {"weather_group": ["clear", "RAINY"]}, [1, 2, 5]),
+        (("weather_group=Wet",), {"weather_group": "Wet"}, [4]),
+        (("time_of_day_group=Daytime",), {"time_of_day_group": "Daytime"}, [1, 4]),
+        (("collision_status=collides_between_vehicles",), {"collision_status": "collides_between_vehicles"}, [1, 4]),
+        (("collision_status=unknown",), {"collision_status": None}, [3]),
+        (("trajectory_type=straight_straight",), {"trajectory_type": "straight_straight"}, [1, 4]),
+        (("contact_side=front_side",), {"contact_side": "Front"}, [1, 4]),
+        (("contact_side=left",), {"contact_side": "rear_side"}, []),
+        (("contact_side!=unknown",), {"spawn_relation": "same"}, [1, 4]),
+        (("collision_ids=1300",), {"collision_ids": {1300, 5}}, [4]),
+        (("collision_ids>1250",), {"collision_ids": "1251.."}, [4]),
+        (("collision_agents=ego_vehicle", "length<5"), {"collision_agents": "ego_vehicle", "length": 4}, [1]),
+        (("collision_classes!=car",), {"collision_classes": None}, [2, 3, 5]),
+        (("impact>6790.1", "impact<6790.2"), {"impact": "6790.1..6790.2"}, [1, 4]),
+        (("impact>=6790.168605131015",), {"impact": 6790.168605131015}, [1, 4]),
+        (("impact>6790.168605131015",), {"impact": "<6790.168605131015"}, []),
+        (("closing_speed=unknown", "length>4"), {"closing_speed": None, "length": "5.."}, [2, 3, 5]),
+        (("velocity_frame=unknown",), {"velocity_frame": None}, [1, 2, 3, 4, 5]),
+        (("length=..5",), {"length": lambda frames: frames <= 5}, [1, 2]),
     ],
 )
 def test_texts_and_keywords_find_the_same(da: DeepAccident, where, filters, found: list[int]) -> None:
     assert numbers(da, *where) == numbers(da, **filters) == found
+
+
+def test_functions_of_records_and_of_values(da: DeepAccident) -> None:
+    assert numbers(da, lambda scenario: scenario["num_frames"] % 2 == 0) == [1, 3, 5]
+    assert numbers(da, "town=Town03", lambda scenario: scenario["collision"] is None, length=lambda n: n > 5) == [3]
+    assert numbers(da, collision=lambda ended: ended is None) == [3]
+    scenario = da.find(lambda scenario: scenario.update(town="changed") or True)[0]
+    assert scenario["town"] == "changed" != da.scenario[0]["town"]
+
+
+def test_closing_speed_is_the_contacts(da_motion: DeepAccident) -> None:
+    (accident,) = (one for one in da_motion.scenario if one["collision"])
+    contact = da_motion.collision(accident)
+    assert contact is not None
+    speed = contact.closing_speed
+    assert speed > 1
+    assert da_motion.find(closing_speed=speed) == da_motion.find(f"closing_speed>{speed - 0.01:.4f}") == [accident]
+    assert da_motion.find(f"closing_speed>{speed + 0.01:.4f}") == []
+    assert accident not in da_motion.find(closing_speed=None)
+
+
+def test_every_column_is_a_field_and_every_group_of_a_breakdown_of_scenarios_too(da: DeepAccident) -> None:
+    fields = set(FIELDS)
+    assert set(ScenarioRecord.__annotations__) <= fields
+    assert {"ids", "classes", "agents"} | set(CollisionRecord.__annotations__) & fields == set(
+        CollisionRecord.__annotations__
+    )
+    of_samples = {"all", "agent", "accident_visibility", "time_to_impact", "impact_step", "time_to_end"}
+    assert set(ATTRIBUTES) - of_samples < fields
+    stories = {one["token"]: group_texts(da, one) for one in da.scenario}
+    for name in set(ATTRIBUTES) - of_samples:
+        for value in {story[name] for story in stories.values()}:
+            found = {one["token"] for one in da.find(f"{name}={value or 'unknown'}")}
+            assert found == {token for token, story in stories.items() if story[name] == value}
+
+
+def test_the_released_evaluations_groups(da: DeepAccident) -> None:
+    (accident,) = da.find(length=4)
+
+    def story(**changes) -> dict[str, str | None]:
+        return group_texts(da, accident | changes)  # type: ignore[arg-type]
+
+    assert (
+        story().items()
+        >= {
+            "weather_group": "Rainy",
+            "time_of_day_group": "Daytime",
+            "collision": "true",
+            "collision_status": "collides_between_vehicles",
+            "trajectory_type": "straight_straight",
+            "accident_type": "1",
+        }.items()
+    )
+    assert story(weather="WetCloudy")["weather_group"] == "Cloudy"
+    assert story(weather="Wet")["weather_group"] == "Wet"
+    assert story(time_of_day="Sunset")["time_of_day_group"] == "Daytime"
+    assert story(time_of_day="Night")["time_of_day_group"] == "Night"
+    assert story(collision=None)["collision_status"] == "no_collision"
+    pedestrian = accident["collision"] | {"classes": ["car", "pedestrian"]}
+    assert story(collision=pedestrian)["collision_status"] == "collides_with_pedestrian"
+    assert story(road_type="three-way junction")["trajectory_type"] == "one_of_the_agents_turning"
+    assert story(other_direction="left")["trajectory_type"] == "one_of_the_agents_turning"
+    assert story(other_direction=None)["trajectory_type"] is None
+    unknown = story(weather=None, time_of_day=None, collision=None, road_type=None)
+    names = ("weather_group", "time_of_day_group", "collision", "collision_status", "road_type", "trajectory_type")
+    assert [unknown[name] for name in names] == [None] * 6
+
+
+@pytest.mark.parametrize(("old", "new"), [("visibility", "accident_visibility"), ("junction", "road_type")])
+def test_old_names_warn(da: DeepAccident, old: str, new: str) -> None:
+    with pytest.warns(DeprecationWarning, match=f"the name '{old}' is deprecated .* use '{new}'") as told:
+        assert da.find(f"{old}=unknown") == da.find(f"{new}=unknown")
+    assert [each.filename for each in told] == [__file__]
 
 
 @pytest.mark.parametrize("field", ["weather=Wet", "length=5..7", "collision=true", "accident_type=1", "town=Town07"])
@@ -124,16 +223,18 @@ def test_texts_that_are_no_filter(text: str) -> None:
 def test_what_is_impossible_is_named_with_what_is_possible(da: DeepAccident) -> None:
     with pytest.raises(FieldError, match=r"cannot be found by 'wether'; the fields are weather, "):
         da.find(wether="Clear")
-    with pytest.raises(FieldError, match="cannot be found by 'token'"):
-        da.find("token=1")
-    with pytest.raises(ChoiceError, match=r"weather: found 'hardrain'; possible are HardRain, .*WetCloudy"):
-        da.find(weather="hardrain")
+    with pytest.raises(FieldError, match="cannot be found by 'frame'"):
+        da.find("frame=1")
+    with pytest.raises(ChoiceError, match=r"weather: found 'heavyrain'; possible are HardRain, .*WetCloudy"):
+        da.find(weather="heavyrain")
     with pytest.raises(ChoiceError, match="town: found '='; possible are Town01"):
         da.find("town==")
     with pytest.raises(ChoiceError, match=r"scenario_type: found 'normal'; possible are .*type1_subtype2_normal"):
         da.find(type="normal")
-    with pytest.raises(ChoiceError, match="visibility: found 'seen'; possible are visible, partial, invisible"):
-        da.find(visibility="seen")
+    with pytest.raises(
+        ChoiceError, match="accident_visibility: found 'seen'; possible are visible, partial, invisible"
+    ):
+        da.find(accident_visibility="seen")
     with pytest.raises(ChoiceError, match="collision: expected true, false or unknown, found 'maybe'"):
         da.find("collision=maybe")
     with pytest.raises(ChoiceError, match="signalized: expected true, false or unknown, found 1"):
@@ -174,7 +275,7 @@ def test_numpys_scalars_are_as_pythons(da: DeepAccident, field: str, value) -> N
     assert numbers(da, **{field: value}) == numbers(da, **{field: plain}) != []
 
 
-@pytest.mark.parametrize("field", ["town", "num_frames", "accident_type", "collision", "visibility"])
+@pytest.mark.parametrize("field", ["town", "num_frames", "accident_type", "collision", "accident_visibility"])
 @pytest.mark.parametrize(
     "value",
     [
@@ -301,8 +402,8 @@ def test_an_agent_must_see_by_itself_and_need_not_see_itself(tmp_path: Path) -> 
 def test_visibility_of_a_scenario(tmp_path: Path, seen_at: set[int], expected: str) -> None:
     da = released(tmp_path, seen_at)
     assert accident_visibility(da, da.scenario[0]) == expected
-    assert len(da.find(visibility=expected)) == 1
-    assert da.find(f"visibility!={expected}") == da.find(visibility=None) == []
+    assert len(da.find(accident_visibility=expected)) == 1
+    assert da.find(f"accident_visibility!={expected}") == da.find(accident_visibility=None) == []
 
 
 @pytest.mark.parametrize("name", SHEER_CURTAINS)
@@ -316,7 +417,7 @@ def test_without_a_collision_every_sample_is_seen_but_no_scenario_has_a_visibili
     da = released(tmp_path, set(), frames=12, meta=QUIET)
     assert at(da, 7)
     assert accident_visibility(da, da.scenario[0]) is None
-    assert len(da.find(visibility=None)) == 1
+    assert len(da.find(accident_visibility=None)) == 1
 
 
 @pytest.mark.parametrize(
@@ -331,7 +432,7 @@ def test_what_cannot_be_told_is_unknown(tmp_path: Path, options: dict) -> None:
     da = released(tmp_path, set(range(41)), frames=12, **options)
     assert at(da, 7) is None
     assert accident_visibility(da, da.scenario[0]) is None
-    assert da.find(visibility=("visible", "partial", "invisible")) == []
+    assert da.find(accident_visibility=("visible", "partial", "invisible")) == []
 
 
 def test_a_release_without_ego_and_a_recording_too_short_have_no_visibility(tmp_path: Path) -> None:
@@ -339,3 +440,7 @@ def test_a_release_without_ego_and_a_recording_too_short_have_no_visibility(tmp_
     assert accident_visibility(without_ego, without_ego.scenario[0]) is None
     short = released(tmp_path / "b", set(range(41)), frames=4)
     assert accident_visibility(short, f"{TYPE}/{NAME}") is None
+
+
+def test_an_overview_sorts_numbers_by_size_and_unknown_ones_last() -> None:
+    assert list(_counts([10, 2, None, 2, 1])) == ["1", "2", "10", "none"]

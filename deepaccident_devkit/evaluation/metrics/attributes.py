@@ -1,4 +1,4 @@
-"""The attributes by which results are broken down: place, weather, story, and how near the accident is."""
+"""The attributes by which results are broken down: those of scenarios (`selection`), and of samples."""
 
 from __future__ import annotations
 
@@ -8,16 +8,15 @@ from typing import TYPE_CHECKING, Final
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.selection import accident_visible
+from deepaccident_devkit.selection.fields import FIELDS, current_name, group_texts
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.text import possible_text
+from deepaccident_devkit.v2x import accident_visible
 
 if TYPE_CHECKING:
-    from deepaccident_devkit.tables.records import SampleRecord, ScenarioRecord
+    from deepaccident_devkit.tables.records import SampleRecord
 
 _FRAMES_PER_SECOND: Final = round(1 / FRAME_PERIOD)
-_WEATHER_GROUPS: Final = {"Rain": "Rainy", "Cloudy": "Cloudy", "Clear": "Clear"}
-STRAIGHT: Final = "straight_straight"
-TURNING: Final = "one_of_the_agents_turning"
 NO_IMPACT: Final = "no impact"
 WITHIN_RECORDINGS: Final = ("time_to_impact", "impact_step", "time_to_end", "accident_visibility")
 """Attributes that differ within a recording: of no use to a task on whole recordings."""
@@ -34,44 +33,14 @@ def cluster_of(scenario: str) -> str:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ScenarioAttributes:
-    """What a scenario's name and meta file say, in the released evaluation's words; None unknown.
-
-    See docs/released_code.md, Visibility and attributes.
-
-    Attributes:
-        scenario_type: such as `type1_subtype1_accident`.
-        town: such as `Town03`.
-        weather: as meta has it, such as `HardRain`.
-        weather_group: `Rainy`, `Cloudy` or `Clear`, by the word in it; a weather with none of them stays as it is.
-        time_of_day: `Noon`, `Sunset` or `Night`.
-        time_of_day_group: `Night`, or `Daytime` for all else.
-        collision_status: `no_collision`, `collides_with_pedestrian` or `collides_between_vehicles`.
-        junction: `four_way_junction` or `three_way_junction`.
-        trajectory_type: `straight_straight` if both drive straight on at a four-way junction, else
-            `one_of_the_agents_turning`: also where both drive straight on at a three-way one.
-    """
-
-    scenario_type: str
-    town: str
-    weather: str | None
-    weather_group: str | None
-    time_of_day: str | None
-    time_of_day_group: str | None
-    collision_status: str | None
-    junction: str | None
-    trajectory_type: str | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class SampleAttributes:
     """The attributes of a sample.
 
     Attributes:
         scenario: token of its scenario.
         agent: whose it is.
-        story: what its scenario's name and meta say.
-        accident_visibility: `visible` or `invisible`, by the released rule (`selection.accident_visible`); None where
+        story: the values of its scenario, by name (`deepaccident_devkit.selection` explains them); None unknown.
+        accident_visibility: `visible` or `invisible`, by the released rule (`v2x.accident_visible`); None where
             that cannot be told.
         time_to_impact: `k s`: the recorded impact is more than k − 1 s ahead and at most k s; `no impact` if nobody
             collides, None without meta.
@@ -81,7 +50,7 @@ class SampleAttributes:
 
     scenario: str
     agent: str
-    story: ScenarioAttributes
+    story: Mapping[str, str | None]
     accident_visibility: str | None
     time_to_impact: str | None
     impact_step: str | None
@@ -90,24 +59,25 @@ class SampleAttributes:
     def value(self, name: str) -> str | None:
         """The value of one of `ATTRIBUTES`; None where it is not known. Raises ChoiceError."""
         if name not in ATTRIBUTES:
-            raise ChoiceError(f"by: expected one of {', '.join(ATTRIBUTES)}, found {name!r}")
+            name = attribute_name(name)
         if name == EVERYTHING:
             return EVERYTHING
-        value: str | None = getattr(self.story if name in ScenarioAttributes.__dataclass_fields__ else self, name)
+        value: str | None = getattr(self, name) if name in _OF_SAMPLES else self.story[name]
         return value
 
 
 EVERYTHING: Final = "all"
-ATTRIBUTES: Final = (
-    EVERYTHING,
-    *ScenarioAttributes.__dataclass_fields__,
-    "agent",
-    "accident_visibility",
-    "time_to_impact",
-    "impact_step",
-    "time_to_end",
-)
+_OF_SAMPLES: Final = ("agent", "accident_visibility", "time_to_impact", "impact_step", "time_to_end")
+ATTRIBUTES: Final = (EVERYTHING, *(name for name, field in FIELDS.items() if field.groups), *_OF_SAMPLES)
 """What results can be broken down by; `all` is not to break them down."""
+
+
+def attribute_name(name: str) -> str:
+    """The one of `ATTRIBUTES` that a name stands for, whatever its case; an old name warns. Raises ChoiceError."""
+    known = current_name(name)
+    if known not in ATTRIBUTES:
+        raise ChoiceError(f"by: expected one of {possible_text(name, ATTRIBUTES)}, found {name!r}")
+    return known
 
 
 def sample_attributes(dataset: Dataset, tokens: Iterable[str]) -> dict[str, SampleAttributes]:
@@ -116,34 +86,20 @@ def sample_attributes(dataset: Dataset, tokens: Iterable[str]) -> dict[str, Samp
     Raises:
         TokenError: no such sample.
     """
-    stories: dict[str, ScenarioAttributes] = {}
+    stories: dict[str, dict[str, str | None]] = {}
     result = {}
     for token in tokens:
         sample = dataset.sample.get(token)
-        scenario = dataset.scenario.get(sample["scenario_token"])
-        story = stories.setdefault(scenario["token"], scenario_attributes(scenario))
-        result[token] = _attributes(sample, story, visible=accident_visible(dataset, token))
+        scenario = sample["scenario_token"]
+        if scenario not in stories:
+            stories[scenario] = group_texts(dataset, dataset.scenario.get(scenario))
+        result[token] = _attributes(sample, stories[scenario], visible=accident_visible(dataset, token))
     return result
-
-
-def scenario_attributes(scenario: ScenarioRecord) -> ScenarioAttributes:
-    """The attributes of a scenario's record."""
-    weather, time_of_day, road = scenario["weather"], scenario["time_of_day"], scenario["road_type"]
-    return ScenarioAttributes(
-        scenario_type=scenario["scenario_type"],
-        town=scenario["town"],
-        weather=weather,
-        weather_group=weather and next((name for word, name in _WEATHER_GROUPS.items() if word in weather), weather),
-        time_of_day=time_of_day,
-        time_of_day_group=time_of_day and ("Night" if time_of_day == "Night" else "Daytime"),
-        collision_status=_collision_status(scenario),
-        junction=road and road.replace("-", "_").replace(" ", "_"),
-        trajectory_type=_trajectory_type(scenario),
-    )
 
 
 def tokens_by_value(attributes: Mapping[str, SampleAttributes], name: str) -> dict[str | None, list[str]]:
     """The samples that have each value of an attribute; values in the order met. Raises ChoiceError."""
+    name = attribute_name(name)
     result: dict[str | None, list[str]] = {}
     for token, each in attributes.items():
         result.setdefault(each.value(name), []).append(token)
@@ -155,10 +111,10 @@ def time_bin(frames: int, width: int) -> str:
     return f"{-(-frames // width) * width / _FRAMES_PER_SECOND:g} s"
 
 
-def _attributes(sample: SampleRecord, story: ScenarioAttributes, *, visible: bool | None) -> SampleAttributes:
+def _attributes(sample: SampleRecord, story: Mapping[str, str | None], *, visible: bool | None) -> SampleAttributes:
     ahead, left = sample["time_to_impact"], sample["time_to_end"]
     frames = None if ahead is None else round(ahead * _FRAMES_PER_SECOND)
-    without = None if story.collision_status is None else NO_IMPACT
+    without = None if story["collision_status"] is None else NO_IMPACT
     return SampleAttributes(
         scenario=sample["scenario_token"],
         agent=sample["agent"],
@@ -168,17 +124,3 @@ def _attributes(sample: SampleRecord, story: ScenarioAttributes, *, visible: boo
         impact_step=without if frames is None else time_bin(frames, _FRAMES_PER_SECOND // 2),
         time_to_end=f"{left:.1f}",
     )
-
-
-def _collision_status(scenario: ScenarioRecord) -> str | None:
-    collision = scenario["collision"]
-    if collision is None:
-        return None if scenario["weather"] is None else "no_collision"  # no weather: no meta
-    return "collides_with_pedestrian" if "pedestrian" in collision["classes"] else "collides_between_vehicles"
-
-
-def _trajectory_type(scenario: ScenarioRecord) -> str | None:
-    road, directions = scenario["road_type"], (scenario["ego_direction"], scenario["other_direction"])
-    if road is None or None in directions:
-        return None
-    return STRAIGHT if road.startswith("four") and directions == ("straight", "straight") else TURNING

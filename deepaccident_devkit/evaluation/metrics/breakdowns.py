@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.metrics.attributes import SampleAttributes, cluster_of, tokens_by_value
+from deepaccident_devkit.evaluation.metrics.attributes import (
+    SampleAttributes,
+    attribute_name,
+    cluster_of,
+    tokens_by_value,
+)
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
 from deepaccident_devkit.evaluation.metrics.intervals import Resampling, intervals_of
 from deepaccident_devkit.taxonomy import INFRASTRUCTURE
+from deepaccident_devkit.text import natural_order
 
 Result = TypeVar("Result")
 
@@ -71,13 +76,14 @@ def breakdown(
     Args:
         evaluator: with all samples counted.
         attributes: of its samples, from `sample_attributes`; those of other samples are ignored.
-        by: one of `sample_attributes.ATTRIBUTES`; `all` for one group.
+        by: one of `attributes.ATTRIBUTES`; `all` for one group.
         resampling: how to make intervals; None for the defaults.
 
     Raises:
         ChoiceError: no such attribute.
         EvaluationError: a sample's attributes are missing.
     """
+    by = attribute_name(by)
     missing = sorted(evaluator.tokens - attributes.keys())
     if missing:
         raise EvaluationError(
@@ -95,7 +101,7 @@ def breakdown(
 def _groups(
     evaluator: Evaluator[Result], attributes: Mapping[str, SampleAttributes], by: str, resampling: Resampling
 ) -> tuple[Group[Result], ...]:
-    by_value = sorted(tokens_by_value(attributes, by).items(), key=lambda item: _rank(item[0]))
+    by_value = sorted(tokens_by_value(attributes, by).items(), key=lambda item: natural_order(item[0]))
     return tuple(_group(evaluator, value, tokens, attributes, resampling) for value, tokens in by_value)
 
 
@@ -121,12 +127,3 @@ def _group(
         intervals=made.ends,
         notes=made.notes,
     )
-
-
-def _rank(value: str | None) -> tuple[bool, float, str]:
-    """Texts in alphabetical order, times by their length, unknown values last."""
-    text = value or ""
-    try:
-        return value is None, float(text.split(" ")[0]), text
-    except ValueError:
-        return value is None, math.inf, text

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.metrics.attributes import WITHIN_RECORDINGS, SampleAttributes
+from deepaccident_devkit.evaluation.metrics.attributes import WITHIN_RECORDINGS, SampleAttributes, attribute_name
 from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown, Group, breakdown
 from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import plain
@@ -36,7 +36,7 @@ BREAKDOWNS: Final = (
     "town",
     "weather_group",
     "time_of_day_group",
-    "junction",
+    "road_type",
     "trajectory_type",
     "collision_status",
 )
@@ -180,7 +180,7 @@ class EvaluationRun:
         Raises:
             ChoiceError: no such attribute.
         """
-        chosen = breakdowns_of(self.setup.task) if by is None else by
+        chosen = breakdowns_of(self.setup.task) if by is None else map(attribute_name, by)
         work = partial(breakdown, self.evaluator, self.attributes, resampling=resampling)
         return replace(self, breakdowns=tuple(run_batch(work, list(dict.fromkeys(chosen)), workers=workers)))
 

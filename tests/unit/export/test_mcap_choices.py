@@ -261,7 +261,7 @@ def test_the_configuration_is_in_order_and_of_all_agents() -> None:
 
 def test_the_verb_writes_the_first_accident(da: DeepAccident, tmp_path: Path) -> None:
     out = tmp_path / "a.mcap"
-    arguments = ["mcap", da.dataroot, "--out", out, "--frames", "2..3", "--channels", "lidar01", "--points", "10"]
+    arguments = ["mcap", da.dataroot, "--out", out, "--frame-range", "2..3", "--channels", "lidar01", "--points", "10"]
     done = CliRunner().invoke(export, [str(each) for each in (*arguments, "--agents", "ego_vehicle,infrastructure")])
     assert done.exit_code == 0, done.output
     first = next(record["token"] for record in da.scenario if record["collision"] is not None)
@@ -277,7 +277,17 @@ def test_the_verb_takes_a_scenario_and_predictions(da: DeepAccident, tmp_path: P
     token, out = da.scenario[1]["token"], tmp_path / "a.mcap"
     with ResultsWriter(tmp_path / "results.json", "accident") as writer:
         writer.add(f"{token}/ego_vehicle/002", [])
-    arguments = [da.dataroot, token, "--out", out, "--no-labels", "--frames", 2, "--results", tmp_path / "results.json"]
+    arguments = [
+        da.dataroot,
+        token,
+        "--out",
+        out,
+        "--no-labels",
+        "--frame-range",
+        2,
+        "--results",
+        tmp_path / "results.json",
+    ]
     done = CliRunner().invoke(export, ["mcap", *map(str, arguments), "--channels", "Camera_Front"])
     assert done.exit_code == 0, done.output
     file = read_mcap(out)
@@ -289,7 +299,7 @@ def test_the_verb_takes_a_scenario_and_predictions(da: DeepAccident, tmp_path: P
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (["--frames", "4..2"], "expected frame numbers such as 20..40, found '4..2'"),
+        (["--frame-range", "4..2"], "expected frame numbers such as 20..40, found '4..2'"),
         (["--points", "few"], "expected all, or a number for every n-th point, found 'few'"),
         (["--agents", "nobody"], "found 'nobody'"),
     ],

@@ -11,7 +11,7 @@ from deepaccident_devkit.evaluation.metrics.attributes import (
     tokens_by_value,
 )
 from deepaccident_devkit.motion import samples
-from deepaccident_devkit.selection import accident_visible
+from deepaccident_devkit.v2x import accident_visible
 
 
 @pytest.mark.parametrize(
