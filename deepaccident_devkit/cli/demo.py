@@ -32,14 +32,14 @@ if TYPE_CHECKING:
 
 _SCENARIO: Final = """\
 # The accident of `deepaccident demo`: in clear weather, by day, the other car runs a red light. A house hides it from
-# ego until two seconds before the impact; from then on it is in ego's front camera.
+# ego until about 2.5 s before the impact; from then on it is in ego's front camera.
 name: demo
 road: {kind: four-way, signalized: true, lanes: 1}
 view: hidden
 actors:
   - {role: ego, from: west, max_speed: 10}
   - {role: ego_behind, gap: [8, 16]}
-  - {role: other, from: south, max_speed: 4.5, ignores: [signal]}
+  - {role: other, from: south, max_speed: 4, ignores: [signal]}
   - {role: other_behind, gap: [8, 16]}
 meet: {actors: [ego, other], offset: [-0.2, 0.2]}
 background: {vehicles: [6, 12], two_wheelers: [2, 6], parked: [3, 9], walking: [3, 9], crossing: [1, 4]}
@@ -51,7 +51,7 @@ _MARK: Final = ".deepaccident_demo"
 """The file by which the demo knows a folder as its own."""
 _SCENARIO_FILE: Final = "accident.yaml"
 _RESULTS: Final = "single_vehicle.json"
-_COUNTDOWN: Final = (3.0, 1.5, 1.0, 0.5, 0.0)
+_COUNTDOWN: Final = (3.0, 2.0, 1.0, 0.5, 0.0)
 """Seconds before the impact; at the first the house hides the other car from ego."""
 _SECONDS_BEFORE: Final = 1.0
 _LABELS: Final = MotionLabelConfig(future_frames=2)

@@ -15,7 +15,8 @@ _POLICY: Final = "default-src 'none'; img-src 'self' file:; frame-src 'self' fil
 """A browser loads only what lies beside the page, on a disk or a server; only the pages in frames run anything."""
 _TABLE: Final = """\
 How well one car and five agents together predict the crash. The predictor is a baseline: each actor that is seen \
-keeps its speed. "warning" is the time before the impact from which on every moment has the right alarm."""
+keeps its speed. IoU and VPQ measure the predicted maps, APA the predicted accidents. "warning" is the time before \
+the impact from which on every moment has the right alarm."""
 _REPLAY: Final = "Press Play, or drag the slider: all five cameras, the scene from above, and who sees whom."
 _REPORT: Final = """\
 The predictions of each agent alone, for both scenarios: what it foresees, what it misses, how often its alarm is \
@@ -58,7 +59,7 @@ def demo_page(pictures: Sequence[Picture], rows: Sequence[HiddenCollider], steps
         rows: of `demo_table`.
         steps: what to try next.
     """
-    heading, *lines = table_rows(rows)
+    heading, *lines = zip(*table_rows(rows), strict=True)  # a column for each set of agents: it fits a narrow window
     parts = [
         *((each.heading, each.sentence, _image(each)) for each in pictures),
         ("What one car and five agents foresee", _TABLE, table(heading, lines)),
