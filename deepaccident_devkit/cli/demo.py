@@ -8,13 +8,14 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import click
+from tqdm import tqdm
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.baselines import demo_table, predict_results
-from deepaccident_devkit.cli.demo_page import PAGE, REPLAY, REPORT_FOLDER, NextStep, Picture, demo_page
+from deepaccident_devkit.cli.demo_page import PAGE, PICTURES, REPLAY, REPORT_FOLDER, NextStep, demo_page
 from deepaccident_devkit.dataset import RowArgument
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import ConfigError
@@ -26,9 +27,7 @@ from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.render import detached_figure, render_replay
 from deepaccident_devkit.render.evaluation import save_report
 from deepaccident_devkit.synth import SynthConfig, make_release
-
-if TYPE_CHECKING:
-    from tqdm import tqdm
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 _SCENARIO: Final = """\
 # The accident of `deepaccident demo`: in clear weather, by day, the other car runs a red light. A house hides it from
@@ -73,8 +72,6 @@ def demo(out: Path, workers: int | None) -> None:
 
     OUT must be missing, empty, or the folder of an earlier demo, which then keeps its release.
     """
-    from tqdm.auto import tqdm
-
     _claim(out)
     steps = _next_steps(out)
     with tqdm(total=sum(_STEPS.values()), bar_format=_BAR, disable=None) as bar:
@@ -83,79 +80,36 @@ def demo(out: Path, workers: int | None) -> None:
         with _step(bar, "indexing"):
             release = DeepAccident("v1", out / "release", workers=workers, verbose=False)
         with _step(bar, "pictures"):
-            pictures = draw_accident(release, out)
+            draw_accident(release, out)
         with _step(bar, "table"):
             rows, table = demo_table(release)
         with _step(bar, "evaluation"):
             _evaluate(release, out)
         with _step(bar, "replay"):
             render_replay(release, None, out / REPLAY)
-    write_bytes(out / PAGE, demo_page(pictures, rows, steps).encode())
+    write_bytes(out / PAGE, demo_page(rows, steps).encode())
     click.echo(f"{table}\n\nNext steps:")
     for number, step in enumerate(steps, 1):
         click.echo(f"{number}. {step.sentence}\n   {step.command}")
     click.echo(f"\nOpen this page in a browser, it shows all that was made: {out / PAGE}")
 
 
-def draw_accident(release: DeepAccident, out: Path) -> list[Picture]:
-    """Render the first accident: the countdown to it, and the five agents, ego's cameras and labels a second before.
-
-    Returns:
-        The pictures written, in the order of the page.
-    """
+def draw_accident(release: DeepAccident, out: Path) -> None:
+    """Render the first accident: the countdown to it, and the five agents, ego's cameras and labels a second before."""
     accident = next(scenario for scenario in release.scenario if scenario["collision"])
     impact = release.getind("frame", accident["last_frame_token"])
-    before = release.frame[impact - round(_SECONDS_BEFORE * 10)]
+    before = release.frame[impact - round(_SECONDS_BEFORE / FRAME_PERIOD)]
     ego = release.samples_of(before)[0]
     countdown = partial(release.render_accident, seconds=_COUNTDOWN, agents=("ego_vehicle", "infrastructure"))
-    drawings: list[tuple[Picture, tuple[float, float], Callable[..., Any], RowArgument]] = [
-        (
-            Picture(
-                "countdown.png",
-                "The crash comes",
-                "From left to right, the last three seconds. In the first row ego drives towards the junction: a "
-                "house on the right hides the other car, until it comes out from behind it. In the second row the "
-                "roadside pole sees both all the time. The colliding pair is red.",
-            ),
-            (17.0, 8.6),
-            countdown,
-            accident,
-        ),
-        (
-            Picture(
-                "five_agents_1s_before.png",
-                "Five agents, one second before the impact",
-                "The front cameras of all five agents; below, from above, their LiDAR points and all labelled boxes.",
-            ),
-            (20.0, 6.5),
-            release.render_frame,
-            before,
-        ),
-        (
-            Picture(
-                "ego_cameras_1s_before.png",
-                "All that ego records, one second before the impact",
-                "The six cameras of ego and its LiDAR points, with the labelled boxes.",
-            ),
-            (16.0, 5.5),
-            release.render_sample,
-            ego,
-        ),
-        (
-            Picture(
-                "motion_labels_1s_before.png",
-                "Motion labels",
-                "What a network learns to predict at this moment, on a grid from above: where everybody is now, in "
-                "0.5 s and in 1 s, when the pair meets.",
-            ),
-            (11.0, 12.0),
-            partial(release.render_motion_labels, config=_LABELS),
-            ego,
-        ),
-    ]
-    for picture, size, render, record in drawings:
-        render(record, fig=detached_figure(size)).savefig(out / picture.name, dpi=80)
-    return [picture for picture, *_ in drawings]
+    labels = partial(release.render_motion_labels, config=_LABELS)
+    drawings: tuple[tuple[tuple[float, float], Callable[..., Any], RowArgument], ...] = (
+        ((17.0, 8.6), countdown, accident),
+        ((20.0, 6.5), release.render_frame, before),
+        ((16.0, 5.5), release.render_sample, ego),
+        ((11.0, 12.0), labels, ego),
+    )
+    for name, (size, render, record) in zip(PICTURES, drawings, strict=True):
+        render(record, fig=detached_figure(size)).savefig(out / name, dpi=80)
 
 
 @contextmanager

@@ -9,6 +9,29 @@ from deepaccident_devkit.baselines.hidden_collider import HiddenCollider, table_
 from deepaccident_devkit.render.evaluation.markup import Markup, document, joined, table, tag
 
 PAGE: Final = "index.html"
+PICTURES: Final = {
+    "countdown.png": (
+        "The crash comes",
+        (
+            "The last three seconds, from left to right. In the first row ego drives towards the junction: a house on "
+            "the right hides the other car, until it comes out from behind it. In the second row the roadside pole "
+            "sees both all the time. The colliding pair is red."
+        ),
+    ),
+    "five_agents_1s_before.png": (
+        "Five agents, one second before the impact",
+        "The front cameras of all five agents; below, from above, their LiDAR points and all labelled boxes.",
+    ),
+    "ego_cameras_1s_before.png": (
+        "All that ego records, one second before the impact",
+        "The six cameras of ego and its LiDAR points, with the labelled boxes.",
+    ),
+    "motion_labels_1s_before.png": (
+        "Motion labels",
+        "What a network learns to predict: where everybody is now, in 0.5 s and in 1 s, on a grid from above.",
+    ),
+}
+"""File beside the page → what it shows, in a few words, and what one sees."""
 REPLAY: Final = "replay.html"
 REPORT_FOLDER: Final = "evaluation"
 _POLICY: Final = "default-src 'none'; img-src 'self' file:; frame-src 'self' file:; style-src 'unsafe-inline'"
@@ -24,21 +47,6 @@ false, and when."""
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
-    """A picture of the page.
-
-    Attributes:
-        name: of its file, beside the page.
-        heading: what it shows, in a few words.
-        sentence: what one sees.
-    """
-
-    name: str
-    heading: str
-    sentence: str
-
-
-@dataclass(frozen=True, slots=True)
 class NextStep:
     """Something to try next.
 
@@ -51,17 +59,16 @@ class NextStep:
     command: str
 
 
-def demo_page(pictures: Sequence[Picture], rows: Sequence[HiddenCollider], steps: Sequence[NextStep]) -> str:
+def demo_page(rows: Sequence[HiddenCollider], steps: Sequence[NextStep]) -> str:
     """The complete page; it refers to the other files of its folder by their names.
 
     Args:
-        pictures: in their order.
         rows: of `demo_table`.
         steps: what to try next.
     """
     heading, *lines = zip(*table_rows(rows), strict=True)  # a column for each set of agents: it fits a narrow window
     parts = [
-        *((each.heading, each.sentence, _image(each)) for each in pictures),
+        *((*words, _image(name, *words)) for name, words in PICTURES.items()),
         ("What one car and five agents foresee", _TABLE, table(heading, lines)),
         ("Replay", _REPLAY, _frame("Replay", REPLAY)),
         ("Report of an evaluation", _REPORT, _frame("Report", f"{REPORT_FOLDER}/report.html")),
@@ -84,10 +91,10 @@ def demo_page(pictures: Sequence[Picture], rows: Sequence[HiddenCollider], steps
     )
 
 
-def _image(picture: Picture) -> Markup:
+def _image(name: str, heading: str, sentence: str) -> Markup:
     """A picture, not larger than it is; in a narrow window it is smaller, and a link to the whole."""
-    image = tag("img", src=picture.name, alt=picture.sentence, style="width: auto; max-width: 100%")
-    return tag("figure", tag("a", image, href=picture.name))
+    image = tag("img", src=name, alt=f"{heading}: {sentence}", style="width: auto; max-width: 100%")
+    return tag("figure", tag("a", image, href=name))
 
 
 def _frame(title: str, source: str) -> Markup:
