@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 from deepaccident_devkit.errors import ChoiceError
 
@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+Progress: TypeAlias = "bool | Callable[[float], object]"
+"""Whether to show a progress bar; or a function that gets each item's share of the work, for a bar of the caller's."""
 
 
 def run_batch(
@@ -51,18 +53,18 @@ def run_unordered(
     workers: int | None = None,
     executor: Executor | None = None,
     label: str = "",
-    progress: bool = False,
+    progress: Progress = False,
     sizes: Sequence[int] | None = None,
 ) -> Generator[tuple[int, Result], None, None]:
     """Apply `work` to every item; yields each one's position and result as soon as it is ready.
 
-    Closing the generator cancels what has not begun. Arguments and errors are those of `run_batch`, and `sizes`: how
-    far each item moves the progress bar; None for one step each.
+    Closing the generator cancels what has not begun. Arguments and errors are those of `run_batch`, but `progress` may
+    be a function, and `sizes` is how far each item moves the progress bar; None for one step each.
     """
     from tqdm.auto import tqdm  # here: with asyncio and multiprocessing, a third of the package's import time
 
     count, steps = _worker_count(workers, len(items)), sizes or [1] * len(items)
-    with tqdm(total=sum(steps), desc=label, disable=not progress, unit="") as bar, ExitStack() as stack:
+    with tqdm(total=sum(steps), desc=label, disable=progress is not True, unit="") as bar, ExitStack() as stack:
         if executor is None and count > 1:
             import multiprocessing
             from concurrent.futures import ProcessPoolExecutor
@@ -73,6 +75,8 @@ def run_unordered(
         results = ((n, work(item)) for n, item in enumerate(items)) if executor is None else _on(executor, work, items)
         for position, result in stack.enter_context(closing(results)):
             bar.update(steps[position])
+            if callable(progress):
+                progress(steps[position] / sum(steps))
             yield position, result
 
 

@@ -3,11 +3,13 @@
 import importlib
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
 import matplotlib as mpl
 import pytest
+from click.testing import CliRunner
 from hypothesis import settings
 from scripts import loaded_script
 
@@ -51,6 +53,18 @@ def release_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("synthetic") / "deep accident"
     config = SynthConfig(scenarios=4, frames=6, image_size=(64, 36), layout="A", seed=3, unplanned=0, exact=True)
     return make_release(root, config, workers=2)
+
+
+@pytest.fixture(scope="session")
+def made_demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The folder of a demo with few frames and small images, and what `deepaccident demo` printed."""
+    out = tmp_path_factory.mktemp("demo") / "of a reader"
+    demo = importlib.import_module("deepaccident_devkit.cli.demo")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demo, "_RELEASE", replace(demo._RELEASE, frames=12, image_size=(64, 36)))
+        result = CliRunner().invoke(demo.demo, [str(out)], catch_exceptions=False)
+    assert result.exit_code == 0
+    return out, result.output
 
 
 @pytest.fixture(scope="session")

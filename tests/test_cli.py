@@ -1,8 +1,6 @@
 """The command line, end to end: the verbs on real folders, their grammar, their errors."""
 
-import importlib
 import json
-import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -18,7 +16,6 @@ from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, LabelFiles, MotionLabelConfig
 from deepaccident_devkit.release import read_split_file
 from deepaccident_devkit.splits import official_split
-from deepaccident_devkit.synth import SynthConfig
 
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -121,33 +118,6 @@ def test_a_verb_does_not_wait_for_what_others_import() -> None:
         "sys.exit('deepaccident_devkit.evaluation' in sys.modules or 'deepaccident_devkit.render' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=60, check=False).returncode == 0
-
-
-@pytest.mark.slow
-def test_demo_draws_its_accident(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    demo_module = importlib.import_module("deepaccident_devkit.cli.demo")
-    monkeypatch.setattr(
-        demo_module, "_RELEASE", SynthConfig(scenarios=2, frames=12, image_size=(64, 36), view="hidden")
-    )
-    out = tmp_path / "demo"
-    result = CliRunner().invoke(deepaccident, ["demo", str(out)], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    pictures = sorted(path.name for path in out.glob("*.png"))
-    assert pictures == [
-        "ego_cameras_1s_before.png",
-        "five_agents_1s_before.png",
-        "five_agents_impact.png",
-        "motion_labels_1s_before.png",
-    ]
-    assert all((out / name).stat().st_size > 20_000 for name in pictures)
-    assert "annotation" in result.output
-    assert "Try next:" in result.output
-    rows = re.findall(r"^(single vehicle|five agents) +([\d.]+)", result.output, re.MULTILINE)
-    assert [name for name, _ in rows] == ["single vehicle", "five agents"]
-    single, five = (float(number) for _, number in rows)
-    assert five > single
-    again = CliRunner().invoke(deepaccident, ["demo", str(out)], catch_exceptions=False)
-    assert "using the release that is in" in again.output
 
 
 @pytest.mark.slow

@@ -1,8 +1,9 @@
-"""One accident, seen by a single vehicle and by all five agents: the table that the demo ends with."""
+"""One accident, seen by a single vehicle and by all five agents: the demo's table."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import takewhile
 from typing import TYPE_CHECKING, Final
@@ -80,7 +81,7 @@ def demo_table(dataset: Dataset, scenario: RowArgument | None = None) -> tuple[t
         apa = evaluators[condition].boxes.compute().apa
         alarms = _alarms(dataset, record, pair, condition.agents)
         rows.append(HiddenCollider(agents=condition.agents, iou=far.iou, vpq=far.pq, apa=apa, **alarms))
-    return tuple(rows), _text(rows)
+    return tuple(rows), columns_text(table_rows(rows))
 
 
 def _accident(dataset: Dataset, scenario: RowArgument | None) -> tuple[ScenarioRecord, set[int]]:
@@ -111,7 +112,8 @@ def _alarms(dataset: Dataset, record: ScenarioRecord, pair: set[int], agents: st
     }
 
 
-def _text(rows: list[HiddenCollider]) -> str:
+def table_rows(rows: Sequence[HiddenCollider]) -> list[list[str]]:
+    """The cells of the table as text: the heading, then a line for each configuration of agents."""
     heading = ["", "IoU (%)", "VPQ (%)", "APA (boxes)", "warning (s)", "precision", "false alarm (% of 4 s)"]
     lines = [
         [
@@ -120,7 +122,7 @@ def _text(rows: list[HiddenCollider]) -> str:
         ]
         for row in rows
     ]
-    return columns_text([heading, *lines])
+    return [heading, *lines]
 
 
 def _number(value: float) -> str:

@@ -1,86 +1,182 @@
-"""`deepaccident demo`: everything once, on a small synthetic release."""
+"""`deepaccident demo`: everything once, on a small synthetic release, and a page that shows it."""
 
-from collections.abc import Callable
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import click
+from tqdm import tqdm
 
-from deepaccident_devkit.baselines import demo_table
+from deepaccident_devkit._version import __version__
+from deepaccident_devkit.baselines import demo_table, predict_results
+from deepaccident_devkit.cli.demo_page import PAGE, PICTURES, REPLAY, REPORT_FOLDER, NextStep, demo_page
 from deepaccident_devkit.dataset import RowArgument
 from deepaccident_devkit.deepaccident import DeepAccident
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.evaluation.results import read_results
+from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.motion import MotionLabelConfig
-from deepaccident_devkit.overview import overview
-from deepaccident_devkit.render import detached_figure
+from deepaccident_devkit.render import detached_figure, render_replay
+from deepaccident_devkit.render.evaluation import save_report
 from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
-_RELEASE = SynthConfig(scenarios=2, frames=40, image_size=(320, 180), view="hidden")
-_SECONDS_BEFORE = 1.0
-_LABELS = MotionLabelConfig(future_frames=2)
-"""The released labels, but they end at the impact."""
-_HIDDEN = """\
-A house hides the other car from the ego vehicle. This table shows how well one car, and five agents together, predict
-the crash. The predictor is a baseline: each actor that is seen keeps its speed (docs/baselines.md). "warning" is the
-time before the impact from which every moment has the right alarm:
+_SCENARIO: Final = """\
+# The accident of `deepaccident demo`: in clear weather, by day, the other car runs a red light. A house hides it from
+# ego until about 2.5 s before the impact; from then on it is in ego's front camera.
+name: demo
+road: {kind: four-way, signalized: true, lanes: 1}
+view: hidden
+actors:
+  - {role: ego, from: west, max_speed: 10}
+  - {role: ego_behind, gap: [8, 16]}
+  - {role: other, from: south, max_speed: 4, ignores: [signal]}
+  - {role: other_behind, gap: [8, 16]}
+meet: {actors: [ego, other], offset: [-0.2, 0.2]}
+background: {vehicles: [6, 12], two_wheelers: [2, 6], parked: [3, 9], walking: [3, 9], crossing: [1, 4]}
+weather: Clear
+time_of_day: Noon
 """
+_RELEASE: Final = SynthConfig(scenarios=2, frames=40, seed=1)
+_MARK: Final = ".deepaccident_demo"
+"""The file by which the demo knows a folder as its own."""
+_SCENARIO_FILE: Final = "accident.yaml"
+_RESULTS: Final = "single_vehicle.json"
+_COUNTDOWN: Final = (3.0, 2.0, 1.0, 0.5, 0.0)
+"""Seconds before the impact; at the first the house hides the other car from ego."""
+_SECONDS_BEFORE: Final = 1.0
+_LABELS: Final = MotionLabelConfig(future_frames=2)
+"""The released labels, but they end at the impact."""
+_SELECTION: Final = SampleSelection(split="train", scope="all")
+_STEPS: Final = {"recording": 32.0, "indexing": 1.0, "pictures": 5.0, "table": 2.0, "evaluation": 4.0, "replay": 2.0}
+"""About how many seconds each step takes on two cores."""
+_BAR: Final = "{desc:<10} {percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
 
 
 @click.command()
 @click.argument("out", type=click.Path(path_type=Path), default="deepaccident_demo")
 @click.option("--workers", type=click.IntRange(min=1), help="Number of processes to use.")
 def demo(out: Path, workers: int | None) -> None:
-    """Make a small synthetic release in the folder OUT and show what the devkit does with it.
+    """Make a small synthetic release in the folder OUT, and a page that shows what the devkit does with it.
 
-    The demo makes an index, prints an overview, renders pictures of the accident, and compares what one car and five
-    agents predict.
+    The release has an accident and its normal twin. The page OUT/index.html has pictures, motion labels, a table of
+    what one car and five agents predict, a replay, the report of an evaluation, and five next steps.
+
+    OUT must be missing, empty, or the folder of an earlier demo, which then keeps its release.
     """
-    root = out / "release"
-    if root.is_dir():
-        click.echo(f"using the release that is in {root}")
-    else:
-        click.echo(f"making an accident and its normal twin, {_RELEASE.frames} frames, five agents …")
-        make_release(root, _RELEASE, workers=workers or 2, progress=True)
-    release = DeepAccident("v1", root, workers=workers)
-    click.echo(f"\n{overview(release).to_text()}\n")
-    for path in draw_accident(release, out):
-        click.echo(f"rendered: {path}")
-    click.echo(_what_next(out, root))
-    click.echo(f"\n{_HIDDEN}\n{demo_table(release)[1]}")
+    _claim(out)
+    steps = _next_steps(out)
+    with tqdm(total=sum(_STEPS.values()), bar_format=_BAR, disable=None) as bar:
+        with _step(bar, "recording"):
+            _make_release(out, workers, bar)
+        with _step(bar, "indexing"):
+            release = DeepAccident("v1", out / "release", workers=workers, verbose=False)
+        with _step(bar, "pictures"):
+            draw_accident(release, out)
+        with _step(bar, "table"):
+            rows, table = demo_table(release)
+        with _step(bar, "evaluation"):
+            _evaluate(release, out)
+        with _step(bar, "replay"):
+            render_replay(release, None, out / REPLAY)
+    write_bytes(out / PAGE, demo_page(rows, steps).encode())
+    click.echo(f"{table}\n\nNext steps:")
+    for number, step in enumerate(steps, 1):
+        click.echo(f"{number}. {step.sentence}\n   {step.command}")
+    click.echo(f"\nOpen this page in a browser, it shows all that was made: {out / PAGE}")
 
 
-def draw_accident(release: DeepAccident, out: Path) -> list[Path]:
-    """Render the first accident: the five agents a second before the impact and at it, the ego's cameras and labels.
-
-    Returns:
-        The pictures written.
-    """
+def draw_accident(release: DeepAccident, out: Path) -> None:
+    """Render the first accident: the countdown to it, and the five agents, ego's cameras and labels a second before."""
     accident = next(scenario for scenario in release.scenario if scenario["collision"])
-    impact = release.get("frame", accident["last_frame_token"])
-    before = release.frame[release.getind("frame", impact) - round(_SECONDS_BEFORE * 10)]
+    impact = release.getind("frame", accident["last_frame_token"])
+    before = release.frame[impact - round(_SECONDS_BEFORE / FRAME_PERIOD)]
     ego = release.samples_of(before)[0]
-    drawings: dict[str, tuple[tuple[float, float], Callable[..., Any], RowArgument]] = {
-        "five_agents_1s_before.png": ((20.0, 6.5), release.render_frame, before),
-        "five_agents_impact.png": ((20.0, 6.5), release.render_frame, impact),
-        "ego_cameras_1s_before.png": ((16.0, 5.5), release.render_sample, ego),
-        "motion_labels_1s_before.png": ((11.0, 12.0), partial(release.render_motion_labels, config=_LABELS), ego),
-    }
-    paths = []
-    for name, (size, render, record) in drawings.items():
-        figure = render(record, fig=detached_figure(size))
-        path = out / name
-        figure.savefig(path, dpi=80)
-        paths.append(path)
-    return paths
+    countdown = partial(release.render_accident, seconds=_COUNTDOWN, agents=("ego_vehicle", "infrastructure"))
+    labels = partial(release.render_motion_labels, config=_LABELS)
+    drawings: tuple[tuple[tuple[float, float], Callable[..., Any], RowArgument], ...] = (
+        ((17.0, 8.6), countdown, accident),
+        ((20.0, 6.5), release.render_frame, before),
+        ((16.0, 5.5), release.render_sample, ego),
+        ((11.0, 12.0), labels, ego),
+    )
+    for name, (size, render, record) in zip(PICTURES, drawings, strict=True):
+        render(record, fig=detached_figure(size)).savefig(out / name, dpi=80)
 
 
-def _what_next(out: Path, root: Path) -> str:
-    return f"""
-Look at the pictures in {out}{"/" if str(out) != "." else ""}: the colliding pair is red.
-Try next:
-  deepaccident info {root} --where collision=true
-  deepaccident validate {root} --deep
-  deepaccident baseline predict {root} --split train --agents all --out {out}/results
-  deepaccident evaluate accident {root} --results {out}/results/accident.json --split train --protocol boxes
-  python -c "from deepaccident_devkit import DeepAccident; DeepAccident(dataroot='{root}').list_scenarios()"
-  deepaccident synth my_release --scenarios 6 --layout B"""
+@contextmanager
+def _step(bar: tqdm[Any], name: str) -> Iterator[None]:
+    """Name a step on the bar, and move the bar to its end."""
+    bar.set_description_str(name)
+    end = sum(list(_STEPS.values())[: list(_STEPS).index(name) + 1])
+    yield
+    bar.update(end - bar.n)
+
+
+def _claim(out: Path) -> None:
+    """Mark a folder as the demo's, before anything else is written.
+
+    Raises:
+        ConfigError: it holds something, and no demo of this version made it.
+    """
+    mark, version = out / _MARK, f"{__version__}\n".encode()
+    if mark.is_file() and mark.read_bytes() == version:
+        return
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ConfigError(
+            f"{out}: exists, and was not made by the demo of version {__version__}; name a folder that does not exist "
+            "yet: deepaccident demo OTHER_FOLDER"
+        )
+    write_bytes(mark, version)
+
+
+def _make_release(out: Path, workers: int | None, bar: tqdm[Any]) -> None:
+    """Make the release, if it is not there; what an interrupted demo has recorded is kept."""
+    root, scenario = out / "release", out / _SCENARIO_FILE
+    if root.is_dir():
+        return
+    if not scenario.exists():
+        write_bytes(scenario, _SCENARIO.encode())
+    config = replace(_RELEASE, spec=scenario)
+    make_release(root, config, workers=workers or 2, progress=lambda share: bar.update(share * _STEPS["recording"]))
+
+
+def _evaluate(release: DeepAccident, out: Path) -> None:
+    """Evaluate what the baseline of a single vehicle predicts, and write a report."""
+    path = out / _RESULTS
+    path.unlink(missing_ok=True)  # of an earlier demo
+    results = read_results(predict_results(release, "accident", _SELECTION.tokens(release), path, workers=1))
+    setup = EvaluationSetup(task="accident", protocol="boxes")
+    run = evaluate_results(release, results, setup, _SELECTION, workers=1).broken_down()
+    save_report(run, out / REPORT_FOLDER, dataset=release, results=results)
+
+
+def _next_steps(out: Path) -> tuple[NextStep, ...]:
+    root, five, scenario = (
+        shlex.quote(str(path)) for path in (out / "release", out / "five_agents", out / _SCENARIO_FILE)
+    )
+    of_both = f"--split {_SELECTION.split} --scope {_SELECTION.scope}"
+    return (
+        NextStep("See what the release holds:", f"deepaccident info {root} --where collision=true"),
+        NextStep("Check its files, as you would check your download:", f"deepaccident validate {root} --deep"),
+        NextStep(
+            "Let five agents predict together:",
+            f"deepaccident baseline predict {root} {of_both} --task accident --agents all --out {five}",
+        ),
+        NextStep(
+            "Evaluate that, and compare it with the report:",
+            f"deepaccident evaluate accident {root} --results {five}/accident.json {of_both} --protocol boxes",
+        ),
+        NextStep(
+            "Edit the scenario file of the accident, such as its weather, and see what happens in it:",
+            f"deepaccident synth --spec {scenario} --check",
+        ),
+    )

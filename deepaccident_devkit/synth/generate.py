@@ -7,7 +7,7 @@ from pathlib import Path
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.files import is_writable_folder
-from deepaccident_devkit.parallel import run_unordered
+from deepaccident_devkit.parallel import Progress, run_unordered
 from deepaccident_devkit.release.layout import SPLIT_FILE_FOLDER
 from deepaccident_devkit.synth.config import SynthConfig
 from deepaccident_devkit.synth.plan import ScenarioPlan, plan_scenarios, plan_splits
@@ -20,7 +20,7 @@ _USUAL_FRAMES = 70
 
 
 def make_release(
-    out: Path, config: SynthConfig | None = None, *, workers: int | None = None, progress: bool = False
+    out: Path, config: SynthConfig | None = None, *, workers: int | None = None, progress: Progress = False
 ) -> Path:
     """Write a complete synthetic release; returns its folder.
 
@@ -32,7 +32,8 @@ def make_release(
         config: the settings of the release; `SynthConfig()` if None.
         workers: number of processes; several may record one scenario. With None the generator chooses. The files
             depend neither on it nor on interruptions.
-        progress: whether to show a progress bar.
+        progress: whether to show a progress bar; or a function that is called after each part of the work, with its
+            share of all that was to do.
 
     Raises:
         ConfigError: `out` is a file, is not empty or cannot be made; an unfinished release of another
@@ -49,7 +50,7 @@ def make_release(
         raise ConfigError(f"{out.parent}: cannot be written; choose another folder")
     with unfinished_release(out, wanted) as unfinished:
         count = workers or _worker_count(wanted, len(plans))
-        jobs = [_jobs(unfinished, wanted, plan, progress=progress and count == 1) for plan in plans]
+        jobs = [_jobs(unfinished, wanted, plan, progress=progress is True and count == 1) for plan in plans]
         _record_all(unfinished, jobs, count, progress=progress)
         splits = plan_splits(plans)
         splits.save(unfinished.release, overwrite=True)
@@ -70,7 +71,7 @@ def _jobs(
 
 
 def _record_all(
-    unfinished: Unfinished, scenarios: Sequence[Mapping[str, RecordingJob]], workers: int, *, progress: bool
+    unfinished: Unfinished, scenarios: Sequence[Mapping[str, RecordingJob]], workers: int, *, progress: Progress
 ) -> None:
     """Record the parts that are not made yet, and bring each scenario into the release when all its parts are there."""
     made = set(unfinished.made())

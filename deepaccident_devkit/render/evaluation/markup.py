@@ -157,17 +157,18 @@ footer {{ margin-top: 3rem; color: #555; font-size: .88rem; }}
 """
 
 
-def document(title: str, *content: Markup) -> str:
+def document(title: str, *content: Markup, policy: str = _POLICY) -> str:
     """A complete HTML page.
 
     Args:
         title: of the window.
         *content: of the body.
+        policy: the Content-Security-Policy: what a browser may load and run.
     """
     head = tag(
         "head",
         tag("meta", charset="utf-8"),
-        tag("meta", http_equiv="Content-Security-Policy", content=_POLICY),
+        tag("meta", http_equiv="Content-Security-Policy", content=policy),
         tag("meta", name_="viewport", content="width=device-width, initial-scale=1"),
         tag("title", title),
         tag("style", Markup(_STYLE)),

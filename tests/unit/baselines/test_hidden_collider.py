@@ -26,7 +26,7 @@ def assert_five_agents_win(da: DeepAccident, *, map_gain: float) -> None:
 
 
 @pytest.mark.slow
-def test_five_agents_win_on_the_demos_seed(da_hidden: DeepAccident) -> None:
+def test_five_agents_win_where_a_house_hides_the_other(da_hidden: DeepAccident) -> None:
     assert_five_agents_win(da_hidden, map_gain=10)
 
 

@@ -1,0 +1,148 @@
+"""`deepaccident demo`: what it makes, where it refuses to, and whether its reader can see the crash coming."""
+
+import importlib
+import io
+import re
+import shlex
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from report_page import page_of
+from tqdm import tqdm
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.baselines import demo_table
+from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.synth import make_release
+
+demo: Any = importlib.import_module("deepaccident_devkit.cli.demo")
+
+
+def run(*words: str) -> str:
+    result = CliRunner().invoke(deepaccident, words, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert result.stderr == "" or words[0] != "demo"  # no bar where nobody sees it
+    return result.output
+
+
+def times(folder: Path) -> dict[Path, int]:
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.slow
+def test_the_page_shows_all_that_was_made(made_demo: tuple[Path, str]) -> None:
+    out, _ = made_demo
+    page = page_of(out / "index.html")
+    pictures = [str(each["src"]) for each in page.all("img")]
+    assert sorted(pictures) == sorted(path.name for path in out.glob("*.png"))
+    assert len(pictures) == 4
+    assert all((out / name).stat().st_size > 20_000 for name in pictures)
+    frames = [each["src"] for each in page.all("iframe")]
+    assert frames == ["replay.html", "evaluation/report.html"]
+    links = [str(each["href"]) for each in page.all("a")]
+    assert [link for link in links if not link.startswith("#") and not (out / link).is_file()] == []
+    anchors = {each.get("id") for each in page.all("section")}
+    assert {link[1:] for link in links if link.startswith("#")} == anchors
+    ((single, five),) = re.findall(r"single vehiclefive agentsIoU \(%\)(\d+\.\d)(\d+\.\d)", page.text)
+    assert float(five) > float(single)
+
+
+@pytest.mark.slow
+def test_the_next_steps_run_as_they_are_printed(made_demo: tuple[Path, str]) -> None:
+    out, printed = made_demo
+    assert printed.rstrip().endswith(str(out / "index.html"))
+    commands = re.findall(r"^ +deepaccident (.+)$", printed, re.MULTILINE)
+    assert len(commands) == 5
+    page = page_of(out / "index.html").text
+    for command in commands:
+        assert f"deepaccident {command}" in page
+        run(*shlex.split(command))
+
+
+@pytest.mark.slow
+def test_another_demo_keeps_the_release_and_the_readers_files(made_demo: tuple[Path, str]) -> None:
+    out, _ = made_demo
+    (out / "notes.txt").write_text("mine")
+    before = times(out)
+    (out / "replay.html").unlink()
+    run("demo", str(out))
+    after = times(out)
+    assert before.keys() == after.keys()
+    kept = {path.relative_to(out).parts[0] for path in before if before[path] == after[path]}
+    assert {"release", "accident.yaml", "notes.txt"} <= kept
+    assert kept.isdisjoint({"index.html", "countdown.png", "single_vehicle.json"})
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "index.html", "release", ".deepaccident_demo"])
+def test_a_folder_of_somebody_else_is_refused(name: str, tmp_path: Path) -> None:
+    """The last one is of a demo of another version, whose page would not fit."""
+    (tmp_path / name).write_text("0.0.1\n")
+    with pytest.raises(ConfigError, match=r"was not made by the demo of version .* deepaccident demo OTHER_FOLDER"):
+        run("demo", str(tmp_path))
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "0.0.1\n")]
+    with pytest.raises(ConfigError, match=f"{name}: exists, and was not made"):
+        run("demo", str(tmp_path / name))
+
+
+@pytest.mark.slow
+def test_an_interrupted_demo_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(demo, "_RELEASE", replace(demo._RELEASE, frames=8, sensors=False))
+    shares: list[float] = []
+
+    def stopped(share: float) -> None:
+        shares.append(share)
+        if len(shares) == 2:
+            raise KeyboardInterrupt
+
+    with tqdm(disable=True) as bar:
+        monkeypatch.setattr(bar, "update", stopped)
+        demo._claim(tmp_path)
+        with pytest.raises(KeyboardInterrupt):
+            demo._make_release(tmp_path, 1, bar)
+    assert sum(shares) == demo._STEPS["recording"]
+    assert not (tmp_path / "release").exists()
+    recorded = times(tmp_path / ".release.unfinished" / "release")
+    assert recorded
+    with tqdm(disable=True) as bar:
+        demo._claim(tmp_path)
+        demo._make_release(tmp_path, 1, bar)
+    assert len(DeepAccident(dataroot=tmp_path / "release", verbose=False).scenario) == 2
+    assert set(recorded.values()) <= set(times(tmp_path / "release").values())
+
+
+def test_one_bar_names_all_steps_and_ends_full() -> None:
+    shown = io.StringIO()
+    with tqdm(total=sum(demo._STEPS.values()), bar_format=demo._BAR, file=shown, mininterval=0) as bar:
+        for name, seconds in demo._STEPS.items():
+            with demo._step(bar, name):
+                bar.update(seconds / 3)
+    names = re.findall(r"\r(\w+) ", shown.getvalue())
+    assert list(dict.fromkeys(names)) == list(demo._STEPS)
+    assert "replay     100%|" in shown.getvalue()
+
+
+@pytest.mark.slow
+def test_ego_sees_the_crash_coming_and_five_agents_see_it_earlier(tmp_path: Path) -> None:
+    (tmp_path / "accident.yaml").write_text(demo._SCENARIO)
+    config = replace(demo._RELEASE, scenarios=1, sensors=False, spec=tmp_path / "accident.yaml")
+    da = DeepAccident(dataroot=make_release(tmp_path / "release", config, workers=1), verbose=False)
+    (accident,) = da.scenario
+    assert (accident["weather"], accident["time_of_day"]) == ("Clear", "Noon")
+    collider = da.agent.get(f"{accident['token']}/other_vehicle")["actor_id"]
+    in_view = []
+    for tenths in range(1, 36):
+        boxes = da.boxes(da.get_sample(accident, "ego_vehicle", frame=40 - tenths), "ego")
+        other = boxes.select(boxes.actor_id == collider)
+        x, y = other.center[0, :2]
+        in_view.append(bool(other.camera_visible[0]) and abs(np.degrees(np.arctan2(y, x))) < 30)  # of 35 to each side
+    assert all(in_view[:20])
+    assert not any(in_view[26:])
+    single, five = demo_table(da)[0]
+    assert 1.5 <= single.warning <= five.warning - 1
+    assert five.iou > single.iou + 10
+    assert (single.false_time, five.false_time) == (0, 0)
