@@ -30,6 +30,7 @@ from deepaccident_devkit.geometry.points_in_boxes import points_in_boxes
 from deepaccident_devkit.geometry.se3 import SE3, checked_transform
 from deepaccident_devkit.nuscenes_names import BOX, BOX_MADE, without_names
 from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES
+from deepaccident_devkit.text import Pictured
 
 if TYPE_CHECKING:
     from pyquaternion import Quaternion
@@ -44,7 +45,7 @@ BOTTOM_CORNERS = (2, 3, 7, 6)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Boxes(FrozenArrays):
+class Boxes(FrozenArrays, Pictured):
     """N oriented boxes in one right-handed coordinate frame; immutable, arrays are read-only copies of those given.
 
     Attributes:

@@ -27,6 +27,7 @@ from deepaccident_devkit.geometry.bev_grid import BevGrid
 from deepaccident_devkit.geometry.frames import checked_frame
 from deepaccident_devkit.geometry.se3 import SE3, checked_transform
 from deepaccident_devkit.nuscenes_names import CLOUD, without_names
+from deepaccident_devkit.text import Pictured
 
 Range = tuple[float, float]
 _FIELDS = ("xyz", "intensity", "frame")
@@ -38,7 +39,7 @@ _FAULTS = (*DAMAGED_ARCHIVE, TypeError, AttributeError)  # the last two: a bare 
 
 @without_names(CLOUD)
 @dataclass(frozen=True, slots=True, eq=False)
-class LidarPointCloud(FrozenArrays):
+class LidarPointCloud(FrozenArrays, Pictured):
     """N points in one right-handed coordinate frame; arrays are read-only views.
 
     Clouds are large, so arrays of the right type are not copied: a change of the caller's array changes the cloud.

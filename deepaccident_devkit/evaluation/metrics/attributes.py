@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.selection import accident_visible
@@ -64,7 +65,7 @@ class ScenarioAttributes:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SampleAttributes:
+class SampleAttributes(ShortRepr):
     """The attributes of a sample.
 
     Attributes:
