@@ -22,6 +22,8 @@ _DPI: Final = 80
 _MOST_POINTS: Final = 20_000
 _MOST_BOXES: Final = 1_000
 """More are thinned out: a picture must not take long."""
+_LETTERS: Final = 7
+"""Points."""
 _LEVEL_FROM_OPTICAL: Final = SE3.from_rotation([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
 
@@ -34,9 +36,9 @@ def png_of(thing: object) -> bytes:
     figure = detached_figure(_INCHES)
     ax = figure.add_subplot()
     _draw(thing, ax)
-    ax.tick_params(labelsize=7)
-    ax.xaxis.label.set_fontsize(7)
-    ax.yaxis.label.set_fontsize(7)
+    ax.tick_params(labelsize=_LETTERS)
+    ax.xaxis.label.set_fontsize(_LETTERS)
+    ax.yaxis.label.set_fontsize(_LETTERS)
     content = BytesIO()
     figure.savefig(content, format="png", dpi=_DPI)
     return content.getvalue()
@@ -55,7 +57,7 @@ def _draw(thing: object, ax: Axes) -> None:
 
 def _draw_boxes(boxes: Boxes, ax: Axes) -> None:
     _name_axes(boxes.frame, ax)
-    shown = boxes[:: -(-len(boxes) // _MOST_BOXES) or 1]
+    shown = boxes[:: -(-len(boxes) // _MOST_BOXES)]
     if boxes.frame in CAMERAS:
         shown = shown.transform(_LEVEL_FROM_OPTICAL, "ego")
     draw_boxes_from_above(shown, ax, [CATEGORY_COLORS[name] for name in shown.category_names], linewidths=0.8)
@@ -64,7 +66,7 @@ def _draw_boxes(boxes: Boxes, ax: Axes) -> None:
 
 def _draw_points(cloud: LidarPointCloud, ax: Axes) -> None:
     _name_axes(cloud.frame, ax)
-    xyz = cloud.xyz[:: -(-len(cloud) // _MOST_POINTS) or 1]
+    xyz = cloud.xyz[:: -(-len(cloud) // _MOST_POINTS)]
     ax.scatter(xyz[:, 0], xyz[:, 1], s=0.5, c=xyz[:, 2], cmap="viridis", linewidths=0)
 
 

@@ -12,17 +12,9 @@ from deepaccident_devkit.taxonomy import AGENTS
 if TYPE_CHECKING:
     from torch import Tensor
 
-_OF_AGENTS: Final = (
-    "agent_valid",
-    "files_missing",
-    "ego_from_agent",
-    "images",
-    "intrinsics",
-    "ego_from_camera",
-    "image_from_ego",
-)
-"""Tensors whose first axis counts agents."""
 _MATRICES: Final = ("ego_from_agent", "intrinsics", "ego_from_camera", "image_from_ego")
+_OF_AGENTS: Final = ("agent_valid", "files_missing", "images", *_MATRICES)
+"""Tensors whose first axis counts agents."""
 _OF_BOXES: Final = ("boxes", "velocity_known", "categories", "actor_ids")
 _LISTS: Final = ("token", "agents", "points", *_OF_BOXES)
 """Keys that stay lists with one entry for each item: texts, and tensors of different lengths."""

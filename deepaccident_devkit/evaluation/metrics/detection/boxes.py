@@ -61,8 +61,8 @@ class DetectedBoxes(FrozenArrays):
             scores: (N,).
             category: (N,) indices or names; None for cars.
             velocity: (N, 2) or (N, 3) m/s over the ground; None for unknown.
-            frame: what all of it is in: `lidar` for an evaluator, `world` for results files. Without one it is `lidar`,
-                which is deprecated, since it is easily forgotten for the other.
+            frame: what all of it is in: `lidar` for an evaluator, `world` for results files. None is `lidar`, and is
+                deprecated.
 
         Raises:
             GeometryError: a shape or a number that cannot be.
