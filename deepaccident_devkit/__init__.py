@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import DeepAccidentError
+from deepaccident_devkit.text import Pictured
 
 if TYPE_CHECKING:
     from deepaccident_devkit.deepaccident import DeepAccident
@@ -18,6 +19,16 @@ def __getattr__(name: str) -> Any:
     from deepaccident_devkit.deepaccident import DeepAccident
 
     return DeepAccident
+
+
+def _png_of(thing: object) -> bytes:
+    """What `Pictured` shows: rendered by the package that is imported for it."""
+    from deepaccident_devkit.render.notebook import png_of
+
+    return png_of(thing)
+
+
+Pictured.png_of = staticmethod(_png_of)
 
 
 def __dir__() -> list[str]:

@@ -227,7 +227,7 @@ def _value_text(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, Mapping | list | tuple) and (len(value) > _FEW or _holds_arrays(value)):
-        return f"<{len(value)} in a {type(value).__name__}>"
+        return f"<{len(value)} in a {'dict' if isinstance(value, Mapping) else type(value).__name__}>"
     text = repr(value)
     return text if len(text) <= _LONGEST_VALUE else f"{type(value).__name__}(…)"
 

@@ -55,6 +55,12 @@ BOX: Final[Mapping[str, str]] = {
 }
 """Attributes of nuScenes' `Box` → what to use here."""
 
+BOX_MADE: Final = (
+    "boxes[0] picks one, and nuScenes' Box(center, wlh, orientation) is Box.from_wlh(center, wlh, orientation, "
+    f"frame='ego') (see {_PAGE})"
+)
+"""What to use here in place of making nuScenes' `Box`."""
+
 CLOUD: Final[Mapping[str, str]] = {
     "from_file": "use da.load_point_cloud(sample); of a path, release.read_lidar(path)",
     "from_file_multisweep": "use da.aggregate_point_cloud(sample, agents='single', sweeps=5)",

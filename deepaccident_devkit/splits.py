@@ -12,6 +12,7 @@ from pathlib import Path
 from random import Random
 from typing import TYPE_CHECKING, Final
 
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, TokenError
 from deepaccident_devkit.files import replacing
@@ -153,7 +154,7 @@ def save_selection(scenarios: Iterable[RowArgument], path: str | os.PathLike[str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SplitReport:
+class SplitReport(ShortRepr):
     """How the scenarios of some splits are distributed.
 
     Attributes:

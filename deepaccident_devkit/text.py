@@ -1,8 +1,12 @@
-"""Text for people: aligned columns for a terminal, and messages that name what was probably meant."""
+"""Text for people: aligned columns for a terminal, HTML for a notebook, messages that name what was probably meant."""
 
+import base64
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from difflib import get_close_matches
+from html import escape
+from typing import ClassVar
 
 _LISTED = 20
 """Words that a message lists at most."""
@@ -26,6 +30,31 @@ def natural_order(value: str | None) -> tuple[bool, float, str]:
         return text == "none", float(text.split(" ")[0]), text
     except ValueError:
         return text == "none", math.inf, text
+
+
+class Pictured:
+    """Base of what a notebook shows with a picture above its text; without a picture, it shows the text alone."""
+
+    __slots__ = ()
+
+    png_of: ClassVar[Callable[[object], bytes]]
+    """Makes the picture. The package's `__init__` sets it, since who renders is in a layer above."""
+
+    def _repr_html_(self) -> str:
+        html = f"<pre>{escape(repr(self))}</pre>"
+        with suppress(Exception):  # a picture is an extra
+            content = base64.b64encode(Pictured.png_of(self)).decode("ascii")
+            html = f'<img src="data:image/png;base64,{content}" alt="seen from above">{html}'
+        return html
+
+
+def rows_html(rows: Sequence[Sequence[str]], caption: str = "") -> str:
+    """A table for a notebook; the first row is the heading."""
+    cells = [
+        "".join(f"<{kind}>{escape(word)}</{kind}>" for word in row)
+        for kind, row in zip(["th", *["td"] * (len(rows) - 1)], rows, strict=True)
+    ]
+    return f"<table><caption>{escape(caption)}</caption>{''.join(f'<tr>{each}</tr>' for each in cells)}</table>"
 
 
 def fixed_text(value: float, digits: int) -> str:

@@ -3,14 +3,15 @@
 import json
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from report_page import page_of
 
-from deepaccident_devkit import DeepAccident
+from deepaccident_devkit import DeepAccident, taxonomy
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, ResultsError
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, accident_context, instances_of
@@ -21,6 +22,7 @@ from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 pytestmark = pytest.mark.slow
 
 AGENTS = ("ego_vehicle", "infrastructure")
+LISTED = ("--samples", "evaluate", "--scope", "all", "--resamples", "0")
 LIST = ("--split", "train", "--agents", ",".join(AGENTS), "--resamples", "0")
 
 
@@ -58,6 +60,22 @@ def write_accidents(dataset: DeepAccident, path: Path, tokens: Iterable[str], mo
     return path
 
 
+def write_motion(dataset: DeepAccident, path: Path, tokens: Iterable[str], moved: int = 0) -> Path:
+    with ResultsWriter(path, "motion", meta={"method": "<b>moved</b>"}) as writer:
+        for token in tokens:
+            label = dataset.motion_labels(token).to_present("bilinear")
+            writer.add(token, instances_of(np.roll(label.instance, moved, axis=2), label.config.grid))
+    return path
+
+
+def write_boxes(dataset: DeepAccident, path: Path, tokens: Iterable[str]) -> Path:
+    with ResultsWriter(path, "detection") as writer:
+        for token in tokens:
+            there = dataset.boxes(token)
+            writer.add(token, DetectedBoxes(boxes=there, scores=np.linspace(0.1, 1, len(there))))
+    return path
+
+
 @pytest.fixture(scope="module")
 def accidents(da_motion: DeepAccident, folder: Path, tokens: list[str]) -> Path:
     """The true accidents, moved a little."""
@@ -67,21 +85,13 @@ def accidents(da_motion: DeepAccident, folder: Path, tokens: list[str]) -> Path:
 @pytest.fixture(scope="module")
 def motion(da_motion: DeepAccident, folder: Path, tokens: list[str]) -> Path:
     """The labels as predictions, moved by a column."""
-    with ResultsWriter(folder / "motion", "motion", meta={"method": "<b>moved</b>"}) as writer:
-        for token in tokens:
-            label = da_motion.motion_labels(token).to_present("bilinear")
-            writer.add(token, instances_of(np.roll(label.instance, 1, axis=2), label.config.grid))
-    return folder / "motion"
+    return write_motion(da_motion, folder / "motion", tokens, moved=1)
 
 
 @pytest.fixture(scope="module")
 def boxes(da_motion: DeepAccident, folder: Path, tokens: list[str]) -> Path:
     """The true boxes."""
-    with ResultsWriter(folder / "boxes.json", "detection") as writer:
-        for token in tokens:
-            there = da_motion.boxes(token)
-            writer.add(token, DetectedBoxes(boxes=there, scores=np.linspace(0.1, 1, len(there))))
-    return folder / "boxes.json"
+    return write_boxes(da_motion, folder / "boxes.json", tokens)
 
 
 @pytest.fixture(scope="module")
@@ -147,6 +157,31 @@ def test_json_is_the_summary(da_motion: DeepAccident, accidents: Path, tmp_path:
     assert summary["switches"] == {"scoring.limit_counts": True}
     assert summary == read_bundle(tmp_path / "b").summary
     assert f"written: {tmp_path / 'b'}" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("task", "protocol", "write", "line"),
+    [
+        ("motion", "released", write_motion, "iou 100x100 100.00 %"),
+        ("accident", "boxes", write_accidents, "apa 1.000"),
+        ("detection", "released", write_boxes, "AP car 97.22 %"),
+        ("warning", "boxes", write_accidents, "warned_share 1.000"),
+    ],
+)
+def test_a_partial_download_is_evaluated_and_its_report_has_pictures(
+    da_partial: DeepAccident, tmp_path: Path, task: str, protocol: str, write: Callable[..., Path], line: str
+) -> None:
+    """The truth of the agents that are there is a perfect prediction (the released AP is 97.22 %, then)."""
+    tokens = da_partial.evaluation_samples("val", "paper", scope="all")
+    assert {token.split("/")[2] for token in tokens} == set(taxonomy.AGENTS) - {"other_vehicle_behind"}
+    results = write(da_partial, tmp_path / "results", tokens)
+    words = (task, da_partial.dataroot, "--results", results, "--split", "val", "--protocol", protocol)
+    text = evaluate(*words, *LISTED, "--sanity", "--out", tmp_path / "bundle").stdout
+    assert "samples      8 of 2 scenarios: split val" in text
+    assert f" {line} " in " ".join(text.split())
+    report = page_of(tmp_path / "bundle" / "report.html")
+    assert len(report.all("img")) >= 2
+    assert line.split(maxsplit=1)[0] in report.text
 
 
 class TestPartial:

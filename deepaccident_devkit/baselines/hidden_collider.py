@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from itertools import takewhile
 from typing import TYPE_CHECKING, Final
 
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.baselines.conditions import Condition
 from deepaccident_devkit.baselines.counting import Counting, counted
 from deepaccident_devkit.baselines.predict import predict_accidents
@@ -29,7 +30,7 @@ _AGENTS: Final = {"single": "single vehicle", "all": "five agents"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class HiddenCollider:
+class HiddenCollider(ShortRepr):
     """How well the ego vehicle foresees one accident with some agents.
 
     Attributes:

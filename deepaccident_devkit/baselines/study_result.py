@@ -12,6 +12,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Final
 
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.baselines.study_config import StudyConfig
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
@@ -86,7 +87,7 @@ class StudyRow(FrozenMappings):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StudyTable:
+class StudyTable(ShortRepr):
     """One of the study's tables.
 
     Attributes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import operator
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NoReturn, overload
 
 import numpy as np
@@ -28,8 +28,9 @@ from deepaccident_devkit.geometry.footprints import gaps, intersection_areas
 from deepaccident_devkit.geometry.frames import checked_frame
 from deepaccident_devkit.geometry.points_in_boxes import points_in_boxes
 from deepaccident_devkit.geometry.se3 import SE3, checked_transform
-from deepaccident_devkit.nuscenes_names import BOX, without_names
+from deepaccident_devkit.nuscenes_names import BOX, BOX_MADE, without_names
 from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES
+from deepaccident_devkit.text import Pictured
 
 if TYPE_CHECKING:
     from pyquaternion import Quaternion
@@ -44,7 +45,7 @@ BOTTOM_CORNERS = (2, 3, 7, 6)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Boxes(FrozenArrays):
+class Boxes(FrozenArrays, Pictured):
     """N oriented boxes in one right-handed coordinate frame; immutable, arrays are read-only copies of those given.
 
     Attributes:
@@ -388,13 +389,53 @@ class Box:
 
     __slots__ = ("_boxes", "instance_token", "token")
 
-    def __init__(self, boxes: Boxes, token: str | None = None, instance_token: str | None = None) -> None:
-        """Wrap the only row of `boxes`; raises GeometryError if there are none or several."""
-        if len(checked_boxes("boxes", boxes)) != 1:
+    def __init__(
+        self, boxes: Boxes, token: str | None = None, instance_token: str | None = None, **others: NoReturn
+    ) -> None:
+        """Wrap the only row of `boxes`; raises GeometryError if there are none or several, or these are no `Boxes`."""
+        if others or not isinstance(boxes, Boxes):
+            raise GeometryError(f"a Box is one row of Boxes, found {type(boxes).__name__}; {BOX_MADE}")
+        if len(boxes) != 1:
             raise GeometryError(f"a Box is one row of Boxes, found {len(boxes)}; pick one with boxes[i]")
         self._boxes = boxes
         self.token = token
         self.instance_token = instance_token
+
+    @classmethod
+    def from_wlh(
+        cls,
+        center: ArrayLike,
+        wlh: ArrayLike,
+        orientation: Quaternion | ArrayLike,
+        *,
+        frame: str,
+        category: str = "car",
+        velocity: ArrayLike = (np.nan, np.nan, np.nan),
+    ) -> Box:
+        """One box of numbers, as nuScenes' `Box(center, wlh, orientation)` makes it.
+
+        Args:
+            center: (3,) metres.
+            wlh: (3,) full width, length, height, metres: the nuScenes order, while `Boxes` begin with the length.
+            orientation: the box's axes in `frame`, a unit quaternion (pyquaternion's, or four numbers w, x, y, z).
+            frame: what all of it is in: `world`, `ego`, `lidar` or a camera channel.
+            category: its name.
+            velocity: (3,) m/s over the ground, NaN where unknown.
+
+        Raises:
+            GeometryError: a shape, number, frame or category that cannot be.
+        """
+        width, length, height = checked("wlh", wlh, (3,))
+        boxes = Boxes.from_arrays(
+            checked("center", center, (3,))[None],
+            [[length, width, height]],
+            [0.0],
+            frame=frame,
+            category=[category],
+            velocity=checked("velocity", velocity, (3,))[None],
+        )
+        wxyz = checked("orientation", getattr(orientation, "elements", orientation), (4,))
+        return cls(replace(boxes, rotation=wxyz[None]))
 
     @property
     def frame(self) -> str:

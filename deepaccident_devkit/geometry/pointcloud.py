@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,16 +27,19 @@ from deepaccident_devkit.geometry.bev_grid import BevGrid
 from deepaccident_devkit.geometry.frames import checked_frame
 from deepaccident_devkit.geometry.se3 import SE3, checked_transform
 from deepaccident_devkit.nuscenes_names import CLOUD, without_names
+from deepaccident_devkit.text import Pictured
 
 Range = tuple[float, float]
 _FIELDS = ("xyz", "intensity", "frame")
+_SOURCES: Final = {"agent": np.int8, "time_lag": np.float32}
+"""Columns that only some clouds have, and the types of their numbers."""
 _FAULTS = (*DAMAGED_ARCHIVE, TypeError, AttributeError)  # the last two: a bare array, which is no archive
 """The errors of reading a damaged file or one of another kind."""
 
 
 @without_names(CLOUD)
 @dataclass(frozen=True, slots=True, eq=False)
-class LidarPointCloud(FrozenArrays):
+class LidarPointCloud(FrozenArrays, Pictured):
     """N points in one right-handed coordinate frame; arrays are read-only views.
 
     Clouds are large, so arrays of the right type are not copied: a change of the caller's array changes the cloud.
@@ -44,11 +48,17 @@ class LidarPointCloud(FrozenArrays):
         xyz: (N, 3) float64, metres.
         intensity: (N,) float32.
         frame: `world`, `ego` or `lidar`.
+        agent: (N,) int8, whose LiDAR recorded each point, as a position in `taxonomy.AGENTS`; None if that is not
+            known. `aggregate_point_cloud` gives it.
+        time_lag: (N,) float32, seconds from the recording of each point to the sample's moment: 0 at the present,
+            above 0 for earlier points, like the times of nuScenes' `from_file_multisweep`; None if that is not known.
     """
 
     xyz: FloatArray
     intensity: AnyArray
     frame: str = "lidar"
+    agent: AnyArray | None = None
+    time_lag: AnyArray | None = None
 
     def __post_init__(self) -> None:
         """Check the shapes; raises GeometryError."""
@@ -57,6 +67,10 @@ class LidarPointCloud(FrozenArrays):
         intensity = checked("LidarPointCloud.intensity", self.intensity, (len(xyz),), np.float32)
         object.__setattr__(self, "xyz", readonly(xyz))
         object.__setattr__(self, "intensity", readonly(intensity))
+        for name, dtype in _SOURCES.items():
+            if (column := getattr(self, name)) is not None:
+                column = checked(f"LidarPointCloud.{name}", column, (len(xyz),), dtype)
+                object.__setattr__(self, name, readonly(column))
 
     def __len__(self) -> int:
         """Number of points."""
@@ -77,14 +91,14 @@ class LidarPointCloud(FrozenArrays):
     def transform(self, target_from_source: SE3, frame: str) -> LidarPointCloud:
         """The same points in another frame. Raises GeometryError."""
         checked_transform("target_from_source", target_from_source)
-        return LidarPointCloud(target_from_source.apply(self.xyz), self.intensity, frame)
+        return replace(self, xyz=target_from_source.apply(self.xyz), frame=frame)
 
     def select(self, which: ArrayLike) -> LidarPointCloud:
         """The points that a mask (N,) or an integer array of rows picks. Raises GeometryError."""
         picked = np.asarray(which)
         rows = picked if picked.size else np.zeros(0, dtype=np.int64)
         try:
-            return LidarPointCloud(self.xyz[rows], self.intensity[rows], self.frame)
+            return replace(self, **{name: column[rows] for name, column in self._columns().items()})
         except IndexError as error:
             raise GeometryError(f"{which!r} does not pick from {len(self)} points: {error}") from error
 
@@ -153,13 +167,13 @@ class LidarPointCloud(FrozenArrays):
         return self.select(np.sort(first))
 
     def save(self, path: str | Path) -> None:
-        """Write the cloud to an `.npz` file (xyz float64, intensity, frame), completely or not at all.
+        """Write the cloud to an `.npz` file (its attributes that are not None), completely or not at all.
 
         `load` returns the same cloud, equal to the bit. This is not the release's format, which is single precision,
         left-handed and in the LiDAR frame: `release.write_lidar` writes that.
         """
         with replacing(Path(path)) as temporary, temporary.open("wb") as file:
-            np.savez_compressed(file, xyz=self.xyz, intensity=self.intensity, frame=np.array(self.frame))
+            np.savez_compressed(file, **self._columns(), frame=np.array(self.frame))
 
     @classmethod
     def load(cls, path: str | Path) -> LidarPointCloud:
@@ -173,7 +187,8 @@ class LidarPointCloud(FrozenArrays):
             # never unpickles; release.npz, which reads the release's own arrays, is in a higher layer
             with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:  # noqa: TID251
                 xyz, intensity, frame = (archive[name] for name in _FIELDS)
-            return cls(xyz, intensity, str(frame))
+                sources = {name: archive[name] for name in _SOURCES if name in archive}
+            return cls(xyz, intensity, str(frame), **sources)
         except FileNotFoundError:
             raise MissingFileError(f"{path}: no such file; LidarPointCloud.save writes one") from None
         except _FAULTS as error:
@@ -182,15 +197,24 @@ class LidarPointCloud(FrozenArrays):
                 "files of the release are read by load_point_cloud"
             ) from error
 
+    def _columns(self) -> dict[str, Any]:
+        """The arrays of N rows that the cloud has, by attribute."""
+        columns = {name: getattr(self, name) for name in ("xyz", "intensity", *_SOURCES)}
+        return {name: column for name, column in columns.items() if column is not None}
+
 
 def concatenate(parts: Sequence[LidarPointCloud], frame: str) -> LidarPointCloud:
-    """All points of `parts`, in order; every part must be in `frame`, or GeometryError is raised."""
+    """All points of `parts`, in order; every part must be in `frame`, or GeometryError is raised.
+
+    A column that not every part has, such as `time_lag`, is None.
+    """
     for part in parts:
         if part.frame != frame:
             raise GeometryError(f"points of frame {part.frame!r} cannot join those of {frame!r}; transform them first")
-    xyz = np.concatenate([np.zeros((0, 3)), *(part.xyz for part in parts)])
-    intensity = np.concatenate([np.zeros(0, dtype=np.float32), *(part.intensity for part in parts)])
-    return LidarPointCloud(xyz, intensity, frame)
+    nothing = LidarPointCloud(np.zeros((0, 3)), np.zeros(0), frame, np.zeros(0), np.zeros(0))
+    columns = [part._columns() for part in (nothing, *parts)]  # noqa: SLF001 - its own kind
+    shared = [name for name in columns[0] if all(name in each for each in columns)]
+    return LidarPointCloud(**{name: np.concatenate([each[name] for each in columns]) for name in shared}, frame=frame)
 
 
 def _within(name: str, values: FloatArray, limits: Range) -> BoolArray:

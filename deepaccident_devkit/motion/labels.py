@@ -15,13 +15,14 @@ from deepaccident_devkit.motion.batch_names import MAPS, BatchNames, from_batch,
 from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
 from deepaccident_devkit.motion.warps.to_present import maps_to_present
 from deepaccident_devkit.motion.warps.warping import WarpMode
+from deepaccident_devkit.text import Pictured
 
 OWN_BOX_ID: Final = -101
 """Key of the ego's own box in `MotionLabels.id_map`, as the released code has it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MotionLabels(FrozenArrays):
+class MotionLabels(FrozenArrays, Pictured):
     """Labels of T = `config.label_frames` frames on H × W cells in `config.grid.orientation`; arrays are read-only.
 
     The five maps share one block of memory, which stays as long as any of them is used. To keep some maps of many

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, IntArray, checked
+from deepaccident_devkit.arrays import AnyArray, IntArray, ShortRepr, checked
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.drawing.label_maps import CoveredCells, label_maps
@@ -24,7 +24,7 @@ _FIRST_DATE: Final = (1980, 1, 1, 0, 0, 0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class StoredLabels:
+class StoredLabels(ShortRepr):
     """The arrays of one sample, in the configuration's orientation; K = highest id.
 
     Attributes:

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import DatarootError, VersionError
 from deepaccident_devkit.taxonomy import (
     AGENTS,
@@ -74,7 +75,7 @@ class ScenarioFolder:
 
 
 @dataclass(frozen=True, slots=True)
-class ReleaseLayout:
+class ReleaseLayout(ShortRepr):
     """What lies under a dataroot, by the names of folders.
 
     Attributes:

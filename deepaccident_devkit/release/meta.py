@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, overload
 
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import MetaError
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.release._content import read_lines
@@ -38,7 +39,7 @@ class Collision:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Meta:
+class Meta(ShortRepr):
     """What a meta file says; None where the file lacks the line.
 
     Attributes:

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.files import is_writable_folder, write_bytes
 from deepaccident_devkit.statistics.results import (
@@ -31,7 +32,7 @@ _PAIRS = "collision_pairs"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DatasetStatistics:
+class DatasetStatistics(ShortRepr):
     """The statistics of a release, or of some of its scenarios; groups are those of `GROUPS`.
 
     Attributes:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import astuple, dataclass, fields
 from typing import Final
 
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.taxonomy import SPLITS
 
 TOTAL: Final = "total"
@@ -35,7 +36,7 @@ Row = tuple[Cell, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LeftOut:
+class LeftOut(ShortRepr):
     """Items that a table does not count, since they have no value.
 
     Attributes:
@@ -48,7 +49,7 @@ class LeftOut:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CountTable:
+class CountTable(ShortRepr):
     """How many there are of each value of a word.
 
     Attributes:
@@ -78,7 +79,7 @@ class CountTable:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Histogram:
+class Histogram(ShortRepr):
     """How a number is distributed.
 
     Attributes:
@@ -121,7 +122,7 @@ class Histogram:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class QuantileRow:
+class QuantileRow(ShortRepr):
     """The quantiles of one number of one category in one group.
 
     Attributes:
@@ -140,7 +141,7 @@ class QuantileRow:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class QuantileTable:
+class QuantileTable(ShortRepr):
     """Quantiles of one or more numbers, by category and group.
 
     Attributes:
@@ -182,7 +183,7 @@ class QuantileTable:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CollisionPair:
+class CollisionPair(ShortRepr):
     """The colliding pair of a scenario at its last frame, by the merged tracks.
 
     The first of the pair is the agent that comes first in `taxonomy.AGENTS`; without an agent, meta's first.

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import ReleaseError
 
 Severity = Literal["error", "warning", "note"]
@@ -11,7 +12,7 @@ SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Finding:
+class Finding(ShortRepr):
     """One thing that is wrong, odd or missing.
 
     Attributes:

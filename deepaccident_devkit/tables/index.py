@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import BrokenReleaseError, ChoiceError, DatarootError, IndexStoreError
 from deepaccident_devkit.files import is_writable_folder
 from deepaccident_devkit.release import ReleaseLayout
@@ -44,7 +45,7 @@ _MESSAGES_A_SCENARIO = 5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Index:
+class Index(ShortRepr):
     """An index on disk.
 
     Attributes:

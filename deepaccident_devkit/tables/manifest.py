@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.files import write_bytes
 
 SCHEMA_VERSION = 2
@@ -13,7 +14,7 @@ MANIFEST_FILE = "manifest.json"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Problem:
+class Problem(ShortRepr):
     """What is wrong with one scenario.
 
     Attributes:

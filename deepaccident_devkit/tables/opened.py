@@ -56,6 +56,10 @@ class OpenTables:
         self._split_files = dict(split_files)
         self._tables = Tables(tables_folder)
 
+    def __repr__(self) -> str:
+        """Kind, version and place."""
+        return f"{type(self).__name__}({self.version!r}, {str(self.dataroot)!r})"
+
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle paths, not tables: the copy opens the same files again."""
         return _reopened, (

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import DatarootError, IndexStoreError, VersionError
 from deepaccident_devkit.release import ReleaseLayout, find_release
 from deepaccident_devkit.tables.clearing import holds_index, megabytes, sizes_in
@@ -24,7 +25,7 @@ _NAMED = 5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class IndexInfo:
+class IndexInfo(ShortRepr):
     """An index on disk.
 
     Attributes:
@@ -87,7 +88,7 @@ class IndexInfo:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class IndexReport:
+class IndexReport(ShortRepr):
     """The indexes of one dataroot.
 
     Attributes:

@@ -27,6 +27,9 @@ class Tables:
         self.views = {name: stored.views for name, stored in self._stored.items()}
         self.resolver = Resolver(self.views)
 
+    def __repr__(self) -> str:
+        return f"Tables({str(self.folder)!r})"
+
     def table(self, name: str) -> "Table[Any]":
         """One table's records; raises TableError."""
         try:

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
+from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray, ShortRepr
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.release.velocities import turned
 from deepaccident_devkit.tables.boxes import ScenarioBoxes, world_rotations
@@ -34,7 +34,7 @@ _AS_GOOD = 0.95
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class VelocityFit:
+class VelocityFit(ShortRepr):
     """How many boxes' velocities fit their displacement in each of `VELOCITY_FRAMES`; adds up over scenarios.
 
     Attributes:

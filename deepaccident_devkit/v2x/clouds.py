@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray, checked_whole
@@ -10,7 +12,7 @@ from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import SE3, Boxes, LidarPointCloud, quaternions
 from deepaccident_devkit.geometry.pointcloud import concatenate
 from deepaccident_devkit.release.missing_files import MissingFiles
-from deepaccident_devkit.taxonomy import LIDAR, OnError
+from deepaccident_devkit.taxonomy import AGENTS, LIDAR, OnError
 from deepaccident_devkit.v2x.configurations import Agents
 from deepaccident_devkit.v2x.link import Link
 from deepaccident_devkit.v2x.messages import Message, messages
@@ -44,7 +46,8 @@ def aggregate_point_cloud(
 
     Returns:
         The points by frame, the present first and then backwards, and for each frame by agent, the ego first; no
-        points if all were lost or left out.
+        points if all were lost or left out. Its `agent` says whose LiDAR recorded each point, its `time_lag` how many
+        seconds before the sample's moment (a link's latency included).
 
     Raises:
         TokenError: no such sample.
@@ -59,7 +62,8 @@ def aggregate_point_cloud(
         raise ChoiceError(f"sweeps: expected a whole number of frames from 1, found {sweeps}")
     frame = dataset.frame_name(frame)
     target_from_world = dataset.world_from(sample, frame).inverse()
-    scenario, _, present = dataset.get("sample", sample)["token"].rsplit("/", 2)
+    record = dataset.get("sample", sample)
+    scenario, _, present = record["token"].rsplit("/", 2)
     tracks = scenario_tracks(dataset, scenario) if compensate else None
     files = MissingFiles(dataset.dataroot, on_missing)
     parts = []
@@ -69,10 +73,11 @@ def aggregate_point_cloud(
         cloud = dataset.load_point_cloud(message.sample, "lidar")
         if tracks is not None:
             cloud = _compensated(cloud, dataset.world_from(message.sample, "lidar"), tracks, message, int(present))
-        parts.append(cloud.transform(message.target_from(dataset, "lidar", target_from_world), frame))
+        cloud = cloud.transform(message.target_from(dataset, "lidar", target_from_world), frame)
+        lag = record["timestamp"] - dataset.get("sample", message.sample)["timestamp"]
+        agent = np.full(len(cloud), AGENTS.index(message.agent), dtype=np.int8)
+        parts.append(replace(cloud, agent=agent, time_lag=np.full(len(cloud), lag, dtype=np.float32)))
     files.tell()
-    if not parts:
-        return LidarPointCloud(np.zeros((0, 3)), np.zeros(0, dtype=np.float32), frame)
     return concatenate(parts, frame)
 
 
@@ -108,4 +113,4 @@ def _compensated(
     if taken == present:
         return cloud
     moved = moved_points(world_from_lidar.apply(cloud.xyz), tracks.at(taken), tracks.at(present))
-    return LidarPointCloud(world_from_lidar.inverse().apply(moved), cloud.intensity, cloud.frame)
+    return replace(cloud, xyz=world_from_lidar.inverse().apply(moved))

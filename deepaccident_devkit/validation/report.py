@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.tables import SEVERITIES, Finding
 from deepaccident_devkit.tables.velocities import VelocityFit
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CHANNELS, VELOCITY_FRAMES
@@ -20,7 +21,7 @@ _ALL_LISTED = "(--all lists all)"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Coverage:
+class Coverage(ShortRepr):
     """Which part of a whole release is here.
 
     Attributes:
@@ -64,7 +65,7 @@ class Coverage:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ValidationReport:
+class ValidationReport(ShortRepr):
     """What was found in a release.
 
     Attributes:

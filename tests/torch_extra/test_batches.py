@@ -107,6 +107,51 @@ def test_agents_that_a_partial_release_lacks(own_release: Path, start: str) -> N
     assert [len(names) for names in one_after_another["agents"]] == counts
 
 
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+@pytest.mark.parametrize("start", [None, "fork", "spawn"])
+def test_a_loader_without_collate_fn_batches_as_collate_does(da: DeepAccident, sample: str, start: str | None) -> None:
+    """The registry of torch's own collation; the items differ in boxes and points, which torch could not stack."""
+    partner = sample.replace("ego_vehicle", "infrastructure")
+    data = V2XDataset(da, [sample, partner], V2XConfig(agents="all"))
+    assert len(data[0]["boxes"]) != len(data[1]["boxes"])
+    workers = {} if start is None else {"num_workers": 1, "multiprocessing_context": start}
+    [batch] = DataLoader(data, batch_size=2, **workers)
+    assert same(batch, collate([data[0], data[1]]))
+    assert type(batch) is dict
+    assert repr(data[0]) == (
+        f"V2XItem({sample}, agents {data[0]['agents']}: agent_valid, ego_from_agent, world_from_ego, augmentation, "
+        "points, boxes, velocity_known, categories, actor_ids)"
+    )
+
+
+def test_skipped_files_are_as_if_they_had_not_arrived(da: DeepAccident, da_partial: DeepAccident, sample: str) -> None:
+    """The pole has no LiDAR, and the ego no front camera: with the pole, images are of the other vehicles."""
+    both = {"agents": ["ego_vehicle", "other_vehicle", "infrastructure"], "past": 2, "step": 1}
+    with pytest.raises(MissingFileError, match=r"infrastructure.*no such file; .* with on_missing='skip'"):
+        V2XDataset(da_partial, [sample], V2XConfig(**both))[0]
+    item, whole = (V2XDataset(each, [sample], V2XConfig(**both, on_missing="skip"))[0] for each in (da_partial, da))
+    assert item["agent_valid"].tolist() == [[True, True], [True, True], [False, False]]
+    assert item["files_missing"].tolist() == [[0, 0], [0, 0], [1, 1]]
+    assert not whole["files_missing"].any()
+    assert same(item["points"][:2], whole["points"][:2])
+    assert [len(cloud) for cloud in item["points"][2]] == [0, 0]
+    assert_array_equal(item["ego_from_agent"][2], np.broadcast_to(np.eye(4), (2, 4, 4)))
+    batch = collate_fusion([item, whole])
+    assert batch["agents"] == [("ego_vehicle", "other_vehicle"), tuple(both["agents"])]
+    assert batch["record_len"].tolist() == [2, 3]
+    assert batch["files_missing"].shape == (5, 2)
+    assert collate([item, whole])["files_missing"].shape == (2, 3, 2)
+    images = V2XConfig(**both, on_missing="skip", points=False, images=ImageConfig())
+    with pytest.raises(MissingFileError, match=r"1 of 6 sensor files of this sample's own agent .*or fewer cameras"):
+        V2XDataset(da_partial, [sample], images)[0]
+    behind = V2XDataset(da_partial, [sample.replace("ego_vehicle", "other_vehicle")], images)[0]
+    assert dict(zip(behind["agents"], behind["files_missing"][:, -1].tolist(), strict=True)) == {
+        **dict.fromkeys(behind["agents"], 0),
+        "ego_vehicle": 1,
+    }
+    assert not behind["images"][behind["agents"].index("ego_vehicle")].any()
+
+
 @pytest.mark.parametrize("collated", [collate, collate_fusion])
 def test_items_that_make_no_batch(da: DeepAccident, tokens: list[str], collated: Callable[..., Any]) -> None:
     with pytest.raises(ConfigError, match="batch: expected at least one item, found none"):

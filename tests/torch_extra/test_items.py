@@ -244,6 +244,7 @@ def test_labels_of_a_sample_without(own_release: Path) -> None:
         ({"bev_segmentation": True}, "bev_segmentation: expected None or the BevGrid"),
         ({"points": "no"}, "points: expected True or False, found 'no'"),
         ({"past": "2"}, "past: expected a whole number from 1, found '2'"),
+        ({"on_missing": "ignore"}, "on_missing: expected one of raise, skip, found 'ignore'"),
         ({"past": True}, "past: expected a whole number from 1, found True"),
     ],
 )

@@ -1,19 +1,36 @@
 """Objects that hold arrays say in one short line what they are, and never print the numbers."""
 
+import base64
 import inspect
 import pkgutil
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass, replace
+from enum import Enum
 from importlib import import_module
+from io import BytesIO
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from matplotlib import pyplot as plt
+from report_page import Page
 
 import deepaccident_devkit
+import deepaccident_devkit.render.notebook
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.arrays import ShortRepr
-from deepaccident_devkit.evaluation import Accident, AccidentEvaluator, DetectedBoxes, MotionOutput
+from deepaccident_devkit.evaluation import (
+    Accident,
+    AccidentEvaluator,
+    DetectedBoxes,
+    DetectionEvaluator,
+    MotionEvaluator,
+    MotionOutput,
+    WarningEvaluator,
+)
+from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.geometry import SE3, BevGrid, Boxes, LidarPointCloud
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionHeads, MotionLabelConfig, MotionLabels
 from deepaccident_devkit.v2x import Contact
@@ -69,29 +86,43 @@ def contact() -> Contact:
 
 OWN = {
     "Boxes": boxes,
+    "AccidentResult": lambda: AccidentEvaluator().compute(),
+    "AnticipationResult": lambda: WarningEvaluator("clean").compute(),
     "Contact": contact,
+    "DetectionResult": lambda: DetectionEvaluator().compute(),
+    "FieldResult": lambda: WarningEvaluator("field").compute(),
     "LidarPointCloud": cloud,
     "MotionHeads": heads,
     "MotionLabels": labels,
+    "MotionResult": lambda: MotionEvaluator().compute(),
+    "WarningResult": lambda: WarningEvaluator("boxes").compute(),
     "MotionOutput": lambda: MotionOutput(grid=GRID, heads=(heads(), heads())),
     "SE3": SE3.identity,
 }
 """Classes with a text of their own → a maker of one."""
 
 
+CHOICES = (
+    "Config", "Protocol", "Spec", "Quirks", "Reading", "Warnings", "Selection", "Resampling", "PostProcessing", "View",
+    "Accidents", "Link", "PoseNoise", "Augmentation", "BevGrid", "Baseline", "Release", "Form",
+)  # fmt: skip
+"""Endings of the names of classes that are choices: their text has every field, as one would type it."""
+
+
 def public_classes() -> dict[str, type]:
-    """The public dataclasses with array fields, by name; those of torch's adapter have none."""
-    found = {}
+    """Name with its package → each public class that is no choice, enum or error; torch's adapter has none."""
+    found: dict[type, str] = {}
     for module in pkgutil.walk_packages(deepaccident_devkit.__path__, "deepaccident_devkit."):
         if module.ispkg and ".torch" not in module.name and "._" not in module.name:
-            found |= {kind.__name__: kind for kind in exported(import_module(module.name))}
-    return found
+            for kind in exported(import_module(module.name)):
+                found.setdefault(kind, f"{module.name}.{kind.__name__}")
+    return {name: kind for kind, name in found.items()}
 
 
 def exported(module: Any) -> Iterator[type]:
     for name in getattr(module, "__all__", ()):
         kind = getattr(module, name)
-        if inspect.isclass(kind) and is_dataclass(kind) and any("rray" in str(one.type) for one in fields(kind)):
+        if inspect.isclass(kind) and not issubclass(kind, BaseException | Enum) and not name.endswith(CHOICES):
             yield kind
 
 
@@ -105,17 +136,26 @@ def full(kind: type) -> Any:
     return result
 
 
-def test_no_public_class_prints_its_arrays() -> None:
+def test_every_public_class_prints_in_a_line() -> None:
+    """By `ShortRepr`, by a text of its own, or as a dataclass with a few plain fields."""
     found = public_classes()
-    assert {*OWN, "DetectionResult", "WarningResult", "WarningCurve", "Trajectory", "Labels", "BevImage"} <= set(found)
-    assert {name for name, kind in found.items() if kind.__repr__ is not ShortRepr.__repr__} == set(OWN)
+    assert {"Labels", "BevImage", "Verification", "CountTable", "ResultsWriter"} <= {
+        kind.__name__ for kind in found.values()
+    }
     for name, kind in found.items():
-        text = repr(OWN[name]() if name in OWN else full(kind))
-        assert text.startswith(f"{name}("), text
-        assert len(text) < 200, text
-        assert "\n" not in text
-        assert "0.1234567" not in text, text
-        assert "array(" not in text, text
+        assert kind.__repr__ is not object.__repr__, name
+        if kind.__name__ in OWN or kind.__repr__ is ShortRepr.__repr__:
+            text = repr(OWN[kind.__name__]() if kind.__name__ in OWN else full(kind))
+            assert text.startswith(f"{kind.__name__}("), text
+            assert len(text) < 200, text
+            assert "\n" not in text
+            assert "0.1234567" not in text, text
+            assert "array(" not in text, text
+        elif is_dataclass(kind) and kind is not EvaluationRun:  # its test is beside those of runs
+            assert len(fields(kind)) < 8, name
+            assert not [field.name for field in fields(kind) if re.search("rray|Mapping|Sequence", str(field.type))], (
+                name
+            )
 
 
 def test_texts() -> None:
@@ -136,6 +176,38 @@ def test_texts() -> None:
     assert repr(detected) == "DetectedBoxes(boxes=Boxes(2 in Camera_Front_Left: 1 car, 1 truck), scores=(2,) float64)"
     alarm = Accident(positions=np.zeros((2, 2)), time=1.5, ids=(3, 7))
     assert repr(alarm) == "Accident(positions=(2, 2) float64, time=1.5, score=1, ids=(3, 7))"
+
+
+def test_results_print_their_first_headlines() -> None:
+    result = replace(AccidentEvaluator().compute(), samples=1234, apa=0.5, id_error=0.25)
+    assert repr(result) == ("AccidentResult(1,234 samples: apa 0.500, accuracy@5 –, accuracy@10 –, accuracy@15 –, …)")
+    html = result._repr_html_()
+    assert html.startswith(
+        "<table><caption>AccidentResult, 1,234 samples</caption><tr><th>number</th><th>value</th></tr>"
+    )
+    assert "<tr><td>id_error</td><td>0.250</td></tr>" in html
+    assert Page(html).text.endswith("id_error0.250position_error20.000 mtime_error1.000 s")
+
+
+PICTURED = [boxes, cloud, labels, lambda: labels().to_present(), lambda: cloud().transform(SE3.identity(), "world")]
+
+
+@pytest.mark.parametrize("make", PICTURED)
+def test_a_notebook_shows_a_small_picture(make: Callable[[], Any]) -> None:
+    page = Page(make()._repr_html_())
+    [image] = page.all("img")
+    kind, _, content = str(image["src"]).partition(",")
+    assert kind == "data:image/png;base64"
+    assert 1000 < len(content) < 60_000
+    assert plt.imread(BytesIO(base64.b64decode(content))).shape == (256, 288, 4)
+    assert page.text == repr(make())
+
+
+def test_a_notebook_shows_the_text_where_there_is_no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    for empty in (boxes()[:0], cloud().select([])):
+        assert empty._repr_html_() == f"<pre>{empty!r}</pre>"
+    monkeypatch.setattr(deepaccident_devkit.render.notebook, "png_of", Mock(side_effect=RuntimeError))
+    assert Page(labels()._repr_html_()).text == repr(labels())
 
 
 def test_evaluators_say_how_many_samples_they_have() -> None:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.selection.fields import FIELDS, current_name, group_texts
@@ -33,7 +34,7 @@ def cluster_of(scenario: str) -> str:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SampleAttributes:
+class SampleAttributes(ShortRepr):
     """The attributes of a sample.
 
     Attributes:

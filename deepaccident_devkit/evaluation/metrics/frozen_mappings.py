@@ -9,6 +9,8 @@ from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 
+from deepaccident_devkit.arrays import ShortRepr
+
 Key = TypeVar("Key")
 Value = TypeVar("Value")
 
@@ -34,7 +36,7 @@ class FrozenDict(dict[Key, Value]):
     clear = pop = popitem = setdefault = update = _refused
 
 
-class FrozenMappings:
+class FrozenMappings(ShortRepr):
     """Base of frozen dataclasses whose mappings are read-only, from the start and in every copy."""
 
     __slots__ = ()

@@ -6,9 +6,11 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Final, Literal
+from typing import Any, ClassVar, Final, Literal
 
 from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
+from deepaccident_devkit.text import rows_html
 
 Unit = Literal["%", "share", "m", "s", "rad", "m/s", "1 - overlap", "1/min"]
 LIMITS: Final[Mapping[Unit, float]] = MappingProxyType({"%": 100.0, "share": 1.0, "1 - overlap": 1.0})
@@ -48,6 +50,8 @@ class _Row:
     better: Literal["higher", "lower", "neither"] = "lower"
 
 
+_SHOWN: Final = 4
+"""Headlines in a result's text."""
 _HIGHER_IS_BETTER: Final = {"higher": True, "lower": False, "neither": None}
 _ROWS: Final[Mapping[str, tuple[_Row, ...]]] = MappingProxyType(
     {
@@ -104,6 +108,25 @@ HEADLINE_UNITS: Final[Mapping[str, Unit]] = MappingProxyType(
     {row.path: row.unit for rows in _ROWS.values() for row in rows}
 )
 """Path of a headline, `*` for any key → its unit."""
+
+
+class TaskResult(FrozenMappings):
+    """Base of the results of a task's evaluators: its text, and what a notebook shows, are its headlines."""
+
+    __slots__ = ()
+
+    task: ClassVar[str]
+    samples: int
+
+    def __repr__(self) -> str:
+        """How many samples, and the first headlines."""
+        found = headlines(self.task, self)
+        shown = [f"{each.name} {each.text()}" for each in found[:_SHOWN]]
+        return f"{type(self).__name__}({self.samples:,} samples: {', '.join(shown)}{', …' * (len(found) > _SHOWN)})"
+
+    def _repr_html_(self) -> str:
+        rows = [(each.name, each.text()) for each in headlines(self.task, self)]
+        return rows_html([("number", "value"), *rows], f"{type(self).__name__}, {self.samples:,} samples")
 
 
 def headlines(task: str, result: object) -> tuple[Headline, ...]:

@@ -231,13 +231,14 @@ def _accidents(token: str, prediction: object) -> list[dict[str, Any]]:
 def _boxes(token: str, prediction: object) -> list[dict[str, Any]]:
     if not isinstance(prediction, DetectedBoxes):
         raise ResultsError(
-            f"expected DetectedBoxes, found {type(prediction).__name__}; DetectedBoxes.from_arrays makes some"
+            f"expected DetectedBoxes, found {type(prediction).__name__}; make them with "
+            "DetectedBoxes.from_arrays(center, size, yaw, scores, frame='world')"
         )
     frame = prediction.boxes.frame
     if frame != "world":
         raise ResultsError(
-            f"expected boxes in the world frame, found {frame}; give those of "
-            f"boxes.transform(dataset.world_from(token, {frame!r}), 'world')"
+            f"expected boxes in the world frame, found {frame}; give "
+            f"detected.transform(dataset.world_from(token, {frame!r}), 'world')"
         )
     return detection_entries(token, prediction)
 

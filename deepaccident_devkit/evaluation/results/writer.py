@@ -93,6 +93,10 @@ class ResultsWriter:
         self._stack = ExitStack()
         self._body: _Body | None = None
 
+    def __repr__(self) -> str:
+        """Its task and path, and how many samples it has written."""
+        return f"ResultsWriter({self.task} to {self.path}: {len(self._tokens):,} samples)"
+
     def __enter__(self) -> ResultsWriter:
         """Begin beside the path; raises ResultsError if nothing can be written there."""
         self._check_free()

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation.runs.evaluation_run import (
     SUMMARY_FORMAT,
@@ -34,7 +35,7 @@ _REMEDY: Final = "give a folder that `deepaccident evaluate … --out` wrote, or
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Bundle:
+class Bundle(ShortRepr):
     """What `deepaccident evaluate … --out DIR` wrote, by its summary; the other files are read when needed.
 
     Attributes:

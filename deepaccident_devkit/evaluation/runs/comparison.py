@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import plain
 from deepaccident_devkit.evaluation.metrics.intervals import Resampling
 from deepaccident_devkit.files import write_bytes
@@ -20,7 +21,7 @@ Family = Literal["main", "headlines", "other"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ComparedNumber:
+class ComparedNumber(ShortRepr):
     """A number of both results.
 
     Attributes:
@@ -61,7 +62,7 @@ _COLUMNS: Final = tuple(ComparedNumber.__dataclass_fields__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Comparison:
+class Comparison(ShortRepr):
     """Two evaluations by the same rules.
 
     Attributes:

@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
 from deepaccident_devkit.evaluation.runs.selection import SampleList, SampleSelection, ScopeName, agent_of
@@ -27,7 +28,7 @@ _LISTS: Final[tuple[tuple[SampleList, ScopeName, float], ...]] = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Coverage:
+class Coverage(ShortRepr):
     """Results against the list of samples that are evaluated; tokens in order.
 
     Attributes:

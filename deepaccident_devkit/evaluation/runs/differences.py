@@ -6,6 +6,8 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
+from deepaccident_devkit.arrays import ShortRepr
+
 DifferenceKind = Literal["version", "file", "scenario", "results", "number", "sample", "evaluation"]
 ABSENT: Final = "absent"
 """Stands for a missing value."""
@@ -14,7 +16,7 @@ _LONGEST: Final = 60
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Difference:
+class Difference(ShortRepr):
     """What a bundle says, and what was found.
 
     Attributes:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from deepaccident_devkit._version import __version__
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.attributes import WITHIN_RECORDINGS, SampleAttributes, attribute_name
 from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown, Group, breakdown
@@ -24,6 +25,7 @@ from deepaccident_devkit.evaluation.runs.selection import SampleSelection
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.parallel import run_batch
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, digest_of, fingerprint
+from deepaccident_devkit.text import rows_html
 
 SUMMARY_FORMAT: Final = "DeepAccident metrics summary"
 SUMMARY_VERSION: Final = 1
@@ -85,7 +87,7 @@ class Partial:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ReleaseInfo:
+class ReleaseInfo(ShortRepr):
     """Of which release the truth is.
 
     Attributes:
@@ -105,7 +107,7 @@ class ReleaseInfo:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ResultsInfo:
+class ResultsInfo(ShortRepr):
     """Of which results the predictions are.
 
     Attributes:
@@ -156,6 +158,25 @@ class EvaluationRun:
     sanity: Mapping[str, Any] | None = None
     explanation: Mapping[str, Any] | None = None
     left_out: int = 0
+
+    def __repr__(self) -> str:
+        """Task, protocol, whether it is partial, and the first headlines."""
+        return f"EvaluationRun({self._title}: {self.result!r})"
+
+    def _repr_html_(self) -> str:
+        """The headlines, with the intervals of the breakdown `all`."""
+        everyone = next((each for each in self.breakdowns if each.by == "all" and each.groups), None)
+        intervals = everyone.groups[0].intervals if everyone else {}
+        heading = f"{everyone.resampling.confidence:.0%} interval" if everyone and intervals else ""
+        ends = {path: f"[{low:.3f}, {high:.3f}]" for path, (low, high) in intervals.items()}
+        shown = headlines(self.setup.task, self.result)
+        rows = [(each.name, each.text(), ends.get(each.path, "")) for each in shown]
+        return rows_html([("number", "value", heading), *rows], f"{self._title}, {len(self.evaluator):,} samples")
+
+    @property
+    def _title(self) -> str:
+        mark = "" if self.partial is None else f", {self.partial.text()}"
+        return f"{self.setup.task}, protocol {self.setup.protocol}{mark}"
 
     @property
     def stamp(self) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from deepaccident_devkit._version import __version__
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import DeepAccidentError, ResultsError
 from deepaccident_devkit.evaluation.metrics.intervals import Resampling
@@ -46,7 +47,7 @@ _NOT_COMPARED: Final = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Verification:
+class Verification(ShortRepr):
     """A bundle against its evaluation made again.
 
     Attributes:

@@ -9,7 +9,8 @@
     data = V2XDataset(da, da.training_samples("train"), config)
     loader = DataLoader(data, batch_size=2, shuffle=True, num_workers=4, collate_fn=collate)
 
-`V2XDataset` describes an item, `collate` and `collate_fusion` describe a batch. docs/training.md has a training loop.
+`V2XDataset` describes an item, `collate` and `collate_fusion` describe a batch; without `collate_fn` a loader uses
+`collate`. docs/training.md has a training loop.
 Only this package imports torch; importing it without torch raises MissingExtraError.
 """
 

@@ -1,8 +1,9 @@
-"""Items of a `V2XDataset` as batches, for a DataLoader's `collate_fn`."""
+"""Items of a `V2XDataset`, and batches of them, for a DataLoader's `collate_fn`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.errors import ConfigError
@@ -11,12 +12,21 @@ from deepaccident_devkit.taxonomy import AGENTS
 if TYPE_CHECKING:
     from torch import Tensor
 
-_OF_AGENTS: Final = ("agent_valid", "ego_from_agent", "images", "intrinsics", "ego_from_camera", "image_from_ego")
-"""Tensors whose first axis counts agents."""
 _MATRICES: Final = ("ego_from_agent", "intrinsics", "ego_from_camera", "image_from_ego")
+_OF_AGENTS: Final = ("agent_valid", "files_missing", "images", *_MATRICES)
+"""Tensors whose first axis counts agents."""
 _OF_BOXES: Final = ("boxes", "velocity_known", "categories", "actor_ids")
 _LISTS: Final = ("token", "agents", "points", *_OF_BOXES)
 """Keys that stay lists with one entry for each item: texts, and tensors of different lengths."""
+
+
+class V2XItem(dict[str, Any]):
+    """An item of a `V2XDataset`: a dict that prints in a line, and that a DataLoader without `collate_fn` can batch."""
+
+    def __repr__(self) -> str:
+        """Its token, its agents, and the names of what else it holds."""
+        others = [name for name in self if name not in ("token", "agents")]
+        return f"V2XItem({self.get('token')}, agents {self.get('agents')}: {', '.join(others)})"
 
 
 def collate(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -78,6 +88,17 @@ def collate_fusion(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
         [_pairwise(item["ego_from_agent"][kept, -1]) for item, kept in zip(items, present, strict=True)]
     )
     return batch
+
+
+def _collate_by_default(items: Sequence[V2XItem], **_: object) -> dict[str, Any]:
+    """`collate`, as torch calls it for a type of item."""
+    return collate(items)
+
+
+with suppress(ImportError):  # torch's documented registry, which has no public place
+    from torch.utils.data._utils.collate import default_collate_fn_map
+
+    default_collate_fn_map[V2XItem] = _collate_by_default
 
 
 def _check_alike(items: Sequence[dict[str, Any]]) -> None:

@@ -15,6 +15,8 @@ from deepaccident_devkit.export.torch.images import ImageConfig
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import Augmentation, MotionLabelConfig
 from deepaccident_devkit.motion.warps.warping import WarpMode
+from deepaccident_devkit.release.missing_files import checked_on_missing
+from deepaccident_devkit.taxonomy import OnError
 from deepaccident_devkit.v2x import Agents, Link
 from deepaccident_devkit.v2x.link import checked_link
 
@@ -48,6 +50,9 @@ class V2XConfig:
         bev_segmentation: cells of the segmentation targets from the BEV camera; None for none.
         augmentation: A, applied to all that is in an ego frame; None for none.
         seed: seed of the drawn augmentations.
+        on_missing: of sensor files that were not downloaded: `raise`, or `skip` takes the agent's data of that frame as
+            not arrived, and says so in the item's `files_missing`. The sample's own files of the present cannot be
+            skipped.
     """
 
     agents: Agents = "single"
@@ -63,6 +68,7 @@ class V2XConfig:
     bev_segmentation: BevGrid | None = None
     augmentation: AugmentationSource | None = None
     seed: int = 0
+    on_missing: OnError = "raise"
 
     def __post_init__(self) -> None:
         """Check and complete."""
@@ -88,6 +94,7 @@ class V2XConfig:
 
     def _check_types(self) -> None:
         checked_link(self.link)
+        checked_on_missing(self.on_missing)
         for name, kind, example in _PARTS:
             value = getattr(self, name)
             if value is not None and not isinstance(value, kind):

@@ -15,6 +15,7 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, NotAvailableError
 from deepaccident_devkit.export.torch import sensor_data
 from deepaccident_devkit.export.torch.augmentation import augmented_boxes, augmented_six_vectors
+from deepaccident_devkit.export.torch.collate import V2XItem
 from deepaccident_devkit.export.torch.config import V2XConfig
 from deepaccident_devkit.motion import Augmentation, MotionLabelConfig, bev_segmentation
 from deepaccident_devkit.motion.sample_labels import motion_labels
@@ -40,12 +41,14 @@ class V2XDataset(TorchDataset):
     Always:
 
     - `token`: str. `agents`: their names, a tuple of A.
-    - `agent_valid` (A, P) bool: False if the link lost a message, or if the frame is before the recording. Then clouds
-      are empty, images are 0 and matrices are the identity.
+    - `agent_valid` (A, P) bool: False if the link lost a message, if the frame is before the recording, or if sensor
+      files are skipped. Then clouds are empty, images are 0 and matrices are the identity.
     - `ego_from_agent` (A, P, 4, 4) float32: the sender's ego frame at that frame → the present ego frame of the
       sample's agent, as this agent believes, with pose noise. [0, −1] is the identity, [0, :] the agent's own motion.
     - `world_from_ego` (4, 4) float64: of the sample's agent at the present; for augmented coordinates.
     - `augmentation` (4, 4) float32: A.
+
+    With `on_missing="skip"`: `files_missing` (A, P) int64, how many of the sensor files asked for are not there.
 
     With `points`: `points`, a list of A lists of P clouds (N, 4) float32: x y z in the sender's own ego frame at that
     frame, and the intensity.
@@ -132,12 +135,12 @@ class V2XDataset(TorchDataset):
             raise ConfigError(f"epoch: expected a whole number from 0, found {epoch}")
         self._epoch.fill_(number)
 
-    def __getitem__(self, index: int) -> dict[str, Any]:
+    def __getitem__(self, index: int) -> V2XItem:
         """The item of a sample, as described for the class.
 
         Raises:
             IndexError: no such item.
-            MissingFileError: a sensor file was not downloaded.
+            MissingFileError: a sensor file was not downloaded, and may not be skipped (`V2XConfig.on_missing`).
             SensorFileError: a sensor file cannot be read.
             ConfigError: images have different sizes without `resize`, or are smaller than the crop; or the function
                 that draws augmentations returns something else.
@@ -153,13 +156,14 @@ class V2XDataset(TorchDataset):
         if self.config.bev_segmentation is not None:
             target = bev_segmentation(self._dataset, sample, self.config.bev_segmentation, augmentation=augmentation)
             item |= {"bev_segmentation": _tensor(target.masks), "bev_known": _tensor(target.known)}
-        return item
+        return V2XItem(item)
 
     def _received_item(self, sample: str, augmentation: Augmentation) -> dict[str, Any]:
         """The sample's own tensors, and the sensor data that arrived."""
         dataset, config = self._dataset, self.config
         names = sensor_data.participants(dataset, sample, config.agents)
-        arrived = sensor_data.received(dataset, sample, names, config)
+        received = sensor_data.received(dataset, sample, names, config)
+        arrived, lacking = sensor_data.with_files(dataset, sample, names, received, config)
         world_from_ego = dataset.world_from(sample, "ego").matrix @ np.linalg.inv(augmentation.matrix)
         item: dict[str, Any] = {
             "token": sample,
@@ -169,6 +173,8 @@ class V2XDataset(TorchDataset):
             "world_from_ego": _tensor(world_from_ego),
             "augmentation": _tensor(augmentation.matrix, np.float32),
         }
+        if config.on_missing == "skip":
+            item["files_missing"] = _tensor(lacking)
         if config.points:
             clouds = sensor_data.point_clouds(dataset, names, arrived, augmentation)
             item["points"] = [[_tensor(cloud) for cloud in of_agent] for of_agent in clouds]

@@ -7,15 +7,16 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.errors import ConfigError, MissingFileError
 from deepaccident_devkit.export.torch.augmentation import augmented_points, augmented_pose
 from deepaccident_devkit.export.torch.config import V2XConfig
 from deepaccident_devkit.export.torch.images import ImageConfig
 from deepaccident_devkit.motion import Augmentation
+from deepaccident_devkit.release.missing_files import MissingFiles
 from deepaccident_devkit.tables.tokens import sample_token
-from deepaccident_devkit.taxonomy import AgentName
+from deepaccident_devkit.taxonomy import LIDAR, AgentName
 from deepaccident_devkit.v2x import Agents, Link, cooperating_agents
 from deepaccident_devkit.v2x.messages import Message, messages
 
@@ -54,6 +55,36 @@ def received(dataset: Dataset, sample: str, names: tuple[AgentName, ...], config
 
 def _reaches(link: Link | None, index: int) -> bool:
     return link is None or index > link.latency_frames
+
+
+def with_files(
+    dataset: Dataset, sample: str, names: Sequence[AgentName], arrived: Received, config: V2XConfig
+) -> tuple[Received, IntArray]:
+    """The messages whose sensor files are all there, and how many files each agent and frame (A, P) lacks.
+
+    Raises:
+        MissingFileError: a file is not there, and it is the sample's own of the present or `on_missing` is `raise`.
+    """
+    channels = (*[LIDAR] * config.points, *(() if config.images is None else config.images.cameras))
+    files = MissingFiles(dataset.dataroot, config.on_missing)
+    lacking = np.zeros((len(names), len(arrived)), dtype=np.int64)
+    for p, moment in enumerate(arrived):
+        for name, message in moment.items():
+            lacking[names.index(name), p] = sum(
+                not files.has(dataset.get_sample_data_path(f"{message.sample}/{channel}"), channel)
+                for channel in channels
+            )
+    if lacking[0, -1]:
+        raise MissingFileError(
+            f"{sample}: {lacking[0, -1]} of {len(channels)} sensor files of this sample's own agent are not there, and "
+            "on_missing='skip' leaves out other agents and frames alone; leave out such samples, or choose "
+            "points=False or fewer cameras"
+        )
+    there = [
+        {name: message for name, message in moment.items() if not lacking[names.index(name), p]}
+        for p, moment in enumerate(arrived)
+    ]
+    return there, lacking
 
 
 def valid_mask(names: Sequence[AgentName], arrived: Received) -> BoolArray:

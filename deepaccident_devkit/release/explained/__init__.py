@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.release._content import read_content
 from deepaccident_devkit.release.explained.calib import calib_text
@@ -26,7 +27,7 @@ _IMAGES = (b"\xff\xd8\xff", b"\x89PNG")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Explanation:
+class Explanation(ShortRepr):
     """What a file says.
 
     Attributes:

@@ -6,7 +6,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray, readonly
+from deepaccident_devkit.arrays import FloatArray, ShortRepr, readonly
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.roads.ground import GroundMap, paint_junction
 from deepaccident_devkit.synth.roads.layout import RoadSpec, parking_places
@@ -40,7 +40,7 @@ _QUARTERS: dict[Turn, int] = {"straight": 2, "left": -1, "right": 1}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Route:
+class Route(ShortRepr):
     """A way over the junction.
 
     Attributes:

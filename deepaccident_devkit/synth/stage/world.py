@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.synth.roads import Arm, GroundMap, Junction, Terrain
@@ -36,7 +37,7 @@ _POLE_UNDER_SENSOR = 0.4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class World:
+class World(ShortRepr):
     """Everything that does not change during a scenario, in the ground frame.
 
     Attributes:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.taxonomy import INFRASTRUCTURE, AgentName
 from deepaccident_devkit.testing.editing import ScenarioEditor
@@ -12,7 +13,7 @@ Apply = Callable[["Victim"], Path]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Breakage:
+class Breakage(ShortRepr):
     """One named way in which a release can be broken, or unusual though its format allows it.
 
     Attributes:
@@ -40,7 +41,7 @@ class Breakage:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BrokenRelease:
+class BrokenRelease(ShortRepr):
     """A release after it was broken.
 
     Attributes:

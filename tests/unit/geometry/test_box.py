@@ -36,6 +36,26 @@ def test_one_row_in_the_nuscenes_vocabulary(box: Box) -> None:
     assert repr(box) == "Box(van 1236, lidar [10.00, 0.00, 1.00], size [4.00, 2.00, 1.50], yaw 0.500, points 42)"
 
 
+def test_a_box_of_nuscenes_arguments() -> None:
+    turn = Quaternion(axis=(0, 1, 0), angle=0.2)
+    made = Box.from_wlh((10, 0, 1), (2, 4, 1.5), turn, frame="ego", category="van", velocity=(3, 0, 0))
+    assert (made.frame, made.category, made.token) == ("ego", "van", None)
+    for name, value in (("center", [10, 0, 1]), ("wlh", [2, 4, 1.5]), ("size", [4, 2, 1.5]), ("velocity", [3, 0, 0])):
+        assert_array_equal(getattr(made, name), value)
+    assert_allclose(made.rotation_matrix, turn.rotation_matrix, atol=1e-12)
+    plain = Box.from_wlh((10, 0, 1), (2, 4, 1.5), [1, 0, 0, 0], frame="world")
+    assert (plain.yaw, plain.category, np.isnan(plain.velocity).all()) == (0, "car", True)
+    with pytest.raises(GeometryError, match=r"wlh: expected shape \(3\), found \(2,\)"):
+        Box.from_wlh((0, 0, 0), (1, 2), turn, frame="ego")
+
+
+def test_nuscenes_call_names_ours() -> None:
+    turn = Quaternion()
+    for arguments, names in ((((0, 0, 0), (1, 2, 3), turn), {}), (((0, 0, 0), (1, 2, 3), turn), {"name": "car"})):
+        with pytest.raises(GeometryError, match=r"found tuple; .* is Box\.from_wlh\(center, wlh, orientation, frame="):
+            Box(*arguments, **names)
+
+
 def test_corners_stand_in_columns(box: Box) -> None:
     turn = np.array([[np.cos(0.5), -np.sin(0.5), 0], [np.sin(0.5), np.cos(0.5), 0], [0, 0, 1]])
     assert box.corners().shape == (3, 8)

@@ -311,7 +311,7 @@ def test_other_things_than_boxes_and_transforms_are_refused(two: Boxes) -> None:
     for compare in (two.iou_bev, two.iou_3d, two.distance_bev, two.center_distance):
         with pytest.raises(GeometryError, match="other: expected Boxes, found NoneType"):
             compare(None)
-    with pytest.raises(GeometryError, match=r"boxes: expected Boxes, found list; da\.boxes\(sample, frame=…\) gives"):
+    with pytest.raises(GeometryError, match=r"a Box is one row of Boxes, found list; boxes\[0\] picks one"):
         Box([])
     with pytest.raises(GeometryError, match="target_from_source: expected an SE3, found ndarray; of a matrix"):
         two.transform(np.eye(4), "ego")

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -105,6 +106,24 @@ def test_clouds_of_one_frame_join(cloud: LidarPointCloud) -> None:
     assert len(concatenate([], "ego")) == 0
     with pytest.raises(GeometryError, match="'lidar' cannot join those of 'ego'; transform them first"):
         concatenate([cloud], "ego")
+
+
+def test_points_keep_their_sources(cloud: LidarPointCloud, tmp_path: Path) -> None:
+    of_two = replace(cloud, agent=[0, 0, 4, 4, 4], time_lag=[0, 0, 0.1, 0.1, 0.2])
+    assert (of_two.agent.dtype, of_two.time_lag.dtype) == (np.int8, np.float32)
+    part = of_two.transform(SE3.identity(), "ego").crop(x=(1, 11)).voxel_downsample(1)
+    assert rows(part) == [1, 4]
+    part.save(tmp_path / "part.npz")
+    for each in (part, LidarPointCloud.load(tmp_path / "part.npz"), concatenate([part], "ego")):
+        assert_array_equal(each.agent, [0, 4])
+        assert_array_equal(each.time_lag, np.float32([0, 0.2]))
+    with pytest.raises(ValueError, match="read-only"):
+        part.time_lag[0] = 1
+    joined = concatenate([of_two, replace(of_two, agent=None)], "lidar")
+    assert joined.agent is None
+    assert len(joined.time_lag) == 10
+    with pytest.raises(GeometryError, match=r"LidarPointCloud.time_lag: expected shape \(5\), found \(2,\)"):
+        replace(cloud, time_lag=[0, 0])
 
 
 def test_the_same_cloud_is_the_same_bytes(cloud: LidarPointCloud, tmp_path: Path) -> None:

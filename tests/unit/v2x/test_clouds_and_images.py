@@ -111,9 +111,23 @@ def test_a_point_keeps_its_place_in_its_box() -> None:
     assert_allclose(points[0], [1.5, 0.5, 0.2])
 
 
+def test_each_point_says_whose_and_how_old_it_is(da: DeepAccident, sample: str) -> None:
+    """Of three sweeps 0.1 s apart; the partner's arrive 0.1 s late, the ego's do not, and none is from frame 0."""
+    cloud = da.aggregate_point_cloud(sample, agents=["infrastructure"], sweeps=3, link=Link(latency=0.1))
+    both = da.aggregate_point_cloud(sample, agents="+infrastructure", sweeps=3, link=Link(latency=0.1))
+    for each, names in ((cloud, ["infrastructure"]), (both, ["ego_vehicle", "infrastructure"])):
+        for name in names:
+            of_agent = each.select(each.agent == AGENTS.index(name))
+            for back in range(3):
+                lag = round(0.1 * (back + (name == "infrastructure")), 1)
+                taken = da.get_sample(da.scenario[0], name, 4 - round(lag * 10))
+                assert (of_agent.time_lag == np.float32(lag)).sum() == len(da.load_point_cloud(taken))
+    assert {AGENTS[code] for code in both.agent} == {"ego_vehicle", "infrastructure"}
+
+
 def test_lost_clouds_leave_no_points(da: DeepAccident, sample: str) -> None:
     cloud = da.aggregate_point_cloud(sample, agents=["infrastructure"], link=Link(packet_loss=1), frame="ego")
-    assert len(cloud) == 0
+    assert len(cloud) == len(cloud.agent) == len(cloud.time_lag) == 0
     assert cloud.frame == "ego"
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.accident.boxes import BoxAccidents
 from deepaccident_devkit.evaluation.metrics.accident.drawn_paths import DrawnPaths
@@ -24,7 +25,7 @@ from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ComparedAccidents:
+class ComparedAccidents(ShortRepr):
     """The accidents of one sample, in the present ego frame; those read off maps have no `ids`.
 
     Attributes:

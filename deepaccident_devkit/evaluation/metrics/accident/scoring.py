@@ -6,17 +6,17 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray
+from deepaccident_devkit.arrays import BoolArray, ShortRepr
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.metrics.alarms.reading import TIE, even
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
 from deepaccident_devkit.evaluation.metrics.choices import with_others
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, ratio
-from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
+from deepaccident_devkit.evaluation.metrics.headlines import TaskResult
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabels
 
 DISTANCES: Final = (5.0, 10.0, 15.0)
@@ -28,7 +28,7 @@ unknown.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AccidentsWithin:
+class AccidentsWithin(ShortRepr):
     """Accidents counted with one distance allowed.
 
     Attributes:
@@ -53,7 +53,7 @@ class AccidentsWithin:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AccidentResult(FrozenMappings):
+class AccidentResult(TaskResult):
     """Accident metrics of some samples.
 
     Attributes:
@@ -70,6 +70,7 @@ class AccidentResult(FrozenMappings):
         beside: results of other choices that are always printed too, by `name=value`.
     """
 
+    task: ClassVar[str] = "accident"
     within: Mapping[float, AccidentsWithin]
     apa: float
     id_error: float | None

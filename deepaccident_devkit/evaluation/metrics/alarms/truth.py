@@ -10,7 +10,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray, FrozenArrays, IntArray
+from deepaccident_devkit.arrays import FloatArray, FrozenArrays, IntArray, ShortRepr
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError, TokenError
 from deepaccident_devkit.evaluation.metrics.alarms.constant_velocity import constant_velocity_alarms
@@ -100,7 +100,7 @@ _OTHER_ENDING: Final[Mapping[str, str]] = MappingProxyType({"normal": "accident"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AccidentContext:
+class AccidentContext(ShortRepr):
     """Facts on a sample that its motion labels do not have; a protocol may need some of them.
 
     Attributes:

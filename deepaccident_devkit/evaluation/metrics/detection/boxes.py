@@ -10,9 +10,10 @@ from numpy.typing import ArrayLike
 
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, as_numbers, checked
 from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.deprecations import warn_deprecated
 from deepaccident_devkit.errors import ConfigError, GeometryError, NotAvailableError
 from deepaccident_devkit.evaluation.metrics.detection.protocols import DetectionProtocol, detection_protocol
-from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.geometry import SE3, Boxes
 from deepaccident_devkit.geometry.boxes import checked_boxes
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID, UNTRACKED_ID
 from deepaccident_devkit.v2x import Agents, cooperative_boxes
@@ -49,7 +50,7 @@ class DetectedBoxes(FrozenArrays):
         *,
         category: ArrayLike | None = None,
         velocity: ArrayLike | None = None,
-        frame: str = "lidar",
+        frame: str | None = None,
     ) -> DetectedBoxes:
         """Boxes that stand upright in `frame`, right-handed (x forward, y left).
 
@@ -60,11 +61,17 @@ class DetectedBoxes(FrozenArrays):
             scores: (N,).
             category: (N,) indices or names; None for cars.
             velocity: (N, 2) or (N, 3) m/s over the ground; None for unknown.
-            frame: what all of it is in.
+            frame: what all of it is in: `lidar` for an evaluator, `world` for results files. None is `lidar`, and is
+                deprecated.
 
         Raises:
             GeometryError: a shape or a number that cannot be.
         """
+        if frame is None:
+            what = "DetectedBoxes.from_arrays without a frame"
+            instead = "frame='lidar' (an evaluator's) or frame='world' (of results files)"
+            warn_deprecated(what, instead, since="0.1", gone_in="0.2")
+            frame = "lidar"
         columns: dict[str, Any] = {}
         if velocity is not None:
             given = as_numbers("velocity", velocity)
@@ -72,6 +79,10 @@ class DetectedBoxes(FrozenArrays):
             columns["velocity"] = np.column_stack([given, np.zeros(len(given))]) if flat else given
         boxes = Boxes.from_arrays(center, size, yaw, frame=frame, category=category, **columns)
         return cls(boxes=boxes, scores=scores)  # type: ignore[arg-type]  # checked in __post_init__
+
+    def transform(self, target_from_source: SE3, frame: str) -> DetectedBoxes:
+        """The same detections in another frame, such as `world` for results files. Raises GeometryError."""
+        return replace(self, boxes=self.boxes.transform(target_from_source, frame))
 
     def __len__(self) -> int:
         """Number of boxes."""

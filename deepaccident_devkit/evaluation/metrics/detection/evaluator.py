@@ -74,7 +74,8 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
         if not isinstance(prediction, DetectedBoxes):
             raise EvaluationError(
                 f"{token}: expected DetectedBoxes as the prediction, found {type(prediction).__name__}; make them with "
-                "DetectedBoxes.from_arrays(center, size, yaw, scores), of no rows where nothing is detected"
+                f"DetectedBoxes.from_arrays(center, size, yaw, scores, frame={self.protocol.frame!r}), of no rows "
+                "where nothing is detected"
             )
         for name, boxes in (("prediction", prediction.boxes), ("truth", checked_boxes("truth", truth))):
             if boxes.frame != self.protocol.frame:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import fsum, isnan, nan
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
@@ -13,11 +13,12 @@ from deepaccident_devkit.arrays import AnyArray, FloatArray, FrozenArrays, IntAr
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.metrics.detection.matching import ERRORS
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings, plain
+from deepaccident_devkit.evaluation.metrics.headlines import TaskResult
 from deepaccident_devkit.text import columns_text
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DetectionResult(FrozenArrays, FrozenMappings):
+class DetectionResult(TaskResult, FrozenArrays):
     """Average precisions and errors, by class; arrays are read-only. NaN: nothing to count.
 
     C classes, R ranges, K thresholds, P points of a curve.
@@ -39,6 +40,7 @@ class DetectionResult(FrozenArrays, FrozenMappings):
         samples: number of samples.
     """
 
+    task: ClassVar[str] = "detection"
     mean_average_precision: float
     class_average_precision: Mapping[str, float]
     mean_errors: Mapping[str, float]

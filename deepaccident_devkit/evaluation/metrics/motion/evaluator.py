@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
-from deepaccident_devkit.arrays import AnyArray, FloatArray
+from deepaccident_devkit.arrays import AnyArray, FloatArray, ShortRepr
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator, ratio, total
 from deepaccident_devkit.evaluation.metrics.frames import (
     cells_within,
@@ -18,7 +18,7 @@ from deepaccident_devkit.evaluation.metrics.frames import (
     frames_there,
     labels_at_present,
 )
-from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
+from deepaccident_devkit.evaluation.metrics.headlines import TaskResult
 from deepaccident_devkit.evaluation.metrics.motion.overlaps import (
     SegmentationCounts,
     iou,
@@ -47,7 +47,7 @@ _INSTANCE_MAPS: Final = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RangeResult:
+class RangeResult(ShortRepr):
     """Metrics within one range.
 
     Attributes:
@@ -70,7 +70,7 @@ class RangeResult:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MotionResult(FrozenMappings):
+class MotionResult(TaskResult):
     """Motion metrics of some samples.
 
     Attributes:
@@ -88,6 +88,7 @@ class MotionResult(FrozenMappings):
         notes: sentences that a reader of the numbers should know.
     """
 
+    task: ClassVar[str] = "motion"
     ranges: Mapping[str, RangeResult]
     min_ade: float
     min_fde: float

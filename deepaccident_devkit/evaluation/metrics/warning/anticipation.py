@@ -6,7 +6,7 @@ import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial
-from typing import Any, Final, get_args
+from typing import Any, ClassVar, Final, get_args
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from deepaccident_devkit.arrays import FloatArray, IntArray
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, ratio
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
+from deepaccident_devkit.evaluation.metrics.headlines import TaskResult
 from deepaccident_devkit.evaluation.metrics.warning.clean import WINDOW, CleanScores, OperatingPoint
 from deepaccident_devkit.evaluation.metrics.warning.drives import (
     GIVEN,
@@ -79,7 +80,7 @@ class AnticipationFigures(FrozenMappings):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AnticipationResult(FrozenMappings):
+class AnticipationResult(TaskResult):
     """The result of the protocol `clean`.
 
     Attributes:
@@ -91,6 +92,7 @@ class AnticipationResult(FrozenMappings):
         notes: sentences that a reader of the numbers should know.
     """
 
+    task: ClassVar[str] = "warning"
     samples: int
     operating_by: str
     groups: Mapping[str, AnticipationFigures]

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
+from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray, ShortRepr
 from deepaccident_devkit.evaluation.metrics.evaluator import ratio
 from deepaccident_devkit.evaluation.metrics.warning.series import ScoreSeries
 
@@ -28,7 +28,7 @@ _MINUTE: Final = 60.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OperatingPoint:
+class OperatingPoint(ShortRepr):
     """The gain and the cost if every score of at least a threshold is an alarm. NaN: nothing to count.
 
     Attributes:
@@ -93,6 +93,9 @@ class CleanScores:
         self._place = np.searchsorted(-self._levels, -self.highest, side="left")
         below = [np.searchsorted(row, self._levels) for row in np.sort(self._scores, axis=1)]
         self._alarmed = self._scores.shape[1] - np.array(below).reshape(len(below), len(self._levels))
+
+    def __repr__(self) -> str:
+        return f"CleanScores({self.series!r})"
 
     def average_precision(self, weight: FloatArray) -> float:
         """Σ (R_k − R_{k−1}) P_k over the recordings' highest scores, falling; NaN without an accident.

@@ -14,7 +14,7 @@ from typing import Final, Literal, get_args
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
+from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray, ShortRepr
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.metrics.warning.series import ScoreSeries
 
@@ -55,7 +55,7 @@ class FieldQuirks:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FieldFigures:
+class FieldFigures(ShortRepr):
     """What one of the four prints; NaN where it raises an error or divides by 0.
 
     Attributes:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any, get_args
+from typing import Any, ClassVar, get_args
 
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.metrics.choices import with_others, with_parts
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
-from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
+from deepaccident_devkit.evaluation.metrics.headlines import TaskResult
 from deepaccident_devkit.evaluation.metrics.warning.drives import (
     GIVEN,
     PREDICTORS,
@@ -24,7 +24,7 @@ from deepaccident_devkit.evaluation.metrics.warning.protocol import WarningRules
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FieldResult(FrozenMappings):
+class FieldResult(TaskResult):
     """The result of the protocol `field`: not comparable between codes, and predictors that know nothing can win.
 
     Attributes:
@@ -35,6 +35,7 @@ class FieldResult(FrozenMappings):
         notes: sentences that a reader of the numbers should know: why numbers are NaN.
     """
 
+    task: ClassVar[str] = "warning"
     samples: int
     figures: Mapping[str, FieldFigures]
     references: Mapping[str, Mapping[str, FieldFigures]]

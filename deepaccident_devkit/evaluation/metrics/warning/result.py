@@ -6,13 +6,14 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray, FrozenArrays
 from deepaccident_devkit.evaluation.metrics.evaluator import ratio
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
+from deepaccident_devkit.evaluation.metrics.headlines import TaskResult
 from deepaccident_devkit.evaluation.metrics.warning.protocol import WarningProtocol
 from deepaccident_devkit.evaluation.metrics.warning.recordings import KINDS, Tally, kind_united
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
@@ -44,7 +45,7 @@ class WarningCurve(FrozenArrays):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class WarningResult(FrozenArrays, FrozenMappings):
+class WarningResult(TaskResult, FrozenArrays):
     """How early accidents are warned of, and how often alarms are false. NaN: nothing to count.
 
     A recording is what one agent saw of one scenario. Its kinds: `accident`; `normal` for nobody collides, which is
@@ -84,6 +85,7 @@ class WarningResult(FrozenArrays, FrozenMappings):
         notes: sentences that a reader of the numbers should know.
     """
 
+    task: ClassVar[str] = "warning"
     samples: int
     recordings: Mapping[str, int]
     minutes: Mapping[str, float]

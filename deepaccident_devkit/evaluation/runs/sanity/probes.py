@@ -13,7 +13,7 @@ from typing import Any, Final, Literal, get_args
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, ShortRepr
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation, turned
 
@@ -105,7 +105,7 @@ def overlap(predicted: BoolArray, true: BoolArray, where: BoolArray) -> tuple[in
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Candidate:
+class Candidate(ShortRepr):
     """How well predictions fit the truth if one thing were wrong with all of them.
 
     Attributes:

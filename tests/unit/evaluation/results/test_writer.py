@@ -103,7 +103,7 @@ class TestWriter:
             ResultsWriter(tmp_path / "x", task).add(FIRST, PREDICTIONS[task]())
 
     def test_predictions_of_another_kind(self, tmp_path: Path, task: Any) -> None:
-        lidar = DetectedBoxes.from_arrays(np.zeros((1, 3)), np.ones((1, 3)), [0.0], [0.5])
+        lidar = DetectedBoxes.from_arrays(np.zeros((1, 3)), np.ones((1, 3)), [0.0], [0.5], frame="lidar")
         wrong: dict[str, list[tuple[Any, str]]] = {
             "motion": [([], "expected a MotionOutput, found list; make one with")],
             "accident": [
@@ -112,8 +112,8 @@ class TestWriter:
                 ([Accident(positions=np.ones((2, 2)), time=0.5, ids=(2**70, 1))], "ids: expected two whole numbers"),
             ],
             "detection": [
-                ([], "expected DetectedBoxes, found list; DetectedBoxes.from_arrays makes some"),
-                (lidar, "expected boxes in the world frame, found lidar; give those of boxes.transform("),
+                ([], "expected DetectedBoxes, found list; make them with DetectedBoxes.from_arrays("),
+                (lidar, "expected boxes in the world frame, found lidar; give detected.transform(dataset."),
             ],
         }
         with ResultsWriter(tmp_path / "x", task) as writer:

@@ -25,6 +25,7 @@ def test_detections_are_coloured_by_their_matches(da_motion: DeepAccident, sampl
         np.append(truth.yaw[some], 0.0),
         np.linspace(1, 0.5, len(center)),
         category=np.append(truth.category[some], 0),
+        frame="lidar",
     )
     ax = draw_detection_outcome(detected, truth, "paper", ax=new_axes())
     shapes = {

@@ -7,7 +7,8 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError, NotAvailableError
-from deepaccident_devkit.evaluation.metrics.detection import detection_protocol, detection_truth
+from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes, detection_protocol, detection_truth
+from deepaccident_devkit.geometry import SE3
 
 
 def test_the_truth_of_each_protocol(da: DeepAccident) -> None:
@@ -30,6 +31,15 @@ def test_the_truth_of_each_protocol(da: DeepAccident) -> None:
         detection_truth(da, sample, "paper", agents="single")
     with pytest.raises(ConfigError, match="label_velocity"):
         detection_truth(da, sample, detection_protocol("opencood", label_velocity=True))
+
+
+def test_detected_boxes_say_their_frame_and_change_it() -> None:
+    arrays = [[1.0, 2.0, 3.0]], [[4.0, 2.0, 1.5]], [0.5], [0.9]
+    with pytest.warns(DeprecationWarning, match=r"without a frame is .*; use frame='lidar' .* frame='world'"):
+        silent = DetectedBoxes.from_arrays(*arrays)
+    assert silent.boxes.frame == "lidar"
+    moved = DetectedBoxes.from_arrays(*arrays, frame="lidar").transform(SE3.from_yaw(0, (10, 0, 0)), "world")
+    assert (moved.boxes.frame, moved.boxes.center.tolist(), moved.scores.tolist()) == ("world", [[11, 2, 3]], [0.9])
 
 
 def test_a_sample_without_label_has_no_truth(own_release: Path) -> None:

@@ -160,7 +160,7 @@ def test_errors_of_the_paper() -> None:
 
 def test_the_released_heading_error_is_not_wrapped_and_its_scale_error_not_aligned() -> None:
     truth = Boxes.from_arrays([[10, 0, 0.75]], [SIZE], [0.1], frame="lidar", velocity=[[math.nan] * 3])
-    prediction = DetectedBoxes.from_arrays([[11, 0, 0.75]], [SIZE], [-0.1], [0.5], velocity=[[3.0, 4.0]])
+    prediction = DetectedBoxes.from_arrays([[11, 0, 0.75]], [SIZE], [-0.1], [0.5], velocity=[[3.0, 4.0]], frame="lidar")
     errors = evaluated("released", (prediction, truth)).compute().errors[0]
     reached = errors - 1 / 36  # one point of 36 is never reached, and counts as 1
     overlap = 1 - 1.0 * 36 / 35 * reached[1]
@@ -172,7 +172,7 @@ def test_the_released_heading_error_is_not_wrapped_and_its_scale_error_not_align
 
 def test_velocities_that_a_detector_does_not_give() -> None:
     truth = truth_at((10, 0))
-    prediction = DetectedBoxes.from_arrays(truth.center, truth.size, truth.yaw, [0.5])
+    prediction = DetectedBoxes.from_arrays(truth.center, truth.size, truth.yaw, [0.5], frame="lidar")
     evaluator = evaluated("paper", (prediction, truth))
     result = evaluator.compute()
     assert math.isnan(result.mean_errors["AVE"])
