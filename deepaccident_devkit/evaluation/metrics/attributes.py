@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.selection import accident_visible
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.text import choice
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import SampleRecord, ScenarioRecord
@@ -89,8 +89,7 @@ class SampleAttributes:
 
     def value(self, name: str) -> str | None:
         """The value of one of `ATTRIBUTES`; None where it is not known. Raises ChoiceError."""
-        if name not in ATTRIBUTES:
-            raise ChoiceError(f"by: expected one of {', '.join(ATTRIBUTES)}, found {name!r}")
+        name = choice("by", name, ATTRIBUTES)
         if name == EVERYTHING:
             return EVERYTHING
         value: str | None = getattr(self.story if name in ScenarioAttributes.__dataclass_fields__ else self, name)

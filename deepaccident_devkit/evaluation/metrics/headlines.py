@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Final, Literal
 
-from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.text import choice
 
 Unit = Literal["%", "share", "m", "s", "rad", "m/s", "1 - overlap", "1/min"]
 LIMITS: Final[Mapping[Unit, float]] = MappingProxyType({"%": 100.0, "share": 1.0, "1 - overlap": 1.0})
@@ -120,8 +120,7 @@ def headlines(task: str, result: object) -> tuple[Headline, ...]:
     Raises:
         ChoiceError: no such task.
     """
-    if task not in _ROWS:
-        raise ChoiceError(f"task: expected one of {', '.join(_ROWS)}, found {task!r}")
+    task = choice("task", task, _ROWS)
     return tuple(
         Headline(
             name=row.name.replace("*", key),
