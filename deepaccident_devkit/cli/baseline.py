@@ -7,7 +7,12 @@ import click
 from deepaccident_devkit.baselines import MOTION_MODELS, Baseline, StudyConfig, predict_results, v2x_study
 from deepaccident_devkit.baselines.figures import save_study
 from deepaccident_devkit.cli.evaluate_options import resamples_parameter
-from deepaccident_devkit.cli.options import cooperating_parameter, names_or_configuration, release_parameters
+from deepaccident_devkit.cli.options import (
+    WordChoice,
+    cooperating_parameter,
+    names_or_configuration,
+    release_parameters,
+)
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation import Resampling
@@ -26,7 +31,7 @@ _SPLIT = click.option("--split", default="val", show_default=True, help="Name of
 _OUT = click.option("--out", required=True, type=click.Path(), metavar="DIR", help="Folder to write the files into.")
 _MODEL = click.option(
     "--model",
-    type=click.Choice(list(MOTION_MODELS)),
+    type=WordChoice(MOTION_MODELS),
     default="constant_velocity",
     show_default=True,
     help="How the baseline moves each actor into the future.",
@@ -34,7 +39,7 @@ _MODEL = click.option(
 _SEED = click.option("--seed", default=0, show_default=True, help="Seed of the pose noise.")
 _SCOPE = click.option(
     "--scope",
-    type=click.Choice(get_args(Scope)),
+    type=WordChoice(get_args(Scope)),
     default="accident",
     show_default=True,
     help="Accident scenarios only, or all scenarios.",
@@ -53,7 +58,7 @@ def baseline() -> None:
     "--task",
     "tasks",
     multiple=True,
-    type=click.Choice([*get_args(ResultsTask), "all"]),
+    type=WordChoice([*get_args(ResultsTask), "all"]),
     default=("all",),
     show_default=True,
     help="Task to write results for; you can repeat this option.",
@@ -76,7 +81,7 @@ def baseline() -> None:
 @click.option(
     "--samples",
     "purpose",
-    type=click.Choice(["evaluate", "all"]),
+    type=WordChoice(["evaluate", "all"]),
     default="evaluate",
     show_default=True,
     help="evaluate: samples within the horizon before the end. all: two samples per second of each scenario.",
@@ -113,13 +118,13 @@ def predict(split: str, tasks: tuple[str, ...], purpose: Any, scope: Scope, out:
     "--ego",
     "egos",
     multiple=True,
-    type=click.Choice(AGENTS),
+    type=WordChoice(AGENTS),
     help="Agent that predicts; you can repeat this option.  [default: ego_vehicle]",
 )
 @_SCOPE
 @click.option(
     "--protocol",
-    type=click.Choice(list(PROTOCOLS)),
+    type=WordChoice(PROTOCOLS),
     default="paper",
     show_default=True,
     help="Protocol for accidents in maps. Explicit accidents always use the protocol boxes.",

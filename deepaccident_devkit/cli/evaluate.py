@@ -16,7 +16,7 @@ from deepaccident_devkit.cli.evaluate_options import (
     selection_parameters,
     switches_of,
 )
-from deepaccident_devkit.cli.options import release_parameters
+from deepaccident_devkit.cli.options import WordChoice, release_parameters
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.metrics.attributes import ATTRIBUTES, EVERYTHING
@@ -63,7 +63,7 @@ def _threshold_options(task: TaskName) -> Callable[[Callable[..., Any]], Callabl
         ),
         click.option(
             "--threshold-by",
-            type=click.Choice(get_args(Chooser)),
+            type=WordChoice(get_args(Chooser)),
             default="best_f1",
             show_default=True,
             help="best_f1: the threshold with the best F1. quiet: at most one second of false alarm per minute.",
@@ -86,7 +86,7 @@ def _task_verb(task: TaskName) -> click.Command:
     @selection_parameters
     @click.option(
         "--protocol",
-        type=click.Choice(protocols),
+        type=WordChoice(protocols),
         default=protocols[0],
         show_default=True,
         help="Rules of the metrics; docs/protocols.md describes them.",
@@ -108,7 +108,7 @@ def _task_verb(task: TaskName) -> click.Command:
     @click.option(
         "--by",
         multiple=True,
-        type=click.Choice(ATTRIBUTES),
+        type=WordChoice(ATTRIBUTES),
         help="Also give the numbers for each value of this attribute; you can repeat this option.",
     )
     @resamples_parameter

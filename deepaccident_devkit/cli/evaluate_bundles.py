@@ -8,7 +8,7 @@ from typing import Any, Literal
 import click
 
 from deepaccident_devkit.cli.evaluate_options import resamples_parameter, selection_of, selection_parameters
-from deepaccident_devkit.cli.options import on_error_parameter
+from deepaccident_devkit.cli.options import WordChoice, on_error_parameter
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.results import read_results
@@ -26,7 +26,7 @@ _workers = click.option("--workers", type=click.IntRange(min=1), help="Number of
 @click.option(
     "--dataroot", type=click.Path(path_type=Path), help="Also compare the samples with those of this release."
 )
-@click.option("--version", type=click.Choice(VERSIONS), default="v1", show_default=True, help="Version of the release.")
+@click.option("--version", type=WordChoice(VERSIONS), default="v1", show_default=True, help="Version of the release.")
 @selection_parameters
 @_workers
 @on_error_parameter

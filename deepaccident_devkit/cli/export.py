@@ -5,7 +5,7 @@ from typing import Any, get_args
 
 import click
 
-from deepaccident_devkit.cli.options import agent_names, agents_parameter, frame_range, release_parameters
+from deepaccident_devkit.cli.options import WordChoice, agent_names, agents_parameter, frame_range, release_parameters
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.export.mcap import McapConfig, export_mcap
@@ -53,7 +53,7 @@ def _points(context: click.Context, parameter: click.Parameter, value: str) -> s
     help="all, or N for every N-th point of a cloud.",
 )
 @click.option("--labels/--no-labels", default=True, show_default=True, help="Whether to write the boxes.")
-@click.option("--motion-labels", type=click.Choice(list(PRESETS)), help="Also write motion labels by this preset.")
+@click.option("--motion-labels", type=WordChoice(PRESETS), help="Also write motion labels by this preset.")
 @click.option(
     "--results",
     type=click.Path(path_type=Path),
@@ -62,7 +62,7 @@ def _points(context: click.Context, parameter: click.Parameter, value: str) -> s
 )
 @click.option(
     "--on-missing",
-    type=click.Choice(get_args(OnError)),
+    type=WordChoice(get_args(OnError)),
     default="skip",
     show_default=True,
     help="skip: leave out missing sensor files. raise: stop at the first one.",

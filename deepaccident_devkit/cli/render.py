@@ -10,6 +10,7 @@ from typing import Any, cast, get_args
 import click
 
 from deepaccident_devkit.cli.options import (
+    WordChoice,
     cooperating_parameter,
     frame_range,
     names_or_configuration,
@@ -89,7 +90,7 @@ def _link_options(latency: float, pose_noise: float) -> tuple[Any, ...]:
 _AGENTS = cooperating_parameter("Agents to show", "chosen by the view")
 _VIEW_RANGE = click.option("--view-range", type=float, metavar="M", help="Metres to show on each side.")
 _COORDINATES = click.option(
-    "--frame", type=click.Choice(get_args(Frame)), help="Coordinate frame of the axes.  [default: ego]"
+    "--frame", type=WordChoice(get_args(Frame)), help="Coordinate frame of the axes.  [default: ego]"
 )
 _LAYERS = click.option(
     "--layers",
@@ -164,7 +165,7 @@ _PICTURES = {
         canvas="ax",
         options=(
             click.option(
-                "--color-by", type=click.Choice(get_args(ColorBy)), help="Colour of the points.  [default: depth]"
+                "--color-by", type=WordChoice(get_args(ColorBy)), help="Colour of the points.  [default: depth]"
             ),
         ),
     ),
@@ -196,7 +197,7 @@ _PICTURES = {
         help="Render the motion labels of one sample: one column per frame; instances, centerness, offset and flow.",
         options=(
             click.option(
-                "--style", type=click.Choice(get_args(MotionStyle)), help="Style of the picture.  [default: maps]"
+                "--style", type=WordChoice(get_args(MotionStyle)), help="Style of the picture.  [default: maps]"
             ),
             _LAYERS,
         ),
@@ -239,7 +240,7 @@ _PICTURES = {
         options=(
             click.option("--results", type=click.Path(path_type=Path), required=True, help="Results file of a model."),
             click.option(
-                "--task", type=click.Choice(["motion", "accident"]), help="Verdict on motion, or on the accident in it."
+                "--task", type=WordChoice(["motion", "accident"]), help="Verdict on motion, or on the accident in it."
             ),
             click.option(
                 "--protocol", help="Name of the protocol.  [default: released; for explicit accidents: boxes]"

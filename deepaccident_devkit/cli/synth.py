@@ -6,7 +6,7 @@ from typing import Any, get_args
 
 import click
 
-from deepaccident_devkit.cli.options import pixel_size
+from deepaccident_devkit.cli.options import WordChoice, pixel_size
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.synth.checking import checked_text
@@ -60,7 +60,7 @@ def _show_design(context: click.Context, _parameter: click.Parameter, number: in
 )
 @click.option(
     "--layout",
-    type=click.Choice(get_args(Layout)),
+    type=WordChoice(get_args(Layout)),
     default=_DEFAULTS.layout,
     show_default=True,
     help="A: all splits in one folder. B: one folder per split.",
@@ -105,7 +105,7 @@ def _show_design(context: click.Context, _parameter: click.Parameter, number: in
 )
 @click.option(
     "--view",
-    type=click.Choice(get_args(View)),
+    type=WordChoice(get_args(View)),
     help="hidden: a house at the corner hides the two vehicles that will collide from each other.",
 )
 @click.option(
