@@ -281,7 +281,7 @@ def test_labels_writes_a_split_and_goes_on_where_it_stopped(own_release: Path, t
     [
         (
             ("--agents", "ego_vehicle,pole"),
-            "--agents: expected all, available or some of ego_vehicle, ego_vehicle_behind,",
+            "--agents: expected one of ego_vehicle, ego_vehicle_behind,",
         ),
         (("--agents", ""), "found ''"),
         (("--agents", "ego_vehicle,"), "found ''"),

@@ -13,6 +13,7 @@ from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.evaluation.runs import compare_bundles, coverage, read_bundle, results_text, verify_bundle
+from deepaccident_devkit.evaluation.runs.sanity import check_sanity
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.taxonomy import VERSIONS
@@ -33,6 +34,7 @@ _workers = click.option("--workers", type=click.IntRange(min=1), help="Number of
 def validate(results: Path, dataroot: Path | None, version: str, workers: int | None, **options: Any) -> None:
     """Check every entry of the results file or folder RESULTS, and print a summary.
 
+    With --dataroot, also repeat the warnings of `evaluate … --sanity`.
     Exit status 1: with --dataroot, samples of --split are missing, or RESULTS has others. 2: an entry is wrong.
     """
     opened = read_results(results)
@@ -41,9 +43,15 @@ def validate(results: Path, dataroot: Path | None, version: str, workers: int | 
     if dataroot is None:
         return
     dataset = DeepAccident(version, dataroot, workers=workers, on_error=options["on_error"])
-    selection = selection_of(EvaluationSetup(task=opened.task, horizon=options["horizon"]), options)
+    protocol = "boxes" if opened.task == "accident" else "released"  # the one that takes explicit accidents
+    setup = EvaluationSetup(task=opened.task, protocol=protocol, horizon=options["horizon"])
+    selection = selection_of(setup, options)
     covered = coverage(dataset, opened.tokens, selection)
     click.echo(f"{selection.text()}: {covered.to_text()}")
+    shared = sorted(set(opened.tokens).intersection(selection.tokens(dataset)))
+    warnings = check_sanity(dataset, opened, setup, shared, workers=workers).warnings_text() if shared else ""
+    if warnings:
+        click.echo(warnings)
     if not covered.is_complete:
         sys.exit(_FINDINGS_STATUS)
 
