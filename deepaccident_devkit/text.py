@@ -63,7 +63,7 @@ def choice(name: str, value: object, words: Collection[Word], *, error: type[Dee
         error: the kind of error.
 
     Raises:
-        ChoiceError: it is none of the words (or the other kind).
+        ChoiceError: there is no such word (or the other kind).
     """
     lowered = value.lower() if isinstance(value, str) else None
     for word in words:

@@ -11,6 +11,7 @@ from deepaccident_devkit.cli.options import (
     WordChoice,
     cooperating_parameter,
     names_or_configuration,
+    refuse_unused,
     release_parameters,
 )
 from deepaccident_devkit.deepaccident import DeepAccident
@@ -96,6 +97,12 @@ def predict(split: str, tasks: tuple[str, ...], purpose: Any, scope: Scope, out:
     noise, latency, seed = options.pop("pose_noise"), options.pop("latency"), options.pop("seed")
     link = Link(latency=latency, pose_noise=noise or None, seed=seed) if noise or latency else None
     options["agents"] = names_or_configuration(options["agents"]) or _ALONE
+    if options["agents"] == _ALONE:
+        refuse_unused("with --agents single, which has no partners", "latency", "pose_noise", "seed")
+    if not noise:
+        refuse_unused("without --pose-noise", "seed")
+    if purpose == "all":
+        refuse_unused("with --samples all, which are those of all scenarios", "scope")
     chosen = Baseline(link=link, **{name: options.pop(name) for name in ("agents", "model", "horizon")})
     folder = writable_folder(out)
     dataset = DeepAccident(**options)

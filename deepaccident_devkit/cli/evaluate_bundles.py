@@ -8,7 +8,7 @@ from typing import Any, Literal
 import click
 
 from deepaccident_devkit.cli.evaluate_options import resamples_parameter, selection_of, selection_parameters
-from deepaccident_devkit.cli.options import WordChoice, on_error_parameter
+from deepaccident_devkit.cli.options import WordChoice, on_error_parameter, refuse_unused
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.results import read_results
@@ -19,6 +19,7 @@ from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.taxonomy import VERSIONS
 
 _FINDINGS_STATUS = 1
+_OF_RELEASE = ("version", "split", "samples", "scope", "agents", "horizon", "on_error")
 _workers = click.option("--workers", type=click.IntRange(min=1), help="Number of processes to use.")
 
 
@@ -37,6 +38,8 @@ def validate(results: Path, dataroot: Path | None, version: str, workers: int | 
     With --dataroot, also repeat the warnings of `evaluate … --sanity`.
     Exit status 1: with --dataroot, samples of --split are missing, or RESULTS has others. 2: an entry is wrong.
     """
+    if dataroot is None:
+        refuse_unused("without --dataroot", *_OF_RELEASE)
     opened = read_results(results)
     opened.check(workers=workers, progress=True)
     click.echo(results_text(opened))

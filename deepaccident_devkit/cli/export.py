@@ -5,12 +5,19 @@ from typing import Any, get_args
 
 import click
 
-from deepaccident_devkit.cli.options import WordChoice, agent_names, agents_parameter, frame_range, release_parameters
+from deepaccident_devkit.cli.options import (
+    WordChoice,
+    agent_names,
+    agents_parameter,
+    frame_range,
+    refuse_unused,
+    release_parameters,
+)
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.export.mcap import McapConfig, export_mcap
 from deepaccident_devkit.motion import PRESETS
-from deepaccident_devkit.taxonomy import AGENTS, OnError
+from deepaccident_devkit.taxonomy import AGENTS, LIDAR, OnError
 from deepaccident_devkit.v2x.collisions import default_scenario
 
 
@@ -84,7 +91,9 @@ def mcap(
     choices = {name: options.pop(name) for name in ("frames", "points", "labels", "motion_labels", "on_missing")}
     choices["agents"] = None if names == AGENTS else names
     choices["channels"] = [name for text in channels for name in text.split(",")] if channels else None
-    McapConfig.of(**choices)  # before the release is indexed
+    config = McapConfig.of(**choices)  # before the release is indexed
+    if LIDAR not in (config.channels or ()):
+        refuse_unused(f"without the channel {LIDAR}", "points")
     prediction = None if results is None else read_results(results)
     dataset = DeepAccident(**options)
     token = scenario or default_scenario(dataset)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+from click.core import ParameterSource
 
 from deepaccident_devkit.taxonomy import AGENTS, VERSIONS
 from deepaccident_devkit.text import choice, meant_text
@@ -41,22 +42,37 @@ on_error_parameter = click.option(
     show_default=True,
     help="raise: list broken scenarios and stop. skip: leave them out.",
 )
-_PARAMETERS = (
-    click.argument("dataroot", type=click.Path(path_type=Path)),
-    click.option(
-        "--version", type=WordChoice(VERSIONS), default="v1", show_default=True, help="Version of the release."
-    ),
-    click.option("--index-dir", type=click.Path(path_type=Path), help="Folder of the index."),
-    click.option("--workers", type=click.IntRange(min=1), help="Number of processes to use."),
-    on_error_parameter,
+
+
+def _tell_unused(_context: click.Context, parameter: click.Parameter, value: str | None) -> None:
+    if value is not None:
+        click.echo(f"{parameter.opts[0]} changes nothing here: the command reads the files, not the index", err=True)
+
+
+_DATAROOT = click.argument("dataroot", type=click.Path(path_type=Path))
+_VERSION = click.option(
+    "--version", type=WordChoice(VERSIONS), default="v1", show_default=True, help="Version of the release."
+)
+_WORKERS = click.option("--workers", type=click.IntRange(min=1), help="Number of processes to use.")
+_INDEX_DIR = click.option("--index-dir", type=click.Path(path_type=Path), help="Folder of the index.")
+_UNUSED = tuple(
+    click.option(name, hidden=True, expose_value=False, callback=_tell_unused) for name in ("--index-dir", "--on-error")
 )
 
 
 def release_parameters(verb: Verb) -> Verb:
     """Give a verb DATAROOT, --version, --index-dir, --workers and --on-error."""
-    for parameter in reversed(_PARAMETERS):
+    return _DATAROOT(_VERSION(_INDEX_DIR(_WORKERS(on_error_parameter(verb)))))
+
+
+def files_parameters(verb: Verb) -> Verb:
+    """Give a verb that reads files and not the index DATAROOT, --version and --workers.
+
+    It takes the other options of a release too, as all verbs do, but does not offer them.
+    """
+    for parameter in _UNUSED:
         verb = parameter(verb)
-    return verb
+    return _DATAROOT(_VERSION(_WORKERS(verb)))
 
 
 def where_parameter(verb: Verb) -> Verb:
@@ -108,6 +124,14 @@ def names_or_configuration(given: tuple[str, ...]) -> str | list[str] | None:
         return names or None
     alone = choice("--agents", names[0], (*AGENT_SETS, *AGENTS))
     return names if alone in AGENTS else alone
+
+
+def refuse_unused(why: str, *parameters: str) -> None:
+    """End with a usage error if one of these options of the verb that runs was given, because it changes nothing."""
+    context = click.get_current_context()
+    for option in context.command.params:
+        if option.name in parameters and context.get_parameter_source(option.name) is not ParameterSource.DEFAULT:
+            raise click.UsageError(f"{option.opts[0]} changes nothing {why}; leave it out", context)
 
 
 def pixel_size(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[int, int] | None:

@@ -15,6 +15,7 @@ from deepaccident_devkit.cli.options import (
     frame_range,
     names_or_configuration,
     pixel_size,
+    refuse_unused,
     release_parameters,
 )
 from deepaccident_devkit.cli.render_targets import picture_paths, rows_to_draw
@@ -301,6 +302,10 @@ def _verb(name: str, picture: _Picture) -> click.Command:
     ) -> None:
         release = {option: options.pop(option) for option in _RELEASE}
         options["agents"] = names_or_configuration(options.pop("agents", ()))
+        if name == "bev" and options["agents"] in (None, "single"):
+            refuse_unused("without --agents: it is about the data of partners", "latency", "pose_noise", "seed")
+        if not options.get("pose_noise"):
+            refuse_unused("without --pose-noise", "seed")
         options["layers"] = _words(options.pop("layers", ()))
         choices = {option: value for option, value in options.items() if value is not None}
         if not tokens and "results" in choices:
