@@ -187,7 +187,7 @@ def test_split_saves_a_selection(own_release: Path, tmp_path: Path) -> None:
     for options in (("--seed", 3), ("--seed", 17), ("--released-skip",)):
         refused = run("split", own_release, "--where", "split=train", "--save", tmp_path / "c.txt", *options)
         assert (refused.returncode, (tmp_path / "c.txt").exists()) == (2, False)
-        assert f"{options[0]} is for the official split" in refused.stderr
+        assert f"{options[0]} changes nothing with --where or --save: it is for the official split" in refused.stderr
     wrong = run("split", own_release, "--where", "wether=Clear")
     assert (wrong.returncode, wrong.stderr.startswith("error: scenarios cannot be found by 'wether'")) == (2, True)
 

@@ -177,7 +177,7 @@ def _refuse_unused(setup: EvaluationSetup, options: dict[str, Any]) -> None:
         refuse_unused("without --threshold-from", "threshold_by")
     elif "threshold" in setup.switches:
         raise click.UsageError("--threshold-from sets the threshold that --switch threshold=… sets; give one of them")
-    if isinstance(setup.rules, FieldWarnings):
+    if isinstance(setup.rules, FieldWarnings) and options["resamples"]:
         refuse_unused("with --protocol field, which has no intervals", "resamples")
     if setup.task == "detection" and options["samples"] == "all":
         refuse_unused("with --samples all: detections are of the present", "horizon")
