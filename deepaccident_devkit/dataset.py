@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 import numpy as np
 
@@ -27,12 +28,16 @@ from deepaccident_devkit.taxonomy import (
     UNTRACKED_ID,
     Frame,
 )
+from deepaccident_devkit.text import choice, spelled
 
-__all__ = ["Dataset", "RowArgument", "VelocitySource", "Visible"]
+__all__ = ["VISIBLE", "Dataset", "RowArgument", "VelocitySource", "Visible"]
 
 Visible = Literal["camera", "released"]
 VelocitySource = Literal["decoded", "derived", "label"]
-_FRAMES = frozenset((*get_args(Frame), *CHANNELS))
+_FRAMES: Final[Mapping[str, str]] = {name: name for name in (*get_args(Frame), *CHANNELS)} | {LIDAR: "lidar"}
+"""What a caller can call a frame → its one name."""
+VISIBLE: Final = (None, *get_args(Visible))
+"""What `visible=` can be."""
 
 
 class Dataset(OpenTables):
@@ -74,12 +79,8 @@ class Dataset(OpenTables):
         Raises:
             ChoiceError: no such frame.
         """
-        if isinstance(frame, str):
-            if frame == LIDAR:
-                return "lidar"
-            if frame in _FRAMES:
-                return frame
-        raise ChoiceError(f"frame: expected world, ego, lidar or one of {', '.join(CHANNELS)}, found {frame!r}")
+        name: str = choice("frame", frame, _FRAMES)
+        return _FRAMES[name]
 
     # boxes
 
@@ -108,9 +109,10 @@ class Dataset(OpenTables):
         """
         token, frame = token_of(sample), self.frame_name(frame)
         row = self._tables.resolver.row("sample", token)
-        lidar_boxes = self._lidar_boxes(row, velocity, token)
-        if visible is not None:
-            lidar_boxes = lidar_boxes.select(self._visible(row, lidar_boxes, visible))
+        lidar_boxes = self._lidar_boxes(row, choice("velocity", velocity, get_args(VelocitySource)), token)
+        seen_by = choice("visible", visible, VISIBLE)
+        if seen_by is not None:
+            lidar_boxes = lidar_boxes.select(self._visible(row, lidar_boxes, seen_by))
         if frame == "lidar":
             return lidar_boxes
         target_from_lidar = self._world_from(row, "lidar")
@@ -227,9 +229,7 @@ class Dataset(OpenTables):
             MissingFileError: the file was not downloaded.
             SensorFileError: it cannot be read.
         """
-        row, name = self._sample_row(sample), self.frame_name(frame)
-        if name not in get_args(Frame):
-            raise ChoiceError(f"frame: expected one of {', '.join(get_args(Frame))}, found {frame!r}")
+        row, name = self._sample_row(sample), choice("frame", self.frame_name(frame), get_args(Frame))
         cloud = read_lidar(self._channel_path(row, LIDAR))
         if name == "lidar":
             return cloud
@@ -253,7 +253,7 @@ class Dataset(OpenTables):
     def _sensor(self, sample_data: RowArgument, channel: str | None) -> tuple[int, str]:
         """The row and the channel of a sensor file; arguments as of `get_sample_data`. Raises TokenError."""
         token = token_of(sample_data)
-        row = self.sample_data.row(token if channel is None else f"{token}/{channel}")
+        row = self.sample_data.row(token if channel is None else f"{token}/{spelled(channel, CHANNELS)}")
         return row, CHANNELS[row % len(CHANNELS)]
 
     def _path(self, sample_data_row: int) -> Path:
@@ -290,8 +290,6 @@ class Dataset(OpenTables):
             columns["velocity"] = self._label_velocity(sample_row, columns["actor_id"], view["velocity_label"][rows])
         elif velocity == "derived":
             columns["velocity"] = self._derived_velocity(sample_row)
-        elif velocity != "decoded":
-            raise ChoiceError(f"velocity: expected 'decoded', 'derived' or 'label', found {velocity!r}")
         return trusted_boxes("lidar", columns, token)
 
     def _derived_velocity(self, sample_row: int) -> FloatArray:
@@ -317,8 +315,6 @@ class Dataset(OpenTables):
     def _visible(self, sample_row: int, boxes: Boxes, visible: Visible) -> BoolArray:
         if visible == "camera":
             return boxes.camera_visible
-        if visible != "released":
-            raise ChoiceError(f"visible: expected None, 'camera' or 'released', found {visible!r}")
         masks, ids = [], []
         for other in self._samples_at_once(sample_row):
             seen = self._lidar_boxes(other, "decoded")

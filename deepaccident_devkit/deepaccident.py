@@ -108,7 +108,7 @@ class DeepAccident(Dataset):
             try:
                 super().__init__(
                     dataroot=layout.root,
-                    version=version,
+                    version=layout.version,
                     layout=layout.layout,
                     split_files=layout.split_files,
                     tables_folder=index.tables_folder,

@@ -1,13 +1,16 @@
-"""Text for people: aligned columns for a terminal, HTML for a notebook, messages that name what was probably meant."""
+"""Text for people and by them: columns, HTML for a notebook, words in any case, what was probably meant."""
 
 import base64
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from difflib import get_close_matches
 from html import escape
-from typing import ClassVar
+from typing import Any, ClassVar, TypeVar
 
+from deepaccident_devkit.errors import ChoiceError, DeepAccidentError
+
+Word = TypeVar("Word", bound=str | None)
 _LISTED = 20
 """Words that a message lists at most."""
 
@@ -70,3 +73,48 @@ def possible_text(wrong: str, possible: Iterable[str]) -> str:
     ordered = list(dict.fromkeys([*close, *words]))
     more = f" and {len(ordered) - _LISTED} more" if len(ordered) > _LISTED else ""
     return ", ".join(ordered[:_LISTED]) + more
+
+
+def meant_text(wrong: object, possible: Iterable[object]) -> str:
+    """Such as `; did you mean 'left'?`, the end of a message; empty if no possible word is like the wrong one."""
+    lowered = {word.lower(): word for word in possible if isinstance(word, str)}
+    if not isinstance(wrong, str) or not wrong:
+        return ""
+    start = wrong.lower()
+    close = get_close_matches(start, lowered, n=1) or [word for word in lowered if word.startswith(start)]
+    return f"; did you mean {lowered[close[0]]!r}?" if close else ""
+
+
+def spelled(value: Any, words: Iterable[str]) -> Any:
+    """The one of some words that a text is, in whatever case of letters; the value itself if no word is like it."""
+    lowered = value.lower() if isinstance(value, str) else None
+    return next((word for word in words if word.lower() == lowered), value)
+
+
+def choice(name: str, value: object, words: Collection[Word], *, error: type[DeepAccidentError] = ChoiceError) -> Word:
+    """The one of some words that a caller means, in its own spelling; small letters may stand for capital ones.
+
+    Args:
+        name: of the argument.
+        value: the caller's.
+        words: all that it can be; None may be among them.
+        error: the kind of error.
+
+    Raises:
+        ChoiceError: there is no such word (or the other kind).
+    """
+    lowered = value.lower() if isinstance(value, str) else None
+    for word in words:
+        if value is word or (isinstance(word, str) and word.lower() == lowered):
+            return word
+    expected = [word for word in words if word is not None]
+    none = ", or None" if len(expected) < len(words) else ""
+    raise error(f"{name}: expected one of {', '.join(expected)}{none}, found {value!r}{meant_text(value, expected)}")
+
+
+def settle_choices(
+    record: object, words: Mapping[str, Collection[str | None]], *, error: type[DeepAccidentError] = ChoiceError
+) -> None:
+    """Give fields of a frozen dataclass, while it is made, the spelling of their words; the errors are `choice`'s."""
+    for name, possible in words.items():
+        object.__setattr__(record, name, choice(name, getattr(record, name), possible, error=error))

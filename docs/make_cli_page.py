@@ -71,7 +71,7 @@ def page() -> str:
 
 
 def _options(command: click.Command) -> list[click.Option]:
-    return [each for each in command.params if isinstance(each, click.Option)]
+    return [each for each in command.params if isinstance(each, click.Option) and not each.hidden]
 
 
 def _commands(
@@ -89,7 +89,7 @@ def _commands(
 
 
 def _on_release(command: click.Command) -> bool:
-    return {each.name for each in command.params} >= _SHARED
+    return {each.name for each in command.params if not getattr(each, "hidden", False)} >= _SHARED
 
 
 def _alike(group: click.Group) -> dict[str, click.Command]:

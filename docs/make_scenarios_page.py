@@ -77,7 +77,7 @@ print(scenario.weather, scenario.actor("ego").max_speed)
 
 The message for a mistake names file, line and field:
 
-    mine.yaml:4: actors[1].turn: did you mean left? Expected one of straight, left, right, found 'lef'
+    mine.yaml:4: actors[1].turn: expected one of straight, left, right, found 'lef'; did you mean 'left'?
 
 Files are read with PyYAML's safe loader, without tags and aliases. Numbers are decimal.
 

@@ -157,7 +157,7 @@ def test_split_saves_a_selection(own_release: Path, tmp_path: Path) -> None:
     for options in (("--seed", 3), ("--seed", 17), ("--released-skip",)):
         refused = run("split", own_release, "--where", "split=train", "--save", tmp_path / "c.txt", *options)
         assert (refused.returncode, (tmp_path / "c.txt").exists()) == (2, False)
-        assert f"{options[0]} is for the official split" in refused.stderr
+        assert f"{options[0]} changes nothing with --where or --save: it is for the official split" in refused.stderr
     wrong = run("split", own_release, "--where", "wether=Clear")
     assert (wrong.returncode, wrong.stderr.startswith("error: scenarios cannot be found by 'wether'")) == (2, True)
 
@@ -268,7 +268,7 @@ def test_labels_writes_a_split_and_goes_on_where_it_stopped(own_release: Path, t
     [
         (
             ("--agents", "ego_vehicle,pole"),
-            "--agents: expected all, available or some of ego_vehicle, ego_vehicle_behind,",
+            "--agents: expected one of ego_vehicle, ego_vehicle_behind,",
         ),
         (("--agents", ""), "found ''"),
         (("--agents", "ego_vehicle,"), "found ''"),

@@ -38,12 +38,12 @@ def test_predict_writes_all_tasks_of_the_samples_that_are_evaluated(da_motion: D
 
 def test_predict_takes_a_link_a_model_a_horizon_and_a_scope(da_motion: DeepAccident, tmp_path: Path) -> None:
     options = "--split train --task accident --model constant_turn_rate --latency 0.2 --pose-noise 0.3 --seed 4"
-    options += " --horizon 1.5 --scope all --workers 1"
+    options += " --agents all --horizon 1.5 --scope all --workers 1"
     run("predict", da_motion.dataroot, *options.split(), "--out", tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["accident.json"]
     results = read_results(tmp_path / "accident.json")
     link = Link(latency=0.2, pose_noise=0.3, seed=4)
-    assert results.meta == Baseline(model="constant_turn_rate", link=link, horizon=1.5).meta()
+    assert results.meta == Baseline(agents="all", model="constant_turn_rate", link=link, horizon=1.5).meta()
     assert list(results.tokens) == da_motion.evaluation_samples("train", "paper", horizon=1.5, scope="all")
 
 

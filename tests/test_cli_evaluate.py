@@ -275,6 +275,18 @@ class TestValidate:
         assert good.endswith("all 8 samples have a prediction, and nothing else has\n")
         assert "12 of 20 samples have no prediction" in evaluate(*words, status=1).stdout
 
+    def test_repeats_the_warnings_of_the_sanity_check(
+        self, da_motion: DeepAccident, tmp_path: Path, tokens: list[str]
+    ) -> None:
+        with ResultsWriter(tmp_path / "empty.json", "accident") as writer:
+            for token in tokens:
+                writer.add(token, [])
+        words = (da_motion.dataroot, "--results", tmp_path / "empty.json", *LIST, "--protocol", "boxes", "--sanity")
+        told = [line for line in evaluate("accident", *words).stdout.splitlines() if line.startswith("WARNING: ")]
+        assert "predictions looked at are empty" in told[0]
+        release = ("--dataroot", da_motion.dataroot, *LIST[:-2])
+        assert evaluate("validate", tmp_path / "empty.json", *release).stdout.splitlines()[-len(told) :] == told
+
     def test_the_first_wrong_entry(self, accidents: Path, tmp_path: Path, tokens: list[str]) -> None:
         content = accidents.read_text().replace('"time":', '"tine":', 1)
         (tmp_path / "wrong.json").write_text(content)
@@ -295,6 +307,7 @@ class TestRefused:
                 r"switch min_score: expected a number, such as 0.0, found 'hi",
             ),
             (("--split", "nowhere"), ChoiceError, r"split: expected one of train, val"),
+            (("--agents", "ego"), ChoiceError, r"--agents: expected one of ego_vehicle, .*did you mean 'ego_vehicle'"),
         ],
     )
     def test_choices(
@@ -307,7 +320,6 @@ class TestRefused:
         ("options", "sentence"),
         [
             (("--switch", "min_score"), "--switch: expected NAME=VALUE, found 'min_score'"),
-            (("--agents", "ego"), "--agents: expected all, available or some of ego_vehicle"),
             (("--by", "wether"), "Invalid value for '--by'"),
             (("--protocol", "boxy"), "Invalid value for '--protocol'"),
         ],

@@ -205,10 +205,10 @@ def test_what_a_picture_lacks_is_logged(
 @pytest.mark.parametrize(
     ("arguments", "kind", "sentence"),
     [
-        (["frame", "--layers", "label"], ChoiceError, "layers: expected any of .*found 'label'"),
+        (["frame", "--layers", "label"], ChoiceError, "layers: expected one of .*found 'label'"),
         (["frame", "--frame-range", "2..999"], ChoiceError, "--frame-range: expected frames from 1 to"),
         (["bev", "--view-range", "-5"], ChoiceError, "view_range: expected metres above 0, found -5.0"),
-        (["frame", "--agents", "pole"], ChoiceError, "agent: expected one of .*'pole'"),
+        (["frame", "--agents", "pole"], ChoiceError, "--agents: expected one of .*'pole'"),
         (["frame", "no/such"], TokenError, "no token 'no/such'"),
         (["link", "--latency", "0.25"], ConfigError, "latency"),
         (["accident", "--seconds", "9"], ChoiceError, r"seconds: expected some from 0 to 0\.5"),

@@ -1,5 +1,6 @@
 """Citation, hooks, workflow and templates say what is so; a wheel and an sdist hold what they should."""
 
+import ast
 import re
 import shutil
 import subprocess
@@ -7,6 +8,7 @@ import sys
 import sysconfig
 import tarfile
 import zipfile
+from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
@@ -61,6 +63,47 @@ def test_the_templates_ask_for_commands_that_exist(path: Path) -> None:
         result = CliRunner().invoke(deepaccident, words)
         assert result.exit_code == 0
         assert all(word in result.output for word in command.split()[1:] if word.startswith("--") and verb[0] != "-")
+
+
+def slow_tests() -> dict[str, list[ast.FunctionDef]]:
+    """File → its test functions that are marked slow, themselves, by their class or by the whole file."""
+
+    def marked(where: ast.AST) -> bool:
+        return "mark.slow" in "".join(ast.unparse(each) for each in getattr(where, "decorator_list", ()))
+
+    found: dict[str, list[ast.FunctionDef]] = {}
+    for path in sorted((TOP / "tests").rglob("test_*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        named = [
+            each for each in tree.body if isinstance(each, ast.Assign) and "pytestmark" in ast.unparse(each.targets)
+        ]
+        whole = any("mark.slow" in ast.unparse(each.value) for each in named)
+        for room in (tree, *(each for each in tree.body if isinstance(each, ast.ClassDef))):
+            tests = [each for each in room.body if isinstance(each, ast.FunctionDef) and each.name.startswith("test_")]
+            slow = [test for test in tests if whole or marked(room) or marked(test)]
+            if slow:
+                found.setdefault(path.relative_to(TOP).as_posix(), []).extend(slow)
+    return found
+
+
+def test_the_list_of_slow_tests_is_complete() -> None:
+    section = (TOP / "CONTRIBUTING.md").read_text(encoding="utf-8").split("## Slow tests")[1].split("\n## ")[0]
+    rows = re.findall(r"^\| (`.*) \| .* \|$", section, re.MULTILINE)
+    listed = [pattern for row in rows for pattern in row.split(", ")]
+    files = {name: [each for each in listed if fnmatch(name, each.strip("`"))] for name in slow_tests()}
+    assert {name: patterns for name, patterns in files.items() if len(patterns) != 1} == {}
+    assert {pattern for patterns in files.values() for pattern in patterns} == set(listed)
+
+
+def test_no_parity_and_no_property_is_slow() -> None:
+    slow = slow_tests()
+    assert [name for name in slow if name.startswith(("tests/parity/", "tests/property/"))] == []
+    decorators = {
+        f"{name}::{test.name}": " ".join(ast.unparse(each) for each in test.decorator_list)
+        for name, tests in slow.items()
+        for test in tests
+    }
+    assert [name for name, text in decorators.items() if re.search(r"\bgiven\(|golden", text)] == []
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from deepaccident_devkit.arrays import FloatArray, FrozenArrays
 from deepaccident_devkit.baselines.motion_models import MotionModel, constant_turn_rate
 from deepaccident_devkit.baselines.oracle import SeenActors, seen_actors, turn_rates
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.text import choice
 from deepaccident_devkit.v2x import Agents, Link
 
 _Rates = Callable[[Dataset, RowArgument, Agents, Link | None, int], FloatArray]
@@ -58,8 +58,7 @@ def outlook(
         ChoiceError: no such model.
         DeepAccidentError: as of `seen_actors`.
     """
-    if model not in MOTION_MODELS:
-        raise ChoiceError(f"model: expected one of {', '.join(MOTION_MODELS)}, found {model!r}")
+    model = choice("model", model, MOTION_MODELS)
     seen = seen_actors(dataset, sample, agents=agents, link=link)
     return Outlook(seen=seen, turn_rate=MOTION_MODELS[model](dataset, sample, agents, link, len(seen.boxes)))
 

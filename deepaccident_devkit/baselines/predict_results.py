@@ -12,12 +12,13 @@ from typing import Any, Final, get_args
 from deepaccident_devkit.baselines.motion_models import MotionModel
 from deepaccident_devkit.baselines.predict import predict_accidents, predict_detections, predict_motion
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.errors import ChoiceError, ConfigError
+from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput
 from deepaccident_devkit.evaluation.results import ResultsTask, ResultsWriter
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.parallel import run_unordered
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.text import choice
 from deepaccident_devkit.v2x import AgentConfig, Agents, Link
 
 Prediction = MotionOutput | list[Accident] | DetectedBoxes
@@ -99,8 +100,7 @@ def predict_results(
         ResultsError: a token comes twice, or the file cannot be written.
         DeepAccidentError: a sample cannot be predicted.
     """
-    if task not in get_args(ResultsTask):
-        raise ChoiceError(f"task: expected one of {', '.join(get_args(ResultsTask))}, found {task!r}")
+    task = choice("task", task, get_args(ResultsTask))
     chosen = baseline or Baseline()
     config = chosen.config
     settings: Mapping[str, Any] = (

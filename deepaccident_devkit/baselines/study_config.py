@@ -13,6 +13,7 @@ from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS
 from deepaccident_devkit.motion.sample_lists import Scope
 from deepaccident_devkit.taxonomy import AGENTS, VEHICLE_AGENTS
+from deepaccident_devkit.text import choice, settle_choices
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,12 +44,10 @@ class StudyConfig:
         """Check the choices; raises ChoiceError, and ConfigError for impossible seeds."""
         if isinstance(self.egos, str):
             raise ChoiceError(f"egos: expected several agents, found {self.egos!r}; give [{self.egos!r}] for one")
-        object.__setattr__(self, "egos", tuple(self.egos))
-        if not self.egos or not set(self.egos) <= set(AGENTS):
-            raise ChoiceError(f"egos: expected some of {', '.join(AGENTS)}, found {', '.join(self.egos) or 'none'}")
-        for name, choices in (("scope", get_args(Scope)), ("model", MOTION_MODELS), ("protocol", PROTOCOLS)):
-            if getattr(self, name) not in choices:
-                raise ChoiceError(f"{name}: expected one of {', '.join(choices)}, found {getattr(self, name)!r}")
+        object.__setattr__(self, "egos", tuple(choice("egos", ego, AGENTS) for ego in self.egos))
+        if not self.egos:
+            raise ChoiceError("egos: expected at least one agent, found none")
+        settle_choices(self, {"scope": get_args(Scope), "model": MOTION_MODELS, "protocol": PROTOCOLS})
         object.__setattr__(self, "seeds", tuple(self.seeds))
         whole = [each for each in self.seeds if type(each) is int]
         if not whole or len(set(whole)) < len(self.seeds):

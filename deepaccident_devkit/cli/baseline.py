@@ -7,7 +7,13 @@ import click
 from deepaccident_devkit.baselines import MOTION_MODELS, Baseline, StudyConfig, predict_results, v2x_study
 from deepaccident_devkit.baselines.figures import save_study
 from deepaccident_devkit.cli.evaluate_options import resamples_parameter
-from deepaccident_devkit.cli.options import cooperating_parameter, names_or_configuration, release_parameters
+from deepaccident_devkit.cli.options import (
+    WordChoice,
+    cooperating_parameter,
+    names_or_configuration,
+    refuse_unused,
+    release_parameters,
+)
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation import Resampling
@@ -26,7 +32,7 @@ _SPLIT = click.option("--split", default="val", show_default=True, help="Name of
 _OUT = click.option("--out", required=True, type=click.Path(), metavar="DIR", help="Folder to write the files into.")
 _MODEL = click.option(
     "--model",
-    type=click.Choice(list(MOTION_MODELS)),
+    type=WordChoice(MOTION_MODELS),
     default="constant_velocity",
     show_default=True,
     help="How the baseline moves each actor into the future.",
@@ -34,7 +40,7 @@ _MODEL = click.option(
 _SEED = click.option("--seed", default=0, show_default=True, help="Seed of the pose noise.")
 _SCOPE = click.option(
     "--scope",
-    type=click.Choice(get_args(Scope)),
+    type=WordChoice(get_args(Scope)),
     default="accident",
     show_default=True,
     help="Accident scenarios only, or all scenarios.",
@@ -53,7 +59,7 @@ def baseline() -> None:
     "--task",
     "tasks",
     multiple=True,
-    type=click.Choice([*get_args(ResultsTask), "all"]),
+    type=WordChoice([*get_args(ResultsTask), "all"]),
     default=("all",),
     show_default=True,
     help="Task to write results for; you can repeat this option.",
@@ -76,7 +82,7 @@ def baseline() -> None:
 @click.option(
     "--samples",
     "purpose",
-    type=click.Choice(["evaluate", "all"]),
+    type=WordChoice(["evaluate", "all"]),
     default="evaluate",
     show_default=True,
     help="evaluate: samples within the horizon before the end. all: two samples per second of each scenario.",
@@ -91,6 +97,12 @@ def predict(split: str, tasks: tuple[str, ...], purpose: Any, scope: Scope, out:
     noise, latency, seed = options.pop("pose_noise"), options.pop("latency"), options.pop("seed")
     link = Link(latency=latency, pose_noise=noise or None, seed=seed) if noise or latency else None
     options["agents"] = names_or_configuration(options["agents"]) or _ALONE
+    if options["agents"] == _ALONE:
+        refuse_unused("with --agents single, which has no partners", "latency", "pose_noise", "seed")
+    if not noise:
+        refuse_unused("without --pose-noise", "seed")
+    if purpose == "all":
+        refuse_unused("with --samples all, which are those of all scenarios", "scope")
     chosen = Baseline(link=link, **{name: options.pop(name) for name in ("agents", "model", "horizon")})
     folder = writable_folder(out)
     dataset = DeepAccident(**options)
@@ -113,13 +125,13 @@ def predict(split: str, tasks: tuple[str, ...], purpose: Any, scope: Scope, out:
     "--ego",
     "egos",
     multiple=True,
-    type=click.Choice(AGENTS),
+    type=WordChoice(AGENTS),
     help="Agent that predicts; you can repeat this option.  [default: ego_vehicle]",
 )
 @_SCOPE
 @click.option(
     "--protocol",
-    type=click.Choice(list(PROTOCOLS)),
+    type=WordChoice(PROTOCOLS),
     default="paper",
     show_default=True,
     help="Protocol for accidents in maps. Explicit accidents always use the protocol boxes.",

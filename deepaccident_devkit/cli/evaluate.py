@@ -16,10 +16,11 @@ from deepaccident_devkit.cli.evaluate_options import (
     selection_parameters,
     switches_of,
 )
-from deepaccident_devkit.cli.options import release_parameters
+from deepaccident_devkit.cli.options import WordChoice, refuse_unused, release_parameters
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.metrics.attributes import ATTRIBUTES, EVERYTHING, attribute_name
+from deepaccident_devkit.evaluation.metrics.warning import FieldWarnings
 from deepaccident_devkit.evaluation.results import Results, read_results
 from deepaccident_devkit.evaluation.runs import (
     EvaluationRun,
@@ -63,7 +64,7 @@ def _threshold_options(task: TaskName) -> Callable[[Callable[..., Any]], Callabl
         ),
         click.option(
             "--threshold-by",
-            type=click.Choice(get_args(Chooser)),
+            type=WordChoice(get_args(Chooser)),
             default="best_f1",
             show_default=True,
             help="best_f1: the threshold with the best F1. quiet: at most one second of false alarm per minute.",
@@ -86,7 +87,7 @@ def _task_verb(task: TaskName) -> click.Command:
     @selection_parameters
     @click.option(
         "--protocol",
-        type=click.Choice(protocols),
+        type=WordChoice(protocols),
         default=protocols[0],
         show_default=True,
         help="Rules of the metrics; docs/protocols.md describes them.",
@@ -139,6 +140,7 @@ def _task_verb(task: TaskName) -> click.Command:
 
 def _evaluate(setup: EvaluationSetup, results: Path, *, by: tuple[str, ...], as_json: bool, **options: Any) -> None:
     out: Path | None = options["out"]
+    _refuse_unused(setup, options)
     if out is not None:
         checked_target(out, overwrite=options["overwrite"])  # before the release is indexed
     opened = read_results(results)
@@ -167,6 +169,20 @@ def _evaluate(setup: EvaluationSetup, results: Path, *, by: tuple[str, ...], as_
         report = partial(save_report, run, dataset=dataset, results=opened)
         kept = {name: options[name] for name in ("include_results", "overwrite")}
         click.echo(f"written: {save_run(run, out, **kept, extras=[report])}", err=as_json)
+
+
+def _refuse_unused(setup: EvaluationSetup, options: dict[str, Any]) -> None:
+    """End with a usage error if an option was given that changes nothing in this evaluation."""
+    if options["out"] is None:
+        refuse_unused("without --out", "overwrite", "include_results")
+    if options.get("threshold_from") is None:
+        refuse_unused("without --threshold-from", "threshold_by")
+    elif "threshold" in setup.switches:
+        raise click.UsageError("--threshold-from sets the threshold that --switch threshold=… sets; give one of them")
+    if isinstance(setup.rules, FieldWarnings) and options["resamples"]:
+        refuse_unused("with --protocol field, which has no intervals", "resamples")
+    if setup.task == "detection" and options["samples"] == "all":
+        refuse_unused("with --samples all: detections are of the present", "horizon")
 
 
 def _examined(

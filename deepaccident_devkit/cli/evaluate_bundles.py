@@ -8,16 +8,18 @@ from typing import Any, Literal
 import click
 
 from deepaccident_devkit.cli.evaluate_options import resamples_parameter, selection_of, selection_parameters
-from deepaccident_devkit.cli.options import on_error_parameter
+from deepaccident_devkit.cli.options import WordChoice, on_error_parameter, refuse_unused
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.evaluation.runs import compare_bundles, coverage, read_bundle, results_text, verify_bundle
+from deepaccident_devkit.evaluation.runs.sanity import check_sanity
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.taxonomy import VERSIONS
 
 _FINDINGS_STATUS = 1
+_OF_RELEASE = ("version", "split", "samples", "scope", "agents", "horizon", "on_error")
 _workers = click.option("--workers", type=click.IntRange(min=1), help="Number of processes to use.")
 
 
@@ -26,24 +28,33 @@ _workers = click.option("--workers", type=click.IntRange(min=1), help="Number of
 @click.option(
     "--dataroot", type=click.Path(path_type=Path), help="Also compare the samples with those of this release."
 )
-@click.option("--version", type=click.Choice(VERSIONS), default="v1", show_default=True, help="Version of the release.")
+@click.option("--version", type=WordChoice(VERSIONS), default="v1", show_default=True, help="Version of the release.")
 @selection_parameters
 @_workers
 @on_error_parameter
 def validate(results: Path, dataroot: Path | None, version: str, workers: int | None, **options: Any) -> None:
     """Check every entry of the results file or folder RESULTS, and print a summary.
 
+    With --dataroot, also repeat the warnings of `evaluate … --sanity`.
     Exit status 1: with --dataroot, samples of --split are missing, or RESULTS has others. 2: an entry is wrong.
     """
+    if dataroot is None:
+        refuse_unused("without --dataroot", *_OF_RELEASE)
     opened = read_results(results)
     opened.check(workers=workers, progress=True)
     click.echo(results_text(opened))
     if dataroot is None:
         return
     dataset = DeepAccident(version, dataroot, workers=workers, on_error=options["on_error"])
-    selection = selection_of(EvaluationSetup(task=opened.task, horizon=options["horizon"]), options)
+    protocol = "boxes" if opened.task == "accident" else "released"  # the one that takes explicit accidents
+    setup = EvaluationSetup(task=opened.task, protocol=protocol, horizon=options["horizon"])
+    selection = selection_of(setup, options)
     covered = coverage(dataset, opened.tokens, selection)
     click.echo(f"{selection.text()}: {covered.to_text()}")
+    shared = sorted(set(opened.tokens).intersection(selection.tokens(dataset)))
+    warnings = check_sanity(dataset, opened, setup, shared, workers=workers).warnings_text() if shared else ""
+    if warnings:
+        click.echo(warnings)
     if not covered.is_complete:
         sys.exit(_FINDINGS_STATUS)
 

@@ -6,7 +6,7 @@ from typing import Any, get_args
 
 import click
 
-from deepaccident_devkit.cli.options import Verb, agent_names, agents_parameter
+from deepaccident_devkit.cli.options import Verb, WordChoice, agent_names, agents_parameter
 from deepaccident_devkit.evaluation.metrics.intervals import RESAMPLES
 from deepaccident_devkit.evaluation.runs import SampleSelection, default_selection
 from deepaccident_devkit.evaluation.runs.selection import SampleList, ScopeName
@@ -22,13 +22,13 @@ _SELECTION = (
     ),
     click.option(
         "--samples",
-        type=click.Choice(get_args(SampleList)),
+        type=WordChoice(get_args(SampleList)),
         help="evaluate: samples within the horizon before the end. all: two samples per second of each scenario.  "
         "[default: evaluate; for warnings: all]",
     ),
     click.option(
         "--scope",
-        type=click.Choice(get_args(ScopeName)),
+        type=WordChoice(get_args(ScopeName)),
         help="Accident scenarios only, or all scenarios.  [default: accident; with --samples all: all]",
     ),
     agents_parameter,

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import click
 
+from deepaccident_devkit.cli.options import refuse_unused
 from deepaccident_devkit.release import explain_file
 
 
@@ -27,6 +28,8 @@ def explain(file: Path, rows: int) -> None:
     status: 0 if the file is good, 2 if it is broken or of another kind.
     """
     explanation = explain_file(file, rows=rows or None)
+    if explanation.kind != "label":
+        refuse_unused(f"for a file of the kind {explanation.kind}", "rows")
     click.echo(explanation.text)
     if explanation.fault is not None:
         raise explanation.fault

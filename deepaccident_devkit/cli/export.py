@@ -6,17 +6,19 @@ from typing import Any, get_args
 import click
 
 from deepaccident_devkit.cli.options import (
+    WordChoice,
     agent_names,
     agents_parameter,
     frame_range_parameter,
     old_frames_parameter,
+    refuse_unused,
     release_parameters,
 )
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.export.mcap import McapConfig, export_mcap
 from deepaccident_devkit.motion import PRESETS
-from deepaccident_devkit.taxonomy import AGENTS, OnError
+from deepaccident_devkit.taxonomy import AGENTS, LIDAR, OnError
 from deepaccident_devkit.v2x.collisions import default_scenario
 
 
@@ -60,7 +62,7 @@ def _points(context: click.Context, parameter: click.Parameter, value: str) -> s
     help="all, or N for every N-th point of a cloud.",
 )
 @click.option("--labels/--no-labels", default=True, show_default=True, help="Whether to write the boxes.")
-@click.option("--motion-labels", type=click.Choice(list(PRESETS)), help="Also write motion labels by this preset.")
+@click.option("--motion-labels", type=WordChoice(PRESETS), help="Also write motion labels by this preset.")
 @click.option(
     "--results",
     type=click.Path(path_type=Path),
@@ -69,7 +71,7 @@ def _points(context: click.Context, parameter: click.Parameter, value: str) -> s
 )
 @click.option(
     "--on-missing",
-    type=click.Choice(get_args(OnError)),
+    type=WordChoice(get_args(OnError)),
     default="skip",
     show_default=True,
     help="skip: leave out missing sensor files. raise: stop at the first one.",
@@ -93,7 +95,9 @@ def mcap(
     choices["frames"] = choices["frames"] or old_frames
     choices["agents"] = None if names == AGENTS else names
     choices["channels"] = [name for text in channels for name in text.split(",")] if channels else None
-    McapConfig.of(**choices)  # before the release is indexed
+    config = McapConfig.of(**choices)  # before the release is indexed
+    if LIDAR not in (config.channels or ()):
+        refuse_unused(f"without the channel {LIDAR}", "points")
     prediction = None if results is None else read_results(results)
     dataset = DeepAccident(**options)
     token = scenario or default_scenario(dataset)

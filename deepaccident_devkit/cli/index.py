@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from deepaccident_devkit.cli.groups import VerbGroup
-from deepaccident_devkit.cli.options import release_parameters
+from deepaccident_devkit.cli.options import WordChoice, release_parameters
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.tables import Tables, clear_index, index_report, open_index
 from deepaccident_devkit.taxonomy import VERSIONS, OnError
@@ -33,7 +33,7 @@ def index(
 
 @index.command(short_help="Print where the index is, what it holds, and whether it is up to date.")
 @click.argument("dataroot", type=click.Path(path_type=Path))
-@click.option("--version", type=click.Choice(VERSIONS), help="Version of the release.  [default: all]")
+@click.option("--version", type=WordChoice(VERSIONS), help="Version of the release.  [default: all]")
 @click.option("--index-dir", type=click.Path(path_type=Path), help="Folder to look in, in place of the usual ones.")
 @click.option("--check", is_flag=True, help="Compare each label, calib and meta file, not only the folders' times.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
@@ -45,7 +45,7 @@ def info(dataroot: Path, version: str | None, index_dir: Path | None, check: boo
 
 @index.command(short_help="Remove the index.")
 @click.argument("dataroot", type=click.Path(path_type=Path))
-@click.option("--version", type=click.Choice(VERSIONS), default="v1", show_default=True, help="Version of the release.")
+@click.option("--version", type=WordChoice(VERSIONS), default="v1", show_default=True, help="Version of the release.")
 @click.option("--index-dir", type=click.Path(path_type=Path), help="Folder of the index, if it is not a usual one.")
 def clear(dataroot: Path, version: str, index_dir: Path | None) -> None:
     """Remove the index of DATAROOT, from its own folder and from your cache. The release itself stays as it is."""

@@ -5,7 +5,7 @@ from typing import Any, get_args
 
 import click
 
-from deepaccident_devkit.cli.options import agent_names, agents_parameter, release_parameters
+from deepaccident_devkit.cli.options import WordChoice, agent_names, agents_parameter, release_parameters
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
@@ -31,30 +31,28 @@ _CONFIG_OPTIONS = ("preset", "protocol", "switches", "orientation", "seen_by", "
 @click.option(
     "--samples",
     "purpose",
-    type=click.Choice(get_args(Purpose)),
+    type=WordChoice(get_args(Purpose)),
     default="every",
     show_default=True,
     help="every: all samples (10 Hz). all: two samples per second. train, evaluate: those of training and evaluation.",
 )
 @click.option(
     "--preset",
-    type=click.Choice(list(PRESETS)),
+    type=WordChoice(PRESETS),
     default="deepaccident",
     show_default=True,
     help="Grid, orientation and protocol of the labels.",
 )
-@click.option(
-    "--protocol", type=click.Choice(list(LABEL_PROTOCOLS)), help="Rules of the labels.  [default: of the preset]"
-)
+@click.option("--protocol", type=WordChoice(LABEL_PROTOCOLS), help="Rules of the labels.  [default: of the preset]")
 @click.option(
     "--switch", "switches", multiple=True, metavar="NAME=yes|no", help="Switch one quirk of the protocol on or off."
 )
 @click.option(
-    "--orientation", type=click.Choice(ORIENTATIONS), help="Order of rows and columns.  [default: of the preset]"
+    "--orientation", type=WordChoice(ORIENTATIONS), help="Order of rows and columns.  [default: of the preset]"
 )
 @click.option(
     "--seen-by",
-    type=click.Choice(AGENT_SETS),
+    type=WordChoice(AGENT_SETS),
     help="Only actors that these agents see.  [default: all actors]",
 )
 @click.option("--only-vehicle", is_flag=True, help="Leave out pedestrians.")

@@ -1,42 +1,79 @@
 """The arguments that every verb on a release takes, the same for all verbs."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+from click.core import ParameterSource
 
 from deepaccident_devkit.deprecations import warn_deprecated
 from deepaccident_devkit.taxonomy import AGENTS, VERSIONS
+from deepaccident_devkit.text import choice, meant_text
 from deepaccident_devkit.v2x import AGENT_SETS, AVAILABLE
 
 _ALL = ("all", AVAILABLE)
 Verb = TypeVar("Verb", bound=Callable[..., Any])
+if TYPE_CHECKING:
+    _Choice = click.Choice[str]
+else:
+    _Choice = click.Choice  # click 8.1 has no `Choice[str]`
+
+
+class WordChoice(_Choice):
+    """One of some words in any case of letters; the error of another one names the word that was probably meant."""
+
+    def __init__(self, words: Iterable[str]) -> None:
+        """Take the words."""
+        super().__init__(tuple(words), case_sensitive=False)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The word in its own spelling."""
+        try:
+            return super().convert(value, param, ctx)
+        except click.BadParameter as error:
+            self.fail(f"{error.message.removesuffix('.')}{meant_text(value, self.choices)}", param, ctx)
+
 
 on_error_parameter = click.option(
     "--on-error",
-    type=click.Choice(["raise", "skip"]),
+    type=WordChoice(["raise", "skip"]),
     default="raise",
     show_default=True,
     help="raise: list broken scenarios and stop. skip: leave them out.",
 )
-_PARAMETERS = (
-    click.argument("dataroot", type=click.Path(path_type=Path)),
-    click.option(
-        "--version", type=click.Choice(VERSIONS), default="v1", show_default=True, help="Version of the release."
-    ),
-    click.option("--index-dir", type=click.Path(path_type=Path), help="Folder of the index."),
-    click.option("--workers", type=click.IntRange(min=1), help="Number of processes to use."),
-    on_error_parameter,
+
+
+def _tell_unused(_context: click.Context, parameter: click.Parameter, value: str | None) -> None:
+    if value is not None:
+        click.echo(f"{parameter.opts[0]} changes nothing here: the command reads the files, not the index", err=True)
+
+
+_DATAROOT = click.argument("dataroot", type=click.Path(path_type=Path))
+_VERSION = click.option(
+    "--version", type=WordChoice(VERSIONS), default="v1", show_default=True, help="Version of the release."
+)
+_WORKERS = click.option("--workers", type=click.IntRange(min=1), help="Number of processes to use.")
+_INDEX_DIR = click.option("--index-dir", type=click.Path(path_type=Path), help="Folder of the index.")
+_UNUSED = tuple(
+    click.option(name, hidden=True, expose_value=False, callback=_tell_unused) for name in ("--index-dir", "--on-error")
 )
 
 
 def release_parameters(verb: Verb) -> Verb:
     """Give a verb DATAROOT, --version, --index-dir, --workers and --on-error."""
-    for parameter in reversed(_PARAMETERS):
+    return _DATAROOT(_VERSION(_INDEX_DIR(_WORKERS(on_error_parameter(verb)))))
+
+
+def files_parameters(verb: Verb) -> Verb:
+    """Give a verb that reads files and not the index DATAROOT, --version and --workers.
+
+    It takes the other options of a release too, as all verbs do, but does not offer them.
+    """
+    for parameter in _UNUSED:
         verb = parameter(verb)
-    return verb
+    return _DATAROOT(_VERSION(_WORKERS(verb)))
 
 
 def where_parameter(verb: Verb) -> Verb:
@@ -67,13 +104,7 @@ def agent_names(given: tuple[str, ...]) -> tuple[str, ...]:
 
     `all` and `available` do too: this only chooses among the samples that are there.
     """
-    names = [name for text in given for name in text.split(",")]
-    unknown = [name for name in names if name not in (*AGENTS, *_ALL)]
-    if unknown:
-        raise click.BadParameter(
-            f"--agents: expected {', '.join(_ALL)} or some of {', '.join(AGENTS)}, whose samples are taken; "
-            f"found {unknown[0]!r}"
-        )
+    names = [choice("--agents", name, (*AGENTS, *_ALL)) for text in given for name in text.split(",")]
     return AGENTS if not names or set(names) & set(_ALL) else tuple(names)
 
 
@@ -90,7 +121,18 @@ def cooperating_parameter(whose: str, default: str) -> Callable[[Verb], Verb]:
 def names_or_configuration(given: tuple[str, ...]) -> str | list[str] | None:
     """Repeated --agents for agents that cooperate: one configuration, names, or None if it was not given."""
     names = [name for text in given for name in text.split(",")]
-    return names[0] if len(names) == 1 and names[0] in AGENT_SETS else names or None
+    if len(names) != 1:
+        return names or None
+    alone = choice("--agents", names[0], (*AGENT_SETS, *AGENTS))
+    return names if alone in AGENTS else alone
+
+
+def refuse_unused(why: str, *parameters: str) -> None:
+    """End with a usage error if one of these options of the verb that runs was given, because it changes nothing."""
+    context = click.get_current_context()
+    for option in context.command.params:
+        if option.name in parameters and context.get_parameter_source(option.name) is not ParameterSource.DEFAULT:
+            raise click.UsageError(f"{option.opts[0]} changes nothing {why}; leave it out", context)
 
 
 def pixel_size(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[int, int] | None:

@@ -10,10 +10,12 @@ from typing import Any, cast, get_args
 import click
 
 from deepaccident_devkit.cli.options import (
+    WordChoice,
     cooperating_parameter,
     frame_range_parameter,
     names_or_configuration,
     pixel_size,
+    refuse_unused,
     release_parameters,
 )
 from deepaccident_devkit.cli.render_targets import picture_paths, rows_to_draw
@@ -89,7 +91,7 @@ def _link_options(latency: float, pose_noise: float) -> tuple[Any, ...]:
 _AGENTS = cooperating_parameter("Agents to show", "chosen by the view")
 _VIEW_RANGE = click.option("--view-range", type=float, metavar="M", help="Metres to show on each side.")
 _COORDINATES = click.option(
-    "--frame", type=click.Choice(get_args(Frame)), help="Coordinate frame of the axes.  [default: ego]"
+    "--frame", type=WordChoice(get_args(Frame)), help="Coordinate frame of the axes.  [default: ego]"
 )
 _LAYERS = click.option(
     "--layers",
@@ -161,7 +163,7 @@ _PICTURES = {
         canvas="ax",
         options=(
             click.option(
-                "--color-by", type=click.Choice(get_args(ColorBy)), help="Colour of the points.  [default: depth]"
+                "--color-by", type=WordChoice(get_args(ColorBy)), help="Colour of the points.  [default: depth]"
             ),
         ),
     ),
@@ -193,7 +195,7 @@ _PICTURES = {
         help="Render the motion labels of one sample: one column per frame; instances, centerness, offset and flow.",
         options=(
             click.option(
-                "--style", type=click.Choice(get_args(MotionStyle)), help="Style of the picture.  [default: maps]"
+                "--style", type=WordChoice(get_args(MotionStyle)), help="Style of the picture.  [default: maps]"
             ),
             _LAYERS,
         ),
@@ -236,7 +238,7 @@ _PICTURES = {
         options=(
             click.option("--results", type=click.Path(path_type=Path), required=True, help="Results file of a model."),
             click.option(
-                "--task", type=click.Choice(["motion", "accident"]), help="Verdict on motion, or on the accident in it."
+                "--task", type=WordChoice(["motion", "accident"]), help="Verdict on motion, or on the accident in it."
             ),
             click.option(
                 "--protocol", help="Name of the protocol.  [default: released; for explicit accidents: boxes]"
@@ -297,6 +299,10 @@ def _verb(name: str, picture: _Picture) -> click.Command:
     ) -> None:
         release = {option: options.pop(option) for option in _RELEASE}
         options["agents"] = names_or_configuration(options.pop("agents", ()))
+        if name == "bev" and options["agents"] in (None, "single"):
+            refuse_unused("without --agents: it is about the data of partners", "latency", "pose_noise", "seed")
+        if not options.get("pose_noise"):
+            refuse_unused("without --pose-noise", "seed")
         options["layers"] = _words(options.pop("layers", ()))
         choices = {option: value for option, value in options.items() if value is not None}
         if not tokens and "results" in choices:

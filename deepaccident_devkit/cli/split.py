@@ -4,9 +4,8 @@ from pathlib import Path
 from typing import Any
 
 import click
-from click.core import ParameterSource
 
-from deepaccident_devkit.cli.options import release_parameters, where_parameter
+from deepaccident_devkit.cli.options import refuse_unused, release_parameters, where_parameter
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.splits import OFFICIAL_SEED, official_split, save_selection, split_report
 
@@ -48,7 +47,9 @@ def split(
     if save and out:
         raise click.UsageError("--out is for the official split, --save for a selection; give one of them")
     if where or save:
-        _refuse("seed", "released_skip")
+        refuse_unused("with --where or --save: it is for the official split", "seed", "released_skip")
+    if not (save or out):
+        refuse_unused("without --out or --save", "overwrite")
     dataset = DeepAccident(**release)
     if where or save:
         chosen = [scenario["token"] for scenario in dataset.find(*where)]
@@ -61,14 +62,3 @@ def split(
     click.echo(report.to_json() if as_json else report.to_text())
     for path in written:
         click.echo(f"written: {path}", err=as_json)
-
-
-def _refuse(*parameters: str) -> None:
-    """End with a usage error if one of these options was given: a selection does not use them."""
-    context = click.get_current_context()
-    for name in parameters:
-        if context.get_parameter_source(name) is not ParameterSource.DEFAULT:
-            option = f"--{name.replace('_', '-')}"
-            raise click.UsageError(
-                f"{option} is for the official split and has no effect with --where or --save; leave one of them out"
-            )

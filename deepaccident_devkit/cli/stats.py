@@ -4,7 +4,7 @@ from typing import Any, get_args
 
 import click
 
-from deepaccident_devkit.cli.options import release_parameters, where_parameter
+from deepaccident_devkit.cli.options import WordChoice, release_parameters, where_parameter
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.render.statistics import PictureFormat, save_statistics
@@ -20,7 +20,7 @@ from deepaccident_devkit.statistics import dataset_statistics, writable_folder
 @click.option(
     "--format",
     "formats",
-    type=click.Choice(get_args(PictureFormat)),
+    type=WordChoice(get_args(PictureFormat)),
     multiple=True,
     help="With --out: format of the figures; you can repeat this option.  [default: both]",
 )

@@ -6,7 +6,7 @@ from typing import Any, get_args
 
 import click
 
-from deepaccident_devkit.cli.options import pixel_size
+from deepaccident_devkit.cli.options import WordChoice, pixel_size, refuse_unused
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.synth.checking import checked_text
@@ -16,6 +16,11 @@ from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, View, design_text, de
 from deepaccident_devkit.taxonomy import Layout
 
 _DEFAULTS = SynthConfig()
+_OF_FILES = (
+    *("scenarios", "image_size", "layout", "no_sensors", "unlabelled_test", "exact", "for_released_code"),
+    *("unplanned", "workers"),
+)
+"""Options of what is written."""
 _FAULTY = 1
 """Exit status if a checked file gives no scenario."""
 _EXAMPLES = """\b
@@ -60,7 +65,7 @@ def _show_design(context: click.Context, _parameter: click.Parameter, number: in
 )
 @click.option(
     "--layout",
-    type=click.Choice(get_args(Layout)),
+    type=WordChoice(get_args(Layout)),
     default=_DEFAULTS.layout,
     show_default=True,
     help="A: all splits in one folder. B: one folder per split.",
@@ -105,7 +110,7 @@ def _show_design(context: click.Context, _parameter: click.Parameter, number: in
 )
 @click.option(
     "--view",
-    type=click.Choice(get_args(View)),
+    type=WordChoice(get_args(View)),
     help="hidden: a house at the corner hides the two vehicles that will collide from each other.",
 )
 @click.option(
@@ -143,6 +148,8 @@ def synth(
         return
     if out is None:
         raise click.UsageError("Missing argument 'OUT': the folder to make.", context)
+    if options["spec"] is not None or options["view"] == "hidden":
+        refuse_unused("with --spec or --view hidden, which ask for one certain accident", "unplanned")
     config = SynthConfig(sensors=not no_sensors, **options)
     if no_sensors and not has_embree():
         click.echo("slow without the package embreex; in a checkout: pip install '.[synth]'", err=True)
@@ -162,6 +169,7 @@ def _check(context: click.Context, out: Path | None, options: Mapping[str, Any])
         raise click.UsageError("--check needs the scenario file: --spec FILE.", context)
     if out is not None:
         raise click.UsageError(f"--check writes nothing; leave {out} out.", context)
+    refuse_unused("with --check, which draws one pair and writes nothing", *_OF_FILES)
     try:
         click.echo(checked_text(SynthConfig(**options), progress=True))
     except ConfigError as error:

@@ -2,18 +2,17 @@
 
 import sys
 from pathlib import Path
-from typing import Any
 
 import click
 
-from deepaccident_devkit.cli.options import release_parameters
+from deepaccident_devkit.cli.options import files_parameters, refuse_unused
 from deepaccident_devkit.validation import validate_release
 
 _FINDINGS_STATUS = 1
 
 
 @click.command()
-@release_parameters
+@files_parameters
 @click.option("--deep", is_flag=True, help="Also decode each image and array, and compare them with the labels.")
 @click.option(
     "--scenario", "scenarios", multiple=True, metavar="TOKEN", help="Only this scenario; you can repeat this option."
@@ -29,19 +28,21 @@ def validate(
     notes: bool,
     whole: bool,
     as_json: bool,
-    **release: Any,
+    workers: int | None,
 ) -> None:
     """Print what is wrong, unusual or missing in the release in DATAROOT, worst scenario first.
 
-    The command reads the files and each scenario, not the index: --index-dir and --on-error have no effect.
+    The command reads the files and each scenario, not the index.
     Exit status 0: there are only notes and known findings of the real release. 1: there are errors or other warnings.
     2: the release cannot be read.
     """
+    if as_json:
+        refuse_unused("with --json, which has all findings and notes", "notes", "whole")
     report = validate_release(
         dataroot,
         version,
         deep=deep,
-        workers=release["workers"],
+        workers=workers,
         scenarios=scenarios or None,
         progress=sys.stderr.isatty(),
     )

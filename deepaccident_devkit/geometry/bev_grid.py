@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray, as_numbers
-from deepaccident_devkit.errors import ChoiceError, ConfigError, GeometryError
+from deepaccident_devkit.errors import ConfigError, GeometryError
+from deepaccident_devkit.text import settle_choices
 
 Orientation = Literal["devkit", "released", "fiery"]
 Axis = tuple[float, float, float]
@@ -47,8 +48,7 @@ class BevGrid:
 
     def __post_init__(self) -> None:
         """Check the ranges; raises ConfigError, or ChoiceError for an unknown orientation."""
-        if self.orientation not in ORIENTATIONS:
-            raise ChoiceError(f"orientation: expected one of {', '.join(ORIENTATIONS)}, found {self.orientation!r}")
+        settle_choices(self, {"orientation": ORIENTATIONS})
         for name in ("x", "y"):
             object.__setattr__(self, name, _axis(name, getattr(self, name)))
         object.__setattr__(self, "_counts", (_cell_count("x", self.x), _cell_count("y", self.y)))

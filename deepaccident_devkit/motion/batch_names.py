@@ -22,17 +22,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, Literal
 
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, checked
-from deepaccident_devkit.errors import ChoiceError, ConfigError, FieldError
+from deepaccident_devkit.errors import ConfigError, FieldError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import Orientation
 from deepaccident_devkit.geometry.handedness import flip_six_vector
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.orientations import to_orientation
+from deepaccident_devkit.text import choice
 
 BatchNames = Literal["fiery", "beverse", "deepaccident"]
 MAPS: Final = ("segmentation", "instance", "centerness", "offset", "flow")
@@ -169,7 +170,7 @@ def config_from_names(settings: Mapping[str, Any], names: BatchNames) -> MotionL
         ChoiceError: no such code.
         ConfigError: an impossible value.
     """
-    found = {ours: _setting(settings, path) for ours, path in _SETTINGS[_checked(names)].items()}
+    found = {ours: _setting(settings, path) for ours, path in _SETTINGS[choice("names", names, _SETTINGS)].items()}
     changes: dict[str, Any] = {ours: value for ours, value in found.items() if value is not None}
     preset = MotionLabelConfig.preset(names)
     bounds = {axis: changes.pop(axis) for axis in ("x", "y") if axis in changes}
@@ -222,11 +223,5 @@ def _bound(given: Any) -> tuple[float, float, float]:
     return low, high, size
 
 
-def _checked(names: str) -> str:
-    if names not in get_args(BatchNames):
-        raise ChoiceError(f"names: expected one of {', '.join(get_args(BatchNames))}, found {names!r}")
-    return names
-
-
 def _batch(names: str) -> _Batch:
-    return _BATCHES[_checked(names)]
+    return _BATCHES[choice("names", names, _BATCHES)]

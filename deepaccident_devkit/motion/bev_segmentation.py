@@ -12,12 +12,13 @@ import numpy as np
 
 from deepaccident_devkit.arrays import BoolArray, IntArray, ShortRepr, readonly
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ChoiceError, ConfigError
+from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.release import BevImage
 from deepaccident_devkit.release.bev_camera import TAGS
 from deepaccident_devkit.taxonomy import BEV_RESOLUTION, BEV_SHAPE
+from deepaccident_devkit.text import choice
 
 BEV_CLASSES: Final = ("road", "lane_line", "sidewalk", "vehicle", "pedestrian")
 """The classes of the targets, in their order."""
@@ -54,9 +55,7 @@ class BevSegmentation(ShortRepr):
 
     def mask(self, name: str) -> BoolArray:
         """(H, W) bool, the layer of a class. Raises ChoiceError."""
-        if name not in BEV_CLASSES:
-            raise ChoiceError(f"class: expected one of {', '.join(BEV_CLASSES)}, found {name!r}")
-        layer: BoolArray = self.masks[BEV_CLASSES.index(name)]
+        layer: BoolArray = self.masks[BEV_CLASSES.index(choice("class", name, BEV_CLASSES))]
         return layer
 
 
@@ -94,10 +93,9 @@ def segmentation_of(
     augmentation: Augmentation | None = None,
 ) -> BevSegmentation:
     """The targets on a grid, from a BEV camera's array; arguments and errors as in `bev_segmentation`."""
-    shares = {**COVERAGE, **(coverage or {})}
+    given = coverage or {}
+    shares = {**COVERAGE, **{choice("coverage", name, BEV_CLASSES, error=ConfigError): given[name] for name in given}}
     for name, share in shares.items():
-        if name not in BEV_CLASSES:
-            raise ConfigError(f"coverage: expected classes of {', '.join(BEV_CLASSES)}, found {name!r}")
         if not 0 <= share < 1:
             raise ConfigError(f"coverage: {name} is {share}; choose a share of a cell, at least 0 and below 1")
     index = _pixels_of_cells(grid, augmentation)

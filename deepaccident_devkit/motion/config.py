@@ -14,8 +14,9 @@ from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import Orientation
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.protocols import LABEL_PROTOCOLS, LabelProtocol, label_protocol
-from deepaccident_devkit.motion.settings import choice, count, flag, number
+from deepaccident_devkit.motion.settings import count, flag, number
 from deepaccident_devkit.taxonomy import AGENTS
+from deepaccident_devkit.text import choice, spelled
 from deepaccident_devkit.v2x import AGENT_SETS, AgentConfig, Agents
 from deepaccident_devkit.v2x.configurations import is_available
 
@@ -214,7 +215,7 @@ def _checked_agents(agents: object) -> AgentConfig | str | tuple[str, ...] | Non
     if agents is None or isinstance(agents, AgentConfig):
         return agents
     if isinstance(agents, str):
-        if agents in AGENTS:
+        if spelled(agents, AGENTS) in AGENTS:
             raise ChoiceError(f"agents: expected a configuration, found {agents!r}; for one agent give [{agents!r}]")
         return choice("agents", agents, AGENT_SETS)
     if not isinstance(agents, Iterable):

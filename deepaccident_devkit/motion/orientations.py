@@ -9,9 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray
-from deepaccident_devkit.errors import ChoiceError, GeometryError
+from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Axis, Orientation, cells_in, turned
+from deepaccident_devkit.text import choice
 
 __all__ = ["axes_of", "cells_in", "to_orientation", "vectors_in"]
 
@@ -35,9 +36,7 @@ def to_orientation(
         GeometryError: `vectors` have another shape.
         ChoiceError: there is no such orientation.
     """
-    for name in (source, target):
-        if name not in ORIENTATIONS:
-            raise ChoiceError(f"orientation: expected one of {', '.join(ORIENTATIONS)}, found {name!r}")
+    source, target = (choice("orientation", name, ORIENTATIONS) for name in (source, target))
     if source == target:
         return array
     devkit = turned(array, source)

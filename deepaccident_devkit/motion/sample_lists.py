@@ -11,8 +11,9 @@ import numpy as np
 from deepaccident_devkit.arrays import checked_number
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.deprecations import warn_deprecated
-from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
+from deepaccident_devkit.errors import ConfigError, NotAvailableError
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.text import choice
 
 Purpose = Literal["train", "evaluate", "all", "every"]
 SampleProtocol = Literal["released", "paper"]
@@ -65,13 +66,9 @@ def samples(
         what = "samples(split) without a purpose, which names the training list,"
         warn_deprecated(what, 'training_samples(split) or samples(split, "train")', since="0.1", gone_in="0.2")
         purpose = "train"
-    for name, value, choices in (
-        ("purpose", purpose, Purpose),
-        ("protocol", protocol, SampleProtocol),
-        ("scope", scope, Scope),
-    ):
-        if value not in get_args(choices):
-            raise ChoiceError(f"{name}: expected one of {', '.join(get_args(choices))}, found {value!r}")
+    listed: str = choice("purpose", purpose, _STEPS)
+    protocol = choice("protocol", protocol, get_args(SampleProtocol))
+    scope = choice("scope", scope, get_args(Scope))
     seconds = checked_number("horizon", horizon, "a number of seconds", ConfigError)
     steps = seconds / (_KEY_STEP * FRAME_PERIOD)
     if not (1 <= steps < float("inf") and abs(steps - round(steps)) < 1e-6):
@@ -92,8 +89,8 @@ def samples(
     if not in_split.any():
         raise NotAvailableError(f"{split}: none of its samples here has labels (the test split has none)")
     to_end = scenarios["num_frames"][row] - (columns["frame_row"] - scenarios["first_frame_row"][row] + 1)
-    chosen = to_end % _STEPS[purpose] == 0
-    if purpose == "evaluate":
+    chosen = to_end % _STEPS[listed] == 0
+    if listed == "evaluate":
         chosen &= (to_end > 0) & (to_end <= round(seconds / FRAME_PERIOD))
         if scope == "accident":
             chosen &= scenarios["designed_accident"][:][row]

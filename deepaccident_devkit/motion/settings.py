@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
 
 import numpy as np
 
 from deepaccident_devkit.arrays import checked_number, checked_whole
-from deepaccident_devkit.errors import ChoiceError, ConfigError
+from deepaccident_devkit.errors import ConfigError
 
 
 def flag(name: str, value: object) -> bool:
@@ -33,10 +32,3 @@ def number(name: str, value: object, expected: str, least: float = -math.inf, mo
     if not (math.isfinite(found) and least <= found <= most):
         raise ConfigError(f"{name}: expected {expected}, found {value!r}")
     return found
-
-
-def choice(name: str, value: object, choices: Collection[str]) -> str:
-    """One of some words, or ChoiceError."""
-    if not isinstance(value, str) or value not in choices:
-        raise ChoiceError(f"{name}: expected one of {', '.join(choices)}, found {value!r}")
-    return str(value)

@@ -16,6 +16,7 @@ from deepaccident_devkit.taxonomy import (
     VERSIONS,
     AgentName,
 )
+from deepaccident_devkit.text import spelled
 
 MINI_FOLDER = "DeepAccident_mini"
 SPLIT_FOLDERS = SPLITS
@@ -100,6 +101,7 @@ def find_release(root: Path, version: str = "v1") -> ReleaseLayout:
         DatarootError: the folder is missing or holds no release.
         VersionError: the version is unknown or not under this folder.
     """
+    version = spelled(version, VERSIONS)
     if version not in VERSIONS:
         raise VersionError(f"unknown version {version!r}; known are {', '.join(VERSIONS)}{_version_remedy(version)}")
     if not _is_unicode(root):

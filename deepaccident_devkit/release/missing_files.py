@@ -7,17 +7,11 @@ from collections import Counter
 from pathlib import Path
 from typing import get_args
 
-from deepaccident_devkit.errors import ChoiceError, MissingFileError
+from deepaccident_devkit.errors import MissingFileError
 from deepaccident_devkit.taxonomy import OnError
+from deepaccident_devkit.text import choice
 
 _logger = logging.getLogger(__name__)
-
-
-def checked_on_missing(value: OnError) -> OnError:
-    """An `on_missing=` argument, checked; raises ChoiceError."""
-    if value not in get_args(OnError):
-        raise ChoiceError(f"on_missing: expected one of {', '.join(get_args(OnError))}, found {value!r}")
-    return value
 
 
 class MissingFiles:
@@ -26,7 +20,7 @@ class MissingFiles:
     def __init__(self, root: Path, on_missing: OnError = "raise") -> None:
         """Files below a release's folder; raises ChoiceError."""
         self._root = root
-        self._skips = checked_on_missing(on_missing) == "skip"
+        self._skips = choice("on_missing", on_missing, get_args(OnError)) == "skip"
         self._asked: Counter[str] = Counter()
         self._missing: Counter[str] = Counter()
 

@@ -10,7 +10,6 @@ import numpy as np
 
 from deepaccident_devkit.arrays import ByteArray, FloatArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import SE3, Boxes, LidarPointCloud
 from deepaccident_devkit.release import BevImage
 from deepaccident_devkit.release.bev_camera import TAGS
@@ -23,6 +22,7 @@ from deepaccident_devkit.render.missing import absence_text, has_cloud, is_there
 from deepaccident_devkit.render.roles import at_once, role_colors, short_name
 from deepaccident_devkit.render.trails import draw_trails
 from deepaccident_devkit.taxonomy import BEV_CAMERA, AgentName, Frame
+from deepaccident_devkit.text import settle_choices
 from deepaccident_devkit.v2x import (
     Agents,
     Link,
@@ -74,8 +74,7 @@ class BevView:
     def __post_init__(self) -> None:
         """Check the frame and the range; raises ChoiceError."""
         check_view_range(self.view_range)
-        if self.frame not in get_args(Frame):
-            raise ChoiceError(f"frame: expected one of {', '.join(get_args(Frame))}, found {self.frame!r}")
+        settle_choices(self, {"frame": get_args(Frame)})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ChoiceError, MissingFileError
+from deepaccident_devkit.errors import MissingFileError
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.render.axes import axes_or_new, set_title
 from deepaccident_devkit.render.bev import BEV_LAYERS, BevView, draw_bev
@@ -26,6 +26,7 @@ from deepaccident_devkit.render.missing import (
 )
 from deepaccident_devkit.render.roles import role_colors
 from deepaccident_devkit.taxonomy import LIDAR, OWN_ACTOR_ID
+from deepaccident_devkit.text import choice
 from deepaccident_devkit.v2x import map_pointcloud_to_image, project_to_image
 from deepaccident_devkit.v2x.projection import ImagePoints, camera_of
 
@@ -181,8 +182,7 @@ def render_pointcloud_in_image(
         ChoiceError: the sensor is no camera, the two are of different scenarios, or there is no such way to colour.
         MissingFileError: neither the image nor a cloud was downloaded. If one of them is there, words name the other.
     """
-    if color_by not in get_args(ColorBy):
-        raise ChoiceError(f"color_by: expected one of {', '.join(get_args(ColorBy))}, found {color_by!r}")
+    color_by = choice("color_by", color_by, get_args(ColorBy))
     record = dataset.get("sample_data", camera)
     own = dataset.sample.get(record["sample_token"])
     whose = own["token"] if sample is None else dataset.get("sample", sample)["token"]

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from typing import Literal, cast, get_args
+from typing import Literal, get_args
 
-from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.text import possible_text
+from deepaccident_devkit.text import choice
 
 Layer = Literal["image", "bev", "points", "boxes", "ids", "velocities", "trajectories", "labels", "visibility", "grid"]
 """`image` is the camera's picture, `bev` the simulator's camera from above, `labels` what the motion labels say."""
@@ -31,8 +30,4 @@ def layers_of(
         ChoiceError: the picture does not have a layer.
     """
     words = default if given is None else given
-    chosen = cast(tuple[Layer, ...], (words,) if isinstance(words, str) else tuple(words))
-    for layer in chosen:
-        if layer not in possible:
-            raise ChoiceError(f"layers: expected any of {possible_text(str(layer), possible)}, found {layer!r}")
-    return frozenset(chosen)
+    return frozenset(choice("layers", layer, possible) for layer in ((words,) if isinstance(words, str) else words))

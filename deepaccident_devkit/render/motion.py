@@ -14,6 +14,7 @@ from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.motion_cells import draw_key, draw_map_of, draw_trail_of
 from deepaccident_devkit.render.motion_maps import MAPS, DrawnMap, MotionMaps, maps_of_labels, maps_of_output
 from deepaccident_devkit.render.roles import collider_ids
+from deepaccident_devkit.text import choice
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -158,8 +159,7 @@ def draw_motion_map(
     Raises:
         ChoiceError: no such map, frame or layer.
     """
-    if name not in MAPS:
-        raise ChoiceError(f"map: expected one of {', '.join(MAPS)}, found {name!r}")
+    name = choice("map", name, MAPS)
     maps, shown = _maps(labels, marked), layers_of(layers, _SHOWN["maps"], _MAP_LAYERS)
     if frame not in range(len(maps.valid)):
         raise ChoiceError(f"frame: expected 0 to {len(maps.valid) - 1}, found {frame!r}")
@@ -202,8 +202,7 @@ def _at_present(maps: MotionMaps) -> MotionMaps:
 
 
 def _draw(maps: MotionMaps, style: MotionStyle, layers: Iterable[Layer] | None, fig: Figure | None) -> Figure:
-    if style not in get_args(MotionStyle):
-        raise ChoiceError(f"style: expected one of {', '.join(get_args(MotionStyle))}, found {style!r}")
+    style = choice("style", style, get_args(MotionStyle))
     shown = layers_of(layers, _SHOWN[style], _POSSIBLE[style])
     if style == "maps":
         return _draw_maps(maps, shown, fig)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, get_args
 
-from deepaccident_devkit.errors import ChoiceError, ConfigError
+from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.render.axes import detached_figure, figure_or_new
 from deepaccident_devkit.render.colors import SPLIT_COLORS
 from deepaccident_devkit.render.pictures import write_figure
@@ -20,6 +20,7 @@ from deepaccident_devkit.render.statistics_panels import (
     render_relative_positions,
 )
 from deepaccident_devkit.statistics import GROUPS, DatasetStatistics
+from deepaccident_devkit.text import choice
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -121,9 +122,7 @@ def render_statistics(statistics: DatasetStatistics, group: str, *, fig: Figure 
     """
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    if group not in _FIGURES:
-        raise ChoiceError(f"group: expected one of {', '.join(_FIGURES)}, found {group!r}")
-    size, draw = _FIGURES[group]
+    size, draw = _FIGURES[choice("group", group, _FIGURES)]
     fig = figure_or_new(fig, size)
     engine = fig.get_layout_engine()
     if isinstance(engine, ConstrainedLayoutEngine):
@@ -158,9 +157,7 @@ def save_statistics(
         ChoiceError: no such format.
         ConfigError: `folder` is a file.
     """
-    folder, wrong = Path(folder), [name for name in formats if name not in get_args(PictureFormat)]
-    if wrong:
-        raise ChoiceError(f"formats: expected some of {', '.join(get_args(PictureFormat))}, found {wrong[0]!r}")
+    folder, formats = Path(folder), [choice("formats", name, get_args(PictureFormat)) for name in formats]
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"{folder}: is a file; give a folder")
     paths = []

@@ -9,7 +9,6 @@ import numpy as np
 
 from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render.axes import axes_or_new, axis_words, check_view_range, set_title, with_light_grid
 from deepaccident_devkit.render.bev import draw_points_from_above
 from deepaccident_devkit.render.boxes import (
@@ -26,6 +25,7 @@ from deepaccident_devkit.render.missing import has_cloud, missing_clouds_text, w
 from deepaccident_devkit.render.roles import in_drawing_order, role_colors, short_name
 from deepaccident_devkit.render.sights import Sights, sights
 from deepaccident_devkit.taxonomy import Frame
+from deepaccident_devkit.text import choice
 from deepaccident_devkit.v2x import Agents, aggregate_point_cloud
 
 if TYPE_CHECKING:
@@ -82,8 +82,7 @@ def render_visibility(
         NotAvailableError: an agent is not in this (partial) release.
     """
     shown = layers_of(layers, _SHOWN, VISIBILITY_LAYERS)
-    if frame not in get_args(Frame):
-        raise ChoiceError(f"frame: expected one of {', '.join(get_args(Frame))}, found {frame!r}")
+    frame = choice("frame", frame, get_args(Frame))
     if view_range is not None:
         check_view_range(view_range)
     known = sights(dataset, moment, agents, frame)

@@ -7,6 +7,7 @@ from typing import Final, get_args
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, View
 from deepaccident_devkit.taxonomy import Layout
+from deepaccident_devkit.text import settle_choices
 
 MAX_FRAMES = 999
 MIN_IMAGE_SIZE = (16, 9)
@@ -71,9 +72,8 @@ class SynthConfig:
         if self.frames is not None:
             _check_range("frames", self.frames, 1, MAX_FRAMES)
         _check_range("seed", self.seed, 0, None)
-        _check_word("layout", self.layout, get_args(Layout))
-        if self.view is not None:
-            _check_word("view", self.view, get_args(View))
+        words = {"layout": get_args(Layout), "view": (None, *get_args(View))}
+        settle_choices(self, words, error=ConfigError)
         if len(self.pixels) != 2:
             raise ConfigError(f"image_size: expected (width, height), found {self.image_size!r}")
         for name, value, least in zip(("width", "height"), self.pixels, MIN_IMAGE_SIZE, strict=True):
@@ -119,11 +119,6 @@ class SynthConfig:
                 "unlabelled_test, for_released_code: the released converter finds the frames of each split by their "
                 f"labels, those of test too; {remedy}"
             )
-
-
-def _check_word(name: str, value: str, words: tuple[str, ...]) -> None:
-    if value not in words:
-        raise ConfigError(f"{name}: expected one of {', '.join(words)}, found {value!r}")
 
 
 def _check_range(name: str, value: int, least: int, most: int | None) -> None:

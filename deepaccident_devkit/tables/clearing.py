@@ -16,6 +16,7 @@ from deepaccident_devkit.tables.indexing import (
 from deepaccident_devkit.tables.locking import LOCK_FILE, index_lock
 from deepaccident_devkit.tables.manifest import MANIFEST_FILE, SCHEMA_VERSION, stored_schema_version
 from deepaccident_devkit.taxonomy import VERSIONS
+from deepaccident_devkit.text import choice
 
 _FILE = re.compile(r".*\.arrow|\..*\.(tmp|part)", re.DOTALL)
 _NAMED = 5
@@ -57,8 +58,7 @@ def clear_index(dataroot: Path, *, version: str = "v1", index_dir: Path | None =
         IndexStoreError: something there is no part of an index, and then nothing is removed; or the removal failed.
         VersionError: the version is unknown.
     """
-    if version not in VERSIONS:
-        raise VersionError(f"unknown version {version!r}; known are {', '.join(VERSIONS)}")
+    version = choice("version", version, VERSIONS, error=VersionError)
     folders = [folder for folder in index_folders(dataroot, version, index_dir) if folder.is_dir()]
     for folder in folders:
         _refuse_foreign(folder)

@@ -20,9 +20,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import get_args
 
 from deepaccident_devkit.arrays import ShortRepr
-from deepaccident_devkit.errors import BrokenReleaseError, ChoiceError, DatarootError, IndexStoreError
+from deepaccident_devkit.errors import BrokenReleaseError, DatarootError, IndexStoreError
 from deepaccident_devkit.files import is_writable_folder
 from deepaccident_devkit.release import ReleaseLayout
 from deepaccident_devkit.tables.indexing import is_unfinished, make_index, scenario_state
@@ -37,6 +38,7 @@ from deepaccident_devkit.tables.manifest import (
 )
 from deepaccident_devkit.tables.scan import folder_digest
 from deepaccident_devkit.taxonomy import OnError
+from deepaccident_devkit.text import choice
 
 logger = logging.getLogger(__name__)
 
@@ -86,8 +88,7 @@ def open_index(
         DatarootError: no scenario has any file.
         IndexStoreError: the index cannot be written, or is a newer devkit's.
     """
-    if on_error not in ("raise", "skip"):
-        raise ChoiceError(f"on_error: expected 'raise' or 'skip', found {on_error!r}")
+    on_error = choice("on_error", on_error, get_args(OnError))
     index = None if check_files else _current_index(layout, index_dir)
     make = partial(_found_or_made, layout, index_dir, check_files=check_files, workers=workers, progress=progress)
     if index is None:

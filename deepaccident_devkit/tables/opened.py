@@ -14,7 +14,8 @@ from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenErro
 from deepaccident_devkit.release import read_split_file
 from deepaccident_devkit.tables.manifest import Problem
 from deepaccident_devkit.tables.tables import Table, Tables, table_names
-from deepaccident_devkit.taxonomy import MINI_SPLITS, SPLITS, OnError
+from deepaccident_devkit.taxonomy import AGENTS, MINI_SPLITS, SPLITS, OnError
+from deepaccident_devkit.text import choice, spelled
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables import records
@@ -172,7 +173,7 @@ class OpenTables:
         """The sample of an agent at frame number `frame` (from 1) of a scenario; raises TokenError."""
         if not isinstance(frame, int | np.integer):
             raise TokenError(f"frame: expected a number from 1, found {frame!r}")
-        return self.sample.get(f"{token_of(scenario)}/{agent}/{frame:03d}")
+        return self.sample.get(f"{token_of(scenario)}/{spelled(agent, AGENTS)}/{frame:03d}")
 
     def samples_of(self, frame: RowArgument) -> list[records.SampleRecord]:
         """The samples of one moment, one for each agent that is there, in the order of `taxonomy.AGENTS`."""
@@ -198,12 +199,12 @@ class OpenTables:
             MissingFileError: there is no such file.
             SplitFileError: your file is no split file: a line has not two words, or a scenario stands twice.
         """
-        if missing not in get_args(OnError):
-            raise ChoiceError(f"missing: expected one of {', '.join(get_args(OnError))}, found {missing!r}")
+        missing = choice("missing", missing, get_args(OnError))
         if not isinstance(split, str | os.PathLike):
             raise ChoiceError(f"split: expected the name of one, or the path of a split file, found {split!r}")
         if not isinstance(split, str) or split.endswith(".txt"):
             return self._listed_scenarios(Path(split).expanduser(), missing)
+        split = choice("split", split, (*SPLITS, *MINI_SPLITS))
         if split in MINI_SPLITS:
             if split not in self._split_files:
                 raise NotAvailableError(
@@ -211,8 +212,6 @@ class OpenTables:
                     f"{self._own_split_text()}"
                 )
             return set(read_split_file(self._split_files[split])) & set(self._tables.resolver.scenario_tokens)
-        if split not in SPLITS:
-            raise ChoiceError(f"split: expected one of {', '.join((*SPLITS, *MINI_SPLITS))}, found {split!r}")
         known = self._tables.views["scenario"]["split"]
         if (known < 0).all():
             raise NotAvailableError(

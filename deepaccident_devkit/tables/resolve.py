@@ -13,6 +13,7 @@ from deepaccident_devkit.errors import TokenError
 from deepaccident_devkit.tables import tokens
 from deepaccident_devkit.tables.tokens import Parts, parse_number, unknown_token
 from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, CHANNEL_FORMAT, CHANNELS
+from deepaccident_devkit.text import meant_text
 
 Views = Mapping[str, Mapping[str, Any]]
 """Table → stored column → view of it."""
@@ -169,7 +170,8 @@ class Resolver:
     def _agent_of(self, table: str, token: str, scenario_row: int, agent: str) -> int:
         agents = self._agents[scenario_row]
         if agent not in agents:
-            raise unknown_token(table, token, f"the scenario's agents are {', '.join(agents)}")
+            known = ", ".join(agents)
+            raise unknown_token(table, token, f"the scenario's agents are {known}{meant_text(agent, agents)}")
         return agents[agent]
 
     def _index_of(self, table: str, token: str, scenario_row: int, word: str) -> int:
@@ -204,7 +206,7 @@ class Resolver:
 
     def _channel_code(self, table: str, token: str, channel: str) -> int:
         if channel not in CHANNELS:
-            raise unknown_token(table, token, f"the channels are {', '.join(CHANNELS)}")
+            raise unknown_token(table, token, f"the channels are {', '.join(CHANNELS)}{meant_text(channel, CHANNELS)}")
         return CHANNELS.index(channel)
 
     def _sensor_row(self, token: str) -> int:
@@ -261,5 +263,6 @@ class Resolver:
 
     def _category_row(self, token: str) -> int:
         if token not in CATEGORIES:
-            raise unknown_token("category", token, f"the categories are {', '.join(CATEGORIES)}")
+            known = ", ".join(CATEGORIES)
+            raise unknown_token("category", token, f"the categories are {known}{meant_text(token, CATEGORIES)}")
         return CATEGORIES.index(token)

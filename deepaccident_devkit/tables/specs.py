@@ -9,6 +9,7 @@ from deepaccident_devkit.errors import TableError
 from deepaccident_devkit.nuscenes_names import table_remedy
 from deepaccident_devkit.tables.columns import Column, Derived, Key, Kind, TableSpec
 from deepaccident_devkit.tables.records import RECORDS
+from deepaccident_devkit.text import meant_text, spelled
 
 
 @cache
@@ -19,10 +20,12 @@ def table_specs() -> Mapping[str, TableSpec]:
 
 def table_spec(name: str) -> TableSpec:
     """One table's specification; raises TableError."""
-    try:
-        return table_specs()[name]
-    except KeyError:
-        raise TableError(f"no table {name!r}; there are {', '.join(table_specs())}{table_remedy(name)}") from None
+    specs = table_specs()
+    known = spelled(name, specs)
+    if known not in specs:
+        remedy = table_remedy(name) or meant_text(name, specs)
+        raise TableError(f"no table {name!r}; there are {', '.join(specs)}{remedy}")
+    return specs[known]
 
 
 def record_columns(record: type) -> tuple[Column, ...]:

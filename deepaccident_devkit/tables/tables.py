@@ -11,6 +11,7 @@ from deepaccident_devkit.tables.columns import NULL_INTEGER, Choice, Column, Key
 from deepaccident_devkit.tables.resolve import Resolver
 from deepaccident_devkit.tables.specs import table_spec, table_specs
 from deepaccident_devkit.tables.store import StoredTable
+from deepaccident_devkit.text import meant_text, spelled
 
 Record = TypeVar("Record")
 _Getter = Callable[[int], Any]
@@ -35,9 +36,10 @@ class Tables:
         try:
             return self._tables[name]
         except KeyError:
-            stored = self._stored[table_spec(name).name]
-            self._tables[name] = Table(stored, self.resolver)
-            return self._tables[name]
+            known = table_spec(name).name  # in its own spelling
+            if known not in self._tables:
+                self._tables[known] = Table(self._stored[known], self.resolver)
+            return self._tables[known]
 
 
 class Table(Sequence[Record], Generic[Record]):
@@ -102,8 +104,9 @@ class Table(Sequence[Record], Generic[Record]):
     def _rows_where(self, field: str, value: Any) -> Sequence[int]:
         column = self._stored.spec.column(field)
         if column is None:
-            fields = ", ".join(name for name, _ in self._getters)
-            raise FieldError(f"table '{self.name}' has no field '{field}'; it has {fields}")
+            fields = [name for name, _ in self._getters]
+            meant = meant_text(field, fields)
+            raise FieldError(f"table '{self.name}' has no field '{field}'; it has {', '.join(fields)}{meant}")
         stored_value = self._stored_value(column, value)
         view = self._stored.views.get(column.stored or "")
         if stored_value is not None and isinstance(view, np.ndarray):
@@ -120,7 +123,8 @@ class Table(Sequence[Record], Generic[Record]):
             except TokenError:
                 return NULL_INTEGER - 1
         if isinstance(kind, Choice) and isinstance(value, str):
-            return kind.values.index(value) if value in kind.values else NULL_INTEGER - 1
+            known = spelled(value, kind.values)
+            return kind.values.index(known) if known in kind.values else NULL_INTEGER - 1
         plain_number = isinstance(value, int | float) and not isinstance(value, bool)
         if isinstance(kind, Number) and plain_number and not (column.nullable and value == NULL_INTEGER):
             return value

@@ -25,6 +25,7 @@ from deepaccident_devkit.taxonomy import (
 )
 from deepaccident_devkit.testing.recording import Recorder
 from deepaccident_devkit.testing.scene import AGENT_IDS, PAIR, SmallScene, small_scene
+from deepaccident_devkit.text import choice, settle_choices
 
 _MOST_FRAMES = 100
 _LEAST_IMAGE, _MOST_IMAGE = (16, 9), (1600, 900)
@@ -57,15 +58,10 @@ class SmallRelease:
         """Check every field; lists become tuples, so that equal configurations have equal hashes."""
         for name in ("splits", "agents", "channels", "image_size"):
             object.__setattr__(self, name, _as_tuple(name, getattr(self, name)))
-        for name, value, known in (
-            ("layout", (self.layout,), get_args(Layout)),
-            ("splits", self.splits, SPLITS),
-            ("agents", self.agents, AGENTS),
-            ("channels", self.channels, CHANNELS),
-        ):
-            unknown = [one for one in value if one not in known]
-            if unknown:
-                raise ConfigError(f"{name}: expected some of {', '.join(known)}, found {unknown[0]!r}")
+        settle_choices(self, {"layout": get_args(Layout)}, error=ConfigError)
+        for name, known in (("splits", SPLITS), ("agents", AGENTS), ("channels", CHANNELS)):
+            named = tuple(choice(name, one, known, error=ConfigError) for one in getattr(self, name))
+            object.__setattr__(self, name, named)
         for name, count in (("splits", len(self.splits)), ("agents", len(self.agents))):
             if not count:
                 raise ConfigError(f"{name}: expected at least one, found none")

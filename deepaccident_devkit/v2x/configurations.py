@@ -9,6 +9,7 @@ from typing import Final, Literal, get_args
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
 from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE, AgentName
+from deepaccident_devkit.text import choice, spelled
 
 Role = Literal["behind", "other", "other_behind", "infrastructure"]
 """The role of a partner: the vehicle behind the ego, the two vehicles of the other side, the infrastructure."""
@@ -64,10 +65,9 @@ class AgentConfig:
 
     def __post_init__(self) -> None:
         """Check the roles; raises ChoiceError."""
-        object.__setattr__(self, "partners", _names("partners", "roles", self.partners))
-        unknown = [role for role in self.partners if role not in get_args(Role)]
-        if unknown:
-            raise ChoiceError(f"partners: expected roles of {', '.join(get_args(Role))}, found {unknown}")
+        named = _names("partners", "roles", self.partners)
+        roles: tuple[Role, ...] = tuple(choice("partners", role, get_args(Role)) for role in named)
+        object.__setattr__(self, "partners", roles)
 
     def agents_for(self, ego: str, *, side: Side = "ego_vehicle") -> tuple[AgentName, ...]:
         """The agents of this configuration by their own names, the ego first.
@@ -87,9 +87,8 @@ class AgentConfig:
         Raises:
             ChoiceError: no such agent or side.
         """
-        agent = _agent_name(ego)
-        if side not in get_args(Side):
-            raise ChoiceError(f"side: expected one of {', '.join(get_args(Side))}, found {side!r}")
+        agent = choice("agent", ego, AGENTS)
+        side = choice("side", side, get_args(Side))
         if agent == INFRASTRUCTURE:
             named: Mapping[Role, AgentName] = {**_PARTNERS[side], "infrastructure": side}
         else:
@@ -150,7 +149,7 @@ def cooperating_agents(dataset: Dataset, sample: RowArgument, agents: Agents = N
 
 def is_available(agents: object) -> bool:
     """Whether an `agents=` argument is the text that stands for None, `available`."""
-    return isinstance(agents, str) and agents == AVAILABLE
+    return isinstance(agents, str) and agents.lower() == AVAILABLE
 
 
 def agents_of(dataset: Dataset, scenario: RowArgument) -> tuple[AgentName, ...]:
@@ -164,15 +163,11 @@ def _named(agents: AgentConfig | str | Sequence[str], ego: str) -> tuple[AgentNa
     if isinstance(agents, AgentConfig):
         return agents.agents_for(ego)
     if isinstance(agents, str):
-        if agents not in AGENT_CONFIGS:
-            hint = f"; for that agent alone give [{agents!r}]" if agents in AGENTS else ""
-            raise ChoiceError(f"agents: expected one of {', '.join(AGENT_SETS)}, found {agents!r}{hint}")
-        return AGENT_CONFIGS[agents].agents_for(ego)
-    return tuple(_agent_name(agent) for agent in _names("agents", "agents' names or a configuration", agents))
-
-
-def _agent_name(name: object) -> AgentName:
-    for agent in AGENTS:
-        if isinstance(name, str) and agent == name:
-            return agent
-    raise ChoiceError(f"agent: expected one of {', '.join(AGENTS)}, found {name!r}")
+        if spelled(agents, AGENTS) in AGENTS:
+            raise ChoiceError(
+                f"agents: expected one of {', '.join(AGENT_SETS)}, found {agents!r}; for that agent alone give "
+                f"[{agents!r}]"
+            )
+        return AGENT_CONFIGS[choice("agents", agents, AGENT_SETS)].agents_for(ego)
+    names = _names("agents", "agents' names or a configuration", agents)
+    return tuple(choice("agent", agent, AGENTS) for agent in names)

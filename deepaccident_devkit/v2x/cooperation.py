@@ -8,13 +8,13 @@ from typing import Final
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray
-from deepaccident_devkit.dataset import Dataset, RowArgument, Visible
-from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.dataset import VISIBLE, Dataset, RowArgument, Visible
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.boxes import concatenate, trusted_boxes
 from deepaccident_devkit.tables import visible_ids, visible_mask
 from deepaccident_devkit.tables.tokens import instance_token
 from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE, OWN_ACTOR_ID, UNTRACKED_ID
+from deepaccident_devkit.text import choice
 from deepaccident_devkit.v2x.configurations import Agents
 from deepaccident_devkit.v2x.link import Link
 from deepaccident_devkit.v2x.messages import Message, messages
@@ -130,7 +130,7 @@ def cooperative_view(
     link: Link | None = None,
 ) -> CooperativeView:
     """`cooperative_boxes`, and who saw each of them; it has the same arguments and errors."""
-    frame = dataset.frame_name(frame)
+    frame, visible = dataset.frame_name(frame), choice("visible", visible, VISIBLE)
     target_from_world = dataset.world_from(sample, frame).inverse()
     parts, actors, agent_codes = [], [], []
     for message in messages(dataset, sample, agents, link):
@@ -201,8 +201,6 @@ def _repeated(boxes: Boxes, agent: AnyArray, loose: IntArray, chosen: IntArray) 
 def _visible_mask(message: Message, boxes: Boxes, visible: Visible) -> BoolArray:
     if visible == "camera":
         return boxes.camera_visible
-    if visible != "released":
-        raise ChoiceError(f"visible: expected None, 'camera' or 'released', found {visible!r}")
     tracked: BoolArray = (boxes.actor_id != OWN_ACTOR_ID) & (boxes.actor_id != UNTRACKED_ID)
     return _released_mask(message, boxes) & tracked
 

@@ -14,6 +14,7 @@ from deepaccident_devkit.arrays import FloatArray, checked_number, checked_whole
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.text import choice
 
 NoiseLaw = Literal["paper", "zero-mean"]
 _NORMAL: Final = NormalDist()
@@ -57,8 +58,7 @@ class PoseNoise:
                 f"pose noise: heading_std is {self.heading_std:g} radians, over half a turn; if these are degrees, "
                 f"give {radians:.4g}"
             )
-        if self.law not in get_args(NoiseLaw):
-            raise ConfigError(f"pose noise: expected a law of {', '.join(get_args(NoiseLaw))}, found {self.law!r}")
+        object.__setattr__(self, "law", choice("pose noise: law", self.law, get_args(NoiseLaw), error=ConfigError))
         if self.law == "zero-mean" and self.mean:
             raise ConfigError(f"pose noise: the law zero-mean takes no mean, found {self.mean}; give std alone")
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deepaccident_devkit.evaluation.metrics.detection import DETECTION_PROTOCOLS, DetectedBoxes, DetectionEvaluator
@@ -50,7 +50,7 @@ def evaluator_of(protocol: str, chosen: Sequence[tuple[int, Sample]], **switches
     return evaluator
 
 
-@pytest.mark.slow
+@settings(max_examples=12)
 @given(samples(), st.randoms())
 @pytest.mark.parametrize("protocol", sorted(DETECTION_PROTOCOLS))
 def test_any_order_and_any_workers_give_the_same_bits(protocol: str, drawn: list[Sample], random) -> None:
@@ -63,7 +63,7 @@ def test_any_order_and_any_workers_give_the_same_bits(protocol: str, drawn: list
         assert getattr(whole, name).tobytes() == getattr(parts, name).tobytes()
 
 
-@pytest.mark.slow
+@settings(max_examples=12)
 @given(samples(), st.lists(st.integers(0, 3), min_size=4, max_size=4), st.integers(0, 4))
 @pytest.mark.parametrize("protocol", [*sorted(DETECTION_PROTOCOLS), "opencood by sample"])
 def test_a_draw_is_the_result_of_that_many_copies(

@@ -4,9 +4,8 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-import pytest
 import shapely
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from strategies import arrays, boxes, cameras, clouds, grids, mutations, points, poses, upright_boxes
@@ -42,7 +41,7 @@ def test_points_in_boxes_are_the_definitions_to_the_bit(
     assert_array_equal(given_boxes.count_points(some), expected.sum(axis=1))
 
 
-@pytest.mark.slow
+@settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.sampled_from([0.0, 3.0, 30.0, 1000.0]))
 def test_points_in_boxes_of_whole_clouds(seed: int, count: int, reach: float) -> None:
     """More points than one piece of the coarse grid takes, on the boxes' faces among them."""

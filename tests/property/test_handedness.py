@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from strategies import ANGLES, arrays, matrices
@@ -127,7 +127,7 @@ LIDAR_TO_EGO = carla_matrix(np.array([0.1, -0.2, 1.94]), 0.12, 0.02, -0.03)
 RAW_CORNERS = np.array([[x, y, z] for x in (1, -1) for y, z in ((-1, 1), (1, 1), (1, -1), (-1, -1))])
 
 
-@pytest.mark.slow
+@settings(max_examples=20)
 @given(
     one_to_world=vehicle_poses(),
     other_to_world=vehicle_poses(),

@@ -4,7 +4,6 @@ from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -58,7 +57,6 @@ def test_label_in_the_other_handedness_is_the_same_boxes(scratch: Path, given_la
         assert_array_equal(getattr(other, name), getattr(given_labels, name) * y)
 
 
-@pytest.mark.slow
 @given(st.lists(labels(), max_size=4))
 def test_many_labels_are_the_files_one_after_another(scratch: Path, several: list[Labels]) -> None:
     paths = [scratch / f"label_{number}.txt" for number in range(len(several))]
@@ -109,8 +107,7 @@ def test_lidar(scratch: Path, cloud: LidarPointCloud) -> None:
     assert_array_equal(read_lidar(scratch / "points.npz", raw=True), cloud.points * [1, -1, 1, 1])
 
 
-@pytest.mark.slow
-@settings(max_examples=6)
+@settings(max_examples=3)
 @given(st.integers(0, 2**32 - 1))
 def test_bev(scratch: Path, seed: int) -> None:
     rng = np.random.default_rng(seed)

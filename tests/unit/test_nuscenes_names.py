@@ -80,7 +80,7 @@ def test_other_names_fail_as_ever(da: DeepAccident) -> None:
 def test_an_unknown_table_of_nuscenes_names_the_counterpart(da: DeepAccident, name: str) -> None:
     with pytest.raises(TableError, match=rf"no table '{name}'; .*; of nuScenes' table '{name}': .*from_nuscenes\.md"):
         da.get(name, "x")
-    with pytest.raises(TableError, match=r"category$"):
+    with pytest.raises(TableError, match=r"category; did you mean 'sample'\?$"):
         da.get("sampel", "x")
 
 

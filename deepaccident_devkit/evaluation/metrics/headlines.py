@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, Literal
 
-from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
-from deepaccident_devkit.text import rows_html
+from deepaccident_devkit.text import choice, rows_html
 
 Unit = Literal["%", "share", "m", "s", "rad", "m/s", "1 - overlap", "1/min"]
 LIMITS: Final[Mapping[Unit, float]] = MappingProxyType({"%": 100.0, "share": 1.0, "1 - overlap": 1.0})
@@ -143,8 +142,7 @@ def headlines(task: str, result: object) -> tuple[Headline, ...]:
     Raises:
         ChoiceError: no such task.
     """
-    if task not in _ROWS:
-        raise ChoiceError(f"task: expected one of {', '.join(_ROWS)}, found {task!r}")
+    task = choice("task", task, _ROWS)
     return tuple(
         Headline(
             name=row.name.replace("*", key),

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, get_args
 
-from deepaccident_devkit.errors import ChoiceError, ResultsError
+from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput
 from deepaccident_devkit.evaluation.results.entries import EntryWriter
@@ -25,6 +25,7 @@ from deepaccident_devkit.evaluation.results.header import (
 from deepaccident_devkit.evaluation.results.shards import ShardWriter
 from deepaccident_devkit.files import replacing, replacing_folder
 from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.text import choice
 
 
 class _Body(Protocol):
@@ -78,12 +79,10 @@ class ResultsWriter:
             ChoiceError: no such task.
             ResultsError: a value that cannot be written, or something stands at `path`.
         """
-        if task not in get_args(ResultsTask):
-            raise ChoiceError(f"task: expected one of {', '.join(get_args(ResultsTask))}, found {task!r}")
+        self.task = choice("task", task, get_args(ResultsTask))
         self.path = Path(path).expanduser().absolute()
-        self.task = task
         try:
-            self._header = Header(task=task, meta=json_meta({} if meta is None else meta))
+            self._header = Header(task=self.task, meta=json_meta({} if meta is None else meta))
         except ContentError as error:
             raise ResultsError(str(error)) from error
         self._motion: dict[str, Any] = {"grid": grid, "step": step, "labels": labels, "store": store}

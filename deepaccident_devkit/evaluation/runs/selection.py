@@ -12,6 +12,7 @@ from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableErr
 from deepaccident_devkit.motion import samples
 from deepaccident_devkit.motion.sample_lists import no_samples_text
 from deepaccident_devkit.taxonomy import AGENTS
+from deepaccident_devkit.text import choice, settle_choices
 
 SampleList = Literal["evaluate", "all"]
 ScopeName = Literal["accident", "all"]
@@ -41,12 +42,7 @@ class SampleSelection:
     def __post_init__(self) -> None:
         """Check and put the agents in order; raises ChoiceError."""
         object.__setattr__(self, "split", os.fspath(self.split))
-        for name, value, choices in (
-            ("samples", self.samples, get_args(SampleList)),
-            ("scope", self.scope, get_args(ScopeName)),
-        ):
-            if value not in choices:
-                raise ChoiceError(f"{name}: expected one of {', '.join(choices)}, found {value!r}")
+        settle_choices(self, {"samples": get_args(SampleList), "scope": get_args(ScopeName)})
         if self.agents is not None:
             object.__setattr__(self, "agents", _agents(self.agents))
 
@@ -112,10 +108,7 @@ def _designed_accident(token: str) -> bool:
 
 
 def _agents(given: Sequence[str]) -> tuple[str, ...]:
-    names = [given] if isinstance(given, str) else list(given)
-    unknown = [name for name in names if name not in AGENTS]
-    if unknown or not names:
-        raise ChoiceError(
-            f"agents: expected some of {', '.join(AGENTS)}, or None for all, found {unknown[0] if unknown else names!r}"
-        )
+    names = [choice("agents", name, AGENTS) for name in ([given] if isinstance(given, str) else given)]
+    if not names:
+        raise ChoiceError("agents: expected at least one agent, or None for all, found none")
     return tuple(name for name in AGENTS if name in names)

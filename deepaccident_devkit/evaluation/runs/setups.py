@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import Any, Final, Literal, get_args
 
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
+from deepaccident_devkit.errors import ConfigError, EvaluationError
 from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS as ACCIDENT_PROTOCOLS
 from deepaccident_devkit.evaluation.metrics.accident import AccidentEvaluator, ReleasedAccidents, accident_context
 from deepaccident_devkit.evaluation.metrics.choices import switched
@@ -25,6 +25,7 @@ from deepaccident_devkit.evaluation.metrics.warning import WARNING_PROTOCOLS, Wa
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels, motion_labels
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.text import choice, settle_choices
 
 TaskName = Literal["motion", "accident", "detection", "warning"]
 TASK_PROTOCOLS: Final[Mapping[str, Mapping[str, Any]]] = MappingProxyType(
@@ -65,13 +66,9 @@ class EvaluationSetup:
 
     def __post_init__(self) -> None:
         """Check; raises ChoiceError or ConfigError."""
-        if self.task not in get_args(TaskName):
-            raise ChoiceError(f"task: expected one of {', '.join(get_args(TaskName))}, found {self.task!r}")
-        if self.protocol not in TASK_PROTOCOLS[self.task]:
-            raise ChoiceError(
-                f"protocol: expected one of {', '.join(TASK_PROTOCOLS[self.task])} for {self.task}, "
-                f"found {self.protocol!r}"
-            )
+        settle_choices(self, {"task": get_args(TaskName)})
+        protocol = choice(f"protocol of {self.task}", self.protocol, TASK_PROTOCOLS[self.task])
+        object.__setattr__(self, "protocol", protocol)
         if not 0 < self.horizon < math.inf:
             raise ConfigError(f"horizon: expected seconds above 0, found {self.horizon!r}")
         object.__setattr__(self, "switches", MappingProxyType(dict(self.switches)))

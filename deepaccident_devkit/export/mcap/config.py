@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args
 
 from deepaccident_devkit.arrays import checked_whole
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.results import Prediction, Results
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.motion.config import label_config
-from deepaccident_devkit.release.missing_files import checked_on_missing
 from deepaccident_devkit.taxonomy import CAMERAS, LIDAR, OnError
-from deepaccident_devkit.text import possible_text
+from deepaccident_devkit.text import choice, possible_text, settle_choices
 from deepaccident_devkit.v2x import Agents
 
 EPOCH: Final = 1_704_067_200
@@ -51,7 +50,7 @@ class McapConfig:
         """Check; raises ChoiceError."""
         object.__setattr__(self, "channels", _channel_names(self.channels))
         object.__setattr__(self, "frames", _frame_numbers(self.frames))
-        checked_on_missing(self.on_missing)
+        settle_choices(self, {"on_missing": get_args(OnError)})
         if self.motion_labels is not None:
             object.__setattr__(self, "motion_labels", label_config(self.motion_labels))
         _ = self.point_step
@@ -92,10 +91,7 @@ def _channel_names(given: object) -> tuple[str, ...]:
         return EXPORTED_CHANNELS
     if isinstance(given, str) or not isinstance(given, Iterable):
         raise ChoiceError(f"channels: expected names of channels, found {given!r}")
-    named = tuple(given)
-    for name in named:
-        if name not in EXPORTED_CHANNELS:
-            raise ChoiceError(f"channels: expected some of {', '.join(EXPORTED_CHANNELS)}, found {name!r}")
+    named = {choice("channels", name, EXPORTED_CHANNELS) for name in given}
     return tuple(name for name in EXPORTED_CHANNELS if name in named)
 
 

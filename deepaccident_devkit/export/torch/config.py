@@ -10,13 +10,13 @@ import numpy as np
 
 from deepaccident_devkit.arrays import checked_whole
 from deepaccident_devkit.dataset import Visible
-from deepaccident_devkit.errors import ChoiceError, ConfigError
+from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.export.torch.images import ImageConfig
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import Augmentation, MotionLabelConfig
 from deepaccident_devkit.motion.warps.warping import WarpMode
-from deepaccident_devkit.release.missing_files import checked_on_missing
 from deepaccident_devkit.taxonomy import OnError
+from deepaccident_devkit.text import settle_choices
 from deepaccident_devkit.v2x import Agents, Link
 from deepaccident_devkit.v2x.link import checked_link
 
@@ -80,13 +80,9 @@ class V2XConfig:
             object.__setattr__(self, "step", labels.step if isinstance(labels, MotionLabelConfig) else _DEFAULT_STEP)
         for name, least in (("past", 1), ("step", 1), ("seed", 0)):
             object.__setattr__(self, name, _count(name, getattr(self, name), least))
-        for name, value, choices in (
-            ("boxes", self.boxes, get_args(BoxSource)),
-            ("visible", self.visible, get_args(Visible)),
-            ("to_present", self.to_present, get_args(WarpMode)),
-        ):
-            if value is not None and value not in choices:
-                raise ChoiceError(f"{name}: expected None or one of {', '.join(choices)}, found {value!r}")
+        words = {"boxes": get_args(BoxSource), "visible": get_args(Visible), "to_present": get_args(WarpMode)}
+        settle_choices(self, {name: (None, *possible) for name, possible in words.items()})
+        settle_choices(self, {"on_missing": get_args(OnError)})
         if isinstance(self.labels, MotionLabelConfig) and self.labels.augmentation is not None:
             raise ConfigError(
                 "labels: their augmentation is that of boxes, points and poses; give V2XConfig(augmentation=…) alone"
@@ -94,7 +90,6 @@ class V2XConfig:
 
     def _check_types(self) -> None:
         checked_link(self.link)
-        checked_on_missing(self.on_missing)
         for name, kind, example in _PARTS:
             value = getattr(self, name)
             if value is not None and not isinstance(value, kind):

@@ -14,6 +14,7 @@ from deepaccident_devkit.arrays import AnyArray, ByteArray, FloatArray, checked
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.taxonomy import CAMERAS
+from deepaccident_devkit.text import choice, settle_choices
 from deepaccident_devkit.v2x.projection import camera_of
 
 ImageDtype = Literal["float32", "uint8"]
@@ -49,8 +50,7 @@ class ImageConfig:
             self._set("crop", _pixels("crop", self.crop, "top, left, height and width", (0, 0, 1, 1)))
             if self.resize is not None:
                 _check_crop(self.crop, self.resize)
-        if self.dtype not in get_args(ImageDtype):
-            raise ConfigError(f"dtype: expected one of {', '.join(get_args(ImageDtype))}, found {self.dtype!r}")
+        settle_choices(self, {"dtype": get_args(ImageDtype)}, error=ConfigError)
         for name in ("mean", "std"):
             self._set(name, _channels(name, getattr(self, name)))
         if min(self.std) <= 0:
@@ -124,8 +124,9 @@ def _channels(name: str, given: ArrayLike) -> tuple[float, ...]:
 
 
 def _cameras(given: Iterable[str]) -> tuple[str, ...]:
-    names = () if isinstance(given, str) or not isinstance(given, Iterable) else tuple(given)
-    if not names or any(name not in CAMERAS for name in names) or len(set(names)) != len(names):
+    listed = () if isinstance(given, str) or not isinstance(given, Iterable) else tuple(given)
+    names = tuple(choice("cameras", name, CAMERAS, error=ConfigError) for name in listed)
+    if not names or len(set(names)) != len(names):
         raise ConfigError(f"cameras: expected a tuple of some of {', '.join(CAMERAS)}, each once; found {given!r}")
     return names
 

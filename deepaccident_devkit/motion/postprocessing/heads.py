@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from deepaccident_devkit.arrays import AnyArray, ShortRepr, as_numbers, checked, readonly
-from deepaccident_devkit.errors import ChoiceError, GeometryError
+from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, Orientation
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.orientations import to_orientation
+from deepaccident_devkit.text import settle_choices
 
 LABEL_LOGIT: Final = 10.0
 """The right class's logit when the released evaluation treats labels as a prediction; the other class has 0."""
@@ -43,8 +44,7 @@ class MotionHeads(ShortRepr):
 
     def __post_init__(self) -> None:
         """Check and freeze; raises GeometryError, or ChoiceError for an unknown orientation."""
-        if self.orientation not in ORIENTATIONS:
-            raise ChoiceError(f"orientation: expected one of {', '.join(ORIENTATIONS)}, found {self.orientation!r}")
+        settle_choices(self, {"orientation": ORIENTATIONS})
         _check_channels(np.shape(self.segmentation))
         segmentation = checked("segmentation", self.segmentation, (None, 2, None, None), np.float32)
         frames, _, height, width = segmentation.shape

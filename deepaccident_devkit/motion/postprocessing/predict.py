@@ -20,7 +20,8 @@ from deepaccident_devkit.motion.postprocessing.heads import LABEL_LOGIT, MotionH
 from deepaccident_devkit.motion.postprocessing.linking import link_frames
 from deepaccident_devkit.motion.postprocessing.redrawing import first_hulls, redrawn_cells
 from deepaccident_devkit.motion.protocols import LabelProtocol, label_protocol
-from deepaccident_devkit.motion.settings import choice, count, flag, number
+from deepaccident_devkit.motion.settings import count, flag, number
+from deepaccident_devkit.text import choice
 
 Foreground = Literal["argmax", "sigmoid"]
 _BETWEEN: Final = (math.ulp(0.0), math.nextafter(1.0, 0.0))

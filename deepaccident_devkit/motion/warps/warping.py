@@ -28,12 +28,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from deepaccident_devkit.arrays import AnyArray, Float32Array, FloatArray, checked
-from deepaccident_devkit.errors import ChoiceError, GeometryError
+from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import BevGrid, six_vectors
 from deepaccident_devkit.geometry.bev_grid import Axis, Orientation
 from deepaccident_devkit.motion.orientations import axes_of
 from deepaccident_devkit.motion.protocols import LabelProtocol
 from deepaccident_devkit.motion.warps import single_precision
+from deepaccident_devkit.text import choice
 
 WarpMode = Literal["nearest", "bilinear"]
 CellIndices = NDArray[np.intp]
@@ -178,9 +179,7 @@ def blend_cells(raster: AnyArray, points: tuple[AnyArray, AnyArray], fill: float
 
 def checked_mode(mode: WarpMode) -> WarpMode:
     """`mode`, or ChoiceError."""
-    if mode not in get_args(WarpMode):
-        raise ChoiceError(f"mode: expected nearest or bilinear, found {mode!r}")
-    return mode
+    return choice("mode", mode, get_args(WarpMode))
 
 
 def sample_points(source_from_target: ArrayLike, grid: BevGrid, rules: LabelProtocol) -> tuple[AnyArray, AnyArray]:

@@ -13,6 +13,7 @@ from deepaccident_devkit.evaluation.metrics.detection import DetectionResult
 from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
 from deepaccident_devkit.render.colors import CATEGORY_COLORS, ESTIMATE_COLOR, SERIES_COLORS
 from deepaccident_devkit.render.evaluation.panels import PANEL, Bar, draw_bars, draw_nothing
+from deepaccident_devkit.text import choice
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,8 +37,7 @@ def render_precision_recall(result: DetectionResult, name: str, *, ring: int = 0
     Raises:
         ChoiceError: no such class, or no such range.
     """
-    if name not in result.classes:
-        raise ChoiceError(f"name: expected one of {', '.join(result.classes)}, found {name!r}")
+    name = choice("name", name, result.classes)
     if ring not in range(len(result.ranges)):
         raise ChoiceError(f"ring: expected 0 to {len(result.ranges) - 1}, found {ring!r}")
     ax, row = axes_or_new(ax, PANEL), result.classes.index(name)

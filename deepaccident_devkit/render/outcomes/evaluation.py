@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.metrics.accident import (
     AccidentEvaluator,
     ComparedAccidents,
@@ -30,6 +29,7 @@ from deepaccident_devkit.render.outcomes.accident import ACCIDENT_LAYERS, draw_a
 from deepaccident_devkit.render.outcomes.detection import DETECTION_LAYERS, WINDOW, draw_detection_outcome, draw_true
 from deepaccident_devkit.render.outcomes.motion import MOTION_LAYERS, draw_motion_side, motion_outcome
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.text import choice
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -106,9 +106,7 @@ def _task(given: object, task: str | None) -> str:
         possible = ("detection",)
     elif isinstance(given, MotionOutput):
         possible = ("motion", "accident")
-    if task is not None and task not in possible:
-        raise ChoiceError(f"task: expected {' or '.join(possible)} of this prediction, found {task!r}")
-    return task or possible[0]
+    return possible[0] if task is None else choice("task of this prediction", task, possible)
 
 
 def _draw_motion(

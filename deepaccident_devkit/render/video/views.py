@@ -23,6 +23,7 @@ from deepaccident_devkit.render.roles import short_name
 from deepaccident_devkit.render.visibility import VISIBILITY_LAYERS, render_visibility, render_visibility_matrix
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import CAMERAS
+from deepaccident_devkit.text import choice
 from deepaccident_devkit.v2x import Agents, cooperating_agents
 
 if TYPE_CHECKING:
@@ -216,8 +217,6 @@ def views_of(
 
 
 def _view(given: object) -> View:
-    if isinstance(given, str) and given in VIEWS:
-        return VIEWS[given]
     if callable(given):
         return View(draw=_Own(given), layers=(), own=given)
-    raise ChoiceError(f"what: expected {', '.join(VIEWS)} or a function, found {given!r}")
+    return VIEWS[choice("what", given, VIEWS)]

@@ -8,6 +8,7 @@ import numpy as np
 from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.roads.terrain import ARMS, OUTWARD, Arm, Hump
+from deepaccident_devkit.text import choice
 
 RoadKind = Literal["four-way", "three-way"]
 
@@ -47,8 +48,7 @@ class RoadSpec:
 
     def __post_init__(self) -> None:
         """Check every field."""
-        if self.kind not in get_args(RoadKind):
-            raise ConfigError(f"road.kind: expected one of {', '.join(get_args(RoadKind))}, found {self.kind!r}")
+        object.__setattr__(self, "kind", choice("road.kind", self.kind, get_args(RoadKind), error=ConfigError))
         if not 1 <= self.lanes <= MAX_LANES:
             raise ConfigError(f"road.lanes: expected 1 or {MAX_LANES} in each direction, found {self.lanes}")
         low, high = _KERB_RADII

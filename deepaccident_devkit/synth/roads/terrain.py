@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from deepaccident_devkit.arrays import Float32Array, FloatArray
 from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.text import choice
 
 Arm = Literal["west", "south", "east", "north"]
 ARMS: tuple[Arm, ...] = get_args(Arm)
@@ -44,8 +45,7 @@ class Hump:
 
     def __post_init__(self) -> None:
         """Check that it fits between the junction and the edge of the ground, and that cars can climb it."""
-        if self.arm not in ARMS:
-            raise ConfigError(f"hump.arm: expected one of {', '.join(ARMS)}, found {self.arm!r}")
+        object.__setattr__(self, "arm", choice("hump.arm", self.arm, ARMS, error=ConfigError))
         if self.length <= 0 or self.height < 0:
             raise ConfigError(
                 f"hump: expected a length above 0 and a height of 0 or more, found {self.length} and {self.height}"

@@ -3,15 +3,15 @@
 import dataclasses
 import math
 import types
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.spec.choices import Choice, Fixed, Items, OneOf, Part, Range, key_of
 from deepaccident_devkit.synth.spec.model import Bounds
 from deepaccident_devkit.synth.spec.yaml_nodes import Node
+from deepaccident_devkit.text import meant_text, spelled
 
 _SETTLED = {"name", "design", "exchange", "role"}
 """Fields with one value, no range or list of choices: they decide which other fields the file needs."""
@@ -70,8 +70,8 @@ def read_part(node: Node, kind: type[Any], path: str = "") -> Part:
     prefix = f"{path}." if path else ""
     for key, entry in entries.items():
         if key not in names:
-            sentence = _after(_did_you_mean(key, names), f"possible: {', '.join(names)}")
-            raise ConfigError(f"{entry.where}: {prefix}{key}: no such field; {sentence}")
+            possible = f"possible: {', '.join(names)}{meant_text(key, names)}"
+            raise ConfigError(f"{entry.where}: {prefix}{key}: no such field; {possible}")
     for name in required_fields(kind):
         if key_of(name) not in entries:
             raise ConfigError(f"{node.where}: {prefix}{key_of(name)}: is missing; add it")
@@ -138,10 +138,11 @@ def _read_one(node: Node, wanted: FieldType, path: str) -> Choice:
         return read_part(node, wanted.base, path)
     if wanted.base in (int, float):
         return Fixed(_number(node, wanted, path))
+    value = spelled(value, wanted.words)
     fits = value in wanted.words if wanted.words else isinstance(value, wanted.base)
     if not fits:
-        meant = _did_you_mean(value, wanted.words) if isinstance(value, str) else ""
-        raise _wrong(node, path, _described(wanted), node, _remedy(wanted, node), meant=meant)
+        remedy = _remedy(wanted, node) + meant_text(value, wanted.words)
+        raise _wrong(node, path, _described(wanted), node, remedy)
     return Fixed(value)
 
 
@@ -155,10 +156,10 @@ def _number(node: Node, wanted: FieldType, path: str) -> float:
     return wanted.base(value)  # type: ignore[no-any-return]
 
 
-def _wrong(node: Node, path: str, expected: str, found: Node, remedy: str = "", *, meant: str = "") -> ConfigError:
+def _wrong(node: Node, path: str, expected: str, found: Node, remedy: str = "") -> ConfigError:
     shown = _shown(found)
     clipped = shown if len(shown) <= _SHOWN_LENGTH else f"{shown[: _SHOWN_LENGTH - 1]}…"
-    return ConfigError(f"{node.where}: {path}: {_after(meant, f'expected {expected}')}, found {clipped}{remedy}")
+    return ConfigError(f"{node.where}: {path}: expected {expected}, found {clipped}{remedy}")
 
 
 def _remedy(wanted: FieldType, node: Node) -> str:
@@ -169,18 +170,6 @@ def _remedy(wanted: FieldType, node: Node) -> str:
     if wanted.base in (int, float) and isinstance(value, str) and _is_number(value):
         return f"; write {_decimal(value)}, without quotes" if node.quoted else f"; {_as_yaml_number(value)}"
     return "; leave the quotes out" if wanted.base is bool and value in ("true", "false") else ""
-
-
-def _did_you_mean(wrong: str, possible: Iterable[str]) -> str:
-    """Such as `did you mean left?`; empty if no possible word is like the wrong one."""
-    of_lowered = {word.lower(): word for word in possible}
-    close = get_close_matches(wrong.lower(), of_lowered, n=1)
-    return f"did you mean {of_lowered[close[0]]}?" if close else ""
-
-
-def _after(question: str, sentence: str) -> str:
-    """A sentence, after a question if there is one."""
-    return f"{question} {sentence[0].upper()}{sentence[1:]}" if question else sentence
 
 
 def _converted(bounds: Bounds, value: float) -> str:

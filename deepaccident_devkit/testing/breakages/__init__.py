@@ -4,13 +4,14 @@ from collections.abc import Mapping
 from hashlib import sha256
 from pathlib import Path
 
-from deepaccident_devkit.errors import ChoiceError, ConfigError
+from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.release import ScenarioFolder, find_release
 from deepaccident_devkit.taxonomy import VEHICLE_AGENTS
 from deepaccident_devkit.testing.breakages import calibs, folders, labels, legal, metas, sensors
 from deepaccident_devkit.testing.breakages.kinds import Breakage, BrokenRelease, Victim
 from deepaccident_devkit.testing.editing import ScenarioEditor
 from deepaccident_devkit.testing.releases import SmallRelease, write_small_release
+from deepaccident_devkit.text import choice
 
 _GROUPS = (
     labels.FORM,
@@ -90,9 +91,7 @@ def broken_release(out: Path, name: str, config: SmallRelease | None = None) -> 
 
 def checked_breakage(name: str) -> Breakage:
     """The breakage with a name. Raises ChoiceError if there is none."""
-    if name not in BREAKAGES:
-        raise ChoiceError(f"breakage: expected one of {', '.join(BREAKAGES)}, found {name!r}")
-    return BREAKAGES[name]
+    return BREAKAGES[choice("breakage", name, BREAKAGES)]
 
 
 class _Watched(ScenarioEditor):

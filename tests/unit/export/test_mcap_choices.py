@@ -117,7 +117,7 @@ def test_every_nth_point(da: DeepAccident, scenario: str, tmp_path: Path) -> Non
     [
         ({"agent": "ego_vehicle"}, "export_mcap has no 'agent'; there are agents, "),
         ({"channels": "lidar01"}, "channels: expected names of channels, found 'lidar01'"),
-        ({"channels": ["BEV_instance_camera"]}, "channels: expected some of Camera_Front, .*found 'BEV_instance_"),
+        ({"channels": ["BEV_instance_camera"]}, "channels: expected one of Camera_Front, .*found 'BEV_instance_"),
         ({"frames": 3}, r"frames: expected frame numbers from 1, such as range\(1, 11\), found 3"),
         ({"frames": [1.5]}, "frames: expected whole numbers from 1, found 1.5"),
         ({"frames": []}, "frames: expected at least one frame number"),

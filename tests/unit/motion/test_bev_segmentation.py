@@ -88,7 +88,7 @@ def test_boxes_of_a_sample_lie_on_vehicle_cells(da: DeepAccident) -> None:
 
 def test_unknown_classes_and_shares_are_refused(da: DeepAccident) -> None:
     image = _image()
-    with pytest.raises(ConfigError, match="expected classes of road, lane_line"):
+    with pytest.raises(ConfigError, match="coverage: expected one of road, lane_line"):
         segmentation_of(image, BevGrid(), coverage={"tram": 0.5})
     with pytest.raises(ConfigError, match="choose a share"):
         segmentation_of(image, BevGrid(), coverage={"road": 1.0})

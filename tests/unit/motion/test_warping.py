@@ -90,7 +90,7 @@ def test_what_does_not_fit_is_refused() -> None:
         warp(raster, np.eye(3), GRID, CLEAN)
     with pytest.raises(GeometryError, match="not all numbers are finite"):
         warp(raster, np.full((4, 4), np.nan), GRID, RELEASED)
-    with pytest.raises(ChoiceError, match="mode: expected nearest or bilinear, found 'cubic'"):
+    with pytest.raises(ChoiceError, match="mode: expected one of nearest, bilinear, found 'cubic'"):
         warp(raster, np.eye(4), GRID, CLEAN, "cubic")  # type: ignore[arg-type]
     with pytest.raises(GeometryError, match="more than a warp can number"):
         nearest_indices(np.eye(4), BevGrid((-50, 50, 0.02), (-50, 50, 0.02)), CLEAN)
@@ -218,7 +218,7 @@ def test_labels_at_the_present_are_not_warped_again() -> None:
     present = make_labels(MotionLabelConfig(grid=GRID), ONE_AHEAD).to_present()
     with pytest.raises(NotAvailableError, match="in the present frame already"):
         present.to_present()
-    with pytest.raises(ChoiceError, match="mode: expected nearest or bilinear"):
+    with pytest.raises(ChoiceError, match="mode: expected one of nearest, bilinear"):
         make_labels(MotionLabelConfig(grid=GRID), ONE_AHEAD).to_present(centerness="linear")  # type: ignore[arg-type]
 
 

@@ -316,9 +316,8 @@ PIECES = [
 ]
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("_little_memory")
-@settings(max_examples=400)
+@settings(max_examples=150)
 @given(data=st.data(), protocol=st.sampled_from(PROTOCOLS))
 def test_damage_raises_our_error_or_nothing(
     tmp_path_factory: pytest.TempPathFactory, raw_calib: Calibs, outcome, data: st.DataObject, protocol: int

@@ -128,7 +128,7 @@ def test_what_cannot_be_counted_down_to_is_named(da_motion: DeepAccident) -> Non
         drawn(da_motion, normal)
     with pytest.raises(ChoiceError, match=r"seconds: expected some from 0 to 3\.4, as recorded"):
         drawn(da_motion, accident_of(da_motion), seconds=[7.0])
-    with pytest.raises(ChoiceError, match=r"layers: expected any of .*, found 'bev'"):
+    with pytest.raises(ChoiceError, match=r"layers: expected one of .*, found 'bev'"):
         drawn(da_motion, accident_of(da_motion), layers=["bev"])
 
 

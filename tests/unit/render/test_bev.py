@@ -200,7 +200,7 @@ def test_words_say_when_and_whose(da: DeepAccident, approach: str) -> None:
 
 
 def test_what_cannot_be_drawn_is_refused(da: DeepAccident, approach: str) -> None:
-    with pytest.raises(ChoiceError, match=r"layers: expected any of .*, found 'image'"):
+    with pytest.raises(ChoiceError, match=r"layers: expected one of .*, found 'image'"):
         render_bev(da, approach, layers=["image"])
     with pytest.raises(ChoiceError, match="frame: expected one of world, ego, lidar, found 'Camera_Front'"):
         render_bev(da, approach, frame="Camera_Front")  # type: ignore[arg-type]

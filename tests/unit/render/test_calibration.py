@@ -69,5 +69,5 @@ def test_boxes_are_those_of_all_agents_but_the_camera_s_own_vehicle(da: DeepAcci
 def test_what_is_no_moment_and_no_layer_is_refused(da: DeepAccident) -> None:
     with pytest.raises(TokenError, match="has no token"):
         render_calibration(da, "nothing")
-    with pytest.raises(ChoiceError, match="layers: expected any of image, points, boxes, ids, found 'bev'"):
+    with pytest.raises(ChoiceError, match="layers: expected one of image, points, boxes, ids, found 'bev'"):
         render_calibration(da, da.sample[3], layers=["bev"])

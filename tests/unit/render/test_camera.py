@@ -85,7 +85,7 @@ def test_the_other_sensors_are_drawn_from_above_in_their_frame(
 
 @pytest.mark.parametrize(("channel", "layer"), [("Camera_Front", "trajectories"), ("lidar01", "image")])
 def test_a_sensor_has_its_own_layers(da: DeepAccident, behind: str, channel: str, layer: Any) -> None:
-    with pytest.raises(ChoiceError, match=rf"layers: expected any of .*, found '{layer}'"):
+    with pytest.raises(ChoiceError, match=rf"layers: expected one of .*, found '{layer}'"):
         render_sample_data(da, f"{behind}/{channel}", layers=[layer])
 
 

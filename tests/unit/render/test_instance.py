@@ -100,7 +100,7 @@ def test_agents_and_layers_can_be_chosen(da: DeepAccident, other: str) -> None:
     assert not panels["path"].images
     assert not any(type(one) is PolyCollection for one in panels["path"].collections)
     assert all("other behind" in panels[name].get_title() for name in ("first", "fourth"))
-    with pytest.raises(ChoiceError, match=r"layers: expected any of .*, found 'ids'"):
+    with pytest.raises(ChoiceError, match=r"layers: expected one of .*, found 'ids'"):
         render_instance(da, other, layers=["ids"])
 
 

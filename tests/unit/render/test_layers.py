@@ -17,7 +17,7 @@ def test_one_layer_needs_no_list_and_any_iterable_is_fine() -> None:
 
 
 def test_a_layer_that_the_picture_has_not_is_refused_with_those_it_has() -> None:
-    with pytest.raises(ChoiceError, match="layers: expected any of image, boxes, found 'points'"):
+    with pytest.raises(ChoiceError, match="layers: expected one of image, boxes, found 'points'"):
         layers_of(["points"], (), ("image", "boxes"))
-    with pytest.raises(ChoiceError, match=r"layers: expected any of boxes, .*, found 'box'"):
+    with pytest.raises(ChoiceError, match=r"layers: expected one of image, .*, found 'box'; did you mean 'boxes'"):
         layers_of(["box"], (), LAYERS)  # type: ignore[list-item]

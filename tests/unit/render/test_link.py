@@ -92,5 +92,5 @@ def test_what_cannot_be_linked_is_named(da_motion: DeepAccident) -> None:
         drawn(da_motion, sample, NOISE, agents="single")
     with pytest.raises(ConfigError, match="reaches back before the first frame"):
         drawn(da_motion, sample, Link(latency=0.5), layers=["boxes"])
-    with pytest.raises(ChoiceError, match=r"layers: expected any of .*, found 'image'"):
+    with pytest.raises(ChoiceError, match=r"layers: expected one of .*, found 'image'"):
         drawn(da_motion, sample, NOISE, layers=["image"])

@@ -206,5 +206,5 @@ def test_labels_as_a_trail(da_motion: DeepAccident, sample: str) -> None:
     assert figure.get_suptitle().replace("/\n", "/") == sample
     with pytest.raises(ChoiceError, match="trail: each frame is in its own ego frame; warp the labels"):
         da_motion.render_motion_labels(sample, style="trail", at_present=False)
-    with pytest.raises(ChoiceError, match=r"layers: expected any of .*, found 'velocities'"):
+    with pytest.raises(ChoiceError, match=r"layers: expected one of .*, found 'velocities'"):
         da_motion.render_motion_labels(sample, style="trail", layers=["velocities"])

@@ -131,7 +131,7 @@ def test_what_is_not_there_is_named(da_motion: DeepAccident) -> None:
     token = da_motion.sample[0]["token"]
     with pytest.raises(TokenError, match="has no token 'nobody'"):
         panel(da_motion, "nobody")
-    with pytest.raises(ChoiceError, match=r"layers: expected any of .*points.*, found 'image'"):
+    with pytest.raises(ChoiceError, match=r"layers: expected one of .*points.*, found 'image'"):
         panel(da_motion, token, layers=["image"])
     with pytest.raises(ChoiceError, match="agent: expected one of"):
         panel(da_motion, token, agents=["me"])

@@ -17,7 +17,7 @@ from deepaccident_devkit.synth import SynthConfig
         ("image_size", (16, 8), "height: 8"),
         ("image_size", (16,), r"expected \(width, height\)"),
         ("layout", "C", "layout: expected one of A, B, found 'C'"),
-        ("view", "close", "view: expected one of open, hidden, found 'close'"),
+        ("view", "close", "view: expected one of open, hidden, or None, found 'close'"),
         ("designs", (1, 13), "designs: 13 is not possible; choose a number from 1 to 12"),
         ("unplanned", 1.5, "unplanned: 1.5 is not a share; choose a number from 0 to 1"),
     ],

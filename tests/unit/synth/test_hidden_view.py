@@ -83,7 +83,7 @@ def test_all_else_of_the_town_stays_the_same():
 
 
 def test_another_view_is_refused():
-    with pytest.raises(ConfigError, match="view: expected one of open, hidden, found 'foggy'"):
+    with pytest.raises(ConfigError, match="view: expected one of open, hidden, or None, found 'foggy'"):
         SynthConfig(view="foggy")
 
 

@@ -186,7 +186,7 @@ def test_clear_of_a_given_folder_leaves_the_others(root: Path, tmp_path: Path) -
     assert report(root)[0]["state"] == "up to date"
     (root / ".deepaccident" / "v1" / "manifest.json").unlink()
     assert len(clear_index(root)) == 1  # what a stopped process left is an index too
-    with pytest.raises(VersionError, match="unknown version 'v2'"):
+    with pytest.raises(VersionError, match="version: expected one of v1, v1-mini, found 'v2'"):
         clear_index(root, version="v2")
 
 

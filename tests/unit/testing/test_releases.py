@@ -164,12 +164,12 @@ def test_options_choose_what_is_written(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"layout": "C"}, "layout: expected some of A, B, found 'C'"),
-        ({"splits": ("train", "train_mini")}, "splits: expected some of train, val, test, found 'train_mini'"),
+        ({"layout": "C"}, "layout: expected one of A, B, found 'C'"),
+        ({"splits": ("train", "train_mini")}, "splits: expected one of train, val, test, found 'train_mini'"),
         ({"splits": ()}, "splits: expected at least one, found none"),
         ({"agents": ()}, "agents: expected at least one, found none"),
-        ({"agents": ("ego",)}, f"agents: expected some of {AGENTS[0]}.*found 'ego'"),
-        ({"channels": ("Camera_Side",)}, "channels: expected some of .*found 'Camera_Side'"),
+        ({"agents": ("ego",)}, f"agents: expected one of {AGENTS[0]}.*found 'ego'"),
+        ({"channels": ("Camera_Side",)}, "channels: expected one of .*found 'Camera_Side'"),
         ({"frames": 0}, "frames: expected 1 to 100, found 0"),
         ({"seed": -1}, "seed: expected a whole number from 0, found -1"),
         ({"channels": "lidar01"}, "channels: expected a tuple or a list, found 'lidar01'"),

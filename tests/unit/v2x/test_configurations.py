@@ -44,7 +44,7 @@ def test_partners_are_renamed_as_in_the_released_code(ego: str, side: str, expec
 
 
 def test_wrong_roles_agents_and_sides() -> None:
-    with pytest.raises(ChoiceError, match=r"partners: expected roles of behind, .*found \['front'\]"):
+    with pytest.raises(ChoiceError, match=r"partners: expected one of behind, .*found 'front'"):
         AgentConfig("mine", ("front",))  # type: ignore[arg-type]
     with pytest.raises(ChoiceError, match=r"agent: expected one of ego_vehicle, .*found 'bus'"):
         AGENT_CONFIGS["all"].agents_for("bus")

@@ -123,7 +123,7 @@ def test_visible_only(stacked) -> None:
     assert_array_equal(seen["released"].actor_id, [6, 7])
     assert da.visible_instances(sample) == [f"{tiny.TOKEN}/actor/6", f"{tiny.TOKEN}/actor/7"]
     assert da.visible_instances(sample, agents="single") == []
-    with pytest.raises(ChoiceError, match="visible: expected None, 'camera' or 'released', found 'all'"):
+    with pytest.raises(ChoiceError, match="visible: expected one of camera, released, or None, found 'all'"):
         da.cooperative_boxes(sample, visible="all")
 
 
@@ -143,7 +143,7 @@ def test_agents_without_labels_see_nothing(tmp_path: Path) -> None:
 
 
 def test_frames_and_samples_that_do_not_exist(da: DeepAccident) -> None:
-    with pytest.raises(ChoiceError, match="frame: expected world, ego, lidar"):
+    with pytest.raises(ChoiceError, match="frame: expected one of world, ego, lidar"):
         da.cooperative_boxes(da.sample[0], frame="map")
 
 

@@ -49,7 +49,7 @@ def test_settings_that_are_not_possible() -> None:
         PoseNoise(std=-1)
     with pytest.raises(ConfigError, match="pose_noise: expected metres or a PoseNoise, found 'much'"):
         Link(pose_noise="much")  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match="expected a law of paper, zero-mean, found 'cauchy'"):
+    with pytest.raises(ConfigError, match="law: expected one of paper, zero-mean, found 'cauchy'"):
         PoseNoise(law="cauchy")  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match=r"zero-mean takes no mean, found 0\.3"):
         PoseNoise(mean=0.3, law="zero-mean")

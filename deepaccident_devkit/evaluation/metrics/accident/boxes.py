@@ -13,7 +13,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
+from deepaccident_devkit.errors import ConfigError, EvaluationError
 from deepaccident_devkit.evaluation.metrics.accident.scoring import (
     AccidentResult,
     Alarm,
@@ -38,6 +38,7 @@ from deepaccident_devkit.evaluation.metrics.choices import with_others, with_par
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, Prediction, checked_prediction
 from deepaccident_devkit.motion import MotionLabels
+from deepaccident_devkit.text import settle_choices
 
 _LEFT_OUT = ("unjudged", "beyond", "at_impact")
 
@@ -108,8 +109,7 @@ class BoxAccidents:
             raise ConfigError(f"min_score: expected a number, found {self.min_score!r}")
         if not 0 < self.match_distance < math.inf:
             raise ConfigError(f"match_distance: expected metres above 0, found {self.match_distance!r}")
-        if self.naming not in get_args(Naming):
-            raise ChoiceError(f"naming: expected one of {', '.join(get_args(Naming))}, found {self.naming!r}")
+        settle_choices(self, {"naming": get_args(Naming)})
 
     def settings(self) -> dict[str, Any]:
         """All choices, as JSON can hold them."""

@@ -7,7 +7,7 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, Final, Protocol, runtime_checkable
 
-from deepaccident_devkit.errors import ChoiceError, EvaluationError
+from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.accident.boxes import BoxAccidents
 from deepaccident_devkit.evaluation.metrics.accident.paper import PaperAccidents
 from deepaccident_devkit.evaluation.metrics.accident.released import ReleasedAccidents
@@ -16,6 +16,7 @@ from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext,
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.metrics.predictions import Prediction, checked_prediction
 from deepaccident_devkit.motion import MotionLabels
+from deepaccident_devkit.text import choice
 
 Truth = MotionLabels | BoxTruth | AccidentContext
 """What an evaluator takes as label: motion labels, or for a protocol without rasters its own truth."""
@@ -158,6 +159,4 @@ def _known(label: Truth | None, context: AccidentContext | None) -> tuple[Motion
 def _protocol(protocol: object) -> AccidentProtocol:
     if isinstance(protocol, AccidentProtocol):
         return protocol
-    if not isinstance(protocol, str) or protocol not in PROTOCOLS:
-        raise ChoiceError(f"protocol: expected one of {', '.join(PROTOCOLS)}, or your own, found {protocol!r}")
-    return PROTOCOLS[protocol]
+    return PROTOCOLS[choice("protocol", protocol, PROTOCOLS)]

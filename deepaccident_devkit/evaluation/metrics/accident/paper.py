@@ -12,7 +12,7 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray
-from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError
+from deepaccident_devkit.errors import ConfigError, EvaluationError
 from deepaccident_devkit.evaluation.metrics.accident.scoring import (
     AccidentResult,
     Alarm,
@@ -44,6 +44,7 @@ from deepaccident_devkit.evaluation.metrics.frames import (
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, Prediction, checked_prediction
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, LabelProtocol, MotionHeads, MotionLabels
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.text import settle_choices
 
 SampleChoice = Literal["best", "mean_first"]
 PredictedBy = Literal["any", "mean"]
@@ -102,10 +103,7 @@ class PaperAccidents:
 
     def __post_init__(self) -> None:
         """Check the values; raises ChoiceError or ConfigError."""
-        for name, allowed in _CHOICES.items():
-            if getattr(self, name) not in allowed:
-                possible = ", ".join(map(str, allowed))
-                raise ChoiceError(f"{name}: expected one of {possible}, found {getattr(self, name)!r}")
+        settle_choices(self, _CHOICES)
         if not 0 < self.match_distance < np.inf:
             raise ConfigError(f"match_distance: expected metres above 0, found {self.match_distance!r}")
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from deepaccident_devkit.arrays import FloatArray, IntArray
-from deepaccident_devkit.errors import ChoiceError, ConfigError
+from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.metrics.alarms.reading import (
     AccidentReading,
     InstanceTracks,
@@ -21,6 +21,7 @@ from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionO
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionLabelConfig, MotionLabels
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.text import choice
 
 LABEL_STEP: Final = 0.5
 """Seconds from one frame of the released labels to the next."""
@@ -133,8 +134,7 @@ def accidents_of(
         ChoiceError: no such labels.
         ConfigError: the step is not above 0.
     """
-    if labels is not None and labels not in LABEL_PROTOCOLS:
-        raise ChoiceError(f"labels: expected one of {', '.join(LABEL_PROTOCOLS)}, or None, found {labels!r}")
+    labels = choice("labels", labels, (None, *LABEL_PROTOCOLS))
     if not 0 < step < math.inf:
         raise ConfigError(f"step: expected seconds above 0, found {step!r}")
     rules = None if labels is None else LABEL_PROTOCOLS[labels]

@@ -12,7 +12,7 @@ from typing import Final, Literal, get_args
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, FloatArray, FrozenArrays, IntArray
-from deepaccident_devkit.errors import ChoiceError, ConfigError
+from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.metrics.alarms.hulls import convex_hulls, hull_distances
 from deepaccident_devkit.evaluation.metrics.choices import with_others
 from deepaccident_devkit.geometry import BevGrid
@@ -20,6 +20,7 @@ from deepaccident_devkit.geometry.bev_grid import Orientation
 from deepaccident_devkit.motion import LabelProtocol, MotionHeads, PostProcessing, predict_instances
 from deepaccident_devkit.motion.orientations import cells_in
 from deepaccident_devkit.motion.postprocessing.predict import Foreground
+from deepaccident_devkit.text import settle_choices
 
 Outline = Literal["centers", "cells"]
 Moment = Literal["closest", "first", "last"]
@@ -56,9 +57,7 @@ class AccidentReading:
 
     def __post_init__(self) -> None:
         """Check the values; raises ChoiceError or ConfigError."""
-        for name, allowed in _CHOICES.items():
-            if getattr(self, name) not in allowed:
-                raise ChoiceError(f"{name}: expected one of {', '.join(allowed)}, found {getattr(self, name)!r}")
+        settle_choices(self, _CHOICES)
         if not 0 < self.danger_distance < np.inf:
             raise ConfigError(f"danger_distance: expected metres above 0, found {self.danger_distance!r}")
         _ = self.post_processing

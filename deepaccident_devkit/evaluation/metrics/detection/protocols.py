@@ -11,7 +11,7 @@ from typing import Any, Final, Literal, get_args
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.evaluation.metrics.choices import as_tuples, with_others
 from deepaccident_devkit.taxonomy import CATEGORIES, SMALL_CATEGORIES
-from deepaccident_devkit.text import possible_text
+from deepaccident_devkit.text import choice, possible_text, settle_choices
 
 TruthSource = Literal["label", "visible", "cooperative"]
 Measure = Literal["distance_of_bottoms", "distance_bev", "iou_3d", "iou_bev"]
@@ -116,9 +116,7 @@ class DetectionProtocol:
         """Check the choices; raises ChoiceError for an unknown word and ConfigError for impossible values."""
         for name in ("classes", "area", "ranges", "thresholds", "small_thresholds"):
             object.__setattr__(self, name, as_tuples(getattr(self, name)))
-        for name, allowed in _CHOICES.items():
-            if getattr(self, name) not in allowed:
-                raise ChoiceError(f"{name}: expected one of {', '.join(allowed)}, found {getattr(self, name)!r}")
+        settle_choices(self, _CHOICES)
         _check_classes(self.classes)
         if self.frame not in ("lidar", "ego"):
             raise ConfigError(f"frame: expected 'lidar' or 'ego', found {self.frame!r}: ranges are around the agent")
@@ -153,9 +151,9 @@ class DetectionProtocol:
         of one agent in its LiDAR frame.
         """
         made = with_others(self, self._free_choices())
-        for choice, value, more in self._bound_choices():
-            if getattr(self, choice) != value:
-                made[f"{choice}={value}"] = replace(self, **{choice: value, **more})
+        for name, value, more in self._bound_choices():
+            if getattr(self, name) != value:
+                made[f"{name}={value}"] = replace(self, **{name: value, **more})
         return made
 
     def _free_choices(self) -> dict[str, tuple[Any, ...]]:
@@ -286,9 +284,7 @@ def detection_protocol(protocol: str | DetectionProtocol, **switches: Any) -> De
         ConfigError: choices that cannot be.
     """
     if not isinstance(protocol, DetectionProtocol):
-        if protocol not in DETECTION_PROTOCOLS:
-            raise ChoiceError(f"protocol: expected one of {', '.join(DETECTION_PROTOCOLS)}, found {protocol!r}")
-        protocol = DETECTION_PROTOCOLS[protocol]
+        protocol = DETECTION_PROTOCOLS[choice("protocol", protocol, DETECTION_PROTOCOLS)]
     names = [field.name for field in fields(DetectionProtocol)]
     for name in switches:
         if name not in names:

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, Final
 
-from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.metrics.choices import with_others, with_parts
 from deepaccident_devkit.evaluation.metrics.motion.overlaps import VpqRules
 from deepaccident_devkit.evaluation.metrics.trajectories import GATE, TrajectoryRules
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, POST_PROCESSING, PostProcessing
+from deepaccident_devkit.text import choice, settle_choices
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,10 +46,7 @@ class MotionProtocol:
 
     def __post_init__(self) -> None:
         """Check the values; raises ChoiceError."""
-        if self.labels is not None and self.labels not in LABEL_PROTOCOLS:
-            raise ChoiceError(
-                f"labels: expected one of {', '.join(LABEL_PROTOCOLS)}, or None for any, found {self.labels!r}"
-            )
+        settle_choices(self, {"labels": (None, *LABEL_PROTOCOLS)})
 
     @property
     def range_names(self) -> tuple[str, ...]:
@@ -103,6 +100,4 @@ def motion_protocol(protocol: str | MotionProtocol) -> MotionProtocol:
     """A protocol by its name, or as it is given; raises ChoiceError."""
     if isinstance(protocol, MotionProtocol):
         return protocol
-    if protocol not in MOTION_PROTOCOLS:
-        raise ChoiceError(f"protocol: expected one of {', '.join(MOTION_PROTOCOLS)}, found {protocol!r}")
-    return MOTION_PROTOCOLS[protocol]
+    return MOTION_PROTOCOLS[choice("protocol", protocol, MOTION_PROTOCOLS)]

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Final, get_args
 import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray, IntArray
-from deepaccident_devkit.errors import ChoiceError, ConfigError
+from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, ratio
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
 from deepaccident_devkit.evaluation.metrics.headlines import TaskResult
@@ -30,6 +30,7 @@ from deepaccident_devkit.evaluation.metrics.warning.drives import (
 )
 from deepaccident_devkit.evaluation.metrics.warning.protocol import WarningRules
 from deepaccident_devkit.evaluation.metrics.warning.recordings import KINDS
+from deepaccident_devkit.text import settle_choices
 
 RANDOM_DRAWS: Final = 20
 LATENCIES: Final = (0.0, 0.1, 0.3)
@@ -123,8 +124,7 @@ class CleanWarnings(WarningRules):
     def __post_init__(self) -> None:
         """Check the values; raises ChoiceError or ConfigError."""
         WarningRules.__post_init__(self)
-        if self.scores_of not in get_args(ScoresOf):
-            raise ChoiceError(f"scores_of: expected one of {', '.join(get_args(ScoresOf))}, found {self.scores_of!r}")
+        settle_choices(self, {"scores_of": get_args(ScoresOf)})
         if not 0 < self.window < math.inf:
             raise ConfigError(f"window: expected seconds above 0, found {self.window!r}")
         if self.threshold is not None and not math.isfinite(self.threshold):

@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from deepaccident_devkit.arrays import IntArray
-from deepaccident_devkit.errors import ChoiceError, EvaluationError
+from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.metrics.predictions import Prediction
@@ -18,6 +18,7 @@ from deepaccident_devkit.evaluation.metrics.warning.published import FieldResult
 from deepaccident_devkit.evaluation.metrics.warning.recordings import sample_counts, tally_of
 from deepaccident_devkit.evaluation.metrics.warning.result import WarningResult, warning_result
 from deepaccident_devkit.motion import MotionLabels
+from deepaccident_devkit.text import choice
 
 Protocol = CleanWarnings | WarningProtocol | FieldWarnings
 Result = AnticipationResult | WarningResult | FieldResult
@@ -126,6 +127,4 @@ class WarningEvaluator(Evaluator[Any]):
 def _protocol(protocol: object) -> Protocol:
     if isinstance(protocol, CleanWarnings | WarningProtocol | FieldWarnings):
         return protocol
-    if not isinstance(protocol, str) or protocol not in WARNING_PROTOCOLS:
-        raise ChoiceError(f"protocol: expected one of {', '.join(WARNING_PROTOCOLS)}, or your own, found {protocol!r}")
-    return WARNING_PROTOCOLS[protocol]
+    return WARNING_PROTOCOLS[choice("protocol", protocol, WARNING_PROTOCOLS)]

@@ -15,8 +15,8 @@ from typing import Final, Literal, get_args
 import numpy as np
 
 from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray, ShortRepr
-from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.metrics.warning.series import ScoreSeries
+from deepaccident_devkit.text import choice
 
 FieldCode = Literal["ustring", "dsta", "drive", "dad"]
 FIELD_CODES: Final[tuple[FieldCode, ...]] = get_args(FieldCode)
@@ -91,8 +91,7 @@ def field_figures(series: ScoreSeries, code: FieldCode, quirks: FieldQuirks | No
     Raises:
         ChoiceError: no such code.
     """
-    if code not in FIELD_CODES:
-        raise ChoiceError(f"code: expected one of {', '.join(FIELD_CODES)}, found {code!r}")
+    code = choice("code", code, FIELD_CODES)
     chosen = quirks or FieldQuirks()
     if not series.valid.any():
         return _nothing(code, "there is no score")

@@ -7,10 +7,11 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Final, Literal, get_args
 
-from deepaccident_devkit.errors import ChoiceError, ConfigError
+from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.metrics.alarms.raised import Naming
 from deepaccident_devkit.evaluation.metrics.alarms.reading import AccidentReading
 from deepaccident_devkit.evaluation.metrics.choices import with_others, with_parts
+from deepaccident_devkit.text import settle_choices
 
 CorrectBy = Literal["either", "pair", "place"]
 _CHOICES: Final[Mapping[str, tuple[str, ...]]] = {"naming": get_args(Naming), "correct_by": get_args(CorrectBy)}
@@ -46,9 +47,7 @@ class WarningRules:
 
     def __post_init__(self) -> None:
         """Check the values; raises ChoiceError or ConfigError."""
-        for name, allowed in _CHOICES.items():
-            if getattr(self, name) not in allowed:
-                raise ChoiceError(f"{name}: expected one of {', '.join(allowed)}, found {getattr(self, name)!r}")
+        settle_choices(self, _CHOICES)
         if not math.isfinite(self.min_score):
             raise ConfigError(f"min_score: expected a number, found {self.min_score!r}")
         for name in ("match_distance", "distance"):

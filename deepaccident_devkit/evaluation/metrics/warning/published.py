@@ -6,7 +6,6 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar, get_args
 
-from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.metrics.choices import with_others, with_parts
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
 from deepaccident_devkit.evaluation.metrics.headlines import TaskResult
@@ -21,6 +20,7 @@ from deepaccident_devkit.evaluation.metrics.warning.drives import (
 )
 from deepaccident_devkit.evaluation.metrics.warning.field import FIELD_CODES, FieldFigures, FieldQuirks, field_figures
 from deepaccident_devkit.evaluation.metrics.warning.protocol import WarningRules
+from deepaccident_devkit.text import settle_choices
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,8 +58,7 @@ class FieldWarnings(WarningRules):
     def __post_init__(self) -> None:
         """Check the values; raises ChoiceError or ConfigError."""
         WarningRules.__post_init__(self)
-        if self.scores_of not in get_args(ScoresOf):
-            raise ChoiceError(f"scores_of: expected one of {', '.join(get_args(ScoresOf))}, found {self.scores_of!r}")
+        settle_choices(self, {"scores_of": get_args(ScoresOf)})
 
     def _own_others(self) -> Mapping[str, tuple[Any, ...]]:
         return {"scores_of": get_args(ScoresOf)}

@@ -54,8 +54,12 @@ class SanityReport(FrozenMappings):
         count = f"{suspected} suspected" if suspected else "none found"
         looked = f"{len(self.candidates)} mistakes looked for (mirrored, turned, shifted, scaled and others): {count}."
         unchecked = [f"Not looked at: {each}" for each in self.unchecked]
-        found = [f"WARNING: {each}" for each in self.warnings]
-        return "\n".join([head, columns_text(rows), looked, *unchecked, *found, *([self.verdict] * bool(self.verdict))])
+        lines = [head, columns_text(rows), looked, *unchecked, self.warnings_text(), self.verdict]
+        return "\n".join(line for line in lines if line)
+
+    def warnings_text(self) -> str:
+        """The warnings alone, a line each; empty if there is none."""
+        return "\n".join(f"WARNING: {each}" for each in self.warnings)
 
 
 def verdict_of(

@@ -62,8 +62,8 @@ def test_parts_of_tokens() -> None:
     [
         ({"samples": "some"}, r"samples: expected one of evaluate, all, found 'some'"),
         ({"scope": "normal"}, r"scope: expected one of accident, all, found 'normal'"),
-        ({"agents": ("ego",)}, r"agents: expected some of ego_vehicle, .*, or None for all, found 'ego'"),
-        ({"agents": ()}, r"agents: expected some of .* found \[\]"),
+        ({"agents": ("ego",)}, r"agents: expected one of ego_vehicle, .*found 'ego'; did you mean 'ego_vehicle'"),
+        ({"agents": ()}, r"agents: expected at least one agent, or None for all, found none"),
     ],
 )
 def test_wrong_choices(changes: dict[str, object], sentence: str) -> None:

@@ -65,7 +65,7 @@ class TestSetup:
             (
                 {"task": "motion", "protocol": "boxes"},
                 ChoiceError,
-                r"protocol: expected one of released, paper for motion, found 'boxes'",
+                r"protocol of motion: expected one of released, paper, found 'boxes'",
             ),
             ({"task": "motion", "horizon": 0.0}, ConfigError, r"horizon: expected seconds above 0, found 0.0"),
             ({"task": "motion", "horizon": float("nan")}, ConfigError, r"horizon: expected seconds above 0, found nan"),

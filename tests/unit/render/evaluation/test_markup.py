@@ -2,15 +2,14 @@
 
 from typing import Any
 
-import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from report_page import Page
 
 from deepaccident_devkit.render.evaluation.markup import Markup, tag, tree
 
 
-@pytest.mark.slow
+@settings(max_examples=25)
 @given(
     st.recursive(
         st.text() | st.floats() | st.none() | st.booleans(),

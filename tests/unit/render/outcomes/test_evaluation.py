@@ -60,9 +60,9 @@ def test_motion_is_seen_as_accidents_by_every_protocol(
 
 
 def test_what_cannot_be_evaluated_is_named(da_motion: DeepAccident, sample: str) -> None:
-    with pytest.raises(ChoiceError, match="task: expected accident of this prediction, found 'motion'"):
+    with pytest.raises(ChoiceError, match="task of this prediction: expected one of accident, found 'motion'"):
         render_evaluation(da_motion, sample, [], task="motion")
     with pytest.raises(EvaluationError, match="the released protocol compares motion"):
         render_evaluation(da_motion, sample, [], protocol="released")
-    with pytest.raises(ChoiceError, match=r"layers: expected any of .*, found 'labels'"):
+    with pytest.raises(ChoiceError, match=r"layers: expected one of .*, found 'labels'"):
         render_evaluation(da_motion, sample, [], layers=["labels"])

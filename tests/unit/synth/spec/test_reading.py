@@ -11,12 +11,12 @@ FIELDS = "name, design, road, view, exchange, actors, meet, background, weather,
     [
         (
             "turn: lef",
-            r"f.yaml:4: actors\[1\].turn: did you mean left\? Expected one of straight, left, right, found 'lef'$",
+            r"f.yaml:4: actors\[1\].turn: expected one of straight, left, right, found 'lef'; did you mean 'left'\?$",
         ),
         ("turn: back", r"actors\[1\].turn: expected one of straight, left, right, found 'back'$"),
         (
             "trun: left",
-            r"f.yaml:4: actors\[1\].trun: no such field; did you mean turn\? Possible: role, category, from, turn, ",
+            r"f.yaml:4: actors\[1\].trun: no such field; possible: role, .*; did you mean 'turn'\?$",
         ),
         ("colour: red", r"f.yaml:4: actors\[1\].colour: no such field; possible: role, category, from, "),
         ("max_speed: fast", r"actors\[1\].max_speed: expected a number, 0.5 to 20 m/s, found 'fast'"),
@@ -41,7 +41,7 @@ FIELDS = "name, design, road, view, exchange, actors, meet, background, weather,
         ("ignores: signal", r"ignores: expected a list, as \[signal, priority\], found 'signal'"),
         (
             "ignores: [signals]",
-            r"ignores\[0\]: did you mean signal\? Expected one of signal, priority, crosswalk, found",
+            r"ignores\[0\]: expected one of signal, priority, crosswalk, found 'signals'; did you mean 'signal'\?$",
         ),
         ("turn: []", r"turn: expected one of straight, left, right, found \[\]"),
         ("turn: [left, [right]]", r"turn\[1\]: expected one of .*, found \['right'\]"),
@@ -56,7 +56,7 @@ def test_a_wrong_value_is_refused_with_line_and_field(with_other, entries, sente
 @pytest.mark.parametrize(
     ("line", "sentence"),
     [
-        ("actor: []", rf"f.yaml:7: actor: no such field; did you mean actors\? Possible: {FIELDS}"),
+        ("actor: []", rf"f.yaml:7: actor: no such field; possible: {FIELDS}.*; did you mean 'actors'\?$"),
         ("design: 13", "design: expected a whole number, 1 to 12, found 13"),
         ("exchange: [true, false]", "exchange: expected true or false, one value and not several"),
         ("background: none", "f.yaml:7: background: expected keys and values, found 'none'"),

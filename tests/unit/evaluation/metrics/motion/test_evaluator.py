@@ -363,7 +363,7 @@ def test_labels_of_another_protocol_are_refused() -> None:
             evaluated(still(boxes(_1=100)), label, protocol)
     for labels in ("clean", None):
         assert evaluated(still(boxes(_1=100)), label, MotionProtocol(labels=labels)).ranges["30x30"].pq == 100.0
-    with pytest.raises(ChoiceError, match=r"labels: expected one of released, clean, .*or None for any, found 'dirty'"):
+    with pytest.raises(ChoiceError, match=r"labels: expected one of released, clean, .*or None, found 'dirty'"):
         MotionProtocol(labels="dirty")
 
 

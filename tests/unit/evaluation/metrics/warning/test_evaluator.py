@@ -375,7 +375,7 @@ def test_choices_are_checked_and_each_has_a_variant() -> None:
     ):
         with pytest.raises(ConfigError, match=message):
             WarningProtocol(**choices)
-    with pytest.raises(ChoiceError, match="protocol: expected one of clean, boxes, field, or your own"):
+    with pytest.raises(ChoiceError, match="protocol: expected one of clean, boxes, field, found"):
         WarningEvaluator("released")
 
 

@@ -1,0 +1,126 @@
+"""Words that the devkit knows are taken in any case of letters; of another word, the error says which was meant."""
+
+import re
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import click
+import pytest
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.baselines import StudyConfig
+from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.cli.options import WordChoice, agent_names, names_or_configuration
+from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError, TableError, TokenError, VersionError
+from deepaccident_devkit.evaluation import AccidentEvaluator, DetectionEvaluator, MotionEvaluator, WarningEvaluator
+from deepaccident_devkit.evaluation.runs import SampleSelection
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.export.mcap import McapConfig
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.motion import MotionLabelConfig
+from deepaccident_devkit.release import find_release
+from deepaccident_devkit.render.layers import layers_of
+from deepaccident_devkit.synth import SynthConfig
+from deepaccident_devkit.testing import SmallRelease
+from deepaccident_devkit.text import choice, meant_text
+from deepaccident_devkit.v2x import AgentConfig, PoseNoise, cooperating_agents
+
+CALLS: list[tuple[str, str, str, type[DeepAccidentError], Callable[[DeepAccident, str], Any]]] = [
+    ("LIDAR", "lidar", "lidarr", ChoiceError, lambda da, word: da.boxes(da.sample[0], word).frame),
+    ("camera_back", "Camera_Back", "Camera_Bck", ChoiceError, lambda da, word: da.boxes(da.sample[0], word).frame),
+    ("Camera", "camera", "camra", ChoiceError, lambda da, word: repr(da.boxes(da.sample[0], visible=word))),
+    ("DERIVED", "derived", "derive", ChoiceError, lambda da, word: repr(da.boxes(da.sample[0], velocity=word))),
+    ("RELEASED", "released", "relased", ChoiceError, lambda da, w: repr(da.cooperative_boxes(da.sample[0], visible=w))),
+    ("LIDAR01", "lidar01", "lidar1", TokenError, lambda da, word: da.get_sample_data_path(da.sample[0], word)),
+    ("Ego_Vehicle", "ego_vehicle", "ego", TokenError, lambda da, word: da.get_sample(da.scenario[0], word, 1)),
+    ("Val", "val", "vall", ChoiceError, lambda da, word: da.split_scenarios(word)),
+    ("Train", "train", "trian", ChoiceError, lambda da, word: da.samples("train", word)),
+    ("+Behind", "+behind", "+behnd", ChoiceError, lambda da, word: cooperating_agents(da, da.sample[0], word)),
+    ("Available", "available", "availible", ChoiceError, lambda da, word: cooperating_agents(da, da.sample[0], word)),
+    ("EGO_VEHICLE", "ego_vehicle", "ego", ChoiceError, lambda da, word: cooperating_agents(da, da.sample[0], [word])),
+    ("Sample_Data", "sample_data", "sampledata", TableError, lambda da, word: len(da.arrow(word))),
+    ("V1", "v1", "v1.0-trainval", VersionError, lambda da, word: find_release(da.dataroot, word).version),
+]
+"""A word in another case, as it is known, a wrong one, its error, and a call."""
+MAKERS: list[tuple[str, str, str, type[DeepAccidentError], Callable[[str], Any]]] = [
+    ("FIERY", "fiery", "firy", ChoiceError, lambda word: BevGrid(orientation=word)),
+    ("Fiery", "fiery", "fire", ChoiceError, MotionLabelConfig.preset),
+    ("ALL", "all", "al", ChoiceError, lambda word: MotionLabelConfig(agents=word)),
+    ("Clean", "clean", "cleen", ChoiceError, lambda word: MotionLabelConfig(protocol=word)),
+    ("Paper", "paper", "papers", ChoiceError, lambda word: MotionEvaluator(protocol=word).protocol),
+    ("Boxes", "boxes", "box", ChoiceError, lambda word: AccidentEvaluator(protocol=word).protocol),
+    ("OpenCOOD", "opencood", "open", ChoiceError, lambda word: DetectionEvaluator(protocol=word).protocol),
+    ("Field", "field", "fields", ChoiceError, lambda word: WarningEvaluator(protocol=word).protocol),
+    ("Motion", "motion", "motoin", ChoiceError, lambda word: EvaluationSetup(task=word)),
+    ("Accident", "accident", "acident", ChoiceError, lambda word: SampleSelection(split="val", scope=word)),
+    ("Lidar01", "lidar01", "lidar", ChoiceError, lambda word: McapConfig(channels=[word])),
+    ("Skip", "skip", "skipp", ChoiceError, lambda word: McapConfig(on_missing=word)),
+    ("Boxes", "boxes", "box", ChoiceError, lambda word: layers_of([word], ())),
+    ("Zero-Mean", "zero-mean", "zero", ConfigError, lambda word: PoseNoise(law=word)),
+    ("Other", "other", "othr", ChoiceError, lambda word: AgentConfig("mine", (word,))),
+    ("Hidden", "hidden", "hiden", ConfigError, lambda word: SynthConfig(view=word)),
+    ("INFRASTRUCTURE", "infrastructure", "infra", ConfigError, lambda w: SmallRelease(agents=(w,))),
+    ("Constant_Velocity", "constant_velocity", "constant", ChoiceError, lambda word: StudyConfig(model=word)),
+    ("Infrastructure", "infrastructure", "infra", ChoiceError, lambda word: agent_names((word,))),
+    ("VEHICLES", "vehicles", "vehicle", ChoiceError, lambda word: names_or_configuration((word,))),
+]
+
+
+@pytest.mark.parametrize(("given", "known", "wrong", "error", "call"), CALLS)
+def test_a_call_takes_a_word_in_any_case(
+    da: DeepAccident, given: str, known: str, wrong: str, error: type[DeepAccidentError], call: Callable[..., Any]
+) -> None:
+    assert call(da, given) == call(da, known)
+    with pytest.raises(error, match=r"; did you mean '[\w+-]+'\?$"):
+        call(da, wrong)
+
+
+@pytest.mark.parametrize(("given", "known", "wrong", "error", "make"), MAKERS)
+def test_a_configuration_takes_a_word_in_any_case(
+    given: str, known: str, wrong: str, error: type[DeepAccidentError], make: Callable[[str], Any]
+) -> None:
+    assert make(given) == make(known)
+    with pytest.raises(error, match=r"; did you mean '[\w+-]+'\?$"):
+        make(wrong)
+
+
+def verbs(group: click.Group, context: click.Context) -> Iterator[click.Command]:
+    for name in group.list_commands(context):
+        verb = group.get_command(context, name)
+        assert verb is not None
+        yield verb
+        if isinstance(verb, click.Group):
+            yield from verbs(verb, context)
+
+
+def test_every_option_with_words_takes_them_in_any_case() -> None:
+    context, found = click.Context(deepaccident), 0
+    for verb in verbs(deepaccident, context):
+        for option in verb.params:
+            if not isinstance(option.type, click.Choice):
+                continue
+            assert isinstance(option.type, WordChoice), f"{verb.name} {option.opts[0]}"
+            for word in option.type.choices:
+                assert option.type.convert(word.upper(), option, context) == word
+            long = max(option.type.choices, key=len)
+            with pytest.raises(click.BadParameter, match=rf" is not one of .*; did you mean '{re.escape(long)}'\?$"):
+                option.type.convert(f"{long}s", option, context)
+            found += 1
+    assert found > 40
+
+
+def test_a_word_that_is_like_none_has_no_suggestion() -> None:
+    assert meant_text("qqq", ["left", "right"]) == meant_text("", ["left"]) == meant_text(None, ["left"]) == ""
+    for wrong in ("qqq", None, 3, ["left"]):
+        with pytest.raises(ChoiceError, match=r"^turn: expected one of left, right, found .*[^?]$"):
+            choice("turn", wrong, ("left", "right"))
+    with pytest.raises(ChoiceError, match=r"expected one of left, or None, found 3$"):
+        choice("turn", 3, (None, "left"))
+    assert choice("turn", None, (None, "left")) is None
+
+
+def test_files_of_a_release_are_read_exactly(da: DeepAccident) -> None:
+    """What stands in a file, or names one, has one spelling."""
+    assert da.get("sample", da.sample[0]["token"]) == da.sample[0]
+    with pytest.raises(TokenError, match=r"the scenario's agents are .*; did you mean 'ego_vehicle'\?$"):
+        da.get("sample", f"{da.scenario[0]['token']}/Ego_Vehicle/001")

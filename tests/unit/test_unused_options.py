@@ -1,0 +1,64 @@
+"""An option that changes nothing in a call is refused, and the message says why; or it is not offered."""
+
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.cli import deepaccident
+
+EVALUATE = "evaluate {} release --results results"
+CASES = [
+    (EVALUATE.format("motion") + " --overwrite", "--overwrite changes nothing without --out"),
+    (EVALUATE.format("motion") + " --include-results", "--include-results changes nothing without --out"),
+    (EVALUATE.format("warning") + " --threshold-by quiet", "--threshold-by changes nothing without --threshold-from"),
+    (
+        EVALUATE.format("warning") + " --threshold-from runs/train --switch threshold=0.5",
+        "--threshold-from sets the threshold that --switch threshold=… sets; give one of them",
+    ),
+    (
+        EVALUATE.format("warning") + " --protocol field --resamples 100",
+        "--resamples changes nothing with --protocol field, which has no intervals",
+    ),
+    (EVALUATE.format("detection") + " --samples all --horizon 3", "--horizon changes nothing with --samples all"),
+    ("evaluate validate results --split val", "--split changes nothing without --dataroot"),
+    ("evaluate validate results --on-error raise", "--on-error changes nothing without --dataroot"),
+    ("baseline predict release --out out --latency 0.2", "--latency changes nothing with --agents single"),
+    ("baseline predict release --out out --agents all --seed 3", "--seed changes nothing without --pose-noise"),
+    ("baseline predict release --out out --samples all --scope all", "--scope changes nothing with --samples all"),
+    ("render bev release --out a.png --pose-noise 0.3", "--pose-noise changes nothing without --agents"),
+    ("render bev release --out a.png --agents all --seed 3", "--seed changes nothing without --pose-noise"),
+    ("export mcap release --out a.mcap --channels Camera_Front --points 3", "--points changes nothing without the cha"),
+    ("validate release --json --notes", "--notes changes nothing with --json"),
+    ("split release --seed 3 --save mine.txt", "--seed changes nothing with --where or --save"),
+    ("split release --overwrite", "--overwrite changes nothing without --out or --save"),
+    ("synth out --spec mine.yaml --unplanned 0.5", "--unplanned changes nothing with --spec or --view hidden"),
+    ("synth --spec mine.yaml --check --layout B", "--layout changes nothing with --check"),
+    ("stats release --format png", "--format is for figures; give --out FOLDER too"),
+]
+
+
+def run(*words: str) -> Result:
+    return CliRunner().invoke(deepaccident, words)
+
+
+@pytest.mark.parametrize(("words", "sentence"), CASES)
+def test_an_option_that_changes_nothing_is_refused(words: str, sentence: str) -> None:
+    result = run(*words.split())
+    assert (result.exit_code, sentence in result.stderr) == (2, True), result.output
+
+
+def test_rows_are_of_labels(da: DeepAccident) -> None:
+    meta = next(da.dataroot.rglob("meta/*.txt"))
+    assert run("explain", str(meta)).exit_code == 0
+    result = run("explain", str(meta), "--rows", "3")
+    assert (result.exit_code, "--rows changes nothing for a file of the kind meta" in result.stderr) == (2, True)
+
+
+def test_validate_offers_no_option_of_the_index(da: DeepAccident, tmp_path: Path) -> None:
+    assert "--index-dir" not in run("validate", "--help").output
+    words = ("validate", str(da.dataroot), "--scenario", da.scenario[0]["token"])
+    plain, given = run(*words), run(*words, "--index-dir", str(tmp_path))
+    assert given.stdout == plain.stdout
+    assert given.stderr == "--index-dir changes nothing here: the command reads the files, not the index\n"
