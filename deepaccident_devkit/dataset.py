@@ -166,6 +166,7 @@ class Dataset(OpenTables):
         """The path of a sensor file, which need not exist; arguments as of `get_sample_data`. Raises TokenError."""
         return self._path(self._sensor(sample_data, channel)[0])
 
+    @nuscenes_names.with_keywords_named
     def get_sample_data(
         self, sample_data: RowArgument, channel: str | None = None
     ) -> tuple[Path, list[Box], FloatArray | None]:

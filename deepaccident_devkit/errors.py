@@ -82,6 +82,10 @@ class MissingNameError(DeepAccidentError, AttributeError):
     """An object has no attribute of this name; the nuScenes devkit's has."""
 
 
+class KeywordError(DeepAccidentError, TypeError):
+    """A function has no argument of this name; the nuScenes devkit's has."""
+
+
 class ChoiceError(DeepAccidentError, ValueError):
     """An argument is not one of the values it can take (a frame, a channel, a layout, …)."""
 

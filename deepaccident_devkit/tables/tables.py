@@ -2,11 +2,12 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Generic, TypeVar, cast, overload
+from typing import Any, Generic, NoReturn, TypeVar, cast, overload
 
 import numpy as np
 
 from deepaccident_devkit.errors import FieldError, TableError, TokenError
+from deepaccident_devkit.nuscenes_names import field_remedy
 from deepaccident_devkit.tables.columns import NULL_INTEGER, Choice, Column, Key, Number, Subset, Vector
 from deepaccident_devkit.tables.resolve import Resolver
 from deepaccident_devkit.tables.specs import table_spec, table_specs
@@ -40,6 +41,19 @@ class Tables:
             if known not in self._tables:
                 self._tables[known] = Table(self._stored[known], self.resolver)
             return self._tables[known]
+
+
+class RecordDict(dict[str, Any]):
+    """A record: a dict that names what was probably meant by a field that it does not have. Its copies are plain."""
+
+    __slots__ = ()
+
+    def __missing__(self, field: object) -> NoReturn:
+        remedy = field_remedy(field) or f"; it has {', '.join(self)}{meant_text(field, self)}"
+        raise FieldError(f"the record has no field {field!r}{remedy}")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return dict, (dict(self),)
 
 
 class Table(Sequence[Record], Generic[Record]):
@@ -99,7 +113,7 @@ class Table(Sequence[Record], Generic[Record]):
         return [self._resolver.token(self.name, int(row)) for row in self._rows_where(field, value)]
 
     def _record(self, row: int) -> Record:
-        return cast(Record, {field: getter(row) for field, getter in self._getters})
+        return cast(Record, RecordDict({field: getter(row) for field, getter in self._getters}))
 
     def _rows_where(self, field: str, value: Any) -> Sequence[int]:
         column = self._stored.spec.column(field)

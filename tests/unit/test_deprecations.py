@@ -1,14 +1,24 @@
 """Deprecated calls name both versions and the caller's line, and are removed in time."""
 
 import ast
+import re
+from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 import deepaccident_devkit
+from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.deprecations import warn_deprecated
+from deepaccident_devkit.evaluation.results import FORMAT_VERSION
+from deepaccident_devkit.evaluation.runs.bundles import SUMMARY_VERSION
+from deepaccident_devkit.motion import label_folder
+from deepaccident_devkit.tables.manifest import SCHEMA_VERSION
 
 PACKAGE = Path(deepaccident_devkit.__file__).parent
+TOP = Path(__file__).parents[2]
+PAGE = (TOP / "docs" / "stability.md").read_text(encoding="utf-8")
 
 
 def old() -> None:
@@ -22,16 +32,56 @@ def test_the_warning_names_both_versions_and_the_callers_line() -> None:
     assert told[0].filename == __file__
 
 
-def test_nothing_is_deprecated_for_longer_than_it_says() -> None:
-    here = version(deepaccident_devkit.__version__)
-    found = 0
+def calls() -> Iterator[tuple[Path, ast.Call]]:
+    """The calls of `warn_deprecated` in the package, and their files."""
     for path in PACKAGE.rglob("*.py"):
         for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(call, ast.Call) and getattr(call.func, "id", None) == "warn_deprecated":
-                named = {one.arg: ast.literal_eval(one.value) for one in call.keywords}
-                assert version(named["since"]) <= here < version(named["gone_in"]), f"{path}: remove what is deprecated"
-                found += 1
+                yield path, call
+
+
+def named(call: ast.Call) -> dict[str, str]:
+    return {one.arg: ast.literal_eval(one.value) for one in call.keywords if one.arg}
+
+
+def test_nothing_is_deprecated_for_longer_than_it_says() -> None:
+    here = version(deepaccident_devkit.__version__)
+    found = list(calls())
     assert found
+    for path, call in found:
+        since, gone_in = named(call)["since"], named(call)["gone_in"]
+        assert version(since) <= here < version(gone_in), f"{path}: remove what is deprecated"
+
+
+def test_the_page_has_every_deprecation() -> None:
+    rows = re.findall(r"^\| `(.*)` \| `(.*)` \| ([\d.]+) \| ([\d.]+) \|$", PAGE, re.MULTILINE)
+    assert sorted((instead, since, gone_in) for _, instead, since, gone_in in rows) == sorted(
+        (ast.literal_eval(call.args[1]), *named(call).values()) for _, call in calls()
+    )
+
+
+def test_what_the_page_lists_warns_and_works(da: DeepAccident) -> None:
+    """One call a row of the page."""
+    assert re.findall(r"^\| `(\w+\(.*?\))` \| ", PAGE, re.MULTILINE) == ["samples(split)"]
+    with pytest.warns(DeprecationWarning, match="use training_samples"):
+        assert da.samples("train") == da.training_samples("train")
+
+
+def test_the_page_has_the_versions_of_files_and_pythons() -> None:
+    versions = re.findall(r"^\| [^|]+ \| (\d) \| ", PAGE, re.MULTILINE)
+    assert versions == [
+        str(each) for each in (SCHEMA_VERSION, label_folder.FORMAT_VERSION, FORMAT_VERSION, SUMMARY_VERSION)
+    ]
+    pythons = re.findall(r"Python :: (3\.\d+)", (TOP / "pyproject.toml").read_text(encoding="utf-8"))
+    assert f"Python {', '.join(pythons[:-1])} and {pythons[-1]}" in PAGE
+
+
+def test_every_package_of_the_reference_says_what_is_public() -> None:
+    pages = "\n".join(path.read_text(encoding="utf-8") for path in (TOP / "docs" / "api").glob("*.md"))
+    names = set(re.findall(r"^\.\. automodule:: (\S+)", pages, re.MULTILINE)) - {"deepaccident_devkit.export.torch"}
+    packages = [import_module(name) for name in ("deepaccident_devkit", *sorted(names))]
+    silent = [each.__name__ for each in packages if hasattr(each, "__path__") and not hasattr(each, "__all__")]
+    assert (len(packages) > 20, silent) == (True, [])
 
 
 def version(text: str) -> tuple[int, ...]:

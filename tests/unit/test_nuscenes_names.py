@@ -2,6 +2,7 @@
 
 import copy
 import inspect
+import json
 import pickle
 import re
 from collections.abc import Mapping
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit import DeepAccident, DeepAccidentError, nuscenes_names, render
-from deepaccident_devkit.errors import MissingNameError, TableError
+from deepaccident_devkit.errors import FieldError, KeywordError, MissingNameError, TableError
 from deepaccident_devkit.geometry import Box, Boxes, LidarPointCloud
 from deepaccident_devkit.tables.specs import table_specs
 
@@ -43,7 +44,11 @@ def test_none_of_the_tables_is_here() -> None:
     assert nuscenes_names.TABLES.keys() & table_specs().keys() == set()
 
 
-@pytest.mark.parametrize("names", [names for _, names in CLASSES], ids=["dataset", "box", "cloud"])
+@pytest.mark.parametrize(
+    "names",
+    [*(names for _, names in CLASSES), nuscenes_names.KEYWORDS, nuscenes_names.FIELDS],
+    ids=["dataset", "box", "cloud", "keywords", "fields"],
+)
 def test_each_counterpart_is_here(names: Mapping[str, str]) -> None:
     for text in names.values():
         for owner, name in re.findall(r"\b(da|box|cloud|render)\.(\w+)", text):
@@ -84,6 +89,43 @@ def test_an_unknown_table_of_nuscenes_names_the_counterpart(da: DeepAccident, na
         da.get("sampel", "x")
 
 
+@pytest.mark.parametrize("name", ["get_sample_data", *(each for each in render.__all__ if each.startswith("render_"))])
+def test_an_argument_of_nuscenes_names_the_counterpart(da: DeepAccident, name: str) -> None:
+    method = getattr(da, name)
+    for argument, counterpart in nuscenes_names.KEYWORDS.items():
+        assert argument not in inspect.signature(method).parameters
+        sentence = f"^{name} has no argument '{argument}': {re.escape(counterpart)} "
+        with pytest.raises(KeywordError, match=sentence) as raised:
+            method("x", **{argument: None})
+        assert isinstance(raised.value, TypeError)
+    with pytest.raises(TypeError, match=r"unexpected keyword argument 'colour'"):
+        method("x", colour=1)
+    assert pickle.loads(pickle.dumps(method.__func__)) is method.__func__
+
+
+@pytest.mark.parametrize("table", table_specs())
+def test_a_field_of_nuscenes_names_the_counterpart(da: DeepAccident, table: str) -> None:
+    record = getattr(da, table)[0]
+    for field, counterpart in nuscenes_names.FIELDS.items():
+        if field in record:  # of this table it is ours too
+            assert (table, field) in {("agent", "first_sample_token"), ("agent", "last_sample_token")}
+            continue
+        with pytest.raises(FieldError, match=rf"^the record has no field '{field}': {re.escape(counterpart)} "):
+            record[field]
+    with pytest.raises(KeyError, match=r"^the record has no field 'tokn'; it has token, .*; did you mean 'token'\?$"):
+        record["tokn"]
+    assert record.get("data") is None
+
+
+def test_records_are_dicts_and_their_copies_plain(da: DeepAccident) -> None:
+    record = da.sample[0]
+    assert isinstance(record, dict)
+    assert json.loads(json.dumps(record)) == record
+    assert repr(record) == repr(dict(record))
+    for copied in (copy.copy(record), copy.deepcopy(record), pickle.loads(pickle.dumps(record)), record.copy()):
+        assert (type(copied), copied) == (dict, record)
+
+
 @pytest.mark.parametrize("name", nuscenes_names.BOX)
 def test_a_box_names_the_counterpart(box: Box, name: str) -> None:
     with pytest.raises(MissingNameError, match=f"^Box has no '{name}': use "):
@@ -111,4 +153,5 @@ def test_the_page_has_every_name() -> None:
     page = (Path(__file__).parents[2] / "docs" / "from_nuscenes.md").read_text(encoding="utf-8")
     left = " ".join(re.findall(r"^\| (.*) \| .* \|$", page, re.MULTILINE))
     every = {name for _, names in CLASSES for name in names} | set(nuscenes_names.TABLES)
+    every |= nuscenes_names.KEYWORDS.keys() | nuscenes_names.FIELDS.keys()
     assert sorted(name for name in every if not re.search(rf"\b{name}\b", left)) == []
