@@ -3,7 +3,7 @@
 import inspect
 import warnings
 
-DEPRECATED = r".+ is deprecated since [\d.]+ and gone in [\d.]+; use "
+DEPRECATED = r"(.+) is deprecated since ([\d.]+) and gone in ([\d.]+); use "
 """A pattern that the warnings of `warn_deprecated` begin with."""
 _PACKAGE = __name__.partition(".")[0]
 

@@ -63,7 +63,7 @@ def samples(
             (the test split has none).
     """
     if purpose is None:
-        what = "samples(split) without a purpose, which names the training list,"
+        what = "samples(split) without a purpose (the training list)"
         warn_deprecated(what, 'training_samples(split) or samples(split, "train")', since="0.1", gone_in="0.2")
         purpose = "train"
     listed: str = choice("purpose", purpose, _STEPS)

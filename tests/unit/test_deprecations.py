@@ -2,15 +2,19 @@
 
 import ast
 import re
+import warnings
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 
 import pytest
+from click import UsageError
 
 import deepaccident_devkit
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.deprecations import warn_deprecated
+from deepaccident_devkit.cli.export import mcap
+from deepaccident_devkit.deprecations import DEPRECATED, warn_deprecated
+from deepaccident_devkit.evaluation import DetectedBoxes
 from deepaccident_devkit.evaluation.results import FORMAT_VERSION
 from deepaccident_devkit.evaluation.runs.bundles import SUMMARY_VERSION
 from deepaccident_devkit.motion import label_folder
@@ -53,18 +57,22 @@ def test_nothing_is_deprecated_for_longer_than_it_says() -> None:
         assert version(since) <= here < version(gone_in), f"{path}: remove what is deprecated"
 
 
-def test_the_page_has_every_deprecation() -> None:
-    rows = re.findall(r"^\| `(.*)` \| `(.*)` \| ([\d.]+) \| ([\d.]+) \|$", PAGE, re.MULTILINE)
-    assert sorted((instead, since, gone_in) for _, instead, since, gone_in in rows) == sorted(
-        (ast.literal_eval(call.args[1]), *named(call).values()) for _, call in calls()
-    )
-
-
-def test_what_the_page_lists_warns_and_works(da: DeepAccident) -> None:
-    """One call a row of the page."""
-    assert re.findall(r"^\| `(\w+\(.*?\))` \| ", PAGE, re.MULTILINE) == ["samples(split)"]
-    with pytest.warns(DeprecationWarning, match="use training_samples"):
+def test_the_page_lists_what_warns_and_all_of_it_works(da: DeepAccident) -> None:
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
         assert da.samples("train") == da.training_samples("train")
+        assert DetectedBoxes.from_arrays([[1, 2, 3]], [[4, 2, 1]], [0.0], [0.5]).boxes.frame == "lidar"
+        assert da.find(visibility=None) == da.find(accident_visibility=None)
+        assert da.find("junction=unknown") == da.find("road_type=unknown")
+        with pytest.raises(UsageError, match="dataroot"):
+            mcap.main(["--frames", "1..2"], standalone_mode=False)
+    rows = re.findall(r"^\| (.*) \| (.*) \| ([\d.]+) \| ([\d.]+) \|$", PAGE.replace("`", ""), re.MULTILINE)
+    warned = [re.fullmatch(DEPRECATED + "(.+)", str(each.message)) for each in told]
+    assert [(what, since, gone_in, instead) for what, instead, since, gone_in in rows] == [
+        each.groups() for each in warned if each
+    ]
+    names = {f"{name}.py" for name in ("sample_lists", "boxes", "fields", "options")}
+    assert {path.name for path, _ in calls()} == names, "list it on the page, and call it above"
 
 
 def test_the_page_has_the_versions_of_files_and_pythons() -> None:
