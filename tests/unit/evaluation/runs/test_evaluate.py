@@ -99,7 +99,7 @@ class TestRun:
         assert [each.by for each in broken.breakdowns] == ["agent", "all"]
         assert broken.breakdowns[1].groups[0].result == run.result
         assert [each.by for each in run.broken_down(resampling=Resampling(resamples=0)).breakdowns] == list(BREAKDOWNS)
-        with pytest.raises(ChoiceError, match=r"by: expected one of weather, .*, found 'wether'"):
+        with pytest.raises(ChoiceError, match=r"by: expected one of all, .*, found 'wether'; did you mean 'weather'"):
             run.broken_down(["wether"])
 
 
