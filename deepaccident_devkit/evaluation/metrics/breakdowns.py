@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.metrics.attributes import SampleAttributes, cluster_of, tokens_by_value
+from deepaccident_devkit.evaluation.metrics.attributes import ATTRIBUTES, SampleAttributes, cluster_of, tokens_by_value
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
 from deepaccident_devkit.evaluation.metrics.intervals import Resampling, intervals_of
 from deepaccident_devkit.taxonomy import INFRASTRUCTURE
+from deepaccident_devkit.text import choice
 
 Result = TypeVar("Result")
 
@@ -78,6 +79,7 @@ def breakdown(
         ChoiceError: no such attribute.
         EvaluationError: a sample's attributes are missing.
     """
+    by = choice("by", by, ATTRIBUTES)
     missing = sorted(evaluator.tokens - attributes.keys())
     if missing:
         raise EvaluationError(
@@ -89,7 +91,9 @@ def breakdown(
     chosen = resampling or Resampling()
     everyone = _groups(evaluator, here, by, chosen)
     without = everyone if len(vehicles) == len(here) else _groups(evaluator, vehicles, by, chosen)
-    return Breakdown(by=by, groups=everyone, without_infrastructure=without, resampling=chosen)
+    return Breakdown(
+        by=choice("by", by, ATTRIBUTES), groups=everyone, without_infrastructure=without, resampling=chosen
+    )
 
 
 def _groups(

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import EvaluationError
-from deepaccident_devkit.evaluation.metrics.attributes import WITHIN_RECORDINGS, SampleAttributes
+from deepaccident_devkit.evaluation.metrics.attributes import ATTRIBUTES, WITHIN_RECORDINGS, SampleAttributes
 from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown, Group, breakdown
 from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import plain
@@ -24,6 +24,7 @@ from deepaccident_devkit.evaluation.runs.selection import SampleSelection
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.parallel import run_batch
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, digest_of, fingerprint
+from deepaccident_devkit.text import choice
 
 SUMMARY_FORMAT: Final = "DeepAccident metrics summary"
 SUMMARY_VERSION: Final = 1
@@ -180,7 +181,7 @@ class EvaluationRun:
         Raises:
             ChoiceError: no such attribute.
         """
-        chosen = breakdowns_of(self.setup.task) if by is None else by
+        chosen = [choice("by", each, ATTRIBUTES) for each in (breakdowns_of(self.setup.task) if by is None else by)]
         work = partial(breakdown, self.evaluator, self.attributes, resampling=resampling)
         return replace(self, breakdowns=tuple(run_batch(work, list(dict.fromkeys(chosen)), workers=workers)))
 

@@ -291,10 +291,16 @@ def test_the_verb_takes_a_scenario_and_predictions(da: DeepAccident, tmp_path: P
     [
         (["--frames", "4..2"], "expected frame numbers such as 20..40, found '4..2'"),
         (["--points", "few"], "expected all, or a number for every n-th point, found 'few'"),
-        (["--agents", "nobody"], "found 'nobody'"),
     ],
 )
 def test_the_verb_refuses_what_it_cannot_read(tmp_path: Path, options: list[str], sentence: str) -> None:
     done = CliRunner().invoke(export, ["mcap", str(tmp_path), "--out", "a.mcap", *options])
     assert done.exit_code == 2
     assert sentence in done.output
+
+
+def test_the_verb_refuses_agents_that_do_not_exist(tmp_path: Path) -> None:
+    with pytest.raises(ChoiceError, match=r"--agents: expected one of ego_vehicle, .*found 'nobody'"):
+        CliRunner().invoke(
+            export, ["mcap", str(tmp_path), "--out", "a.mcap", "--agents", "nobody"], catch_exceptions=False
+        )
