@@ -18,7 +18,7 @@ from deepaccident_devkit.evaluation.results import ResultsTask, ResultsWriter
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.parallel import run_unordered
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
-from deepaccident_devkit.text import choice
+from deepaccident_devkit.text import choice, settle_choices
 from deepaccident_devkit.v2x import AgentConfig, Agents, Link
 
 Prediction = MotionOutput | list[Accident] | DetectedBoxes
@@ -41,6 +41,10 @@ class Baseline:
     model: MotionModel = "constant_velocity"
     link: Link | None = None
     horizon: float = 2.0
+
+    def __post_init__(self) -> None:
+        """Check the model; raises ChoiceError."""
+        settle_choices(self, {"model": get_args(MotionModel)})
 
     @property
     def config(self) -> MotionLabelConfig:

@@ -19,6 +19,7 @@ from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.export.mcap import McapConfig, export_mcap
 from deepaccident_devkit.motion import PRESETS
 from deepaccident_devkit.taxonomy import AGENTS, LIDAR, OnError
+from deepaccident_devkit.text import spelled
 from deepaccident_devkit.v2x.collisions import default_scenario
 
 
@@ -29,6 +30,7 @@ def export() -> None:
 
 def _points(context: click.Context, parameter: click.Parameter, value: str) -> str | int:
     """Parse `all`, or n."""
+    value = spelled(value, ("all",))
     if value != "all" and not value.isdecimal():
         raise click.BadParameter(f"expected all, or a number for every n-th point, found {value!r}", context, parameter)
     return value if value == "all" else int(value)

@@ -90,6 +90,7 @@ def _switched(rules: LabelProtocol, switches: tuple[str, ...]) -> LabelProtocol:
     changes: dict[str, Any] = {}
     for text in switches:
         name, _, value = text.partition("=")
+        value = value.lower()
         if name not in slip_names() or value not in ("yes", "no"):
             names = ", ".join(slip_names())
             raise click.BadParameter(f"--switch: expected NAME=yes or NAME=no, NAME one of {names}; found {text!r}")

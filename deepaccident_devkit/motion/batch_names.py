@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 
@@ -170,7 +170,8 @@ def config_from_names(settings: Mapping[str, Any], names: BatchNames) -> MotionL
         ChoiceError: no such code.
         ConfigError: an impossible value.
     """
-    found = {ours: _setting(settings, path) for ours, path in _SETTINGS[choice("names", names, _SETTINGS)].items()}
+    names = choice("names", names, get_args(BatchNames))
+    found = {ours: _setting(settings, path) for ours, path in _SETTINGS[names].items()}
     changes: dict[str, Any] = {ours: value for ours, value in found.items() if value is not None}
     preset = MotionLabelConfig.preset(names)
     bounds = {axis: changes.pop(axis) for axis in ("x", "y") if axis in changes}

@@ -5,10 +5,11 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import click
+import numpy as np
 import pytest
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.baselines import StudyConfig
+from deepaccident_devkit.baselines import Baseline, StudyConfig
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.cli.options import WordChoice, agent_names, names_or_configuration
 from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError, TableError, TokenError, VersionError
@@ -17,13 +18,20 @@ from deepaccident_devkit.evaluation.runs import SampleSelection
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.export.mcap import McapConfig
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.motion import MotionLabelConfig
+from deepaccident_devkit.motion import MotionLabelConfig, agents_to_ego, config_from_names
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.render.layers import layers_of
 from deepaccident_devkit.synth import SynthConfig
 from deepaccident_devkit.testing import SmallRelease
 from deepaccident_devkit.text import choice, meant_text
 from deepaccident_devkit.v2x import AgentConfig, PoseNoise, cooperating_agents
+
+SETTINGS = {"grid_conf": {"xbound": (-50.0, 50.0, 0.5), "ybound": (-30.0, 50.0, 0.5)}}
+
+
+def warped(mode: str) -> np.ndarray:
+    return agents_to_ego(np.zeros((2, 200, 200), dtype=np.int16), np.zeros((2, 6)), mode=mode)
+
 
 CALLS: list[tuple[str, str, str, type[DeepAccidentError], Callable[[DeepAccident, str], Any]]] = [
     ("LIDAR", "lidar", "lidarr", ChoiceError, lambda da, word: da.boxes(da.sample[0], word).frame),
@@ -60,6 +68,16 @@ MAKERS: list[tuple[str, str, str, type[DeepAccidentError], Callable[[str], Any]]
     ("Other", "other", "othr", ChoiceError, lambda word: AgentConfig("mine", (word,))),
     ("Hidden", "hidden", "hiden", ConfigError, lambda word: SynthConfig(view=word)),
     ("INFRASTRUCTURE", "infrastructure", "infra", ConfigError, lambda w: SmallRelease(agents=(w,))),
+    ("BEVerse", "beverse", "bevers", ChoiceError, lambda word: config_from_names(SETTINGS, word)),
+    ("DeepAccident", "deepaccident", "accident", ChoiceError, lambda word: config_from_names(SETTINGS, word)),
+    (
+        "Bilinear",
+        "bilinear",
+        "linear",
+        ChoiceError,
+        lambda word: warped(word).dtype,
+    ),
+    ("Constant_Turn_Rate", "constant_turn_rate", "constant_turn", ChoiceError, lambda word: Baseline(model=word)),
     ("Constant_Velocity", "constant_velocity", "constant", ChoiceError, lambda word: StudyConfig(model=word)),
     ("Infrastructure", "infrastructure", "infra", ChoiceError, lambda word: agent_names((word,))),
     ("VEHICLES", "vehicles", "vehicle", ChoiceError, lambda word: names_or_configuration((word,))),
@@ -82,6 +100,11 @@ def test_a_configuration_takes_a_word_in_any_case(
     assert make(given) == make(known)
     with pytest.raises(error, match=r"; did you mean '[\w+-]+'\?$"):
         make(wrong)
+
+
+def test_what_is_told_of_a_split_is_its_name() -> None:
+    assert SampleSelection(split="VAL_mini") == SampleSelection(split="val_mini")
+    assert SampleSelection(split="Mine.txt").split == "Mine.txt"
 
 
 def verbs(group: click.Group, context: click.Context) -> Iterator[click.Command]:

@@ -11,8 +11,8 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
 from deepaccident_devkit.motion import samples
 from deepaccident_devkit.motion.sample_lists import no_samples_text
-from deepaccident_devkit.taxonomy import AGENTS
-from deepaccident_devkit.text import choice, settle_choices
+from deepaccident_devkit.taxonomy import AGENTS, MINI_SPLITS, SPLITS
+from deepaccident_devkit.text import choice, settle_choices, spelled
 
 SampleList = Literal["evaluate", "all"]
 ScopeName = Literal["accident", "all"]
@@ -41,7 +41,7 @@ class SampleSelection:
 
     def __post_init__(self) -> None:
         """Check and put the agents in order; raises ChoiceError."""
-        object.__setattr__(self, "split", os.fspath(self.split))
+        object.__setattr__(self, "split", spelled(os.fspath(self.split), (*SPLITS, *MINI_SPLITS)))
         settle_choices(self, {"samples": get_args(SampleList), "scope": get_args(ScopeName)})
         if self.agents is not None:
             object.__setattr__(self, "agents", _agents(self.agents))

@@ -12,7 +12,7 @@ from deepaccident_devkit.evaluation.results import Prediction, Results
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.motion.config import label_config
 from deepaccident_devkit.taxonomy import CAMERAS, LIDAR, OnError
-from deepaccident_devkit.text import choice, possible_text, settle_choices
+from deepaccident_devkit.text import choice, possible_text, settle_choices, spelled
 from deepaccident_devkit.v2x import Agents
 
 EPOCH: Final = 1_704_067_200
@@ -67,7 +67,7 @@ class McapConfig:
     @property
     def point_step(self) -> int:
         """The n of "every n-th point is written"."""
-        if self.points == "all":
+        if spelled(self.points, ("all",)) == "all":
             return 1
         step = checked_whole("points", self.points, "'all', or n for every n-th point", ChoiceError)
         if step < 1:

@@ -9,7 +9,7 @@ from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.protocols import LabelProtocol, label_protocol
 from deepaccident_devkit.motion.warps.chains import ego_from_agents, present_from_past
-from deepaccident_devkit.motion.warps.warping import WarpMode, sampling_matrix, warp
+from deepaccident_devkit.motion.warps.warping import WarpMode, checked_mode, sampling_matrix, warp
 
 
 def past_to_present(
@@ -90,7 +90,7 @@ def _warped(
 ) -> AnyArray:
     """A copy of the maps in which those numbered `moved` are warped, each with its transform."""
     cells = BevGrid() if grid is None else grid
-    result = maps.astype(maps.dtype if mode == "nearest" else np.float32)
+    result = maps.astype(maps.dtype if checked_mode(mode) == "nearest" else np.float32)
     for index, matrix in zip(moved, sampling_matrix(target_from_source, rules), strict=True):
         result[index] = warp(maps[index], matrix, cells, rules, mode, orientation=cells.orientation)
     return result

@@ -46,7 +46,7 @@ def maps_to_present(
     Raises:
         ChoiceError: no such mode.
     """
-    checked_mode(centerness)
+    centerness = checked_mode(centerness)
     rules = config.rules
     transforms = present_from_frames(label_egomotion, rules, config.augmentation)
     ignored = np.zeros_like(missing) if rules.missing_frames_are_empty else missing
