@@ -95,9 +95,7 @@ def breakdown(
     chosen = resampling or Resampling()
     everyone = _groups(evaluator, here, by, chosen)
     without = everyone if len(vehicles) == len(here) else _groups(evaluator, vehicles, by, chosen)
-    return Breakdown(
-        by=choice("by", by, ATTRIBUTES), groups=everyone, without_infrastructure=without, resampling=chosen
-    )
+    return Breakdown(by=by, groups=everyone, without_infrastructure=without, resampling=chosen)
 
 
 def _groups(
