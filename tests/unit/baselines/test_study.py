@@ -255,8 +255,8 @@ def test_other_protocols_and_egos(da_hidden: DeepAccident, monkeypatch: pytest.M
     ("options", "sentence"),
     [
         ({"egos": "ego_vehicle"}, r"egos: expected several agents, found 'ego_vehicle'; give \['ego_vehicle'\]"),
-        ({"egos": ["ego"]}, "egos: expected some of ego_vehicle, .*, found ego"),
-        ({"egos": []}, "egos: expected some of ego_vehicle, .*, found none"),
+        ({"egos": ["ego"]}, "egos: expected one of ego_vehicle, .*, found 'ego'"),
+        ({"egos": []}, "egos: expected at least one agent, found none"),
         ({"model": "still"}, "model: expected one of constant_velocity, constant_turn_rate, found 'still'"),
         ({"protocol": "mine"}, "protocol: expected one of released, paper, boxes, found 'mine'"),
         ({"scope": "some"}, "scope: expected one of accident, all, found 'some'"),

@@ -122,7 +122,7 @@ def test_each_panel_draws_the_layers_that_it_has(da: DeepAccident, frame: str) -
 
 
 def test_layers_and_agents_that_are_not_there_are_refused(da: DeepAccident, frame: str) -> None:
-    with pytest.raises(ChoiceError, match=r"layers: expected any of image, .*, found 'labels'"):
+    with pytest.raises(ChoiceError, match=r"layers: expected one of image, .*, found 'labels'"):
         render_frame(da, frame, layers=["labels"])
     with pytest.raises(ChoiceError, match="agents: expected one of single"):
         render_frame(da, frame, agents="pole")

@@ -33,7 +33,7 @@ def test_files_are_the_same_bytes_each_time(statistics: DatasetStatistics, tmp_p
     for path in second:
         assert path.read_bytes() == (tmp_path / "a" / path.name).read_bytes(), path
         assert path.stat().st_size > 5000
-    with pytest.raises(ChoiceError, match="expected some of png, pdf, found 'svg'"):
+    with pytest.raises(ChoiceError, match="expected one of png, pdf, found 'svg'"):
         save_statistics(statistics, tmp_path, formats=("svg",))  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="is a file; give a folder"):
         save_statistics(statistics, first[0])
