@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray
+from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import Box, Boxes, PinholeCamera
+from deepaccident_devkit.render.chips import keep_free, place_chips
 from deepaccident_devkit.render.colors import CATEGORY_COLORS
 from deepaccident_devkit.render.layers import Layer
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID, UNTRACKED_ID
@@ -21,8 +22,6 @@ EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4),
 """The twelve edges of a box between its corners, in `Box.corners` order; the first four are its front."""
 NEAREST_DRAWN = 0.1
 """Metres in front of the camera at which edges are cut off."""
-SMALLEST_TEXT: Final = 7
-"""In points: text of this size can still be read in a notebook."""
 
 
 def draw_box(box: Box, ax: Axes, color: str | None = None) -> Axes:
@@ -55,8 +54,7 @@ def draw_boxes_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str], *, fill
 
 def draw_ids_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str]) -> None:
     """Write the label ids of tracked boxes beside them; the recording agent is `own`."""
-    for center, actor_id, color in zip(boxes.center.tolist(), boxes.actor_id.tolist(), colors, strict=True):
-        _write_id(ax, (center[0], center[1]), actor_id, color)
+    _write_ids(boxes.center[:, :2], boxes.actor_id, ax, colors)
 
 
 def draw_velocities_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str]) -> None:
@@ -103,8 +101,7 @@ def draw_ids_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Seq
     top = boxes.corners()[:, (0, 1, 4, 5)].mean(axis=1)
     pixels, depth = camera.project(top)
     seen = camera.in_image(pixels, depth, min_depth=NEAREST_DRAWN)
-    for row in np.flatnonzero(seen).tolist():
-        _write_id(ax, (pixels[row, 0], pixels[row, 1]), int(boxes.actor_id[row]), colors[row])
+    _write_ids(pixels[seen], boxes.actor_id[seen], ax, [colors[row] for row in np.flatnonzero(seen).tolist()])
 
 
 def draw_velocities_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Sequence[str]) -> None:
@@ -147,6 +144,7 @@ def _draw_footprints(
     faces[:, 3] *= fill
     style = {"linewidths": 1.2, "zorder": 3, **how}
     ax.add_collection(PolyCollection(list(corners), facecolors=faces, edgecolors=list(colors), **style))
+    keep_free(ax, corners)
     headings = np.stack([centers, corners[:, :2].mean(axis=1)], axis=1)
     ax.add_collection(LineCollection(list(headings), colors=list(colors), **style))
 
@@ -156,26 +154,14 @@ def _moving(boxes: Boxes) -> BoolArray:
     return moving
 
 
-def _write_id(ax: Axes, place: tuple[float, float], actor_id: int, color: str) -> None:
-    if actor_id == UNTRACKED_ID:
-        return
-    words = "own" if actor_id == OWN_ACTOR_ID else str(actor_id)
-    write_beside(ax, words, place, color)
+def _write_ids(places: FloatArray, actor_ids: IntArray, ax: Axes, colors: Sequence[str]) -> None:
+    """Write the ids of tracked actors at places (N, 2): first those of hues, which are the accident's actors."""
+    shades = set(CATEGORY_COLORS.values())
+    order = sorted(np.flatnonzero(actor_ids != UNTRACKED_ID).tolist(), key=lambda row: colors[row] in shades)
+    words = ["own" if actor_ids[row] == OWN_ACTOR_ID else str(actor_ids[row]) for row in order]
+    place_chips(ax, zip(words, places[order], strict=True), colors=[colors[row] for row in order])
 
 
 def write_beside(ax: Axes, words: str, place: tuple[float, float], color: str) -> None:
-    """Write a few words just above a place in data coordinates, readable on any background; not outside the axes."""
-    from matplotlib.patheffects import withStroke
-
-    ax.annotate(
-        words,
-        place,
-        xytext=(2, 2),
-        textcoords="offset points",
-        color=color,
-        fontsize=SMALLEST_TEXT,
-        annotation_clip=True,
-        clip_on=True,
-        path_effects=[withStroke(linewidth=2, foreground="white")],
-        zorder=6,
-    )
+    """Write a few words near a place in data coordinates, on a chip whose edge has the colour; not outside the axes."""
+    place_chips(ax, [(words, place)], colors=[color])

@@ -13,12 +13,12 @@ from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render.axes import axes_or_new, axis_words, check_view_range, set_title, with_light_grid
 from deepaccident_devkit.render.bev import draw_points_from_above
 from deepaccident_devkit.render.boxes import (
-    SMALLEST_TEXT,
     draw_boxes_from_above,
     draw_ids_from_above,
     draw_velocities_from_above,
     write_beside,
 )
+from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, GRID_COLOR, MUTED_COLOR, OWN_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import agent_handles, draw_legend
