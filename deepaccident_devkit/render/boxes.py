@@ -10,8 +10,8 @@ import numpy as np
 from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import Box, Boxes, PinholeCamera
-from deepaccident_devkit.render.chips import keep_free, place_chips
-from deepaccident_devkit.render.colors import CATEGORY_COLORS
+from deepaccident_devkit.render.chips import SMALLEST_TEXT, keep_free, place_chips
+from deepaccident_devkit.render.colors import CASING_COLOR, CATEGORY_COLORS, CATEGORY_MARKERS, OWN_COLOR
 from deepaccident_devkit.render.layers import Layer
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID, UNTRACKED_ID
 
@@ -20,6 +20,10 @@ if TYPE_CHECKING:
 
 EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
 """The twelve edges of a box between its corners, in `Box.corners` order; the first four are its front."""
+SMALLEST_MARK = 6.0
+"""Points: the size of the mark of a small actor from above."""
+_KEY_SPEED = 10
+"""Metres a second of the arrow in a corner that gives the scale of the others."""
 NEAREST_DRAWN = 0.1
 """Metres in front of the camera at which edges are cut off."""
 
@@ -48,8 +52,11 @@ def draw_boxes_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str], *, fill
         colors: one colour for each box.
         fill: how opaque the inside is, from 0 to 1.
         how: matplotlib's arguments for the outlines, such as `linestyle` or `linewidths`.
+
+    Pedestrians, cyclists and motorcycles also have their class's mark, which is not smaller in a large view.
     """
     _draw_footprints(boxes.center[:, :2], boxes.bottom_corners()[..., :2], ax, colors, fill, how)
+    _draw_small(boxes, ax, colors, filled=fill > 0)
 
 
 def draw_ids_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str]) -> None:
@@ -58,13 +65,19 @@ def draw_ids_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str]) -> None:
 
 
 def draw_velocities_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str]) -> None:
-    """Render an arrow to where each box with a known velocity would be in a second."""
+    """Render an arrow to where each box with a known velocity would be in a second, and a key for their scale."""
     moving = _moving(boxes)
     if moving.any():
         center, velocity = boxes.center[moving], boxes.velocity[moving]
         chosen = [color for color, moves in zip(colors, moving.tolist(), strict=True) if moves]
         start, step = center[:, :2].T, velocity[:, :2].T
-        ax.quiver(*start, *step, color=chosen, angles="xy", scale_units="xy", scale=1, width=0.004, zorder=4)
+        how: Any = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.004, "zorder": 4}
+        arrows = ax.quiver(*start, *step, color=chosen, **how)
+        words = f"{_KEY_SPEED} m/s"
+        key = ax.quiverkey(
+            arrows, 0.85, 0.03, _KEY_SPEED, words, color=OWN_COLOR, fontproperties={"size": SMALLEST_TEXT}
+        )
+        key.text.set_bbox({"facecolor": CASING_COLOR, "edgecolor": "none", "pad": 1.5})
 
 
 def draw_actors_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str], layers: Collection[Layer]) -> None:
@@ -147,6 +160,18 @@ def _draw_footprints(
     keep_free(ax, corners)
     headings = np.stack([centers, corners[:, :2].mean(axis=1)], axis=1)
     ax.add_collection(LineCollection(list(headings), colors=list(colors), **style))
+
+
+def _draw_small(boxes: Boxes, ax: Axes, colors: Sequence[str], *, filled: bool) -> None:
+    """The marks of classes that are too small to be found."""
+    from matplotlib.lines import Line2D
+
+    kinds = list(zip(boxes.category_names, colors, strict=True))
+    for name, color in sorted({kind for kind in kinds if kind[0] in CATEGORY_MARKERS}):
+        x, y = boxes.center[[kind == (name, color) for kind in kinds], :2].T
+        inside, edge = (color, CASING_COLOR) if filled else ("none", color)
+        style: Any = {"marker": CATEGORY_MARKERS[name], "markersize": SMALLEST_MARK, "zorder": 3.5}
+        ax.add_line(Line2D(x, y, linestyle="none", markerfacecolor=inside, markeredgecolor=edge, mew=0.7, **style))
 
 
 def _moving(boxes: Boxes) -> BoolArray:

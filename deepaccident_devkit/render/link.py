@@ -13,7 +13,7 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.render.axes import check_view_range, figure_or_new, set_title, settled, with_light_grid
-from deepaccident_devkit.render.bev import BevView, draw_bev
+from deepaccident_devkit.render.bev import BevView, draw_bev, link_words
 from deepaccident_devkit.render.boxes import draw_boxes_from_above, draw_ids_from_above
 from deepaccident_devkit.render.colors import AGENT_COLORS, OWN_COLOR, TRUE_PLACE_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
@@ -21,7 +21,6 @@ from deepaccident_devkit.render.legends import draw_legend
 from deepaccident_devkit.render.roles import short_name
 from deepaccident_devkit.taxonomy import UNTRACKED_ID
 from deepaccident_devkit.v2x import Agents, Link, cooperating_agents, cooperative_boxes
-from deepaccident_devkit.v2x.link import PoseNoise
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -125,19 +124,6 @@ def shared_boxes(dataset: Dataset, sample: RowArgument, link: Link, agents: Agen
         )
         for agent in partners
     ]
-
-
-def link_words(link: Link) -> str:
-    """A link in words: `latency 0.2 s, poses off by 0.3 m (σ 0.02 m), 10 % of messages lost`."""
-    words = [f"latency {link.latency:g} s"]
-    noise = link.pose_noise
-    if isinstance(noise, PoseNoise):
-        words.append(f"poses off by {noise.mean:g} m (σ {noise.std:g} m)")
-        if noise.heading_std:
-            words.append(f"headings by σ {np.degrees(noise.heading_std):.1f}°")
-    if link.packet_loss:
-        words.append(f"{100 * link.packet_loss:g} % of messages lost")
-    return ", ".join(words)
 
 
 def _tracked(boxes: Boxes) -> Boxes:

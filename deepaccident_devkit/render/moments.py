@@ -11,7 +11,7 @@ from deepaccident_devkit.render.bev import BEV_DEFAULT, BEV_LAYERS, BevView, dra
 from deepaccident_devkit.render.camera import CAMERA_DEFAULT, CAMERA_LAYERS, draw_camera
 from deepaccident_devkit.render.colors import CATEGORY_COLORS
 from deepaccident_devkit.render.layers import LAYERS, Layer, layers_of
-from deepaccident_devkit.render.legends import agent_handles, box_handles, draw_legend
+from deepaccident_devkit.render.legends import box_handles, draw_legend, handles_from_above
 from deepaccident_devkit.render.roles import at_once, in_drawing_order
 from deepaccident_devkit.taxonomy import CAMERAS
 from deepaccident_devkit.v2x import Agents, Link, cooperating_agents
@@ -83,9 +83,7 @@ def render_sample(
         draw_camera(dataset, dataset.get("sample_data", f"{record['token']}/{channel}"), in_cameras, axes[channel])
     drawn = draw_bev(dataset, record, BevView(agents=names, link=link), from_above, axes["bev"])
     axes["bev"].set_title("")
-    handles = box_handles(drawn.colors)
-    if len(names) > 1:
-        handles += agent_handles(drawn.clouds)
+    handles = handles_from_above(drawn.colors, drawn.clouds if len(names) > 1 else ())
     draw_legend(fig, handles, columns=len(handles), loc="outside lower center")
     set_title(fig, _heading(record["token"], record))
     return fig
