@@ -80,27 +80,36 @@ def place_chips(
         )
 
 
-def keep_free(ax: Axes, shapes: ArrayLike) -> None:
-    """Let no chip cover shapes (N, corners, 2), in data coordinates."""
+def keep_free(ax: Axes, shapes: ArrayLike, *, margin: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)) -> None:
+    """Let no chip cover shapes.
+
+    Args:
+        ax: axes of the chips.
+        shapes: (N, corners, 2) in data coordinates.
+        margin: points to add to a shape's left, low, right and high side: to the left and down they are negative.
+    """
     corners = np.asarray(shapes, dtype=np.float64)
     if corners.size:
-        _placer(ax).shapes.append(np.stack([corners.min(axis=1), corners.max(axis=1)], axis=1))
+        placer = _placer(ax)
+        placer.shapes.append(np.stack([corners.min(axis=1), corners.max(axis=1)], axis=1))
+        placer.margins.append(np.tile(margin, (len(corners), 1)))
 
 
 @dataclass(slots=True, eq=False)
 class _Placer:
-    """The chips of axes, and what they must not cover: corners (N, 2, 2) of upright rectangles."""
+    """The chips of axes, and what they must not cover: corners (N, 2, 2) and margins (N, 4) of upright rectangles."""
 
     ax: Axes
     chips: list[Annotation] = field(default_factory=list)
     shapes: list[FloatArray] = field(default_factory=list)
+    margins: list[FloatArray] = field(default_factory=list)
 
     def place(self, renderer: Any) -> None:
         """Move the chips, and render the lines that lead to them; rectangles are pixels (left, low, right, high)."""
         if not self.chips:
             return
         point = renderer.points_to_pixels(1.0)
-        area, taken = np.array(self.ax.bbox.extents), self._taken()
+        area, taken = np.array(self.ax.bbox.extents), self._taken(point)
         anchors = self.ax.transData.transform([chip.xy for chip in self.chips])
         leaders = []
         for chip, anchor in zip(self.chips, anchors, strict=True):
@@ -123,12 +132,12 @@ class _Placer:
                 leaders.append([anchor, np.clip(anchor, found[best, :2], found[best, 2:])])
         self._draw_leaders(leaders, renderer)
 
-    def _taken(self) -> FloatArray:
-        """(N, 4) the pixels of the shapes."""
+    def _taken(self, point: float) -> FloatArray:
+        """(N, 4) the pixels of the shapes, at so many pixels a point."""
         if not self.shapes:
             return np.zeros((0, 4))
         ends = self.ax.transData.transform(np.concatenate(self.shapes).reshape(-1, 2)).reshape(-1, 2, 2)
-        return np.column_stack([ends.min(axis=1), ends.max(axis=1)])
+        return np.column_stack([ends.min(axis=1), ends.max(axis=1)]) + np.concatenate(self.margins) * point
 
     def _draw_leaders(self, leaders: list[list[FloatArray]], renderer: Any) -> None:
         from matplotlib.collections import LineCollection
