@@ -8,7 +8,9 @@ import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, FloatArray
 from deepaccident_devkit.render.axes import with_light_grid
+from deepaccident_devkit.render.chips import place_chips
 from deepaccident_devkit.render.colors import (
+    AGENT_COLORS,
     BEYOND_COLOR,
     CENTERNESS_COLORMAP,
     COLLIDER_COLOR,
@@ -17,6 +19,7 @@ from deepaccident_devkit.render.colors import (
 )
 from deepaccident_devkit.render.layers import Layer
 from deepaccident_devkit.render.motion_maps import DrawnMap, MotionMaps
+from deepaccident_devkit.render.roles import short_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,6 +41,8 @@ def draw_map_of(maps: MotionMaps, name: DrawnMap, frame: int, shown: frozenset[L
         _draw_picture(maps, name, frame, ax)
     if name == "flow" and "velocities" in shown:
         _draw_arrows(maps, frame, ax)
+    if name == "flow" and maps.instance[frame].any() and np.isnan(maps.vectors("flow")[frame]).all():
+        ax.text(0.5, 0.5, "no next frame", ha="center", va="center", transform=ax.transAxes)
     return _with_ids_and_grid(maps, frame, shown, ax)
 
 
@@ -152,8 +157,8 @@ def _with_ids_and_grid(maps: MotionMaps, frame: int, shown: frozenset[Layer], ax
         x, y = _cell_centers(maps)
         for identity in np.unique(maps.instance[frame][maps.instance[frame] > 0]).tolist():
             row, column = np.nonzero(maps.instance[frame] == identity)
-            place = x[column].mean(), y[row].max()
-            ax.annotate(str(identity), place, (0, 2), textcoords="offset points", fontsize=7, ha="center", clip_on=True)
+            low, high = (x[column.min()], y[row.min()]), (x[column.max()], y[row.max()])
+            place_chips(ax, [(str(identity), (x[column].mean(), y[row].mean()))], avoid=[[low, high]])
     return with_light_grid(ax, "both") if "grid" in shown else ax
 
 
@@ -163,11 +168,12 @@ def _draw_cells(ax: Axes, picture: AnyArray, maps: MotionMaps, **how: Any) -> No
 
 
 def _draw_instance_key(maps: MotionMaps, ax: Axes) -> None:
-    from matplotlib.colors import to_rgb
+    from matplotlib.colors import to_hex
     from matplotlib.patches import Patch
 
-    red = np.isclose(maps.colors, to_rgb(COLLIDER_COLOR)).all(axis=1).any()
-    handles = [Patch(label="colliding pair", facecolor=COLLIDER_COLOR)] if red else []
+    drawn = {to_hex(color) for color in maps.colors}
+    meanings = {"colliding pair": COLLIDER_COLOR} | {short_name(name): hue for name, hue in AGENT_COLORS.items()}
+    handles = [Patch(label=name, facecolor=color) for name, color in meanings.items() if color in drawn]
     if maps.own > 0:
         handles.append(Patch(label="own box", facecolor="none", edgecolor=OWN_COLOR, linewidth=1.5))
     if handles:
