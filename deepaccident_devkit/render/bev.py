@@ -56,6 +56,8 @@ _BEYOND: Final = 5.0
 """Metres outside the picture up to which a box may still reach into it."""
 _MARK: Final = np.array([[1.8, 0.0], [-1.2, 1.1], [-0.6, 0.0], [-1.2, -1.1]])
 """An arrow head, metres of an agent's ego frame."""
+_PALE: Final = 0.55
+"""How opaque agents' points are."""
 _MOST_PIXELS: Final = 400
 """Pixels along a side, about: panels of a video have fewer, and more take time."""
 
@@ -301,9 +303,21 @@ def link_words(link: Link) -> str:
 def draw_points_from_above(
     xyz: FloatArray, ax: Axes, *, center: FloatArray, view_range: float, color: str = POINT_COLOR
 ) -> None:
-    """Render the points (P, 3) within a square of ±`view_range` metres around `center` (2,), all in one colour."""
+    """Render the points (P, 3) within a square of ±`view_range` metres around `center` (2,), all in one colour.
+
+    Hues are paler than those of boxes, which lie over them.
+    """
     near = (np.abs(xyz[:, :2] - center) < view_range).all(axis=1)
-    ax.scatter(xyz[near, 0], xyz[near, 1], s=0.6, c=color, linewidths=0, rasterized=True, zorder=1)
+    ax.scatter(
+        xyz[near, 0],
+        xyz[near, 1],
+        s=0.6,
+        c=color,
+        alpha=None if color == POINT_COLOR else _PALE,
+        linewidths=0,
+        rasterized=True,
+        zorder=1,
+    )
 
 
 def draw_underlay(image: BevImage, ax: Axes, *, target_from_ego: SE3, view_range: float) -> None:
