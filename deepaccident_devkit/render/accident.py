@@ -12,8 +12,9 @@ from deepaccident_devkit.errors import ChoiceError, NotAvailableError
 from deepaccident_devkit.geometry import SE3, Boxes
 from deepaccident_devkit.render.axes import axis_words, figure_or_new, set_title, settled, with_light_grid
 from deepaccident_devkit.render.best_view import best_camera
-from deepaccident_devkit.render.boxes import SMALLEST_TEXT, draw_actors_from_above, write_beside
+from deepaccident_devkit.render.boxes import draw_actors_from_above, write_beside
 from deepaccident_devkit.render.camera import CAMERA_LAYERS, draw_camera
+from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, GRID_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.roles import in_drawing_order, role_colors, short_name

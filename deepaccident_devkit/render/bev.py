@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, get_args
 
@@ -11,21 +11,32 @@ import numpy as np
 from deepaccident_devkit.arrays import ByteArray, FloatArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.geometry import SE3, Boxes, LidarPointCloud
+from deepaccident_devkit.geometry.boxes import concatenate
 from deepaccident_devkit.release import BevImage
 from deepaccident_devkit.release.bev_camera import TAGS
 from deepaccident_devkit.render.axes import axes_or_new, axis_words, check_view_range, set_title
 from deepaccident_devkit.render.boxes import draw_actors_from_above, write_beside
-from deepaccident_devkit.render.colors import AGENT_COLORS, BEV_COLORS, GRID_COLOR, OWN_COLOR, POINT_COLOR
+from deepaccident_devkit.render.chips import keep_free
+from deepaccident_devkit.render.colors import (
+    AGENT_COLORS,
+    BEV_COLORS,
+    CASING_COLOR,
+    COLLIDER_COLOR,
+    GRID_COLOR,
+    OWN_COLOR,
+    POINT_COLOR,
+)
 from deepaccident_devkit.render.layers import Layer, layers_of
-from deepaccident_devkit.render.legends import agent_handles, box_handles, draw_legend
+from deepaccident_devkit.render.legends import draw_legend, handles_from_above
 from deepaccident_devkit.render.missing import absence_text, has_cloud, is_there, missing_clouds_text, write_missing
-from deepaccident_devkit.render.roles import at_once, role_colors, short_name
+from deepaccident_devkit.render.roles import at_once, collider_ids, recorder_ids, role_colors, short_name
 from deepaccident_devkit.render.trails import draw_trails
-from deepaccident_devkit.taxonomy import BEV_CAMERA, AgentName, Frame
+from deepaccident_devkit.taxonomy import BEV_CAMERA, OWN_ACTOR_ID, AgentName, Frame
 from deepaccident_devkit.text import settle_choices
 from deepaccident_devkit.v2x import (
     Agents,
     Link,
+    PoseNoise,
     aggregate_point_cloud,
     cooperating_agents,
     cooperative_boxes,
@@ -45,6 +56,8 @@ _BEYOND: Final = 5.0
 """Metres outside the picture up to which a box may still reach into it."""
 _MARK: Final = np.array([[1.8, 0.0], [-1.2, 1.1], [-0.6, 0.0], [-1.2, -1.1]])
 """An arrow head, metres of an agent's ego frame."""
+_PALE: Final = 0.55
+"""How opaque agents' points are."""
 _MOST_PIXELS: Final = 400
 """Pixels along a side, about: panels of a video have fewer, and more take time."""
 
@@ -105,9 +118,9 @@ def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a 
 ) -> Axes:
     """Render a moment from above: boxes, LiDAR points and more, in one coordinate frame, metres.
 
-    The colliding pair is red, their companions green, the others coloured by category. The sample's own agent has a
-    dark mark, other agents have a mark in their colour and their name. If several agents' points are rendered, they
-    have their agents' colours.
+    The colliding pair is red, other recording vehicles have their agents' hues, all others a shade for their category.
+    Agents have a mark in their hue, the sample's own with a dark edge; several agents have names, and their points have
+    their hues. The title says what a link does, and how many sweeps there are.
 
     Args:
         dataset: the release.
@@ -140,9 +153,7 @@ def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a 
     names = cooperating_agents(dataset, sample, agents)
     ax = axes_or_new(ax, (6, 6.6))
     drawn = draw_bev(dataset, sample, view, chosen, ax)
-    handles = box_handles(drawn.colors)
-    if len(names) > 1:
-        handles += agent_handles(drawn.clouds)
+    handles = handles_from_above(drawn.colors, drawn.clouds if len(names) > 1 else ())
     draw_legend(ax, handles, columns=5, loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=5)
     return ax
 
@@ -178,21 +189,31 @@ def draw_bev(dataset: Dataset, sample: RowArgument, view: BevView, layers: froze
                 dataset, record, boxes, colors, target_from_world=target_from_world, seconds=view.seconds, ax=ax
             )
         draw_actors_from_above(boxes, ax, colors, layers)
+        if "boxes" in layers:
+            _name_pair(dataset, record, boxes, ax, named=names if len(names) > 1 else ())
         colored = frozenset(colors)
     shown = tuple(agent for agent, cloud in clouds.items() if cloud is not None and len(cloud))
     if "bev" in layers and not (has_ground or shown):
         absent.append(f"{BEV_CAMERA}: {absence_text(dataset, ground)}")
     _draw_marks(dataset, record, view.frame, names, ax)
-    _finish(record, view.frame, grid="grid" in layers, ax=ax)
+    _finish(record, view, grid="grid" in layers, ax=ax)
     write_missing(ax, "; ".join(filter(None, absent)))
     return DrawnBev(colors=colored, clouds=shown)
 
 
 def _boxes(dataset: Dataset, record: SampleRecord, view: BevView, names: Sequence[AgentName]) -> Boxes:
-    """The sample's own boxes with their label ids, or several agents' with CARLA's."""
+    """The sample's own boxes with their label ids, or several agents' with CARLA's.
+
+    The receiver knows its own place: no message moves its box.
+    """
     if list(names) == [record["agent"]]:
         return dataset.boxes(record, view.frame)
-    return cooperative_boxes(dataset, record, agents=names, frame=view.frame, link=view.link)
+    boxes = cooperative_boxes(dataset, record, agents=names, frame=view.frame, link=view.link)
+    own = dataset.get("agent", record["agent_token"])["actor_id"]
+    if view.link is None or own is None:
+        return boxes
+    true = cooperative_boxes(dataset, record, agents=names, frame=view.frame)
+    return concatenate([true.select(true.actor_id == own), boxes.select(boxes.actor_id != own)], view.frame)
 
 
 def _draw_clouds(
@@ -231,29 +252,71 @@ def _draw_marks(dataset: Dataset, record: SampleRecord, frame: str, names: Seque
     for agent in names:
         axes_from_ego = transform(dataset, record, at_once(record, agent), frame, "ego")
         heads.append(axes_from_ego.apply(np.column_stack([_MARK, np.zeros(len(_MARK))]))[:, :2])
-        colors.append(OWN_COLOR if agent == record["agent"] else AGENT_COLORS[agent])
+        colors.append(AGENT_COLORS[agent])
         if len(names) > 1:
             x, y = axes_from_ego.translation[:2].tolist()
             write_beside(ax, short_name(agent), (x, y), colors[-1])
-    ax.add_collection(PolyCollection(heads, facecolors=colors, edgecolors="white", linewidths=0.6, zorder=5))
+    edges = [OWN_COLOR if agent == record["agent"] else CASING_COLOR for agent in names]
+    ax.add_collection(PolyCollection(heads, facecolors=colors, edgecolors=edges, linewidths=0.8, zorder=5))
+    keep_free(ax, heads)
 
 
-def _finish(record: SampleRecord, frame: str, *, grid: bool, ax: Axes) -> None:
+def _name_pair(dataset: Dataset, record: SampleRecord, boxes: Boxes, ax: Axes, *, named: Collection[AgentName]) -> None:
+    """Write who collides: the agents that are not yet `named`, others by their category."""
+    agents = recorder_ids(dataset, record)
+    own = dataset.get("agent", record["agent_token"])["actor_id"]
+    colliders = collider_ids(dataset, record)
+    for row, actor in enumerate(np.where(boxes.actor_id == own, OWN_ACTOR_ID, boxes.actor_id).tolist()):
+        agent = agents.get(actor)
+        if actor in colliders and agent not in named:
+            x, y = boxes.center[row, :2].tolist()
+            write_beside(ax, boxes.category_names[row] if agent is None else short_name(agent), (x, y), COLLIDER_COLOR)
+
+
+def _finish(record: SampleRecord, view: BevView, *, grid: bool, ax: Axes) -> None:
     countdown = "" if record["time_to_impact"] is None else f", {record['time_to_impact']:.1f} s to the impact"
-    words = axis_words(frame)
+    words = axis_words(view.frame)
     ax.set(xlabel=words[0], ylabel=words[1])
-    set_title(ax, f"{record['agent']}, t = {record['timestamp']:.1f} s{countdown}", fontsize="medium")
+    shared = [] if view.link is None else [link_words(view.link)]
+    shared += [f"{view.sweeps} sweeps"] if view.sweeps > 1 else []
+    title = f"{record['agent']}, t = {record['timestamp']:.1f} s{countdown}"
+    set_title(ax, "\n".join(filter(None, [title, ", ".join(shared)])), fontsize="medium")
     ax.set_axisbelow(True)
     if grid:
         ax.grid(color=GRID_COLOR, linewidth=0.4)
 
 
+def link_words(link: Link) -> str:
+    """A link in words: `latency 0.2 s, poses off by 0.3 m (σ 0.02 m), 10 % of messages lost`."""
+    words = [f"latency {link.latency:g} s"]
+    noise = link.pose_noise
+    if isinstance(noise, PoseNoise):
+        words.append(f"poses off by {noise.mean:g} m (σ {noise.std:g} m)")
+        if noise.heading_std:
+            words.append(f"headings by σ {np.degrees(noise.heading_std):.1f}°")
+    if link.packet_loss:
+        words.append(f"{100 * link.packet_loss:g} % of messages lost")
+    return ", ".join(words)
+
+
 def draw_points_from_above(
     xyz: FloatArray, ax: Axes, *, center: FloatArray, view_range: float, color: str = POINT_COLOR
 ) -> None:
-    """Render the points (P, 3) within a square of ±`view_range` metres around `center` (2,), all in one colour."""
+    """Render the points (P, 3) within a square of ±`view_range` metres around `center` (2,), all in one colour.
+
+    Hues are paler than those of boxes, which lie over them.
+    """
     near = (np.abs(xyz[:, :2] - center) < view_range).all(axis=1)
-    ax.scatter(xyz[near, 0], xyz[near, 1], s=0.6, c=color, linewidths=0, rasterized=True, zorder=1)
+    ax.scatter(
+        xyz[near, 0],
+        xyz[near, 1],
+        s=0.6,
+        c=color,
+        alpha=None if color == POINT_COLOR else _PALE,
+        linewidths=0,
+        rasterized=True,
+        zorder=1,
+    )
 
 
 def draw_underlay(image: BevImage, ax: Axes, *, target_from_ego: SE3, view_range: float) -> None:

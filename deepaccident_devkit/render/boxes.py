@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray
+from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import Box, Boxes, PinholeCamera
-from deepaccident_devkit.render.colors import CATEGORY_COLORS
+from deepaccident_devkit.render.chips import SMALLEST_TEXT, keep_free, place_chips
+from deepaccident_devkit.render.colors import CASING_COLOR, CATEGORY_COLORS, CATEGORY_MARKERS, OWN_COLOR
 from deepaccident_devkit.render.layers import Layer
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID, UNTRACKED_ID
 
@@ -19,10 +20,12 @@ if TYPE_CHECKING:
 
 EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
 """The twelve edges of a box between its corners, in `Box.corners` order; the first four are its front."""
+SMALLEST_MARK = 6.0
+"""Points: the size of the mark of a small actor from above."""
+_KEY_SPEED = 10
+"""Metres a second of the arrow in a corner that gives the scale of the others."""
 NEAREST_DRAWN = 0.1
 """Metres in front of the camera at which edges are cut off."""
-SMALLEST_TEXT: Final = 7
-"""In points: text of this size can still be read in a notebook."""
 
 
 def draw_box(box: Box, ax: Axes, color: str | None = None) -> Axes:
@@ -49,24 +52,32 @@ def draw_boxes_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str], *, fill
         colors: one colour for each box.
         fill: how opaque the inside is, from 0 to 1.
         how: matplotlib's arguments for the outlines, such as `linestyle` or `linewidths`.
+
+    Pedestrians, cyclists and motorcycles also have their class's mark, which is not smaller in a large view.
     """
     _draw_footprints(boxes.center[:, :2], boxes.bottom_corners()[..., :2], ax, colors, fill, how)
+    _draw_small(boxes, ax, colors, filled=fill > 0)
 
 
 def draw_ids_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str]) -> None:
     """Write the label ids of tracked boxes beside them; the recording agent is `own`."""
-    for center, actor_id, color in zip(boxes.center.tolist(), boxes.actor_id.tolist(), colors, strict=True):
-        _write_id(ax, (center[0], center[1]), actor_id, color)
+    _write_ids(boxes.center[:, :2], boxes.actor_id, ax, colors)
 
 
 def draw_velocities_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str]) -> None:
-    """Render an arrow to where each box with a known velocity would be in a second."""
+    """Render an arrow to where each box with a known velocity would be in a second, and a key for their scale."""
     moving = _moving(boxes)
     if moving.any():
         center, velocity = boxes.center[moving], boxes.velocity[moving]
         chosen = [color for color, moves in zip(colors, moving.tolist(), strict=True) if moves]
         start, step = center[:, :2].T, velocity[:, :2].T
-        ax.quiver(*start, *step, color=chosen, angles="xy", scale_units="xy", scale=1, width=0.004, zorder=4)
+        how: Any = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.004, "zorder": 4}
+        arrows = ax.quiver(*start, *step, color=chosen, **how)
+        words = f"{_KEY_SPEED} m/s"
+        key = ax.quiverkey(
+            arrows, 0.85, 0.03, _KEY_SPEED, words, color=OWN_COLOR, fontproperties={"size": SMALLEST_TEXT}
+        )
+        key.text.set_bbox({"facecolor": CASING_COLOR, "edgecolor": "none", "pad": 1.5})
 
 
 def draw_actors_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str], layers: Collection[Layer]) -> None:
@@ -103,8 +114,7 @@ def draw_ids_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Seq
     top = boxes.corners()[:, (0, 1, 4, 5)].mean(axis=1)
     pixels, depth = camera.project(top)
     seen = camera.in_image(pixels, depth, min_depth=NEAREST_DRAWN)
-    for row in np.flatnonzero(seen).tolist():
-        _write_id(ax, (pixels[row, 0], pixels[row, 1]), int(boxes.actor_id[row]), colors[row])
+    _write_ids(pixels[seen], boxes.actor_id[seen], ax, [colors[row] for row in np.flatnonzero(seen).tolist()])
 
 
 def draw_velocities_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Sequence[str]) -> None:
@@ -147,8 +157,21 @@ def _draw_footprints(
     faces[:, 3] *= fill
     style = {"linewidths": 1.2, "zorder": 3, **how}
     ax.add_collection(PolyCollection(list(corners), facecolors=faces, edgecolors=list(colors), **style))
+    keep_free(ax, corners)
     headings = np.stack([centers, corners[:, :2].mean(axis=1)], axis=1)
     ax.add_collection(LineCollection(list(headings), colors=list(colors), **style))
+
+
+def _draw_small(boxes: Boxes, ax: Axes, colors: Sequence[str], *, filled: bool) -> None:
+    """The marks of classes that are too small to be found."""
+    from matplotlib.lines import Line2D
+
+    kinds = list(zip(boxes.category_names, colors, strict=True))
+    for name, color in sorted({kind for kind in kinds if kind[0] in CATEGORY_MARKERS}):
+        x, y = boxes.center[[kind == (name, color) for kind in kinds], :2].T
+        inside, edge = (color, CASING_COLOR) if filled else ("none", color)
+        style: Any = {"marker": CATEGORY_MARKERS[name], "markersize": SMALLEST_MARK, "zorder": 3.5}
+        ax.add_line(Line2D(x, y, linestyle="none", markerfacecolor=inside, markeredgecolor=edge, mew=0.7, **style))
 
 
 def _moving(boxes: Boxes) -> BoolArray:
@@ -156,26 +179,14 @@ def _moving(boxes: Boxes) -> BoolArray:
     return moving
 
 
-def _write_id(ax: Axes, place: tuple[float, float], actor_id: int, color: str) -> None:
-    if actor_id == UNTRACKED_ID:
-        return
-    words = "own" if actor_id == OWN_ACTOR_ID else str(actor_id)
-    write_beside(ax, words, place, color)
+def _write_ids(places: FloatArray, actor_ids: IntArray, ax: Axes, colors: Sequence[str]) -> None:
+    """Write the ids of tracked actors at places (N, 2): first those of hues, which are the accident's actors."""
+    shades = set(CATEGORY_COLORS.values())
+    order = sorted(np.flatnonzero(actor_ids != UNTRACKED_ID).tolist(), key=lambda row: colors[row] in shades)
+    words = ["own" if actor_ids[row] == OWN_ACTOR_ID else str(actor_ids[row]) for row in order]
+    place_chips(ax, zip(words, places[order], strict=True), colors=[colors[row] for row in order])
 
 
 def write_beside(ax: Axes, words: str, place: tuple[float, float], color: str) -> None:
-    """Write a few words just above a place in data coordinates, readable on any background; not outside the axes."""
-    from matplotlib.patheffects import withStroke
-
-    ax.annotate(
-        words,
-        place,
-        xytext=(2, 2),
-        textcoords="offset points",
-        color=color,
-        fontsize=SMALLEST_TEXT,
-        annotation_clip=True,
-        clip_on=True,
-        path_effects=[withStroke(linewidth=2, foreground="white")],
-        zorder=6,
-    )
+    """Write a few words near a place in data coordinates, on a chip whose edge has the colour; not outside the axes."""
+    place_chips(ax, [(words, place)], colors=[color])

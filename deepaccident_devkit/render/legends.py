@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-from deepaccident_devkit.render.colors import AGENT_COLORS, CATEGORY_COLORS, COLLIDER_COLOR, COMPANION_COLOR
+from deepaccident_devkit.render.colors import AGENT_COLORS, CATEGORY_COLORS, CATEGORY_MARKERS, COLLIDER_COLOR
 from deepaccident_devkit.render.roles import in_drawing_order, short_name
 
 if TYPE_CHECKING:
@@ -17,13 +17,16 @@ BESIDE: Final[Mapping[str, Any]] = {"loc": "upper left", "bbox_to_anchor": (1.01
 
 
 def box_handles(colors: Collection[str]) -> list[Artist]:
-    """A patch with its meaning for each of these colours of boxes."""
+    """What these colours of boxes mean: a patch for each, or the mark of a class of small actors."""
     from matplotlib.colors import to_rgba
     from matplotlib.patches import Patch
 
-    meanings = {"colliding pair": COLLIDER_COLOR, "companion": COMPANION_COLOR, **CATEGORY_COLORS}
+    agents = {short_name(agent): color for agent, color in AGENT_COLORS.items()}
+    meanings = {"colliding pair": COLLIDER_COLOR, **agents, **CATEGORY_COLORS}
     return [
-        Patch(label=name, facecolor=to_rgba(color, 0.25), edgecolor=color)
+        _mark(name, CATEGORY_MARKERS[name], color)
+        if name in CATEGORY_MARKERS
+        else Patch(label=name, facecolor=to_rgba(color, 0.25), edgecolor=color)
         for name, color in meanings.items()
         if color in colors
     ]
@@ -31,12 +34,19 @@ def box_handles(colors: Collection[str]) -> list[Artist]:
 
 def agent_handles(agents: Collection[str]) -> list[Artist]:
     """A dot for each agent, in the order of all pictures."""
+    return [_mark(short_name(agent), "o", AGENT_COLORS[agent]) for agent in in_drawing_order(agents)]
+
+
+def handles_from_above(colors: Collection[str], clouds: Collection[str]) -> list[Artist]:
+    """What the colours of boxes and of agents' clouds mean; an agent with a cloud is named once."""
+    known = {AGENT_COLORS[agent] for agent in clouds}
+    return [*box_handles(set(colors) - known), *agent_handles(clouds)]
+
+
+def _mark(label: str, marker: str, color: str) -> Artist:
     from matplotlib.lines import Line2D
 
-    return [
-        Line2D([], [], linestyle="none", marker="o", color=AGENT_COLORS[agent], label=short_name(agent))
-        for agent in in_drawing_order(agents)
-    ]
+    return Line2D([], [], linestyle="none", marker=marker, color=color, label=label)
 
 
 def draw_legend(where: Any, handles: Sequence[Artist], *, columns: int, **how: Any) -> None:

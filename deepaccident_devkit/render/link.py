@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -13,15 +13,15 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.render.axes import check_view_range, figure_or_new, set_title, settled, with_light_grid
-from deepaccident_devkit.render.bev import BevView, draw_bev
+from deepaccident_devkit.render.bev import BevView, draw_bev, link_words
 from deepaccident_devkit.render.boxes import draw_boxes_from_above, draw_ids_from_above
-from deepaccident_devkit.render.colors import AGENT_COLORS, OWN_COLOR, TRUE_PLACE_COLOR
+from deepaccident_devkit.render.chips import keep_free
+from deepaccident_devkit.render.colors import AGENT_COLORS, MUTED_COLOR, OWN_COLOR, TRUE_PLACE_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import draw_legend
 from deepaccident_devkit.render.roles import short_name
 from deepaccident_devkit.taxonomy import UNTRACKED_ID
 from deepaccident_devkit.v2x import Agents, Link, cooperating_agents, cooperative_boxes
-from deepaccident_devkit.v2x.link import PoseNoise
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -30,6 +30,16 @@ if TYPE_CHECKING:
 
 _LAYERS: Final[tuple[Layer, ...]] = ("points", "boxes", "ids", "grid")
 _SHOWN: Final[tuple[Layer, ...]] = ("points", "boxes", "grid")
+
+
+_DASHED: Final = (0, (2, 1))
+_RECEIVER: Final[Mapping[str, Any]] = {
+    "linestyle": "none",
+    "marker": "*",
+    "color": OWN_COLOR,
+    "markersize": 8,
+    "zorder": 5,
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -65,9 +75,9 @@ def render_link(
 ) -> Figure:
     """Render the effects of latency, wrong poses and losses on the data that partners share with a sample's agent.
 
-    The first panel has the partners' boxes: dashed at their true places, in the partner's colour at the received
-    places, with arrows between these places and the metres in the legend. The next panels have the agents' clouds,
-    without the link and with it.
+    Each partner has a panel with its boxes: dashed at their true places, in the partner's hue at the received places,
+    with arrows between these places and the metres in its title. The last panels have the agents' clouds, without the
+    link and with it.
 
     Args:
         dataset: the release.
@@ -92,20 +102,27 @@ def render_link(
     check_view_range(view_range)
     shared = shared_boxes(dataset, sample, link, agents)
     clouds = {"without the link": None, "with the link": link} if "points" in shown else {}
-    fig = figure_or_new(fig, (5.4 * (1 + len(clouds)), 6.2))
-    first, *others = fig.subplots(1, 1 + len(clouds), squeeze=False)[0]
-    first.set(xlim=(-view_range, view_range), ylim=(-view_range, view_range), aspect="equal")
-    first.set(xlabel="x forward (m)", ylabel="y left (m)", title="the partners' boxes")
-    handles = _draw_shared(shared, shown, first)
-    for ax, (words, there) in zip(others, clouds.items(), strict=True):
+    rows = min(2, len(shared))
+    columns = -(-len(shared) // rows)
+    fig = figure_or_new(fig, (4.2 * (columns + -(-len(clouds) // rows)) + 0.4, 4.4 * rows + 1.1))
+    axes = fig.subplots(rows, columns + -(-len(clouds) // rows), squeeze=False)
+    panels = [*axes[:, :columns].flat, *axes[:, columns:].flat]
+    for ax in panels[len(shared) : rows * columns]:
+        ax.set_axis_off()
+    for each, ax in zip(shared, panels, strict=False):
+        ax.set(xlim=(-view_range, view_range), ylim=(-view_range, view_range), aspect="equal")
+        ax.set(xlabel="x forward (m)", ylabel="y left (m)")
+        ax.set_title(_shift_words(each), fontsize="medium")
+        _draw_shared(each, shown, ax)
+    for ax, (words, there) in zip(panels[rows * columns :], clouds.items(), strict=True):
         view = BevView(view_range=view_range, agents=agents, link=there)
         draw_bev(dataset, sample, view, shown - {"boxes", "ids"}, ax)
-        ax.set_title(f"clouds {words}")
+        ax.set_title(f"clouds {words}", fontsize="medium")
         ax.set_anchor("C")
         if "boxes" in shown:
             truth = cooperative_boxes(dataset, sample, agents=agents, frame="ego")
             draw_boxes_from_above(truth, ax, [OWN_COLOR] * len(truth), fill=0.0, linewidths=0.7)
-    draw_legend(fig, handles, columns=min(3, 1 + len(clouds)), loc="outside lower center")
+    draw_legend(fig, _handles(), columns=4, loc="outside lower center")
     token = dataset.get("sample", sample)["token"]
     set_title(fig, f"{link_words(link)}\n{token}", fontsize=11)
     return settled(fig)
@@ -127,52 +144,40 @@ def shared_boxes(dataset: Dataset, sample: RowArgument, link: Link, agents: Agen
     ]
 
 
-def link_words(link: Link) -> str:
-    """A link in words: `latency 0.2 s, poses off by 0.3 m (σ 0.02 m), 10 % of messages lost`."""
-    words = [f"latency {link.latency:g} s"]
-    noise = link.pose_noise
-    if isinstance(noise, PoseNoise):
-        words.append(f"poses off by {noise.mean:g} m (σ {noise.std:g} m)")
-        if noise.heading_std:
-            words.append(f"headings by σ {np.degrees(noise.heading_std):.1f}°")
-    if link.packet_loss:
-        words.append(f"{100 * link.packet_loss:g} % of messages lost")
-    return ", ".join(words)
-
-
 def _tracked(boxes: Boxes) -> Boxes:
     return boxes.select(boxes.actor_id != UNTRACKED_ID)
 
 
-def _draw_shared(shared: list[SharedBoxes], shown: frozenset[Layer], ax: Axes) -> list[Artist]:
-    """Render the partners' boxes on axes; returns what the legend says."""
+def _draw_shared(shared: SharedBoxes, shown: frozenset[Layer], ax: Axes) -> None:
+    """Render a partner's boxes, and how far they are from their places."""
+    ax.plot(0, 0, **_RECEIVER)
+    keep_free(ax, [[(0.0, 0.0)]], margin=(-5, -5, 5, 5))
+    colors = [AGENT_COLORS[shared.agent]] * len(shared.received)
+    if "boxes" in shown:
+        true = [TRUE_PLACE_COLOR] * len(shared.true)
+        draw_boxes_from_above(shared.true, ax, true, fill=0, linestyle=_DASHED, linewidths=1)
+        draw_boxes_from_above(shared.received, ax, colors, fill=0.4, linewidths=1.2)
+    start, end = shared.shifts
+    if len(start):
+        how: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.006, "zorder": 4}
+        ax.quiver(*start.T, *(end - start).T, color=OWN_COLOR, **how)
+    if "ids" in shown:
+        draw_ids_from_above(shared.received, ax, colors)
+    if "grid" in shown:
+        with_light_grid(ax, "both")
+
+
+def _handles() -> list[Artist]:
+    """What the marks of the partners' panels mean."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    ax.plot(0, 0, "*", color=OWN_COLOR, markersize=10, zorder=5)
-    handles: list[Artist] = [
-        Line2D([], [], linestyle="none", marker="*", color=OWN_COLOR, markersize=8, label="receiver"),
+    return [
+        Line2D([], [], label="receiver", **_RECEIVER),
         Patch(facecolor="none", edgecolor=TRUE_PLACE_COLOR, linestyle="--", label="where they truly are"),
+        Patch(facecolor=(MUTED_COLOR, 0.4), edgecolor=MUTED_COLOR, label="where they arrive, in the partner's hue"),
+        Line2D([], [], linestyle="none", marker="$\\rightarrow$", color=OWN_COLOR, markersize=12, label="the error"),
     ]
-    for each in shared:
-        color = AGENT_COLORS[each.agent]
-        if "boxes" in shown:
-            dashed = (0, (2, 1))
-            draw_boxes_from_above(
-                each.true, ax, [TRUE_PLACE_COLOR] * len(each.true), fill=0, linestyle=dashed, linewidths=1
-            )
-            draw_boxes_from_above(each.received, ax, [color] * len(each.received), fill=0.15, linewidths=1.2)
-        if "ids" in shown:
-            draw_ids_from_above(each.received, ax, [color] * len(each.received))
-        start, end = each.shifts
-        if len(start):
-            ax.quiver(
-                *start.T, *(end - start).T, color=color, angles="xy", scale_units="xy", scale=1, width=0.004, zorder=4
-            )
-        handles.append(Patch(facecolor=(color, 0.15), edgecolor=color, label=_shift_words(each)))
-    if "grid" in shown:
-        with_light_grid(ax, "both")
-    return handles
 
 
 def _shift_words(shared: SharedBoxes) -> str:
@@ -183,4 +188,4 @@ def _shift_words(shared: SharedBoxes) -> str:
     if not len(start):
         return f"{name}: no box in common"
     apart = np.linalg.norm(end - start, axis=1)
-    return f"{name}: {len(apart)} boxes off by {apart.mean():.2f} m, at most {apart.max():.2f} m"
+    return f"{name}: {len(apart)} boxes off by {apart.mean():.2f} m,\nat most {apart.max():.2f} m"

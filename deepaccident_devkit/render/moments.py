@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.render.axes import figure_or_new, set_title
@@ -11,8 +13,8 @@ from deepaccident_devkit.render.bev import BEV_DEFAULT, BEV_LAYERS, BevView, dra
 from deepaccident_devkit.render.camera import CAMERA_DEFAULT, CAMERA_LAYERS, draw_camera
 from deepaccident_devkit.render.colors import CATEGORY_COLORS
 from deepaccident_devkit.render.layers import LAYERS, Layer, layers_of
-from deepaccident_devkit.render.legends import agent_handles, box_handles, draw_legend
-from deepaccident_devkit.render.roles import at_once, in_drawing_order
+from deepaccident_devkit.render.legends import box_handles, draw_legend, handles_from_above
+from deepaccident_devkit.render.roles import at_once, in_drawing_order, short_name
 from deepaccident_devkit.taxonomy import CAMERAS
 from deepaccident_devkit.v2x import Agents, Link, cooperating_agents
 
@@ -36,6 +38,10 @@ _WIDE: Final = 2.1
 _VIEW_RANGE: Final = 50.0
 """Metres to each side of an agent if there are several; in a tall figure more to its left and right."""
 _TALLEST: Final = 2.0
+_LEAST_SHARED, _AROUND_SHARED = 30.0, 12.0
+"""Metres: the least reach of a view that agents share, and what it shows around them."""
+_MOST_CAMERAS: Final = 0.66
+"""Of the width, for cameras beside a shared view."""
 _LEGEND_ENTRY: Final = 1.1
 """Inches of an entry of the legend, about."""
 _BESIDE, _ABOUT = 0.9, 1.6
@@ -83,9 +89,7 @@ def render_sample(
         draw_camera(dataset, dataset.get("sample_data", f"{record['token']}/{channel}"), in_cameras, axes[channel])
     drawn = draw_bev(dataset, record, BevView(agents=names, link=link), from_above, axes["bev"])
     axes["bev"].set_title("")
-    handles = box_handles(drawn.colors)
-    if len(names) > 1:
-        handles += agent_handles(drawn.clouds)
+    handles = handles_from_above(drawn.colors, drawn.clouds if len(names) > 1 else ())
     draw_legend(fig, handles, columns=len(handles), loc="outside lower center")
     set_title(fig, _heading(record["token"], record))
     return fig
@@ -101,7 +105,7 @@ def render_frame(
 ) -> Figure:
     """Render the front views of a moment's agents, and each one's boxes and LiDAR from above, side by side.
 
-    The colliding pair is red and their companions green, as in the paper.
+    The colliding pair is red, other recording vehicles have their agents' hues, all others a shade for their category.
 
     Args:
         dataset: the release.
@@ -144,6 +148,51 @@ def render_frame(
     draw_legend(fig, box_handles(drawn), columns=columns, loc="outside lower center")
     set_title(fig, _heading(f"{record['token']}, t = {record['timestamp']:.1f} s", record))
     return fig
+
+
+def draw_shared_moment(
+    dataset: Dataset,
+    frame: RowArgument,
+    names: Sequence[str],
+    layers: Iterable[Layer] | None,
+    fig: Figure,
+) -> None:
+    """Render the front views of agents beside one view from above that they share, in world, as wide as they need.
+
+    Args:
+        dataset: the release.
+        frame: token or record.
+        names: the agents; boxes and points from above are all of theirs.
+        layers: as in `render_frame`.
+        fig: an empty figure to render on; about 16 to 9, or wider.
+
+    Raises:
+        ChoiceError: no such layer.
+    """
+    in_cameras, from_above = panel_layers(layers)
+    record = dataset.get("frame", frame)
+    moments = [at_once(dataset.samples_of(record)[0], agent) for agent in names]
+    width, height = fig.bbox.width / fig.dpi, fig.bbox.height / fig.dpi
+    rows = min(2 if width > _WIDE * height else 3, len(names))
+    columns = -(-len(names) // rows)
+    camera_width = (height - _ABOUT) / rows * 16 / 9
+    share = min(columns * camera_width, _MOST_CAMERAS * width)
+    grid = fig.add_gridspec(rows, columns + 1, width_ratios=(width - share, *[share / columns] * columns))
+    for number, (agent, moment) in enumerate(zip(names, moments, strict=True)):
+        ax = fig.add_subplot(grid[number // columns, 1 + number % columns])
+        draw_camera(dataset, dataset.get("sample_data", f"{moment}/Camera_Front"), in_cameras, ax)
+        ax.set_title(short_name(agent), fontsize="medium")
+    places = np.array([dataset.world_from(moment, "ego").translation[:2] for moment in moments])
+    low, high = places.min(axis=0), places.max(axis=0)
+    reach = max(_LEAST_SHARED, float((high - low).max()) / 2 + _AROUND_SHARED)
+    x, y = ((low + high) / 2).tolist()
+    view = BevView(view_range=reach, frame="world", agents=tuple(names), center=(x, y))
+    above = fig.add_subplot(grid[:, 0])
+    drawn = draw_bev(dataset, moments[0], view, from_above, above)
+    above.set(title="", anchor="C")
+    handles = handles_from_above(drawn.colors, drawn.clouds if len(names) > 1 else ())
+    draw_legend(fig, handles, columns=max(1, int(width / _LEGEND_ENTRY)), loc="outside lower center")
+    set_title(fig, _heading(f"{record['token']}, t = {record['timestamp']:.1f} s", record))
 
 
 def panel_layers(layers: Iterable[Layer] | None) -> tuple[frozenset[Layer], frozenset[Layer]]:

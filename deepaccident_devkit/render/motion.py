@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from typing import TYPE_CHECKING, Final, Literal, get_args
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
@@ -13,7 +13,7 @@ from deepaccident_devkit.render.axes import axes_or_new, figure_or_new, set_titl
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.motion_cells import draw_key, draw_map_of, draw_trail_of
 from deepaccident_devkit.render.motion_maps import MAPS, DrawnMap, MotionMaps, maps_of_labels, maps_of_output
-from deepaccident_devkit.render.roles import collider_ids
+from deepaccident_devkit.render.roles import collider_ids, recorder_ids
 from deepaccident_devkit.text import choice
 
 if TYPE_CHECKING:
@@ -66,7 +66,8 @@ def render_motion_labels(
     labels = motion_labels(dataset, sample, config)
     if at_present:
         labels = labels.to_present()
-    fig = draw_motion_labels(labels, marked=collider_ids(dataset, sample), style=style, layers=layers, fig=fig)
+    pair, agents = collider_ids(dataset, sample), recorder_ids(dataset, sample)
+    fig = draw_motion_labels(labels, marked=pair, agents=agents, style=style, layers=layers, fig=fig)
     set_title(fig, dataset.get("sample", sample)["token"])
     return settled(fig) if style == "trail" else fig
 
@@ -75,6 +76,7 @@ def draw_motion_labels(
     labels: MotionLabels,
     *,
     marked: Collection[int] = (),
+    agents: Mapping[int, str] | None = None,
     style: MotionStyle = "maps",
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
@@ -84,6 +86,7 @@ def draw_motion_labels(
     Args:
         labels: warped to the present or not; they are rendered as they are.
         marked: label ids.
+        agents: label ids of recording vehicles and their agents, whose hues they have.
         style: `maps` or `trail`.
         layers: as in `render_motion_labels`.
         fig: an empty figure to render on; a new one if None.
@@ -94,7 +97,7 @@ def draw_motion_labels(
     Raises:
         ChoiceError: no such style or layer, or a trail of frames that are not at the present.
     """
-    return _draw(maps_of_labels(labels, marked), style, layers, fig)
+    return _draw(maps_of_labels(labels, marked, agents), style, layers, fig)
 
 
 def draw_motion_output(

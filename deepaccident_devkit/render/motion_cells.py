@@ -8,15 +8,26 @@ import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, FloatArray
 from deepaccident_devkit.render.axes import with_light_grid
-from deepaccident_devkit.render.colors import BEYOND_COLOR, COLLIDER_COLOR, OWN_COLOR
+from deepaccident_devkit.render.chips import place_chips
+from deepaccident_devkit.render.colors import (
+    AGENT_COLORS,
+    BEYOND_COLOR,
+    CENTERNESS_COLORMAP,
+    COLLIDER_COLOR,
+    DIRECTION_COLORS,
+    OWN_COLOR,
+)
 from deepaccident_devkit.render.layers import Layer
 from deepaccident_devkit.render.motion_maps import DrawnMap, MotionMaps
+from deepaccident_devkit.render.roles import short_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 PALEST: Final = 0.22
 """How opaque the last frame of a trail is; the present is 1."""
+_STILL: Final = 0.92
+"""Grey of what does not move."""
 
 
 def draw_map_of(maps: MotionMaps, name: DrawnMap, frame: int, shown: frozenset[Layer], ax: Axes) -> Axes:
@@ -30,6 +41,8 @@ def draw_map_of(maps: MotionMaps, name: DrawnMap, frame: int, shown: frozenset[L
         _draw_picture(maps, name, frame, ax)
     if name == "flow" and "velocities" in shown:
         _draw_arrows(maps, frame, ax)
+    if name == "flow" and maps.instance[frame].any() and np.isnan(maps.vectors("flow")[frame]).all():
+        ax.text(0.5, 0.5, "no next frame", ha="center", va="center", transform=ax.transAxes)
     return _with_ids_and_grid(maps, frame, shown, ax)
 
 
@@ -65,7 +78,9 @@ def draw_key(maps: MotionMaps, name: DrawnMap, ax: Axes) -> None:
         from matplotlib.cm import ScalarMappable
         from matplotlib.colors import Normalize
 
-        ax.figure.colorbar(ScalarMappable(Normalize(0, 1), "magma"), cax=ax.inset_axes((0.1, 0.15, 0.15, 0.7)))
+        ax.figure.colorbar(
+            ScalarMappable(Normalize(0, 1), CENTERNESS_COLORMAP), cax=ax.inset_axes((0.1, 0.15, 0.15, 0.7))
+        )
     else:
         side = np.linspace(-1, 1, 101)
         along, left = np.meshgrid(side, side)
@@ -78,11 +93,13 @@ def draw_key(maps: MotionMaps, name: DrawnMap, ax: Axes) -> None:
 
 def direction_colors(left: AnyArray, along: AnyArray, *, longest: float) -> AnyArray:
     """(H, W, 3) a colour for the direction of vectors (left, forward), paler for shorter ones."""
-    from matplotlib.colors import hsv_to_rgb
+    from matplotlib.colors import to_rgb
 
-    hue = (np.arctan2(left, along) / (2 * np.pi)) % 1
+    corners = np.array([to_rgb(color) for color in (*DIRECTION_COLORS, DIRECTION_COLORS[0])])
+    turn = np.arctan2(left, along) / (2 * np.pi) % 1 * len(DIRECTION_COLORS)
+    full = np.stack([np.interp(turn, range(len(corners)), each) for each in corners.T], axis=-1)
     strength = np.minimum(np.hypot(left, along) / longest, 1)
-    return hsv_to_rgb(np.stack([hue, strength, np.full(hue.shape, 0.92)], axis=-1))
+    return _STILL - strength[..., None] * (_STILL - full)
 
 
 def _draw_picture(maps: MotionMaps, name: DrawnMap, frame: int, ax: Axes) -> None:
@@ -91,7 +108,7 @@ def _draw_picture(maps: MotionMaps, name: DrawnMap, frame: int, ax: Axes) -> Non
         _edge_own(maps, frame, ax)
     elif name == "centerness":
         if maps.centerness is not None:
-            _draw_cells(ax, maps.centerness[frame], maps, cmap="magma", vmin=0, vmax=1)
+            _draw_cells(ax, maps.centerness[frame], maps, cmap=CENTERNESS_COLORMAP, vmin=0, vmax=1)
     else:
         vectors = maps.vectors(name)[frame]
         colors = direction_colors(*np.nan_to_num(vectors), longest=maps.longest(name))
@@ -140,8 +157,8 @@ def _with_ids_and_grid(maps: MotionMaps, frame: int, shown: frozenset[Layer], ax
         x, y = _cell_centers(maps)
         for identity in np.unique(maps.instance[frame][maps.instance[frame] > 0]).tolist():
             row, column = np.nonzero(maps.instance[frame] == identity)
-            place = x[column].mean(), y[row].max()
-            ax.annotate(str(identity), place, (0, 2), textcoords="offset points", fontsize=7, ha="center", clip_on=True)
+            low, high = (x[column.min()], y[row.min()]), (x[column.max()], y[row.max()])
+            place_chips(ax, [(str(identity), (x[column].mean(), y[row].mean()))], avoid=[[low, high]])
     return with_light_grid(ax, "both") if "grid" in shown else ax
 
 
@@ -151,11 +168,12 @@ def _draw_cells(ax: Axes, picture: AnyArray, maps: MotionMaps, **how: Any) -> No
 
 
 def _draw_instance_key(maps: MotionMaps, ax: Axes) -> None:
-    from matplotlib.colors import to_rgb
+    from matplotlib.colors import to_hex
     from matplotlib.patches import Patch
 
-    red = np.isclose(maps.colors, to_rgb(COLLIDER_COLOR)).all(axis=1).any()
-    handles = [Patch(label="colliding pair", facecolor=COLLIDER_COLOR)] if red else []
+    drawn = {to_hex(color) for color in maps.colors}
+    meanings = {"colliding pair": COLLIDER_COLOR} | {short_name(name): hue for name, hue in AGENT_COLORS.items()}
+    handles = [Patch(label=name, facecolor=color) for name, color in meanings.items() if color in drawn]
     if maps.own > 0:
         handles.append(Patch(label="own box", facecolor="none", edgecolor=OWN_COLOR, linewidth=1.5))
     if handles:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
@@ -21,13 +21,11 @@ from deepaccident_devkit.motion import (
     predict_instances,
 )
 from deepaccident_devkit.motion.orientations import to_orientation
-from deepaccident_devkit.render.colors import COLLIDER_COLOR, OWN_COLOR
+from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, INSTANCE_COLORS, OWN_COLOR
 from deepaccident_devkit.taxonomy import FRAME_PERIOD, OWN_ACTOR_ID
 
 DrawnMap = Literal["instance", "centerness", "offset", "flow"]
 MAPS: Final[tuple[DrawnMap, ...]] = get_args(DrawnMap)
-_PALETTE: Final = (0, 1, 2, 3, 8, 9, 10, 11, 12, 13, 16, 17, 18, 19)
-"""Colours of matplotlib's tab20, without its greens, reds and greys: these have a meaning here."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -83,8 +81,10 @@ class MotionMaps(FrozenArrays):
         return instance_paths(self.instance[self.valid], self.grid) if self.valid[0] else {}
 
 
-def maps_of_labels(labels: MotionLabels, marked: Collection[int] = ()) -> MotionMaps:
-    """Labels as they are rendered; actors whose label ids are `marked` (the ego itself: −100) are red."""
+def maps_of_labels(
+    labels: MotionLabels, marked: Collection[int] = (), agents: Mapping[int, str] | None = None
+) -> MotionMaps:
+    """Labels as they are rendered; `marked` actors are red, `agents` have their hues (both by label ids)."""
     source, ignore = labels.config.grid.orientation, labels.config.ignore_index
     valid = labels.label_valid
 
@@ -103,7 +103,7 @@ def maps_of_labels(labels: MotionLabels, marked: Collection[int] = ()) -> Motion
         at_present=labels.at_present,
         valid=valid,
         instance=instance,
-        colors=_label_colors(labels, instance, marked),
+        colors=_label_colors(labels, instance, marked, agents or {}),
         own=labels.id_map.get(OWN_BOX_ID, -1),
         centerness=lying("centerness")[:, 0],
         offset=offset,
@@ -173,25 +173,27 @@ def _head_maps(heads: MotionHeads, instance: AnyArray) -> dict[str, AnyArray]:
     return {"centerness": lying.centerness[:, 0], "offset": offset, "flow": flow}
 
 
-def _label_colors(labels: MotionLabels, instance: AnyArray, marked: Collection[int]) -> FloatArray:
-    """The palette with red for marked actors, and a dark colour for the ego's own box if it is not marked."""
+def _label_colors(
+    labels: MotionLabels, instance: AnyArray, marked: Collection[int], agents: Mapping[int, str]
+) -> FloatArray:
+    """The palette with red for marked actors, agents' hues, and a dark colour for an own box that has neither."""
     from matplotlib.colors import to_rgb
 
     highest = max([int(instance.max(initial=0)), *labels.id_map.values()])
     named = {OWN_ACTOR_ID if actor == OWN_BOX_ID else actor: identity for actor, identity in labels.id_map.items()}
     colors = _palette(highest, [identity for actor, identity in named.items() if actor in marked])
-    if OWN_ACTOR_ID in named and OWN_ACTOR_ID not in marked:
-        colors[named[OWN_ACTOR_ID]] = to_rgb(OWN_COLOR)
+    hues = {OWN_ACTOR_ID: OWN_COLOR} | {actor: AGENT_COLORS[agent] for actor, agent in agents.items()}
+    for actor in hues.keys() & named.keys() - {*marked}:
+        colors[named[actor]] = to_rgb(hues[actor])
     return colors
 
 
 def _palette(highest: int, marked: Collection[int]) -> FloatArray:
     """(1 + ids, 3) white for the background, a colour of the palette for each id, red for some."""
-    from matplotlib import colormaps
     from matplotlib.colors import to_rgb
 
-    palette = colormaps["tab20"]
-    colors = np.array([palette(_PALETTE[number % len(_PALETTE)])[:3] for number in range(1 + highest)])
+    shades = [to_rgb(color) for color in INSTANCE_COLORS]
+    colors = np.array([shades[number % len(shades)] for number in range(1 + highest)])
     colors[0] = 1.0
     for identity in marked:
         if 0 < identity <= highest:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Final, get_args
+from collections.abc import Collection, Iterable
+from typing import TYPE_CHECKING, Any, Final, get_args
 
 import numpy as np
 
@@ -12,13 +12,12 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.render.axes import axes_or_new, axis_words, check_view_range, set_title, with_light_grid
 from deepaccident_devkit.render.bev import draw_points_from_above
 from deepaccident_devkit.render.boxes import (
-    SMALLEST_TEXT,
     draw_boxes_from_above,
     draw_ids_from_above,
     draw_velocities_from_above,
-    write_beside,
 )
-from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, COMPANION_COLOR, GRID_COLOR, MUTED_COLOR
+from deepaccident_devkit.render.chips import SMALLEST_TEXT, keep_free, place_chips
+from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, GRID_COLOR, MUTED_COLOR, OWN_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import agent_handles, draw_legend
 from deepaccident_devkit.render.missing import has_cloud, missing_clouds_text, write_missing
@@ -39,8 +38,12 @@ _LEAST: Final = 25.0
 """At least so many metres are shown to each side."""
 _SLOT: Final = 4.6
 """Points from one agent's dot to the next."""
-_ABOVE: Final = 10.0
-"""Points from an actor's centre up to its dots."""
+_ABOVE: Final = 5.0
+"""Points from an actor's box up to its dots."""
+_ASIDE: Final = 0.006
+"""Of the width of the view that a line lies to the right of its way, so that two that look at each other have two."""
+_EDGE: Final = 0.05
+"""Of half the view, between its edge and a box that has made it larger."""
 _MOST_ROWS: Final = 24
 _BRIGHT: Final = 0.3
 """Relative luminance (as in sRGB) of a colour from which black text on it is easier to read."""
@@ -58,9 +61,9 @@ def render_visibility(
 ) -> Axes:
     """Render who sees whom, from above: each actor has a dot for each agent that sees it by the released rule.
 
-    A dot has its agent's colour and its own place in the row, and lines go from the agents to those of the colliding
-    pair that they see. The accident's actors that the sample's agent does not see are dashed, and for the colliding
-    pair words say so.
+    A dot has its agent's colour and its own place in the row, and lines go from the agents (stars) to those of the
+    colliding pair that they see. The sample's agent has a circle. The accident's actors that it does not see are
+    dashed, and for the colliding pair words say so.
 
     Args:
         dataset: the release.
@@ -68,7 +71,7 @@ def render_visibility(
         agents: the agents that look: names, a configuration or its name as seen from the ego; None for all that are
             there.
         frame: `ego`, `lidar` or `world`.
-        view_range: metres to each side of the ego; None shows all agents and the colliding pair.
+        view_range: metres to each side of the ego; None shows all agents, the colliding pair, and who is among them.
         layers: `boxes`, `visibility` (dots, lines, words) and `grid` are the default; also `points` (the LiDAR of the
             agents that look), `ids` and `velocities`.
         ax: axes to render on; new ones if None.
@@ -102,14 +105,14 @@ def render_visibility(
         draw_boxes_from_above(unseen, ax, _chosen(colors, hidden), fill=0.0, linestyle=(0, (2, 1)), linewidths=2.0)
     if "velocities" in shown:
         draw_velocities_from_above(known.boxes, ax, colors)
-    if "ids" in shown:
-        draw_ids_from_above(known.boxes, ax, colors)
     if "visibility" in shown:
         _draw_sight_lines(known, ax)
         _draw_dots(known, ax)
-        _write_hidden(known, hidden, colors, ax)
+        _write_hidden(known, hidden, ax)
+    if "ids" in shown:
+        draw_ids_from_above(known.boxes, ax, colors)
     _draw_agents(known, ax)
-    _draw_legend(known, hidden, ax)
+    _draw_legend(known, hidden, shown, ax)
     return with_light_grid(ax, "both") if "grid" in shown else ax
 
 
@@ -119,8 +122,8 @@ def render_visibility_matrix(
     """Render who sees whom as a table: one row for each actor, one column for each agent.
 
     A filled cell means that the agent sees the actor, an empty one that it does not. The number is the agent's LiDAR
-    points in the box; if its label lacks the actor, there is no cell. The colliding pair comes first, then the agents,
-    then the actors that most agents see.
+    points in the box; if its label lacks the actor, there is a dash. A key below says so. The colliding pair comes
+    first, then the agents, then the actors that most agents see.
 
     Args:
         dataset: the release.
@@ -147,15 +150,15 @@ def render_visibility_matrix(
     words = [f"{names[row]} {known.boxes.actor_id[row]}" for row in shown.tolist()]
     ax.set_yticks(range(len(shown)), words, fontsize=8)
     for label, row in zip(ax.get_yticklabels(), shown.tolist(), strict=True):
-        label.set_color(_word_color(known, row))
+        label.set_color(COLLIDER_COLOR if known.collides[row] else OWN_COLOR)
     ax.set_xticks(range(len(columns)), [short_name(agent).replace(" ", "\n") for agent in columns], fontsize=8)
     ax.xaxis.tick_top()
     ax.set(xlim=(-0.5, len(columns) - 0.5), ylim=(max(len(shown), 1) - 0.5, -0.5))
     ax.tick_params(length=0)
     ax.spines[:].set_visible(False)
     more = len(rows) - len(shown)
-    below = f"numbers: LiDAR points{f'; {more} more actors' if more else ''}"
-    ax.set_xlabel(below, fontsize=8)
+    key = "filled: the agent sees the actor; number: its LiDAR points (0: none)\n–: not in the agent's label"
+    ax.set_xlabel(f"{key}{f'; {more} more actors' if more else ''}", fontsize=8)
     ax.set_title(_title(dataset, known), fontsize=9)
     return ax
 
@@ -173,10 +176,18 @@ def _view(known: Sights, view_range: float | None) -> tuple[FloatArray, FloatArr
         column = known.agents.index(known.ego) if known.ego in known.agents else 0
         middle, half = known.place[column], view_range
     else:
-        places = np.concatenate([known.place, known.boxes.center[known.collides | known.records, :2]])
-        low, high = places.min(axis=0), places.max(axis=0)
-        middle, half = (low + high) / 2, max(_LEAST, float((high - low).max()) / 2 + _MARGIN)
+        corners = known.boxes.bottom_corners()[..., :2]
+        middle, half = _square_about(np.concatenate([known.place, *corners[known.collides | known.records]]), _MARGIN)
+        among = (np.abs(corners - middle) < half).all(axis=-1).any(axis=-1)  # none of them is cut
+        whole = np.concatenate([[middle - half, middle + half], *corners[among]])
+        middle, half = _square_about(whole, _EDGE * half * (np.abs(whole - middle).max() > half))
     return middle - half, middle + half
+
+
+def _square_about(places: FloatArray, margin: float) -> tuple[FloatArray, float]:
+    """The middle (2,) and half the side of a square around places (P, 2)."""
+    low, high = places.min(axis=0), places.max(axis=0)
+    return (low + high) / 2, max(_LEAST, float((high - low).max()) / 2 + margin)
 
 
 def _draw_points(dataset: Dataset, known: Sights, frame: str, ax: Axes) -> None:
@@ -197,8 +208,11 @@ def _draw_sight_lines(known: Sights, ax: Axes) -> None:
 
     row, column = np.nonzero(known.seen & known.collides[:, None])
     lines = np.stack([known.place[column], known.boxes.center[row, :2]], axis=1)
+    way = lines[:, 1] - lines[:, 0]
+    right = np.column_stack([way[:, 1], -way[:, 0]]) / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
+    lines += (right * _ASIDE * np.ptp(ax.get_xlim()))[:, None]
     colors = [AGENT_COLORS[known.agents[each]] for each in column.tolist()]
-    ax.add_collection(LineCollection(list(lines), colors=colors, linewidths=0.9, alpha=0.8, zorder=2))
+    ax.add_collection(LineCollection(list(lines), colors=colors, linewidths=1.2, alpha=0.8, zorder=2))
 
 
 def _draw_dots(known: Sights, ax: Axes) -> None:
@@ -206,8 +220,11 @@ def _draw_dots(known: Sights, ax: Axes) -> None:
 
     order = in_drawing_order(known.agents)
     inches = ax.figure.dpi_scale_trans
+    tops = np.column_stack([known.boxes.center[:, 0], known.boxes.bottom_corners()[..., 1].max(axis=1)])
+    side = len(order) / 2 * _SLOT
+    keep_free(ax, tops[known.seen.any(axis=1), None], margin=(-side, 0.0, side, 2 * _ABOVE))
     for slot, agent in enumerate(order):
-        x, y, _ = known.boxes.center[known.seen[:, known.agents.index(agent)]].T
+        x, y = tops[known.seen[:, known.agents.index(agent)]].T
         beside = ScaledTranslation((slot - (len(order) - 1) / 2) * _SLOT / 72, _ABOVE / 72, inches)
         ax.scatter(
             x,
@@ -222,10 +239,12 @@ def _draw_dots(known: Sights, ax: Axes) -> None:
         )
 
 
-def _write_hidden(known: Sights, hidden: BoolArray, colors: list[str], ax: Axes) -> None:
-    for row in np.flatnonzero(hidden & known.collides).tolist():
-        x, y = known.boxes.center[row, :2].tolist()
-        write_beside(ax, f"{short_name(known.ego)} cannot see", (x, y - known.boxes.size[row, 0] / 2 - 1), colors[row])
+def _write_hidden(known: Sights, hidden: BoolArray, ax: Axes) -> None:
+    chips = [
+        (f"{short_name(known.ego)} cannot see", known.boxes.center[row, :2].tolist())
+        for row in np.flatnonzero(hidden & known.collides).tolist()
+    ]
+    place_chips(ax, chips, colors=[COLLIDER_COLOR] * len(chips))
 
 
 def _draw_agents(known: Sights, ax: Axes) -> None:
@@ -237,20 +256,28 @@ def _draw_agents(known: Sights, ax: Axes) -> None:
         ax.plot(x, y, "o", markersize=15, fillstyle="none", color=AGENT_COLORS[known.ego], zorder=5)
 
 
-def _draw_legend(known: Sights, hidden: BoolArray, ax: Axes) -> None:
+def _draw_legend(known: Sights, hidden: BoolArray, shown: Collection[Layer], ax: Axes) -> None:
+    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    handles = agent_handles(known.agents)
+    handles, ego = agent_handles(known.agents), short_name(known.ego)
     if known.pair:
         handles.append(Patch(facecolor="none", edgecolor=COLLIDER_COLOR, label="colliding pair"))
+    mark: dict[str, Any] = {"linestyle": "none", "color": MUTED_COLOR}
+    handles.append(Line2D([], [], marker="*", markersize=8, label="an agent", **mark))
+    if known.ego in known.agents:
+        handles.append(Line2D([], [], marker="o", markersize=9, fillstyle="none", label=f"whose view: {ego}", **mark))
+    if "visibility" in shown and known.pair:
+        handles.append(Line2D([], [], color=MUTED_COLOR, linewidth=1.2, label="sees one of the pair"))
     if hidden.any():
-        words = f"{short_name(known.ego)} cannot see"
-        handles.append(Patch(facecolor="none", edgecolor="black", linestyle="--", label=words))
+        handles.append(Patch(facecolor="none", edgecolor=OWN_COLOR, linestyle="--", label=f"{ego} cannot see"))
     place = {"loc": "upper center", "bbox_to_anchor": (0.5, 0), "borderaxespad": 5}
     draw_legend(ax, handles, columns=4, title="dots above an actor: who sees it", title_fontsize=8, **place)
 
 
 def _draw_column(known: Sights, rows: IntArray, agent: str, column: int, ax: Axes) -> None:
+    from matplotlib.patches import Rectangle
+
     source = known.agents.index(agent)
     for place, row in enumerate(rows.tolist()):
         seen, own = bool(known.seen[row, source]), bool(known.own[row, source])
@@ -258,7 +285,7 @@ def _draw_column(known: Sights, rows: IntArray, agent: str, column: int, ax: Axe
             ax.text(column, place, "itself" if own else "–", ha="center", va="center", fontsize=8, color=MUTED_COLOR)
             continue
         face, edge = (AGENT_COLORS[agent],) * 2 if seen else ("none", GRID_COLOR)
-        ax.scatter(column, place, s=260, marker="s", facecolors=face, edgecolors=edge)
+        ax.add_patch(Rectangle((column - 0.3, place - 0.4), 0.6, 0.8, facecolor=face, edgecolor=edge))
         ink = _legible_on(AGENT_COLORS[agent]) if seen else MUTED_COLOR
         ax.text(
             column, place, f"{known.points[row, source]}", ha="center", va="center", fontsize=SMALLEST_TEXT, color=ink
@@ -271,12 +298,6 @@ def _legible_on(color: str) -> str:
 
     luminance = np.dot(np.power(to_rgb(color), 2.2), (0.2126, 0.7152, 0.0722))
     return "black" if luminance > _BRIGHT else "white"
-
-
-def _word_color(known: Sights, row: int) -> str:
-    if known.collides[row]:
-        return COLLIDER_COLOR
-    return COMPANION_COLOR if known.pair and known.records[row] else "black"
 
 
 def _chosen(colors: list[str], which: BoolArray) -> list[str]:

@@ -12,7 +12,7 @@ from selenium.webdriver.common.keys import Keys
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import Accident, box_truth
-from deepaccident_devkit.render.colors import COLLIDER_COLOR, COMPANION_COLOR
+from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.render.replay import render_replay
 from deepaccident_devkit.render.replay.recording import recording_of
 from deepaccident_devkit.v2x.tracks import scenario_tracks
@@ -151,9 +151,10 @@ def test_boxes_are_drawn_where_the_labels_say(at: int, opened: Browser, da_motio
     origin = recording_of(da_motion, scenario, None).origin
     scrub(opened, at)
     pair = da_motion.get("scenario", scenario)["collision"]["ids"]
-    behind = [da_motion.get("agent", f"{scenario}/{side}_vehicle_behind")["actor_id"] for side in ("ego", "other")]
+    followers = ("ego_vehicle_behind", "other_vehicle_behind")
+    behind = [(da_motion.get("agent", f"{scenario}/{each}")["actor_id"], AGENT_COLORS[each]) for each in followers]
     boxes = scenario_tracks(da_motion, scenario).at(at + 1)
-    for actor, color in [(each, COLLIDER_COLOR) for each in pair] + [(each, COMPANION_COLOR) for each in behind]:
+    for actor, color in [(each, COLLIDER_COLOR) for each in pair] + behind:
         row = int(boxes.actor_id.searchsorted(actor))
         center, (length, width, _) = boxes.center[row, :2], boxes.size[row]
         forward = np.array([np.cos(boxes.yaw[row]), np.sin(boxes.yaw[row])])

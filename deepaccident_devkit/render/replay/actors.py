@@ -10,9 +10,9 @@ import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, IntArray
 from deepaccident_devkit.geometry import quaternions
-from deepaccident_devkit.render.colors import AGENT_COLORS, CATEGORY_COLORS, COLLIDER_COLOR, COMPANION_COLOR
+from deepaccident_devkit.render.colors import AGENT_COLORS
 from deepaccident_devkit.render.replay.recording import Recording
-from deepaccident_devkit.render.roles import short_name
+from deepaccident_devkit.render.roles import actor_color, short_name
 from deepaccident_devkit.v2x.cooperation import visible_actors
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
@@ -62,7 +62,6 @@ def _actor(
     category = boxes.category_names[0]
     length, width = np.rint(boxes.size[0, :2] * 100).astype(int).tolist()
     role = _role(recording, actor, agent)
-    colors = {"pair": COLLIDER_COLOR, "companion": COMPANION_COLOR}
     states: list[Any] = [None] * len(recording.frames)
     moments = zip(
         tracks.index[rows].tolist(),
@@ -78,7 +77,7 @@ def _actor(
         "title": f"{category} {actor}" + (f" ({short_name(agent)})" if agent else ""),
         "category": category,
         "role": role,
-        "color": colors.get(role, CATEGORY_COLORS[category]),
+        "color": actor_color(category, agent, collides=role == "pair"),
         "length": length,
         "width": width,
         "states": states,

@@ -34,10 +34,10 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
 ) -> Path:
     """Write a scenario as a video.
 
-    The views are those of the `render_…` functions: `frame` (the agents side by side), `sample` (six cameras), `bev`,
-    `visibility`, `visibility_matrix`, `calibration`, `labels` (motion labels as a trail), a camera by its channel, and
-    `accident`: the countdown to the impact in five cameras, from above and in speeds. `accident`, or two or three of
-    the others side by side, fill a picture of 16 to 9; `frame` alone fills (1280, 448).
+    The views are those of the `render_…` functions: `frame` (the agents' front cameras beside one view from above),
+    `sample` (six cameras), `bev`, `visibility`, `visibility_matrix`, `calibration`, `labels` (motion labels as a
+    trail), a camera by its channel, and `accident`: the countdown to the impact in five cameras, from above and in
+    speeds. `frame`, `accident`, or two or three of the others side by side, fill a picture of 16 to 9.
 
     Args:
         dataset: the release.

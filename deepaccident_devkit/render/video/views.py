@@ -16,10 +16,10 @@ from deepaccident_devkit.render.bev import BEV_LAYERS, render_bev
 from deepaccident_devkit.render.calibration import CALIBRATION_LAYERS, render_calibration
 from deepaccident_devkit.render.camera import CAMERA_DEFAULT, CAMERA_LAYERS, draw_camera
 from deepaccident_devkit.render.layers import LAYERS, Layer, layers_of
-from deepaccident_devkit.render.moments import MOMENT_LAYERS, render_frame, render_sample
+from deepaccident_devkit.render.moments import MOMENT_LAYERS, draw_shared_moment, render_sample
 from deepaccident_devkit.render.motion import TRAIL_LAYERS, render_motion_labels
 from deepaccident_devkit.render.pictures import figure_of_pixels
-from deepaccident_devkit.render.roles import short_name
+from deepaccident_devkit.render.roles import in_drawing_order, short_name
 from deepaccident_devkit.render.visibility import VISIBILITY_LAYERS, render_visibility, render_visibility_matrix
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import CAMERAS
@@ -82,8 +82,8 @@ class View:
     own: OwnView | None = None
 
 
-def _frame(moment: Moment, fig: Figure) -> object:
-    return render_frame(moment.dataset, moment.frame, agents=moment.agents, layers=moment.layers, fig=fig)
+def _frame(moment: Moment, fig: Figure) -> None:
+    draw_shared_moment(moment.dataset, moment.frame, in_drawing_order(moment.names), moment.layers, fig)
 
 
 def _sample(moment: Moment, fig: Figure) -> object:

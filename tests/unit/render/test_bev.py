@@ -1,5 +1,6 @@
 """A moment from above: places, colours, layers and frames."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 from drawing import has_color, new_axes, on_canvas, rendered
 from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection, PathCollection, PolyCollection
-from matplotlib.colors import to_hex
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.quiver import Quiver
 from numpy.testing import assert_allclose
 
@@ -20,12 +21,13 @@ from deepaccident_devkit.render.bev import BevView, draw_bev, draw_underlay, ren
 from deepaccident_devkit.render.colors import (
     AGENT_COLORS,
     BEV_COLORS,
+    CASING_COLOR,
     COLLIDER_COLOR,
-    COMPANION_COLOR,
     OWN_COLOR,
     POINT_COLOR,
 )
 from deepaccident_devkit.render.roles import collider_ids, short_name
+from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID
 from deepaccident_devkit.v2x import Link, PoseNoise, cooperative_boxes
 
@@ -69,7 +71,7 @@ def test_without_a_collision_nobody_is_red(da: DeepAccident) -> None:
     sample = f"{scenario['token']}/ego_vehicle/003"
     ax = render_bev(da, sample, layers=("boxes",), ax=new_axes())
     assert COLLIDER_COLOR not in outlines(ax).values()
-    assert COMPANION_COLOR in outlines(ax).values()
+    assert AGENT_COLORS["ego_vehicle"] in outlines(ax).values()
 
 
 def test_of_several_agents_each_has_its_colour_its_name_and_its_place(da: DeepAccident, approach: str) -> None:
@@ -78,14 +80,15 @@ def test_of_several_agents_each_has_its_colour_its_name_and_its_place(da: DeepAc
     clouds = of_kind(ax, PathCollection)
     assert [to_hex(one.get_facecolor()[0]) for one in clouds] == list(AGENT_COLORS.values())
     marks = of_kind(ax, PolyCollection)[-1]
-    assert [to_hex(color) for color in marks.get_facecolor()] == [OWN_COLOR, *list(AGENT_COLORS.values())[1:]]
+    assert [to_hex(color) for color in marks.get_facecolor()] == list(AGENT_COLORS.values())
+    assert [to_hex(color) for color in marks.get_edgecolor()] == [OWN_COLOR, *[CASING_COLOR] * 4]
     for agent, path, text in zip(AGENTS, marks.get_paths(), ax.texts, strict=True):
         world_from_ego = da.world_from(f"{scenario}/{agent}/{number}", "ego")
         assert_allclose(path.vertices[0], world_from_ego.apply([[1.8, 0, 0]])[0, :2])
         assert_allclose(text.xy, world_from_ego.translation[:2])
         assert text.get_text() == short_name(agent)
     entries = [one.get_text() for one in ax.get_legend().get_texts()]
-    assert entries[:2] == ["colliding pair", "companion"]
+    assert entries[:2] == ["colliding pair", "car"]  # agents with a cloud are named once
     assert entries[-5:] == ["ego", "ego behind", "other", "other behind", "infrastructure"]
     center = np.mean([ax.get_xlim(), ax.get_ylim()], axis=1)
     assert_allclose(center, da.world_from(approach, "ego").translation[:2])
@@ -110,6 +113,35 @@ def test_a_link_moves_what_a_partner_sends_and_not_the_partner_s_mark(da: DeepAc
     assert_allclose(marks[0], marks[1])
 
 
+def test_the_receiver_s_own_box_is_where_it_is_and_the_title_says_what_the_link_does(
+    da: DeepAccident, approach: str
+) -> None:
+    both, link = ("ego_vehicle", "other_vehicle"), Link(latency=0.2, pose_noise=PoseNoise(mean=2.0, std=0.0))
+    ax = render_bev(da, approach, agents=both, link=link, sweeps=2, layers=["boxes"], ax=new_axes())
+    own = da.boxes(approach, "ego")
+    own = own.select(own.actor_id == OWN_ACTOR_ID)
+    assert tuple(np.round(own.bottom_corners()[0, :, :2].ravel(), 6)) in outlines(ax)
+    moved = cooperative_boxes(da, approach, agents=both, frame="ego", link=link)
+    sent = moved.select(moved.actor_id == da.get("agent", approach.replace("/003", ""))["actor_id"])
+    assert np.linalg.norm(sent.center[0, :2] - own.center[0, :2]) > 1  # where the partner's message has it
+    assert ax.get_title().endswith("\nlatency 0.2 s, poses off by 2 m (σ 0 m), 2 sweeps")
+
+
+def test_the_pair_is_named_and_a_pedestrian_that_is_hit_is_found(tmp_path: Path) -> None:
+    make_release(tmp_path / "r", SynthConfig(scenarios=1, frames=3, unplanned=1.0, seed=0, sensors=False), workers=1)
+    da = DeepAccident("v1", tmp_path / "r", verbose=False)
+    sample = next(one for one in da.sample if one["agent"] == "ego_vehicle" and one["time_to_impact"] == 0)
+    ax = render_bev(da, sample, view_range=100, ax=new_axes())
+    assert [text.get_text() for text in ax.texts if text.get_text() == "pedestrian"] == ["pedestrian"]
+    picture, boxes = rendered(ax), da.boxes(sample, "ego")
+    hit = np.flatnonzero([name == "pedestrian" for name in boxes.category_names])
+    hit = hit[np.isin(boxes.actor_id[hit], [*collider_ids(da, sample)])]
+    place = on_canvas(ax, boxes.center[hit, :2])[0]
+    red = np.abs(picture - np.array(to_rgb(COLLIDER_COLOR)) * 255).max(axis=-1) < 40
+    rows, columns = np.nonzero(red)
+    assert (np.hypot(columns + 0.5 - place[0], rows + 0.5 - place[1]) < 4).sum() >= 12
+
+
 def test_sweeps_add_the_points_of_the_frames_before(da: DeepAccident, approach: str) -> None:
     counts = [
         len(of_kind(render_bev(da, approach, sweeps=sweeps, ax=new_axes()), PathCollection)[0].get_offsets())
@@ -127,7 +159,7 @@ def test_each_layer_draws_its_own_and_nothing_else(da: DeepAccident, approach: s
     assert kinds == {
         "bev": {"AxesImage"},
         "points": {PathCollection.__name__},
-        "boxes": {PolyCollection.__name__, LineCollection.__name__},
+        "boxes": {PolyCollection.__name__, LineCollection.__name__, "text"},  # the colliding pair's names
         "ids": {"text"},
         "velocities": {Quiver.__name__},
         "trajectories": {LineCollection.__name__},

@@ -174,6 +174,19 @@ def test_velocities_are_arrows_of_a_second_where_they_are_known_and_not_zero() -
     assert_allclose(arrows.get_facecolor(), [[0xE6 / 255, 0, 0x26 / 255, 1]])
 
 
+def test_small_actors_have_a_mark_of_their_class() -> None:
+    ax = new_axes()
+    small = boxes(category=["pedestrian", "car", "cyclist"])
+    draw_boxes_from_above(small, ax, [RED, RED, CATEGORY_COLORS["cyclist"]])
+    marks = {line.get_marker(): (tuple(line.get_xydata()[0]), line.get_markerfacecolor()) for line in ax.lines}
+    first, last = (tuple(small.center[row, :2]) for row in (0, 2))
+    assert marks == {"o": (first, RED), "D": (last, CATEGORY_COLORS["cyclist"])}
+    assert all(line.get_markersize() >= 6 for line in ax.lines)
+    hidden = new_axes()
+    draw_boxes_from_above(small, hidden, [RED] * 3, fill=0)
+    assert {line.get_markerfacecolor() for line in hidden.lines} == {"none"}
+
+
 def test_velocities_in_an_image_lead_to_where_the_centre_would_be() -> None:
     ax = image_axes()
     draw_velocities_in_image(boxes().transform(OPTICAL_FROM_EGO, "Camera_Front"), CAMERA, ax, [RED] * 3)

@@ -12,7 +12,9 @@ from numpy.testing import assert_array_equal
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render import detached_figure, render_frame, render_sample
-from deepaccident_devkit.render.colors import COLLIDER_COLOR, COMPANION_COLOR
+from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR
+from deepaccident_devkit.render.moments import draw_shared_moment
+from deepaccident_devkit.render.roles import short_name
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 
 pytestmark = pytest.mark.slow
@@ -24,6 +26,10 @@ def images(axes: Any) -> list[Any]:
 
 def colors_from_above(ax: Any) -> set[str]:
     return {to_hex(color) for color in ax.collections[1].get_edgecolor()}
+
+
+def colors_from_above_shared(ax: Any) -> set[str]:
+    return {to_hex(color) for each in ax.collections for color in each.get_edgecolor()}
 
 
 def clouds(fig: Any) -> dict[str, int]:
@@ -39,12 +45,31 @@ def test_a_frame_shows_its_agents_in_their_order(da: DeepAccident, frame: str) -
     for agent, image in zip(AGENTS, images(cameras), strict=True):
         assert_array_equal(image, da.load_image(f"{scenario}/{agent}/004/Camera_Front"))
     for ax in above:
-        assert {COLLIDER_COLOR, COMPANION_COLOR} <= colors_from_above(ax)
+        assert {COLLIDER_COLOR, *(AGENT_COLORS[AGENTS[each]] for each in (1, 3))} <= colors_from_above(ax)
     assert "0.2 s to the impact" in fig._suptitle.get_text()
     legend = [one.get_text() for one in fig.legends[0].get_texts()]
-    assert legend[:2] == ["colliding pair", "companion"]
+    assert legend[:2] == ["colliding pair", "ego behind"]
     assert tuple(fig.get_size_inches()) == (16, 9)
     assert plt.get_fignums() == []
+
+
+@pytest.mark.parametrize(("size", "least"), [((12.8, 7.2), 290), ((12.8, 4.48), 240)])
+def test_a_shared_moment_has_large_cameras_and_one_view_from_above_of_all_agents(
+    da: DeepAccident, frame: str, size: tuple[float, float], least: float
+) -> None:
+    fig = detached_figure(size)
+    draw_shared_moment(da, frame, AGENTS, None, fig)
+    fig.draw_without_rendering()
+    *cameras, above = fig.axes
+    assert [ax.get_title() for ax in cameras] == list(map(short_name, AGENTS))
+    assert min(ax.get_window_extent().width for ax in cameras) > least
+    (left, right), (low, high) = above.get_xlim(), above.get_ylim()
+    scenario, number = frame.rsplit("/", 1)
+    for agent in AGENTS:
+        x, y = da.world_from(f"{scenario}/{agent}/{number}", "ego").translation[:2]
+        assert left + 10 < x < right - 10
+        assert low + 10 < y < high - 10
+    assert {COLLIDER_COLOR, AGENT_COLORS["ego_vehicle_behind"]} <= colors_from_above_shared(above)
 
 
 def test_the_order_of_agents_is_fixed_and_who_is_left_out_leaves_no_hole(da: DeepAccident, frame: str) -> None:

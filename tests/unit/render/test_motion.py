@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from drawing import new_axes, picture
 from matplotlib.collections import LineCollection
-from matplotlib.colors import to_rgb
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.quiver import Quiver
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -31,7 +31,7 @@ from deepaccident_devkit.render import (
     draw_motion_output,
     draw_motion_trail,
 )
-from deepaccident_devkit.render.colors import COLLIDER_COLOR, OWN_COLOR
+from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, INSTANCE_COLORS, OWN_COLOR
 from deepaccident_devkit.render.motion_cells import PALEST
 from deepaccident_devkit.render.roles import collider_ids
 
@@ -86,6 +86,22 @@ def test_instances_are_where_they_are_and_have_their_colours() -> None:
     both = panel(labels, "instance", marked={7, -100})
     assert_allclose(color_at(both, 0.2, 0.2), to_rgb(COLLIDER_COLOR))
     assert len(both.collections) == 1  # the own box's edge
+
+
+def test_recording_vehicles_have_their_hues_and_others_shades_in_the_picture_and_its_key() -> None:
+    figure = draw_motion_labels(
+        two_cars().to_present(), agents={-100: "ego_vehicle"}, style="trail", fig=detached_figure((7, 6))
+    )
+    ax, key = figure.axes
+    assert_allclose(color_at(ax, 0.2, 0.2), to_rgb(AGENT_COLORS["ego_vehicle"]))
+    assert to_hex(color_at(ax, 10.2, 5.2)) in INSTANCE_COLORS
+    assert [text.get_text() for text in key.get_legend().get_texts()] == ["ego", "own box"]
+
+
+def test_the_flow_says_where_it_ends() -> None:
+    figure = draw_motion_labels(two_cars(), fig=detached_figure((8, 8)))
+    said = [[text.get_text() for text in ax.texts] for ax in figure.axes[12:15]]
+    assert said == [[], [], ["no next frame"]]
 
 
 def test_arrows_lead_from_instances_to_where_they_are_next() -> None:

@@ -32,7 +32,7 @@ def panel(da: DeepAccident, moment: Any, size: tuple[float, float] = (5, 5.6), *
 
 
 def dots(ax: Any) -> dict[str, Any]:
-    """Agent → (n, 2) centres of the actors that have its dot."""
+    """Agent → (n, 2) the places that have its dot."""
     return {each.get_label(): each.get_offsets() for each in ax.collections if each.get_label() in AGENTS}
 
 
@@ -48,8 +48,9 @@ def test_dots_are_at_who_is_visible_by_the_rule(hidden: DeepAccident) -> None:
     for agent in AGENTS:
         seen = hidden.visible_instances(f"{scenario}/{agent}/010", agents=[agent])
         ids = [int(token.rsplit("/", 1)[1]) for token in seen]
-        expected = boxes.center[np.isin(boxes.actor_id, ids), :2]
-        assert_allclose(dots(ax)[agent], expected)
+        seen_boxes = boxes.select(np.isin(boxes.actor_id, ids))
+        tops = seen_boxes.bottom_corners()[..., 1].max(axis=1)
+        assert_allclose(dots(ax)[agent], np.column_stack([seen_boxes.center[:, 0], tops]))
     assert (
         to_hex(next(each for each in ax.collections if each.get_label() == AGENTS[2]).get_facecolor()[0])
         == (AGENT_COLORS[AGENTS[2]])
@@ -63,7 +64,7 @@ def test_a_dot_is_drawn_right_above_its_actor(hidden: DeepAccident) -> None:
     (drawn,) = (each for each in ax.collections if each.get_label() == "ego_vehicle")
     centers = ax.transData.transform(drawn.get_offsets())
     moved = drawn.get_offset_transform().transform(drawn.get_offsets())
-    assert_allclose(moved - centers, np.tile([0, 10 / 72 * ax.figure.dpi], (len(centers), 1)), atol=0.01)
+    assert_allclose(moved - centers, np.tile([0, 5 / 72 * ax.figure.dpi], (len(centers), 1)), atol=0.01)
 
 
 def test_the_hidden_collider_stands_out(hidden: DeepAccident) -> None:
@@ -110,13 +111,15 @@ def test_the_matrix_has_a_cell_for_each_actor_and_agent(hidden: DeepAccident) ->
     assert [int(row.split()[1]) in known.pair for row in rows[:3]] == [True, True, False]
     by_id = {int(row.split()[1]): number for number, row in enumerate(rows)}
     full = np.zeros((len(rows), 5), dtype=bool)
-    for each in ax.collections:
-        column, row = each.get_offsets()[0].astype(int).tolist()
-        full[row, column] = each.get_facecolor().size > 0
+    for each in ax.patches:
+        column, row = np.rint(np.add(each.get_xy(), (0.3, 0.4))).astype(int).tolist()
+        full[row, column] = to_rgba(each.get_facecolor())[3] > 0
     for row, actor in enumerate(known.boxes.actor_id.tolist()):
         if actor in by_id:
             order = [known.agents.index(agent) for agent in AGENTS]
             assert_array_equal(full[by_id[actor]], known.seen[row, order])
+    assert "0: none" in ax.get_xlabel()
+    assert "–: not in the agent's label" in ax.get_xlabel()
     assert sum(text.get_text() == "itself" for text in ax.texts) == 4  # the pole has no body
 
 
@@ -137,6 +140,28 @@ def test_what_is_not_there_is_named(da_motion: DeepAccident) -> None:
         panel(da_motion, token, agents=["me"])
     with pytest.raises(ChoiceError, match="frame: expected one of world, ego, lidar, found 'Camera_Front'"):
         panel(da_motion, token, frame="Camera_Front")
+
+
+def test_two_that_see_each_other_have_two_lines_and_the_legend_says_what_marks_mean(hidden: DeepAccident) -> None:
+    scenario = hidden.scenario[0]
+    ax = panel(hidden, hidden.get_sample(scenario, "ego_vehicle", scenario["num_frames"]))
+    lines = next(each for each in ax.collections if each.get_alpha() == 0.8)
+    ways = {to_hex(color): line for color, line in zip(lines.get_colors(), lines.get_segments(), strict=True)}
+    out, back = ways[AGENT_COLORS["ego_vehicle"]], ways[AGENT_COLORS["other_vehicle"]]
+    assert_allclose(out[1] - out[0], back[0] - back[1], atol=0.5)  # a car's box is about its agent, not at it
+    assert 0.3 < np.linalg.norm(out[0] - back[1]) < 2  # side by side
+    words = {text.get_text() for text in ax.get_legend().get_texts()}
+    assert words >= {"an agent", "whose view: ego", "sees one of the pair", "colliding pair"}
+
+
+@pytest.mark.parametrize("index", [1, 5, 10, 15])
+def test_no_actor_of_the_view_is_cut(hidden: DeepAccident, index: int) -> None:
+    sample = hidden.get_sample(hidden.scenario[0], "ego_vehicle", index)
+    ax = panel(hidden, sample)
+    low, high = np.array([ax.get_xlim(), ax.get_ylim()]).T
+    known = sights(hidden, sample)
+    corners = known.boxes.bottom_corners()[known.collides | known.records, :, :2].reshape(-1, 2)
+    assert ((corners > low) & (corners < high)).all()
 
 
 def test_the_title_is_whole(da: DeepAccident) -> None:

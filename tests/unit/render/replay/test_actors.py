@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from replay_page import accident
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.render.colors import CATEGORY_COLORS, COLLIDER_COLOR, COMPANION_COLOR
+from deepaccident_devkit.render.colors import AGENT_COLORS, CATEGORY_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.render.replay.recording import recording_of
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x.tracks import scenario_tracks
@@ -54,12 +54,14 @@ def test_who_sees_whom_is_the_released_rule(da: DeepAccident, data: dict[str, An
             assert seen  # or nothing is tested
 
 
-def test_the_pair_is_red_and_first_and_its_companions_are_green(da: DeepAccident, data: dict[str, Any]) -> None:
+def test_the_pair_is_red_and_first_and_its_companions_have_their_agents_hues(
+    da: DeepAccident, data: dict[str, Any]
+) -> None:
     pair = da.get("scenario", accident(da))["collision"]["ids"]
-    behind = [agent["actor"] for agent in data["agents"] if agent["name"].endswith("_behind")]
+    behind = {agent["actor"]: agent["name"] for agent in data["agents"] if agent["name"].endswith("_behind")}
     assert [actor["id"] for actor in data["actors"][:2]] == sorted(pair)
     for actor in data["actors"]:
         color = CATEGORY_COLORS[actor["category"]]
-        color = COMPANION_COLOR if actor["id"] in behind else color
+        color = AGENT_COLORS[behind[actor["id"]]] if actor["id"] in behind else color
         assert actor["color"] == (COLLIDER_COLOR if actor["id"] in pair else color)
     assert {actor["id"] for actor in data["actors"] if actor["role"] == "companion"} == set(behind)
