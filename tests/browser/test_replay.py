@@ -406,6 +406,13 @@ def test_the_verdict_stands_beside(browser: Browser, judged: Path) -> None:
     assert browser.complaints() == []
 
 
+CHOSEN_CUT = """
+const pen = document.createElement('canvas').getContext('2d');
+return [...document.querySelectorAll('.agent select')].filter((each) => each.offsetParent).filter((each) => {
+  pen.font = getComputedStyle(each).font;
+  return pen.measureText(each.selectedOptions[0].text).width + 18 > each.clientWidth;  // 18 for the arrow
+}).map((each) => [each.selectedOptions[0].text, each.clientWidth]);
+"""
 CUT = """
 return [...document.querySelectorAll('.name, .badge, .where, th, td, button, p, dt, dd, legend, #legend span')]
   .filter((each) => each.offsetParent && each.scrollWidth > each.clientWidth + 1 && each.clientWidth)
@@ -421,6 +428,7 @@ def test_nothing_is_cut(width: int, browser: Browser, recorded: Path, judged: Pa
             scrub(browser, at)
             assert browser.overflowing() == []
             assert browser.script(CUT) == []
+            assert browser.script(CHOSEN_CUT) == []
             assert browser.script("return document.documentElement.scrollWidth") <= width
     table = "const box = document.getElementById('samples'); return box.scrollWidth - box.clientWidth"
     assert browser.script(table) <= 0

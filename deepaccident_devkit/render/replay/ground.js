@@ -232,7 +232,7 @@ class Ground {
     if (state === null) return;
     const pen = this.pen;
     const [x, y] = this.at(state);
-    const [length, width] = this.size(actor);
+    const length = this.size(actor)[0];
     pen.save();
     pen.translate(x, y);
     pen.rotate(-state[2] / 1000);
@@ -254,12 +254,13 @@ class Ground {
       pen.stroke();
     }
     pen.restore();
-    if (this.state.layers.dots) this.drawDots(actor, x, y + Math.max(width, 8) / 2 + 7);
+    if (this.state.layers.dots) this.drawDots(actor, x, this.extent(actor)[3] + 6);
   }
 
   drawDots(actor, x, y) {
     const seen = actor.seen[this.state.frame];
     const seeing = this.data.agents.filter((agent, bit) => seen & (1 << bit));
+    this.taken.push([x - 3 * seeing.length, y - 3, x + 3 * seeing.length, y + 3]);
     seeing.forEach((agent, place) => {
       this.pen.fillStyle = agent.color;
       this.pen.beginPath();
@@ -307,8 +308,6 @@ class Ground {
     const [x, y] = this.at(this.data.impact);
     const pen = this.pen;
     const now = this.data.countdown[this.state.frame] === 0;
-    pen.strokeStyle = this.data.colors.pair;
-    pen.lineWidth = now ? 3 : 1.5;
     pen.beginPath();
     for (let ray = 0; ray < 8; ray += 1) {
       const [across, down] = [Math.cos((ray * Math.PI) / 4), Math.sin((ray * Math.PI) / 4)];
@@ -316,7 +315,12 @@ class Ground {
       pen.moveTo(x + across * inner, y + down * inner);
       pen.lineTo(x + across * outer, y + down * outer);
     }
-    pen.stroke();
+    // on the red cars the rays need a white casing
+    for (const [color, width] of [["#ffffff", 3], [this.data.colors.pair, 0]]) {
+      pen.strokeStyle = color;
+      pen.lineWidth = width + (now ? 3 : 1.5);
+      pen.stroke();
+    }
     if (now) this.writeBeside("impact", [x - 30, y - 30, x + 30, y + 30], this.data.colors.pair);
   }
 
