@@ -11,24 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.render.axes import axes_or_new, detached_figure, figure_or_new, with_light_grid
+from deepaccident_devkit.render.colors import CONFIGURATION_COLORS, OWN_COLOR, PREDICTED_COLOR
 from deepaccident_devkit.render.pictures import write_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-CONFIGURATION_COLORS: Final[Mapping[str, str]] = {
-    "single": "#9a9a9a",
-    "+behind": "#9ecae1",
-    "+other": "#1f77b4",
-    "+infrastructure": "#e08a1e",
-    "+behind+other": "#08306b",
-    "vehicles": "#6a4fc4",
-    "all": "#1a9850",
-}
-"""Colours of the paper's seven configurations."""
-_OTHER: Final = "#b5651d"
-_DARK: Final = "#333333"
 _PANEL: Final = (4.2, 3.8)
 _LEGEND: Final = 0.6
 _DPI: Final = 120
@@ -115,7 +104,7 @@ def _draw_bars(panel: Panel, ax: Axes) -> None:
     for place, (name, bars) in enumerate(panel.values.items()):
         known = [(index, value) for index, group in enumerate(groups) if (value := bars.get(group)) is not None]
         middle = [index + (place - (len(panel.values) - 1) / 2) * width for index, _ in known]
-        color = CONFIGURATION_COLORS.get(name, _OTHER)
+        color = CONFIGURATION_COLORS.get(name, PREDICTED_COLOR)
         ax.bar(middle, [value for _, value in known], width=width * 0.92, color=color, label=name)
         ends = panel.intervals.get(name, {})
         _draw_intervals(
@@ -127,18 +116,19 @@ def _draw_bars(panel: Panel, ax: Axes) -> None:
 def _draw_lines(panel: Panel, ax: Axes) -> None:
     for place, (name, line) in enumerate(panel.values.items()):
         known = [(x, y) for x, y in line.items() if y is not None]
+        color = CONFIGURATION_COLORS.get(name, PREDICTED_COLOR)
         ax.plot(
             [x for x, _ in known],
             [y for _, y in known],
-            color=CONFIGURATION_COLORS.get(name, _OTHER),
+            color=color,
             label=name,
             linestyle=("-", "--")[place % 2],  # so that both of two equal lines are seen
             marker="so"[place % 2],
             markersize=6 - 2 * (place % 2),
         )
-        _draw_intervals(ax, list(panel.intervals.get(name, {}).items()), CONFIGURATION_COLORS.get(name, _OTHER))
+        _draw_intervals(ax, list(panel.intervals.get(name, {}).items()), color)
 
 
-def _draw_intervals(ax: Axes, ends: Sequence[tuple[Any, tuple[float, float]]], color: str = _DARK) -> None:
+def _draw_intervals(ax: Axes, ends: Sequence[tuple[Any, tuple[float, float]]], color: str = OWN_COLOR) -> None:
     """Upright lines from low to high ends at places along x."""
     ax.vlines([x for x, _ in ends], [low for _, (low, _) in ends], [high for _, (_, high) in ends], color, linewidth=1)

@@ -106,9 +106,9 @@ def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a 
 ) -> Axes:
     """Render a moment from above: boxes, LiDAR points and more, in one coordinate frame, metres.
 
-    The colliding pair is red, their companions green, the others coloured by category. The sample's own agent has a
-    dark mark, other agents have a mark in their colour and their name. If several agents' points are rendered, they
-    have their agents' colours.
+    The colliding pair is red, other recording vehicles have their agents' hues, all others a shade for their category.
+    The sample's own agent has a dark mark, other agents have a mark in their colour and their name. If several agents'
+    points are rendered, they have their agents' colours.
 
     Args:
         dataset: the release.

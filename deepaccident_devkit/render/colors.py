@@ -1,40 +1,53 @@
-"""The one colour table of all pictures."""
+"""The one colour table: every picture, page and export takes its colours from here.
+
+- Saturated hues are the five agents': an agent's name, points, sight lines and box have its hue.
+- Red is the colliding pair, and nothing else.
+- Classes are shades of slate; pedestrians, cyclists and motorcycles also have a shape of their own.
+- Verdicts are muted, and no agent's hue. Charts are shades. No colour map has red.
+
+Hues differ in lightness too, for colour-blind readers: `docs/check_colors.py` measures it, and a test asserts it.
+"""
 
 from collections.abc import Mapping
 
 from deepaccident_devkit.taxonomy import AGENTS, SPLITS
 
-CATEGORY_COLORS: Mapping[str, str] = {
-    "car": "#2f6fde",
-    "truck": "#6a4fc4",
-    "van": "#1793a5",
-    "cyclist": "#e08a1e",
-    "motorcycle": "#b5651d",
-    "pedestrian": "#c2379a",
-}
 AGENT_COLORS: Mapping[str, str] = dict(
-    zip(AGENTS, ("#1f6fe0", "#1fb5d6", "#f07f09", "#c9a800", "#9b4de0"), strict=True)
+    zip(AGENTS, ("#2b6fe0", "#2fc0cc", "#fa7b40", "#dfb000", "#563083"), strict=True)
 )
-"""Easy to see on white and in camera images; without red and green, which mark the accident's actors."""
-SPLIT_COLORS: Mapping[str, str] = dict(
-    zip((*SPLITS, "unknown"), ("#2f6fde", "#e08a1e", "#1a9850", "#9a9a9a"), strict=True)
-)
-COLLIDER_COLOR = "#e60026"
-COMPANION_COLOR = "#1a9850"
-"""The agents behind the colliding pair, as in the paper."""
+"""Blue, cyan, orange, dark yellow and purple; too pale for words on white, which are dark."""
+COLLIDER_COLOR = "#c4001a"
+"""The colliding pair."""
+CATEGORY_COLORS: Mapping[str, str] = {
+    "car": "#63717e",
+    "truck": "#323f4b",
+    "van": "#94a2b0",
+    "cyclist": "#4a5864",
+    "motorcycle": "#7b8996",
+    "pedestrian": "#1d272f",
+}
+CATEGORY_MARKERS: Mapping[str, str] = {"cyclist": "D", "motorcycle": "^", "pedestrian": "o"}
+"""matplotlib's markers of the classes whose boxes are too small to be found from above."""
+INSTANCE_COLORS = ("#63717e", "#b5c3cf", "#4a5864", "#94a2b0", "#323f4b", "#7b8996")
+"""Instances of motion maps, by turns."""
 OWN_COLOR = "#111111"
 """A mark for the recording agent itself, in addition to the colour of its part in the accident."""
+CASING_COLOR = "#ffffff"
+"""Edges around marks and lines that lie on pictures."""
 POINT_COLOR = "#9a9a9a"
 """LiDAR points that are not coloured by a value."""
-DEPTH_COLORMAP = "turbo_r"
-"""LiDAR points in images; the nearest are red."""
-HEIGHT_COLORMAP = "viridis"
+DEPTH_COLORMAP = "viridis_r"
+"""LiDAR points in images; the nearest are yellow."""
+HEIGHT_COLORMAP = "cividis"
+CENTERNESS_COLORMAP = "Greys"
+DIRECTION_COLORS = ("#2a78c2", "#2a9d6f", "#c9b23a", "#8a5fb0")
+"""Flow forward, to the left, backward and to the right; between them the colours are mixed."""
 BEV_COLORS: Mapping[str, str] = {
     "road": "#e9e9ec",
     "road_line": "#ffffff",
-    "sidewalk": "#f6efe4",
-    "vehicle": "#cdd6e6",
-    "pedestrian": "#ecd2e4",
+    "sidewalk": "#f6f2ea",
+    "vehicle": "#d3d9e0",
+    "pedestrian": "#d3d9e0",
 }
 """CARLA's tags in the BEV camera, in pale colours: boxes are rendered over them."""
 GRID_COLOR = "#d0d0d0"
@@ -44,13 +57,30 @@ MUTED_COLOR = "#666666"
 """Less important words."""
 TRUE_PLACE_COLOR = "#8a8a8a"
 """The true place of something that is also rendered at another place."""
-OUTCOME_COLORS: Mapping[str, str] = {"right": "#1a9850", "false": "#e08a1e", "missed": "#9a9a9a"}
-"""Predictions that are right, predictions that are false, and truths that are missed."""
-SERIES_COLORS = ("#08306b", "#2f6fde", "#7fb2e5", "#9a9a9a")
+OUTCOME_COLORS: Mapping[str, str] = {"right": "#23644d", "false": "#a98c52", "missed": "#bcc0c3"}
+"""Predictions that are right, predictions that are false, and truths that are missed: green, sand and pale grey."""
+PREDICTED_COLOR = "#a8679b"
+"""Predictions without a verdict: mauve."""
+SERIES_COLORS = ("#1a3344", "#4b667c", "#8399ac", "#b5c3cf")
 """Lines or bars of the same kind for several values of one number, the strictest value first."""
-ESTIMATE_COLOR = "#2f6fde"
+SPLIT_COLORS: Mapping[str, str] = dict(
+    zip((*SPLITS, "unknown"), ("#284052", "#627a8e", "#9badbe", "#d3d8dc"), strict=True)
+)
+CONFIGURATION_COLORS: Mapping[str, str] = {
+    "single": AGENT_COLORS[AGENTS[0]],
+    "+behind": AGENT_COLORS[AGENTS[1]],
+    "+other": AGENT_COLORS[AGENTS[2]],
+    "+infrastructure": AGENT_COLORS[AGENTS[4]],
+    "+behind+other": "#d3d8dc",
+    "vehicles": "#4b667c",
+    "all": "#111c24",
+}
+"""The paper's seven sets of agents: the hue of the one agent that is added, shades for several."""
+ESTIMATE_COLOR = "#3d627d"
 """A number with an interval."""
-WARNING_COLOR = "#b00020"
-"""Important words; dark enough for text on white."""
+WARNING_COLOR = "#6b4a10"
+"""Important words, dark brown: the words of a warning are not the colliding pair."""
+LINK_COLOR = "#2f4a63"
+"""Links and the focus of the keyboard on pages."""
 BEYOND_COLOR = "#e4e4e4"
 """Background of a frame that is not recorded."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-from deepaccident_devkit.render.colors import AGENT_COLORS, CATEGORY_COLORS, COLLIDER_COLOR, COMPANION_COLOR
+from deepaccident_devkit.render.colors import AGENT_COLORS, CATEGORY_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.render.roles import in_drawing_order, short_name
 
 if TYPE_CHECKING:
@@ -21,7 +21,8 @@ def box_handles(colors: Collection[str]) -> list[Artist]:
     from matplotlib.colors import to_rgba
     from matplotlib.patches import Patch
 
-    meanings = {"colliding pair": COLLIDER_COLOR, "companion": COMPANION_COLOR, **CATEGORY_COLORS}
+    agents = {short_name(agent): color for agent, color in AGENT_COLORS.items()}
+    meanings = {"colliding pair": COLLIDER_COLOR, **agents, **CATEGORY_COLORS}
     return [
         Patch(label=name, facecolor=to_rgba(color, 0.25), edgecolor=color)
         for name, color in meanings.items()

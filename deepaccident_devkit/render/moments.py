@@ -101,7 +101,7 @@ def render_frame(
 ) -> Figure:
     """Render the front views of a moment's agents, and each one's boxes and LiDAR from above, side by side.
 
-    The colliding pair is red and their companions green, as in the paper.
+    The colliding pair is red, other recording vehicles have their agents' hues, all others a shade for their category.
 
     Args:
         dataset: the release.

@@ -8,7 +8,13 @@ import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, FloatArray
 from deepaccident_devkit.render.axes import with_light_grid
-from deepaccident_devkit.render.colors import BEYOND_COLOR, COLLIDER_COLOR, OWN_COLOR
+from deepaccident_devkit.render.colors import (
+    BEYOND_COLOR,
+    CENTERNESS_COLORMAP,
+    COLLIDER_COLOR,
+    DIRECTION_COLORS,
+    OWN_COLOR,
+)
 from deepaccident_devkit.render.layers import Layer
 from deepaccident_devkit.render.motion_maps import DrawnMap, MotionMaps
 
@@ -17,6 +23,8 @@ if TYPE_CHECKING:
 
 PALEST: Final = 0.22
 """How opaque the last frame of a trail is; the present is 1."""
+_STILL: Final = 0.92
+"""Grey of what does not move."""
 
 
 def draw_map_of(maps: MotionMaps, name: DrawnMap, frame: int, shown: frozenset[Layer], ax: Axes) -> Axes:
@@ -65,7 +73,9 @@ def draw_key(maps: MotionMaps, name: DrawnMap, ax: Axes) -> None:
         from matplotlib.cm import ScalarMappable
         from matplotlib.colors import Normalize
 
-        ax.figure.colorbar(ScalarMappable(Normalize(0, 1), "magma"), cax=ax.inset_axes((0.1, 0.15, 0.15, 0.7)))
+        ax.figure.colorbar(
+            ScalarMappable(Normalize(0, 1), CENTERNESS_COLORMAP), cax=ax.inset_axes((0.1, 0.15, 0.15, 0.7))
+        )
     else:
         side = np.linspace(-1, 1, 101)
         along, left = np.meshgrid(side, side)
@@ -78,11 +88,13 @@ def draw_key(maps: MotionMaps, name: DrawnMap, ax: Axes) -> None:
 
 def direction_colors(left: AnyArray, along: AnyArray, *, longest: float) -> AnyArray:
     """(H, W, 3) a colour for the direction of vectors (left, forward), paler for shorter ones."""
-    from matplotlib.colors import hsv_to_rgb
+    from matplotlib.colors import to_rgb
 
-    hue = (np.arctan2(left, along) / (2 * np.pi)) % 1
+    corners = np.array([to_rgb(color) for color in (*DIRECTION_COLORS, DIRECTION_COLORS[0])])
+    turn = np.arctan2(left, along) / (2 * np.pi) % 1 * len(DIRECTION_COLORS)
+    full = np.stack([np.interp(turn, range(len(corners)), each) for each in corners.T], axis=-1)
     strength = np.minimum(np.hypot(left, along) / longest, 1)
-    return hsv_to_rgb(np.stack([hue, strength, np.full(hue.shape, 0.92)], axis=-1))
+    return _STILL - strength[..., None] * (_STILL - full)
 
 
 def _draw_picture(maps: MotionMaps, name: DrawnMap, frame: int, ax: Axes) -> None:
@@ -91,7 +103,7 @@ def _draw_picture(maps: MotionMaps, name: DrawnMap, frame: int, ax: Axes) -> Non
         _edge_own(maps, frame, ax)
     elif name == "centerness":
         if maps.centerness is not None:
-            _draw_cells(ax, maps.centerness[frame], maps, cmap="magma", vmin=0, vmax=1)
+            _draw_cells(ax, maps.centerness[frame], maps, cmap=CENTERNESS_COLORMAP, vmin=0, vmax=1)
     else:
         vectors = maps.vectors(name)[frame]
         colors = direction_colors(*np.nan_to_num(vectors), longest=maps.longest(name))

@@ -21,13 +21,11 @@ from deepaccident_devkit.motion import (
     predict_instances,
 )
 from deepaccident_devkit.motion.orientations import to_orientation
-from deepaccident_devkit.render.colors import COLLIDER_COLOR, OWN_COLOR
+from deepaccident_devkit.render.colors import COLLIDER_COLOR, INSTANCE_COLORS, OWN_COLOR
 from deepaccident_devkit.taxonomy import FRAME_PERIOD, OWN_ACTOR_ID
 
 DrawnMap = Literal["instance", "centerness", "offset", "flow"]
 MAPS: Final[tuple[DrawnMap, ...]] = get_args(DrawnMap)
-_PALETTE: Final = (0, 1, 2, 3, 8, 9, 10, 11, 12, 13, 16, 17, 18, 19)
-"""Colours of matplotlib's tab20, without its greens, reds and greys: these have a meaning here."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -187,11 +185,10 @@ def _label_colors(labels: MotionLabels, instance: AnyArray, marked: Collection[i
 
 def _palette(highest: int, marked: Collection[int]) -> FloatArray:
     """(1 + ids, 3) white for the background, a colour of the palette for each id, red for some."""
-    from matplotlib import colormaps
     from matplotlib.colors import to_rgb
 
-    palette = colormaps["tab20"]
-    colors = np.array([palette(_PALETTE[number % len(_PALETTE)])[:3] for number in range(1 + highest)])
+    shades = [to_rgb(color) for color in INSTANCE_COLORS]
+    colors = np.array([shades[number % len(shades)] for number in range(1 + highest)])
     colors[0] = 1.0
     for identity in marked:
         if 0 < identity <= highest:

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from typing import Any
 
+import numpy as np
+
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.render.colors import CATEGORY_COLORS, COLLIDER_COLOR, COMPANION_COLOR
+from deepaccident_devkit.render.colors import AGENT_COLORS, CATEGORY_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID, AgentName
 from deepaccident_devkit.v2x.configurations import agents_of
@@ -23,15 +25,11 @@ def collider_ids(dataset: Dataset, sample: RowArgument) -> set[int]:
     return {OWN_ACTOR_ID if actor_id == agent_id else actor_id for actor_id in collision["ids"]}
 
 
-def companion_ids(dataset: Dataset, sample: RowArgument) -> set[int]:
-    """The label ids, in this sample, of the recording vehicles that do not collide: −100 where the agent is one.
-
-    In an accident of the paper's design these are the two vehicles behind the colliding pair.
-    """
+def recorder_ids(dataset: Dataset, sample: RowArgument) -> dict[int, AgentName]:
+    """The label ids, in this sample, of the recording vehicles → their agents: −100 is the sample's own."""
     record = dataset.get("sample", sample)
     actors = agent_actors(dataset, record["scenario_token"])
-    label_ids = {OWN_ACTOR_ID if agent == record["agent"] else actor for agent, actor in actors.items()}
-    return label_ids - collider_ids(dataset, record)
+    return {OWN_ACTOR_ID if agent == record["agent"] else actor: agent for agent, actor in actors.items()}
 
 
 def agent_actors(dataset: Dataset, scenario: str) -> dict[AgentName, int]:
@@ -40,24 +38,24 @@ def agent_actors(dataset: Dataset, scenario: str) -> dict[AgentName, int]:
     return {agent: actor for agent, actor in actors.items() if actor is not None}
 
 
-def box_colors(boxes: Boxes, colliders: Collection[int] = (), companions: Collection[int] = ()) -> list[str]:
-    """One colour for each box: the colliding pair red, their companions green, the others by category."""
-    colors = []
-    for actor_id, name in zip(boxes.actor_id.tolist(), boxes.category_names, strict=True):
-        other = COMPANION_COLOR if actor_id in companions else CATEGORY_COLORS[name]
-        colors.append(COLLIDER_COLOR if actor_id in colliders else other)
-    return colors
+def actor_color(category: str, agent: str | None = None, *, collides: bool = False) -> str:
+    """The colour of an actor's box: red if it collides, else the hue of the agent that it is, else its category's."""
+    if collides:
+        return COLLIDER_COLOR
+    return CATEGORY_COLORS[category] if agent is None else AGENT_COLORS[agent]
 
 
 def role_colors(dataset: Dataset, sample: RowArgument, boxes: Boxes) -> list[str]:
     """The colours of boxes that are a sample's own (its agent has −100) or several agents' (it has CARLA's id)."""
     record = dataset.get("sample", sample)
     own = dataset.get("agent", record["agent_token"])["actor_id"]
-    colliders, companions = collider_ids(dataset, record), companion_ids(dataset, record)
-    for ids in (colliders, companions):
-        if OWN_ACTOR_ID in ids and own is not None:
-            ids.add(own)
-    return box_colors(boxes, colliders, companions)
+    colliders, recorders = collider_ids(dataset, record), recorder_ids(dataset, record)
+    return [
+        actor_color(category, recorders.get(actor), collides=actor in colliders)
+        for actor, category in zip(
+            np.where(boxes.actor_id == own, OWN_ACTOR_ID, boxes.actor_id).tolist(), boxes.category_names, strict=True
+        )
+    ]
 
 
 def short_name(agent: str) -> str:

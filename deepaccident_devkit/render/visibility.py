@@ -19,7 +19,7 @@ from deepaccident_devkit.render.boxes import (
     draw_velocities_from_above,
     write_beside,
 )
-from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, COMPANION_COLOR, GRID_COLOR, MUTED_COLOR
+from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, GRID_COLOR, MUTED_COLOR, OWN_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import agent_handles, draw_legend
 from deepaccident_devkit.render.missing import has_cloud, missing_clouds_text, write_missing
@@ -148,7 +148,7 @@ def render_visibility_matrix(
     words = [f"{names[row]} {known.boxes.actor_id[row]}" for row in shown.tolist()]
     ax.set_yticks(range(len(shown)), words, fontsize=8)
     for label, row in zip(ax.get_yticklabels(), shown.tolist(), strict=True):
-        label.set_color(_word_color(known, row))
+        label.set_color(COLLIDER_COLOR if known.collides[row] else OWN_COLOR)
     ax.set_xticks(range(len(columns)), [short_name(agent).replace(" ", "\n") for agent in columns], fontsize=8)
     ax.xaxis.tick_top()
     ax.set(xlim=(-0.5, len(columns) - 0.5), ylim=(max(len(shown), 1) - 0.5, -0.5))
@@ -272,12 +272,6 @@ def _legible_on(color: str) -> str:
 
     luminance = np.dot(np.power(to_rgb(color), 2.2), (0.2126, 0.7152, 0.0722))
     return "black" if luminance > _BRIGHT else "white"
-
-
-def _word_color(known: Sights, row: int) -> str:
-    if known.collides[row]:
-        return COLLIDER_COLOR
-    return COMPANION_COLOR if known.pair and known.records[row] else "black"
 
 
 def _chosen(colors: list[str], which: BoolArray) -> list[str]:

@@ -17,7 +17,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import Accident, box_truth
 from deepaccident_devkit.render.boxes import EDGES, NEAREST_DRAWN, segments_in_image
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR
-from deepaccident_devkit.render.replay import render_replay
+from deepaccident_devkit.render.replay import render_replay, sensors
 from deepaccident_devkit.render.replay.recording import recording_of
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x.tracks import scenario_tracks
@@ -300,6 +300,22 @@ def test_every_camera_is_chosen(browser: Browser, recorded: Path) -> None:
     click(browser, "layer-points")
     assert browser.complaints() == []
     assert len(browser.requests()) == 1
+
+
+def test_where_a_frame_has_no_picture_the_one_before_is_shown_with_its_boxes(
+    browser: Browser, da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sensors, "_OTHERS", (2,))
+    browser.open(render_replay(da, None, tmp_path / "replay.html"), 1280)
+    where = "return document.querySelector('figure[data-agent=infrastructure] .where').textContent"
+    boxes = "return document.querySelector('figure[data-agent=infrastructure] svg').innerHTML"
+    scrub(browser, 4)
+    choose(browser, 'select[aria-label="Camera of infrastructure"]', "FrontLeft")
+    before = browser.script(boxes)
+    assert browser.script(where) == "FrontLeft"
+    scrub(browser, 5)
+    assert browser.script(where) == "FrontLeft, frame 5"
+    assert browser.script(boxes) == before
 
 
 LARGE = "return document.querySelector('.agent.large').dataset.agent"

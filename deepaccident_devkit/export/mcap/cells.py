@@ -15,7 +15,7 @@ from deepaccident_devkit.export.mcap.recording import Recording
 from deepaccident_devkit.export.mcap.roles import Roles
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, motion_labels
-from deepaccident_devkit.render.colors import CATEGORY_COLORS, COLLIDER_COLOR, OWN_COLOR
+from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, INSTANCE_COLORS
 
 CELL_POINT: Final = np.dtype(
     [*((name, COLORED_POINT[name].str) for name in COLORED_POINT.names or ()), ("instance", "<i4"), ("frame", "<i4")]
@@ -23,7 +23,6 @@ CELL_POINT: Final = np.dtype(
 """A point of a map: `instance` is the map's id, `frame` counts from 0, the present."""
 FRAME_HEIGHT: Final = 0.2
 """Metres from each future frame up to the next one, so that no frame hides another."""
-_PALETTE: Final = tuple(CATEGORY_COLORS.values())
 _FADING: Final = 0.6
 """The share of its opacity that an instance has lost at the last frame."""
 
@@ -34,7 +33,7 @@ class MotionMaps:
     def __init__(self, dataset: Dataset, scenario: str, config: MotionLabelConfig) -> None:
         """Prepare the labels of a scenario."""
         self._dataset, self._config = dataset, config
-        self._pair = Roles(dataset, scenario).pair
+        self._roles = Roles(dataset, scenario)
 
     def write(self, moment: Moment, recording: Recording) -> None:
         """Write the motion labels of the samples of a moment that have labels."""
@@ -42,16 +41,19 @@ class MotionMaps:
             record = self._dataset.get("sample", sample)
             if record["labelled"]:
                 own = self._dataset.get("agent", record["agent_token"])["actor_id"]
-                points = self._points(sample, own)
+                points = self._points(sample, agent, own)
                 message = cloud_message(points, frame_id(agent, "ego"), moment.index)
                 recording.write(f"/{agent}/motion_labels/points", message, moment.index)
 
-    def _points(self, sample: str, own_actor: int | None) -> AnyArray:
+    def _points(self, sample: str, agent: str, own_actor: int | None) -> AnyArray:
         labels = motion_labels(self._dataset, sample, self._config).to_present()
         actors = {own_actor if actor == OWN_BOX_ID else actor: name for actor, name in labels.id_map.items()}
-        colors = {name: COLLIDER_COLOR for actor, name in actors.items() if actor in self._pair}
-        if OWN_BOX_ID in labels.id_map:
-            colors.setdefault(labels.id_map[OWN_BOX_ID], OWN_COLOR)
+        colors = {name: AGENT_COLORS[agent] for actor, name in labels.id_map.items() if actor == OWN_BOX_ID}
+        for actor, name in actors.items():
+            if actor in self._roles.pair:
+                colors[name] = COLLIDER_COLOR
+            elif actor is not None and actor in self._roles.agents:
+                colors[name] = AGENT_COLORS[self._roles.agents[actor]]
         return cell_points(labels.instance, labels.config.grid, labels.label_valid, colors)
 
 
@@ -84,5 +86,5 @@ def cell_points(
 
 
 def _colors(names: Sequence[int], chosen: Mapping[int, str]) -> AnyArray:
-    colors: Any = [rgb(chosen.get(name, _PALETTE[name % len(_PALETTE)])) for name in names]
+    colors: Any = [rgb(chosen.get(name, INSTANCE_COLORS[name % len(INSTANCE_COLORS)])) for name in names]
     return np.array(colors, dtype=np.uint8).reshape(-1, 3)

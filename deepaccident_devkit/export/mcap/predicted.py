@@ -29,7 +29,7 @@ from deepaccident_devkit.export.mcap.messages import cloud_message, color_messag
 from deepaccident_devkit.export.mcap.moment import Moment
 from deepaccident_devkit.export.mcap.recording import Recording
 from deepaccident_devkit.motion import predict_instances
-from deepaccident_devkit.render.colors import ESTIMATE_COLOR
+from deepaccident_devkit.render.colors import PREDICTED_COLOR
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 _MARK: Final = 1.0
@@ -97,13 +97,13 @@ def _write_boxes(agent: str, detected: DetectedBoxes, topic: str, index: int, re
             frame,
             index,
             {"category": CATEGORIES[boxes.category[row]], "score": f"{score:.3f}"},
-            cubes=[cube(boxes, row, ESTIMATE_COLOR)],
-            lines=[lines(segments[row], ESTIMATE_COLOR)],
+            cubes=[cube(boxes, row, PREDICTED_COLOR)],
+            lines=[lines(segments[row], PREDICTED_COLOR)],
         )
         for row, score in enumerate(detected.scores.tolist())
     ]
     recording.write(topic, scene_update(entities, index), index)
-    points = segment_points(segments.reshape(-1, 2, 3), ESTIMATE_COLOR)
+    points = segment_points(segments.reshape(-1, 2, 3), PREDICTED_COLOR)
     recording.write(f"{topic}/points", cloud_message(points, frame, index), index)
 
 
@@ -122,11 +122,11 @@ def _write_accidents(agent: str, accidents: Sequence[Accident], topic: str, inde
                 index,
                 facts,
                 spheres=[_sphere(place) for place in places],
-                lines=[lines(places[None], ESTIMATE_COLOR)],
-                texts=[label(text, places.mean(axis=0) + np.array([0.0, 0.0, _MARK]), ESTIMATE_COLOR)],
+                lines=[lines(places[None], PREDICTED_COLOR)],
+                texts=[label(text, places.mean(axis=0) + np.array([0.0, 0.0, _MARK]), PREDICTED_COLOR)],
             )
         )
-        points += [colored_points(places, ESTIMATE_COLOR), segment_points(places[None], ESTIMATE_COLOR)]
+        points += [colored_points(places, PREDICTED_COLOR), segment_points(places[None], PREDICTED_COLOR)]
     recording.write(topic, scene_update(entities, index), index)
     recording.write(f"{topic}/points", cloud_message(joined(points), frame, index), index)
 
@@ -134,5 +134,5 @@ def _write_accidents(agent: str, accidents: Sequence[Accident], topic: str, inde
 def _sphere(place: Any) -> Any:
     turn = np.array([1.0, 0.0, 0.0, 0.0])
     return SpherePrimitive(
-        pose=pose(place, turn), size=vector(np.full(3, _MARK)), color=color_message(ESTIMATE_COLOR, 0.8)
+        pose=pose(place, turn), size=vector(np.full(3, _MARK)), color=color_message(PREDICTED_COLOR, 0.8)
     )

@@ -15,9 +15,9 @@ class Roles:
         """Read the roles of a scenario from its meta."""
         collision = dataset.get("scenario", scenario)["collision"]
         self.pair: frozenset[int] = frozenset() if collision is None else frozenset(collision["ids"])
-        self._agents: Mapping[int, str] = {actor: agent for agent, actor in agent_actors(dataset, scenario).items()}
+        self.agents: Mapping[int, str] = {actor: agent for agent, actor in agent_actors(dataset, scenario).items()}
 
     def role(self, actor: int) -> str:
         """The role of an actor, such as `ego_vehicle, collides`; empty for most actors."""
-        words = [self._agents[actor]] if actor in self._agents else []
+        words = [self.agents[actor]] if actor in self.agents else []
         return ", ".join([*words, "collides"] if actor in self.pair else words)

@@ -10,9 +10,9 @@ import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, IntArray
 from deepaccident_devkit.geometry import quaternions
-from deepaccident_devkit.render.colors import AGENT_COLORS, CATEGORY_COLORS, COLLIDER_COLOR
+from deepaccident_devkit.render.colors import AGENT_COLORS
 from deepaccident_devkit.render.replay.recording import Recording
-from deepaccident_devkit.render.roles import short_name
+from deepaccident_devkit.render.roles import actor_color, short_name
 from deepaccident_devkit.taxonomy import CAMERAS
 from deepaccident_devkit.v2x.cooperation import visible_actors
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
@@ -94,7 +94,6 @@ def _actor(
     category = boxes.category_names[0]
     length, width, height = np.rint(boxes.size[0] * 100).astype(int).tolist()
     role = _role(recording, actor, agent)
-    color = CATEGORY_COLORS[category] if agent is None else AGENT_COLORS[agent]
     states: list[Any] = [None] * len(recording.frames)
     moments = zip(
         tracks.index[rows].tolist(),
@@ -114,7 +113,7 @@ def _actor(
         "category": category,
         "role": role,
         "tag": "" if agent is None else _letters(agent),
-        "color": COLLIDER_COLOR if role == "pair" else color,
+        "color": actor_color(category, agent, collides=role == "pair"),
         "length": length,
         "width": width,
         "height": height,

@@ -209,6 +209,7 @@ function showCamera(card) {
     if (card.picture.src !== coded) card.picture.src = coded;
     card.picture.alt = `${card.agent.title}, camera ${camera.title}, frame ${frame + 1}`;
     card.where.textContent = frame === state.frame ? camera.title : `${camera.title}, frame ${frame + 1}`;
+    card.where.classList.toggle("earlier", frame !== state.frame);
     card.select.options[0].textContent = card.chosen ? "automatic" : `auto: ${camera.title}`;
     if (state.boxes) drawBoxes(card, camera, frame);
   }

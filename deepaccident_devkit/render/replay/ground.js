@@ -8,7 +8,7 @@ const LEAST_SPAN = 30;
 const PAIR_SPAN = 36;
 const LEAST_PIXELS = 5;
 const LEAST_MARK = 9;
-const MARKS = { pedestrian: "circle", cyclist: "diamond", motorcycle: "triangle" };
+const SHAPES = { o: "circle", D: "diamond", "^": "triangle" }; // of the colour table's markers
 const RING = 1.2; // metres
 const ZOOM_STEP = 1.25;
 const ZOOM_RANGE = [0.5, 120];
@@ -24,14 +24,15 @@ class Ground {
     this.pen = canvas.getContext("2d");
     this.road = data.road && Object.assign(new Image(), { src: `data:image/png;base64,${data.road.png}` });
     if (this.road) this.road.addEventListener("load", () => this.draw());
+    this.pair = data.actors.filter((actor) => actor.role === "pair");
+    for (const actor of data.actors) actor.shape = SHAPES[data.markers[actor.category]];
     this.clouds = (data.points || []).map((coded) => (coded === null ? null : decodedCloud(coded)));
     this.showWhole();
   }
 
   // All agents' paths and the colliding pair's, in metres.
   showWhole() {
-    const pair = this.data.actors.filter((actor) => actor.role === "pair");
-    const states = [...this.data.agents.flatMap((agent) => agent.poses), ...pair.flatMap((actor) => actor.states)];
+    const states = [...this.data.agents, ...this.pair].flatMap((each) => each.poses || each.states);
     const places = states.filter((each) => each !== null);
     const xs = places.map((each) => each[0] / 100);
     const ys = places.map((each) => each[1] / 100);
@@ -44,8 +45,7 @@ class Ground {
 
   // The pair in the middle, the closer the larger; it stays where it was while nobody annotated one of the two.
   showPair() {
-    const pair = this.data.actors.filter((actor) => actor.role === "pair");
-    const states = pair.map((actor) => actor.states[this.state.frame]).filter((each) => each);
+    const states = this.pair.map((actor) => actor.states[this.state.frame]).filter((each) => each);
     if (states.length < 2) return;
     const [x, y] = [0, 1].map((axis) => states.map((each) => each[axis] / 100));
     [this.x, this.y] = [(x[0] + x[1]) / 2, (y[0] + y[1]) / 2];
@@ -114,7 +114,6 @@ class Ground {
   drawRoad() {
     const { left, top, width, height } = this.data.road;
     const scale = this.scale / 100;
-    this.pen.imageSmoothingEnabled = true;
     this.pen.drawImage(this.road, ...this.at([left, top]), width * scale, height * scale);
   }
 
@@ -198,7 +197,7 @@ class Ground {
 
   // Length and width in pixels: small actors stay large enough to be found.
   size(actor) {
-    const least = MARKS[actor.category] ? LEAST_MARK : LEAST_PIXELS;
+    const least = actor.shape ? LEAST_MARK : LEAST_PIXELS;
     return [actor.length, actor.width].map((each) => Math.max(least, (each / 100) * this.scale));
   }
 
@@ -220,9 +219,9 @@ class Ground {
     const corners = {
       diamond: [[length, 0], [0, width], [-length, 0], [0, -width]],
       triangle: [[length, 0], [-length, width], [-length, -width]],
-    }[MARKS[actor.category]] || [[length, -width], [length, width], [-length, width], [-length, -width]];
+    }[actor.shape] || [[length, -width], [length, width], [-length, width], [-length, -width]];
     pen.beginPath();
-    if (MARKS[actor.category] === "circle") pen.arc(0, 0, length, 0, 2 * Math.PI);
+    if (actor.shape === "circle") pen.arc(0, 0, length, 0, 2 * Math.PI);
     else corners.forEach((corner) => pen.lineTo(...corner));
     pen.closePath();
   }
@@ -246,7 +245,7 @@ class Ground {
     pen.globalAlpha = 1;
     pen.lineWidth = actor.role === "other" ? 1.2 : 2;
     pen.stroke();
-    if (!MARKS[actor.category]) {
+    if (!actor.shape) {
       pen.strokeStyle = "#ffffff";
       pen.beginPath();
       pen.moveTo(0, 0);
@@ -294,7 +293,8 @@ class Ground {
   drawNames() {
     const { agents, ids } = this.state.layers;
     for (const actor of this.data.actors) {
-      const words = [agents && actor.tag, ids && String(actor.id)].filter(Boolean).join(" ");
+      const named = ids || (agents && this.pair.includes(actor) && !actor.tag);
+      const words = [agents && actor.tag, named && String(actor.id)].filter(Boolean).join(" ");
       if (words && actor.states[this.state.frame] !== null) this.writeBeside(words, this.extent(actor), actor.color);
     }
     if (!agents) return;
@@ -360,7 +360,7 @@ class Ground {
 
   // Agents that foresee the same have one alarm; actors are named unless they are those who collide.
   joined(alarms) {
-    const pair = this.data.actors.filter((actor) => actor.role === "pair").map((actor) => actor.id);
+    const pair = this.pair.map((actor) => actor.id);
     const byWords = new Map();
     for (const alarm of alarms) {
       const right = alarm.actors.length === 2 && alarm.actors.every((id) => pair.includes(id));

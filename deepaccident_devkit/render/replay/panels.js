@@ -2,11 +2,12 @@
 
 const data = JSON.parse(document.getElementById("data").textContent);
 const last = data.countdown.length - 1;
+const pair = data.actors.filter((actor) => actor.role === "pair");
 const state = {
   frame: 0,
   playing: false,
   speed: 1,
-  follow: data.actors.some((actor) => actor.role === "pair") ? "pair" : "",
+  follow: pair.length ? "pair" : "",
   sight: "",
   large: "",
   boxes: true,
@@ -65,8 +66,8 @@ function showSeen() {
       if (cell.textContent !== text) cell.textContent = text;
     });
   }
-  const sentences = data.actors
-    .filter((actor) => actor.role === "pair" && actor.states[state.frame] !== null)
+  const sentences = pair
+    .filter((actor) => actor.states[state.frame] !== null)
     .map((actor) => {
       const names = data.agents.filter((_, bit) => actor.seen[state.frame] & (1 << bit)).map((agent) => agent.title);
       const speed = actor.states[state.frame][3];

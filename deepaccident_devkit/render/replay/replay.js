@@ -80,7 +80,8 @@ choice(byId("speed"), SPEEDS.map((speed) => [String(speed), `${speed} ×`]), "1"
   state.speed = Number(value);
   begun = null;
 });
-choice(byId("follow"), [["", "nobody"], ["pair", "the colliding pair"], ...agentOptions], state.follow, (value) => {
+const followOptions = [["", "nobody"], ...(pair.length ? [["pair", "the colliding pair"]] : []), ...agentOptions];
+choice(byId("follow"), followOptions, state.follow, (value) => {
   state.follow = value;
 });
 choice(byId("sight"), [["", "none"], ["all", "all agents"], ...agentOptions], "", (value) => {
@@ -173,10 +174,9 @@ for (const [name, value] of data.facts) {
 }
 byId("notes").append(...data.notes.map((note) => made("li", { textContent: note })));
 const others = data.actors.filter((actor) => actor.role === "other");
-const kinds = new Map(others.map((actor) => [actor.category, chip(actor.color, MARKS[actor.category])]));
-const pair = data.actors.find((actor) => actor.role === "pair");
+const kinds = new Map(others.map((actor) => [actor.category, chip(actor.color, actor.shape)]));
 byId("legend").append(
-  ...(pair ? [made("span", {}, chip(pair.color), "colliding pair")] : []),
+  ...(pair.length ? [made("span", {}, chip(data.colors.pair), "colliding pair")] : []),
   ...data.agents.map((agent) => made("span", {}, chip(agent.color), `${agent.short} ${agent.title}`)),
   ...[...kinds].map(([name, mark]) => made("span", {}, mark, name)),
 );

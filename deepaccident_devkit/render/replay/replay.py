@@ -16,7 +16,13 @@ from typing import Any, Final
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.files import write_bytes
-from deepaccident_devkit.render.colors import COLLIDER_COLOR, GRID_COLOR, OUTCOME_COLORS, POINT_COLOR
+from deepaccident_devkit.render.colors import (
+    CATEGORY_MARKERS,
+    COLLIDER_COLOR,
+    GRID_COLOR,
+    OUTCOME_COLORS,
+    POINT_COLOR,
+)
 from deepaccident_devkit.render.replay.actors import actor_entries, agent_entries, camera_entries, camera_title
 from deepaccident_devkit.render.replay.facts import facts, notes
 from deepaccident_devkit.render.replay.follow import Followed, follow_pair
@@ -130,6 +136,7 @@ def _data(recording: Recording, prediction: Foreseen | None) -> dict[str, Any]:
             "grid": GRID_COLOR,
             **OUTCOME_COLORS,
         },
+        "markers": dict(CATEGORY_MARKERS),
         "agents": agent_entries(recording),
         "actors": actor_entries(recording),
         "points": lidar_points(recording, first),

@@ -13,12 +13,12 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.export.mcap import EPOCH, export_mcap
 from deepaccident_devkit.motion import motion_labels
-from deepaccident_devkit.render.colors import COLLIDER_COLOR, COMPANION_COLOR
+from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, LIDAR
 from deepaccident_devkit.v2x import cooperative_boxes, visible_instances
 
 FRAMES = 6
-RED = (0xE6, 0x00, 0x26)
+RED = tuple(bytes.fromhex(COLLIDER_COLOR[1:]))
 
 
 @pytest.fixture(scope="module")
@@ -190,18 +190,20 @@ def test_actors_say_who_sees_them(da: DeepAccident, scenario: str, file: McapFil
     assert any(seen_by.values())
 
 
-def test_the_colliding_pair_is_red_and_other_recorders_green(da: DeepAccident, scenario: str, file: McapFile) -> None:
+def test_the_colliding_pair_is_red_and_other_recorders_have_their_hues(
+    da: DeepAccident, scenario: str, file: McapFile
+) -> None:
     pair = da.get("scenario", scenario)["collision"]["ids"]
-    recorders = {record["actor_id"] for record in da.agent if record["scenario_token"] == scenario} - {None}
+    agents = {each["actor_id"]: each["name"] for each in da.agent if each["scenario_token"] == scenario}
     colors, words = {}, {}
     for entity in file.only("/actors")[-1].entities:
         color = entity.cubes[0].color
         colors[entity.id] = "#" + bytes(round(255 * each) for each in (color.r, color.g, color.b)).hex()
         words[entity.id] = entity.texts[0].text
     assert [name for name, color in colors.items() if color == COLLIDER_COLOR] == sorted(map(str, pair), key=int)
-    companions = {str(actor) for actor in recorders - set(pair)}
-    assert {name for name, color in colors.items() if color == COMPANION_COLOR} == companions
-    assert len(companions) == 2
+    behind = {str(actor): AGENT_COLORS[agents[actor]] for actor in agents.keys() - {None, *pair}}
+    assert {name: color for name, color in colors.items() if color in AGENT_COLORS.values()} == behind
+    assert len(behind) == 2
     assert all("collides" in words[str(actor)] for actor in pair)
     cloud = cloud_of(file.only("/actors/points")[-1])
     red = (cloud["red"] == RED[0]) & (cloud["green"] == RED[1]) & (cloud["blue"] == RED[2]) & (cloud["alpha"] == 255)

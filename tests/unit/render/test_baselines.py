@@ -3,7 +3,8 @@ from dataclasses import replace
 import pytest
 
 from deepaccident_devkit.render import detached_figure
-from deepaccident_devkit.render.baselines import CONFIGURATION_COLORS, Panel, render_panel, render_panels
+from deepaccident_devkit.render.baselines import Panel, render_panel, render_panels
+from deepaccident_devkit.render.colors import CONFIGURATION_COLORS
 from deepaccident_devkit.v2x import AGENT_CONFIGS
 
 BARS = Panel(

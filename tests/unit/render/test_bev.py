@@ -21,7 +21,6 @@ from deepaccident_devkit.render.colors import (
     AGENT_COLORS,
     BEV_COLORS,
     COLLIDER_COLOR,
-    COMPANION_COLOR,
     OWN_COLOR,
     POINT_COLOR,
 )
@@ -69,7 +68,7 @@ def test_without_a_collision_nobody_is_red(da: DeepAccident) -> None:
     sample = f"{scenario['token']}/ego_vehicle/003"
     ax = render_bev(da, sample, layers=("boxes",), ax=new_axes())
     assert COLLIDER_COLOR not in outlines(ax).values()
-    assert COMPANION_COLOR in outlines(ax).values()
+    assert AGENT_COLORS["ego_vehicle"] in outlines(ax).values()
 
 
 def test_of_several_agents_each_has_its_colour_its_name_and_its_place(da: DeepAccident, approach: str) -> None:
@@ -85,7 +84,7 @@ def test_of_several_agents_each_has_its_colour_its_name_and_its_place(da: DeepAc
         assert_allclose(text.xy, world_from_ego.translation[:2])
         assert text.get_text() == short_name(agent)
     entries = [one.get_text() for one in ax.get_legend().get_texts()]
-    assert entries[:2] == ["colliding pair", "companion"]
+    assert entries[:2] == ["colliding pair", "ego behind"]
     assert entries[-5:] == ["ego", "ego behind", "other", "other behind", "infrastructure"]
     center = np.mean([ax.get_xlim(), ax.get_ylim()], axis=1)
     assert_allclose(center, da.world_from(approach, "ego").translation[:2])

@@ -12,7 +12,7 @@ from numpy.testing import assert_array_equal
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render import detached_figure, render_frame, render_sample
-from deepaccident_devkit.render.colors import COLLIDER_COLOR, COMPANION_COLOR
+from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 
 pytestmark = pytest.mark.slow
@@ -39,10 +39,10 @@ def test_a_frame_shows_its_agents_in_their_order(da: DeepAccident, frame: str) -
     for agent, image in zip(AGENTS, images(cameras), strict=True):
         assert_array_equal(image, da.load_image(f"{scenario}/{agent}/004/Camera_Front"))
     for ax in above:
-        assert {COLLIDER_COLOR, COMPANION_COLOR} <= colors_from_above(ax)
+        assert {COLLIDER_COLOR, *(AGENT_COLORS[AGENTS[each]] for each in (1, 3))} <= colors_from_above(ax)
     assert "0.2 s to the impact" in fig._suptitle.get_text()
     legend = [one.get_text() for one in fig.legends[0].get_texts()]
-    assert legend[:2] == ["colliding pair", "companion"]
+    assert legend[:2] == ["colliding pair", "ego behind"]
     assert tuple(fig.get_size_inches()) == (16, 9)
     assert plt.get_fignums() == []
 

@@ -13,7 +13,7 @@ from video_views import colors, decoded
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.render.colors import COLLIDER_COLOR, COMPANION_COLOR
+from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.render.video import render_scenario_video
 from deepaccident_devkit.render.video.writers import write_video
 
@@ -29,7 +29,7 @@ def test_few_pixels_keep_their_color_in_a_gif(tmp_path: Path) -> None:
     """A box is some pixels of a picture of thousands of other colours."""
     rng = np.random.default_rng(0)
     photo = rng.integers(60, 140, (90, 160, 3), dtype=np.uint8)
-    marks = {(10, 20): COLLIDER_COLOR, (50, 60): COMPANION_COLOR}
+    marks = {(10, 20): COLLIDER_COLOR, (50, 60): AGENT_COLORS["ego_vehicle"]}
     for (row, column), color in marks.items():
         photo[row : row + 2, column : column + 12] = np.array(to_rgba(color)[:3]) * 255
     write_video(tmp_path / "v.gif", [photo, photo[::-1]], fps=10)

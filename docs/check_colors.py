@@ -1,0 +1,90 @@
+"""Measure the colour table for normal and colour-blind eyes: `python docs/check_colors.py`.
+
+Distances are CIELAB ΔE (1976, D65); colour blindness is simulated with the matrices of Machado and others (2009),
+severity 1; contrast is WCAG's ratio of luminances.
+"""
+
+from collections.abc import Iterable
+
+import numpy as np
+from matplotlib.colors import to_rgb
+from numpy.typing import NDArray
+
+from deepaccident_devkit.render import colors
+
+EYES = {
+    "normal": np.eye(3),
+    "protanopia": np.array(
+        [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
+    ),
+    "deuteranopia": np.array(
+        [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
+    ),
+    "tritanopia": np.array(
+        [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]]
+    ),
+}
+"""What each kind of eye makes of linear RGB."""
+XYZ_FROM_RGB = np.array(
+    [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
+)
+GROUPS = {
+    "agents and the pair": (*colors.AGENT_COLORS.values(), colors.COLLIDER_COLOR),
+    "verdicts": tuple(colors.OUTCOME_COLORS.values()),
+    "classes of vehicles": tuple(colors.CATEGORY_COLORS[name] for name in ("car", "truck", "van")),
+    "all classes": tuple(colors.CATEGORY_COLORS.values()),
+    "series": colors.SERIES_COLORS,
+    "splits": tuple(colors.SPLIT_COLORS.values()),
+    "configurations": tuple(colors.CONFIGURATION_COLORS.values()),
+}
+"""Colours that stand together in a picture and must be distinguished."""
+GROUNDS = {"white": "#ffffff", "road": colors.BEV_COLORS["road"], "mid-grey image": "#808080"}
+
+
+def linear(names: Iterable[str]) -> NDArray[np.float64]:
+    """(N, 3) linear RGB of sRGB colours."""
+    encoded = np.array([to_rgb(name) for name in names])
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+def lab(names: Iterable[str], eye: str = "normal") -> NDArray[np.float64]:
+    """(N, 3) lightness, green to red, and blue to yellow of CIELAB, as an eye of `EYES` sees the colours."""
+    seen = np.clip(linear(names) @ EYES[eye].T, 0, 1)
+    part = seen @ XYZ_FROM_RGB.T / XYZ_FROM_RGB.sum(axis=1)
+    x, y, z = np.where(part > (6 / 29) ** 3, np.cbrt(part), part / (3 * (6 / 29) ** 2) + 4 / 29).T
+    return np.column_stack([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+
+def chroma(names: Iterable[str]) -> NDArray[np.float64]:
+    """(N,) how saturated colours are; grey has 0."""
+    return np.hypot(*lab(names)[:, 1:].T)
+
+
+def distances(first: Iterable[str], second: Iterable[str], eye: str = "normal") -> NDArray[np.float64]:
+    """(N, M) ΔE between the colours of two groups."""
+    return np.linalg.norm(lab(first, eye)[:, None] - lab(second, eye), axis=-1)
+
+
+def least_distance(group: Iterable[str], eye: str = "normal") -> float:
+    """The smallest ΔE between two colours of a group."""
+    group = tuple(group)
+    return float(distances(group, group, eye)[np.triu_indices(len(group), 1)].min())
+
+
+def contrast(names: Iterable[str], ground: str) -> NDArray[np.float64]:
+    """(N,) the ratio of luminances of colours to that of a ground, from 1 to 21."""
+    light, behind = ((linear(each) @ XYZ_FROM_RGB[1]) + 0.05 for each in (names, [ground]))
+    return np.maximum(light, behind) / np.minimum(light, behind)
+
+
+def main() -> None:
+    print(f"{'smallest ΔE':22}", *(f"{eye:>13}" for eye in EYES))
+    for name, group in GROUPS.items():
+        print(f"{name:22}", *(f"{least_distance(group, eye):13.1f}" for eye in EYES))
+    print(f"\n{'smallest contrast':22}", *(f"{ground:>15}" for ground in GROUNDS))
+    for name, group in GROUPS.items():
+        print(f"{name:22}", *(f"{contrast(group, ground).min():15.2f}" for ground in GROUNDS.values()))
+
+
+if __name__ == "__main__":
+    main()
