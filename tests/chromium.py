@@ -9,6 +9,7 @@ OVERFLOWING = """
 const width = document.documentElement.clientWidth;
 const scrolls = (element) => element && (element.classList.contains('wide') || scrolls(element.parentElement));
 return [...document.querySelectorAll('body *')]
+  .filter((each) => !each.ownerSVGElement)  // a drawing is cut off at its edges
   .filter((each) => each.getBoundingClientRect().right > width + 1 && !scrolls(each.parentElement))
   .map((each) => each.outerHTML.slice(0, 200));
 """

@@ -56,7 +56,7 @@ _SECONDS_BEFORE: Final = 1.0
 _LABELS: Final = MotionLabelConfig(future_frames=2)
 """The released labels, but they end at the impact."""
 _SELECTION: Final = SampleSelection(split="train", scope="all")
-_STEPS: Final = {"recording": 32.0, "indexing": 1.0, "pictures": 5.0, "table": 2.0, "evaluation": 4.0, "replay": 2.0}
+_STEPS: Final = {"recording": 32.0, "indexing": 1.0, "pictures": 5.0, "table": 2.0, "evaluation": 4.0, "replay": 4.0}
 """About how many seconds each step takes on two cores."""
 _BAR: Final = "{desc:<10} {percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
 

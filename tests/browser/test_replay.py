@@ -1,5 +1,6 @@
 """Replays, opened as a reader opens them: they play, scrub, show the impact, and ask for nothing."""
 
+import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -8,13 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 from chromium import Browser
+from numpy.testing import assert_allclose
+from replay_page import data_of
 from selenium.webdriver.common.keys import Keys
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import Accident, box_truth
+from deepaccident_devkit.render.boxes import EDGES, NEAREST_DRAWN, segments_in_image
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR
-from deepaccident_devkit.render.replay import render_replay
+from deepaccident_devkit.render.replay import render_replay, sensors
 from deepaccident_devkit.render.replay.recording import recording_of
+from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 pytestmark = pytest.mark.slow
@@ -40,8 +45,9 @@ def page(da_motion: DeepAccident, scenario: str, tmp_path_factory: pytest.TempPa
 
 @pytest.fixture
 def opened(browser: Browser, page: Path) -> Browser:
-    """The page, in which nobody is marked but by their boxes."""
+    """The page with the whole scene, in which nobody is marked but by their boxes."""
     browser.open(page, 1280)
+    click(browser, "whole")
     for layer in ("trails", "dots", "agents"):
         click(browser, f"layer-{layer}")
     return browser
@@ -151,10 +157,13 @@ def test_boxes_are_drawn_where_the_labels_say(at: int, opened: Browser, da_motio
     origin = recording_of(da_motion, scenario, None).origin
     scrub(opened, at)
     pair = da_motion.get("scenario", scenario)["collision"]["ids"]
-    followers = ("ego_vehicle_behind", "other_vehicle_behind")
-    behind = [(da_motion.get("agent", f"{scenario}/{each}")["actor_id"], AGENT_COLORS[each]) for each in followers]
+    colors_of = {
+        da_motion.get("agent", f"{scenario}/{agent}")["actor_id"]: AGENT_COLORS[agent]
+        for agent in ("ego_vehicle_behind", "other_vehicle_behind")
+    }
+    colors_of |= dict.fromkeys(pair, COLLIDER_COLOR)
     boxes = scenario_tracks(da_motion, scenario).at(at + 1)
-    for actor, color in [(each, COLLIDER_COLOR) for each in pair] + behind:
+    for actor, color in colors_of.items():
         row = int(boxes.actor_id.searchsorted(actor))
         center, (length, width, _) = boxes.center[row, :2], boxes.size[row]
         forward = np.array([np.cos(boxes.yaw[row]), np.sin(boxes.yaw[row])])
@@ -269,22 +278,118 @@ def test_who_sees_whom_is_listed_and_drawn(opened: Browser, da_motion: DeepAccid
     assert len({before, everyone, drawn(opened)}) == 3
 
 
-def test_cameras_are_chosen(browser: Browser, da: DeepAccident, tmp_path: Path) -> None:
-    browser.open(render_replay(da, None, tmp_path / "replay.html"), 1280)
-    source = "return document.querySelector('figure[data-agent=ego_vehicle] img').src"
+@pytest.fixture(scope="module")
+def recorded(da: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A page with pictures."""
+    return render_replay(da, None, tmp_path_factory.mktemp("recorded") / "replay.html")
+
+
+def test_every_camera_is_chosen(browser: Browser, recorded: Path) -> None:
+    data = data_of(recorded)
+    browser.open(recorded, 1280)
+    source = "return document.querySelector('figure[data-agent={}] img').src"
     wait_until(lambda: browser.script("return [...document.images].every((each) => each.naturalWidth === 64)"))
     assert browser.script("return document.images.length") == 5
-    front = browser.script(source)
-    choose(browser, "select[data-agent=ego_vehicle]", "3")
-    back = browser.script(source)
-    assert back != front
-    alt = browser.script("return document.querySelector('figure[data-agent=ego_vehicle] img').alt")
-    assert alt == "ego, camera Back, frame 1"
-    scrub(browser, 5)
-    assert browser.script(source) not in (front, back)
+    scrub(browser, 4)
+    for agent, cameras in zip(data["agents"], data["cameras"], strict=True):
+        for camera in cameras:
+            choose(browser, f'select[aria-label="Camera of {agent["title"]}"]', camera["title"])
+            assert browser.script(source.format(agent["name"])).endswith(camera["pictures"][4])
+        alt = browser.script(f"return document.querySelector('figure[data-agent={agent['name']}] img').alt")
+        assert alt == f"{agent['title']}, camera BackRight, frame 5"
     click(browser, "layer-points")
     assert browser.complaints() == []
     assert len(browser.requests()) == 1
+
+
+def test_where_a_frame_has_no_picture_the_one_before_is_shown_with_its_boxes(
+    browser: Browser, da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sensors, "_OTHERS", (2,))
+    browser.open(render_replay(da, None, tmp_path / "replay.html"), 1280)
+    where = "return document.querySelector('figure[data-agent=infrastructure] .where').textContent"
+    boxes = "return document.querySelector('figure[data-agent=infrastructure] svg').innerHTML"
+    scrub(browser, 4)
+    choose(browser, 'select[aria-label="Camera of infrastructure"]', "FrontLeft")
+    before = browser.script(boxes)
+    assert browser.script(where) == "FrontLeft"
+    scrub(browser, 5)
+    assert browser.script(where) == "FrontLeft, frame 5"
+    assert browser.script(boxes) == before
+
+
+LARGE = "return document.querySelector('.agent.large').dataset.agent"
+
+
+def test_one_picture_is_large_and_by_default_it_follows_the_pair(browser: Browser, recorded: Path) -> None:
+    data = data_of(recorded)
+    pair = [actor["id"] for actor in data["actors"] if actor["role"] == "pair"]
+    browser.open(recorded, 1280)
+    for frame_ in (0, 5):  # the last is the impact
+        scrub(browser, frame_)
+        number = data["automatic"]["agents"][frame_]
+        agent = data["agents"][number]["name"]
+        assert browser.script(LARGE) == agent
+        title = data["automatic"]["cameras"][number][frame_]
+        (camera,) = [each for each in data["cameras"][number] if each["title"] == title]
+        shown = browser.script("return document.querySelector('.agent.large img').src")
+        assert shown.endswith(camera["pictures"][frame_])
+        boxes = browser.script("return [...document.querySelectorAll('.agent.large g')].map((g) => g.dataset.actor)")
+        assert {str(each) for each in pair} & set(boxes)
+    browser.script("document.querySelector('figure[data-agent=other_vehicle] .pictured').click()")
+    assert browser.script(LARGE) == "other_vehicle"
+    press(browser, "5")
+    assert browser.script(LARGE) == "infrastructure"
+    choose(browser, "#large", "1")
+    assert browser.script(LARGE) == "ego_vehicle_behind"
+    press(browser, "0")
+    assert browser.script(LARGE) == agent
+    widths = browser.script("return [...document.querySelectorAll('.pictured')].map((each) => each.clientWidth)")
+    small, large = sorted(widths)[-2:]
+    assert large > 3.5 * small
+
+
+def test_boxes_are_where_the_camera_has_them(browser: Browser, da: DeepAccident, recorded: Path) -> None:
+    """At the impact, of all agents, cut off at the near plane: as Python draws them, to a hundredth."""
+    scenario = data_of(recorded)["scenario"]
+    browser.open(recorded, 1280)
+    scrub(browser, 5)
+    cut = 0
+    tracks = scenario_tracks(da, scenario).at(6)
+    for agent, cameras in zip(AGENTS, data_of(recorded)["automatic"]["cameras"], strict=True):
+        drawn_ = browser.script(
+            f"return [...document.querySelectorAll('figure[data-agent={agent}] g')]"
+            ".map((g) => [Number(g.dataset.actor), g.querySelectorAll('path')[1].getAttribute('d')])"
+        )
+        sample, channel = f"{scenario}/{agent}/006", f"Camera_{cameras[5]}"
+        optical = tracks.transform(da.world_from(sample, channel).inverse(), channel)
+        for actor, path in drawn_:
+            (corners,) = optical.select(optical.actor_id == actor).corners()
+            wanted, there = segments_in_image(corners[np.array(EDGES)], da.camera(sample, channel))
+            cut += int((corners[:, 2] < NEAREST_DRAWN).any())
+            found = np.array([float(each) for each in re.findall(r"-?[\d.]+", path)]).reshape(-1, 2, 2)
+            assert len(found) == int(there.sum())
+            away = (corners[np.array(EDGES), 2] > 1.0).all(axis=1)[there]  # nearer, half a centimetre is many pixels
+            assert_allclose(found[away], wanted[away], rtol=0.01, atol=0.3)
+        assert len(drawn_) > 0 or agent != "infrastructure"
+    assert cut > 0
+    click(browser, "boxes")
+    assert browser.script("return document.querySelectorAll('.boxes g').length") == 0
+
+
+def test_the_road_lies_beneath(browser: Browser, recorded: Path) -> None:
+    browser.open(recorded, 1280)
+    wait_until(lambda: browser.script("return ground.road.complete"))
+    click(browser, "whole")
+    with_it = drawn(browser)
+    click(browser, "layer-road")
+    assert drawn(browser) != with_it
+
+
+def test_it_loads_soon(browser: Browser, recorded: Path) -> None:
+    browser.open(recorded, 1280)
+    times = "const [times] = performance.getEntriesByType('navigation'); return times.loadEventEnd"
+    assert 0 < browser.script(times) < 3000
 
 
 @pytest.fixture(scope="module")
@@ -315,6 +420,36 @@ def test_the_verdict_stands_beside(browser: Browser, judged: Path) -> None:
     assert text(browser, "foreseen").startswith("FP + FNego at frame 30")
     assert "places off by 40.0 m" in text(browser, "foreseen")
     assert browser.complaints() == []
+
+
+CHOSEN_CUT = """
+const pen = document.createElement('canvas').getContext('2d');
+return [...document.querySelectorAll('.agent select')].filter((each) => each.offsetParent).filter((each) => {
+  pen.font = getComputedStyle(each).font;
+  return pen.measureText(each.selectedOptions[0].text).width + 18 > each.clientWidth;  // 18 for the arrow
+}).map((each) => [each.selectedOptions[0].text, each.clientWidth]);
+"""
+CUT = """
+return [...document.querySelectorAll('.name, .badge, .where, th, td, button, p, dt, dd, legend, #legend span')]
+  .filter((each) => each.offsetParent && each.scrollWidth > each.clientWidth + 1 && each.clientWidth)
+  .map((each) => each.outerHTML.slice(0, 200));
+"""
+
+
+@pytest.mark.parametrize("width", [1400, 1100, 700, 390])
+def test_nothing_is_cut(width: int, browser: Browser, recorded: Path, judged: Path) -> None:
+    for page_, last in ((recorded, 5), (judged, 34)):
+        browser.open(page_, width)
+        for at in (0, last):
+            scrub(browser, at)
+            assert browser.overflowing() == []
+            assert browser.script(CUT) == []
+            assert browser.script(CHOSEN_CUT) == []
+            assert browser.script("return document.documentElement.scrollWidth") <= width
+    table = "const box = document.getElementById('samples'); return box.scrollWidth - box.clientWidth"
+    assert browser.script(table) <= 0
+    lines = "return [...document.querySelectorAll('.name')].map((each) => each.getClientRects().length)"
+    assert browser.script(lines) == [1] * 5
 
 
 @pytest.mark.parametrize("width", [1280, 700, 390])

@@ -24,7 +24,7 @@ def notes(recording: Recording, pictures: CameraPictures, *, points: bool) -> li
         pictures: the cameras' pictures.
         points: whether there are LiDAR points.
     """
-    return [*_labels(recording), *_pictures(recording, pictures), *_points(recording, points=points)]
+    return [*_labels(recording), *_pictures(pictures), *_points(recording, points=points)]
 
 
 def _setting(recording: Recording) -> Iterator[tuple[str, str]]:
@@ -79,7 +79,7 @@ def _labels(recording: Recording) -> Iterator[str]:
         yield f"Meta and the recording disagree: {'; '.join(recording.contact.disagreements)}."
 
 
-def _pictures(recording: Recording, pictures: CameraPictures) -> Iterator[str]:
+def _pictures(pictures: CameraPictures) -> Iterator[str]:
     settings = pictures.settings
     if not pictures.found:
         yield f"No pictures: none of the {pictures.wanted} camera files is here; unpack the cameras' archives."
@@ -90,13 +90,17 @@ def _pictures(recording: Recording, pictures: CameraPictures) -> Iterator[str]:
     if settings is None:
         yield "No pictures: the file would be too large with them."
         return
-    kept = [short_name(agent) for agent in recording.agents]
-    others = kept if settings.front_only else kept[1:]
     yield f"Pictures are up to {settings.width} pixels wide, of JPEG quality {settings.quality}."
     if settings.every > 1:
         yield f"One of every {settings.every} frames has pictures, to keep the file small."
-    if others:
-        yield f"To keep the file small, these agents have only the front camera: {', '.join(others)}."
+    if not settings.others:
+        yield "To keep the file small, only the front cameras and those that follow the pair have pictures."
+    elif settings.other_width < settings.width or settings.others > 1:
+        each = "every frame" if settings.others == 1 else f"one of every {settings.others} frames"
+        yield (
+            "To keep the file small, cameras other than the front ones and those that follow the pair have smaller "
+            f"pictures, up to {settings.other_width} pixels wide, of {each}."
+        )
 
 
 def _points(recording: Recording, *, points: bool) -> Iterator[str]:

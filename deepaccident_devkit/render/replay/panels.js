@@ -1,14 +1,17 @@
-// The panels beside the scene: cameras, who sees whom, predictions. Text of the data is only set as text, not as HTML.
+// The tables below the scene: who sees whom, predictions. Text of the data is only set as text, not as HTML.
 
 const data = JSON.parse(document.getElementById("data").textContent);
 const last = data.countdown.length - 1;
+const pair = data.actors.filter((actor) => actor.role === "pair");
 const state = {
   frame: 0,
   playing: false,
   speed: 1,
-  follow: "",
+  follow: pair.length ? "pair" : "",
   sight: "",
-  layers: { trails: true, dots: true, ids: false, agents: true, points: false, prediction: true },
+  large: "",
+  boxes: true,
+  layers: { road: true, trails: true, dots: true, ids: false, agents: true, points: false, prediction: true },
   foreseen: [],
 };
 const byId = (name) => document.getElementById(name);
@@ -38,68 +41,14 @@ function choice(element, options, chosen, changed) {
   });
 }
 
-// the cameras
-
-const cameras = data.agents.map((agent, number) => {
-  const available = data.cameras[number];
-  const title = made("span", {}, chip(agent.color, "round"), agent.title);
-  const caption = made("figcaption", {}, title);
-  const picture = made("img", { alt: "" });
-  const none = made("div", { className: "none" });
-  const sees = made("p");
-  const pictured = made("div", { className: "pictured" }, picture, none);
-  pictured.style.borderColor = agent.color;
-  const card = { agent, available, chosen: 0, picture, none, sees, shown: null };
-  if (available.length > 1) {
-    const select = made("select", { ariaLabel: `Camera of ${agent.title}` });
-    select.dataset.agent = agent.name;
-    choice(select, available.map((camera, index) => [String(index), camera.title]), "0", (value) => {
-      card.chosen = Number(value);
-    });
-    caption.append(select);
-  } else if (available.length) {
-    caption.append(made("span", { className: "small", textContent: available[0].title }));
-  }
-  const figure = made("figure", { className: "agent" }, caption, pictured, sees);
-  figure.dataset.agent = agent.name;
-  byId("agents").append(figure);
-  return card;
-});
-
-// The picture of a frame, or the last picture before it if not every frame has one.
-function pictureAt(camera, frame) {
-  for (let at = frame; at >= 0; at -= 1) if (camera.pictures[at] !== null) return camera.pictures[at];
-  return null;
-}
-
-function showCameras() {
-  cameras.forEach((card, bit) => {
-    const camera = card.available[card.chosen];
-    const coded = camera ? pictureAt(camera, state.frame) : null;
-    if (coded !== card.shown) {
-      card.shown = coded;
-      if (coded !== null) card.picture.src = `data:image/jpeg;base64,${coded}`;
-    }
-    card.picture.hidden = coded === null;
-    card.none.hidden = coded !== null;
-    card.none.classList.toggle("absent", !camera);
-    card.none.textContent = camera ? "no picture at this moment" : "no pictures from this agent";
-    card.picture.alt = camera ? `${card.agent.title}, camera ${camera.title}, frame ${state.frame + 1}` : "";
-    const others = data.actors.filter((actor) => actor.states[state.frame] && actor.id !== card.agent.actor);
-    const seen = others.filter((actor) => actor.seen[state.frame] & (1 << bit));
-    const hidden = others.filter((actor) => actor.role === "pair" && !seen.includes(actor));
-    const without = hidden.length ? `; not ${hidden.map((actor) => actor.title).join(", ")}` : "";
-    card.sees.textContent = others.length ? `sees ${seen.length} of ${others.length}${without}` : "";
-  });
-}
-
 // who sees whom
 
 const table = byId("seen");
-const heads = data.agents.map((agent) =>
-  made("th", { scope: "col", title: agent.title }, chip(agent.color, "round"), agent.short),
-);
-table.append(made("thead", {}, made("tr", {}, made("th", { scope: "col", textContent: "actor" }), ...heads)));
+const headsOf = () =>
+  data.agents.map((agent) =>
+    made("th", { scope: "col", title: agent.title }, chip(agent.color, "round"), agent.short),
+  );
+table.append(made("thead", {}, made("tr", {}, made("th", { scope: "col", textContent: "actor" }), ...headsOf())));
 const rows = data.actors.map((actor) => {
   const cells = data.agents.map(() => made("td"));
   const row = made("tr", {}, made("th", { scope: "row" }, chip(actor.color), actor.title), ...cells);
@@ -117,8 +66,8 @@ function showSeen() {
       if (cell.textContent !== text) cell.textContent = text;
     });
   }
-  const sentences = data.actors
-    .filter((actor) => actor.role === "pair" && actor.states[state.frame] !== null)
+  const sentences = pair
+    .filter((actor) => actor.states[state.frame] !== null)
     .map((actor) => {
       const names = data.agents.filter((_, bit) => actor.seen[state.frame] & (1 << bit)).map((agent) => agent.title);
       const speed = actor.states[state.frame][3];
@@ -133,13 +82,13 @@ function showSeen() {
 const verdictColors = {
   TP: data.colors.right,
   TN: data.colors.right,
-  FN: data.colors.warning,
-  "not judged": data.colors.missed,
+  FN: data.colors.missed,
+  "not judged": data.colors.grid,
 };
 const verdictColor = (verdict) => verdictColors[verdict] || data.colors.false;
 const badge = (verdict) => {
-  const element = made("span", { className: verdict === "FN" ? "badge dark" : "badge", textContent: verdict });
-  element.style.background = verdictColor(verdict);
+  const element = made("span", { className: "badge", textContent: verdict });
+  element.style.borderColor = verdictColor(verdict);
   return element;
 };
 const samplesAt = new Map();
@@ -149,7 +98,6 @@ if (data.prediction) {
   for (const sample of data.prediction.samples) {
     samplesAt.set(sample.frame, [...(samplesAt.get(sample.frame) || []), sample]);
   }
-  const head = data.agents.map((agent) => made("th", { scope: "col", textContent: agent.title }));
   const body = [...samplesAt].map(([frame, samples]) => {
     const number = String(frame + 1);
     const jump = made("button", { type: "button", textContent: number, ariaLabel: `Go to frame ${number}` });
@@ -162,7 +110,7 @@ if (data.prediction) {
     row.dataset.frame = String(frame);
     return row;
   });
-  const heading = made("tr", {}, made("th", { scope: "col", textContent: "frame" }), ...head);
+  const heading = made("tr", {}, made("th", { scope: "col", textContent: "frame" }), ...headsOf());
   byId("samples").append(made("table", {}, made("thead", {}, heading), made("tbody", {}, ...body)));
 }
 

@@ -2,10 +2,11 @@
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2];
 const LAYERS = {
+  road: "road",
   trails: "trails",
   dots: "who sees",
-  ids: "ids",
   agents: "agents",
+  ids: "ids",
   points: "LiDAR",
   prediction: "prediction",
 };
@@ -79,15 +80,15 @@ choice(byId("speed"), SPEEDS.map((speed) => [String(speed), `${speed} ×`]), "1"
   state.speed = Number(value);
   begun = null;
 });
-const agentOptions = data.agents.map((agent, index) => [String(index), agent.title]);
-choice(byId("follow"), [["", "nobody"], ...agentOptions], "", (value) => {
+const followOptions = [["", "nobody"], ...(pair.length ? [["pair", "the colliding pair"]] : []), ...agentOptions];
+choice(byId("follow"), followOptions, state.follow, (value) => {
   state.follow = value;
 });
 choice(byId("sight"), [["", "none"], ["all", "all agents"], ...agentOptions], "", (value) => {
   state.sight = value;
 });
 for (const [layer, title] of Object.entries(LAYERS)) {
-  if ((layer === "points" && !data.points) || (layer === "prediction" && !data.prediction)) continue;
+  if (data[layer] === null) continue; // the release does not have it
   const box = made("input", { type: "checkbox", checked: state.layers[layer], id: `layer-${layer}` });
   box.addEventListener("change", () => {
     state.layers[layer] = box.checked;
@@ -96,14 +97,19 @@ for (const [layer, title] of Object.entries(LAYERS)) {
   byId("layers").append(made("label", {}, box, ` ${title}`));
 }
 
+function follow(value) {
+  byId("follow").value = state.follow = value;
+}
+
 function zoom(factor) {
+  if (state.follow === "pair") follow(""); // it has its own scale
   ground.zoom(factor);
   ground.draw();
 }
 byId("closer").addEventListener("click", () => zoom(ZOOM_STEP));
 byId("farther").addEventListener("click", () => zoom(1 / ZOOM_STEP));
 byId("whole").addEventListener("click", () => {
-  byId("follow").value = state.follow = "";
+  follow("");
   ground.showWhole();
   ground.draw();
 });
@@ -126,9 +132,9 @@ ground.canvas.addEventListener("pointermove", (event) => {
   if (!before) return;
   const apart = fingers.size === 2 ? spread() : null;
   fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
-  if (apart !== null) ground.zoom(spread() / Math.max(apart, 1));
+  if (apart !== null) zoom(spread() / Math.max(apart, 1));
   else {
-    byId("follow").value = state.follow = "";
+    follow("");
     ground.move(event.clientX - before.x, event.clientY - before.y);
   }
   ground.draw();
@@ -145,7 +151,10 @@ const keys = {
   End: () => step(last),
   "+": () => zoom(ZOOM_STEP),
   "-": () => zoom(1 / ZOOM_STEP),
+  0: () => enlarge(""),
+  b: () => byId("boxes").click(),
 };
+for (const card of cards) keys[card.bit + 1] = () => enlarge(String(card.bit));
 document.addEventListener("keydown", (event) => {
   // a control that has the focus keeps the keys that it needs itself
   const control = event.target.closest("button, select, input");
@@ -154,7 +163,7 @@ document.addEventListener("keydown", (event) => {
   event.preventDefault();
   keys[event.key]();
 });
-new ResizeObserver(() => ground.draw()).observe(ground.canvas);
+new ResizeObserver(show).observe(ground.canvas);
 
 // what does not change with time
 
@@ -164,15 +173,14 @@ for (const [name, value] of data.facts) {
   byId("facts").append(made("dt", { textContent: name }), made("dd", { textContent: value }));
 }
 byId("notes").append(...data.notes.map((note) => made("li", { textContent: note })));
-const kinds = new Map();
-for (const actor of data.actors) {
-  const name = { pair: "colliding pair", companion: "companion" }[actor.role] || actor.category;
-  kinds.set(name, actor.color);
-}
-byId("legend").append(...[...kinds].map(([name, color]) => made("span", {}, chip(color), name)));
-for (const agent of data.agents) {
-  byId("legend").append(made("span", {}, chip(agent.color, "round"), `${agent.short} ${agent.title}`));
-}
+const others = data.actors.filter((actor) => actor.role === "other");
+const kinds = new Map(others.map((actor) => [actor.category, chip(actor.color, actor.shape)]));
+byId("legend").append(
+  ...(pair.length ? [made("span", {}, chip(data.colors.pair), "colliding pair")] : []),
+  ...data.agents.map((agent) => made("span", {}, chip(agent.color), `${agent.short} ${agent.title}`)),
+  ...[...kinds].map(([name, mark]) => made("span", {}, mark, name)),
+);
+byId("foreseen-key").hidden = !data.prediction;
 const impact = data.countdown.indexOf(0);
 const marks = [...samplesAt].map(([frame, samples]) => [frame, verdictColor(samples[0].verdict)]);
 if (impact >= 0) marks.push([impact, data.colors.pair]);

@@ -16,12 +16,21 @@ from typing import Any, Final
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.files import write_bytes
-from deepaccident_devkit.render.colors import COLLIDER_COLOR, GRID_COLOR, OUTCOME_COLORS, POINT_COLOR, WARNING_COLOR
-from deepaccident_devkit.render.replay.actors import actor_entries, agent_entries
+from deepaccident_devkit.render.colors import (
+    CATEGORY_MARKERS,
+    COLLIDER_COLOR,
+    GRID_COLOR,
+    OUTCOME_COLORS,
+    POINT_COLOR,
+)
+from deepaccident_devkit.render.replay.actors import actor_entries, agent_entries, camera_entries, camera_title
 from deepaccident_devkit.render.replay.facts import facts, notes
+from deepaccident_devkit.render.replay.follow import Followed, follow_pair
 from deepaccident_devkit.render.replay.recording import Recording, recording_of
+from deepaccident_devkit.render.replay.road import road_picture
 from deepaccident_devkit.render.replay.sensors import (
     CameraPictures,
+    camera_files,
     camera_pictures,
     check_picture_settings,
     lidar_points,
@@ -35,7 +44,7 @@ SIZE_LIMIT: Final = 15_000_000
 _BASE64: Final = 4 / 3
 _BESIDE: Final = 8
 """Bytes of a picture in JSON in addition to its base64: quotes, a comma and padding."""
-_SCRIPTS: Final = ("ground.js", "panels.js", "replay.js")
+_SCRIPTS: Final = ("ground.js", "panels.js", "cameras.js", "replay.js")
 """Each script uses the ones before it."""
 
 
@@ -52,9 +61,10 @@ def render_replay(
 ) -> Path:
     """Write a scenario as one HTML file that plays in any browser: no server, no network, small enough for a mail.
 
-    It shows the agents' front cameras and all six cameras of the first agent, all actors from above with trails, who
-    sees whom by the released rule, the LiDAR of the first agent and the countdown to the impact. What the release lacks
-    (images, points, labels) is left out, and the page says so.
+    It shows the agents' cameras with the actors' boxes, one of them large, by default the one that shows the colliding
+    pair best; from above the road, all actors and their trails; who sees whom by the released rule, the LiDAR of the
+    first agent and the countdown to the impact. The front cameras, and the cameras while they show the pair best, have
+    the larger pictures. What the release lacks (images, points, labels) is left out, and the page says so.
 
     Args:
         dataset: the release.
@@ -86,19 +96,25 @@ def render_replay(
     check_picture_settings(image_width, quality)
     recording = recording_of(dataset, scenario, agents)
     data = _data(recording, prediction)
+    files = camera_files(recording)
+    seen = {actor["id"]: actor["seen"] for actor in data["actors"]}
+    there = {key: [path is not None for path in paths] for key, paths in files.items()}
+    followed = follow_pair(recording, seen, there)
+    data |= {"automatic": _automatic(recording, followed), "cameras": camera_entries(recording)}
     free = (SIZE_LIMIT - len(replay_page("", data).encode())) / _BASE64
-    free -= _BESIDE * len(recording.frames) * (len(recording.agents) + 5)
+    free -= _BESIDE * len(recording.frames) * len(files)
     pictures = camera_pictures(
-        recording,
+        files,
+        followed,
         math.inf if image_width and quality else free,
         width=image_width,
         quality=quality,
         progress=progress,
     )
     said = notes(recording, pictures, points=data["points"] is not None)
-    page = {**data, "notes": said, "cameras": _cameras(recording, pictures)}
+    data |= {"notes": said, "cameras": _with_pictures(recording, data["cameras"], pictures)}
     title = f"Accident replay: {recording.scenario['name']}"
-    write_bytes(target, replay_page(title, page).encode())
+    write_bytes(target, replay_page(title, data).encode())
     return target
 
 
@@ -118,28 +134,44 @@ def _data(recording: Recording, prediction: Foreseen | None) -> dict[str, Any]:
             "pair": COLLIDER_COLOR,
             "points": POINT_COLOR,
             "grid": GRID_COLOR,
-            "warning": WARNING_COLOR,
             **OUTCOME_COLORS,
         },
+        "markers": dict(CATEGORY_MARKERS),
         "agents": agent_entries(recording),
         "actors": actor_entries(recording),
         "points": lidar_points(recording, first),
+        "road": road_picture(recording),
         "prediction": None if prediction is None else verdicts(recording, prediction),
     }
 
 
-def _cameras(recording: Recording, pictures: CameraPictures) -> list[list[dict[str, Any]]]:
-    """For each agent its cameras, with one picture for each frame in base64; null where there is none."""
-    return [
-        [
-            {
-                "title": channel.removeprefix("Camera_"),
-                "pictures": [None if jpeg is None else base64.b64encode(jpeg).decode("ascii") for jpeg in jpegs],
-            }
-            for channel, jpegs in pictures.jpegs.get(agent, {}).items()
-        ]
-        for agent in recording.agents
-    ]
+def _automatic(recording: Recording, followed: Followed) -> dict[str, Any]:
+    """For each frame the number of the agent that shows the pair best, and for each agent its camera."""
+    return {
+        "agents": [recording.agents.index(agent) for agent in followed.agents],
+        "cameras": [[camera_title(channel) for channel in followed.channels[agent]] for agent in recording.agents],
+    }
+
+
+def _with_pictures(
+    recording: Recording, cameras: list[list[dict[str, Any]]], pictures: CameraPictures
+) -> list[list[dict[str, Any]]]:
+    """For each agent its cameras that have pictures, with one for each frame in base64; null where there is none."""
+    shown = []
+    for agent, entries in zip(recording.agents, cameras, strict=True):
+        jpegs = {camera_title(channel): each for channel, each in pictures.jpegs.get(agent, {}).items()}
+        shown.append(
+            [
+                {**entry, "pictures": [*map(_coded, jpegs[entry["title"]])]}
+                for entry in entries
+                if entry["title"] in jpegs
+            ]
+        )
+    return shown
+
+
+def _coded(jpeg: bytes | None) -> str | None:
+    return None if jpeg is None else base64.b64encode(jpeg).decode("ascii")
 
 
 def replay_page(title: str, data: Mapping[str, Any]) -> str:

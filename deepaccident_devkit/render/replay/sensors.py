@@ -18,6 +18,7 @@ from deepaccident_devkit.arrays import ByteArray
 from deepaccident_devkit.errors import ConfigError, MissingFileError
 from deepaccident_devkit.parallel import run_batch
 from deepaccident_devkit.release import read_image
+from deepaccident_devkit.render.replay.follow import Followed
 from deepaccident_devkit.render.replay.recording import Recording
 from deepaccident_devkit.taxonomy import CAMERAS
 
@@ -27,6 +28,10 @@ _LADDER: Final = ((960, 80), (800, 75), (640, 75), (640, 65), (560, 60), (480, 6
 _WIDTHS: Final = (960, 800, 640, 560, 480, 400, 320, 256)
 _QUALITIES: Final = (80, 70, 60, 50, 40, 30)
 """The widths to try if the quality is given, and the qualities to try if the width is given."""
+_OTHERS: Final = (1, 2, 2, 2, 4)
+"""For each step of a ladder, one of how many frames has a picture of the other cameras; the last is for the rest."""
+_LEAST_OTHER: Final = 256
+"""Pixels: the other cameras' pictures are half as wide as the others, but not smaller than this."""
 _PROBED: Final = 12
 """The number of pictures from which the size of all is estimated."""
 _QUALITY_RANGE: Final = (1, 95)
@@ -42,19 +47,24 @@ _GROUND: Final = 5.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PictureSettings:
-    """How pictures are written.
+    """How pictures are written: those of the front cameras, and of the cameras while they follow the pair, are larger.
 
     Attributes:
         width: pixels; narrower images stay as they are.
         quality: of JPEG.
         every: one of so many frames has a picture.
-        front_only: whether the other cameras of the first agent are left out as well.
+        others: one of so many frames has a picture of the other cameras; 0 for none.
     """
 
     width: int
     quality: int
     every: int = 1
-    front_only: bool = False
+    others: int = 1
+
+    @property
+    def other_width(self) -> int:
+        """Of the other cameras' pictures, pixels."""
+        return min(self.width, max(self.width // 2, _LEAST_OTHER))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,13 +97,43 @@ def check_picture_settings(width: int | None, quality: int | None) -> None:
         )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Image:
+    """An image file, and whether its picture is one of the larger ones."""
+
+    path: Path
+    large: bool
+
+
+CameraFiles = Mapping[tuple[str, str], Sequence[Path | None]]
+"""Agent and camera → one file for each frame; None where there is none."""
+_Images = dict[tuple[str, str], list[_Image | None]]
+_Jpegs = dict[str, dict[str, tuple[bytes | None, ...]]]
+
+
+def camera_files(recording: Recording) -> CameraFiles:
+    """The image files of all cameras of the agents."""
+    return {
+        (agent, channel): [_file(recording, agent, frame, channel) for frame in recording.frames]
+        for agent in recording.agents
+        for channel in CAMERAS
+    }
+
+
 def camera_pictures(
-    recording: Recording, limit: float, *, width: int | None = None, quality: int | None = None, progress: bool = False
+    files: CameraFiles,
+    followed: Followed,
+    limit: float,
+    *,
+    width: int | None = None,
+    quality: int | None = None,
+    progress: bool = False,
 ) -> CameraPictures:
-    """The pictures of the agents' front cameras, and of the first agent's other cameras.
+    """The pictures of the agents' cameras.
 
     Args:
-        recording: the scenario and the agents.
+        files: of all cameras.
+        followed: the cameras that follow the pair: while they do, their pictures are as large as the front cameras'.
         limit: the most bytes of all pictures together: the largest pictures within it are taken. If the smallest ones
             do not fit, there are fewer pictures.
         width: pixels; None for a width that fits.
@@ -103,20 +143,18 @@ def camera_pictures(
     Raises:
         SensorFileError: a file cannot be read.
     """
-    files: _Files = {
-        (agent, channel): [_file(recording, agent, frame, channel) for frame in recording.frames]
-        for number, agent in enumerate(recording.agents)
-        for channel in (CAMERAS if number == 0 else (FRONT,))
+    images: _Images = {
+        (agent, channel): [
+            None if path is None else _Image(path=path, large=channel in (FRONT, follows))
+            for path, follows in zip(paths, followed.channels[agent], strict=True)
+        ]
+        for (agent, channel), paths in files.items()
     }
     wanted = sum(len(paths) for paths in files.values())
     found = sum(path is not None for paths in files.values() for path in paths)
-    settings, jpegs = _fitting(files, limit, _ladder(width, quality, len(recording.frames)), progress=progress)
+    frames = max(map(len, files.values()))
+    settings, jpegs = _fitting(images, limit, _ladder(width, quality, frames), progress=progress)
     return CameraPictures(jpegs=jpegs, settings=settings, found=found, wanted=wanted)
-
-
-_Files = dict[tuple[str, str], list[Path | None]]
-"""Agent and camera → one file for each frame; None where there is none."""
-_Jpegs = dict[str, dict[str, tuple[bytes | None, ...]]]
 
 
 def _file(recording: Recording, agent: str, frame: int, channel: str) -> Path | None:
@@ -131,70 +169,74 @@ def _ladder(width: int | None, quality: int | None, frames: int) -> Iterator[Pic
         steps = [(width, each) for each in (_QUALITIES if quality is None else [quality])]
     elif quality is not None:
         steps = [(each, quality) for each in _WIDTHS]
-    for pixels, each in steps:
-        yield PictureSettings(width=pixels, quality=each)
+    for number, (pixels, each) in enumerate(steps):
+        yield PictureSettings(width=pixels, quality=each, others=_OTHERS[min(number, len(_OTHERS) - 1)])
     every = 1
     while every < 2 * frames:
-        yield PictureSettings(width=steps[-1][0], quality=steps[-1][1], every=every, front_only=True)
+        yield PictureSettings(width=steps[-1][0], quality=steps[-1][1], every=every, others=0)
         every *= 2
 
 
 def _fitting(
-    files: _Files, limit: float, ladder: Iterator[PictureSettings], *, progress: bool
+    images: _Images, limit: float, ladder: Iterator[PictureSettings], *, progress: bool
 ) -> tuple[PictureSettings | None, _Jpegs]:
-    probes = _probes(files)
+    probes = _probes(images)
     for settings in ladder if probes else ():
-        kept = _kept(files, settings)
-        paths = [path for each in kept.values() for path in each if path is not None]
-        if sum(len(_jpeg(image, settings)) for image in probes) / len(probes) * len(paths) > limit:
+        kept = _kept(images, settings)
+        written = [image for each in kept.values() for image in each if image is not None]
+        weight = {large: sum(len(_jpeg(each, settings, large=large)) for each in probes) for large in (True, False)}
+        if sum(weight[image.large] for image in written) / len(probes) > limit:
             continue
-        encoded = _encoded(paths, settings, progress=progress)
+        encoded = _encoded(written, settings, progress=progress)
         if sum(map(len, encoded)) <= limit:
             return settings, _by_agent(kept, encoded)
     return None, {}
 
 
-def _probes(files: _Files) -> list[ByteArray]:
-    paths = [path for each in files.values() for path in each if path is not None]
-    return [read_image(path) for path in paths[:: max(1, len(paths) // _PROBED)]]
+def _probes(images: _Images) -> list[ByteArray]:
+    there = [image for each in images.values() for image in each if image is not None]
+    return [read_image(image.path) for image in there[:: max(1, len(there) // _PROBED)]]
 
 
-def _kept(files: _Files, settings: PictureSettings) -> _Files:
-    return {
-        key: [path if frame % settings.every == 0 else None for frame, path in enumerate(paths)]
-        for key, paths in files.items()
-        if key[1] == FRONT or not settings.front_only
-    }
+def _kept(images: _Images, settings: PictureSettings) -> _Images:
+    """The images that have pictures; the others are None."""
+
+    def kept(image: _Image | None, frame: int) -> _Image | None:
+        every = settings.every if image is not None and image.large else settings.others
+        return image if every and frame % every == 0 else None
+
+    return {key: [kept(image, frame) for frame, image in enumerate(each)] for key, each in images.items()}
 
 
-def _encoded(paths: Sequence[Path], settings: PictureSettings, *, progress: bool) -> list[bytes]:
+def _encoded(images: Sequence[_Image], settings: PictureSettings, *, progress: bool) -> list[bytes]:
     """The pictures as JPEG; made in threads, because the libraries that do most of the work let other threads run."""
     work = partial(_jpeg_of, settings=settings)
     with ThreadPoolExecutor(os.cpu_count()) as threads:
-        return run_batch(work, paths, executor=threads, label="pictures", progress=progress)
+        return run_batch(work, images, executor=threads, label="pictures", progress=progress)
 
 
-def _by_agent(kept: _Files, encoded: Sequence[bytes]) -> _Jpegs:
+def _by_agent(kept: _Images, encoded: Sequence[bytes]) -> _Jpegs:
     following = iter(encoded)
     jpegs: _Jpegs = {}
-    for (agent, channel), paths in kept.items():
-        pictures = tuple(None if path is None else next(following) for path in paths)
+    for (agent, channel), images in kept.items():
+        pictures = tuple(None if image is None else next(following) for image in images)
         if any(pictures):
             jpegs.setdefault(agent, {})[channel] = pictures
     return jpegs
 
 
-def _jpeg_of(path: Path, settings: PictureSettings) -> bytes:
-    return _jpeg(read_image(path), settings)
+def _jpeg_of(image: _Image, settings: PictureSettings) -> bytes:
+    return _jpeg(read_image(image.path), settings, large=image.large)
 
 
-def _jpeg(image: ByteArray, settings: PictureSettings) -> bytes:
+def _jpeg(image: ByteArray, settings: PictureSettings, *, large: bool) -> bytes:
     from PIL import Image
 
     height, width = image.shape[:2]
+    most = settings.width if large else settings.other_width
     picture = Image.fromarray(image)
-    if width > settings.width:
-        picture = picture.resize((settings.width, max(1, round(height * settings.width / width))), reducing_gap=2.0)
+    if width > most:
+        picture = picture.resize((most, max(1, round(height * most / width))), reducing_gap=2.0)
     written = io.BytesIO()
     picture.save(written, "JPEG", quality=settings.quality, optimize=True)
     return written.getvalue()

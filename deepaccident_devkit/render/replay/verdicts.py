@@ -78,9 +78,6 @@ def _sample(recording: Recording, prediction: Foreseen, agent: str, frame: int, 
         "agent": recording.agents.index(agent),
         "verdict": _verdict(given, label, context),
         "text": f"{short_name(agent)} at frame {frame}: {_truth_text(context)}",
-        "truth": None
-        if truth.accident is None
-        else recording.places(_on_ground(world_from_ego, truth.accident.positions)),
         "alarms": sorted(alarms, key=lambda alarm: not alarm["right"])[:_SHOWN],
         "more": max(0, len(alarms) - _SHOWN),
     }
@@ -122,6 +119,7 @@ def _alarm(
     return {
         "places": recording.places(_on_ground(world_from_ego, accident.positions)),
         "right": right,
+        "time": round(accident.time, 1),
         "text": text,
         "actors": [each for each in ids or () if each is not None],
     }

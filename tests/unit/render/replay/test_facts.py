@@ -36,7 +36,7 @@ def test_where_nobody_collides_nothing_is_red(da_b: DeepAccident, tmp_path: Path
     assert data["countdown"] == [None] * 4
     assert data["impact"] is None
     assert dict(data["facts"])["Ends"] == "without a collision"
-    assert {actor["role"] for actor in data["actors"]} == {"companion", "other"}
+    assert {actor["role"] for actor in data["actors"]} == {"agent", "other"}
     assert COLLIDER_COLOR not in {actor["color"] for actor in data["actors"]}
 
 
@@ -44,7 +44,7 @@ def test_labels_alone_are_enough(da_b: DeepAccident, tmp_path: Path) -> None:
     data = data_of(render_replay(da_b, None, tmp_path / "replay.html"))
     assert data["scenario"] == accident(da_b)
     assert (data["cameras"], data["points"]) == ([[]] * 5, None)
-    assert any(note.startswith("No pictures: none of the 40 camera files is here") for note in data["notes"])
+    assert any(note.startswith("No pictures: none of the 120 camera files is here") for note in data["notes"])
     assert any(note.startswith("No LiDAR points: no file of ego is here") for note in data["notes"])
     assert all(any(state for state in actor["states"]) for actor in data["actors"])
 

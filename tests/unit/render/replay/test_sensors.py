@@ -1,6 +1,7 @@
 """The pictures and points of a replay, which keep its size."""
 
 import base64
+import io
 import math
 import os
 import shutil
@@ -14,9 +15,10 @@ from replay_page import accident, data_of, picture
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.render.replay import render_replay, sensors
+from deepaccident_devkit.render.replay.follow import Followed
 from deepaccident_devkit.render.replay.recording import recording_of
 from deepaccident_devkit.render.replay.replay import SIZE_LIMIT
-from deepaccident_devkit.render.replay.sensors import camera_pictures
+from deepaccident_devkit.render.replay.sensors import CameraPictures, camera_files, camera_pictures
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 
@@ -34,20 +36,18 @@ def test_points_lie_on_those_of_the_lidar(da: DeepAccident, data: dict[str, Any]
         assert apart.max() < 0.0708  # half a decimetre along both axes
 
 
-def test_the_first_agent_has_six_cameras_and_the_others_one(da: DeepAccident, data: dict[str, Any]) -> None:
-    titles = [[camera["title"] for camera in cameras] for cameras in data["cameras"]]
-    assert titles == [[channel.removeprefix("Camera_") for channel in CAMERAS], *[["Front"]] * 4]
+def test_each_agent_has_six_cameras(da: DeepAccident, data: dict[str, Any]) -> None:
     shown, true = {}, {}
     for agent, cameras in zip(AGENTS, data["cameras"], strict=True):
+        assert [camera["title"] for camera in cameras] == [channel.removeprefix("Camera_") for channel in CAMERAS]
         for camera in cameras:
-            for frame in (1, 6):
-                token = f"{accident(da)}/{agent}/{frame:03d}/Camera_{camera['title']}"
-                shown[token] = np.asarray(picture(camera["pictures"][frame - 1]), dtype=float)
-                true[token] = da.load_image(token)
-    assert len(shown) == 20
+            token = f"{accident(da)}/{agent}/006/Camera_{camera['title']}"
+            shown[token] = np.asarray(picture(camera["pictures"][5]), dtype=float)
+            true[token] = da.load_image(token)
+    assert len(shown) == 30
     for token, pixels in shown.items():
         assert min(true, key=lambda other: np.abs(true[other] - pixels).mean()) == token
-    assert any("have only the front camera: ego behind, other" in note for note in data["notes"])
+    assert any("have smaller pictures, up to 480 pixels wide, of every frame." in note for note in data["notes"])
 
 
 def test_width_and_quality_are_as_asked(da: DeepAccident, tmp_path: Path) -> None:
@@ -60,35 +60,58 @@ def test_width_and_quality_are_as_asked(da: DeepAccident, tmp_path: Path) -> Non
     assert "Agents not shown: ego, ego behind, other, other behind." in data["notes"]
 
 
+def taken(dataset: DeepAccident, limit: float, **how: int) -> CameraPictures:
+    """The pictures of a page on which each agent's back camera follows the pair from frame 4 on."""
+    files = camera_files(recording_of(dataset, accident(dataset), None))
+    channels = (*[CAMERAS[0]] * 3, *["Camera_Back"] * 3)
+    followed = Followed(channels=dict.fromkeys(AGENTS, channels), agents=(AGENTS[0],) * 6)
+    return camera_pictures(files, followed, limit, **how)
+
+
+def weight(pictures: CameraPictures) -> int:
+    return sum(len(each) for cameras in pictures.jpegs.values() for all_ in cameras.values() for each in all_ if each)
+
+
 @pytest.mark.parametrize("how", [{}, {"width": 48}, {"quality": 60}])
 def test_pictures_keep_the_limit_and_at_last_become_fewer(da: DeepAccident, how: dict[str, int]) -> None:
-    recording = recording_of(da, accident(da), None)
     sizes = []
-    for limit in (math.inf, 45_000, 20_000, 8_000, 5_000):
-        taken = camera_pictures(recording, limit, **how)
-        weight = sum(
-            len(each) for cameras in taken.jpegs.values() for all_ in cameras.values() for each in all_ if each
-        )
-        assert weight <= limit
-        assert taken.settings is not None
-        sizes.append(weight)
-        assert set(taken.jpegs) == set(AGENTS)
-        others = len(taken.jpegs["ego_vehicle"]) == len(CAMERAS)
-        assert others != taken.settings.front_only
-        given = [each is not None for each in taken.jpegs["infrastructure"][CAMERAS[0]]]
-        assert given == [frame % taken.settings.every == 0 for frame in range(6)]
+    for limit in (math.inf, 145_000, 45_000, 20_000, 12_000):
+        pictures = taken(da, limit, **how)
+        settings = pictures.settings
+        assert settings is not None
+        assert weight(pictures) <= limit
+        sizes.append(weight(pictures))
+        assert set(pictures.jpegs) == set(AGENTS)
+        given = {
+            channel: [each is not None for each in jpegs] for channel, jpegs in pictures.jpegs["infrastructure"].items()
+        }
+        assert given[CAMERAS[0]] == [frame % settings.every == 0 for frame in range(6)]
+        others = [bool(settings.others) and frame % settings.others == 0 for frame in range(6)]
+        assert given.get("Camera_BackLeft", [False] * 6) == others
+        follows = [frame % settings.every == 0 for frame in range(3, 6)]
+        assert given.get("Camera_Back", [False] * 6) == others[:3] + follows
     assert sizes == sorted(sizes, reverse=True)
-    assert taken.settings.every > 1
-    assert camera_pictures(recording, 10, **how).jpegs == {}
+    assert (settings.others, settings.every > 1) == (0, True)
+    assert taken(da, 10, **how).jpegs == {}
+
+
+def test_other_cameras_have_smaller_pictures(da: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sensors, "_LEAST_OTHER", 8)
+    jpegs = taken(da, math.inf, width=40, quality=60).jpegs["other_vehicle"]
+    assert [size_of(each) for each in jpegs["Camera_Front"]] == [(40, 22)] * 6
+    assert [size_of(each) for each in jpegs["Camera_Back"]] == [(20, 11)] * 3 + [(40, 22)] * 3
+    assert [size_of(each) for each in jpegs["Camera_FrontRight"]] == [(20, 11)] * 6
+
+
+def size_of(jpeg: bytes | None) -> tuple[int, int]:
+    assert jpeg is not None
+    return Image.open(io.BytesIO(jpeg)).size
 
 
 def test_a_wrong_estimate_does_not_break_the_limit(da: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:
     """The size of all is estimated from a black picture, which is smaller than any other."""
     monkeypatch.setattr(sensors, "_probes", lambda _: [np.zeros((36, 64, 3), dtype=np.uint8)])
-    taken = camera_pictures(recording_of(da, accident(da), None), 50_000)
-    sizes = [len(each) for cameras in taken.jpegs.values() for all_ in cameras.values() for each in all_ if each]
-    assert len(sizes) == 60
-    assert 25_000 < sum(sizes) <= 50_000
+    assert 70_000 < weight(taken(da, 100_000)) <= 100_000
 
 
 @pytest.mark.slow
@@ -100,8 +123,8 @@ def test_forty_frames_of_real_size_go_by_mail(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (56, 100, 3), dtype=np.uint8)
     source = tmp_path / "noise.jpg"
     Image.fromarray(noise).resize((1600, 900), Image.Resampling.BICUBIC).save(source, quality=90)
-    for number, agent in enumerate(AGENTS):
-        for channel in CAMERAS if number == 0 else CAMERAS[:1]:
+    for agent in AGENTS:
+        for channel in CAMERAS:
             for frame in range(1, 41):
                 path = dataset.get_sample_data_path(f"{scenario}/{agent}/{frame:03d}/{channel}")
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -109,9 +132,10 @@ def test_forty_frames_of_real_size_go_by_mail(tmp_path: Path) -> None:
     page = render_replay(dataset, None, tmp_path / "replay.html")
     assert 0.5 * SIZE_LIMIT < page.stat().st_size <= SIZE_LIMIT == 15_000_000
     data = data_of(page)
-    assert [len(cameras) for cameras in data["cameras"]] == [6, 1, 1, 1, 1]
-    assert all(coded is not None for cameras in data["cameras"] for each in cameras for coded in each["pictures"])
+    assert [len(cameras) for cameras in data["cameras"]] == [6] * 5
+    assert all(coded is not None for cameras in data["cameras"] for coded in cameras[0]["pictures"])
     assert picture(data["cameras"][0][0]["pictures"][0]).width >= 320
+    assert picture(data["cameras"][0][4]["pictures"][0]).width >= 256
 
 
 def test_a_missing_picture_leaves_a_hole(da: DeepAccident, tmp_path: Path) -> None:
@@ -125,4 +149,4 @@ def test_a_missing_picture_leaves_a_hole(da: DeepAccident, tmp_path: Path) -> No
     there = [coded is not None for coded in data["cameras"][2][0]["pictures"]]
     assert there == [True, True, False, True, True, True]
     assert [cloud is not None for cloud in data["points"]] == [True, False, True, True, True, True]
-    assert "1 of 60 camera files are missing in the release; unpack the cameras' archives." in data["notes"]
+    assert "1 of 180 camera files are missing in the release; unpack the cameras' archives." in data["notes"]

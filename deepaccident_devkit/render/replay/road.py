@@ -1,0 +1,97 @@
+"""The road around a scenario as one pale picture, merged from what the agents' BEV cameras saw."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from deepaccident_devkit.arrays import ByteArray, FloatArray
+from deepaccident_devkit.geometry import SE3
+from deepaccident_devkit.release import BevImage
+from deepaccident_devkit.release.bev_camera import TAGS
+from deepaccident_devkit.render.colors import BEV_COLORS
+from deepaccident_devkit.render.missing import is_there
+from deepaccident_devkit.render.replay.recording import Recording
+from deepaccident_devkit.taxonomy import BEV_CAMERA, BEV_RESOLUTION, BEV_SHAPE
+
+_GROUND: Final = ("sidewalk", "road", "road_line")
+"""What is drawn. Vehicles and pedestrians move: another moment shows what is beneath them."""
+_MOMENTS: Final = 4
+"""The number of moments whose pictures are merged."""
+_CELLS: Final = (0.2, 0.3, 0.5, 0.8)
+"""Metres: side of a pixel. The first is taken whose picture is small enough."""
+_MOST: Final = 200_000
+"""Bytes of the picture; in base64 it has a third more."""
+
+
+def road_picture(recording: Recording) -> dict[str, Any] | None:
+    """The road as the page has it: a PNG in base64, and its left, top, width and height (cm, y up).
+
+    White is nothing, or not seen. None if the release has no BEV camera file of these moments, or if they give no small
+    picture.
+
+    Raises:
+        SensorFileError: a file cannot be read.
+    """
+    seen = _seen(recording)
+    if not seen:
+        return None
+    reach = BEV_RESOLUTION * BEV_SHAPE[0] / 2
+    middles = np.array([pose.translation[:2] for _, pose in seen])
+    low, high = middles.min(axis=0) - reach, middles.max(axis=0) + reach
+    pictures = (_png(_merged(seen, low, high, cell)) for cell in _CELLS)
+    png = next((each for each in pictures if len(each) <= _MOST), None)
+    if png is None:
+        return None
+    left, top = recording.places([low[0], high[1]])
+    width, height = np.rint((high - low) * 100).astype(int).tolist()
+    return {"png": base64.b64encode(png).decode("ascii"), "left": left, "top": top, "width": width, "height": height}
+
+
+def _seen(recording: Recording) -> list[tuple[BevImage, SE3]]:
+    """The pictures of the agents at a few moments, and where the agents are in world."""
+    frames = np.linspace(recording.frames[0], recording.frames[-1], _MOMENTS).round().astype(int)
+    dataset = recording.dataset
+    samples = [recording.sample(agent, frame) for agent in recording.agents for frame in np.unique(frames).tolist()]
+    there = [sample for sample in samples if is_there(dataset, f"{sample}/{BEV_CAMERA}")]
+    return [(dataset.load_bev(sample), dataset.world_from(sample, "ego")) for sample in there]
+
+
+def _merged(seen: Sequence[tuple[BevImage, SE3]], low: FloatArray, high: FloatArray, cell: float) -> ByteArray:
+    """(H, W) uint8: in each cell the ground, from 1, of the first picture that has any there; the top is high y.
+
+    Args:
+        seen: pictures and the agents' poses.
+        low: (2,) least x and y, world, metres.
+        high: (2,) largest x and y.
+        cell: side of a cell, metres.
+    """
+    columns, rows = np.ceil((high - low) / cell).astype(int).tolist()
+    x, y = low[0] + (np.arange(columns) + 0.5) * cell, high[1] - (np.arange(rows) + 0.5) * cell
+    kinds = np.zeros(256, dtype=np.uint8)
+    for number, name in enumerate(_GROUND, 1):
+        kinds[TAGS[name]] = number
+    merged = np.zeros((rows, columns), dtype=np.uint8)
+    for image, pose in seen:
+        yaw = np.arctan2(pose.rotation[1, 0], pose.rotation[0, 0])
+        right, up = x[None] - pose.translation[0], y[:, None] - pose.translation[1]
+        middle = (len(image.semantic) - 1) / 2
+        row = np.rint(middle - (right * np.cos(yaw) + up * np.sin(yaw)) / image.resolution).astype(np.int64)
+        column = np.rint(middle - (up * np.cos(yaw) - right * np.sin(yaw)) / image.resolution).astype(np.int64)
+        free = (merged == 0) & (row >= 0) & (row <= 2 * middle) & (column >= 0) & (column <= 2 * middle)
+        merged[free] = kinds[image.semantic[row[free], column[free]]]
+    return merged
+
+
+def _png(cells: ByteArray) -> bytes:
+    from PIL import Image, ImageColor
+
+    picture = Image.fromarray(cells)
+    picture.putpalette([255, 255, 255, *(part for name in _GROUND for part in ImageColor.getrgb(BEV_COLORS[name]))])
+    written = io.BytesIO()
+    picture.save(written, "PNG", optimize=True, bits=2)
+    return written.getvalue()
