@@ -24,6 +24,8 @@ include_patterns = ["docs/*.md", "docs/api/*.md", "schema/**.md", "tutorials/*.m
 templates_path = ["templates"]
 html_theme = "furo"
 html_title = project
+html_static_path = ["static"]
+html_css_files = ["code.css"]
 html_additional_pages = {"index": "to_docs.html"}  # for those who open the folder
 html_copy_source = False
 

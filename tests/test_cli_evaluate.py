@@ -248,11 +248,14 @@ def two(da_motion: DeepAccident, folder: Path) -> list[Path]:
 class TestCompare:
     def test_text_and_files(self, two: list[Path], tmp_path: Path) -> None:
         for name in ("numbers.csv", "numbers.json"):
-            text = evaluate("compare", *two, "--resamples", 20, "--out", tmp_path / name).output
+            picture = tmp_path / "differences.svg"
+            out = ("--out", tmp_path / name, "--out", picture)
+            text = evaluate("compare", *two, "--resamples", 20, *out).output
             # one cluster says nothing of others
             error = next(line.split() for line in text.splitlines() if line.startswith("position_error"))
             assert (error[2:5], error[-2:]) == (["0.283", "2.828", "+2.546"], ["are", "needed"])
-            assert f"written: {tmp_path / name}" in text
+            assert f"written: {tmp_path / name}\nwritten: {picture}" in text
+            assert "<svg" in picture.read_text()
         stated = json.loads((tmp_path / "numbers.json").read_text())
         assert stated == json.loads(evaluate("compare", *two, "--resamples", 20, "--json").stdout)
         assert (tmp_path / "numbers.csv").read_text().count("\n") == len(stated["numbers"]) + 1
@@ -261,7 +264,7 @@ class TestCompare:
         with pytest.raises(EvaluationError, match=r"samples only in .*; evaluate both at the same samples"):
             evaluate("compare", two[0], bundle)
         text = evaluate("compare", *two, "--out", tmp_path / "numbers.txt", status=2).output
-        assert "--out: expected a file that ends in .csv or .json" in text
+        assert "--out: expected a file that ends in .csv, .json, .png" in text
 
 
 class TestValidate:

@@ -16,10 +16,14 @@ from deepaccident_devkit.evaluation.runs import compare_bundles, coverage, read_
 from deepaccident_devkit.evaluation.runs.sanity import check_sanity
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.render.evaluation import render_comparison
+from deepaccident_devkit.render.pictures import PICTURE_SUFFIXES, save_picture
 from deepaccident_devkit.taxonomy import VERSIONS
 
 _FINDINGS_STATUS = 1
 _OF_RELEASE = ("version", "split", "samples", "scope", "agents", "horizon", "on_error")
+_KINDS = (".csv", ".json", *PICTURE_SUFFIXES)
+_DPI = 130
 _workers = click.option("--workers", type=click.IntRange(min=1), help="Number of processes to use.")
 
 
@@ -97,19 +101,27 @@ def verify(
 @click.argument("b", type=click.Path(path_type=Path))
 @click.option("--common", is_flag=True, help="Compare only the samples that both evaluations have.")
 @resamples_parameter
-@click.option("--out", type=click.Path(path_type=Path), help="File to write all numbers into (.csv or .json).")
+@click.option(
+    "--out",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    help="File to write all numbers into (.csv or .json), or a figure of the differences "
+    f"({', '.join(PICTURE_SUFFIXES)}); you can repeat this option.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
-def compare(a: Path, b: Path, common: bool, resamples: int, out: Path | None, as_json: bool) -> None:
+def compare(a: Path, b: Path, common: bool, resamples: int, out: tuple[Path, ...], as_json: bool) -> None:
     """Compare the evaluations in the folders A and B, and test which differences are statistically significant."""
-    if out is not None and out.suffix not in (".csv", ".json"):
-        raise click.BadParameter(f"--out: expected a file that ends in .csv or .json, found {str(out)!r}")
+    for path in out:
+        if path.suffix.lower() not in _KINDS:
+            raise click.BadParameter(f"--out: expected a file that ends in {', '.join(_KINDS)}, found {str(path)!r}")
     comparison = compare_bundles(a, b, Resampling(resamples=resamples), common=common)
     as_text = json.dumps(comparison.as_dict(), indent=1)
     click.echo(as_text if as_json else comparison.to_text())
-    if out is None:
-        return
-    if out.suffix == ".csv":
-        comparison.to_csv(out)
-    else:
-        write_bytes(out, as_text.encode())
-    click.echo(f"written: {out}", err=as_json)
+    for path in out:
+        if path.suffix.lower() == ".csv":
+            comparison.to_csv(path)
+        elif path.suffix.lower() == ".json":
+            write_bytes(path, as_text.encode())
+        else:
+            save_picture(render_comparison(comparison), path, dpi=_DPI)
+        click.echo(f"written: {path}", err=as_json)

@@ -16,7 +16,7 @@ from deepaccident_devkit.evaluation.metrics.attributes import (
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import FrozenMappings
 from deepaccident_devkit.evaluation.metrics.intervals import Resampling, intervals_of
-from deepaccident_devkit.taxonomy import INFRASTRUCTURE
+from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE
 from deepaccident_devkit.text import natural_order
 
 Result = TypeVar("Result")
@@ -52,7 +52,7 @@ class Breakdown(FrozenMappings, Generic[Result]):
 
     Attributes:
         by: the attribute.
-        groups: of all samples, by value.
+        groups: of all samples, by value; agents in the order of `taxonomy.AGENTS`.
         without_infrastructure: the same without the samples of the roadside pole, which no vehicle drives.
         resampling: how the intervals were made.
     """
@@ -101,8 +101,11 @@ def breakdown(
 def _groups(
     evaluator: Evaluator[Result], attributes: Mapping[str, SampleAttributes], by: str, resampling: Resampling
 ) -> tuple[Group[Result], ...]:
-    by_value = sorted(tokens_by_value(attributes, by).items(), key=lambda item: natural_order(item[0]))
-    return tuple(_group(evaluator, value, tokens, attributes, resampling) for value, tokens in by_value)
+    by_value = tokens_by_value(attributes, by)
+    ordered: list[str | None] = sorted(by_value, key=natural_order)
+    if by == "agent":
+        ordered.sort(key=AGENTS.index)
+    return tuple(_group(evaluator, value, by_value[value], attributes, resampling) for value in ordered)
 
 
 def _group(

@@ -7,6 +7,7 @@ from deepaccident_devkit.render.evaluation.accident import (
     render_outcomes,
 )
 from deepaccident_devkit.render.evaluation.breakdowns import render_breakdown
+from deepaccident_devkit.render.evaluation.comparison import render_comparison
 from deepaccident_devkit.render.evaluation.detection import render_average_precisions, render_precision_recall
 from deepaccident_devkit.render.evaluation.motion import render_quality_by_time, render_ranges
 from deepaccident_devkit.render.evaluation.report import save_report
@@ -25,6 +26,7 @@ __all__ = [
     "render_alarms",
     "render_average_precisions",
     "render_breakdown",
+    "render_comparison",
     "render_detection_rates",
     "render_errors",
     "render_false_alarms",

@@ -73,7 +73,7 @@ def render_average_precisions(result: DetectionResult, *, ax: Axes | None = None
         Bar(
             label=name,
             below=f"{truths:,} true",
-            value=average if math.isfinite(average) else None,
+            value=average if truths and math.isfinite(average) else None,
             text=f"{average:.1f} %",
             color=CATEGORY_COLORS.get(name, ESTIMATE_COLOR),
         )

@@ -21,7 +21,7 @@ from deepaccident_devkit.evaluation.metrics.motion.evaluator import MotionEvalua
 from deepaccident_devkit.evaluation.metrics.warning import AnticipationResult, WarningResult
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.render.axes import detached_figure
-from deepaccident_devkit.render.colors import WARNING_COLOR
+from deepaccident_devkit.render.colors import MUTED_COLOR, WARNING_COLOR
 from deepaccident_devkit.render.evaluation import accident, detection, motion, warning
 from deepaccident_devkit.render.evaluation.breakdowns import UNKNOWN, render_breakdown
 from deepaccident_devkit.render.evaluation.panels import PANEL
@@ -79,7 +79,7 @@ def save_figure(run: EvaluationRun, drawn: RunFigure, folder: Path) -> Path:
         folder: where; it is made if it is not there.
 
     Returns:
-        The file's path. The figure names its task, protocol, devkit and release, and in red what a partial run lacks.
+        The file's path. The figure names its task, protocol, devkit and release, and what a partial run lacks.
     """
     path = folder / f"{drawn.name}.png"
     figure = detached_figure((PANEL[0], max(PANEL[1], _ROW * drawn.rows + 1.2)))
@@ -87,7 +87,7 @@ def save_figure(run: EvaluationRun, drawn: RunFigure, folder: Path) -> Path:
     made_of = (
         f"{run.setup.task}, protocol {run.setup.protocol}, devkit {__version__}, release {run.release.fingerprint}"
     )
-    figure.supxlabel(made_of, fontsize=6, color="#666666")
+    figure.supxlabel(made_of, fontsize=6, color=MUTED_COLOR)
     mark = "" if run.partial is None else run.partial.text()
     if mark:
         figure.suptitle(mark, color=WARNING_COLOR, fontsize=10, fontweight="bold")
@@ -96,14 +96,15 @@ def save_figure(run: EvaluationRun, drawn: RunFigure, folder: Path) -> Path:
 
 
 def run_figures(run: EvaluationRun) -> tuple[RunFigure, ...]:
-    """All figures of a run, those of its task first, then the breakdowns that have more than one group."""
+    """All figures of a run: those of its task, then breakdowns with several groups of which one has a number."""
     own = _FIGURES[run.setup.task](run)
     left_out = (EVERYTHING, *(WITHIN_RECORDINGS if run.setup.task == "warning" else ()))
     broken = {each.by: each for each in run.breakdowns if each.by not in left_out and len(each.groups) > 1}
     numbers = [path for path in MAIN_NUMBERS[run.setup.task] if _headline(run.setup.task, run.result, path) is not None]
     pairs = [(path, each) for path in numbers[:1] for each in broken.values()]
     pairs[1:1] = [(path, broken[_BY_TIME]) for path in numbers[1:] if _BY_TIME in broken]
-    return (*own, *(_by(run.setup.task, each, path) for path, each in pairs))
+    shown = [(path, each) for path, each in pairs if _has_numbers(run.setup.task, each, path)]
+    return (*own, *(_by(run.setup.task, each, path) for path, each in shown))
 
 
 def _accident(run: EvaluationRun) -> Iterator[RunFigure]:
@@ -251,6 +252,11 @@ def _by(task: str, broken: Breakdown[Any], path: str) -> RunFigure:
         draw=partial(render_breakdown, task, broken, path),
         rows=len(broken.groups),
     )
+
+
+def _has_numbers(task: str, broken: Breakdown[Any], path: str) -> bool:
+    shown = [_headline(task, group.result, path) for group in broken.groups]
+    return any(each is not None and each.value is not None for each in shown)
 
 
 def _headline(task: str, result: object, path: str) -> Headline | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
@@ -11,6 +12,8 @@ from deepaccident_devkit.render.colors import GRID_COLOR, WARNING_COLOR
 
 _VOID: Final = ("img", "meta")
 _MOST_DIGITS: Final = 6
+_JOINTS: Final = re.compile(r"(?<=[/_=])(?=\w)|(?=@)")
+"""Where a name may be broken."""
 _LONG: Final = 40
 """A text with more letters than this is not a name."""
 
@@ -41,10 +44,15 @@ def joined(parts: Iterable[str]) -> Markup:
     return Markup("".join(part if isinstance(part, Markup) else html.escape(part) for part in parts))
 
 
+def breakable(text: str) -> Markup:
+    """A text, escaped, whose names may be broken after `/`, `_` and `=` and before `@`; `Markup` as it is."""
+    return text if isinstance(text, Markup) else Markup("<wbr>".join(map(html.escape, _JOINTS.split(text))))
+
+
 def table(heading: Sequence[str], rows: Iterable[Sequence[str]], caption: str = "") -> Markup:
     """A table in a box that scrolls if the table is too wide; the first column has the rows' headings."""
-    head = tag("tr", *(tag("th", each, scope="col") for each in heading))
-    body = [tag("tr", tag("th", first, scope="row"), *map(_cell, others)) for first, *others in rows]
+    head = tag("tr", *(tag("th", breakable(each), scope="col") for each in heading))
+    body = [tag("tr", tag("th", breakable(first), scope="row"), *map(_cell, others)) for first, *others in rows]
     above = [tag("caption", caption)] if caption else []
     parts = tag("table", *above, tag("thead", head), tag("tbody", *body))
     return tag("div", parts, class_="wide")
@@ -52,7 +60,9 @@ def table(heading: Sequence[str], rows: Iterable[Sequence[str]], caption: str = 
 
 def facts(values: Mapping[str, str]) -> Markup:
     """Names with their values, one below the other."""
-    return tag("dl", *(tag("div", tag("dt", name), tag("dd", value)) for name, value in values.items()))
+    return tag(
+        "dl", *(tag("div", tag("dt", breakable(name)), tag("dd", breakable(value))) for name, value in values.items())
+    )
 
 
 def tree(value: Any) -> Markup:
@@ -79,6 +89,17 @@ def scalar(value: Any) -> str:
     return f"{value:.{_MOST_DIGITS}g}" if isinstance(value, float) else str(value)
 
 
+def number(value: Any) -> str:
+    """A result as text: three decimals, and three digits from 10 on; whole numbers whole; a dash for an unknown one."""
+    if isinstance(value, list | tuple):
+        return ("; " if any(isinstance(each, list | tuple) for each in value) else ", ").join(map(number, value))
+    if isinstance(value, bool | str) or value is None or not math.isfinite(value):
+        return scalar(value)
+    if value == round(value):
+        return f"{value:,.0f}"
+    return f"{value:.3f}" if abs(value) < 10 else f"{value:.3g}" if abs(value) < 1000 else f"{value:,.0f}"
+
+
 def _cell(content: str) -> Markup:
     """Numbers and names stay on one line, sentences may have several."""
     is_sentence = "<" not in content and len(content) > _LONG
@@ -103,29 +124,30 @@ _STYLE: Final = f"""
 :root {{ color-scheme: light; }}
 * {{ box-sizing: border-box; }}
 body {{ margin: 0 auto; padding: 1rem 1.25rem 3rem; max-width: 76rem; background: #fff; color: #1c1c1c;
-  font: 16px/1.5 system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; overflow-wrap: anywhere; }}
+  font: 16px/1.5 system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; overflow-wrap: break-word; }}
 h1 {{ font-size: 1.7rem; line-height: 1.2; margin: .6rem 0 .4rem; }}
 h2 {{ font-size: 1.25rem; margin: 2.2rem 0 .6rem; padding-bottom: .2rem; border-bottom: 2px solid {GRID_COLOR}; }}
 h3 {{ font-size: 1rem; margin: 1.4rem 0 .4rem; }}
 p {{ margin: .4rem 0; max-width: 46rem; }}
 nav a {{ display: inline-block; margin: 0 .9rem .3rem 0; }}
 a {{ color: #14489c; }}
-dl {{ display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 21rem), 1fr)); gap: 0 2rem;
+dl {{ display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 28rem), 1fr)); gap: 0 2rem;
   margin: .6rem 0; }}
 dl div {{ display: flex; gap: .8rem; padding: .2rem 0; border-bottom: 1px solid #ececec; min-width: 0; }}
 dt {{ flex: 0 0 8.5rem; color: #555; }}
 dd {{ margin: 0; min-width: 0; }}
 .wide {{ overflow-x: auto; max-width: 100%; }}
-table {{ border-collapse: collapse; font-size: .92rem; font-variant-numeric: tabular-nums; }}
+table {{ border-collapse: collapse; font-size: .86rem; font-variant-numeric: tabular-nums; }}
 caption {{ text-align: left; color: #555; padding: .2rem 0; }}
-th, td {{ padding: .28rem .9rem .28rem 0; text-align: right; vertical-align: top; border-bottom: 1px solid #ececec;
+th, td {{ padding: .28rem .6rem .28rem 0; text-align: right; vertical-align: top; border-bottom: 1px solid #ececec;
   overflow-wrap: normal; }}
 thead th {{ border-bottom: 2px solid {GRID_COLOR}; font-weight: 600; }}
 th:first-child {{ text-align: left; font-weight: 500; }}
 @media (min-width: 700px) {{ .wide th:first-child {{ position: sticky; left: 0; background: #fff; }} }}
 .text td, .text th, .tree td, .tree th {{ text-align: left; overflow-wrap: break-word; }}
-.wide th, .wide td {{ white-space: nowrap; }}
-.wide.text th, .wide.text td {{ white-space: normal; }}
+.wide td {{ white-space: nowrap; }}
+.wide.text td, .wide .interval {{ white-space: normal; }}
+.wide .interval {{ min-width: 5em; }}
 .wide td.long {{ white-space: normal; text-align: left; min-width: 18rem; }}
 .big td {{ font-size: 1.02rem; font-weight: 600; }}
 .big td ~ td {{ font-weight: 400; color: #444; font-size: .92rem; }}
@@ -145,7 +167,7 @@ footer {{ margin-top: 3rem; color: #555; font-size: .88rem; }}
   body {{ max-width: none; padding: 0; font-size: 10.5pt; }}
   nav {{ display: none; }}
   .wide {{ overflow: visible; }}
-  .wide th, .wide td {{ white-space: normal; }}
+  .wide td {{ white-space: normal; }}
   table {{ font-size: 7.5pt; }}
   th, td {{ padding-right: .5rem; }}
   figure, tr, .partial {{ break-inside: avoid; }}

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from deepaccident_devkit.render.axes import with_light_grid
-from deepaccident_devkit.render.colors import ESTIMATE_COLOR
+from deepaccident_devkit.render.colors import ESTIMATE_COLOR, MUTED_COLOR
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -70,6 +70,7 @@ def draw_bars(bars: Sequence[Bar], ax: Axes, limit: float | None = None) -> Axes
             textcoords="offset points",
             va="center",
             fontsize=8,
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5},  # over a line that marks a value
         )
         ends.append(end)
     reach = max(ends) if limit is None else limit
@@ -83,6 +84,6 @@ def draw_bars(bars: Sequence[Bar], ax: Axes, limit: float | None = None) -> Axes
 
 def draw_nothing(ax: Axes, why: str = "nothing to count") -> Axes:
     """Write into a panel why it is empty; returns the axes."""
-    ax.text(0.5, 0.5, why, ha="center", va="center", transform=ax.transAxes, color="#555555")
+    ax.text(0.5, 0.5, why, ha="center", va="center", transform=ax.transAxes, color=MUTED_COLOR)
     ax.set(xticks=[], yticks=[])
     return ax

@@ -15,7 +15,7 @@ from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.render.evaluation import sections
 from deepaccident_devkit.render.evaluation.figures import RunFigure, run_figures, save_figure
-from deepaccident_devkit.render.evaluation.markup import Markup, document, joined, tag
+from deepaccident_devkit.render.evaluation.markup import Markup, breakable, document, joined, tag
 from deepaccident_devkit.render.evaluation.samples import sample_figures
 
 REPORT_FILE: Final = "report.html"
@@ -89,7 +89,7 @@ def report_html(run: EvaluationRun, figures: Sequence[tuple[RunFigure, Path]]) -
 def _figure(drawn: RunFigure, path: Path) -> Markup:
     content = base64.b64encode(path.read_bytes()).decode("ascii")
     image = tag("img", src=f"data:image/png;base64,{content}", alt=drawn.alt)
-    return tag("figure", image, tag("figcaption", drawn.caption))
+    return tag("figure", image, tag("figcaption", breakable(drawn.caption)))
 
 
 def _mark(run: EvaluationRun) -> Markup:

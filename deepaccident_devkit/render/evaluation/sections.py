@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 from deepaccident_devkit.evaluation.metrics.attributes import EVERYTHING
 from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown, Group
+from deepaccident_devkit.evaluation.metrics.detection import DetectionResult
 from deepaccident_devkit.evaluation.metrics.headlines import Headline, headlines, value_text
 from deepaccident_devkit.evaluation.metrics.intervals import LEAST_CLUSTERS
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.evaluation.runs.notes import reading_notes
 from deepaccident_devkit.evaluation.runs.predictors import predictor_tables
 from deepaccident_devkit.render.evaluation.breakdowns import UNKNOWN
-from deepaccident_devkit.render.evaluation.markup import Markup, facts, joined, scalar, table, tag, tree
+from deepaccident_devkit.render.evaluation.markup import Markup, facts, joined, number, scalar, table, tag, tree
 
 _BETTER: Final = {True: "higher", False: "lower", None: ""}
 _PARTS: Final = {
@@ -29,6 +31,8 @@ _PARTS: Final = {
     "beside": "With other choices, always reported as well",
 }
 """Field of a result → heading of its table."""
+_COUNTED: Final = ("thresholds", "truths", "detections")
+"""What is known of a class without true boxes."""
 _SHOWN_META: Final = ("method", "name", "authors", "url", "date")
 """Fields that results give about themselves and that are shown at the top, if there are any."""
 _SIDES: Final = {"empty": "nothing predicted", "given": "given", "perfect": "perfect"}
@@ -63,7 +67,7 @@ def headline_table(run: EvaluationRun) -> Markup:
     group = everything.groups[0] if everything is not None and everything.groups else None
     rows = [
         [each.name, each.text(), _interval_text(each, group), _BETTER[each.higher_is_better]]
-        for each in headlines(run.setup.task, run.result)
+        for each in _headlines(run.setup.task, run.result)
     ]
     percent = f"{100 * everything.resampling.confidence:g} % interval" if everything is not None else "interval"
     notes = [tag("p", note, class_="note") for note in (() if group is None else group.notes)]
@@ -83,8 +87,11 @@ def predictors(run: EvaluationRun) -> Markup:
 def counts(run: EvaluationRun) -> Markup:
     """What was counted: the whole numbers of a result, its notes, and its other tables."""
     told = run.result.as_dict()
-    numbers = {name: f"{value:,}" for name, value in told.items() if isinstance(value, int)}
+    numbers = {name: number(value) for name, value in told.items() if isinstance(value, int)}
     named = {title: told[name] for name, title in _PARTS.items() if told.get(name)}
+    for name in _absent_classes(run.result):
+        row = told["classes"][name]
+        row.update({key: None for key in row if key not in _COUNTED})
     said = [*(told.get("notes") or ()), *reading_notes(run.summary())]
     notes = [tag("p", str(note), class_="note") for note in said]
     parts = [tag("div", tag("h3", title), _columns(value)) for title, value in named.items()]
@@ -205,15 +212,28 @@ def checking() -> Markup:
 
 
 def _groups(task: str, broken: Breakdown[Any], groups: Sequence[Group[Any]], whose: str) -> Markup:
-    names = list(dict.fromkeys(each.name for group in groups for each in headlines(task, group.result)))
+    names = list(dict.fromkeys(each.name for group in groups for each in _headlines(task, group.result)))
     rows = []
     for group in groups:
-        known = {each.name: each for each in headlines(task, group.result)}
+        known = {each.name: each for each in _headlines(task, group.result)}
         cells = [_cell(known.get(name), group) for name in names]
         label = UNKNOWN if group.value is None else group.value
         rows.append([label, f"{group.samples:,}", f"{group.scenarios:,}", *cells])
     how = f"{100 * broken.resampling.confidence:g} % intervals, if there are {LEAST_CLUSTERS} clusters"
     return table([broken.by.replace("_", " "), "samples", "scenarios", *names], rows, f"{whose}; {how}")
+
+
+def _headlines(task: str, result: object) -> list[Headline]:
+    """The headlines as a report shows them: a class without true boxes has no value, also where the rules count 0."""
+    paths = {f"class_average_precision/{name}" for name in _absent_classes(result)}
+    return [replace(each, value=None) if each.path in paths else each for each in headlines(task, result)]
+
+
+def _absent_classes(result: object) -> list[str]:
+    """Classes without true boxes, of a detection's result."""
+    if not isinstance(result, DetectionResult):
+        return []
+    return [name for name, truths in zip(result.classes, result.truths.sum(axis=1), strict=True) if not truths]
 
 
 def _cell(headline: Headline | None, group: Group[Any]) -> Markup:
@@ -238,10 +258,10 @@ def _columns(value: Any) -> Markup:
             "p", "; ".join(f"{low:g} m and more" if high is None else f"{low:g} to {high:g} m" for low, high in value)
         )
     if not all(isinstance(each, Mapping) for each in value.values()):
-        return facts({str(name): scalar(each) for name, each in value.items()})
+        return facts({str(name): number(each) for name, each in value.items()})
     names = list(dict.fromkeys(name for each in value.values() for name in each))
     plain = [name for name in names if not any(isinstance(each.get(name), Mapping) for each in value.values())]
-    return table(["", *plain], [[key, *(tree(each.get(name)) for name in plain)] for key, each in value.items()])
+    return table(["", *plain], [[key, *(number(each.get(name)) for name in plain)] for key, each in value.items()])
 
 
 def _samples(groups: Sequence[Group[Any]]) -> int:

@@ -72,7 +72,7 @@ def render_predictors(result: AnticipationResult, *, ax: Axes | None = None) -> 
     ]
     ax = draw_bars(bars, ax, 1.0)
     ax.axvline(0.5, color="black", linestyle="--", linewidth=1)
-    ax.set(xlabel="chance that an accident's score is above another recording's at the same moment")
+    ax.set(xlabel="chance that an accident's score is above\nanother recording's at the same moment")
     ax.set_title(f"Accidents distinguished from other recordings: {group}", fontsize=10)
     return ax
 

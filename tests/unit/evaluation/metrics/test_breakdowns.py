@@ -21,7 +21,7 @@ from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator, 
 from deepaccident_devkit.evaluation.metrics.intervals import Resampling
 from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator
 from deepaccident_devkit.evaluation.metrics.predictions import instances_of
-from deepaccident_devkit.taxonomy import INFRASTRUCTURE
+from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE
 
 STORY = {
     "scenario_type": "type1_subtype1_accident",
@@ -139,6 +139,12 @@ def test_the_pole_is_left_out_beside() -> None:
     by_agent = breakdown(filled(), MANY | poles, "agent", Resampling(resamples=0))
     assert [group.value for group in by_agent.groups] == ["ego_vehicle", INFRASTRUCTURE]
     assert [group.value for group in by_agent.without_infrastructure] == ["ego_vehicle"]
+
+
+def test_agents_are_in_their_usual_order() -> None:
+    attributes = {token: replace(each, agent=AGENTS[int(token) % 5]) for token, each in MANY.items()}
+    found = breakdown(filled(), attributes, "agent", Resampling(resamples=0))
+    assert [group.value for group in found.groups] == list(AGENTS) != sorted(AGENTS)
 
 
 @pytest.mark.parametrize("kind", [Shares, PooledShares])

@@ -1,5 +1,7 @@
 """Panels of detection results: what they draw is what the result says."""
 
+from dataclasses import replace
+
 import pytest
 from drawing import new_axes, words
 from numpy.testing import assert_array_equal
@@ -29,4 +31,6 @@ def test_bars_are_average_precisions(detected: DetectionResult) -> None:
     assert [bar.get_width() for bar in ax.patches] == [62.5, 25.0]
     assert [text.get_text() for text in ax.texts] == ["62.5 %", "25.0 %", "–"]
     assert [label.get_text() for label in ax.get_yticklabels()] == ["car\n8 true", "van\n4 true", "truck\n0 true"]
+    zeros = replace(detected, class_average_precision={**detected.class_average_precision, "truck": 0.0})
+    assert "–" in words(render_average_precisions(zeros, ax=new_axes()))  # also where the rules count it as 0
     render_average_precisions(DetectionEvaluator("paper").compute(), ax=new_axes()).figure.draw_without_rendering()

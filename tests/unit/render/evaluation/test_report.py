@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from drawing import new_axes, rendered
 from evaluation_runs import PARTIAL, evaluation_run
+from matplotlib.colors import to_rgb
 from PIL import Image
 from report_page import page_of
 
@@ -16,8 +18,10 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.metrics.headlines import headlines
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.render.colors import WARNING_COLOR
 from deepaccident_devkit.render.evaluation import save_report
 from deepaccident_devkit.render.evaluation.figures import run_figures
+from deepaccident_devkit.render.evaluation.panels import PANEL
 
 pytestmark = pytest.mark.slow
 
@@ -31,9 +35,10 @@ SETUPS = (
 )
 
 
-def red_pixels(path: Path) -> int:
+def warning_pixels(path: Path) -> int:
     with Image.open(path) as picture:
-        return int((np.abs(np.asarray(picture.convert("RGB")) - (176, 0, 32)).max(axis=-1) < 8).sum())
+        warning = 255 * np.array(to_rgb(WARNING_COLOR))
+        return int((np.abs(np.asarray(picture.convert("RGB")) - warning).max(axis=-1) < 8).sum())
 
 
 EVIL = '</script><script>alert("x")</script><img src=http://x.example/y.png onerror=alert(1)>&'
@@ -55,7 +60,7 @@ def test_a_report_holds_all_and_asks_for_nothing(
     assert {str(link["href"])[0] for link in page.all("a")} == {"#"}
     assert {str(link["href"])[1:] for link in page.all("a")} == {str(each["id"]) for each in page.all("section")}
     assert "PARTIAL" not in page.text
-    assert not any(map(red_pixels, figures))
+    assert not any(map(warning_pixels, figures))
     for headline in headlines(setup.task, run.result):
         assert headline.name in page.text
         assert headline.text() in page.text
@@ -65,6 +70,27 @@ def test_a_report_holds_all_and_asks_for_nothing(
         assert told in page.text
     for switch in re.findall(r"'(\w+)':", str(run.setup.as_dict()["settings"])):
         assert switch in page.text
+
+
+@pytest.mark.parametrize("setup", SETUPS, ids=lambda setup: f"{setup.task} {setup.protocol}")
+def test_no_words_of_a_figure_are_cut(setup: EvaluationSetup, da_motion: DeepAccident, tokens: list[str]) -> None:
+    for each in run_figures(evaluation_run(da_motion, setup, tokens)):
+        ax = new_axes(PANEL)
+        each.draw(ax=ax)
+        rendered(ax)
+        drawn = ax.figure.get_tightbbox()
+        assert min(*drawn.min, *(PANEL - drawn.max)) > -0.01, each.name
+
+
+def test_a_class_without_true_boxes_has_a_dash(da_motion: DeepAccident, tokens: list[str], tmp_path: Path) -> None:
+    run = evaluation_run(da_motion, SETUPS[3], tokens)
+    result = run.result
+    truths = result.truths * (np.array(result.classes) != "car")[:, None]
+    page = page_of(save_report(replace(run, result=replace(result, truths=truths)), tmp_path))
+    there = f"{result.class_average_precision['car']:.2f} %"
+    assert f"AP car{there}" in page_of(save_report(run, tmp_path)).text
+    assert "AP car–" in page.text
+    assert f"AP car{there}" not in page.text
 
 
 def test_intervals_stand_beside_their_numbers(da_motion: DeepAccident, tokens: list[str], tmp_path: Path) -> None:
@@ -92,7 +118,7 @@ def test_a_partial_run_says_so_everywhere(da_motion: DeepAccident, tokens: list[
     marks = page.text.count("PARTIAL: 120 of 180 samples, 2 predictions left out")
     assert marks == 1 + len(page.all("section"))
     for path in (tmp_path / "figures").iterdir():
-        assert red_pixels(path) > 50, path
+        assert warning_pixels(path) > 50, path
         with Image.open(path) as picture:
             assert str(picture.info["Description"]).startswith("PARTIAL: 120 of 180 samples")
             assert "protocol boxes, devkit" in str(picture.info["Description"])
@@ -131,4 +157,6 @@ def test_names_from_elsewhere_are_harmless(da_motion: DeepAccident, tokens: list
     assert page.text.count(EVIL) >= 13
     assert "+0.250" in page.text
     assert "No number changes with: idle=no." in page.text
-    assert "http" not in re.sub(r"http-equiv", "", path.read_text().replace("http://x.example/y.png", ""))
+    assert "http" not in re.sub(
+        r"http-equiv", "", path.read_text().replace("<wbr>", "").replace("http://x.example/y.png", "")
+    )

@@ -1,0 +1,64 @@
+"""The picture of a comparison: a row for each headline number, at its difference, with its interval."""
+
+from pathlib import Path
+from typing import Any
+
+from numpy.testing import assert_array_equal
+
+from deepaccident_devkit.evaluation import Resampling
+from deepaccident_devkit.evaluation.runs import ComparedNumber, Comparison
+from deepaccident_devkit.render import detached_figure
+from deepaccident_devkit.render.evaluation import render_comparison
+
+SIZE = (7.2, 5.0)
+
+
+def compared(name: str, **changes: Any) -> ComparedNumber:
+    """A headline number that is 0.25 more in b."""
+    values: dict[str, Any] = {"headline": name, "unit": "share", "a": 0.5, "b": 0.75, "difference": 0.25}
+    tested: dict[str, Any] = {"low": -0.1, "high": 0.6, "p": 0.2, "adjusted_p": 0.2, "real": False, "better": None}
+    return ComparedNumber(number=name, family="headlines", decision="", **{**values, **tested, **changes})
+
+
+def comparison(*numbers: ComparedNumber, **changes: Any) -> Comparison:
+    folders = {"a": Path("runs/single"), "b": Path("runs/five")}
+    counts = {"samples": 1200, "scenarios": 16, "clusters": 8, "left_out": 0, "swaps": 128}
+    others: dict[str, Any] = {"partial": (), "resampling": Resampling(), "all_swaps": True, **changes}
+    return Comparison(task="accident", protocol="boxes", numbers=numbers, **folders, **counts, **others)
+
+
+def test_a_number_is_at_its_difference() -> None:
+    worse = {"a": 2.0, "b": 1.5, "difference": -0.5, "low": -0.75, "high": -0.25, "real": True, "better": "b"}
+    numbers = (
+        compared("apa"),
+        compared("error", unit="m", **worse),
+        compared("recall", low=None, high=None),
+        compared("other", headline=None),
+        compared("unknown", b=None, difference=None),
+    )
+    fig = render_comparison(comparison(*numbers), fig=detached_figure(SIZE))
+    shares, metres = fig.axes
+    assert [label.get_text() for label in shares.get_yticklabels()] == ["apa\n0.500 → 0.750", "recall\n0.500 → 0.750"]
+    assert [text.get_text() for text in (*shares.texts, *metres.texts)] == ["+0.250", "+0.250", "−0.500, b is better"]
+    _, whisker, dot, alone = shares.lines
+    assert_array_equal(whisker.get_xydata(), [(-0.1, 0), (0.6, 0)])
+    assert_array_equal([dot.get_xydata()[0], alone.get_xydata()[0]], [(0.25, 0), (0.25, 1)])
+    assert dot.get_markerfacecolor() == "white" != metres.lines[-1].get_markerfacecolor()
+    assert [ax.get_xlabel() for ax in fig.axes] == ["b − a", "b − a (m)"]
+
+
+def test_no_words_are_cut_and_partial_runs_are_marked() -> None:
+    numbers = [compared(f"quite_a_long_name_{row}", real=True, better="b") for row in range(6)]
+    fig = render_comparison(comparison(*numbers, partial=("a: PARTIAL",)), fig=detached_figure(SIZE))
+    fig.draw_without_rendering()
+    drawn = fig.get_tightbbox()
+    assert min(*drawn.min, *(SIZE - drawn.max)) > -0.01
+    assert "\na: PARTIAL" in fig.get_suptitle()
+
+
+def test_equal_numbers_and_none() -> None:
+    fig = render_comparison(comparison(compared("apa", difference=1e-9, low=0.0, high=2e-9)), fig=detached_figure(SIZE))
+    left, right = fig.axes[0].get_xlim()
+    assert left < -0.001 < 0.001 < right  # no axis of billionths
+    fig = render_comparison(comparison(), fig=detached_figure(SIZE))
+    assert fig.axes[0].texts[0].get_text() == "no number of both"
