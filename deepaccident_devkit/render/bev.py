@@ -14,13 +14,14 @@ from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import SE3, Boxes, LidarPointCloud
 from deepaccident_devkit.release import BevImage
 from deepaccident_devkit.release.bev_camera import TAGS
-from deepaccident_devkit.render.axes import axes_or_new, axis_words, check_view_range, set_title
+from deepaccident_devkit.render.axes import axes_or_new, axis_words, check_view_range
 from deepaccident_devkit.render.boxes import draw_actors_from_above, write_beside
 from deepaccident_devkit.render.colors import AGENT_COLORS, BEV_COLORS, GRID_COLOR, OWN_COLOR, POINT_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import agent_handles, box_handles, draw_legend
 from deepaccident_devkit.render.missing import absence_text, has_cloud, is_there, missing_clouds_text, write_missing
 from deepaccident_devkit.render.roles import at_once, role_colors, short_name
+from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.render.trails import draw_trails
 from deepaccident_devkit.taxonomy import BEV_CAMERA, AgentName, Frame
 from deepaccident_devkit.v2x import (
@@ -141,6 +142,7 @@ def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a 
     names = cooperating_agents(dataset, sample, agents)
     ax = axes_or_new(ax, (6, 6.6))
     drawn = draw_bev(dataset, sample, view, chosen, ax)
+    set_scene_title(ax, dataset, dataset.get("sample", sample)["token"])
     handles = box_handles(drawn.colors)
     if len(names) > 1:
         handles += agent_handles(drawn.clouds)
@@ -184,7 +186,7 @@ def draw_bev(dataset: Dataset, sample: RowArgument, view: BevView, layers: froze
     if "bev" in layers and not (has_ground or shown):
         absent.append(f"{BEV_CAMERA}: {absence_text(dataset, ground)}")
     _draw_marks(dataset, record, view.frame, names, ax)
-    _finish(record, view.frame, grid="grid" in layers, ax=ax)
+    _finish(view.frame, grid="grid" in layers, ax=ax)
     write_missing(ax, "; ".join(filter(None, absent)))
     return DrawnBev(colors=colored, clouds=shown)
 
@@ -239,11 +241,9 @@ def _draw_marks(dataset: Dataset, record: SampleRecord, frame: str, names: Seque
     ax.add_collection(PolyCollection(heads, facecolors=colors, edgecolors="white", linewidths=0.6, zorder=5))
 
 
-def _finish(record: SampleRecord, frame: str, *, grid: bool, ax: Axes) -> None:
-    countdown = "" if record["time_to_impact"] is None else f", {record['time_to_impact']:.1f} s to the impact"
+def _finish(frame: str, *, grid: bool, ax: Axes) -> None:
     words = axis_words(frame)
     ax.set(xlabel=words[0], ylabel=words[1])
-    set_title(ax, f"{record['agent']}, t = {record['timestamp']:.1f} s{countdown}", fontsize="medium")
     ax.set_axisbelow(True)
     if grid:
         ax.grid(color=GRID_COLOR, linewidth=0.4)

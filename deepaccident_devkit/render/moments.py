@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Final
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.render.axes import figure_or_new, set_title
+from deepaccident_devkit.render.axes import figure_or_new
 from deepaccident_devkit.render.bev import BEV_DEFAULT, BEV_LAYERS, BevView, draw_bev
 from deepaccident_devkit.render.camera import CAMERA_DEFAULT, CAMERA_LAYERS, draw_camera
-from deepaccident_devkit.render.colors import CATEGORY_COLORS
 from deepaccident_devkit.render.layers import LAYERS, Layer, layers_of
 from deepaccident_devkit.render.legends import agent_handles, box_handles, draw_legend
 from deepaccident_devkit.render.roles import at_once, in_drawing_order
+from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.taxonomy import CAMERAS
 from deepaccident_devkit.v2x import Agents, Link, cooperating_agents
 
@@ -36,8 +36,6 @@ _WIDE: Final = 2.1
 _VIEW_RANGE: Final = 50.0
 """Metres to each side of an agent if there are several; in a tall figure more to its left and right."""
 _TALLEST: Final = 2.0
-_LEGEND_ENTRY: Final = 1.1
-"""Inches of an entry of the legend, about."""
 _BESIDE, _ABOUT = 0.9, 1.6
 """Inches of room for words beside panels, and above and below them."""
 MOMENT_LAYERS: Final = tuple(layer for layer in LAYERS if layer in {*CAMERA_LAYERS, *BEV_LAYERS})
@@ -82,12 +80,11 @@ def render_sample(
     for channel in CAMERAS:
         draw_camera(dataset, dataset.get("sample_data", f"{record['token']}/{channel}"), in_cameras, axes[channel])
     drawn = draw_bev(dataset, record, BevView(agents=names, link=link), from_above, axes["bev"])
-    axes["bev"].set_title("")
     handles = box_handles(drawn.colors)
     if len(names) > 1:
         handles += agent_handles(drawn.clouds)
     draw_legend(fig, handles, columns=len(handles), loc="outside lower center")
-    set_title(fig, _heading(record["token"], record))
+    set_scene_title(fig, dataset, record["token"])
     return fig
 
 
@@ -140,9 +137,9 @@ def render_frame(
         _plain(above, labelled=column == 0)
     if fig.figure is fig:  # a part of a figure is laid out with it
         fig.set_layout_engine("compressed")
-    columns = min(2 + len(CATEGORY_COLORS), max(1, int(fig.bbox.width / fig.dpi / _LEGEND_ENTRY)))
-    draw_legend(fig, box_handles(drawn), columns=columns, loc="outside lower center")
-    set_title(fig, _heading(f"{record['token']}, t = {record['timestamp']:.1f} s", record))
+    handles = box_handles(drawn)
+    draw_legend(fig, handles, columns=len(handles), loc="outside lower center")
+    set_scene_title(fig, dataset, record["token"])
     return fig
 
 
@@ -162,13 +159,7 @@ def _tallness(fig: Figure, columns: int) -> float:
 
 
 def _plain(ax: Axes, *, labelled: bool) -> None:
-    """Remove a panel's title and, unless it is `labelled`, the labels of its y axis."""
-    ax.set_title("")
+    """Unless a panel is `labelled`, remove the labels of its y axis."""
     if not labelled:
         ax.set_ylabel("")
         ax.tick_params(labelleft=False)
-
-
-def _heading(words: str, record: Mapping[str, Any]) -> str:
-    end = record["time_to_impact"]
-    return words if end is None else f"{words}, {end:.1f} s to the impact"

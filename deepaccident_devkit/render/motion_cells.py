@@ -8,6 +8,7 @@ import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, FloatArray
 from deepaccident_devkit.render.axes import with_light_grid
+from deepaccident_devkit.render.boxes import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import BEYOND_COLOR, COLLIDER_COLOR, OWN_COLOR
 from deepaccident_devkit.render.layers import Layer
 from deepaccident_devkit.render.motion_maps import DrawnMap, MotionMaps
@@ -141,7 +142,15 @@ def _with_ids_and_grid(maps: MotionMaps, frame: int, shown: frozenset[Layer], ax
         for identity in np.unique(maps.instance[frame][maps.instance[frame] > 0]).tolist():
             row, column = np.nonzero(maps.instance[frame] == identity)
             place = x[column].mean(), y[row].max()
-            ax.annotate(str(identity), place, (0, 2), textcoords="offset points", fontsize=7, ha="center", clip_on=True)
+            ax.annotate(
+                str(identity),
+                place,
+                (0, 2),
+                textcoords="offset points",
+                fontsize=SMALLEST_TEXT,
+                ha="center",
+                clip_on=True,
+            )
     return with_light_grid(ax, "both") if "grid" in shown else ax
 
 
