@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 
 from deepaccident_devkit.render import detached_figure
 
@@ -37,6 +38,17 @@ def has_color(picture: Any, place: Any, color: str, *, within: float = 2.0, tole
     near = np.hypot(columns + 0.5 - place[0], rows + 0.5 - place[1]) <= within
     distance = np.abs(picture[near] - np.array(to_rgb(color)) * 255).max(axis=1)
     return bool((distance < tolerance).any())
+
+
+def title_of(drawn: Axes | Figure) -> str:
+    """The title of axes or of a figure on one line, and without the room for its token."""
+    text = drawn.get_title() if isinstance(drawn, Axes) else drawn.get_suptitle()
+    return " ".join(text.split())
+
+
+def tokens_of(figure: Any) -> list[str]:
+    """The tokens beneath the titles of a figure."""
+    return [each.get_text().replace("\n", "") for each in figure.artists if each.get_gid() == "token"]
 
 
 def words(ax: Axes) -> str:

@@ -23,6 +23,7 @@ from deepaccident_devkit.render.motion import (
 )
 from deepaccident_devkit.render.outcomes import draw_accident_outcome, draw_detection_outcome, render_evaluation
 from deepaccident_devkit.render.replay import render_replay
+from deepaccident_devkit.render.styles import style
 from deepaccident_devkit.render.video import render_scenario_video
 from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix
 
@@ -53,6 +54,7 @@ __all__ = [
     "render_scenario_video",
     "render_visibility",
     "render_visibility_matrix",
+    "style",
 ]
 
 if not TYPE_CHECKING:  # the types stay those of the functions themselves

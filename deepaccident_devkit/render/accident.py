@@ -9,22 +9,19 @@ import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
-from deepaccident_devkit.geometry import SE3, Boxes
-from deepaccident_devkit.render.axes import axis_words, figure_or_new, set_title, settled, with_light_grid
-from deepaccident_devkit.render.best_view import best_camera
-from deepaccident_devkit.render.boxes import draw_actors_from_above, write_beside
-from deepaccident_devkit.render.camera import CAMERA_LAYERS, draw_camera
+from deepaccident_devkit.render.axes import figure_or_new, settled, with_light_grid
+from deepaccident_devkit.render.boxes import write_beside
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
-from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, GRID_COLOR
+from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
-from deepaccident_devkit.render.roles import in_drawing_order, role_colors, short_name
-from deepaccident_devkit.render.trails import draw_trails
+from deepaccident_devkit.render.pair import PAIR_LAYERS, Pair, draw_pair_from_above, draw_pair_in_camera, number_words
+from deepaccident_devkit.render.roles import in_drawing_order, short_name
+from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD
 from deepaccident_devkit.v2x import Agents, Contact, collision, cooperating_agents
 from deepaccident_devkit.v2x.collisions import CONTACT_GAP
 from deepaccident_devkit.v2x.configurations import agents_of
-from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,17 +29,11 @@ if TYPE_CHECKING:
 
 COUNTDOWN: Final = (2.0, 1.0, 0.5, 0.0)
 """Seconds before the impact."""
-COUNTDOWN_LAYERS: Final[tuple[Layer, ...]] = (*CAMERA_LAYERS, "trajectories", "grid")
-_SHOWN: Final[tuple[Layer, ...]] = ("image", "boxes", "trajectories", "grid")
-_NEAR: Final = 18.0
-_NEAR_IN_VIDEO: Final = 28.0
-"""How many metres around the place of contact are shown."""
+_SHOWN: Final[tuple[Layer, ...]] = ("image", "bev", "boxes", "trajectories", "grid")
 _WIDTH: Final = 3.3
 """Width of a panel in inches."""
 _MOSAIC: Final[list[Any]] = [[*AGENTS[:3]], ["above", *AGENTS[3:]], ["above", "speeds", "speeds"]]
 """The panels of a video's picture."""
-_SHOWS_BEST: Final = 0.5
-"""Seconds before the impact at which the cameras are chosen: at the impact the pair may be beside each other."""
 _DASHES: Final = ("-", "--")
 
 
@@ -80,7 +71,7 @@ def render_accident(
             meta, or an agent is not in this release.
         ChoiceError: no such agent, configuration or layer, or none of the moments was recorded.
     """
-    shown = layers_of(layers, _SHOWN, COUNTDOWN_LAYERS)
+    shown = layers_of(layers, _SHOWN, PAIR_LAYERS)
     contact = _contact(dataset, scenario, "look at moments of this one with render_frame")
     record = dataset.get("scenario", scenario)
     cut = _cut_words(contact, record["num_frames"])
@@ -91,20 +82,20 @@ def render_accident(
     rows = len(names) + 1
     fig = figure_or_new(fig, (_WIDTH * len(moments) + 0.8, 1.95 * len(names) + _WIDTH + 1.1))
     axes = fig.subplots(rows, len(moments), squeeze=False, height_ratios=(*[9 / 16] * len(names), 1))
-    tracks = scenario_tracks(dataset, record["token"])
+    pair = Pair.of(dataset, contact)
     for column, (left, index) in enumerate(moments):
-        for row, agent in enumerate(names):
-            sample = sample_token(record["token"], agent, index)
-            _draw_image(dataset, sample, _pair_at(tracks, contact, index), shown, axes[row, column])
-        moment = sample_token(record["token"], there[0], index)
-        _draw_contact(dataset, moment, contact, tracks, shown, axes[-1, column])
+        for agent, ax in zip(names, axes[:, column], strict=False):
+            channel = draw_pair_in_camera(pair, agent, index, shown, ax)
+            write_beside(ax, channel, (ax.get_xlim()[0], ax.get_ylim()[0]), "black")
+        draw_pair_from_above(pair, index, shown, axes[-1, column])
         end = "the last frame" if cut else "the impact"
-        axes[0, column].set_title(end if left == 0 else f"{left:g} s before")
-    for row, agent in enumerate(names):
-        _write_row(short_name(agent), AGENT_COLORS[agent], axes[row, 0])
-    for ax in axes[-1, 1:]:
-        ax.set_ylabel("")
-    set_title(fig, "\n".join(filter(None, [accident_words(dataset, contact), cut])), fontsize=11)
+        first = axes[0, column]
+        first.set_title("\n".join(filter(None, [end if left == 0 else f"{left:g} s before", first.get_title()])))
+    for agent, ax in zip(names, axes[:, 0], strict=False):
+        _write_row(short_name(agent), AGENT_COLORS[agent], ax)
+    _write_row("from above", "black", axes[-1, 0])
+    words = "\n".join(filter(None, [accident_words(dataset, contact), cut]))
+    set_scene_title(fig, dataset, record["token"], below=words, fontsize=11)
     return settled(fig)
 
 
@@ -113,7 +104,7 @@ def draw_countdown(
 ) -> None:
     """Render a moment of an accident: five cameras, the place of contact from above, the speeds of the pair.
 
-    Each agent's camera is the one that shows the pair best shortly before the impact, in all moments.
+    Each agent's camera is chosen as in `render_accident`.
 
     Args:
         dataset: the release.
@@ -126,30 +117,22 @@ def draw_countdown(
         NotAvailableError: nobody collides in the scenario, or it has no meta.
         ChoiceError: no such layer.
     """
-    shown = layers_of(layers, _SHOWN, COUNTDOWN_LAYERS)
+    shown = layers_of(layers, _SHOWN, PAIR_LAYERS)
     record = dataset.get("frame", frame)
-    scenario, index = record["scenario_token"], record["index"]
-    contact = _contact(dataset, scenario, "the view 'frame'")
-    tracks = scenario_tracks(dataset, scenario)
-    impact = int(tracks.index.max())
-    chosen_at = max(1, impact - round(_SHOWS_BEST / FRAME_PERIOD))
+    index = record["index"]
+    contact = _contact(dataset, record["scenario_token"], "the view 'frame'")
+    pair = Pair.of(dataset, contact)
     axes = fig.subplot_mosaic(_MOSAIC, height_ratios=(1, 1, 0.8))
     for agent in AGENTS:
         if agent not in agents:
             axes[agent].set_axis_off()
             continue
-        pair = _pair_at(tracks, contact, chosen_at)
-        channel = best_camera(dataset, sample_token(scenario, agent, chosen_at), pair)
-        _draw_camera(dataset, f"{sample_token(scenario, agent, index)}/{channel}", shown, axes[agent])
-    moment = sample_token(scenario, agents[0], index)
-    _draw_contact(dataset, moment, contact, tracks, shown, axes["above"], near=_NEAR_IN_VIDEO)
-    axes["above"].set(xlabel="", ylabel="")
-    axes["above"].set_title("from above, world (m)", fontsize="medium")
-    _draw_speeds(dataset, contact, tracks, index, axes["speeds"])
-    axes["speeds"].set_title(accident_words(dataset, contact).replace("\n", "; "), fontsize=9)
-    left = (impact - index) * FRAME_PERIOD
-    words = f"{left:.1f} s to the impact" if index < impact else "the impact"
-    fig.suptitle(words, fontsize=15, fontweight="bold", color=COLLIDER_COLOR)
+        channel = draw_pair_in_camera(pair, agent, index, shown, axes[agent])
+        axes[agent].set_title(f"{short_name(agent)}: {channel}", fontsize="medium", color=AGENT_COLORS[agent])
+    draw_pair_from_above(pair, index, shown, axes["above"])
+    axes["above"].set_title(f"from above, {axes['above'].get_title()}", fontsize="medium")
+    _draw_speeds(pair, index, axes["speeds"])
+    set_scene_title(fig, dataset, frame, below=accident_words(dataset, contact).replace("\n", "; "), fontsize=12)
 
 
 def accident_words(dataset: Dataset, contact: Contact) -> str:
@@ -167,9 +150,9 @@ def accident_words(dataset: Dataset, contact: Contact) -> str:
     hitting, hit = (names[each] for each in order)
     verb = "hits" if contact.sides[order[0]] == "front" else "touches"
     sides = " to ".join(contact.sides[each] for each in order)
-    speeds = " and ".join(_number(contact.speeds[each], "m/s") for each in order)
+    speeds = " and ".join(number_words(contact.speeds[each]) for each in order)
     return (
-        f"{hitting} {verb} {hit}, {sides}\n{speeds}, closing at {_number(contact.closing_speed, 'm/s')}, "
+        f"{hitting} {verb} {hit}, {sides}\n{speeds} m/s, closing at {number_words(contact.closing_speed)} m/s, "
         f"{np.degrees(contact.impact_angle):.0f}° between their headings"
     )
 
@@ -205,86 +188,28 @@ def _moments(seconds: Sequence[float], last: int) -> list[tuple[float, int]]:
     return recorded
 
 
-def _pair_at(tracks: ScenarioTracks, contact: Contact, index: int) -> Boxes:
-    """The boxes, in world, of the colliding actors that exist in a frame (number from 1)."""
-    there = tracks.at(index)
-    return there.select(np.isin(there.actor_id, contact.actor_ids))
-
-
-def _draw_image(dataset: Dataset, sample: str, pair: Boxes, shown: frozenset[Layer], ax: Axes) -> None:
-    channel = best_camera(dataset, sample, pair)
-    draw_camera(dataset, dataset.get("sample_data", f"{sample}/{channel}"), shown.intersection(CAMERA_LAYERS), ax)
-    ax.set_title("")
-    write_beside(ax, channel, (ax.get_xlim()[0], ax.get_ylim()[0]), "black")
-
-
-def _draw_contact(
-    dataset: Dataset,
-    sample: str,
-    contact: Contact,
-    tracks: ScenarioTracks,
-    shown: frozenset[Layer],
-    ax: Axes,
-    *,
-    near: float = _NEAR,
-) -> None:
-    """Render a sample (a token) around the place of contact, in world; of the layers `shown`, those that it has."""
-    record, index = dataset.get("sample", sample), int(sample.rsplit("/", 1)[1])
-    x, y = contact.point[:2].tolist()
-    ax.set(xlim=(x - near, x + near), ylim=(y - near, y + near), aspect="equal")
-    boxes = tracks.at(index)
-    colors = role_colors(dataset, record, boxes)
-    pair = np.isin(boxes.actor_id, contact.actor_ids)
-    if "trajectories" in shown:
-        seconds = (3.0, record["time_to_impact"] or 0.0)
-        both, red = boxes.select(pair), [COLLIDER_COLOR] * int(pair.sum())
-        draw_trails(dataset, record, both, red, target_from_world=SE3.identity(), seconds=seconds, ax=ax)
-    draw_actors_from_above(boxes, ax, colors, shown)
-    ax.plot(x, y, "x", color="black", markersize=9, markeredgewidth=1.8, zorder=5)
-    for row in np.flatnonzero(pair).tolist():
-        speed = float(np.linalg.norm(boxes.velocity[row]))
-        corner = boxes.center[row, :2] + (1.0, 1.0)
-        write_beside(ax, _number(speed, "m/s"), (float(corner[0]), float(corner[1])), COLLIDER_COLOR)
-    if "grid" in shown:
-        ax.grid(color=GRID_COLOR, linewidth=0.4)
-        ax.set_axisbelow(True)
-    words = axis_words("world")
-    ax.set(xlabel=words[0], ylabel=words[1])
-    ax.tick_params(labelsize=SMALLEST_TEXT)
-
-
 def _write_row(words: str, color: str, ax: Axes) -> None:
     ax.text(
         -0.02, 0.5, words, rotation=90, ha="right", va="center", color=color, fontweight="bold", transform=ax.transAxes
     )
 
 
-def _number(value: float, unit: str) -> str:
-    return f"{value:.1f} {unit}" if np.isfinite(value) else f"unknown {unit}"
-
-
-def _draw_camera(dataset: Dataset, camera: str, shown: Collection[Layer], ax: Axes) -> None:
-    draw_camera(dataset, dataset.get("sample_data", camera), shown, ax)
-    agent, _, channel = camera.rsplit("/", 3)[1:]
-    ax.set_title(f"{short_name(agent)}: {channel}", fontsize="medium", color=AGENT_COLORS[agent])
-
-
-def _draw_speeds(dataset: Dataset, contact: Contact, tracks: ScenarioTracks, index: int, ax: Axes) -> None:
+def _draw_speeds(pair: Pair, index: int, ax: Axes) -> None:
     """Render the pair's speeds over the seconds before the impact: strong up to the present, pale after it."""
-    impact, fastest = int(tracks.index.max()), 1.0
-    for actor, instance, dashes in zip(contact.actor_ids, contact.instances, _DASHES, strict=True):
+    tracks = pair.tracks
+    impact = int(tracks.index.max())
+    for actor, dashes in zip(pair.contact.actor_ids, _DASHES, strict=True):
         rows = np.flatnonzero(tracks.actor_id == actor)
         before = (tracks.index[rows] - impact) * FRAME_PERIOD
         speed = np.linalg.norm(tracks.boxes.velocity[rows], axis=1)
-        fastest = max(fastest, float(np.nan_to_num(speed).max()))
         past = tracks.index[rows] <= index
-        words = f"{dataset.instance.get(instance)['category']} {actor}"
-        ax.plot(before, speed, color=COLLIDER_COLOR, linestyle=dashes, linewidth=1.2, alpha=0.25)
-        ax.plot(before[past], speed[past], color=COLLIDER_COLOR, linestyle=dashes, linewidth=2.0, label=words)
+        style: dict[str, Any] = {"color": COLLIDER_COLOR, "linestyle": dashes}
+        ax.plot(before, speed, linewidth=1.2, alpha=0.25, **style)
+        ax.plot(before[past], speed[past], linewidth=2.0, label=pair.tags[actor], **style)
     ax.axvline((index - impact) * FRAME_PERIOD, color="black", linewidth=1.2)
     ax.axvline(0, color=COLLIDER_COLOR, linewidth=1.2, linestyle=":")
     ax.set(
         xlabel="time to the impact (s)", ylabel="speed (m/s)", xlim=(-(impact - 1) * FRAME_PERIOD, 0.1), ylim=(0, None)
     )
-    ax.legend(loc="lower left", fontsize=8, ncols=2, framealpha=0.7)
+    ax.legend(loc="lower left", fontsize=SMALLEST_TEXT, ncols=2, framealpha=0.7)
     with_light_grid(ax, "both")

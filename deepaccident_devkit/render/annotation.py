@@ -9,13 +9,15 @@ import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.render.axes import figure_or_new, set_title
+from deepaccident_devkit.render.axes import figure_or_new
 from deepaccident_devkit.render.best_view import BestView, best_view, crop_about
 from deepaccident_devkit.render.bev import BEV_LAYERS, BevView, draw_bev
 from deepaccident_devkit.render.boxes import draw_boxes_from_above, draw_boxes_in_image
 from deepaccident_devkit.render.camera import draw_image
+from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.layers import LAYERS, Layer, layers_of
 from deepaccident_devkit.render.roles import role_colors, short_name
+from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.v2x.projection import camera_of
 
 if TYPE_CHECKING:
@@ -75,8 +77,10 @@ def render_annotation(
     columns = _facts(dataset, record, own)
     for column, lines in enumerate(columns):
         place = column / len(columns)
-        axes["words"].text(place, 1, "\n".join(lines), va="top", fontsize=8.5, transform=axes["words"].transAxes)
-    set_title(fig, record["token"])
+        axes["words"].text(
+            place, 1, "\n".join(lines), va="top", fontsize=SMALLEST_TEXT, transform=axes["words"].transAxes
+        )
+    set_scene_title(fig, dataset, record["token"], record["category"])
     return fig
 
 

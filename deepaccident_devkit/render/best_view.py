@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Final
 
+import numpy as np
+
+from deepaccident_devkit.arrays import FloatArray, as_floats
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.geometry import Boxes, PinholeCamera
+from deepaccident_devkit.geometry.boxes import CORNER_SIGNS
 from deepaccident_devkit.geometry.camera import IN_FRONT_DEPTH
+from deepaccident_devkit.render.boxes import bounds_in_image
 from deepaccident_devkit.render.missing import is_there
-from deepaccident_devkit.taxonomy import CAMERAS, UNTRACKED_ID
+from deepaccident_devkit.taxonomy import CAMERAS
 from deepaccident_devkit.v2x.projection import camera_of
+
+_STEPS: Final = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5)] * 3), axis=-1).reshape(-1, 1, 3)
+_LATTICE: Final = ((1 + CORNER_SIGNS * _STEPS) / 2).prod(axis=2)
+"""(125, 8) weights of a box's corners, of points spread evenly over it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -19,9 +29,9 @@ class BestView:
 
     Attributes:
         camera: token of the image (sample data).
-        shown: sum of the shares of the boxes' surroundings that are in the image, rounded to hundredths.
-        area: pixels² of the image that their surroundings cover.
-        bounds: left, top, right and bottom of those boxes in the image, pixels.
+        shown: sum of the shares of the boxes that are in the image, rounded to hundredths.
+        area: pixels² of the image that their bounds cover.
+        bounds: left, top, right and bottom of what is in the image of those boxes, pixels.
     """
 
     camera: str
@@ -30,7 +40,9 @@ class BestView:
     bounds: tuple[float, float, float, float]
 
 
-def best_view(dataset: Dataset, samples: Iterable[str], boxes: Boxes) -> BestView | None:
+def best_view(
+    dataset: Dataset, samples: Iterable[str], boxes: Boxes, channels: Sequence[str] = CAMERAS
+) -> BestView | None:
     """The view of boxes, in world, that shows most of them; of equal views, the one that shows them largest.
 
     A view whose image was not downloaded only counts if there is no other.
@@ -38,53 +50,44 @@ def best_view(dataset: Dataset, samples: Iterable[str], boxes: Boxes) -> BestVie
     Args:
         dataset: the release.
         samples: tokens of the samples whose cameras are compared, at the moment of the boxes.
-        boxes: at least one.
+        boxes: any number.
+        channels: of the cameras that are compared.
 
     Returns:
-        The first best view; None if no camera has, in its image, any box that is entirely in front of it.
+        The first best view; None if no camera has any part of a box in its image.
 
     Raises:
         TokenError: no such sample.
     """
-    views = [_view(dataset, f"{sample}/{channel}", boxes) for sample in samples for channel in CAMERAS]
+    views = [_view(dataset, f"{sample}/{channel}", boxes) for sample in samples for channel in channels]
     there = [view for view in views if view is not None]
     return max(there, key=lambda view: (is_there(dataset, view.camera), view.shown, view.area), default=None)
-
-
-def best_camera(dataset: Dataset, sample: str, boxes: Boxes) -> str:
-    """The channel of a sample whose image shows most of some boxes, in world, without the agent itself.
-
-    The front camera if no image shows any.
-
-    Raises:
-        TokenError: no such sample.
-    """
-    own = dataset.agent.get(sample.rsplit("/", 1)[0])["actor_id"]
-    others = boxes.select(boxes.actor_id != (UNTRACKED_ID if own is None else own))
-    view = best_view(dataset, [sample], others)
-    return CAMERAS[0] if view is None else view.camera.rsplit("/", 1)[1]
 
 
 def _view(dataset: Dataset, camera: str, boxes: Boxes) -> BestView | None:
     sample, channel = camera.rsplit("/", 1)
     lens = camera_of(dataset, camera)
-    corners = boxes.transform(dataset.world_from(sample, channel).inverse(), channel).corners()
-    corners = corners[(corners[..., 2] > IN_FRONT_DEPTH).all(axis=1)]
-    pixels = lens.project(corners.reshape(-1, 3))[0].reshape(-1, 8, 2)
-    low, high = pixels.min(axis=1), pixels.max(axis=1)
-    whole = (high - low).prod(axis=1)
-    low, high = (corner.clip(0, (lens.width, lens.height)) for corner in (low, high))
-    inside = (high - low).prod(axis=1)
-    seen = inside > 0
+    optical = boxes.transform(dataset.world_from(sample, channel).inverse(), channel)
+    shown = _shares_in_image(optical, lens)
+    seen = shown > 0
     if not seen.any():
         return None
-    (left, top), (right, bottom) = low[seen].min(axis=0).tolist(), high[seen].max(axis=0).tolist()
+    bounds = bounds_in_image(optical.select(seen), lens)
+    (left, top), (right, bottom) = bounds[:, :2].min(axis=0).tolist(), bounds[:, 2:].max(axis=0).tolist()
     return BestView(
         camera=camera,
-        shown=round(float((inside[seen] / whole[seen]).sum()), 2),
-        area=float(inside.sum()),
+        shown=round(float(shown.sum()), 2),
+        area=float((bounds[:, 2:] - bounds[:, :2]).prod(axis=1).sum()),
         bounds=(left, top, right, bottom),
     )
+
+
+def _shares_in_image(optical: Boxes, lens: PinholeCamera) -> FloatArray:
+    """Which share (N,) of the volume of each box of the camera's frame is in its image."""
+    points = _LATTICE @ optical.corners()
+    pixels, depth = lens.project(points.reshape(-1, 3))
+    inside = lens.in_image(pixels, depth, min_depth=IN_FRONT_DEPTH)
+    return as_floats(inside.reshape(points.shape[:2]).mean(axis=1))
 
 
 def crop_about(

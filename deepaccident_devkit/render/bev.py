@@ -14,7 +14,7 @@ from deepaccident_devkit.geometry import SE3, Boxes, LidarPointCloud
 from deepaccident_devkit.geometry.boxes import concatenate
 from deepaccident_devkit.release import BevImage
 from deepaccident_devkit.release.bev_camera import TAGS
-from deepaccident_devkit.render.axes import axes_or_new, axis_words, check_view_range, set_title
+from deepaccident_devkit.render.axes import axes_or_new, axis_words, check_view_range
 from deepaccident_devkit.render.boxes import draw_actors_from_above, write_beside
 from deepaccident_devkit.render.chips import keep_free
 from deepaccident_devkit.render.colors import (
@@ -30,6 +30,7 @@ from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import draw_legend, handles_from_above
 from deepaccident_devkit.render.missing import absence_text, has_cloud, is_there, missing_clouds_text, write_missing
 from deepaccident_devkit.render.roles import at_once, collider_ids, recorder_ids, role_colors, short_name
+from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.render.trails import draw_trails
 from deepaccident_devkit.taxonomy import BEV_CAMERA, OWN_ACTOR_ID, AgentName, Frame
 from deepaccident_devkit.text import settle_choices
@@ -153,6 +154,9 @@ def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a 
     names = cooperating_agents(dataset, sample, agents)
     ax = axes_or_new(ax, (6, 6.6))
     drawn = draw_bev(dataset, sample, view, chosen, ax)
+    shared = [] if link is None else [link_words(link)]
+    shared += [f"{sweeps} sweeps"] if sweeps > 1 else []
+    set_scene_title(ax, dataset, dataset.get("sample", sample)["token"], below=", ".join(shared))
     handles = handles_from_above(drawn.colors, drawn.clouds if len(names) > 1 else ())
     draw_legend(ax, handles, columns=5, loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=5)
     return ax
@@ -196,7 +200,7 @@ def draw_bev(dataset: Dataset, sample: RowArgument, view: BevView, layers: froze
     if "bev" in layers and not (has_ground or shown):
         absent.append(f"{BEV_CAMERA}: {absence_text(dataset, ground)}")
     _draw_marks(dataset, record, view.frame, names, ax)
-    _finish(record, view, grid="grid" in layers, ax=ax)
+    _finish(view.frame, grid="grid" in layers, ax=ax)
     write_missing(ax, "; ".join(filter(None, absent)))
     return DrawnBev(colors=colored, clouds=shown)
 
@@ -273,14 +277,9 @@ def _name_pair(dataset: Dataset, record: SampleRecord, boxes: Boxes, ax: Axes, *
             write_beside(ax, boxes.category_names[row] if agent is None else short_name(agent), (x, y), COLLIDER_COLOR)
 
 
-def _finish(record: SampleRecord, view: BevView, *, grid: bool, ax: Axes) -> None:
-    countdown = "" if record["time_to_impact"] is None else f", {record['time_to_impact']:.1f} s to the impact"
-    words = axis_words(view.frame)
+def _finish(frame: str, *, grid: bool, ax: Axes) -> None:
+    words = axis_words(frame)
     ax.set(xlabel=words[0], ylabel=words[1])
-    shared = [] if view.link is None else [link_words(view.link)]
-    shared += [f"{view.sweeps} sweeps"] if view.sweeps > 1 else []
-    title = f"{record['agent']}, t = {record['timestamp']:.1f} s{countdown}"
-    set_title(ax, "\n".join(filter(None, [title, ", ".join(shared)])), fontsize="medium")
     ax.set_axisbelow(True)
     if grid:
         ax.grid(color=GRID_COLOR, linewidth=0.4)

@@ -90,23 +90,53 @@ def draw_actors_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str], layers
         draw_ids_from_above(boxes, ax, colors)
 
 
-def draw_boxes_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Sequence[str]) -> None:
-    """Render the edges of boxes given in the camera's optical frame, as far as they lie in front of the camera.
+def draw_boxes_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Sequence[str], **how: Any) -> None:
+    """Render the edges of boxes given in the camera's optical frame, and fill their fronts.
 
-    The front of a box is filled if all of it is in front of the camera.
+    What is not in front of the camera is cut off.
+
+    Args:
+        boxes: in the optical frame.
+        camera: whose image it is.
+        ax: axes to render on, in pixels.
+        colors: one colour for each box.
+        how: matplotlib's arguments for the edges, such as `linestyle` or `linewidths`.
     """
     from matplotlib.collections import LineCollection, PolyCollection
     from matplotlib.colors import to_rgba_array
 
-    corners = boxes.corners()
-    pixels, drawn = segments_in_image(corners[:, EDGES].reshape(-1, 2, 3), camera)
-    edge_colors = to_rgba_array(list(colors)).repeat(len(EDGES), axis=0)[drawn]
-    ax.add_collection(LineCollection(list(pixels), colors=edge_colors, linewidths=1.2))
-    before = (corners[:, :4, 2] >= NEAREST_DRAWN).all(axis=1)
-    fronts = camera.project(corners[before, :4].reshape(-1, 3))[0].reshape(-1, 4, 2)
-    faces = to_rgba_array(list(colors))[before]
+    pixels, row, edge = _edges_in_image(boxes, camera)
+    faces = to_rgba_array(list(colors))
+    ax.add_collection(LineCollection(list(pixels), **{"colors": faces[row], "linewidths": 1.2, **how}))
     faces[:, 3] *= 0.25
-    ax.add_collection(PolyCollection(list(fronts), facecolors=faces, edgecolors="none"))
+    front = edge < 4  # going round, the ends of what is left of the edges are the corners of what is left of the face
+    rows, starts = np.unique(row[front], return_index=True)
+    fronts = np.split(pixels[front].reshape(-1, 2), 2 * starts[1:])
+    ax.add_collection(PolyCollection(fronts if len(rows) else [], facecolors=faces[rows], edgecolors="none"))
+
+
+def boxes_in_image(boxes: Boxes, camera: PinholeCamera) -> BoolArray:
+    """Which boxes (N,) of the camera's frame have a part in its image."""
+    bounds = bounds_in_image(boxes, camera)
+    return np.asarray((bounds[:, 2:] > bounds[:, :2]).all(axis=1))
+
+
+def bounds_in_image(boxes: Boxes, camera: PinholeCamera) -> FloatArray:
+    """Left, top, right and bottom (N, 4) of the part of each box that is in the image; no area if none is."""
+    pixels, row, _ = _edges_in_image(boxes, camera)
+    bounds = np.zeros((len(boxes), 4))
+    if len(row):
+        rows, starts = np.unique(row, return_index=True)
+        bounds[rows, :2] = np.minimum.reduceat(pixels.min(axis=1), starts)
+        bounds[rows, 2:] = np.maximum.reduceat(pixels.max(axis=1), starts)
+    return bounds.clip(0, (camera.width, camera.height) * 2)
+
+
+def _edges_in_image(boxes: Boxes, camera: PinholeCamera) -> tuple[FloatArray, IntArray, IntArray]:
+    """Edges (V, 2, 2) in front of the camera, as pixels, the rows (V,) of their boxes, and their numbers in `EDGES`."""
+    pixels, drawn = segments_in_image(boxes.corners()[:, EDGES].reshape(-1, 2, 3), camera)
+    row, edge = np.divmod(np.flatnonzero(drawn), len(EDGES))
+    return pixels, row, edge
 
 
 def draw_ids_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Sequence[str]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import TokenError
 from deepaccident_devkit.geometry import Boxes, LidarPointCloud
-from deepaccident_devkit.render.axes import figure_or_new, set_title
+from deepaccident_devkit.render.axes import figure_or_new
 from deepaccident_devkit.render.camera import draw_camera_boxes, draw_image, draw_points_in_image
 from deepaccident_devkit.render.colors import AGENT_COLORS
 from deepaccident_devkit.render.layers import Layer, layers_of
@@ -18,6 +18,7 @@ from deepaccident_devkit.render.legends import agent_handles, draw_legend
 from deepaccident_devkit.render.missing import has_cloud, missing_clouds_text, write_missing
 from deepaccident_devkit.render.moments import CAMERA_GRID
 from deepaccident_devkit.render.roles import at_once, in_drawing_order
+from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.v2x import Agents, cooperating_agents, cooperative_boxes, project_to_image
 
 if TYPE_CHECKING:
@@ -88,7 +89,7 @@ def render_calibration(
         draw_legend(fig, agent_handles(clouds), columns=len(clouds), loc="outside lower center", fontsize=9)
     whose = "each agent" if len(names) > 1 else names[0]
     where = record["frame_token"] if is_frame else record["token"]
-    set_title(fig, f"LiDAR of {whose} in the cameras of\n{where}", fontsize="medium")
+    set_scene_title(fig, dataset, where, f"LiDAR of {whose}")
     write_missing(axes[0, 0], missing_clouds_text([agent for agent in lookers if agent not in clouds]))
     return fig
 

@@ -11,12 +11,17 @@ from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import MissingFileError
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.render.axes import axes_or_new, set_title
+from deepaccident_devkit.render.axes import axes_or_new
 from deepaccident_devkit.render.bev import BEV_LAYERS, BevView, draw_bev
-from deepaccident_devkit.render.boxes import draw_boxes_in_image, draw_ids_in_image, draw_velocities_in_image
+from deepaccident_devkit.render.boxes import (
+    boxes_in_image,
+    draw_boxes_in_image,
+    draw_ids_in_image,
+    draw_velocities_in_image,
+)
 from deepaccident_devkit.render.colors import AGENT_COLORS, DEPTH_COLORMAP, HEIGHT_COLORMAP
 from deepaccident_devkit.render.layers import Layer, layers_of
-from deepaccident_devkit.render.legends import agent_handles, draw_legend
+from deepaccident_devkit.render.legends import agent_handles, box_handles, draw_legend
 from deepaccident_devkit.render.missing import (
     draw_missing_image,
     has_cloud,
@@ -25,6 +30,7 @@ from deepaccident_devkit.render.missing import (
     write_missing,
 )
 from deepaccident_devkit.render.roles import role_colors
+from deepaccident_devkit.render.titles import moment_words, set_scene_title
 from deepaccident_devkit.taxonomy import LIDAR, OWN_ACTOR_ID
 from deepaccident_devkit.text import choice
 from deepaccident_devkit.v2x import map_pointcloud_to_image, project_to_image
@@ -50,7 +56,7 @@ def render_sample_data(
 ) -> Axes:
     """Render what a sensor recorded: a camera's image, or the LiDAR or the BEV camera from above.
 
-    Colours of boxes are those of `render_bev`.
+    Colours of boxes are those of `render_bev`; a legend says what they mean.
 
     Args:
         dataset: the release.
@@ -79,22 +85,30 @@ def render_sample_data(
                 f"{dataset.get_sample_data_path(record)}: no such file, and nothing else to render; unpack the archive "
                 "that holds it, or choose other layers, such as boxes"
             )
-        return draw_camera(dataset, record, chosen, axes_or_new(ax, (8, 4.6)))
-    return _draw_from_above(dataset, record, layers, axes_or_new(ax, (6, 6)))
-
-
-def _draw_from_above(dataset: Dataset, record: Any, layers: Iterable[Layer] | None, ax: Axes) -> Axes:
-    """A LiDAR's or a BEV camera's record of `render_sample_data`."""
-    lidar = record["channel"] == LIDAR
-    default: tuple[Layer, ...] = ("points" if lidar else "bev", "boxes", "grid")
-    chosen = layers_of(layers, default, BEV_LAYERS)
-    draw_bev(dataset, record["sample_token"], BevView(frame="lidar" if lidar else "ego"), chosen, ax)
-    set_title(ax, f"{record['channel']}, {ax.get_title()}", fontsize="medium")
+        ax = axes_or_new(ax, (8, 5.4))
+        colors, below = draw_camera(dataset, record, chosen, ax), 0.5
+    else:
+        ax = axes_or_new(ax, (6, 6.8))
+        colors, below = _draw_from_above(dataset, record, layers, ax), 4.5
+    set_scene_title(ax, dataset, record["token"], record["channel"])
+    handles = box_handles(colors)
+    draw_legend(ax, handles, columns=len(handles), loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=below)
     return ax
 
 
-def draw_camera(dataset: Dataset, record: Any, layers: Collection[Layer], ax: Axes) -> Axes:
-    """Render a camera's panel of `render_sample_data`; what is not there is named in its place."""
+def _draw_from_above(dataset: Dataset, record: Any, layers: Iterable[Layer] | None, ax: Axes) -> frozenset[str]:
+    """A LiDAR's or a BEV camera's record of `render_sample_data`; returns the colours of its boxes."""
+    lidar = record["channel"] == LIDAR
+    default: tuple[Layer, ...] = ("points" if lidar else "bev", "boxes", "grid")
+    chosen = layers_of(layers, default, BEV_LAYERS)
+    return draw_bev(dataset, record["sample_token"], BevView(frame="lidar" if lidar else "ego"), chosen, ax).colors
+
+
+def draw_camera(dataset: Dataset, record: Any, layers: Collection[Layer], ax: Axes) -> frozenset[str]:
+    """Render a camera's panel of `render_sample_data`, and return the colours of the boxes in its image.
+
+    What is not there is named in its place.
+    """
     sample = record["sample_token"]
     draw_image(dataset, record, ax, image="image" in layers)
     if "points" in layers and has_cloud(dataset, sample):
@@ -103,8 +117,7 @@ def draw_camera(dataset: Dataset, record: Any, layers: Collection[Layer], ax: Ax
     elif "points" in layers:
         write_missing(ax, missing_clouds_text([sample.rsplit("/", 2)[1]]))
     boxes = dataset.boxes(sample, frame=record["channel"], visible="camera")
-    draw_camera_boxes(dataset, record, boxes.select(boxes.actor_id != OWN_ACTOR_ID), layers, ax)
-    return ax
+    return draw_camera_boxes(dataset, record, boxes.select(boxes.actor_id != OWN_ACTOR_ID), layers, ax)
 
 
 def draw_image(dataset: Dataset, camera: Any, ax: Axes, *, image: bool = True) -> None:
@@ -143,8 +156,14 @@ def draw_points_in_image(pixels: FloatArray, ax: Axes, *, size: float = 2.0, **c
     return ax.scatter(pixels[:, 0], pixels[:, 1], s=size, linewidths=0, rasterized=True, **colors)
 
 
-def draw_camera_boxes(dataset: Dataset, camera: Any, boxes: Boxes, layers: Collection[Layer], ax: Axes) -> None:
-    """Render the layers of boxes, given in the optical frame of a camera (a record), in its image."""
+def draw_camera_boxes(
+    dataset: Dataset, camera: Any, boxes: Boxes, layers: Collection[Layer], ax: Axes
+) -> frozenset[str]:
+    """Render the layers of boxes, given in the optical frame of a camera (a record), in its image.
+
+    Returns:
+        The colours of the rendered boxes that are in the image.
+    """
     lens = camera_of(dataset, camera)
     colors = role_colors(dataset, camera["sample_token"], boxes)
     if "boxes" in layers:
@@ -153,6 +172,8 @@ def draw_camera_boxes(dataset: Dataset, camera: Any, boxes: Boxes, layers: Colle
         draw_velocities_in_image(boxes, lens, ax, colors)
     if "ids" in layers:
         draw_ids_in_image(boxes, lens, ax, colors)
+    inside = boxes_in_image(boxes, lens).tolist()
+    return frozenset(color for color, seen in zip(colors, inside, strict=True) if seen and "boxes" in layers)
 
 
 def render_pointcloud_in_image(
@@ -185,8 +206,8 @@ def render_pointcloud_in_image(
     color_by = choice("color_by", color_by, get_args(ColorBy))
     record = dataset.get("sample_data", camera)
     own = dataset.sample.get(record["sample_token"])
-    whose = own["token"] if sample is None else dataset.get("sample", sample)["token"]
     sources = [own if sample is None else dataset.sample[dataset.getind("sample", sample)]]
+    whose = "this agent" if sample is None else moment_words(dataset, sources[0]["token"])
     if color_by == "agent" and sample is None:
         sources, whose = dataset.samples_of(own["frame_token"]), "all agents"
     absent = [source["agent"] for source in sources if not has_cloud(dataset, source["token"])]
@@ -206,7 +227,7 @@ def render_pointcloud_in_image(
         draw_legend(ax, handles, columns=len(handles), loc="upper center", bbox_to_anchor=(0.5, 0))
     elif sources:
         _draw_metres(dataset, sources[0], record, color_by, ax)
-    set_title(ax, f"{own['agent']}, {record['channel']}\nLiDAR of {whose}", fontsize="medium")
+    set_scene_title(ax, dataset, record["token"], record["channel"], below=f"LiDAR: {whose}")
     return ax
 
 

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.text import Annotation
 
-SMALLEST_TEXT: Final = 7
-"""In points: text of this size can still be read in a notebook."""
+SMALLEST_TEXT: Final = 9
+"""In points: text of this size can be read in print."""
 _PAD: Final = 1.5
 """Points of white around words."""
 _RINGS: Final = np.array([2.0, 5.0, 9.0, 14.0, 20.0, 28.0, 38.0, 50.0, 65.0, 85.0, 110.0])

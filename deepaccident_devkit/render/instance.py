@@ -12,14 +12,16 @@ from deepaccident_devkit.arrays import IntArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.render.annotation import draw_view
-from deepaccident_devkit.render.axes import axis_words, figure_or_new, set_title, with_light_grid
+from deepaccident_devkit.render.axes import axis_words, figure_or_new, with_light_grid
 from deepaccident_devkit.render.best_view import best_view
 from deepaccident_devkit.render.bev import draw_underlay
 from deepaccident_devkit.render.boxes import draw_boxes_from_above, write_beside
+from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, GRID_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.roles import agent_actors, in_drawing_order, role_colors, short_name
 from deepaccident_devkit.render.sights import Sightings, sightings
+from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.render.trails import draw_trail
 from deepaccident_devkit.tables.tokens import instance_token, sample_token
 from deepaccident_devkit.taxonomy import BEV_CAMERA, FRAME_PERIOD, frame_timestamp
@@ -79,7 +81,9 @@ def render_instance(
     _draw_seen(actor, known, axes["seen"])
     for name in ("speed", "points", "seen"):
         _finish_time(actor, axes[name])
-    set_title(fig, f"{instance_token(actor.scenario, actor.actor_id)}: {actor.boxes.category_names[0]}")
+    who = "" if actor.own_agent is None else f" ({short_name(actor.own_agent)})"
+    words = f"{actor.boxes.category_names[0]} {actor.actor_id}{who}"
+    set_scene_title(fig, dataset, instance_token(actor.scenario, actor.actor_id), words)
     return fig
 
 
@@ -185,7 +189,7 @@ def _draw_crops(
         colors = [actor.color] if "boxes" in layers else []
         draw_view(dataset, view, box.select(np.arange(len(colors))), colors, ax, image="image" in layers)
         agent, _, channel = view.camera.rsplit("/", 3)[1:]
-        ax.set_title(f"{frame_timestamp(int(index)):.1f} s, {short_name(agent)}, {channel}", fontsize="small")
+        ax.set_title(f"{frame_timestamp(int(index)):.1f} s, {short_name(agent)}, {channel}", fontsize=SMALLEST_TEXT)
 
 
 def _draw_speed(actor: _Actor, ax: Axes) -> None:
@@ -210,7 +214,7 @@ def _draw_seen(actor: _Actor, known: Sequence[Sightings], ax: Axes) -> None:
             spans = [(time - FRAME_PERIOD / 2, FRAME_PERIOD) for time in one.timestamp[which].tolist()]
             ax.broken_barh(spans, (row - 0.35, 0.7), facecolors=AGENT_COLORS[one.agent], alpha=opacity, linewidth=0)
         if one.agent == actor.own_agent:
-            ax.text(actor.duration / 2, row, "is the actor itself", ha="center", va="center", fontsize=8)
+            ax.text(actor.duration / 2, row, "is the actor itself", ha="center", va="center", fontsize=SMALLEST_TEXT)
     ax.set_yticks(range(len(known)), [short_name(one.agent) for one in known])
     ax.set_ylim(len(known) - 0.5, -0.5)
     ax.set_title("who sees it (pale: only annotated)", fontsize="medium")

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
+from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import AGENT_COLORS, CATEGORY_COLORS, CATEGORY_MARKERS, COLLIDER_COLOR
 from deepaccident_devkit.render.roles import in_drawing_order, short_name
+from deepaccident_devkit.render.titles import room_of, text_width
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -14,6 +16,10 @@ if TYPE_CHECKING:
 
 BESIDE: Final[Mapping[str, Any]] = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0), "borderaxespad": 0.0}
 """A place where a legend hides nothing."""
+INSIDE: Final[Mapping[str, Any]] = {"loc": "upper right", "frameon": True, "framealpha": 0.85}
+"""A place in the picture, if nothing may stand beside it."""
+_HANDLE: Final = 0.4
+"""Inches of a sign and the blanks around it."""
 
 
 def box_handles(colors: Collection[str]) -> list[Artist]:
@@ -50,15 +56,20 @@ def _mark(label: str, marker: str, color: str) -> Artist:
 
 
 def draw_legend(where: Any, handles: Sequence[Artist], *, columns: int, **how: Any) -> None:
-    """Render a small legend below axes or a figure; nothing if it would be empty."""
+    """Render a legend below axes or a figure, with as many columns as have room; nothing if it would be empty."""
+    from matplotlib.font_manager import FontProperties
+
     if handles:
-        style = {"fontsize": 7.5, "frameon": False, "handlelength": 1.2, "columnspacing": 1.0, **how}
+        font = FontProperties(size=SMALLEST_TEXT)
+        widest = max(text_width(str(handle.get_label()), font) for handle in handles) / 72 + _HANDLE
+        columns = max(1, min(columns, int(room_of(where) / widest)))
+        style = {"fontsize": SMALLEST_TEXT, "frameon": False, "handlelength": 1.2, "columnspacing": 1.0, **how}
         where.legend(handles=list(handles), ncols=columns, **style)
 
 
 def draw_legend_of_fills(ax: Axes, colors: Mapping[str, str]) -> None:
-    """Put a legend of filled shapes beside the axes."""
+    """Put a legend of filled shapes into the axes."""
     from matplotlib.patches import Patch
 
     handles = [Patch(label=name, facecolor=(color, 0.4), edgecolor=color) for name, color in colors.items()]
-    draw_legend(ax, handles, columns=1, **BESIDE)
+    draw_legend(ax, handles, columns=1, **INSIDE)

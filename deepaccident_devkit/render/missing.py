@@ -7,6 +7,7 @@ from collections.abc import Collection
 from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import MISSING_COLOR
 from deepaccident_devkit.render.roles import in_drawing_order
 from deepaccident_devkit.taxonomy import LIDAR
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 _GID: Final = "missing"
 """Marks the words in a figure, so that `missing_words` finds them."""
-_LETTERS: Final = 60
+_LETTERS: Final = 50
 """In a line of a corner."""
 
 
@@ -35,8 +36,8 @@ def draw_missing_image(dataset: Dataset, sample_data: str, ax: Axes) -> None:
     """Make axes a grey panel that names the agent and the camera of an image (a token) that is not there."""
     agent, _, channel = sample_data.rsplit("/", 3)[1:]
     ax.set_facecolor(MISSING_COLOR)
-    words = f"{agent}\n{channel}: {absence_text(dataset, sample_data)}"
-    ax.text(0.5, 0.95, words, ha="center", va="top", fontsize=8, transform=ax.transAxes, gid=_GID)
+    words = f"{agent}\n{channel}:\n{absence_text(dataset, sample_data)}"
+    ax.text(0.5, 0.95, words, ha="center", va="top", fontsize=SMALLEST_TEXT, transform=ax.transAxes, gid=_GID)
 
 
 def absence_text(dataset: Dataset, sample_data: str) -> str:
@@ -50,7 +51,7 @@ def write_missing(ax: Axes, words: str) -> None:
     if words:
         paper = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5}
         text = textwrap.fill(words, _LETTERS)
-        style: dict[str, Any] = {"fontsize": 7.5, "bbox": paper, "zorder": 8, "gid": _GID}
+        style: dict[str, Any] = {"fontsize": SMALLEST_TEXT, "bbox": paper, "zorder": 8, "gid": _GID}
         ax.annotate(text, (0, 0), (4, 4), xycoords="axes fraction", textcoords="offset points", **style)
 
 

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.render.axes import figure_or_new, set_title
+from deepaccident_devkit.render.axes import figure_or_new
 from deepaccident_devkit.render.bev import BEV_DEFAULT, BEV_LAYERS, BevView, draw_bev
 from deepaccident_devkit.render.camera import CAMERA_DEFAULT, CAMERA_LAYERS, draw_camera
-from deepaccident_devkit.render.colors import CATEGORY_COLORS
 from deepaccident_devkit.render.layers import LAYERS, Layer, layers_of
 from deepaccident_devkit.render.legends import box_handles, draw_legend, handles_from_above
 from deepaccident_devkit.render.roles import at_once, in_drawing_order, short_name
+from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.taxonomy import CAMERAS
 from deepaccident_devkit.v2x import Agents, Link, cooperating_agents
 
@@ -42,8 +42,6 @@ _LEAST_SHARED, _AROUND_SHARED = 30.0, 12.0
 """Metres: the least reach of a view that agents share, and what it shows around them."""
 _MOST_CAMERAS: Final = 0.66
 """Of the width, for cameras beside a shared view."""
-_LEGEND_ENTRY: Final = 1.1
-"""Inches of an entry of the legend, about."""
 _BESIDE, _ABOUT = 0.9, 1.6
 """Inches of room for words beside panels, and above and below them."""
 MOMENT_LAYERS: Final = tuple(layer for layer in LAYERS if layer in {*CAMERA_LAYERS, *BEV_LAYERS})
@@ -88,10 +86,9 @@ def render_sample(
     for channel in CAMERAS:
         draw_camera(dataset, dataset.get("sample_data", f"{record['token']}/{channel}"), in_cameras, axes[channel])
     drawn = draw_bev(dataset, record, BevView(agents=names, link=link), from_above, axes["bev"])
-    axes["bev"].set_title("")
     handles = handles_from_above(drawn.colors, drawn.clouds if len(names) > 1 else ())
     draw_legend(fig, handles, columns=len(handles), loc="outside lower center")
-    set_title(fig, _heading(record["token"], record))
+    set_scene_title(fig, dataset, record["token"])
     return fig
 
 
@@ -144,9 +141,9 @@ def render_frame(
         _plain(above, labelled=column == 0)
     if fig.figure is fig:  # a part of a figure is laid out with it
         fig.set_layout_engine("compressed")
-    columns = min(2 + len(CATEGORY_COLORS), max(1, int(fig.bbox.width / fig.dpi / _LEGEND_ENTRY)))
-    draw_legend(fig, box_handles(drawn), columns=columns, loc="outside lower center")
-    set_title(fig, _heading(f"{record['token']}, t = {record['timestamp']:.1f} s", record))
+    handles = box_handles(drawn)
+    draw_legend(fig, handles, columns=len(handles), loc="outside lower center")
+    set_scene_title(fig, dataset, record["token"])
     return fig
 
 
@@ -191,8 +188,8 @@ def draw_shared_moment(
     drawn = draw_bev(dataset, moments[0], view, from_above, above)
     above.set(title="", anchor="C")
     handles = handles_from_above(drawn.colors, drawn.clouds if len(names) > 1 else ())
-    draw_legend(fig, handles, columns=max(1, int(width / _LEGEND_ENTRY)), loc="outside lower center")
-    set_title(fig, _heading(f"{record['token']}, t = {record['timestamp']:.1f} s", record))
+    draw_legend(fig, handles, columns=len(handles), loc="outside lower center")
+    set_scene_title(fig, dataset, record["token"])
 
 
 def panel_layers(layers: Iterable[Layer] | None) -> tuple[frozenset[Layer], frozenset[Layer]]:
@@ -211,13 +208,7 @@ def _tallness(fig: Figure, columns: int) -> float:
 
 
 def _plain(ax: Axes, *, labelled: bool) -> None:
-    """Remove a panel's title and, unless it is `labelled`, the labels of its y axis."""
-    ax.set_title("")
+    """Unless a panel is `labelled`, remove the labels of its y axis."""
     if not labelled:
         ax.set_ylabel("")
         ax.tick_params(labelleft=False)
-
-
-def _heading(words: str, record: Mapping[str, Any]) -> str:
-    end = record["time_to_impact"]
-    return words if end is None else f"{words}, {end:.1f} s to the impact"

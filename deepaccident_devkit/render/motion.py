@@ -9,11 +9,12 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
 from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels, PostProcessing, motion_labels
-from deepaccident_devkit.render.axes import axes_or_new, figure_or_new, set_title, settled
+from deepaccident_devkit.render.axes import axes_or_new, figure_or_new, settled
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.motion_cells import draw_key, draw_map_of, draw_trail_of
 from deepaccident_devkit.render.motion_maps import MAPS, DrawnMap, MotionMaps, maps_of_labels, maps_of_output
 from deepaccident_devkit.render.roles import collider_ids, recorder_ids
+from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.text import choice
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ def render_motion_labels(
         labels = labels.to_present()
     pair, agents = collider_ids(dataset, sample), recorder_ids(dataset, sample)
     fig = draw_motion_labels(labels, marked=pair, agents=agents, style=style, layers=layers, fig=fig)
-    set_title(fig, dataset.get("sample", sample)["token"])
+    set_scene_title(fig, dataset, dataset.get("sample", sample)["token"], "motion labels")
     return settled(fig) if style == "trail" else fig
 
 

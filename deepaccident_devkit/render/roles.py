@@ -12,6 +12,7 @@ from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.render.colors import AGENT_COLORS, CATEGORY_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID, AgentName
+from deepaccident_devkit.v2x import Contact
 from deepaccident_devkit.v2x.configurations import agents_of
 
 
@@ -61,6 +62,17 @@ def role_colors(dataset: Dataset, sample: RowArgument, boxes: Boxes) -> list[str
 def short_name(agent: str) -> str:
     """An agent's short name for pictures: `ego`, `ego behind`, `other`, `other behind`, `infrastructure`."""
     return agent.replace("_vehicle", "").replace("_", " ")
+
+
+def actor_tags(dataset: Dataset, contact: Contact) -> dict[int, str]:
+    """Short names of the two that collide: the initials of agents, such as `E` and `OB`, else the category."""
+    agents = {actor: agent for agent, actor in agent_actors(dataset, contact.frame.rsplit("/", 1)[0]).items()}
+    return {
+        actor: "".join(word[0].upper() for word in short_name(agents[actor]).split())
+        if actor in agents
+        else dataset.instance.get(instance)["category"]
+        for actor, instance in zip(contact.actor_ids, contact.instances, strict=True)
+    }
 
 
 def in_drawing_order(agents: Collection[str]) -> list[str]:

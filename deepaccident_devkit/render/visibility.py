@@ -9,7 +9,7 @@ import numpy as np
 
 from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.render.axes import axes_or_new, axis_words, check_view_range, set_title, with_light_grid
+from deepaccident_devkit.render.axes import axes_or_new, axis_words, check_view_range, with_light_grid
 from deepaccident_devkit.render.bev import draw_points_from_above
 from deepaccident_devkit.render.boxes import (
     draw_boxes_from_above,
@@ -23,6 +23,7 @@ from deepaccident_devkit.render.legends import agent_handles, draw_legend
 from deepaccident_devkit.render.missing import has_cloud, missing_clouds_text, write_missing
 from deepaccident_devkit.render.roles import in_drawing_order, role_colors, short_name
 from deepaccident_devkit.render.sights import Sights, sights
+from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.taxonomy import Frame
 from deepaccident_devkit.text import choice
 from deepaccident_devkit.v2x import Agents, aggregate_point_cloud
@@ -94,7 +95,7 @@ def render_visibility(
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", anchor="N")
     words = axis_words(frame)
     ax.set(xlabel=words[0], ylabel=words[1])
-    set_title(ax, _title(dataset, known), fontsize="medium")
+    set_scene_title(ax, dataset, dataset.get("sample", known.sample)["frame_token"], "who sees whom")
     if "points" in shown:
         _draw_points(dataset, known, frame, ax)
     colors = role_colors(dataset, known.sample, known.boxes)
@@ -158,16 +159,9 @@ def render_visibility_matrix(
     ax.spines[:].set_visible(False)
     more = len(rows) - len(shown)
     key = "filled: the agent sees the actor; number: its LiDAR points (0: none)\n–: not in the agent's label"
-    ax.set_xlabel(f"{key}{f'; {more} more actors' if more else ''}", fontsize=8)
-    ax.set_title(_title(dataset, known), fontsize=9)
+    ax.set_xlabel(f"{key}{f'; {more} more actors' if more else ''}", fontsize=SMALLEST_TEXT)
+    set_scene_title(ax, dataset, dataset.get("sample", known.sample)["frame_token"], "who sees whom")
     return ax
-
-
-def _title(dataset: Dataset, known: Sights) -> str:
-    record = dataset.get("sample", known.sample)
-    left = record["time_to_impact"]
-    countdown = "" if left is None else f", {left:.1f} s to the impact"
-    return f"who sees whom, t = {record['timestamp']:.1f} s{countdown}"
 
 
 def _view(known: Sights, view_range: float | None) -> tuple[FloatArray, FloatArray]:

@@ -23,11 +23,12 @@ from deepaccident_devkit.evaluation.metrics.detection import (
 from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput, Prediction, checked_prediction
 from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels, motion_labels
-from deepaccident_devkit.render.axes import figure_or_new, set_title, settled, titled_from_above
+from deepaccident_devkit.render.axes import figure_or_new, settled, titled_from_above
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.outcomes.accident import ACCIDENT_LAYERS, draw_accident_outcome, verdict_words
 from deepaccident_devkit.render.outcomes.detection import DETECTION_LAYERS, WINDOW, draw_detection_outcome, draw_true
 from deepaccident_devkit.render.outcomes.motion import MOTION_LAYERS, draw_motion_side, motion_outcome
+from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.text import choice
 
@@ -96,7 +97,7 @@ def render_evaluation(
         default = "released" if isinstance(given, MotionOutput) else "boxes"
         judge = AccidentEvaluator(protocol or default)
         fig, words = _draw_accident(dataset, token, given, label, judge, shown, fig)
-    set_title(fig, f"{token}\n{words}", fontsize=11)
+    set_scene_title(fig, dataset, token, below=words, fontsize=11)
     return settled(fig)
 
 

@@ -11,15 +11,16 @@ import numpy as np
 from deepaccident_devkit.arrays import ByteArray
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.render.accident import COUNTDOWN_LAYERS, draw_countdown
+from deepaccident_devkit.render.accident import draw_countdown
 from deepaccident_devkit.render.bev import BEV_LAYERS, render_bev
 from deepaccident_devkit.render.calibration import CALIBRATION_LAYERS, render_calibration
 from deepaccident_devkit.render.camera import CAMERA_DEFAULT, CAMERA_LAYERS, draw_camera
 from deepaccident_devkit.render.layers import LAYERS, Layer, layers_of
 from deepaccident_devkit.render.moments import MOMENT_LAYERS, draw_shared_moment, render_sample
 from deepaccident_devkit.render.motion import TRAIL_LAYERS, render_motion_labels
+from deepaccident_devkit.render.pair import PAIR_LAYERS
 from deepaccident_devkit.render.pictures import figure_of_pixels
-from deepaccident_devkit.render.roles import in_drawing_order, short_name
+from deepaccident_devkit.render.roles import in_drawing_order
 from deepaccident_devkit.render.visibility import VISIBILITY_LAYERS, render_visibility, render_visibility_matrix
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import CAMERAS
@@ -113,8 +114,7 @@ def _calibration(moment: Moment, fig: Figure) -> object:
 
 
 def _labels(moment: Moment, fig: Figure) -> object:
-    render_motion_labels(moment.dataset, moment.sample, style="trail", layers=moment.layers, fig=fig)
-    return fig.suptitle(f"motion labels of {short_name(moment.names[0])}", fontsize="medium")  # the token is too long
+    return render_motion_labels(moment.dataset, moment.sample, style="trail", layers=moment.layers, fig=fig)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +139,7 @@ class _Own:
 VIEWS: Final[Mapping[str, View]] = {
     "frame": View(draw=_frame, layers=MOMENT_LAYERS, share=2, inches=12.8),
     "sample": View(draw=_sample, layers=MOMENT_LAYERS, share=2, inches=12.8),
-    "accident": View(draw=_accident, layers=COUNTDOWN_LAYERS, share=2, inches=12.8),
+    "accident": View(draw=_accident, layers=PAIR_LAYERS, share=2, inches=12.8),
     "bev": View(draw=_bev, layers=BEV_LAYERS, inches=4.6),
     "visibility": View(draw=_visibility, layers=VISIBILITY_LAYERS),
     "visibility_matrix": View(draw=_visibility_matrix, layers=()),

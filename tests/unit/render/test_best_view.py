@@ -7,15 +7,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.render.best_view import best_camera, best_view, crop_about
+from deepaccident_devkit.render.best_view import best_view, crop_about
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
 from deepaccident_devkit.v2x.projection import camera_of
-
-
-def test_where_no_camera_sees_the_boxes_it_is_the_front_one(da: DeepAccident) -> None:
-    nobody = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [])
-    assert best_camera(da, da.sample[0]["token"], nobody) == "Camera_Front"
 
 
 def test_the_best_view_of_the_vehicle_ahead_is_the_front_camera(da: DeepAccident, behind: str) -> None:

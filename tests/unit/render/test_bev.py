@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drawing import has_color, new_axes, on_canvas, rendered
+from drawing import has_color, new_axes, on_canvas, rendered, title_of, tokens_of
 from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection, PathCollection, PolyCollection
 from matplotlib.colors import to_hex, to_rgb
@@ -225,10 +225,11 @@ def test_a_release_without_sensor_files_is_drawn_from_its_labels(da_b: DeepAccid
 
 def test_words_say_when_and_whose(da: DeepAccident, approach: str) -> None:
     ax = render_bev(da, approach, ax=new_axes())
-    assert ax.get_title() == "ego_vehicle, t = 0.2 s, 0.3 s to the impact"
+    assert title_of(ax) == "Night, wet cloudy, Town02: 0.3 s to the impact, ego vehicle"
+    assert tokens_of(ax.figure) == [approach]
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("x forward (m)", "y left (m)")
     sizes = [*ax.get_legend().get_texts(), *ax.get_xticklabels(), ax.title]
-    assert min(one.get_fontsize() for one in sizes) >= 7
+    assert min(one.get_fontsize() for one in sizes) >= 9
 
 
 def test_what_cannot_be_drawn_is_refused(da: DeepAccident, approach: str) -> None:

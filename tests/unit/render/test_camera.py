@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drawing import has_color, new_axes, on_canvas, rendered
+from drawing import has_color, new_axes, on_canvas, rendered, title_of
 from matplotlib import colormaps
 from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection, PathCollection, PolyCollection
@@ -38,7 +38,7 @@ def test_the_image_fills_the_pixels_of_its_calibration(da: DeepAccident, behind:
     assert_array_equal(image.get_array(), da.load_image(f"{behind}/Camera_Front"))
     assert tuple(image.get_extent()) == (0, 64, 36, 0)
     assert (ax.get_xlim(), ax.get_ylim()) == ((0, 64), (36, 0))
-    assert ax.get_title() == "Camera_Front"
+    assert title_of(ax) == "Night, wet cloudy, Town02: the impact, ego vehicle behind, Camera_Front"
     assert plt.get_fignums() == []
 
 
@@ -80,7 +80,7 @@ def test_the_other_sensors_are_drawn_from_above_in_their_frame(
     assert drawn == {tuple(np.round(one[:, :2].ravel(), 6)) for one in near.bottom_corners()}
     clouds = [one for one in ax.collections if type(one) is PathCollection]
     assert (len(clouds), len(ax.images)) == ((1, 0) if channel == "lidar01" else (0, 1))
-    assert ax.get_title().startswith(f"{channel}, ego_vehicle_behind")
+    assert title_of(ax).endswith(f": the impact, ego vehicle behind, {channel}")
 
 
 @pytest.mark.parametrize(("channel", "layer"), [("Camera_Front", "trajectories"), ("lidar01", "image")])
@@ -102,7 +102,7 @@ def test_points_of_another_agent_lie_in_the_image_where_they_project(da: DeepAcc
     assert_allclose(drawn.get_offsets(), points.pixels[order])
     assert_allclose(drawn.get_array(), height[order])
     assert drawn.get_cmap().name == HEIGHT_COLORMAP
-    assert pole in ax.get_title().replace("/\n", "/")
+    assert title_of(ax).endswith("ego vehicle behind, Camera_Front LiDAR: the impact, infrastructure")
 
 
 def test_points_by_depth_are_the_camera_s_own_unless_told(da: DeepAccident, behind: str) -> None:

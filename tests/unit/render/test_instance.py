@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from drawing import tokens_of
 from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection, PathCollection, PolyCollection
 from matplotlib.colors import to_hex
@@ -38,7 +39,7 @@ def test_the_path_is_where_all_agents_labels_have_the_actor(da: DeepAccident, ot
     (x0, x1), (y0, y1) = path.get_xlim(), path.get_ylim()
     assert x0 < track.center[:, 0].min() <= track.center[:, 0].max() < x1
     assert y0 < track.center[:, 1].min() <= track.center[:, 1].max() < y1
-    assert other in fig._suptitle.get_text()
+    assert tokens_of(fig) == [other]
     assert plt.get_fignums() == []
 
 

@@ -12,8 +12,6 @@ from matplotlib.figure import Figure
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import MissingFileError
-from deepaccident_devkit.render import detached_figure
-from deepaccident_devkit.render.axes import set_title
 from deepaccident_devkit.render.best_view import best_view
 from deepaccident_devkit.render.colors import MISSING_COLOR
 from deepaccident_devkit.render.missing import missing_words
@@ -164,19 +162,3 @@ def test_accident_instance_and_video_are_rendered(da_partial: DeepAccident, scen
         assert path.stat().st_size > 0
     page = da_partial.render_replay(scenario, tmp_path / "replay.html")
     assert page.stat().st_size > 0
-
-
-@pytest.mark.parametrize("fontsize", [None, "medium", 14])
-def test_a_title_is_as_wide_as_its_figure(fontsize: float | str | None) -> None:
-    words = "type1_subtype1_accident/Town10HD_type001_subtype0001_scenario00001/ego_vehicle/030, t = 2.9 s"
-    for width in (2.0, 4.0, 30.0):
-        figure = detached_figure((width, 4.0))
-        ax = figure.add_subplot()
-        for where, title in ((figure, figure.get_suptitle), (ax, ax.get_title)):
-            set_title(where, words, fontsize=fontsize)
-            assert title().replace("\n", "") in (words, words.replace(", ", ","))
-            assert ("\n" in title()) == (width < 30)
-        text: Any = figure._suptitle
-        figure.draw_without_rendering()
-        assert text.get_window_extent().width <= figure.bbox.width
-        assert ax.title.get_window_extent().width <= figure.bbox.width

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drawing import new_axes, picture
+from drawing import new_axes, picture, tokens_of
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.quiver import Quiver
@@ -151,7 +151,7 @@ def test_a_sample_of_an_accident(da_motion: DeepAccident) -> None:
     figure = detached_figure((12, 9))
     assert da_motion.render_motion_labels(sample, fig=figure) is figure
     assert len(figure.axes) == 4 * (5 + 1)  # five frames and a key
-    assert figure.get_suptitle() == sample["token"]
+    assert tokens_of(figure) == [sample["token"]]
     assert [ax.get_title() for ax in figure.axes[:5]] == ["present", "+0.5 s", "+1.0 s", "+1.5 s", "+2.0 s"]
     labels = da_motion.motion_labels(sample).to_present()
     pair = [labels.id_map[OWN_BOX_ID if actor == -100 else actor] for actor in collider_ids(da_motion, sample)]
@@ -219,7 +219,7 @@ def test_outputs_have_the_rows_that_they_have(labels: MotionLabels) -> None:
 def test_labels_as_a_trail(da_motion: DeepAccident, sample: str) -> None:
     figure = da_motion.render_motion_labels(sample, style="trail", fig=detached_figure((6, 6)))
     assert len(figure.axes) == 2
-    assert figure.get_suptitle().replace("/\n", "/") == sample
+    assert tokens_of(figure) == [sample]
     with pytest.raises(ChoiceError, match="trail: each frame is in its own ego frame; warp the labels"):
         da_motion.render_motion_labels(sample, style="trail", at_present=False)
     with pytest.raises(ChoiceError, match=r"layers: expected one of .*, found 'velocities'"):

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from drawing import new_axes
+from drawing import new_axes, title_of
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import Accident, AccidentEvaluator, box_truth
@@ -19,7 +19,7 @@ def test_accidents_without_truth(da_motion: DeepAccident) -> None:
     token = da_motion.get_sample(normal, "ego_vehicle", 5)["token"]
     alarm = Accident(positions=np.array([[5.0, 0.0], [7.0, 0.0]]), time=1.0)
     figure = render_evaluation(da_motion, token, [alarm], fig=detached_figure((9, 5)))
-    assert figure.get_suptitle().endswith("5 m: FP, 10 m: FP, 15 m: FP")
+    assert title_of(figure).endswith("5 m: FP, 10 m: FP, 15 m: FP")
     assert figure.axes[0].get_title() == "truth: no accident comes"
     nothing = ComparedAccidents(true=None, predicted=())
     assert difference_words(nothing) == "no accident comes, none is foreseen"

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from drawing import title_of
 from numpy.testing import assert_allclose
 
 from deepaccident_devkit import DeepAccident
@@ -21,7 +22,7 @@ def test_accidents_have_their_metres_and_verdict(da_motion: DeepAccident, sample
     near = Accident(positions=true.positions + np.array([3.0, 0.0]), time=true.time + 0.5, score=0.9)
     figure = render_evaluation(da_motion, sample, [near], fig=detached_figure((10, 6)))
     left, right = figure.axes
-    assert figure.get_suptitle().endswith("accident: 5 m: FP + FN, 10 m: TP, 15 m: TP")
+    assert title_of(figure).endswith("accident: 5 m: FP + FN, 10 m: TP, 15 m: TP")
     assert right.get_title() == f"an accident comes in {true.time:.1f} s; foreseen 6.0 m off in sum, +0.5 s"
     assert [text.get_text() for text in right.texts] == [f"in {near.time:.1f} s, score 0.9", "3.0 m", "3.0 m"]
     assert_allclose(left.lines[0].get_xydata(), true.positions)
@@ -29,7 +30,7 @@ def test_accidents_have_their_metres_and_verdict(da_motion: DeepAccident, sample
     assert left.get_xlim() == right.get_xlim()
     assert not left.texts
     silent = render_evaluation(da_motion, sample, [], fig=detached_figure((10, 6)))
-    assert silent.get_suptitle().endswith("5 m: FN, 10 m: FN, 15 m: FN")
+    assert title_of(silent).endswith("5 m: FN, 10 m: FN, 15 m: FN")
     assert silent.axes[1].get_title().endswith("none is foreseen")
 
 
@@ -49,7 +50,7 @@ def test_motion_is_seen_as_accidents_by_every_protocol(
     rules = PROTOCOLS[protocol]
     evaluator = AccidentEvaluator(rules)
     evaluator.update(sample, output, labels, context)
-    assert figure.get_suptitle().endswith(verdict_words(evaluator.compute()))
+    assert title_of(figure).endswith(verdict_words(evaluator.compute()))
     compared = compared_accidents(output, labels, context, rules)
     assert len(compared.predicted) == 1
     true, predicted = (2 * [compared.true.positions] if compared.true else []), compared.predicted[0].positions

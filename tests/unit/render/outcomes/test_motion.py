@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from drawing import picture
+from drawing import picture, title_of
 from matplotlib.colors import to_rgb
 from numpy.testing import assert_allclose
 
@@ -44,7 +44,7 @@ def test_motion_outcomes_are_those_that_are_counted(da_motion: DeepAccident, sam
     left, right = figure.axes
     assert left.get_title() == f"true instances: {counted.true_positive} found, {counted.false_negative} missed"
     assert right.get_title().endswith(f"{counted.true_positive} right, {counted.false_positive} false")
-    assert f"PQ {counted.pq:.1f} %" in figure.get_suptitle()
+    assert f"PQ {counted.pq:.1f} %" in title_of(figure)
     present = np.isin(labels.instance[0], 3)
     assert_allclose(picture(left)[present], np.broadcast_to(to_rgb(OUTCOME_COLORS["missed"]), (present.sum(), 3)))
     assert_allclose(picture(right)[4, 4], to_rgb(OUTCOME_COLORS["false"]))
