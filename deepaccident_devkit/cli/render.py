@@ -3,6 +3,7 @@
 import logging
 import os
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast, get_args
@@ -35,6 +36,7 @@ from deepaccident_devkit.render.moments import render_frame, render_sample
 from deepaccident_devkit.render.motion import MotionStyle, render_motion_labels
 from deepaccident_devkit.render.outcomes import render_evaluation
 from deepaccident_devkit.render.pictures import PICTURE_SUFFIXES, figure_of_pixels, save_picture
+from deepaccident_devkit.render.styles import StyleName, style, style_dpi
 from deepaccident_devkit.render.video import SUFFIXES, VIEWS, render_scenario_video
 from deepaccident_devkit.render.video.writers import check_target
 from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix
@@ -44,7 +46,6 @@ from deepaccident_devkit.v2x.collisions import default_scenario
 
 _RELEASE = ("dataroot", "version", "index_dir", "workers", "on_error")
 _logger = logging.getLogger(__name__)
-_DPI = 100.0
 _OUT = f"File to write ({', '.join(PICTURE_SUFFIXES)}), or a folder for several pictures."
 
 
@@ -112,6 +113,7 @@ class _Picture:
         options: of this verb.
         help: the first line of the verb's help.
         default: what is rendered without a token.
+        styles: of its own, the default first.
     """
 
     draw: Callable[..., Any]
@@ -120,6 +122,7 @@ class _Picture:
     canvas: str = "fig"
     options: tuple[Any, ...] = (_LAYERS,)
     default: str = "the first accident, or if there is none, the first scenario"
+    styles: tuple[str, ...] = ()
 
     def drawn(
         self, dataset: Dataset, row: str, size: tuple[int, int] | None, dpi: float, choices: dict[str, Any]
@@ -193,12 +196,7 @@ _PICTURES = {
         draw=render_motion_labels,
         of="sample",
         help="Render the motion labels of one sample: one column per frame; instances, centerness, offset and flow.",
-        options=(
-            click.option(
-                "--style", type=WordChoice(get_args(MotionStyle)), help="Style of the picture.  [default: maps]"
-            ),
-            _LAYERS,
-        ),
+        styles=get_args(MotionStyle),
     ),
     "visibility": _Picture(
         draw=render_visibility,
@@ -274,6 +272,7 @@ def _verb(name: str, picture: _Picture) -> click.Command:
     text = f"{picture.help}\n\nTOKEN is a row of the table {table}."
     if picture.of != "scenario":
         text += " A scenario's token stands for the moment one second before its end."
+    own = f"{' or '.join(picture.styles)}  [default: {picture.styles[0]}]; " if picture.styles else ""
     text += f" Without TOKEN the command renders {picture.default}."
 
     @click.command(name, help=text, short_help=picture.help)
@@ -284,16 +283,22 @@ def _verb(name: str, picture: _Picture) -> click.Command:
     @click.option(
         "--dpi",
         type=click.FloatRange(min=1),
-        default=_DPI,
-        show_default=True,
-        help="Pixels per inch; the text grows with it.",
+        help="Pixels per inch; the text grows with it.  [default: 100; paper: 300; slide: 240]",
+    )
+    @click.option(
+        "--style",
+        "styles",
+        multiple=True,
+        type=WordChoice((*picture.styles, *get_args(StyleName))),
+        help=f"{own}paper: as wide as a column, without token; slide: 16 to 9, with large text.",
     )
     @frame_range_parameter
     def verb(
         tokens: tuple[str, ...],
         out: Path,
         size: tuple[int, int] | None,
-        dpi: float,
+        dpi: float | None,
+        styles: tuple[str, ...],
         frames: range | None,
         **options: Any,
     ) -> None:
@@ -309,12 +314,16 @@ def _verb(name: str, picture: _Picture) -> click.Command:
             tokens = read_results(choices["results"]).tokens[:1]
         dataset = DeepAccident(**release)
         rows = rows_to_draw(dataset, picture.of, tokens, frames)
-        for row, path in zip(rows, picture_paths(out, name, rows), strict=True):
-            drawn = picture.drawn(dataset, row, size, dpi, choices)
-            save_picture(drawn, path, dpi=dpi)
-            if words := missing_words(drawn):
-                _logger.warning("%s: %s", path, "; ".join(words))
-            click.echo(f"rendered: {row} in {path}")
+        for word in set(styles).intersection(picture.styles):
+            choices["style"] = word
+        places = [cast(StyleName, word) for word in styles if word not in picture.styles]
+        with style(places[-1]) if places else nullcontext():
+            for row, path in zip(rows, picture_paths(out, name, rows), strict=True):
+                drawn = picture.drawn(dataset, row, size, dpi or style_dpi(), choices)
+                save_picture(drawn, path, dpi=dpi)
+                if words := missing_words(drawn):
+                    _logger.warning("%s: %s", path, "; ".join(words))
+                click.echo(f"rendered: {row} in {path}")
 
     for option in picture.options:  # on a command they come last, on a function they would come first
         verb = option(verb)

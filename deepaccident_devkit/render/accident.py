@@ -48,17 +48,19 @@ def render_accident(
 ) -> Figure:
     """Render the countdown to an accident: a column for each moment, a row for each agent, and one from above.
 
-    Each agent has the image of the camera that sees the colliding pair best (the front one if no camera does), of those
-    that were downloaded; if none was, a grey panel. The view
-    from above has the place of contact (a cross), the pair's speeds, and the pair's paths up to the contact.
+    In a wide figure rows are columns. Each agent has a part of the image that shows the colliding pair best, of those
+    that were downloaded; if none was, a grey panel. If no camera shows the pair, it is the last one that did, or the
+    front one. The pair's boxes are dashed where the agent's label says that no camera sees them. The view from above
+    has the place of contact (a cross), the pair's speeds, and the pair's paths up to the contact; its scale is that of
+    its bar. `E` is the ego vehicle, `O` the other one.
 
     Args:
         dataset: the release.
         scenario: token or record of one with a collision.
         seconds: before the impact, which is the recording's last frame; moments before the first are left out.
         agents: whose images are shown; None for all that are there, and an empty list for none.
-        layers: `image`, `boxes`, `trajectories` and `grid` are the default; also `points` (of the LiDAR, in images),
-            `ids` and `velocities`. Without `image` no image file is read.
+        layers: `image`, `bev` (the road), `boxes`, `trajectories` and `grid` are the default; also
+            `points` (of the LiDAR, in images), `ids` and `velocities`. Without `image` no image file is read.
         fig: an empty figure to render on; a new one if None.
 
     Returns:
@@ -79,9 +81,8 @@ def render_accident(
     there = agents_of(dataset, scenario)
     first = sample_token(record["token"], there[0], record["num_frames"])
     names = in_drawing_order([] if agents == [] else cooperating_agents(dataset, first, agents))
-    rows = len(names) + 1
     fig = figure_or_new(fig, (_WIDTH * len(moments) + 0.8, 1.95 * len(names) + _WIDTH + 1.1))
-    axes = fig.subplots(rows, len(moments), squeeze=False, height_ratios=(*[9 / 16] * len(names), 1))
+    axes, across = _panels(fig, len(names), len(moments))
     pair = Pair.of(dataset, contact)
     for column, (left, index) in enumerate(moments):
         for agent, ax in zip(names, axes[:, column], strict=False):
@@ -89,11 +90,10 @@ def render_accident(
             write_beside(ax, channel, (ax.get_xlim()[0], ax.get_ylim()[0]), "black")
         draw_pair_from_above(pair, index, shown, axes[-1, column])
         end = "the last frame" if cut else "the impact"
-        first = axes[0, column]
-        first.set_title("\n".join(filter(None, [end if left == 0 else f"{left:g} s before", first.get_title()])))
+        _write_head(end if left == 0 else f"{left:g} s before", "black", axes[0, column], above=not across)
     for agent, ax in zip(names, axes[:, 0], strict=False):
-        _write_row(short_name(agent), AGENT_COLORS[agent], ax)
-    _write_row("from above", "black", axes[-1, 0])
+        _write_head(short_name(agent), AGENT_COLORS[agent], ax, above=across)
+    _write_head("from above", "black", axes[-1, 0], above=across)
     words = "\n".join(filter(None, [accident_words(dataset, contact), cut]))
     set_scene_title(fig, dataset, record["token"], below=words, fontsize=11)
     return settled(fig)
@@ -128,7 +128,8 @@ def draw_countdown(
             axes[agent].set_axis_off()
             continue
         channel = draw_pair_in_camera(pair, agent, index, shown, axes[agent])
-        axes[agent].set_title(f"{short_name(agent)}: {channel}", fontsize="medium", color=AGENT_COLORS[agent])
+        words = channel.replace("\n", " ")
+        axes[agent].set_title(f"{short_name(agent)}: {words}", fontsize="medium", color=AGENT_COLORS[agent])
     draw_pair_from_above(pair, index, shown, axes["above"])
     axes["above"].set_title(f"from above, {axes['above'].get_title()}", fontsize="medium")
     _draw_speeds(pair, index, axes["speeds"])
@@ -188,10 +189,22 @@ def _moments(seconds: Sequence[float], last: int) -> list[tuple[float, int]]:
     return recorded
 
 
-def _write_row(words: str, color: str, ax: Axes) -> None:
-    ax.text(
-        -0.02, 0.5, words, rotation=90, ha="right", va="center", color=color, fontweight="bold", transform=ax.transAxes
-    )
+def _panels(fig: Figure, agents: int, moments: int) -> tuple[Any, bool]:
+    """Axes (agents + 1, moments), and whether an agent's are a column because that fills the figure better."""
+    figure = fig.bbox.width / fig.bbox.height
+    down, across = moments / (agents * 9 / 16 + 1), (agents * 16 / 9 + 1) / moments
+    if abs(np.log(figure / across)) < abs(np.log(figure / down)):
+        return fig.subplots(moments, agents + 1, squeeze=False, width_ratios=(*[16 / 9] * agents, 1)).T, True
+    return fig.subplots(agents + 1, moments, squeeze=False, height_ratios=(*[9 / 16] * agents, 1)), False
+
+
+def _write_head(words: str, color: str, ax: Axes, *, above: bool) -> None:
+    """Write the head of a column above its first panel, or that of a row beside it."""
+    if above:
+        ax.set_title("\n".join(filter(None, [words, ax.get_title()])), color=color, fontsize="medium")
+        return
+    style: dict[str, Any] = {"rotation": 90, "ha": "right", "va": "center", "fontweight": "bold"}
+    ax.text(-0.02, 0.5, words, color=color, transform=ax.transAxes, **style)
 
 
 def _draw_speeds(pair: Pair, index: int, ax: Axes) -> None:

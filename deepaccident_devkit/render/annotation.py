@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, Final
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _POSSIBLE: Final = tuple(layer for layer in LAYERS if layer in {"image", *BEV_LAYERS})
+_LETTERS_AN_INCH: Final = 12
 _DEFAULT: Final[tuple[Layer, ...]] = ("image", "bev", "points", "boxes", "grid")
 
 
@@ -75,7 +77,9 @@ def render_annotation(
 
     axes["words"].set_axis_off()
     columns = _facts(dataset, record, own)
-    for column, lines in enumerate(columns):
+    letters = int(_LETTERS_AN_INCH * fig.bbox.width / fig.dpi / len(columns))
+    for column, facts in enumerate(columns):
+        lines = [textwrap.fill(fact, letters, subsequent_indent="  ") for fact in facts]
         place = column / len(columns)
         axes["words"].text(
             place, 1, "\n".join(lines), va="top", fontsize=SMALLEST_TEXT, transform=axes["words"].transAxes

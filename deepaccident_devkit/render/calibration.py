@@ -18,7 +18,7 @@ from deepaccident_devkit.render.legends import agent_handles, draw_legend
 from deepaccident_devkit.render.missing import has_cloud, missing_clouds_text, write_missing
 from deepaccident_devkit.render.moments import CAMERA_GRID
 from deepaccident_devkit.render.roles import at_once, in_drawing_order
-from deepaccident_devkit.render.titles import set_scene_title
+from deepaccident_devkit.render.titles import set_scene_title, set_title
 from deepaccident_devkit.v2x import Agents, cooperating_agents, cooperative_boxes, project_to_image
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def render_calibration(
     for camera, ax in zip(cameras, axes.flat, strict=False):
         _draw_panel(dataset, camera, clouds, boxes, chosen, ax)
         if is_frame:
-            ax.set_title(f"{camera.rsplit('/', 3)[1]}, Camera_Front")
+            set_title(ax, f"{camera.rsplit('/', 3)[1]}, Camera_Front")
     if clouds:
         draw_legend(fig, agent_handles(clouds), columns=len(clouds), loc="outside lower center", fontsize=9)
     whose = "each agent" if len(names) > 1 else names[0]

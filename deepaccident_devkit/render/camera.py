@@ -88,7 +88,7 @@ def render_sample_data(
         ax = axes_or_new(ax, (8, 5.4))
         colors, below = draw_camera(dataset, record, chosen, ax), 0.5
     else:
-        ax = axes_or_new(ax, (6, 6.8))
+        ax = axes_or_new(ax, (6, 7.2))
         colors, below = _draw_from_above(dataset, record, layers, ax), 4.5
     set_scene_title(ax, dataset, record["token"], record["channel"])
     handles = box_handles(colors)

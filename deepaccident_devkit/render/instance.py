@@ -19,9 +19,9 @@ from deepaccident_devkit.render.boxes import draw_boxes_from_above, write_beside
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR, GRID_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
-from deepaccident_devkit.render.roles import agent_actors, in_drawing_order, role_colors, short_name
+from deepaccident_devkit.render.roles import agent_actors, camera_name, in_drawing_order, role_colors, short_name
 from deepaccident_devkit.render.sights import Sightings, sightings
-from deepaccident_devkit.render.titles import set_scene_title
+from deepaccident_devkit.render.titles import set_scene_title, set_title
 from deepaccident_devkit.render.trails import draw_trail
 from deepaccident_devkit.tables.tokens import instance_token, sample_token
 from deepaccident_devkit.taxonomy import BEV_CAMERA, FRAME_PERIOD, frame_timestamp
@@ -189,7 +189,8 @@ def _draw_crops(
         colors = [actor.color] if "boxes" in layers else []
         draw_view(dataset, view, box.select(np.arange(len(colors))), colors, ax, image="image" in layers)
         agent, _, channel = view.camera.rsplit("/", 3)[1:]
-        ax.set_title(f"{frame_timestamp(int(index)):.1f} s, {short_name(agent)}, {channel}", fontsize=SMALLEST_TEXT)
+        words = f"{frame_timestamp(int(index)):.1f} s, {short_name(agent)}, {camera_name(channel)}"
+        set_title(ax, words, fontsize=SMALLEST_TEXT)
 
 
 def _draw_speed(actor: _Actor, ax: Axes) -> None:
@@ -217,7 +218,7 @@ def _draw_seen(actor: _Actor, known: Sequence[Sightings], ax: Axes) -> None:
             ax.text(actor.duration / 2, row, "is the actor itself", ha="center", va="center", fontsize=SMALLEST_TEXT)
     ax.set_yticks(range(len(known)), [short_name(one.agent) for one in known])
     ax.set_ylim(len(known) - 0.5, -0.5)
-    ax.set_title("who sees it (pale: only annotated)", fontsize="medium")
+    set_title(ax, "who sees it, pale: only annotated", fontsize="medium")
 
 
 def _finish_time(actor: _Actor, ax: Axes) -> None:

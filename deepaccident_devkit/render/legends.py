@@ -14,10 +14,8 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
-BESIDE: Final[Mapping[str, Any]] = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0), "borderaxespad": 0.0}
-"""A place where a legend hides nothing."""
 INSIDE: Final[Mapping[str, Any]] = {"loc": "upper right", "frameon": True, "framealpha": 0.85}
-"""A place in the picture, if nothing may stand beside it."""
+"""A place in axes, so that nothing stands beside them."""
 _HANDLE: Final = 0.4
 """Inches of a sign and the blanks around it."""
 

@@ -23,7 +23,7 @@ from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import COLLIDER_COLOR, GRID_COLOR
 from deepaccident_devkit.render.layers import Layer
 from deepaccident_devkit.render.missing import is_there
-from deepaccident_devkit.render.roles import actor_tags, role_colors
+from deepaccident_devkit.render.roles import actor_tags, camera_name, role_colors
 from deepaccident_devkit.render.trails import draw_trails
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, FRAME_PERIOD
@@ -112,27 +112,28 @@ def draw_pair_in_camera(pair: Pair, agent: str, index: int, layers: Collection[L
         ax: axes to render on.
 
     Returns:
-        The camera, and how long ago it saw the pair if it does not now.
+        The short name of the camera, and how long ago it saw the pair if it does not now.
     """
     dataset, sample = pair.dataset, sample_token(pair.scenario, agent, index)
     channel, view, last = pair.view(agent, index)
+    name = camera_name(channel)
     camera = dataset.get("sample_data", f"{sample}/{channel}")
     draw_camera(dataset, camera, {*layers}.intersection(CAMERA_LAYERS), ax)
     ax.set_title("")
     if view is None:
-        return channel if last is None else f"{channel}, {(index - last) * FRAME_PERIOD:.1f} s after it saw them"
+        return name if last is None else f"{name}:\nseen {(index - last) * FRAME_PERIOD:.1f} s ago"
     lens = camera_of(dataset, camera)
     left, top, right, bottom = crop_about(view.bounds, width=lens.width, height=lens.height, share=_LEAST_CROP)
     ax.set(xlim=(left, right), ylim=(bottom, top))
     if "boxes" not in layers:
-        return channel
+        return name
     both = pair.at(index, agent).transform(dataset.world_from(sample, channel).inverse(), channel)
     seen = np.isin(both.actor_id, dataset.boxes(sample, visible="camera").actor_id)
     for rows, how in ((seen, "-"), (~seen, _HIDDEN)):
         red = [COLLIDER_COLOR] * int(rows.sum())
         draw_boxes_in_image(both.select(rows), lens, ax, red, linewidths=1.8, linestyle=how)
     _write_tags_in_image(pair, both.actor_id.tolist(), bounds_in_image(both, lens), ax)
-    return channel
+    return name
 
 
 def draw_pair_from_above(pair: Pair, index: int, layers: Collection[Layer], ax: Axes) -> None:

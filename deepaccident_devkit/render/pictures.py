@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.files import replacing
 from deepaccident_devkit.render.axes import detached_figure
+from deepaccident_devkit.render.styles import style_dpi
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,13 +36,13 @@ def figure_of_pixels(width: int, height: int, *, dpi: float) -> Figure:
     return figure
 
 
-def save_picture(drawn: Axes | Figure, path: str | os.PathLike[str], *, dpi: float = 100) -> Path:
+def save_picture(drawn: Axes | Figure, path: str | os.PathLike[str], *, dpi: float | None = None) -> Path:
     """Write the result of a `render_…` function atomically into a file, which it replaces, and close it in pyplot.
 
     Args:
         drawn: a figure, or axes, whose whole figure is written.
         path: the file, by its suffix one of `PICTURE_SUFFIXES`.
-        dpi: pixels an inch.
+        dpi: pixels an inch; None for those of the style, in a notebook's 100.
 
     Returns:
         The path written.
@@ -54,7 +55,7 @@ def save_picture(drawn: Axes | Figure, path: str | os.PathLike[str], *, dpi: flo
     path = check_picture_path(path)
     figure: Any = drawn.figure
     try:
-        return write_figure(figure, path, dpi=dpi)
+        return write_figure(figure, path, dpi=dpi or style_dpi())
     finally:
         plt.close(figure)
 

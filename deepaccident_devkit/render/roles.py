@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping
 from typing import Any
 
@@ -73,6 +74,11 @@ def actor_tags(dataset: Dataset, contact: Contact) -> dict[int, str]:
         else dataset.instance.get(instance)["category"]
         for actor, instance in zip(contact.actor_ids, contact.instances, strict=True)
     }
+
+
+def camera_name(channel: str) -> str:
+    """A camera's short name for pictures: `front`, `back left`."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", channel.removeprefix("Camera_")).lower()
 
 
 def in_drawing_order(agents: Collection[str]) -> list[str]:

@@ -41,7 +41,7 @@ _NOTEBOOK: Final = _Style(dpi=100, rc={})
 _STYLES: Final[Mapping[str, _Style]] = {
     "paper": _Style(dpi=300, panel=3.5, figure=7.2, tokens=False, rc=_TEXT),
     # letters of 9 points are large on a slide that is 8 inches wide
-    "slide": _Style(dpi=240, panel=8.0, figure=8.0, ratio=16 / 9, rc=_TEXT),
+    "slide": _Style(dpi=240, panel=8.0, figure=8.0, ratio=16 / 9, tokens=False, rc=_TEXT),
 }
 _current: ContextVar[_Style] = ContextVar("style", default=_NOTEBOOK)
 
@@ -52,8 +52,8 @@ def style(name: StyleName) -> Iterator[None]:
 
     Args:
         name: `paper`: 3.5 inches wide, or with several panels 7.2 (one and two columns), letters of 9 points or more,
-            no tokens, fonts embedded in PDF, 300 pixels an inch. `slide`: 16 to 9, with large letters, 1920 × 1080
-            pixels.
+            fonts embedded in PDF, 300 pixels an inch. `slide`: 16 to 9, with large letters, 1920 × 1080 pixels.
+            Neither has tokens.
 
     Raises:
         ChoiceError: no such style.

@@ -61,9 +61,13 @@ def set_scene_title(
         below: another line.
         style: as `set_title` takes it.
     """
+    from matplotlib.axes import Axes
+
     kind, name, *rest = token.split("/")
     moment = "" if rest[:1] in ([], ["actor"]) else moment_words(dataset, token)
     said = ", ".join(filter(None, [moment, words]))
+    if isinstance(where, Axes):
+        style.setdefault("fontsize", "medium")
     first = ": ".join(filter(None, [scene_words(dataset, f"{kind}/{name}"), said]))
     set_title(where, "\n".join(filter(None, [first, below])), token=token, **style)
 

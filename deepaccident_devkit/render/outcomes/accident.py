@@ -15,9 +15,9 @@ from deepaccident_devkit.evaluation.metrics.predictions import Accident
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.render.axes import axes_or_new, titled_from_above
 from deepaccident_devkit.render.boxes import draw_boxes_from_above, draw_ids_from_above, write_beside
-from deepaccident_devkit.render.colors import OUTCOME_COLORS
+from deepaccident_devkit.render.colors import COLLIDER_COLOR, OUTCOME_COLORS
 from deepaccident_devkit.render.layers import Layer, layers_of
-from deepaccident_devkit.render.legends import BESIDE, draw_legend
+from deepaccident_devkit.render.legends import INSIDE, draw_legend
 from deepaccident_devkit.render.trails import draw_trail
 
 if TYPE_CHECKING:
@@ -28,8 +28,8 @@ _SHOWN: Final[tuple[Layer, ...]] = ("boxes", "trajectories", "grid")
 _LEAST: Final = 20.0
 _MOST: Final = 60.0
 """Metres around an accident that are shown, at least and at most."""
-_TRUE: Final = OUTCOME_COLORS["right"]
-_FORESEEN: Final = OUTCOME_COLORS["false"]
+_FORESEEN: Final = "black"
+"""Whether it is right is what the picture shows."""
 
 
 def draw_accident_outcome(
@@ -59,7 +59,8 @@ def draw_accident_outcome(
         _draw_actors(truth, compared, shown, ax)
     if compared.true is not None:
         x, y = compared.true.positions.T
-        ax.plot(x, y, "o-", markersize=12, fillstyle="none", color=_TRUE, linewidth=1.6, zorder=5, label="to come")
+        (line,) = ax.plot(x, y, "o-", markersize=12, fillstyle="none", color=COLLIDER_COLOR, linewidth=1.6, zorder=5)
+        line.set_label("to come")
     for alarm in compared.predicted:
         (line,) = ax.plot(*alarm.positions.T, "x--", color=_FORESEEN, markersize=9, markeredgewidth=2, zorder=6)
         line.set_label("foreseen" if alarm is compared.predicted[0] else "")
@@ -71,7 +72,7 @@ def draw_accident_outcome(
             _draw_differences(alarm, compared.true, ax)
     _look_at(compared, ax)
     handles, _ = ax.get_legend_handles_labels()
-    draw_legend(ax, handles, columns=1, **BESIDE)
+    draw_legend(ax, handles, columns=1, **INSIDE)
     return titled_from_above(ax, difference_words(compared), grid="grid" in shown)
 
 
@@ -111,16 +112,17 @@ def _draw_actors(truth: BoxTruth, compared: ComparedAccidents, shown: frozenset[
         frame="ego",
         actor_id=truth.actor_id[here],
     )
-    colors = [OUTCOME_COLORS["missed"]] * len(boxes)
+    ids = (None if compared.true is None or truth.accident is None else truth.accident.ids) or ()
+    pair = np.isin(boxes.actor_id, ids).tolist()
+    colors = [COLLIDER_COLOR if collides else OUTCOME_COLORS["missed"] for collides in pair]
     if "boxes" in shown:
         draw_boxes_from_above(boxes, ax, colors, fill=0.15, linewidths=0.8)
     if "ids" in shown:
         draw_ids_from_above(boxes, ax, ["black"] * len(boxes))
-    ids = None if compared.true is None or truth.accident is None else truth.accident.ids
-    if "trajectories" in shown and ids is not None:
+    if "trajectories" in shown:
         for column in np.flatnonzero(np.isin(truth.actor_id, ids)).tolist():
             path = truth.footprint[:, column, :2]
-            draw_trail(path[np.isfinite(path[:, 0])], ax, _TRUE, linewidths=2.0)
+            draw_trail(path[np.isfinite(path[:, 0])], ax, COLLIDER_COLOR, linewidths=2.0)
 
 
 def _draw_differences(alarm: Accident, true: Accident, ax: Axes) -> None:

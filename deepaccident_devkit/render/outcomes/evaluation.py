@@ -58,7 +58,7 @@ def render_evaluation(
 
     Motion: true instances are found or missed, predicted ones right or false, frame by frame. Accidents: the places
     where two collide, with the metres between foreseen and true places. Detections: matched, false and missed boxes.
-    Right is green, false is orange, missed is grey.
+    The true pair that collides is red.
 
     Args:
         dataset: the release.

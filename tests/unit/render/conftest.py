@@ -5,6 +5,7 @@ import pytest
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.statistics import DatasetStatistics, dataset_statistics
+from deepaccident_devkit.synth import SynthConfig, make_release
 
 
 @pytest.fixture(scope="session")
@@ -46,6 +47,14 @@ def sample(da_motion: DeepAccident) -> str:
 @pytest.fixture(scope="session")
 def labels(da_motion: DeepAccident, sample: str) -> MotionLabels:
     return da_motion.motion_labels(sample).to_present()
+
+
+@pytest.fixture(scope="session")
+def da_designs(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
+    """An accident of each of the twelve designs and its normal twin, labels only."""
+    root = tmp_path_factory.mktemp("synthetic") / "designs"
+    config = SynthConfig(scenarios=24, frames=6, seed=7, sensors=False, unplanned=0, designs=tuple(range(1, 13)))
+    return DeepAccident("v1", make_release(root, config, workers=2), verbose=False)
 
 
 @pytest.fixture(scope="session")

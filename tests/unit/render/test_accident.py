@@ -1,22 +1,26 @@
 """The countdown to an impact: which cameras, which moments, what is at which place, and the words."""
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from drawing import title_of, tokens_of
-from matplotlib.collections import PolyCollection
+from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_hex, to_rgba
 from numpy.testing import assert_allclose
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
+from deepaccident_devkit.geometry import SE3, Boxes
 from deepaccident_devkit.render import detached_figure
 from deepaccident_devkit.render.accident import accident_words, draw_countdown, render_accident
 from deepaccident_devkit.render.best_view import best_view
 from deepaccident_devkit.render.colors import COLLIDER_COLOR
+from deepaccident_devkit.render.pair import Pair
+from deepaccident_devkit.render.roles import camera_name
 from deepaccident_devkit.render.video import render_scenario_video
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 from deepaccident_devkit.v2x import collision
@@ -46,8 +50,8 @@ def test_a_column_a_moment_and_a_row_an_agent(da: DeepAccident) -> None:
     assert [ax.get_title() for ax in figure.axes[:2]] == ["0.4 s before", "the impact"]
     assert [figure.axes[row * 2].texts[-1].get_text() for row in range(2)] == ["ego", "infrastructure"]
     assert all(ax.images for ax in figure.axes[:4])
-    channels = {text.get_text().split(",")[0] for ax in figure.axes[:4] for text in ax.texts if text.get_gid() != "tag"}
-    assert channels - {"ego", "infrastructure"} <= {*CAMERAS}
+    names = {text.get_text().split(":")[0] for ax in figure.axes[:4] for text in ax.texts if text.get_gid() != "tag"}
+    assert names - {"ego", "infrastructure"} <= {camera_name(channel) for channel in CAMERAS}
     assert title_of(figure).endswith(" ".join(accident_words(da, da.collision(scenario)).split()))
     assert tokens_of(figure) == [scenario["token"]]
     plain = drawn(da, scenario, seconds=[0.0], layers=["boxes", "ids"])
@@ -110,7 +114,7 @@ def test_images_are_those_that_show_the_pair_best(da: DeepAccident) -> None:
     view = best_view(da, [sample], boxes.select(np.isin(boxes.actor_id, scenario["collision"]["ids"])))
     assert view is not None
     panel = figure.axes[0]
-    assert view.camera.rsplit("/", 1)[1] in {text.get_text() for text in panel.texts}
+    assert camera_name(view.camera.rsplit("/", 1)[1]) in {text.get_text() for text in panel.texts}
     left, top, right, bottom = view.bounds
     assert panel.get_xlim()[0] <= left < right <= panel.get_xlim()[1]
     assert panel.get_ylim()[1] <= top < bottom <= panel.get_ylim()[0]
@@ -144,7 +148,7 @@ def test_what_cannot_be_counted_down_to_is_named(da_motion: DeepAccident) -> Non
 def test_the_countdown_has_five_cameras_and_the_pair_at_its_place(da: DeepAccident, accident: str) -> None:
     fig = detached_figure((12.8, 7.2))
     draw_countdown(da, f"{accident}/004", AGENTS, None, fig)
-    agents = [ax.get_title().split(":")[0] for ax in fig.axes if "Camera_" in ax.get_title()]
+    agents = [ax.get_title().split(":")[0] for ax in fig.axes if ":" in ax.get_title()]
     assert agents == ["ego", "ego behind", "other", "other behind", "infrastructure"]
     assert ": 0.2 s to the impact other (car" in title_of(fig)
     above = next(ax for ax in fig.axes if ax.get_title().startswith("from above"))
@@ -171,3 +175,61 @@ def test_nothing_to_count_down_to_is_said(da: DeepAccident, tmp_path: Path) -> N
     with pytest.raises(NotAvailableError, match=r"nobody collides in it.*the view 'frame'"):
         render_scenario_video(da, normal, tmp_path / "v.gif", what="accident", workers=1, progress=False)
     assert not list(tmp_path.iterdir())
+
+
+def seen_pixels(ax: Any) -> float:
+    """The smaller side, in pixels, of the red lines that a panel shows."""
+    low, high = ax.get_window_extent().get_points()
+    lines = [each for each in ax.collections if isinstance(each, LineCollection) and len(each.get_segments())]
+    red = [each for each in lines if to_hex(each.get_color()[0], keep_alpha=False) == COLLIDER_COLOR]
+    ends = [ax.transData.transform(np.concatenate(each.get_segments())).clip(low, high) for each in red]
+    return float(np.ptp(np.concatenate(ends), axis=0).min()) if ends else 0.0
+
+
+def assert_pair_is_seen(da: DeepAccident, scenario: Any, seconds: Sequence[float]) -> None:
+    """At every moment: in the cameras of three agents or more, and from above with both tags."""
+    contact = da.collision(scenario)
+    assert contact is not None
+    tags, figure = Pair.of(da, contact).tags.values(), detached_figure((3.3 * len(seconds), 14))
+    render_accident(da, scenario, seconds=seconds, fig=figure)
+    figure.draw_without_rendering()
+    panels = np.array(figure.axes).reshape(6, len(seconds))
+    for column in panels.T:
+        assert sum(seen_pixels(ax) > 12 for ax in column[:-1]) >= 3
+        assert {text.get_text() for text in column[-1].texts if text.get_gid() == "tag"} == {*tags}
+        assert seen_pixels(column[-1]) > 30
+
+
+def test_the_pair_is_seen_up_to_the_impact(da_b: DeepAccident) -> None:
+    assert_pair_is_seen(da_b, accident_of(da_b), (0.3, 0.2, 0.1, 0.0))
+
+
+@pytest.mark.slow
+def test_the_pair_of_each_design_is_seen_up_to_the_impact(da_designs: DeepAccident) -> None:
+    for scenario in [scenario for scenario in da_designs.scenario if scenario["collision"]]:
+        assert_pair_is_seen(da_designs, scenario, (0.4, 0.3, 0.2, 0.1, 0.0))
+
+
+def test_a_camera_that_saw_the_pair_is_kept(da: DeepAccident, accident: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    contact, at = da.collision(accident), Pair.at
+    assert contact is not None
+    pair, below = Pair.of(da, contact), SE3.from_rotation(np.eye(3), [0.0, 0.0, -500.0])
+    channel, view, last = pair.view("ego_vehicle_behind", 5)
+    assert view is not None
+    assert last == 5
+
+    def gone_at_the_impact(self: Pair, index: int, seen_by: str | None = None) -> Boxes:
+        boxes = at(self, index, seen_by)
+        return boxes.transform(below, "world") if index == 6 else boxes
+
+    monkeypatch.setattr(Pair, "at", gone_at_the_impact)
+    assert pair.view("ego_vehicle_behind", 6) == (channel, None, 5)
+    figure = drawn(da, accident, seconds=[0.0], agents=["ego_vehicle_behind"])
+    assert "seen 0.1 s ago" in figure.axes[0].texts[0].get_text()
+
+
+def test_rows_are_columns_in_a_wide_figure(da: DeepAccident, accident: str) -> None:
+    figure = detached_figure((16, 9))
+    render_accident(da, accident, seconds=(0.3, 0.2, 0.1, 0.0), fig=figure)
+    heads = [ax.get_title().split("\n")[0] for ax in figure.axes[:6]]
+    assert heads == ["ego", "ego behind", "other", "other behind", "infrastructure", "from above"]
