@@ -72,7 +72,7 @@ def points3(points: FloatArray) -> list[Any]:
 
 
 def rgb(color: str) -> ByteArray:
-    """(3,) uint8 of a colour of `render.colors`, such as `#c4001a`."""
+    """(3,) uint8 of a colour of `render.colors`, such as `#9a9a9a`."""
     return np.frombuffer(bytes.fromhex(color[1:]), dtype=np.uint8)
 
 

@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
-from deepaccident_devkit.render.colors import GRID_COLOR, WARNING_COLOR
+from deepaccident_devkit.render.colors import GRID_COLOR, LINK_COLOR, WARNING_COLOR
 
 _VOID: Final = ("img", "meta")
 _MOST_DIGITS: Final = 6
@@ -130,7 +130,7 @@ h2 {{ font-size: 1.25rem; margin: 2.2rem 0 .6rem; padding-bottom: .2rem; border-
 h3 {{ font-size: 1rem; margin: 1.4rem 0 .4rem; }}
 p {{ margin: .4rem 0; max-width: 46rem; }}
 nav a {{ display: inline-block; margin: 0 .9rem .3rem 0; }}
-a {{ color: #14489c; }}
+a {{ color: {LINK_COLOR}; }}
 dl {{ display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 28rem), 1fr)); gap: 0 2rem;
   margin: .6rem 0; }}
 dl div {{ display: flex; gap: .8rem; padding: .2rem 0; border-bottom: 1px solid #ececec; min-width: 0; }}

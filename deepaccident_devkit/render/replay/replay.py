@@ -20,8 +20,10 @@ from deepaccident_devkit.render.colors import (
     CATEGORY_MARKERS,
     COLLIDER_COLOR,
     GRID_COLOR,
+    LINK_COLOR,
     OUTCOME_COLORS,
     POINT_COLOR,
+    WARNING_COLOR,
 )
 from deepaccident_devkit.render.replay.actors import actor_entries, agent_entries, camera_entries, camera_title
 from deepaccident_devkit.render.replay.facts import facts, notes
@@ -184,7 +186,8 @@ def replay_page(title: str, data: Mapping[str, Any]) -> str:
         title: of the window.
         data: what the scripts play, as JSON holds it.
     """
-    style, script = _part("replay.css"), "".join(map(_part, _SCRIPTS))
+    table = f":root {{ --link: {LINK_COLOR}; --warning: {WARNING_COLOR}; }}\n"
+    style, script = table + _part("replay.css"), "".join(map(_part, _SCRIPTS))
     policy = (
         f"default-src 'none'; img-src data:; style-src '{_hash(style)}'; script-src '{_hash(script)}'; "
         "base-uri 'none'; form-action 'none'"

@@ -1,16 +1,26 @@
 """The colour table keeps its promises to normal and colour-blind eyes; `docs/check_colors.py` prints the numbers."""
 
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
 from matplotlib import colormaps
-from matplotlib.colors import to_hex
+from matplotlib.colors import is_color_like, to_hex
 from scripts import loaded_script
 
+import deepaccident_devkit
 from deepaccident_devkit.render import colors
 from deepaccident_devkit.render.motion_cells import direction_colors
 
+PACKAGE = Path(deepaccident_devkit.__file__).parent
+PAINTED = ("synth", "testing")
+"""These paint a world for cameras, not pictures for readers."""
+PLAIN = {"black", "white", "none"}
+HEX = re.compile(r"#(?:[0-9a-fA-F]{8}|[0-9a-fA-F]{6}|[0-9a-fA-F]{3,4})\b")
 EYES = ("normal", "protanopia", "deuteranopia", "tritanopia")
 
 
@@ -82,3 +92,53 @@ def test_words_can_be_read_and_marks_be_seen(script: ModuleType) -> None:
     assert script.contrast(colors.CATEGORY_COLORS.values(), "#ffffff").min() >= 2.5
     for ground, bound in (("white", 2.0), ("road", 1.6)):
         assert script.contrast(colors.AGENT_COLORS.values(), script.GROUNDS[ground]).min() >= bound
+
+
+def sources(*suffixes: str) -> Iterator[tuple[str, str]]:
+    """Names and texts of the package's files that may name colours."""
+    for path in sorted(PACKAGE.rglob("*")):
+        name = path.relative_to(PACKAGE)
+        if path.suffix in suffixes and name.parts[0] not in PAINTED and name.as_posix() != "render/colors.py":
+            yield name.as_posix(), path.read_text(encoding="utf-8")
+
+
+def test_colours_come_from_the_one_table() -> None:
+    """Pages may have greys of their own: of their lines, grounds and words."""
+    found = [
+        f"{name}: {color}"
+        for name, text in sources(".py", ".js", ".css", ".html")
+        for color in HEX.findall(text)
+        if not is_grey(color)
+    ]
+    found += [
+        f"{name}: {color}"
+        for name, text in sources(".js", ".css", ".html")
+        for color in re.findall(r"\brgba?\(|\bhsla?\(", text)
+    ]
+    assert found == []
+
+
+def is_grey(color: str) -> bool:
+    red, green, blue = (int(each, 16) for each in re.findall("..", to_hex(color)[1:]))
+    return max(red, green, blue) - min(red, green, blue) <= 4
+
+
+def test_no_picture_names_a_colour_of_matplotlib() -> None:
+    """No argument of a call, no entry of its style, is such a name, except black, white and none."""
+    found = []
+    for name, text in sources(".py"):
+        for node in ast.walk(ast.parse(text)):
+            pairs = list(zip(node.keys, node.values, strict=True)) if isinstance(node, ast.Dict) else []
+            given = [(key.value, value) for key, value in pairs if isinstance(key, ast.Constant)]
+            given += [(key.arg, key.value) for key in getattr(node, "keywords", []) if isinstance(key, ast.keyword)]
+            for key, value in given:
+                kind = re.fullmatch(r"(?:\w*colors?|c|cmap|foreground|mfc|mec)", str(key))
+                if kind and isinstance(value, ast.Constant) and is_named(value.value):
+                    found.append(f"{name}:{value.lineno}: {key}={value.value!r}")
+    assert found == []
+
+
+def is_named(value: object) -> bool:
+    if not isinstance(value, str) or value in PLAIN:
+        return False
+    return value in colormaps or (is_color_like(value) and not value.startswith("#"))
