@@ -159,7 +159,7 @@ def frame_range_parameter(verb: Verb) -> Verb:
 
 def old_frames_parameter(verb: Verb) -> Verb:
     """Give a verb `old_frames`: --frames, which --frame-range replaces."""
-    return click.option("--frames", "old_frames", callback=_old_frames, hidden=True)(verb)
+    return click.option("--frames", "old_frames", callback=_old_frames, hidden=True, help="Old name.")(verb)
 
 
 def _old_frames(context: click.Context, parameter: click.Parameter, value: str | None) -> range | None:

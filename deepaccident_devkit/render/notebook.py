@@ -10,7 +10,7 @@ from deepaccident_devkit.geometry import SE3, Boxes, LidarPointCloud
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render.axes import axis_words, detached_figure, with_light_grid
 from deepaccident_devkit.render.boxes import draw_boxes_from_above
-from deepaccident_devkit.render.colors import CATEGORY_COLORS
+from deepaccident_devkit.render.colors import CATEGORY_COLORS, HEIGHT_COLORMAP
 from deepaccident_devkit.render.motion import draw_motion_trail
 from deepaccident_devkit.taxonomy import CAMERAS
 
@@ -67,7 +67,7 @@ def _draw_boxes(boxes: Boxes, ax: Axes) -> None:
 def _draw_points(cloud: LidarPointCloud, ax: Axes) -> None:
     _name_axes(cloud.frame, ax)
     xyz = cloud.xyz[:: -(-len(cloud) // _MOST_POINTS)]
-    ax.scatter(xyz[:, 0], xyz[:, 1], s=0.5, c=xyz[:, 2], cmap="viridis", linewidths=0)
+    ax.scatter(xyz[:, 0], xyz[:, 1], s=0.5, c=xyz[:, 2], cmap=HEIGHT_COLORMAP, linewidths=0)
 
 
 def _name_axes(frame: str, ax: Axes) -> None:
