@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.files import replacing
-from deepaccident_devkit.render.axes import detached_figure
+from deepaccident_devkit.render.axes import detached_figure, settled
 from deepaccident_devkit.render.styles import style_dpi
 
 if TYPE_CHECKING:
@@ -74,5 +74,5 @@ def write_figure(figure: Figure, path: Path, *, dpi: float, words: dict[str, Any
     """
     kind = path.suffix[1:].lower()
     with replacing(path) as temporary:
-        figure.savefig(temporary, format=kind, dpi=dpi, metadata=_UNDATED.get(kind, words))
+        settled(figure).savefig(temporary, format=kind, dpi=dpi, metadata=_UNDATED.get(kind, words))
     return path

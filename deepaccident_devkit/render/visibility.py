@@ -9,7 +9,7 @@ import numpy as np
 
 from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.render.axes import axes_or_new, axis_words, check_view_range, with_light_grid
+from deepaccident_devkit.render.axes import axes_or_new, axis_words, check_view_range, settled, with_light_grid
 from deepaccident_devkit.render.bev import draw_points_from_above
 from deepaccident_devkit.render.boxes import (
     draw_boxes_from_above,
@@ -114,7 +114,10 @@ def render_visibility(
         draw_ids_from_above(known.boxes, ax, colors)
     _draw_agents(known, ax)
     _draw_legend(known, hidden, shown, ax)
-    return with_light_grid(ax, "both") if "grid" in shown else ax
+    if "grid" in shown:
+        with_light_grid(ax, "both")
+    settled(ax.figure)
+    return ax
 
 
 def render_visibility_matrix(
@@ -158,9 +161,9 @@ def render_visibility_matrix(
     ax.tick_params(length=0)
     ax.spines[:].set_visible(False)
     more = len(rows) - len(shown)
-    key = "filled: the agent sees the actor; number: its LiDAR points (0: none)\n–: not in the agent's label"
+    key = "filled: the agent sees the actor\nnumber: its LiDAR points, 0: none\n–: not in the agent's label"
     ax.set_xlabel(f"{key}{f'; {more} more actors' if more else ''}", fontsize=SMALLEST_TEXT)
-    set_scene_title(ax, dataset, dataset.get("sample", known.sample)["frame_token"], "who sees whom")
+    set_scene_title(ax, dataset, dataset.get("sample", known.sample)["frame_token"], below="who sees whom")
     return ax
 
 
