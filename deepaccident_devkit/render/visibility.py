@@ -116,7 +116,8 @@ def render_visibility(
     _draw_legend(known, hidden, shown, ax)
     if "grid" in shown:
         with_light_grid(ax, "both")
-    settled(ax.figure)
+    figure: Any = ax.figure
+    settled(figure)
     return ax
 
 
