@@ -59,7 +59,18 @@ def test_every_view_draws_the_first_accident_when_no_token_is_given(
 def test_a_view_has_its_own_size_if_none_is_given(da: DeepAccident, tmp_path: Path) -> None:
     run("sample-data", da.dataroot, "--out", tmp_path / "a.png", "--dpi", 100)
     with Image.open(tmp_path / "a.png") as image:
-        assert image.size == (800, 460)
+        assert image.size == (800, 540)
+    assert not plt.get_fignums()
+
+
+def test_a_style_gives_size_and_fonts(da: DeepAccident, tmp_path: Path) -> None:
+    run("sample-data", da.dataroot, "--out", tmp_path / "a.png", "--style", "paper")
+    with Image.open(tmp_path / "a.png") as image:
+        assert image.size[0] == 1050  # 3.5 inches of 300 pixels
+    run("labels", da.dataroot, "--out", tmp_path / "a.pdf", "--style", "trail", "--style", "slide")
+    pdf = (tmp_path / "a.pdf").read_bytes()
+    assert b"/CIDFontType2" in pdf
+    assert b"/MediaBox [ 0 0 576 324 ]" in pdf
     assert not plt.get_fignums()
 
 
@@ -85,7 +96,7 @@ def test_a_link_moves_what_partners_share(da: DeepAccident, accident: str, tmp_p
 def test_several_rows_go_into_a_folder(da: DeepAccident, accident: str, tmp_path: Path) -> None:
     out = tmp_path / "drawn"
     tokens = [f"{accident}/{agent}/002/Camera_Back" for agent in ("ego_vehicle", "infrastructure")]
-    run("sample-data", da.dataroot, *tokens, "--out", out, "--size", "160x90")
+    run("sample-data", da.dataroot, *tokens, "--out", out, "--size", "160x90", "--dpi", 40)
     names = sorted(f"sample-data_{token.replace('/', '_')}.png" for token in tokens)
     assert sorted(path.name for path in out.iterdir()) == names
 

@@ -163,6 +163,7 @@ def _draw_path(dataset: Dataset, actor: _Actor, layers: frozenset[Layer], ax: Ax
     if actor.impact is not None and actor.color == COLLIDER_COLOR:
         ax.scatter(path[-1:, 0], path[-1:, 1], s=130, c=actor.color, marker="*", edgecolors="white", zorder=7)
         write_beside(ax, "impact", (float(path[-1, 0]), float(path[-1, 1])), actor.color)
+    ax.locator_params(nbins=5)
     x_words, y_words = axis_words("world")
     ax.set(xlabel=x_words, ylabel=y_words)
     if "grid" in layers:

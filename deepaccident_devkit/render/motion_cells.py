@@ -51,7 +51,7 @@ def draw_trail_of(maps: MotionMaps, shown: frozenset[Layer], ax: Axes) -> Axes:
     ax.set(xlim=maps.grid.x[:2], ylim=maps.grid.y[:2], aspect="equal", xlabel="x forward (m)", ylabel="y left (m)")
     if "labels" in shown:
         _draw_cells(ax, trail_picture(maps), maps)
-        _edge_own(maps, 0, ax)
+        draw_edge(maps, maps.own, ax, OWN_COLOR)
     if "trajectories" in shown:
         _draw_paths(maps, ax)
     return _with_ids_and_grid(maps, 0, shown, ax)
@@ -105,7 +105,7 @@ def direction_colors(left: AnyArray, along: AnyArray, *, longest: float) -> AnyA
 def _draw_picture(maps: MotionMaps, name: DrawnMap, frame: int, ax: Axes) -> None:
     if name == "instance":
         _draw_cells(ax, maps.colors[maps.instance[frame]], maps)
-        _edge_own(maps, frame, ax)
+        draw_edge(maps, maps.own, ax, OWN_COLOR, frame=frame)
     elif name == "centerness":
         if maps.centerness is not None:
             _draw_cells(ax, maps.centerness[frame], maps, cmap=CENTERNESS_COLORMAP, vmin=0, vmax=1)
@@ -115,10 +115,11 @@ def _draw_picture(maps: MotionMaps, name: DrawnMap, frame: int, ax: Axes) -> Non
         _draw_cells(ax, np.where(np.isnan(vectors[0])[..., None], 1.0, colors), maps)
 
 
-def _edge_own(maps: MotionMaps, frame: int, ax: Axes) -> None:
-    own = maps.instance[frame] == maps.own
-    if own.any():
-        ax.contour(*_cell_centers(maps), own, levels=(0.5,), colors=OWN_COLOR, linewidths=1.5)
+def draw_edge(maps: MotionMaps, identity: int, ax: Axes, color: str, *, frame: int = 0) -> None:
+    """Render the edge of an instance's cells."""
+    cells = maps.instance[frame] == identity
+    if cells.any():
+        ax.contour(*_cell_centers(maps), cells, levels=(0.5,), colors=color, linewidths=1.5)
 
 
 def _draw_arrows(maps: MotionMaps, frame: int, ax: Axes) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.evaluation.metrics.accident import (
@@ -20,19 +22,26 @@ from deepaccident_devkit.evaluation.metrics.detection import (
     detection_protocol,
     detection_truth,
 )
+from deepaccident_devkit.evaluation.metrics.frames import labels_at_present
 from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput, Prediction, checked_prediction
-from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels, motion_labels
+from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, MotionLabels, motion_labels
 from deepaccident_devkit.render.axes import figure_or_new, settled, titled_from_above
+from deepaccident_devkit.render.boxes import draw_boxes_from_above
+from deepaccident_devkit.render.colors import COLLIDER_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
+from deepaccident_devkit.render.motion_cells import draw_edge
+from deepaccident_devkit.render.motion_maps import maps_of_labels
 from deepaccident_devkit.render.outcomes.accident import ACCIDENT_LAYERS, draw_accident_outcome, verdict_words
 from deepaccident_devkit.render.outcomes.detection import DETECTION_LAYERS, WINDOW, draw_detection_outcome, draw_true
 from deepaccident_devkit.render.outcomes.motion import MOTION_LAYERS, draw_motion_side, motion_outcome
+from deepaccident_devkit.render.roles import collider_ids
 from deepaccident_devkit.render.titles import set_scene_title
-from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.taxonomy import FRAME_PERIOD, OWN_ACTOR_ID
 from deepaccident_devkit.text import choice
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _POSSIBLE: Final[Mapping[str, tuple[Layer, ...]]] = {
@@ -93,6 +102,8 @@ def render_evaluation(
         rules = MotionEvaluator(protocol or "released")
         truth = label or _label(dataset, token, given, rules.protocol.labels)
         fig, words = _draw_motion(token, given, truth, rules, shown, fig)
+        if "labels" in shown:
+            _edge_pair(truth, collider_ids(dataset, token), fig.axes[0])
     else:
         default = "released" if isinstance(given, MotionOutput) else "boxes"
         judge = AccidentEvaluator(protocol or default)
@@ -131,6 +142,13 @@ def _draw_motion(
         for name, within in result.ranges.items()
     ]
     return fig, "; ".join(ranges)
+
+
+def _edge_pair(label: MotionLabels, ids: Collection[int], ax: Axes) -> None:
+    """Render red edges around the present cells of the actors with these label ids."""
+    maps = maps_of_labels(labels_at_present(label))
+    for actor in ids:
+        draw_edge(maps, label.id_map.get(OWN_BOX_ID if actor == OWN_ACTOR_ID else actor, -1), ax, COLLIDER_COLOR)
 
 
 def _draw_accident(
@@ -172,6 +190,9 @@ def _draw_detection(
     matches = detection_matches(given, truth, rules)
     if "boxes" in shown:
         draw_true(truth, matches, left)
+        pair = truth.select(np.isin(truth.actor_id, [*collider_ids(dataset, token)]))
+        for ax in (left, right):
+            draw_boxes_from_above(pair, ax, [COLLIDER_COLOR] * len(pair), fill=0, linewidths=1.6)
     left.set(xlim=(-WINDOW, WINDOW), ylim=(-WINDOW, WINDOW))
     titled_from_above(
         left, f"true boxes: {len(matches.truth)} found, {len(matches.missed)} missed (dashed)", grid="grid" in shown

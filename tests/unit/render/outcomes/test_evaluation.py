@@ -3,17 +3,29 @@
 import numpy as np
 import pytest
 from drawing import title_of
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_hex
+from matplotlib.contour import ContourSet
 from numpy.testing import assert_allclose
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError
-from deepaccident_devkit.evaluation import Accident, AccidentEvaluator, accident_context, box_truth, instances_of
+from deepaccident_devkit.evaluation import (
+    Accident,
+    AccidentEvaluator,
+    DetectedBoxes,
+    accident_context,
+    box_truth,
+    instances_of,
+)
 from deepaccident_devkit.evaluation.metrics.accident.compared import compared_accidents
 from deepaccident_devkit.evaluation.metrics.accident.evaluator import PROTOCOLS
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render import detached_figure
+from deepaccident_devkit.render.colors import COLLIDER_COLOR
 from deepaccident_devkit.render.outcomes.accident import verdict_words
 from deepaccident_devkit.render.outcomes.evaluation import render_evaluation
+from deepaccident_devkit.render.roles import collider_ids
 
 
 def test_accidents_have_their_metres_and_verdict(da_motion: DeepAccident, sample: str) -> None:
@@ -67,3 +79,19 @@ def test_what_cannot_be_evaluated_is_named(da_motion: DeepAccident, sample: str)
         render_evaluation(da_motion, sample, [], protocol="released")
     with pytest.raises(ChoiceError, match=r"layers: expected one of .*, found 'labels'"):
         render_evaluation(da_motion, sample, [], layers=["labels"])
+
+
+def test_the_pair_that_collides_is_red_in_every_task(
+    da_motion: DeepAccident, sample: str, labels: MotionLabels
+) -> None:
+    ids = collider_ids(da_motion, sample)
+    assert len(ids) == 2
+    boxes = da_motion.boxes(sample)
+    detected = DetectedBoxes(boxes=boxes, scores=np.ones(len(boxes)))
+    accident = box_truth(da_motion, sample).accident
+    assert accident is not None
+    for prediction in (detected, [accident], instances_of(labels.instance, labels.config.grid)):
+        left = render_evaluation(da_motion, sample, prediction, fig=detached_figure((10, 6))).axes[0]
+        edges = [each for each in left.collections if isinstance(each, (ContourSet, PolyCollection))]
+        red = [color for each in edges for color in each.get_edgecolor() if to_hex(color) == COLLIDER_COLOR]
+        assert len(red) == 2

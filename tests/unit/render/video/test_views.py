@@ -9,7 +9,7 @@ from matplotlib import pyplot as plt
 from video_views import STEP, grey
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.render.camera import render_sample_data
+from deepaccident_devkit.render.camera import CAMERA_DEFAULT, draw_camera
 from deepaccident_devkit.render.video import VIEWS
 from deepaccident_devkit.render.video.views import Scene, names_at, views_of
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
@@ -45,7 +45,8 @@ def test_a_camera_is_the_one_of_the_first_agent_named(da: DeepAccident, accident
     scene = Scene(dataset=da, views=views_of("Camera_Back", None), agents=names, width=320, height=180)
 
     def draw(dataset: Any, record: Any, fig: Any) -> None:
-        render_sample_data(dataset, f"{accident}/other_vehicle/003/Camera_Back", ax=fig.add_subplot())
+        camera = dataset.get("sample_data", f"{accident}/other_vehicle/003/Camera_Back")
+        draw_camera(dataset, camera, CAMERA_DEFAULT, fig.add_subplot())
 
     own = Scene(dataset=da, views=views_of(draw, None), agents=None, width=320, height=180)
     np.testing.assert_array_equal(scene.picture(frame), own.picture(frame))
