@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.render import detached_figure
 from deepaccident_devkit.render.best_view import best_view
+from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.render.pictures import save_picture
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.synth.spec import DESIGNS
@@ -76,14 +77,14 @@ def draw_design(release: DeepAccident, above: Axes, image: Axes) -> None:
 
 
 def draw_meeting(release: DeepAccident, ego: str, contact: Contact, ax: Axes) -> None:
-    """The ways of ego (blue) and other (red) and the cross where they meet, in the ego frame of a sample (a token)."""
+    """The ways of ego and other in their hues and a red cross where they meet, in the ego frame of a sample (token)."""
     own = release.get("agent", ego.rsplit("/", 1)[0])["actor_id"]
     for instance, actor in zip(contact.instances, contact.actor_ids, strict=True):
-        color = "C0" if actor == own else "C3"
+        color = AGENT_COLORS["ego_vehicle" if actor == own else "other_vehicle"]
         way = release.trajectory(instance, ego, "ego").center
-        ax.plot(way[:, 0], way[:, 1], color=color, linewidth=3, zorder=4)
+        ax.plot(way[:, 0], way[:, 1], color=color, linewidth=4, zorder=4)
     x, y, _ = release.world_from(ego, "ego").inverse().apply(contact.point[None])[0]
-    ax.plot(x, y, "x", color="black", markersize=16, markeredgewidth=4, zorder=6)
+    ax.plot(x, y, "x", color=COLLIDER_COLOR, markersize=16, markeredgewidth=4, zorder=6)
 
 
 if __name__ == "__main__":

@@ -1,60 +1,87 @@
-"""Render the pictures of README.md and docs/pictures.md from a synthetic release: `python docs/make_pictures.py`."""
+"""Run the commands of docs/gallery.md and keep the pictures that the page shows: `python docs/make_pictures.py`.
 
+It takes some three minutes on two cores. Pictures of web pages need chromium and the extra `test`.
+"""
+
+import os
+import re
+import shlex
+import shutil
 import tempfile
+import time
 from pathlib import Path
 
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from PIL import Image
+from selenium import webdriver
 
-from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.render import detached_figure
-from deepaccident_devkit.render.pictures import save_picture
+from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.cli.demo import SCENARIO
+from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.synth import SynthConfig, make_release
-from deepaccident_devkit.v2x import Link
 
-IMAGES = Path(__file__).parent / "images"
-RELEASE = SynthConfig(scenarios=1, frames=40, image_size=(640, 360), seed=33, view="hidden")
-"""By daylight: Clear, Noon."""
-FRAMES_BEFORE = 8
-HIDDEN_BEFORE = 10
-"""When the house on the corner still hides the other car from the ego."""
+PAGE = Path(__file__).parent / "gallery.md"
+IMAGES = PAGE.parent / "images"
+COMMAND = re.compile(r"^(?: {4})?deepaccident (\S.*)$", re.MULTILINE)
+PICTURE = re.compile(r"\]\(images/(\S+)\)")
+NOT_RUN = "export mcap"
+"""It makes no picture."""
+MADE_ELSEWHERE = ("colour_key.png",)
+WINDOW = "1400,1000"
+"""Pixels."""
+MOVE_ON = """
+const scrubber = document.querySelector('input[type=range]');
+if (scrubber) {
+  scrubber.value = scrubber.max - 5;
+  scrubber.dispatchEvent(new Event('input'));
+}
+"""
 
 
 def main() -> None:
-    IMAGES.mkdir(exist_ok=True)
-    with tempfile.TemporaryDirectory() as folder:
-        release = DeepAccident(dataroot=make_release(Path(folder) / "release", RELEASE, progress=True))
-        scenario = release.scenario[0]
-        render_pictures(release, scenario["token"])
-        release.render_scenario_video(scenario, IMAGES / "accident.webp", what="accident", size=(1024, 576))
+    text = PAGE.read_text(encoding="utf-8")
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        os.chdir(folder)
+        make_demo(folder / "deepaccident_demo")
+        for line in COMMAND.findall(text):
+            if not line.startswith(NOT_RUN):
+                print(f"deepaccident {line}")
+                deepaccident.main(shlex.split(line), standalone_mode=False)
+        for picture in PICTURE.findall(text):
+            if picture not in MADE_ELSEWHERE:
+                keep(picture, folder)
+        os.chdir(PAGE.parent)
 
 
-def save(drawn: Axes | Figure, name: str, *, dpi: float) -> None:
-    """Into docs/images; the resolution keeps each below 250 kB."""
-    save_picture(drawn, IMAGES / f"{name}.png", dpi=dpi)
+def make_demo(folder: Path) -> None:
+    """The accident of `deepaccident demo`, with larger images."""
+    spec = folder / "accident.yaml"
+    write_bytes(spec, SCENARIO.encode())
+    config = SynthConfig(scenarios=1, frames=40, seed=1, image_size=(640, 360), spec=spec)
+    make_release(folder / "release", config, progress=True)
 
 
-def render_pictures(release: DeepAccident, scenario: str) -> None:
-    frames = release.field2token("frame", "scenario_token", scenario)
-    frame = frames[-1 - FRAMES_BEFORE]
-    ego = release.samples_of(frame)[0]
-    save(release.render_frame(frame, fig=detached_figure((18, 6.9))), "five_agents", dpi=64)
-    save(release.render_sample(ego, fig=detached_figure((16, 5.6))), "six_cameras", dpi=72)
+def keep(picture: str, folder: Path) -> None:
+    """Copy a picture into docs/images; where no command made it, it is that of the web page of its name."""
+    made = next(folder.rglob(picture), None) or page_picture(next(folder.rglob(f"{Path(picture).stem}.html")))
+    shutil.copy(made, IMAGES / picture)
+    print(f"{picture}: {made.stat().st_size / 1000:.0f} kB")
 
-    above = detached_figure((6.4, 7)).add_subplot()
-    layers = ("bev", "points", "boxes", "trajectories", "grid")
-    save(release.render_bev(ego, agents="all", view_range=40, layers=layers, ax=above), "from_above", dpi=80)
-    seen = detached_figure((6.4, 7.2)).add_subplot()
-    save(release.render_visibility(frames[-1 - HIDDEN_BEFORE], view_range=40, ax=seen), "who_sees_whom", dpi=80)
 
-    agents = ["ego_vehicle", "other_vehicle"]
-    countdown = release.render_accident(
-        scenario, seconds=(1.0, 0.5, 0.0), agents=agents, fig=detached_figure((10, 7.4))
-    )
-    save(countdown, "countdown", dpi=72)
-    late = Link(latency=0.3, pose_noise=0.5)
-    link = release.render_link(ego, late, agents="all", view_range=40, fig=detached_figure((15, 5.8)))
-    save(link, "link", dpi=72)
+def page_picture(page: Path) -> Path:
+    """What a browser's window shows of a web page; a replay half a second before its end."""
+    options = webdriver.ChromeOptions()
+    for option in ("--headless=new", "--no-sandbox", "--hide-scrollbars", f"--window-size={WINDOW}"):
+        options.add_argument(option)
+    shot = page.with_suffix(".png")
+    with webdriver.Chrome(options) as browser:
+        browser.get(page.as_uri())
+        browser.execute_script(MOVE_ON)
+        time.sleep(1)  # the images are decoded
+        browser.save_screenshot(str(shot))
+    picture = page.with_suffix(".webp")
+    Image.open(shot).convert("RGB").save(picture)
+    return picture
 
 
 if __name__ == "__main__":

@@ -128,7 +128,7 @@ def test_one_bar_names_all_steps_and_ends_full() -> None:
 
 @pytest.mark.slow
 def test_ego_sees_the_crash_coming_and_five_agents_see_it_earlier(tmp_path: Path) -> None:
-    (tmp_path / "accident.yaml").write_text(demo._SCENARIO)
+    (tmp_path / "accident.yaml").write_text(demo.SCENARIO)
     config = replace(demo._RELEASE, scenarios=1, sensors=False, spec=tmp_path / "accident.yaml")
     da = DeepAccident(dataroot=make_release(tmp_path / "release", config, workers=1), verbose=False)
     (accident,) = da.scenario

@@ -171,6 +171,16 @@ def test_the_code_on_evaluating_runs(in_labels_demo: Path, capsys: pytest.Captur
     assert "all numbers are equal" in capsys.readouterr().out
 
 
+def test_the_commands_of_the_gallery_run(da_motion: DeepAccident, in_demo: Path) -> None:
+    """`docs/make_pictures.py` runs them, too, and takes minutes."""
+    (in_demo / "many").symlink_to(da_motion.dataroot, target_is_directory=True)
+    run_page(DOCS / "gallery.md")
+    script = loaded_script("docs/make_pictures.py")
+    for picture in script.PICTURE.findall(script.PAGE.read_text(encoding="utf-8")):
+        page = f"{Path(picture).stem}.html"  # which a browser shows
+        assert picture in script.MADE_ELSEWHERE or [*in_demo.rglob(picture), *in_demo.rglob(page)], picture
+
+
 @pytest.mark.parametrize(
     "choices",
     [

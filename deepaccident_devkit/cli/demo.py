@@ -29,7 +29,7 @@ from deepaccident_devkit.render.evaluation import save_report
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
-_SCENARIO: Final = """\
+SCENARIO: Final = """\
 # The accident of `deepaccident demo`: in clear weather, by day, the other car runs a red light. A house hides it from
 # ego until about 2.5 s before the impact; from then on it is in ego's front camera.
 name: demo
@@ -144,7 +144,7 @@ def _make_release(out: Path, workers: int | None, bar: tqdm[Any]) -> None:
     if root.is_dir():
         return
     if not scenario.exists():
-        write_bytes(scenario, _SCENARIO.encode())
+        write_bytes(scenario, SCENARIO.encode())
     config = replace(_RELEASE, spec=scenario)
     make_release(root, config, workers=workers or 2, progress=lambda share: bar.update(share * _STEPS["recording"]))
 

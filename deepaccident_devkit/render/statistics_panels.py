@@ -121,9 +121,11 @@ def render_angles(histogram: Histogram, *, ax: Axes | None = None) -> Axes:
     middles = [radians((low + high) / 2) for low, high in pairwise(edges)]
     _draw_stacked(histogram, ax, middles, radians(edges[1] - edges[0]))
     ax.set_xticks([radians(angle) for angle in range(0, 360, 30)])
-    ax.set_rlabel_position(15)
     ax.tick_params(labelsize=8)
-    highest = max(1, *histogram.counts[GROUPS[0]])
+    counts = histogram.counts[GROUPS[0]]
+    lowest = min(range(len(counts)), key=lambda bar: counts[bar - 1] + counts[bar])
+    ax.set_rlabel_position(edges[lowest])  # beside the bars
+    highest = max(1, *counts)
     ax.set_ylim(0, highest)
     ax.set_yticks(sorted({-(-highest * part // 3) for part in (1, 2, 3)}))
     ax.set_title(_title(histogram), fontsize=10)

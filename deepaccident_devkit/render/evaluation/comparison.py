@@ -67,17 +67,20 @@ def _draw_differences(ax: Axes, rows: Sequence[tuple[ComparedNumber, float]]) ->
             ax.plot((each.low, each.high), (row, row), color=ESTIMATE_COLOR, linewidth=1.4, marker="|", markersize=7)
         face = ESTIMATE_COLOR if each.real else "white"
         ax.plot(difference, row, "o", markersize=6.5, markerfacecolor=face, markeredgecolor=ESTIMATE_COLOR)
-        better = f", {each.better} is better" if each.better else ""
-        text = f"{difference:+.{_decimals(each)}f}{better}"
-        ax.annotate(text.replace("-", "−"), (1.015, row), xycoords=("axes fraction", "data"), va="center", fontsize=9)
+        text = _text(difference, each, "+") + (f", {each.better} is better" if each.better else "")
+        ax.annotate(text, (1.015, row), xycoords=("axes fraction", "data"), va="center", fontsize=9)
         least = 10.0 ** -_decimals(each)  # smaller differences are none to the reader
         ax.update_datalim([(-least, row), (least, row)])
-    labels = [f"{each.headline}\n{each.a:.{_decimals(each)}f} → {each.b:.{_decimals(each)}f}" for each, _ in rows]
-    ax.set_yticks(range(len(rows)), [label.replace("-", "−") for label in labels], fontsize=9, linespacing=1.15)
+    labels = [f"{each.headline}\n{_text(each.a, each)} → {_text(each.b, each)}" for each, _ in rows]
+    ax.set_yticks(range(len(rows)), labels, fontsize=9, linespacing=1.15)
     ax.set_ylim(len(rows) - 0.5, -0.5)
     ax.margins(x=0.08)
     ax.xaxis.set_major_locator(MaxNLocator(nbins=6))
     with_light_grid(ax, "x")
+
+
+def _text(value: float | None, number: ComparedNumber, sign: str = "") -> str:
+    return "–" if value is None else f"{value:{sign}.{_decimals(number)}f}".replace("-", "−")
 
 
 def _decimals(number: ComparedNumber) -> int:

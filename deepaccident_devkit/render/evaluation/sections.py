@@ -245,7 +245,7 @@ def _cell(headline: Headline | None, group: Group[Any]) -> Markup:
 
 def _interval_text(headline: Headline, group: Group[Any] | None) -> str:
     low, high = (math.nan, math.nan) if group is None else group.intervals.get(headline.path, (math.nan, math.nan))
-    if math.isnan(low) or math.isnan(high):
+    if headline.value is None or math.isnan(low) or math.isnan(high):
         return ""
     digits = 2 if headline.unit == "%" else 3
     return f"{low:.{digits}f} to {high:.{digits}f}"

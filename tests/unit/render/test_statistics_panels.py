@@ -21,8 +21,14 @@ def test_bars_add_up_to_the_counts(statistics: DatasetStatistics) -> None:
     ax = render_histogram(histogram)
     assert sum(bar.get_height() for bar in ax.patches) == sum(histogram.counts["total"])
     assert ax.get_xlabel() == "distance (m)"
-    ax = render_angles(statistics.histograms["collision_angles"])
+    angles = statistics.histograms["collision_angles"]
+    ax = render_angles(angles)
     assert sum(bar.get_height() for bar in ax.patches) == len(statistics.collisions)
+    counts, place = (
+        angles.counts["total"],
+        [edge % 360 for edge in angles.edges].index(round(ax.get_rlabel_position(), 6) % 360),
+    )
+    assert counts[place - 1] + counts[place] == 0  # the numbers of the circles lie beside the bars
     ax = render_relative_positions(statistics.collisions)
     assert sum(len(points.get_offsets()) for points in ax.collections) == len(statistics.collisions)
     assert render_quantiles(statistics.quantiles["box_sizes"], "width").get_ylabel() == "width (m)"
