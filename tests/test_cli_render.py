@@ -19,7 +19,7 @@ from deepaccident_devkit.cli.render import _PICTURES
 from deepaccident_devkit.cli.render_targets import rows_to_draw
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError, TokenError
 from deepaccident_devkit.render import detached_figure, render_bev, render_sample_data
-from deepaccident_devkit.render.pictures import figure_of_pixels, save_picture
+from deepaccident_devkit.render.pictures import figure_of_pixels, save_picture, save_picture
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
 
 SIZE = (480, 480)
@@ -82,7 +82,7 @@ def test_the_picture_is_what_the_function_draws(da: DeepAccident, accident: str,
     render_bev(
         da, sample, agents="+infrastructure", layers=["boxes", "ids", "grid"], view_range=30, ax=fig.add_subplot()
     )
-    fig.savefig(tmp_path / "b.png", dpi=80)
+    save_picture(fig, tmp_path / "b.png", dpi=80)
     np.testing.assert_array_equal(pixels(tmp_path / "a.png"), pixels(tmp_path / "b.png"))
 
 

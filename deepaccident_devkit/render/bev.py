@@ -29,10 +29,10 @@ from deepaccident_devkit.render.colors import (
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import draw_legend, handles_from_above
 from deepaccident_devkit.render.missing import absence_text, has_cloud, is_there, missing_clouds_text, write_missing
-from deepaccident_devkit.render.roles import at_once, collider_ids, recorder_ids, role_colors, short_name
+from deepaccident_devkit.render.roles import at_once, collider_ids, label_ids, recorder_ids, role_colors, short_name
 from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.render.trails import draw_trails
-from deepaccident_devkit.taxonomy import BEV_CAMERA, OWN_ACTOR_ID, AgentName, Frame
+from deepaccident_devkit.taxonomy import BEV_CAMERA, AgentName, Frame
 from deepaccident_devkit.text import settle_choices
 from deepaccident_devkit.v2x import (
     Agents,
@@ -267,10 +267,8 @@ def _draw_marks(dataset: Dataset, record: SampleRecord, frame: str, names: Seque
 
 def _name_pair(dataset: Dataset, record: SampleRecord, boxes: Boxes, ax: Axes, *, named: Collection[AgentName]) -> None:
     """Write who collides: the agents that are not yet `named`, others by their category."""
-    agents = recorder_ids(dataset, record)
-    own = dataset.get("agent", record["agent_token"])["actor_id"]
-    colliders = collider_ids(dataset, record)
-    for row, actor in enumerate(np.where(boxes.actor_id == own, OWN_ACTOR_ID, boxes.actor_id).tolist()):
+    agents, colliders = recorder_ids(dataset, record), collider_ids(dataset, record)
+    for row, actor in enumerate(label_ids(dataset, record, boxes)):
         agent = agents.get(actor)
         if actor in colliders and agent not in named:
             x, y = boxes.center[row, :2].tolist()

@@ -50,14 +50,18 @@ def actor_color(category: str, agent: str | None = None, *, collides: bool = Fal
 def role_colors(dataset: Dataset, sample: RowArgument, boxes: Boxes) -> list[str]:
     """The colours of boxes that are a sample's own (its agent has −100) or several agents' (it has CARLA's id)."""
     record = dataset.get("sample", sample)
-    own = dataset.get("agent", record["agent_token"])["actor_id"]
     colliders, recorders = collider_ids(dataset, record), recorder_ids(dataset, record)
     return [
         actor_color(category, recorders.get(actor), collides=actor in colliders)
-        for actor, category in zip(
-            np.where(boxes.actor_id == own, OWN_ACTOR_ID, boxes.actor_id).tolist(), boxes.category_names, strict=True
-        )
+        for actor, category in zip(label_ids(dataset, record, boxes), boxes.category_names, strict=True)
     ]
+
+
+def label_ids(dataset: Dataset, sample: RowArgument, boxes: Boxes) -> list[int]:
+    """The label ids, in this sample, of boxes that may have CARLA's: the agent itself is −100."""
+    own = dataset.get("agent", dataset.get("sample", sample)["agent_token"])["actor_id"]
+    ids: list[int] = np.where(boxes.actor_id == own, OWN_ACTOR_ID, boxes.actor_id).tolist()
+    return ids
 
 
 def short_name(agent: str) -> str:

@@ -12,7 +12,6 @@ from deepaccident_devkit.arrays import ByteArray
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render.accident import draw_countdown
-from deepaccident_devkit.render.axes import settled
 from deepaccident_devkit.render.bev import BEV_LAYERS, render_bev
 from deepaccident_devkit.render.calibration import CALIBRATION_LAYERS, render_calibration
 from deepaccident_devkit.render.camera import CAMERA_DEFAULT, CAMERA_LAYERS, draw_camera
@@ -94,14 +93,12 @@ def _sample(moment: Moment, fig: Figure) -> object:
 
 def _bev(moment: Moment, fig: Figure) -> object:
     ax = fig.add_subplot()
-    render_bev(moment.dataset, moment.sample, agents=moment.agents, layers=moment.layers, ax=ax)
-    return settled(fig)
+    return render_bev(moment.dataset, moment.sample, agents=moment.agents, layers=moment.layers, ax=ax)
 
 
 def _visibility(moment: Moment, fig: Figure) -> object:
     ax = fig.add_subplot()
-    render_visibility(moment.dataset, moment.sample, agents=moment.agents, layers=moment.layers, ax=ax)
-    return settled(fig)
+    return render_visibility(moment.dataset, moment.sample, agents=moment.agents, layers=moment.layers, ax=ax)
 
 
 def _visibility_matrix(moment: Moment, fig: Figure) -> object:
