@@ -65,13 +65,14 @@ def with_light_grid(ax: Axes, grid: Literal["x", "y", "both"]) -> Axes:
     return ax
 
 
-def settled(fig: Figure) -> Figure:
-    """The figure, laid out once.
+def settled(fig: Figure, passes: int = 1) -> Figure:
+    """The figure, laid out so many times.
 
     matplotlib measures the room for titles and legends before it makes the panels' scales equal, so the room is too
     small. When it lays the figure out again at rendering, it starts from panels that are nearly right.
     """
     engine = fig.get_layout_engine() if fig.figure is fig else None  # a part of a figure is laid out with it
     if engine is not None:
-        engine.execute(fig)
+        for _ in range(passes):
+            engine.execute(fig)
     return fig

@@ -45,6 +45,8 @@ _ASIDE: Final = 0.006
 """Of the width of the view that a line lies to the right of its way, so that two that look at each other have two."""
 _EDGE: Final = 0.05
 """Of half the view, between its edge and a box that has made it larger."""
+_MIDDLE: Final = 0.36
+"""Of the table's width, about: where the middle of the picture is, with the names of actors on the left."""
 _MOST_ROWS: Final = 24
 _BRIGHT: Final = 0.3
 """Relative luminance (as in sRGB) of a colour from which black text on it is easier to read."""
@@ -153,10 +155,11 @@ def render_visibility_matrix(
         _draw_column(known, shown, agent, column, ax)
     names = known.boxes.category_names
     words = [f"{names[row]} {known.boxes.actor_id[row]}" for row in shown.tolist()]
-    ax.set_yticks(range(len(shown)), words, fontsize=8)
+    ax.set_yticks(range(len(shown)), words, fontsize=SMALLEST_TEXT)
     for label, row in zip(ax.get_yticklabels(), shown.tolist(), strict=True):
         label.set_color(COLLIDER_COLOR if known.collides[row] else OWN_COLOR)
-    ax.set_xticks(range(len(columns)), [short_name(agent).replace(" ", "\n") for agent in columns], fontsize=8)
+    heads = [short_name(agent) for agent in columns]
+    ax.set_xticks(range(len(columns)), heads, fontsize=SMALLEST_TEXT, rotation=90)
     ax.xaxis.tick_top()
     ax.set(xlim=(-0.5, len(columns) - 0.5), ylim=(max(len(shown), 1) - 0.5, -0.5))
     ax.tick_params(length=0)
@@ -164,7 +167,7 @@ def render_visibility_matrix(
     more = len(rows) - len(shown)
     key = "filled: the agent sees the actor\nnumber: its LiDAR points, 0: none\n–: not in the agent's label"
     ax.set_xlabel(f"{key}{f'; {more} more actors' if more else ''}", fontsize=SMALLEST_TEXT)
-    set_scene_title(ax, dataset, dataset.get("sample", known.sample)["frame_token"], below="who sees whom")
+    set_scene_title(ax, dataset, dataset.get("sample", known.sample)["frame_token"], below="who sees whom", x=_MIDDLE)
     return ax
 
 
@@ -270,7 +273,7 @@ def _draw_legend(known: Sights, hidden: BoolArray, shown: Collection[Layer], ax:
     if hidden.any():
         handles.append(Patch(facecolor="none", edgecolor=OWN_COLOR, linestyle="--", label=f"{ego} cannot see"))
     place = {"loc": "upper center", "bbox_to_anchor": (0.5, 0), "borderaxespad": 5}
-    draw_legend(ax, handles, columns=4, title="dots above an actor: who sees it", title_fontsize=8, **place)
+    draw_legend(ax, handles, columns=4, title="dots above an actor: who sees it", title_fontsize=SMALLEST_TEXT, **place)
 
 
 def _draw_column(known: Sights, rows: IntArray, agent: str, column: int, ax: Axes) -> None:
@@ -280,7 +283,7 @@ def _draw_column(known: Sights, rows: IntArray, agent: str, column: int, ax: Axe
     for place, row in enumerate(rows.tolist()):
         seen, own = bool(known.seen[row, source]), bool(known.own[row, source])
         if own or not known.annotated[row, source]:
-            ax.text(column, place, "itself" if own else "–", ha="center", va="center", fontsize=8, color=MUTED_COLOR)
+            ax.text(column, place, "itself" if own else "–", ha="center", va="center", fontsize=SMALLEST_TEXT, color=MUTED_COLOR)
             continue
         face, edge = (AGENT_COLORS[agent],) * 2 if seen else ("none", GRID_COLOR)
         ax.add_patch(Rectangle((column - 0.3, place - 0.4), 0.6, 0.8, facecolor=face, edgecolor=edge))
