@@ -197,7 +197,7 @@ def draw_bev(dataset: Dataset, sample: RowArgument, view: BevView, layers: froze
     if "bev" in layers and not (has_ground or shown):
         absent.append(f"{BEV_CAMERA}: {absence_text(dataset, ground)}")
     _draw_marks(dataset, record, view.frame, names, ax)
-    _finish(record, view, grid="grid" in layers, ax=ax)
+    _finish(record, view, shared=len(names) > 1, grid="grid" in layers, ax=ax)
     write_missing(ax, "; ".join(filter(None, absent)))
     return DrawnBev(colors=colored, clouds=shown)
 
@@ -272,14 +272,17 @@ def _name_pair(dataset: Dataset, record: SampleRecord, boxes: Boxes, ax: Axes, *
             write_beside(ax, boxes.category_names[row] if agent is None else short_name(agent), (x, y), COLLIDER_COLOR)
 
 
-def _finish(record: SampleRecord, view: BevView, *, grid: bool, ax: Axes) -> None:
+def _finish(record: SampleRecord, view: BevView, *, shared: bool, grid: bool, ax: Axes) -> None:
     countdown = "" if record["time_to_impact"] is None else f", {record['time_to_impact']:.1f} s to the impact"
     words = axis_words(view.frame)
     ax.set(xlabel=words[0], ylabel=words[1])
-    shared = [] if view.link is None else [link_words(view.link)]
-    shared += [f"{view.sweeps} sweeps"] if view.sweeps > 1 else []
+    made = []
+    if shared and view.link is not None and view.link != Link(seed=view.link.seed):
+        made.append(link_words(view.link))
+    if view.sweeps > 1:
+        made.append(f"{view.sweeps} sweeps")
     title = f"{record['agent']}, t = {record['timestamp']:.1f} s{countdown}"
-    set_title(ax, "\n".join(filter(None, [title, ", ".join(shared)])), fontsize="medium")
+    set_title(ax, "\n".join(filter(None, [title, ", ".join(made)])), fontsize="medium")
     ax.set_axisbelow(True)
     if grid:
         ax.grid(color=GRID_COLOR, linewidth=0.4)
