@@ -154,7 +154,8 @@ def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a 
     names = cooperating_agents(dataset, sample, agents)
     ax = axes_or_new(ax, (6, 6.6))
     drawn = draw_bev(dataset, sample, view, chosen, ax)
-    shared = [] if link is None or link == Link() else [link_words(link)]
+    ideal = link is None or link == Link(seed=link.seed)
+    shared = [] if ideal or len(names) == 1 else [link_words(link)]
     shared += [f"{sweeps} sweeps"] if sweeps > 1 else []
     set_scene_title(ax, dataset, dataset.get("sample", sample)["token"], below=", ".join(shared))
     handles = handles_from_above(drawn.colors, drawn.clouds if len(names) > 1 else ())

@@ -283,7 +283,15 @@ def _draw_column(known: Sights, rows: IntArray, agent: str, column: int, ax: Axe
     for place, row in enumerate(rows.tolist()):
         seen, own = bool(known.seen[row, source]), bool(known.own[row, source])
         if own or not known.annotated[row, source]:
-            ax.text(column, place, "itself" if own else "–", ha="center", va="center", fontsize=SMALLEST_TEXT, color=MUTED_COLOR)
+            ax.text(
+                column,
+                place,
+                "itself" if own else "–",
+                ha="center",
+                va="center",
+                fontsize=SMALLEST_TEXT,
+                color=MUTED_COLOR,
+            )
             continue
         face, edge = (AGENT_COLORS[agent],) * 2 if seen else ("none", GRID_COLOR)
         ax.add_patch(Rectangle((column - 0.3, place - 0.4), 0.6, 0.8, facecolor=face, edgecolor=edge))

@@ -124,6 +124,9 @@ def test_the_receiver_s_own_box_is_where_it_is_and_the_title_says_what_the_link_
     moved = cooperative_boxes(da, approach, agents=both, frame="ego", link=link)
     sent = moved.select(moved.actor_id == da.get("agent", approach.replace("/003", ""))["actor_id"])
     assert np.linalg.norm(sent.center[0, :2] - own.center[0, :2]) > 1  # where the partner's message has it
+    without = render_bev(da, approach, agents=both, link=Link(seed=3), ax=new_axes())
+    assert without.get_title() == render_bev(da, approach, link=link, ax=new_axes()).get_title()
+    assert "latency" not in without.get_title()
     assert ax.get_title().rstrip().endswith("\nlatency 0.2 s, poses off by 2 m (σ 0 m), 2 sweeps")
 
 

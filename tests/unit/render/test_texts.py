@@ -12,6 +12,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.render import detached_figure, style
 from deepaccident_devkit.render.accident import draw_countdown
 from deepaccident_devkit.taxonomy import AGENTS
+from deepaccident_devkit.v2x import Link
 
 DRAWN = ("boxes", "trajectories", "grid")
 """Layers of releases without sensor files."""
@@ -37,6 +38,11 @@ VIEWS: dict[str, Callable[[DeepAccident, Any], Any]] = {
     "labels trail": lambda da, scenario: da.render_motion_labels(ego(scenario), style="trail"),
     "sample": lambda da, scenario: da.render_sample(ego(scenario), layers=["boxes"]),
     "camera": lambda da, scenario: da.render_sample_data(f"{ego(scenario)}/Camera_Front", layers=["boxes"]),
+    "bev": lambda da, scenario: da.render_bev(ego(scenario), agents="all", layers=["boxes", "ids"]),
+    "link": lambda da, scenario: da.render_link(ego(scenario), Link(latency=0.1, pose_noise=0.5)),
+    "pointcloud": lambda da, scenario: da.render_pointcloud_in_image(f"{ego(scenario)}/Camera_Front"),
+    "visibility": lambda da, scenario: da.render_visibility(scenario["last_frame_token"]),
+    "visibility matrix": lambda da, scenario: da.render_visibility_matrix(scenario["last_frame_token"]),
     "lidar": lambda da, scenario: da.render_sample_data(f"{ego(scenario)}/lidar01", layers=["boxes"]),
 }
 
