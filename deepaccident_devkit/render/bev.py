@@ -154,10 +154,10 @@ def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a 
     names = cooperating_agents(dataset, sample, agents)
     ax = axes_or_new(ax, (6, 6.6))
     drawn = draw_bev(dataset, sample, view, chosen, ax)
-    ideal = link is None or link == Link(seed=link.seed)
-    shared = [] if ideal or len(names) == 1 else [link_words(link)]
-    shared += [f"{sweeps} sweeps"] if sweeps > 1 else []
-    set_scene_title(ax, dataset, dataset.get("sample", sample)["token"], below=", ".join(shared))
+    made = [f"{sweeps} sweeps"] if sweeps > 1 else []
+    if link is not None and link != Link(seed=link.seed) and len(names) > 1:
+        made.insert(0, link_words(link))
+    set_scene_title(ax, dataset, dataset.get("sample", sample)["token"], below=", ".join(made))
     handles = handles_from_above(drawn.colors, drawn.clouds if len(names) > 1 else ())
     draw_legend(ax, handles, columns=5, loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=5)
     return ax

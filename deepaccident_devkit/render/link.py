@@ -189,4 +189,4 @@ def _shift_words(shared: SharedBoxes) -> str:
     if not len(start):
         return f"{name}: no box in common"
     apart = np.linalg.norm(end - start, axis=1)
-    return f"{name}: {len(apart)} boxes\noff by {apart.mean():.2f} m, at most {apart.max():.2f} m"
+    return f"{name}: {len(apart)} boxes\noff by {apart.mean():.2f} m\n(at most {apart.max():.2f} m)"

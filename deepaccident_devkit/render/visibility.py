@@ -165,8 +165,8 @@ def render_visibility_matrix(
     ax.tick_params(length=0)
     ax.spines[:].set_visible(False)
     more = len(rows) - len(shown)
-    key = "filled: the agent sees the actor\nnumber: its LiDAR points, 0: none\n–: not in the agent's label"
-    ax.set_xlabel(f"{key}{f'; {more} more actors' if more else ''}", fontsize=SMALLEST_TEXT)
+    key = ["filled: the agent sees the actor", "number: its LiDAR points, 0: none", "–: not in the agent's label"]
+    ax.set_xlabel("\n".join([*key, *([f"{more} more actors"] if more else [])]), fontsize=SMALLEST_TEXT)
     set_scene_title(ax, dataset, dataset.get("sample", known.sample)["frame_token"], below="who sees whom", x=_MIDDLE)
     return ax
 

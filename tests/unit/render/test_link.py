@@ -43,7 +43,7 @@ def test_arrows_are_as_long_as_the_poses_are_off(da_motion: DeepAccident) -> Non
         assert np.linalg.norm(true.center[:, :2] - place, axis=1).min() < 1e-9
     assert_allclose(np.hypot(found.U, found.V), 0.5, atol=2.5e-3)  # the agents may stand on a slope, 10 % at most
     assert ax.get_title().startswith("other: ")
-    assert ax.get_title().endswith("\noff by 0.50 m, at most 0.50 m")
+    assert ax.get_title().endswith("\noff by 0.50 m\n(at most 0.50 m)")
     hues = {to_hex(color) for each in ax.collections for color in each.get_edgecolor()}
     assert {AGENT_COLORS["other_vehicle"], TRUE_PLACE_COLOR} <= hues
     assert legend(figure)[-1] == "the error"
