@@ -66,6 +66,8 @@ RUN_ELSEWHERE = {
 STAND_FOR = {
     "DATAROOT": "deepaccident_demo/release",
     "FILE": "deepaccident_demo/release/type1_subtype1_accident/meta/Town10HD_type001_subtype0001_scenario00001.txt",
+    "LABEL": "deepaccident_demo/release/type1_subtype1_accident/ego_vehicle/label/"
+    "Town10HD_type001_subtype0001_scenario00001/Town10HD_type001_subtype0001_scenario00001_001.txt",
     "OUT": "out",
 }
 """What the words in capitals of a command line may be."""

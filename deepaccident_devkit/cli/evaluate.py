@@ -18,6 +18,7 @@ from deepaccident_devkit.cli.evaluate_options import (
 )
 from deepaccident_devkit.cli.options import WordChoice, refuse_unused, release_parameters
 from deepaccident_devkit.deepaccident import DeepAccident
+from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.metrics.attributes import ATTRIBUTES, EVERYTHING, attribute_name
 from deepaccident_devkit.evaluation.metrics.warning import FieldWarnings
@@ -73,6 +74,14 @@ def _threshold_options(task: TaskName) -> Callable[[Callable[..., Any]], Callabl
     return lambda verb: options[0](options[1](verb))
 
 
+def _attributes(context: click.Context, parameter: click.Parameter, names: tuple[str, ...]) -> tuple[str, ...]:
+    """The attributes that repeated --by names."""
+    try:
+        return tuple(map(attribute_name, names))
+    except ChoiceError as error:
+        raise click.BadParameter(str(error), context, parameter) from error
+
+
 def _task_verb(task: TaskName) -> click.Command:
     """The verb of one task."""
     protocols = list(TASK_PROTOCOLS[task])
@@ -109,7 +118,7 @@ def _task_verb(task: TaskName) -> click.Command:
     @click.option(
         "--by",
         multiple=True,
-        callback=lambda _context, _parameter, names: tuple(map(attribute_name, names)),
+        callback=_attributes,
         metavar="NAME",
         help="Also give the numbers for each value of this attribute; you can repeat this option. One of "
         f"{', '.join(ATTRIBUTES)}.",

@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.render import detached_figure
+from deepaccident_devkit.render.axes import settled
 from deepaccident_devkit.render.chips import keep_free, place_chips
 from deepaccident_devkit.render.colors import MUTED_COLOR
 from deepaccident_devkit.v2x import Link, PoseNoise
@@ -99,7 +100,7 @@ def test_in_twelve_scenes_no_words_are_cut_and_no_two_cover_each_other(da: DeepA
     for number in np.random.default_rng(0).permutation(len(samples))[:12]:
         fig: Any = detached_figure((6, 6.9) if name != "link" else (9, 10))
         VIEWS[name](da, samples[number], fig)
-        fig.draw_without_rendering()
+        settled(fig, passes=2).draw_without_rendering()  # as it is saved
         for ax in fig.axes:
             chips = shown(ax)
             assert not any(cover(one, other) for one, other in combinations(chips, 2))

@@ -53,7 +53,7 @@ def test_a_frame_shows_its_agents_in_their_order(da: DeepAccident, frame: str) -
     assert plt.get_fignums() == []
 
 
-@pytest.mark.parametrize(("size", "least"), [((12.8, 7.2), 290), ((12.8, 4.48), 240)])
+@pytest.mark.parametrize(("size", "least"), [((12.8, 7.2), 290), ((12.8, 4.48), 235)])
 def test_a_shared_moment_has_large_cameras_and_one_view_from_above_of_all_agents(
     da: DeepAccident, frame: str, size: tuple[float, float], least: float
 ) -> None:
