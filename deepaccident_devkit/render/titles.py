@@ -22,8 +22,8 @@ _TITLE_SHARE: Final = 0.92
 """Of a figure's width that a title may take."""
 _LEAST_SHRINKING: Final = 0.85
 """How small letters may become, by size, before a title is broken into lines."""
-_PANEL_SHARE: Final = 0.82
-"""Of a panel's width: what is beside the axes moves their title to one side."""
+_PANEL_SHARE: Final = 0.78
+"""Of a panel's width: what is beside the axes moves their title to one side, and few pixels make letters wider."""
 _TOKEN_TEXT: Final = 7.5
 """Points of a token's letters: it is there to be copied, not to be read."""
 _GID: Final = "token"
