@@ -18,7 +18,7 @@ def text_faults(figure: Any) -> list[str]:
 
     A token may be small, and is in the room that its title has for it.
     """
-    FigureCanvasAgg(settled(figure, passes=2)).draw()  # as it is saved
+    FigureCanvasAgg(settled(figure, passes=3)).draw()  # as it is saved
     texts = [text for text in _drawn(figure) if text.get_visible() and text.get_text().strip()]
     page = figure.bbox.padded(TOUCHING)
     boxes = [(text, text.get_window_extent().padded(-TOUCHING)) for text in texts if text.get_gid() != "token"]

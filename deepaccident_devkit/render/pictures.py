@@ -74,5 +74,5 @@ def write_figure(figure: Figure, path: Path, *, dpi: float, words: dict[str, Any
     """
     kind = path.suffix[1:].lower()
     with replacing(path) as temporary:
-        settled(figure, passes=2).savefig(temporary, format=kind, dpi=dpi, metadata=_UNDATED.get(kind, words))
+        settled(figure, passes=3).savefig(temporary, format=kind, dpi=dpi, metadata=_UNDATED.get(kind, words))
     return path

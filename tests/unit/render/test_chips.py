@@ -100,7 +100,7 @@ def test_in_twelve_scenes_no_words_are_cut_and_no_two_cover_each_other(da: DeepA
     for number in np.random.default_rng(0).permutation(len(samples))[:12]:
         fig: Any = detached_figure((6, 6.9) if name != "link" else (9, 10))
         VIEWS[name](da, samples[number], fig)
-        settled(fig, passes=2).draw_without_rendering()  # as it is saved
+        settled(fig, passes=3).draw_without_rendering()  # as it is saved
         for ax in fig.axes:
             chips = shown(ax)
             assert not any(cover(one, other) for one, other in combinations(chips, 2))
