@@ -107,12 +107,16 @@ def draw_boxes_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: S
 
     pixels, row, edge = _edges_in_image(boxes, camera)
     faces = to_rgba_array(list(colors))
-    ax.add_collection(LineCollection(list(pixels), **{"colors": faces[row], "linewidths": 1.2, **how}))
+    if not len(row):
+        return
+    lines = LineCollection(list(pixels), **{"colors": faces[row], "linewidths": 1.2, **how})
+    ax.add_collection(lines, autolim=False)  # the image has set the limits
     faces[:, 3] *= 0.25
     front = edge < 4  # going round, the ends of what is left of the edges are the corners of what is left of the face
     rows, starts = np.unique(row[front], return_index=True)
     fronts = np.split(pixels[front].reshape(-1, 2), 2 * starts[1:])
-    ax.add_collection(PolyCollection(fronts if len(rows) else [], facecolors=faces[rows], edgecolors="none"))
+    filled = PolyCollection(fronts if len(rows) else [], facecolors=faces[rows], edgecolors="none")
+    ax.add_collection(filled, autolim=False)
 
 
 def boxes_in_image(boxes: Boxes, camera: PinholeCamera) -> BoolArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from typing import TYPE_CHECKING, Any, Final, get_args
+from typing import TYPE_CHECKING, Any, Final, cast, get_args
 
 import numpy as np
 
@@ -92,7 +92,7 @@ def render_visibility(
     if view_range is not None:
         check_view_range(view_range)
     known = sights(dataset, moment, agents, frame)
-    ax = axes_or_new(ax, (6, 6.9))
+    own_figure, ax = ax is None, axes_or_new(ax, (6, 6.9))
     low, high = _view(known, view_range)
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", anchor="N")
     words = axis_words(frame)
@@ -118,8 +118,8 @@ def render_visibility(
     _draw_legend(known, hidden, shown, ax)
     if "grid" in shown:
         with_light_grid(ax, "both")
-    figure: Any = ax.figure
-    settled(figure)
+    if own_figure:
+        settled(cast("Any", ax.figure))
     return ax
 
 
