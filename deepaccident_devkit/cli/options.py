@@ -152,7 +152,7 @@ def frame_range_parameter(verb: Verb) -> Verb:
         "frames",
         callback=_frame_range,
         metavar="FIRST..LAST",
-        help="Only these frames of a scenario, counted from 1.  [default: all]",
+        help="Only these frames of a scenario, counted from 1.",
     )
     return option(verb)
 
