@@ -26,6 +26,7 @@ from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.render import detached_figure, render_replay
 from deepaccident_devkit.render.evaluation import save_report
+from deepaccident_devkit.render.pictures import save_picture
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
@@ -109,7 +110,7 @@ def draw_accident(release: DeepAccident, out: Path) -> None:
         ((11.0, 12.0), labels, ego),
     )
     for name, (size, render, record) in zip(PICTURES, drawings, strict=True):
-        render(record, fig=detached_figure(size)).savefig(out / name, dpi=80)
+        save_picture(render(record, fig=detached_figure(size)), out / name, dpi=80)
 
 
 @contextmanager

@@ -186,7 +186,7 @@ def draw_shared_moment(
     view = BevView(view_range=reach, frame="world", agents=tuple(names), center=(x, y))
     above = fig.add_subplot(grid[:, 0])
     drawn = draw_bev(dataset, moments[0], view, from_above, above)
-    above.set(title="", anchor="C")
+    above.set_anchor("C")
     handles = handles_from_above(drawn.colors, drawn.clouds if len(names) > 1 else ())
     draw_legend(fig, handles, columns=len(handles), loc="outside lower center")
     set_scene_title(fig, dataset, record["token"])
