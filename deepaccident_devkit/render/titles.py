@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from deepaccident_devkit.dataset import Dataset
@@ -99,6 +100,8 @@ def set_title(
     # blank lines keep the room for the token, so that the layout need not know of it
     blank = math.ceil(small_size * (small.count("\n") + 1) / size) if small else 0
     text += "\n " * blank
+    if panel:
+        style.setdefault("y", 1.0)  # matplotlib measures all ticks, again and again, to find a title's height
     title = drawn.set_title(text, fontsize=size, **style) if panel else drawn.suptitle(text, fontsize=size, **style)
     _write_token(where, small, small_size, title)
 
@@ -158,6 +161,16 @@ def _longest(text: str, font: FontProperties) -> float:
 
 def text_width(text: str, font: FontProperties) -> float:
     """Points of a line."""
+    from matplotlib.font_manager import findfont
+
+    return _width_in(findfont(font), text, font.get_size_in_points())
+
+
+@lru_cache(maxsize=1024)  # a video writes the same words again and again
+def _width_in(file: str, text: str, size: float) -> float:
+    """Points of a line in a font's file."""
+    from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import text_to_path
 
+    font = FontProperties(fname=file, size=size)
     return float(text_to_path.get_text_width_height_descent(text, font, ismath=False)[0]) if text else 0.0

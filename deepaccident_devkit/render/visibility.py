@@ -167,7 +167,8 @@ def render_visibility_matrix(
     more = len(rows) - len(shown)
     key = ["filled: the agent sees the actor", "number: its LiDAR points, 0: none", "–: not in the agent's label"]
     ax.set_xlabel("\n".join([*key, *([f"{more} more actors"] if more else [])]), fontsize=SMALLEST_TEXT)
-    set_scene_title(ax, dataset, dataset.get("sample", known.sample)["frame_token"], below="who sees whom", x=_MIDDLE)
+    above: dict[str, Any] = {"x": _MIDDLE, "y": None}  # above the heads of the columns
+    set_scene_title(ax, dataset, dataset.get("sample", known.sample)["frame_token"], below="who sees whom", **above)
     return ax
 
 
