@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from deepaccident_devkit.errors import IndexStoreError, VersionError
+from deepaccident_devkit.files import temporary_of
 from deepaccident_devkit.tables.index import index_folders
 from deepaccident_devkit.tables.indexing import (
     MARK_FILE,
@@ -119,9 +120,7 @@ def _is_own(path: Path) -> bool:
         return False
     if path.is_dir():
         return name == SHARDS_FOLDER or name.startswith((TABLES_PREFIX, f".{TABLES_PREFIX}"))
-    return name in (MANIFEST_FILE, MARK_FILE, LOCK_FILE) or (
-        name.startswith(f".{MANIFEST_FILE}.") and name.endswith(".tmp")
-    )
+    return name in (MANIFEST_FILE, MARK_FILE, LOCK_FILE) or temporary_of(name) == MANIFEST_FILE
 
 
 def _remove(folder: Path) -> Cleared:

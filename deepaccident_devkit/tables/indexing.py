@@ -3,7 +3,6 @@
 import hashlib
 import shutil
 from collections.abc import Iterator, Sequence
-from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -245,7 +244,7 @@ def _marked_unfinished(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def _store_errors(folder: Path) -> Iterator[None]:
-    """Turn errors of files and workers into errors that name the folder and the remedy."""
+    """Turn errors of files into errors that name the folder and the remedy."""
     import pyarrow as pa
 
     try:
@@ -255,6 +254,3 @@ def _store_errors(folder: Path) -> Iterator[None]:
     except (OSError, pa.ArrowException) as error:
         remedy = "make room there or give another index_dir="
         raise IndexStoreError(f"{folder}: the index cannot be written ({error}); {remedy}") from error
-    except BrokenExecutor as error:
-        remedy = "if memory ran out, give fewer workers="
-        raise IndexStoreError(f"{folder}: a process that made the index was killed ({error}); {remedy}") from error
