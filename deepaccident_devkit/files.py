@@ -45,7 +45,7 @@ _TEMPORARY: Final = re.compile(
     r"\.(?P<name>.+?)\.(?:(?P<host>[0-9a-f]{8})-(?P<process>[1-9]\d{0,9})-(?P<start>\d+)-)?\d+\.tmp(?:\.\w+)?",
     re.DOTALL,
 )
-"""A temporary name. Earlier devkits wrote `.NAME.PROCESS.tmp`; a library may add the suffix that it writes by."""
+"""A temporary name. Earlier versions wrote `.NAME.PROCESS.tmp`; a library may add the suffix that it writes by."""
 _NUMBERS: Final = itertools.count()
 _NAME_LENGTH: Final = 50
 """Characters of the final name that a temporary name has: names of files end at 255 bytes."""
@@ -96,7 +96,7 @@ def remove_leftovers(folder: Path) -> None:
     """Remove the temporary files and folders of dead writers; what cannot be removed is left to the next time.
 
     A writer on this host is dead if no process has its number and its start time; one on another host if nothing was
-    changed for a day. A name without a host, as earlier devkits gave, may be another program's, and is left.
+    changed for a day. A name without a host, as earlier versions gave, may be another program's, and is left.
     """
     with suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:

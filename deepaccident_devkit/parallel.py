@@ -121,9 +121,10 @@ def _on(
 
 @contextmanager
 def _own_workers(count: int) -> Iterator[Executor]:
-    """A pool of spawned processes: an error lets them end what they do, an interruption does not.
+    """A pool of spawned processes: an error of an item lets the others end what they do; all else ends them at once.
 
-    It cancels what has not begun by itself: if others did and a process was killed, a thread of the pool would fail.
+    The pool itself cancels what has not begun: if others did and a process was killed, a thread of it would fail. If
+    one is killed while another begins, the pool would wait for that one for ever.
     """
     import multiprocessing
     from concurrent.futures import ProcessPoolExecutor
@@ -131,13 +132,12 @@ def _own_workers(count: int) -> Iterator[Executor]:
     pool = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_worker)
     try:
         yield pool
-    except Exception:
-        pool.shutdown(cancel_futures=True)
-        raise
-    except BaseException:  # Ctrl-C, or the generator was closed
-        for process in list((pool._processes or {}).values()):  # noqa: SLF001 - public from Python 3.14
-            process.kill()
-        pool.shutdown(wait=False)
+    except BaseException as error:
+        of_an_item = isinstance(error, Exception) and not isinstance(error, WorkerError)
+        if not of_an_item:  # a killed worker, Ctrl-C, or the generator was closed
+            for process in list((pool._processes or {}).values()):  # noqa: SLF001 - public from Python 3.14
+                process.kill()
+        pool.shutdown(wait=of_an_item, cancel_futures=of_an_item)
         raise
     pool.shutdown()
 

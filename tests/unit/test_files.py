@@ -70,7 +70,8 @@ def test_threads_that_write_one_picture(tmp_path: Path) -> None:
     with ThreadPoolExecutor(24) as threads:
         list(threads.map(save, range(48)))
     assert names(tmp_path / "new") == ["picture.png"]
-    assert Image.open(tmp_path / "new" / "picture.png").size == (50, 50)
+    with Image.open(tmp_path / "new" / "picture.png") as picture:
+        assert picture.size == (50, 50)
 
 
 def test_a_name_says_of_what_and_by_whom() -> None:
