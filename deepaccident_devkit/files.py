@@ -126,7 +126,7 @@ def _is_abandoned(entry: os.DirEntry[str]) -> bool:
     found = _TEMPORARY.fullmatch(entry.name)
     if found is None or found["host"] is None:
         return False
-    if found["host"] != _host() or os.name != "posix":  # elsewhere asking for a process may end it
+    if found["host"] != _host():
         return time.time() - entry.stat(follow_symlinks=False).st_mtime > _ABANDONED_AFTER
     return not _is_running(int(found["process"]), found["start"])
 

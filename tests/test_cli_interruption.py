@@ -224,3 +224,21 @@ def test_a_second_signal_ends_at_once() -> None:
         process.wait(timeout=ALLOWED)
         assert time.monotonic() - begin < 1.2
         assert process.returncode == 143
+
+
+def test_other_signals_end_nothing() -> None:
+    """Such as that of a terminal whose size changes."""
+    script = """
+        import signal, time
+        from deepaccident_devkit.cli.interruption import run_interruptibly
+
+        def verb():
+            signal.signal(signal.SIGUSR1, lambda *_: None)
+            signal.raise_signal(signal.SIGUSR1)
+            time.sleep(1.8)
+            print("whole")
+
+        run_interruptibly(verb)
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("whole\n", "")

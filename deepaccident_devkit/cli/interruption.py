@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from typing import Any, Final, NoReturn
 
+_ENDING: Final = (signal.SIGINT, signal.SIGTERM)
 _LINE: Final = b"interrupted; no file is half-written, and the same command can be run again\n"
 _TIDYING_SECONDS: Final = 1.5
 """Time for the verb to remove its temporary files; then the process ends as it is."""
@@ -35,7 +36,7 @@ class _Signals:
         os.set_blocking(writing, False)
         signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
         threading.Thread(target=self._watch, args=(reading,), name="signals", daemon=True).start()
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in _ENDING:
             signal.signal(number, self._handle)
 
     def verb_ended(self) -> None:
@@ -52,7 +53,9 @@ class _Signals:
             _end_now(number)
 
     def _watch(self, reading: int) -> None:
-        number = os.read(reading, 1)[0]
+        number = 0
+        while number not in _ENDING:  # a library may handle others
+            number = os.read(reading, 1)[0]
         time.sleep(_TIDYING_SECONDS)
         _end_now(number)
 

@@ -62,6 +62,7 @@ def make_index(
     Raises:
         IndexStoreError: something cannot be written; the index that was there stays as it was.
         SplitFileError: a split file cannot be read.
+        WorkerError: a worker was killed.
     """
     splits = assign_splits(layout)
     candidates = [scenario for scenario in layout.scenarios if scenario.token not in splits.problems]

@@ -9,9 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
-import time
 import zipfile
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
@@ -20,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny
+from processes import wait_for
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, LabelFilesError, NotAvailableError, TokenError
@@ -695,13 +694,6 @@ class TestStops:
         tokens = {token for purpose in purposes for token in da_motion.samples("train", purpose)}
         write(da_motion, tmp_path / "fresh", sorted(tokens))
         assert contents(tmp_path / "labels") == contents(tmp_path / "fresh")
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.001)
 
 
 def test_a_disk_that_fails_while_writing_is_our_error(tmp_path: Path) -> None:
