@@ -1,5 +1,8 @@
 """Predictions beside labels, with the verdict of a protocol."""
 
+from contextlib import nullcontext
+from typing import Any
+
 import numpy as np
 import pytest
 from drawing import title_of
@@ -7,6 +10,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex
 from matplotlib.contour import ContourSet
 from numpy.testing import assert_allclose
+from picture_texts import text_faults
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError
@@ -21,7 +25,7 @@ from deepaccident_devkit.evaluation import (
 from deepaccident_devkit.evaluation.metrics.accident.compared import compared_accidents
 from deepaccident_devkit.evaluation.metrics.accident.evaluator import PROTOCOLS
 from deepaccident_devkit.motion import MotionLabels
-from deepaccident_devkit.render import detached_figure
+from deepaccident_devkit.render import detached_figure, style
 from deepaccident_devkit.render.colors import COLLIDER_COLOR
 from deepaccident_devkit.render.outcomes.accident import verdict_words
 from deepaccident_devkit.render.outcomes.evaluation import render_evaluation
@@ -35,7 +39,7 @@ def test_accidents_have_their_metres_and_verdict(da_motion: DeepAccident, sample
     figure = render_evaluation(da_motion, sample, [near], fig=detached_figure((10, 6)))
     left, right = figure.axes
     assert title_of(figure).endswith("accident: 5 m: FP + FN, 10 m: TP, 15 m: TP")
-    assert right.get_title() == f"an accident comes in {true.time:.1f} s; foreseen 6.0 m off in sum, +0.5 s"
+    assert right.get_title() == f"an accident comes in {true.time:.1f} s;\nforeseen 6.0 m off in sum, +0.5 s"
     assert [text.get_text() for text in right.texts] == [f"in {near.time:.1f} s, score 0.9", "3.0 m", "3.0 m"]
     assert_allclose(left.lines[0].get_xydata(), true.positions)
     assert_allclose(right.lines[1].get_xydata(), near.positions)
@@ -95,3 +99,16 @@ def test_the_pair_that_collides_is_red_in_every_task(
         edges = [each for each in left.collections if isinstance(each, (ContourSet, PolyCollection))]
         red = [color for each in edges for color in each.get_edgecolor() if to_hex(color) == COLLIDER_COLOR]
         assert len(red) == 2
+
+
+@pytest.mark.parametrize("where", [None, "paper"])
+def test_words_are_in_the_picture_and_apart(
+    da_motion: DeepAccident, sample: str, labels: MotionLabels, where: Any
+) -> None:
+    boxes, accident = da_motion.boxes(sample), box_truth(da_motion, sample).accident
+    assert accident is not None
+    near = Accident(positions=accident.positions + 1.5, time=accident.time, score=0.9)
+    detected = DetectedBoxes(boxes=boxes, scores=np.ones(len(boxes)))
+    for prediction in (detected, [accident], [near], [], instances_of(labels.instance, labels.config.grid)):
+        with style(where) if where else nullcontext():
+            assert text_faults(render_evaluation(da_motion, sample, prediction)) == []
