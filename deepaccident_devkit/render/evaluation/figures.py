@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _DPI: Final = 160
-_ROW: Final = 0.4
+_ROW: Final = 0.38
 """The least height of a bar in inches."""
-_AROUND_BARS: Final = 1.2
+_AROUND_BARS: Final = 1.1
 """Inches of a title, ticks and labels."""
 _GID: Final = "token"
 """Marks what a figure is made of: words to be copied, not to be read, may be small."""

@@ -14,8 +14,8 @@ from deepaccident_devkit.render.colors import ESTIMATE_COLOR, MUTED_COLOR
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-PANEL: Final = (5.2, 3.9)
-"""Width and height of one panel in inches: a printed report has two side by side."""
+PANEL: Final = (5.2, 3.0)
+"""Width and height of one panel in inches: a page of a printed report has two rows of two."""
 _BESIDE: Final = 1.3
 """The axis' length in lengths of the longest bar, so that the words beside the bars have room."""
 

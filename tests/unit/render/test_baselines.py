@@ -59,6 +59,7 @@ def test_panels_share_a_title_and_a_legend() -> None:
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["single", "all"]
 
 
+@pytest.mark.slow
 def test_words_of_all_configurations_are_apart() -> None:
     bars = replace(BARS, values=dict.fromkeys(AGENT_CONFIGS, BARS.values["all"]))
     lines = replace(LINES, values=dict.fromkeys(AGENT_CONFIGS, LINES.values["all"]))

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from drawing import title_of
+from matplotlib import pyplot as plt
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex
 from matplotlib.contour import ContourSet
@@ -101,14 +102,34 @@ def test_the_pair_that_collides_is_red_in_every_task(
         assert len(red) == 2
 
 
+def faults_of_predictions(dataset: DeepAccident, token: str) -> list[str]:
+    """What is wrong with the words of detections, and of accidents that are foreseen exactly, nearly and not at all."""
+    boxes, accident = dataset.boxes(token), box_truth(dataset, token).accident
+    assert accident is not None
+    near = Accident(positions=accident.positions + 1.5, time=accident.time, score=0.9)
+    detected = DetectedBoxes(boxes=boxes, scores=np.ones(len(boxes)))
+    faults = []
+    for given in (detected, [accident], [near], []):
+        picture = render_evaluation(dataset, token, given)
+        faults += text_faults(picture)
+        plt.close(picture)
+    return faults
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("where", [None, "paper"])
 def test_words_are_in_the_picture_and_apart(
     da_motion: DeepAccident, sample: str, labels: MotionLabels, where: Any
 ) -> None:
-    boxes, accident = da_motion.boxes(sample), box_truth(da_motion, sample).accident
-    assert accident is not None
-    near = Accident(positions=accident.positions + 1.5, time=accident.time, score=0.9)
-    detected = DetectedBoxes(boxes=boxes, scores=np.ones(len(boxes)))
-    for prediction in (detected, [accident], [near], [], instances_of(labels.instance, labels.config.grid)):
-        with style(where) if where else nullcontext():
-            assert text_faults(render_evaluation(da_motion, sample, prediction)) == []
+    with style(where) if where else nullcontext():
+        assert faults_of_predictions(da_motion, sample) == []
+        output = instances_of(labels.instance, labels.config.grid)
+        assert text_faults(render_evaluation(da_motion, sample, output)) == []
+
+
+@pytest.mark.slow
+def test_words_of_twelve_scenes_are_apart(da_designs: DeepAccident) -> None:
+    tokens = [f"{scenario['token']}/ego_vehicle/001" for scenario in da_designs.scenario if scenario["collision"]]
+    assert len(tokens) == 12
+    found = {token: faults_of_predictions(da_designs, token) for token in tokens}
+    assert {token: faults for token, faults in found.items() if faults} == {}
