@@ -118,9 +118,8 @@ def draw_boxes_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: S
         lines = LineCollection(list(pixels), **{"colors": faces[row], "linewidths": _EDGE, **how})
         ax.add_collection(lines, autolim=False)  # the image has set the limits
         faces[:, 3] *= 0.25
-        front = (
-            edge < 4
-        )  # going round, the ends of what is left of the edges are the corners of what is left of the face
+        # going round, the ends of what is left of the edges are the corners of what is left of the face
+        front = edge < 4
         rows, starts = np.unique(row[front], return_index=True)
         fronts = np.split(pixels[front].reshape(-1, 2), 2 * starts[1:])
         filled = PolyCollection(fronts if len(rows) else [], facecolors=faces[rows], edgecolors="none")

@@ -164,6 +164,7 @@ def draw_camera_boxes(
         The colours of the rendered boxes that are in the image.
     """
     lens = camera_of(dataset, camera)
+    boxes = boxes.select(np.argsort(-boxes.center[:, 2]))  # the nearest are on top
     colors = role_colors(dataset, camera["sample_token"], boxes)
     drawn: frozenset[str] = frozenset()
     if "boxes" in layers:

@@ -50,8 +50,8 @@ _CROSS: Final = 9.0
 """Points: the size of the cross at the place of contact."""
 _EDGE: Final = 0.01
 """Share of a panel's width and height that the places of tags keep to its edges."""
-_FREE: Final = 0.3
-"""Share of an image's height, at the top, in which tags may cover a car: it may fill the image."""
+_FREE: Final = 22.0
+"""Points, about, at the top of an image in which tags may cover a car: it may fill the image."""
 _HIDDEN: Final = (0, (3, 2))
 
 
@@ -218,7 +218,9 @@ def _write_tags_in_image(pair: Pair, actors: list[int], bounds: FloatArray, ax: 
     places = np.column_stack([cars[..., 0].mean(axis=1), cars[:, 0, 1]])
     if len(cars) > 1:
         places[:, 0] = cars[0, 0, 0], cars[1, 1, 0]
-    cars[..., 1] = cars[..., 1].clip(top + _FREE * (bottom - top))
+    free = top + (bottom - top) * min(0.5, _FREE * ax.figure.dpi / 72 / ax.bbox.height)
+    places[places[:, 1] < free, 1] = top
+    cars[..., 1] = cars[..., 1].clip(free)
     _write_tags([pair.tags[actors[row]] for row in shown.tolist()], places, ax)
     keep_free(ax, cars)
 
