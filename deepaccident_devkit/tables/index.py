@@ -25,6 +25,7 @@ from typing import get_args
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import BrokenReleaseError, DatarootError, IndexStoreError
 from deepaccident_devkit.files import is_writable_folder
+from deepaccident_devkit.reading import RefusedFileError, fault_text, limit_of
 from deepaccident_devkit.release import ReleaseLayout
 from deepaccident_devkit.tables.indexing import is_unfinished, make_index
 from deepaccident_devkit.tables.locking import index_lock
@@ -87,9 +88,11 @@ def open_index(
     Raises:
         BrokenReleaseError: some scenarios are broken and `on_error` is `raise`, or all of them are.
         DatarootError: no scenario has any file.
-        IndexStoreError: the index cannot be written, or is a newer devkit's.
+        IndexStoreError: the index cannot be written, or is a newer devkit's; or the limits of files' sizes that the
+            environment gives cannot be understood.
     """
     on_error = choice("on_error", on_error, get_args(OnError))
+    _refuse_wrong_limits()
     index = None if check_files else _current_index(layout, index_dir)
     make = partial(_found_or_made, layout, index_dir, check_files=check_files, workers=workers, progress=progress)
     if index is None:
@@ -100,6 +103,14 @@ def open_index(
         index = _finished(index, make)
     _accept(layout, index, on_error)
     return index
+
+
+def _refuse_wrong_limits() -> None:
+    """Raise IndexStoreError before every file counts as broken, and a good index is made again of what is left."""
+    try:
+        limit_of("index")
+    except RefusedFileError as error:
+        raise IndexStoreError(fault_text(error)) from None
 
 
 def find_indexes(layout: ReleaseLayout, index_dir: Path | None = None) -> Iterator[Index]:

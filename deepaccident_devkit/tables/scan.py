@@ -134,7 +134,7 @@ def content_words(content: bytes) -> bytes:
 
 
 def _digest(scenario: ScenarioFolder, words_of: Callable[[str, FileKind], bytes]) -> str:
-    """A digest of the name of each label and calib file, and of what `words_of` its path and kind gives; of meta's."""
+    """A digest of where a scenario lies, and of each small file's name and what `words_of` its path and kind gives."""
     digest = hashlib.blake2b(os.fsencode(f"{scenario.folder}/{scenario.token}"), digest_size=16)
     kinds: tuple[FileKind, ...] = ("calib", "label")
     for agent in AGENTS:

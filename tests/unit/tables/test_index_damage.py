@@ -216,6 +216,15 @@ def test_nobody_waits_for_a_pipe(root: Path, name: str) -> None:
     assert contents(root / INDEX) == before
 
 
+def test_limits_that_cannot_be_understood_cost_no_index(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened(root)
+    before = contents(root / INDEX)
+    monkeypatch.setenv("DEEPACCIDENT_LIMITS", "labels=1G")
+    with pytest.raises(IndexStoreError, match=r"^DEEPACCIDENT_LIMITS: expected .* found 'labels=1G'$"):
+        opened(root)
+    assert contents(root / INDEX) == before
+
+
 def linked(path: Path, target: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.symlink_to(target)
