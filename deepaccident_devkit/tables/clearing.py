@@ -9,13 +9,9 @@ from pathlib import Path
 from deepaccident_devkit.errors import IndexStoreError, VersionError
 from deepaccident_devkit.files import temporary_of
 from deepaccident_devkit.tables.index import index_folders
-from deepaccident_devkit.tables.indexing import (
-    MARK_FILE,
-    SHARDS_FOLDER,
-    TABLES_PREFIX,
-)
+from deepaccident_devkit.tables.indexing import MARK_FILE, SHARDS_FOLDER
 from deepaccident_devkit.tables.locking import LOCK_FILE, index_lock
-from deepaccident_devkit.tables.manifest import MANIFEST_FILE, SCHEMA_VERSION, stored_schema_version
+from deepaccident_devkit.tables.manifest import MANIFEST_FILE, SCHEMA_VERSION, TABLES_PREFIX, stored_schema_version
 from deepaccident_devkit.taxonomy import VERSIONS
 from deepaccident_devkit.text import choice
 
