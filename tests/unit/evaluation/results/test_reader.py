@@ -6,6 +6,7 @@ import json
 import pickle
 import re
 import struct
+import tracemalloc
 import warnings
 import zipfile
 from collections.abc import Callable
@@ -493,6 +494,28 @@ def test_giants(tmp_path: Path) -> None:
     with (folder / "shards" / "00000.npz").open("r+b") as file:
         file.truncate(3 << 30)
     refused(folder, "shards/00000.npz takes 3,221,225,472 bytes")
+
+
+@pytest.mark.parametrize("way", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_members_that_are_packed_otherwise(tmp_path: Path, way: int) -> None:
+    folder = plain.write_motion(tmp_path / "motion")
+    path = folder / "shards" / "00000.npz"
+    with zipfile.ZipFile(path) as archive:
+        contents = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w", way) as archive:
+        for name, content in contents.items():
+            archive.writestr(name, content)
+    plain.relist(folder)
+    refused(folder, "instance: cannot be read (a member is encrypted or compressed by an unknown method)")
+
+
+def test_a_bomb_is_not_unpacked(tmp_path: Path) -> None:
+    folder = plain.write_motion(tmp_path / "motion")
+    rewritten(folder, {MEMBER: npy(np.zeros(100_000_000, dtype=np.uint8))})
+    tracemalloc.start()
+    refused(folder, "instance: expected shape (1 to 2, 3, 6, 8), which has at most", "found 100,000,128 bytes")
+    assert tracemalloc.get_traced_memory()[1] < 10 << 20
+    tracemalloc.stop()
 
 
 @pytest.mark.parametrize("change", [{"x" * 10**6: 1}, {"task": "y" * 10**6}, {"results": {"z" * 10**6: []}}])
