@@ -138,13 +138,15 @@ def _check_end(file: BinaryIO) -> None:
 
 def _stored(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
     """The bytes of a member as they are in the file."""
-    file: Any = archive.fp
-    file.seek(entry.header_offset)
-    head = file.read(_LOCAL_LENGTH)
-    if not head.startswith(_LOCAL) or len(head) < _LOCAL_LENGTH:
-        raise zipfile.BadZipFile("a member's head is damaged")
-    file.seek(_number(head, 26, 2) + _number(head, 28, 2), os.SEEK_CUR)
-    content: bytes = file.read(entry.compress_size)
+    shared: Any = archive
+    file = shared.fp
+    with shared._lock:  # noqa: SLF001 - which zipfile's own readers hold while they move in the file
+        file.seek(entry.header_offset)
+        head = file.read(_LOCAL_LENGTH)
+        if not head.startswith(_LOCAL) or len(head) < _LOCAL_LENGTH:
+            raise zipfile.BadZipFile("a member's head is damaged")
+        file.seek(_number(head, 26, 2) + _number(head, 28, 2), os.SEEK_CUR)
+        content: bytes = file.read(entry.compress_size)
     if len(content) < entry.compress_size:
         raise zipfile.BadZipFile("a member ends early")
     return content

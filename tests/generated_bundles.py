@@ -44,7 +44,21 @@ def write_bundle(folder: Path, cells: Sequence[tuple[int, int]], *, twins: bool 
         evaluator.add(token, each)
     folder.mkdir(parents=True)
     evaluator.save(folder / COUNTS_FILE)
-    summary = {"format": SUMMARY_FORMAT, "version": SUMMARY_VERSION, "partial": None, **SETUP.as_dict()}
+    summary = {
+        "format": SUMMARY_FORMAT,
+        "version": SUMMARY_VERSION,
+        "partial": None,
+        **SETUP.as_dict(),
+        "split": "val",
+        "samples": "evaluate",
+        "scope": "all",
+        "agents": None,
+        "counts": {"left_out": 0},
+        "release": {"version": "v1", "dataroot": "data"},
+        "results": {"path": "results", "form": None},
+        "breakdowns": {},
+        "environment": {},
+    }
     (folder / SUMMARY_FILE).write_text(json.dumps(summary))
     scenarios = {token.rsplit("/", 2)[0]: {} for token in counts}
     stated = {"format": SCENARIOS_FORMAT, "version": SUMMARY_VERSION, "scenarios": scenarios}

@@ -1,6 +1,8 @@
 """`deepaccident evaluate`, end to end: results in, numbers out, checked and compared again."""
 
 import json
+import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
@@ -211,19 +213,20 @@ class TestPartial:
 
 
 class TestVerify:
-    def test_the_same(self, bundle: Path) -> None:
-        done = run("verify", bundle, "--on-error", "skip")
+    def test_the_same(self, bundle: Path, da_motion: DeepAccident) -> None:
+        done = run("verify", bundle, "--dataroot", da_motion.dataroot, "--on-error", "skip")
         assert (done.returncode, "the same; 8 samples evaluated again" in done.stdout) == (0, True), done.stderr
 
-    def test_differences(self, bundle: Path) -> None:
+    def test_differences(self, bundle: Path, da_motion: DeepAccident) -> None:
+        words = ("verify", bundle, "--dataroot", da_motion.dataroot)
         path = bundle / "metrics_summary.json"
         before = path.read_text()
         summary = json.loads(before)
         summary["metrics"]["apa"] = 0.5
         path.write_text(json.dumps(summary))
         try:
-            assert "number: metrics/apa: stored 0.5, found 1.0" in evaluate("verify", bundle, status=1).output
-            stated = json.loads(evaluate("verify", bundle, "--json", status=1).stdout)
+            assert "number: metrics/apa: stored 0.5, found 1.0" in evaluate(*words, status=1).output
+            stated = json.loads(evaluate(*words, "--json", status=1).stdout)
             assert [each["where"] for each in stated["differences"]] == ["metrics_summary.json", "metrics/apa"]
         finally:
             path.write_text(before)
@@ -232,6 +235,28 @@ class TestVerify:
         for words in (("verify", tmp_path), ("verify", bundle, "--dataroot", tmp_path / "nowhere")):
             failed = run(*words)
             assert (failed.returncode, failed.stderr.startswith("error: ")) == (2, True)
+
+    def test_paths_in_a_bundle_are_to_be_repeated(self, bundle: Path, da_motion: DeepAccident) -> None:
+        failed = run("verify", bundle)
+        command = f"deepaccident evaluate verify {shlex.quote(str(bundle))} --dataroot {da_motion.dataroot}\n"
+        assert (failed.returncode, failed.stderr.count("\n"), failed.stderr.endswith(command)) == (2, 1, True)
+
+    def test_nothing_is_written_into_the_release(
+        self, bundle: Path, da_motion: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        copied = tmp_path / "release"
+        shutil.copytree(da_motion.dataroot, copied, ignore=shutil.ignore_patterns(".deepaccident"))
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+        before = sorted(copied.rglob("*"))
+        assert "the same" in evaluate("verify", bundle, "--dataroot", copied).output
+        assert sorted(copied.rglob("*")) == before
+        assert list((tmp_path / "cache").rglob("manifest.json"))
+        shutil.rmtree(tmp_path / "cache")
+        assert "the same" in evaluate("verify", bundle, "--dataroot", copied, "--index-dir", tmp_path / "index").output
+        assert not (tmp_path / "cache").exists()
+        DeepAccident(dataroot=copied, verbose=False)
+        assert "the same" in evaluate("verify", bundle, "--dataroot", copied).output
+        assert not (tmp_path / "cache").exists()
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@
 import json
 import sys
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import click
 
@@ -15,10 +15,13 @@ from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.evaluation.runs import compare_bundles, coverage, read_bundle, results_text, verify_bundle
 from deepaccident_devkit.evaluation.runs.sanity import check_sanity
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.runs.verification import check_repeated
 from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.release import find_release
 from deepaccident_devkit.render.evaluation import render_comparison
 from deepaccident_devkit.render.pictures import PICTURE_SUFFIXES, save_picture
-from deepaccident_devkit.taxonomy import VERSIONS
+from deepaccident_devkit.tables import place_outside
+from deepaccident_devkit.taxonomy import VERSIONS, OnError
 
 _FINDINGS_STATUS = 1
 _OF_RELEASE = ("version", "split", "samples", "scope", "agents", "horizon", "on_error")
@@ -65,13 +68,15 @@ def validate(results: Path, dataroot: Path | None, version: str, workers: int | 
 
 @click.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+@click.option("--dataroot", type=click.Path(path_type=Path), help="Folder of the release; without it, nothing is done.")
 @click.option(
-    "--dataroot", type=click.Path(path_type=Path), help="Folder of the release.  [default: as in the evaluation]"
+    "--results", type=click.Path(path_type=Path), help="Results file or folder.  [default: the copy in DIR, if any]"
 )
+@click.option("--split", help="Split file, if the evaluation in DIR is of one.")
 @click.option(
-    "--results",
+    "--index-dir",
     type=click.Path(path_type=Path),
-    help="Results file or folder.  [default: the copy in DIR, or as in the evaluation]",
+    help="Folder of the index.  [default: as it is, or else in the user's cache]",
 )
 @_workers
 @on_error_parameter
@@ -80,17 +85,25 @@ def verify(
     folder: Path,
     dataroot: Path | None,
     results: Path | None,
+    split: str | None,
+    index_dir: Path | None,
     workers: int | None,
-    on_error: Literal["raise", "skip"],
+    on_error: OnError,
     as_json: bool,
 ) -> None:
     """Repeat the evaluation in the folder DIR and list all differences.
 
-    Exit status 0: there is no difference. 1: there are differences.
+    DIR may come from anyone: paths that it names are opened only if you give them, as the error says; links in it are
+    not followed; nothing is written into the release.
+
+    Exit status 0: there is no difference. 1: there are differences. 2: nothing could be compared.
     """
     bundle = read_bundle(folder)
-    dataset = DeepAccident(bundle.release_version, dataroot or bundle.dataroot, workers=workers, on_error=on_error)
-    verification = verify_bundle(folder, dataset, results=results, workers=workers, progress=True)
+    check_repeated(bundle, {"dataroot": dataroot, "results": results, "split": split})
+    layout = find_release((dataroot or bundle.dataroot).absolute(), bundle.release_version)
+    place = index_dir or place_outside(layout)
+    dataset = DeepAccident(layout.version, layout.root, place, workers=workers, on_error=on_error)
+    verification = verify_bundle(folder, dataset, results=results, split=split, workers=workers, progress=True)
     click.echo(json.dumps(verification.as_dict(), indent=1) if as_json else verification.to_text())
     if not verification.is_same:
         sys.exit(_FINDINGS_STATUS)

@@ -1,16 +1,16 @@
 """The options that say which samples are evaluated, and by which rules."""
 
-import json
 from collections.abc import Mapping
 from typing import Any, get_args
 
 import click
 
 from deepaccident_devkit.cli.options import Verb, WordChoice, agent_names, agents_parameter
-from deepaccident_devkit.evaluation.metrics.intervals import RESAMPLES
+from deepaccident_devkit.evaluation.metrics.intervals import MOST_RESAMPLES, RESAMPLES
 from deepaccident_devkit.evaluation.runs import SampleSelection, default_selection
 from deepaccident_devkit.evaluation.runs.selection import SampleList, ScopeName
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.taxonomy import AGENTS
 
 _SELECTION = (
@@ -36,7 +36,7 @@ _SELECTION = (
 )
 resamples_parameter = click.option(
     "--resamples",
-    type=click.IntRange(min=0),
+    type=click.IntRange(min=0, max=MOST_RESAMPLES),
     default=RESAMPLES,
     show_default=True,
     help="Number of resamples for intervals and tests, at most; 0 for no intervals and no tests.",
@@ -70,7 +70,7 @@ def switches_of(texts: tuple[str, ...]) -> dict[str, Any]:
         if not (name and equals):
             raise click.BadParameter(f"--switch: expected NAME=VALUE, found {text!r}")
         try:
-            switches[name] = json.loads(value)
+            switches[name] = parsed_json(value.encode())
         except ValueError:
             switches[name] = value
     return switches

@@ -14,7 +14,9 @@ from typing import Any, Final
 
 from deepaccident_devkit.errors import ConfigError, DeepAccidentError, LabelFilesError
 from deepaccident_devkit.files import temporary_of, write_bytes
+from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.motion.config import MotionLabelConfig
+from deepaccident_devkit.reading import check_size, fault_text, read_bytes, shortened
 from deepaccident_devkit.taxonomy import AGENTS
 
 logger = logging.getLogger(__name__)
@@ -23,6 +25,8 @@ FORMAT: Final = "DeepAccident motion labels"
 FORMAT_VERSION: Final = 1
 """Increased when the files' contents change, or the labels of the same configuration and release."""
 MANIFEST: Final = "manifest.json"
+_CELL_BYTES: Final = 16
+"""Of the maps of a sample, in memory, at least."""
 _LOCK: Final = ".lock"
 _WRITTEN: Final = (MANIFEST, *(f"{agent}.npz" for agent in AGENTS))
 _RECORDING: Final = re.compile(rf"(?!\.)[^/\\\0]+/(?!\.)[^/\\\0]+/({'|'.join(AGENTS)})")
@@ -68,22 +72,22 @@ class Manifest:
     def read(cls, root: Path) -> Manifest:
         """The manifest that a folder has; raises LabelFilesError."""
         path = root / MANIFEST
-        if not path.is_file():
+        if not path.exists():
             raise LabelFilesError(
                 f"{root}: holds no motion labels (no {MANIFEST}); make them with `deepaccident labels`"
             )
         try:
-            told = json.loads(path.read_text(encoding="utf-8"))
+            told = parsed_json(read_bytes(path, "bundle"))
             _check_version(path, told["format"], told["version"])
             config, samples = MotionLabelConfig.from_dict(told["config"]), _samples(told["samples"])
             if config.digest != told["config_digest"]:
                 raise ValueError("its digest is not that of its configuration")
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            check_size(config.grid.cells * config.label_frames * _CELL_BYTES, "motion_labels", "a sample")
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             if isinstance(error, LabelFilesError):
                 raise
-            raise LabelFilesError(
-                f"{path}: cannot be read ({error}); make the labels again in an empty folder"
-            ) from error
+            told = fault_text(error) if isinstance(error, OSError) else f"cannot be read ({shortened(str(error), 600)})"
+            raise LabelFilesError(f"{path}: {told}; make the labels again in an empty folder") from error
         return cls(config, samples)
 
     def check(self, root: Path, config: MotionLabelConfig) -> None:

@@ -11,6 +11,8 @@ from typing import Any
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.json_text import parsed_json
+from deepaccident_devkit.reading import fault_text, read_bytes, shortened
 from deepaccident_devkit.synth.config import SynthConfig
 
 _CONFIG_FILE, _MADE_FILE, _LOCK_FILE = "config.json", "made.txt", ".lock"
@@ -42,7 +44,7 @@ class Unfinished:
     def made(self) -> frozenset[str]:
         """Names of the complete parts; a last line without its end does not count."""
         path = self.folder / _MADE_FILE
-        return frozenset(path.read_text(encoding="utf-8").split("\n")[:-1] if path.is_file() else ())
+        return frozenset(_text(path).split("\n")[:-1] if path.exists() else ())
 
     def note(self, name: str) -> None:
         """Remember that a part is complete."""
@@ -88,23 +90,40 @@ def unfinished_release(out: Path, config: SynthConfig) -> Iterator[Unfinished]:
 def _agree(path: Path, config: SynthConfig) -> None:
     """Write the configuration beside the release, or compare it with the one that is there."""
     wanted = _as_json(config)
-    if not path.is_file():
+    if not path.exists():
         write_bytes(path, json.dumps(wanted, indent=1).encode())
         return
-    there = json.loads(path.read_text(encoding="utf-8"))
+    there = _parsed(path)
     for name, value in wanted.items():
         found = there.get(name)
         if found != value:
-            differs = "spec" if name == "spec" else f"{name}: {found!r} there, {value!r} asked for"
+            differs = "spec" if name == "spec" else f"{name}: {shortened(repr(found))} there, {value!r} asked for"
             raise ConfigError(
                 f"{path.parent}: holds an unfinished release of another configuration ({differs}); ask for the same "
                 "to finish it, or remove the folder"
             )
 
 
+def _parsed(path: Path) -> dict[str, Any]:
+    text = _text(path)
+    try:
+        there = parsed_json(text.encode())
+    except ValueError as error:
+        raise ConfigError(f"{path}: {error}; remove its folder") from error
+    return there if isinstance(there, dict) else {}
+
+
+def _text(path: Path) -> str:
+    """A text file's content; raises ConfigError."""
+    try:
+        return read_bytes(path, "spec").decode()
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: {fault_text(error)}; make it readable, or remove it") from error
+
+
 def _as_json(config: SynthConfig) -> dict[str, Any]:
     """All that the bytes of a release depend on, as JSON returns it; of the scenario file its text."""
-    text = None if config.spec is None else config.spec.read_text(encoding="utf-8")
+    text = None if config.spec is None else _text(config.spec)
     fields = {"version": __version__, **asdict(config), "image_size": config.pixels, "spec": text}
     as_read: dict[str, Any] = json.loads(json.dumps(fields))
     return as_read

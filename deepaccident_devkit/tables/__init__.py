@@ -2,7 +2,7 @@
 
 from deepaccident_devkit.tables.clearing import Cleared, clear_index
 from deepaccident_devkit.tables.findings import SEVERITIES, Finding, Severity
-from deepaccident_devkit.tables.index import Index, open_index
+from deepaccident_devkit.tables.index import Index, open_index, place_outside
 from deepaccident_devkit.tables.manifest import Problem
 from deepaccident_devkit.tables.opened import OpenTables, RowArgument
 from deepaccident_devkit.tables.report import IndexInfo, IndexReport, index_report
@@ -27,6 +27,7 @@ __all__ = [
     "displacement_velocities",
     "index_report",
     "open_index",
+    "place_outside",
     "table_names",
     "visible_ids",
     "visible_mask",

@@ -133,6 +133,15 @@ def index_folders(root: Path, version: str, index_dir: Path | None = None) -> It
     yield user_cache_path("deepaccident_devkit") / key / version
 
 
+def place_outside(layout: ReleaseLayout) -> Path | None:
+    """The `index_dir` with which opening a release writes nothing into its folder: None where a good index is there."""
+    index = _current_index(layout, None)
+    if index is not None and not is_unfinished(index.folder):
+        return None
+    *_, cache = index_folders(layout.root, layout.version)
+    return cache.parent
+
+
 def _current_index(layout: ReleaseLayout, index_dir: Path | None) -> Index | None:
     fingerprint = folder_digest(layout.scenarios, layout.split_files.values())
     found = (index for index in find_indexes(layout, index_dir) if is_current(layout, index, fingerprint))

@@ -4,12 +4,13 @@ import io
 import struct
 import tracemalloc
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from deepaccident_devkit.archives import DAMAGED_ARCHIVE, array_of, open_zip, read_array
+from deepaccident_devkit.archives import DAMAGED_ARCHIVE, array_of, open_zip, read_array, read_member
 
 ARRAY = np.arange(12, dtype=np.float32).reshape(3, 4)
 MOST_MEMORY = 100 << 20
@@ -110,6 +111,17 @@ def test_a_hostile_archive_is_refused_in_little_memory(name: str) -> None:
     assert tracemalloc.get_traced_memory()[1] < MOST_MEMORY
     tracemalloc.stop()
     assert len(str(raised.value)) < 500
+
+
+def test_threads_may_read_one_archive(tmp_path: Path) -> None:
+    path = tmp_path / "shared.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        for number in range(50):
+            archive.writestr(str(number), bytes([number]) * 200_000)
+    with open_zip(path) as archive, ThreadPoolExecutor(8) as threads:
+        entries = archive.infolist() * 20
+        contents = threads.map(lambda entry: read_member(archive, entry, "label"), entries)
+        assert all(content[0] == int(entry.filename) for content, entry in zip(contents, entries, strict=True))
 
 
 def test_an_archive_of_many_members_is_refused() -> None:

@@ -13,15 +13,19 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.arrays import IntArray
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.json_text import parsed_json
+from deepaccident_devkit.reading import fault_text, read_bytes, shortened
 
 Counts = Mapping[str, Any]
 """What one sample adds: names → whole numbers, floats, None, or nested lists of them; as JSON holds it."""
+_MOST_SETTINGS: Final = 600
+"""Characters of another evaluation's settings in a message."""
 Result = TypeVar("Result")
 EvaluatorT = TypeVar("EvaluatorT", bound="Evaluator[Any]")
 
@@ -207,15 +211,17 @@ class Evaluator(ABC, Generic[Result]):
         """
         source = Path(path).expanduser()
         try:
-            state = json.loads(source.read_text(encoding="utf-8"))
+            state = parsed_json(read_bytes(source, "results"), constants=True)
             maker, settings, repeated = state["made_by"], state["settings"], set(state["repeated"])
             counts = {token: dict(each) for token, each in state["counts"].items()}
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise EvaluationError(f"{source}: no saved evaluation ({error}); begin again") from error
+            raise EvaluationError(f"{source}: no saved evaluation ({fault_text(error)}); begin again") from error
         if maker != self._maker:
-            raise EvaluationError(f"{source}: was saved by {maker}, this is {self._maker}; begin again")
+            saver = shortened(str(maker))
+            raise EvaluationError(f"{source}: was saved by {saver}, this is {self._maker}; begin again")
         if settings != self.settings:
-            raise EvaluationError(f"{source}: was saved with other settings ({settings}); begin again, or use those")
+            others = shortened(str(settings), _MOST_SETTINGS)
+            raise EvaluationError(f"{source}: was saved with other settings ({others}); begin again, or use those")
         for token, each in counts.items():
             self.add(token, each)
         self.repeated |= repeated

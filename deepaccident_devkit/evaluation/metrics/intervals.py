@@ -18,9 +18,11 @@ from deepaccident_devkit.arrays import FloatArray, IntArray, as_floats
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.metrics.numbers import has_interval, numbers_of, range_of
+from deepaccident_devkit.reading import shortened
 
 RESAMPLES: Final = 1000
 """The default, to evaluate and to compare, in the library and on the command line."""
+MOST_RESAMPLES: Final = 100_000
 LEAST_CLUSTERS: Final = 6
 """Fewer have no interval, since its coverage would be too low; and no test at 5 % can decide with fewer."""
 _MOST_PARTS: Final = 100
@@ -49,8 +51,11 @@ class Resampling:
 
     def __post_init__(self) -> None:
         """Check the values; raises ConfigError."""
-        if type(self.resamples) is not int or self.resamples < 0:
-            raise ConfigError(f"resamples: expected a whole number from 0, found {self.resamples!r}")
+        if type(self.resamples) is not int or not 0 <= self.resamples <= MOST_RESAMPLES:
+            expected = f"a whole number from 0 to {MOST_RESAMPLES:,}"
+            raise ConfigError(f"resamples: expected {expected}, found {shortened(repr(self.resamples))}")
+        if type(self.seed) is not int or self.seed < 0:
+            raise ConfigError(f"seed: expected a whole number from 0, found {shortened(repr(self.seed))}")
         if not 0 < self.confidence < 1:
             raise ConfigError(f"confidence: expected a share between 0 and 1, such as 0.95, found {self.confidence!r}")
 

@@ -15,6 +15,7 @@ from deepaccident_devkit.errors import DeepAccidentError, ResultsError
 from deepaccident_devkit.evaluation.results.faults import ContentError, at, parsed_json, shown
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import LABEL_PROTOCOLS
+from deepaccident_devkit.reading import shortened
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 ResultsTask = Literal["motion", "accident", "detection"]
@@ -24,8 +25,10 @@ FORMAT_VERSION: Final = 1
 """Counted up with what files hold."""
 RESULTS_FILE: Final = "results.json"
 """The manifest of motion results, in their folder; results of the other tasks in a folder are called so too."""
-_MOST_VALUES: Final = 2**30
-"""Cells over all frames and predictions of a sample: more would not fit into memory."""
+_MOST_VALUES: Final = 2**26
+"""Cells over all frames and predictions of a sample, twenty times as many as ten released predictions have. A small
+archive can hold more, but memory cannot.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -130,6 +133,8 @@ BODY_FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
 """Task → the fields after the header's."""
 _MOST_LEVELS: Final = 30
 """The largest depth of nested objects and lists in `meta`, which people and reports read."""
+_LONGEST_TOKEN: Final = 1000
+"""Characters."""
 WORDS: Final = r"^[^/\\]+(/[^/\\]+)*$"
 """A regular expression of tokens: words with `/` between."""
 
@@ -212,9 +217,11 @@ def check_token(token: object) -> str:
     """A sample's token, if it could be one: words with `/` between; raises ContentError."""
     if not isinstance(token, str):
         raise ContentError(f"expected a sample's token, a text, found {shown(token)}")
-    words = token.split("/")
-    if not re.fullmatch(WORDS, token) or not token.isprintable() or {".", ".."} & set(words):
-        raise ContentError(f"expected a sample's token, <scenario_type>/<name>/<agent>/<NNN>, found {token!r}")
+    good = len(token) <= _LONGEST_TOKEN and token.isprintable() and re.fullmatch(WORDS, token)
+    if not good or {".", ".."} & set(token.split("/")):
+        raise ContentError(
+            f"expected a sample's token, <scenario_type>/<name>/<agent>/<NNN>, found {shortened(token)!r}"
+        )
     return token
 
 

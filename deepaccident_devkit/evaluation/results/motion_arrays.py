@@ -13,7 +13,7 @@ from typing import IO, Final
 
 import numpy as np
 
-from deepaccident_devkit.archives import DAMAGED_ARCHIVE
+from deepaccident_devkit.archives import DAMAGED_ARCHIVE, read_member
 from deepaccident_devkit.arrays import AnyArray, FloatArray
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
@@ -26,6 +26,9 @@ from deepaccident_devkit.motion import LinkedInstances, predict_instances, traje
 Length = int | range
 """Of an axis: how long it must be, or may be."""
 _FIRST_DATE: Final = (1980, 1, 1, 0, 0, 0)
+_WIDEST: Final = 8
+"""Bytes of a number."""
+_LONGEST_HEADER: Final = 1 << 16
 
 
 def member_name(token: str, name: str) -> str:
@@ -51,7 +54,7 @@ def take_array(archive: zipfile.ZipFile, token: str, name: str, shape: Sequence[
         archive: open.
         token: of the sample.
         name: of the array.
-        shape: its shape, which is checked before anything except the header is decompressed.
+        shape: its shape; what is larger is not decompressed.
         kinds: numpy's letters of the kinds of element types that it may have.
 
     Raises:
@@ -62,9 +65,13 @@ def take_array(archive: zipfile.ZipFile, token: str, name: str, shape: Sequence[
             entry = archive.getinfo(member_name(token, name))
         except KeyError:
             raise ContentError(f"is missing; expected the member {member_name(token, name)}") from None
+        most = math.prod(_range(each)[-1] for each in shape) * _WIDEST + _LONGEST_HEADER
+        if entry.file_size > most:
+            found = f"{entry.file_size:,} bytes"
+            raise ContentError(f"expected shape {_shape_text(shape)}, which has at most {most:,} bytes, found {found}")
         try:
-            with archive.open(entry) as file:
-                return _array(file, entry.file_size, shape, kinds)
+            content = read_member(archive, entry, "results")
+            return _array(io.BytesIO(content), len(content), shape, kinds)
         except ContentError:
             raise
         except DAMAGED_ARCHIVE as error:

@@ -22,9 +22,8 @@ from deepaccident_devkit.evaluation.results.faults import at, parsed_json, told_
 from deepaccident_devkit.evaluation.results.header import RESULTS_FILE, Header, MotionForm, ResultsTask, read_header
 from deepaccident_devkit.evaluation.results.motion_arrays import paths_of, stored_output, stored_paths
 from deepaccident_devkit.evaluation.results.shards import OpenShards, ShardCheck, check_shard, read_manifest
-from deepaccident_devkit.files import file_checksum
 from deepaccident_devkit.parallel import run_batch
-from deepaccident_devkit.reading import irregular_text
+from deepaccident_devkit.reading import irregular_text, read_bytes
 
 Prediction = MotionOutput | list[Accident] | DetectedBoxes
 
@@ -104,7 +103,7 @@ def contents_of(path: Path, fingerprint: str) -> Contents:
         ResultsError: it cannot be read, is not as its format says, or has other bytes now.
     """
     with told_of(path):
-        content = path.read_bytes()
+        content = read_bytes(path, "results")
     if content_fingerprint(content) != fingerprint:
         raise ResultsError(f"{path}: was changed after it was opened; open it again")
     with told_of(path), _collector_paused():
@@ -225,7 +224,7 @@ class Results:
             ResultsError: names the shard, the token and the array of the first fault, or the file was changed.
         """
         with told_of(self._file):
-            now = file_checksum(self._file)
+            now = content_fingerprint(read_bytes(self._file, "results"))
         if now != self.fingerprint:
             raise ResultsError(f"{self._file}: was changed after it was opened; open it again")
         self._contents.check(workers=workers, progress=progress)
@@ -257,7 +256,7 @@ def read_results(path: str | os.PathLike[str]) -> Results:
     """
     file = _file_of(Path(path).expanduser().absolute())
     with told_of(file):
-        fingerprint = content_fingerprint(file.read_bytes())
+        fingerprint = content_fingerprint(read_bytes(file, "results"))
     task = contents_of(file, fingerprint).header.task
     if task == "motion" and file.name != RESULTS_FILE:
         raise ResultsError(f"{file}: is the manifest of motion results; call it {RESULTS_FILE}, as others look for it")

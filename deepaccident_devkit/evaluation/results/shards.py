@@ -38,7 +38,7 @@ from deepaccident_devkit.evaluation.results.motion_arrays import (
 )
 from deepaccident_devkit.files import file_checksum
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.reading import irregular_text
+from deepaccident_devkit.reading import check_size, irregular_text
 
 SHARD_FIELDS: Final = ("file", "tokens", "bytes", "checksum")
 
@@ -92,10 +92,12 @@ def read_manifest(document: Mapping[str, Any], root: Path) -> Manifest:
         raise ContentError(f"shards: expected a list of at least one, found {shown(told)}")
     shards: list[Shard] = []
     shard_of: dict[str, int] = {}
+    files: set[str] = set()
     for number, each in enumerate(told):
         with at(f"shards: entry {number}"):
             shard = _shard(each)
-            _check_file(shard, root, {other.file for other in shards})
+            _check_file(shard, root, files)
+        files.add(shard.file)
         for token in shard.tokens:
             if token in shard_of:
                 others = "twice" if shard_of[token] == number else f"also in {shards[shard_of[token]].file}"
@@ -152,6 +154,7 @@ def _check_file(shard: Shard, root: Path, others: AbstractSet[str]) -> None:
     irregular = irregular_text(status.st_mode)
     if irregular:
         raise ContentError(f"file: {shard.file} is {irregular}")
+    check_size(status.st_size, "results", shard.file)
     if status.st_size != shard.bytes:
         raise ContentError(f"bytes: {shard.file} should have {shard.bytes}, found {status.st_size}; copy it again")
 

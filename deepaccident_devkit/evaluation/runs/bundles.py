@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+import stat
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -21,8 +22,11 @@ from deepaccident_devkit.evaluation.runs.evaluation_run import (
 from deepaccident_devkit.evaluation.runs.rows import sample_rows, write_rows
 from deepaccident_devkit.evaluation.runs.selection import SampleSelection
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.evaluation.runs.shapes import FILES, SCENARIOS, SUMMARY, misfits
 from deepaccident_devkit.files import file_checksum, replacing_folder, temporary_path
-from deepaccident_devkit.reading import irregular_text
+from deepaccident_devkit.json_text import parsed_json
+from deepaccident_devkit.reading import check_size, fault_text, irregular_text, read_bytes, shortened
+from deepaccident_devkit.taxonomy import MINI_SPLITS, SPLITS
 
 SUMMARY_FILE: Final = "metrics_summary.json"
 COUNTS_FILE: Final = "counts.json"
@@ -32,6 +36,8 @@ FILES_FILE: Final = "files.json"
 RESULTS_FOLDER: Final = "results"
 SCENARIOS_FORMAT: Final = "DeepAccident scenario hashes"
 FILES_FORMAT: Final = "DeepAccident evaluation bundle"
+_MOST_TOLD: Final = 600
+"""Characters of what is wrong, names in the file among them."""
 _REMEDY: Final = "give a folder that `deepaccident evaluate … --out` wrote, or evaluate again"
 
 
@@ -49,124 +55,181 @@ class Bundle(ShortRepr):
 
     @property
     def setup(self) -> EvaluationSetup:
-        """Task and rules; raises ResultsError if the summary does not say them."""
+        """Task and rules; raises ResultsError if there are no such ones."""
         try:
-            return EvaluationSetup(
-                task=self.summary["task"],
-                protocol=self.summary["protocol"],
-                switches=self.summary["switches"],
-                horizon=self.summary["horizon"],
-            )
-        except (KeyError, TypeError, ValueError) as error:
+            return EvaluationSetup(**{name: self.summary[name] for name in ("task", "protocol", "switches", "horizon")})
+        except (ArithmeticError, LookupError, TypeError, ValueError) as error:  # whatever a switch's value can cause
             raise self._damaged(error) from error
 
     @property
     def selection(self) -> SampleSelection:
-        """Which samples; raises ResultsError if the summary does not say."""
+        """Which samples; raises ResultsError if there is no such choice."""
         try:
             agents = self.summary["agents"]
             return SampleSelection(
                 agents=None if agents is None else tuple(agents),
                 **{name: self.summary[name] for name in ("split", "samples", "scope", "horizon")},
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (TypeError, ValueError) as error:
             raise self._damaged(error) from error
 
     @property
     def dataroot(self) -> Path:
-        """The release that it was evaluated with; raises ResultsError if the summary does not say."""
-        return Path(self._text("release", "dataroot"))
+        """The release that it was evaluated with."""
+        return Path(self.summary["release"]["dataroot"])
 
     @property
     def release_version(self) -> str:
-        """`v1` or `v1-mini`; raises ResultsError if the summary does not say."""
-        return self._text("release", "version")
+        """`v1` or `v1-mini`."""
+        version: str = self.summary["release"]["version"]
+        return version
 
     @property
     def results_path(self) -> Path:
         """The results: the copy in the bundle where there is one, else where they were.
 
         Raises:
-            ResultsError: the summary does not say where, or a copy is not what it should be.
+            ResultsError: a copy is not what it should be.
         """
-        copies = self.folder / RESULTS_FOLDER
-        if not copies.is_dir():
-            return Path(self._text("results", "path"))
-        inside = sorted(copies.iterdir())
-        if len(inside) != 1:
-            raise ResultsError(f"{copies}: expected one results file or folder, found {len(inside)}; {_REMEDY}")
-        return inside[0]
+        return self._copy() or Path(self.summary["results"]["path"])
+
+    def outside_paths(self) -> dict[str, str]:
+        """The paths in the summary that lead out of the bundle, and that `verify_bundle` opens only if it is told to.
+
+        Returns:
+            `dataroot`; `results`, where the bundle has no copy of them; `split`, where it is a split file.
+
+        Raises:
+            ResultsError: a copy of the results is not what it should be.
+        """
+        named = {"dataroot": os.fspath(self.dataroot)}
+        if self._copy() is None:
+            named["results"] = self.summary["results"]["path"]
+        if self.summary["split"] not in (*SPLITS, *MINI_SPLITS):
+            named["split"] = self.summary["split"]
+        return named
 
     def scenarios(self) -> dict[str, dict[str, str | None]]:
         """Scenario → hashes of its label, meta and calib files; raises ResultsError."""
-        path = self.folder / SCENARIOS_FILE
-        stored = read_json(path, SCENARIOS_FORMAT).get("scenarios")
-        if not isinstance(stored, dict) or not all(isinstance(each, dict) for each in stored.values()):
-            raise ResultsError(f"{path}: expected scenarios with their hashes; {_REMEDY}")
+        stored: dict[str, dict[str, str | None]] = self._checked(SCENARIOS_FILE, SCENARIOS_FORMAT, SCENARIOS)
         return stored
 
     def checksums(self) -> dict[str, str]:
         """File → checksum of all that was written, except the list itself; raises ResultsError."""
-        path = self.folder / FILES_FILE
-        stored = read_json(path, FILES_FORMAT).get("files")
-        if not isinstance(stored, dict):
-            raise ResultsError(f"{path}: expected files with their checksums; {_REMEDY}")
+        stored: dict[str, str] = self._checked(FILES_FILE, FILES_FORMAT, FILES)
         return stored
 
-    def _text(self, part: str, name: str) -> str:
-        try:
-            value = self.summary[part][name]
-        except (KeyError, TypeError) as error:
-            raise self._damaged(error) from error
-        if not isinstance(value, str):
-            raise self._damaged(f"{part}/{name} is no text: {value!r}")
-        return value
+    def _copy(self) -> Path | None:
+        """The bundle's copy of the results; raises ResultsError if it is not one, or has links or pipes in it."""
+        copies = self.folder / RESULTS_FOLDER
+        if not os.path.lexists(copies):
+            return None
+        for name, irregular in entries_in(self.folder).items():
+            if irregular and name.split("/")[0] == RESULTS_FOLDER:
+                raise ResultsError(f"{self.folder}: {shortened(name)} is {irregular}; {_REMEDY}")
+        inside = sorted(copies.iterdir()) if copies.is_dir() else []
+        if len(inside) != 1:
+            raise ResultsError(f"{copies}: expected one results file or folder, found {len(inside)}; {_REMEDY}")
+        return inside[0]
+
+    def _checked(self, name: str, form: str, shape: Mapping[str, Any]) -> Any:
+        """The part of one of the files that a shape is of; raises ResultsError."""
+        stored = read_json(self.folder / name, form)
+        for misfit in misfits(stored, shape):
+            raise ResultsError(f"{self.folder / name}: {misfit}; {_REMEDY}")
+        (part,) = shape
+        return stored[part]
 
     def _damaged(self, reason: object) -> ResultsError:
-        return ResultsError(f"{self.folder / SUMMARY_FILE}: does not say what was evaluated ({reason}); {_REMEDY}")
+        told = shortened(str(reason), _MOST_TOLD)
+        return ResultsError(f"{self.folder / SUMMARY_FILE}: does not say what was evaluated ({told}); {_REMEDY}")
 
 
 def read_bundle(folder: Path) -> Bundle:
     """Open a bundle; raises ResultsError if there is none that this devkit can read."""
     if not folder.is_dir():
         raise ResultsError(f"{folder}: no such folder; {_REMEDY}")
-    return Bundle(folder=folder, summary=read_json(folder / SUMMARY_FILE, SUMMARY_FORMAT))
+    path = folder / SUMMARY_FILE
+    summary = read_json(path, SUMMARY_FORMAT)
+    for misfit in misfits(summary, SUMMARY):
+        raise ResultsError(f"{path}: does not say what was evaluated ({misfit}); {_REMEDY}")
+    return Bundle(folder=folder, summary=summary)
+
+
+def own_file(path: Path) -> Path:
+    """The path of a bundle's file, which must not be a link; raises ResultsError."""
+    if path.is_symlink():
+        raise ResultsError(f"{path}: is a link, which is not followed; {_REMEDY}")
+    return path
 
 
 def read_json(path: Path, expected: str | None) -> dict[str, Any]:
-    """One of a bundle's JSON files, of a format; None for any object. Raises ResultsError."""
+    """One of a bundle's JSON files, of a format; None for the counts. Raises ResultsError."""
     try:
-        odd = irregular_text(path.stat().st_mode)
-        if odd:
-            raise ResultsError(f"{path}: is {odd}; {_REMEDY}")
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parsed_json(read_bytes(own_file(path), "bundle" if expected else "results"), constants=not expected)
     except FileNotFoundError as error:
         raise ResultsError(f"{path}: is missing; {_REMEDY}") from error
-    except (OSError, ValueError, RecursionError) as error:
-        raise ResultsError(f"{path}: cannot be read ({error}); {_REMEDY}") from error
+    except (OSError, ValueError) as error:
+        if isinstance(error, ResultsError):
+            raise
+        raise ResultsError(f"{path}: {fault_text(error)}; {_REMEDY}") from error
     if not isinstance(content, dict):
         raise ResultsError(f"{path}: expected an object, found {type(content).__name__}; {_REMEDY}")
     found = content.get("format")
     if expected is None:
         return content
     if found != expected:
-        raise ResultsError(f"{path}: expected the format {expected!r}, found {found!r}; {_REMEDY}")
+        raise ResultsError(f"{path}: expected the format {expected!r}, found {shortened(repr(found))}; {_REMEDY}")
     if content.get("version") != SUMMARY_VERSION:
+        version, writer = (shortened(repr(content.get(name))) for name in ("version", "devkit_version"))
         raise ResultsError(
-            f"{path}: is of version {content.get('version')!r}, this devkit reads {SUMMARY_VERSION}; use the devkit "
-            f"that wrote it ({content.get('devkit_version')})"
+            f"{path}: is of version {version}, this devkit reads {SUMMARY_VERSION}; use the devkit that wrote it "
+            f"({writer})"
         )
     return content
 
 
-def names_in(folder: Path) -> list[str]:
-    """The files in a folder and those below it, by their paths in it, in order."""
-    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir())
+def entries_in(folder: Path) -> dict[str, str | None]:
+    """What is in a folder and in those below it, by its path there, in order → what it is (`a link`) if it is no file.
+
+    Links are not followed.
+    """
+    found = {}
+    for place, folders, files in os.walk(folder):
+        for name in (*folders, *files):
+            path = Path(place, name)
+            mode = path.lstat().st_mode
+            if not stat.S_ISDIR(mode):
+                irregular = "a link" if stat.S_ISLNK(mode) else irregular_text(mode)
+                found[path.relative_to(folder).as_posix()] = irregular
+    return dict(sorted(found.items()))
 
 
-def checksums_of(folder: Path) -> dict[str, str]:
-    """File, as of `names_in` → checksum, of all but the list of files itself."""
-    return {name: file_checksum(folder / name) for name in names_in(folder) if name != FILES_FILE}
+def checksums_of(folder: Path, listed: Collection[str] | None = None) -> dict[str, str]:
+    """File, as of `entries_in` → checksum, of all but the list of files itself.
+
+    Args:
+        folder: of a bundle.
+        listed: the files that are opened; a word stands for the checksum of others, of links, pipes, and of what cannot
+            be read. None for all files, of which there are no others.
+    """
+    found = {}
+    for name, irregular in entries_in(folder).items():
+        if name == FILES_FILE:
+            continue
+        if listed is None:
+            found[name] = file_checksum(folder / name)
+        else:
+            found[name] = irregular or (_checksum(folder / name) if name in listed else "a file that is not listed")
+    return found
+
+
+def _checksum(path: Path) -> str:
+    try:
+        check_size(path.stat().st_size, "results")  # the largest that it can hold
+        return file_checksum(path)
+    except OSError as error:
+        return fault_text(error)
 
 
 def save_run(
@@ -227,7 +290,7 @@ def checked_target(folder: str | os.PathLike[str], *, overwrite: bool = False) -
         return target
     if not target.is_dir():
         raise ResultsError(f"{target}: is a file; choose a folder that is new")
-    found = names_in(target)
+    found = entries_in(target)
     if not found:
         return target
     try:

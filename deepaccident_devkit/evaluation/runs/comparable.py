@@ -7,13 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from deepaccident_devkit.errors import EvaluationError
+from deepaccident_devkit.errors import EvaluationError, ResultsError
 from deepaccident_devkit.evaluation.metrics.attributes import cluster_of
 from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
 from deepaccident_devkit.evaluation.metrics.intervals import Clusters
-from deepaccident_devkit.evaluation.runs.bundles import COUNTS_FILE, Bundle, read_bundle
+from deepaccident_devkit.evaluation.results.header import check_token
+from deepaccident_devkit.evaluation.runs.bundles import COUNTS_FILE, Bundle, own_file, read_bundle
 from deepaccident_devkit.evaluation.runs.differences import differing
 from deepaccident_devkit.evaluation.runs.selection import scenario_of
+from deepaccident_devkit.reading import shortened
 
 _SETUP: Final = ("task", "protocol", "switches", "horizon", "settings")
 _SHOWN: Final = 3
@@ -86,7 +88,10 @@ def _check_rules(one: Bundle, other: Bundle) -> None:
         stated = [{**rules, "cells": those} for rules, those in zip(stated, cells, strict=True)]
     unlike = list(differing(*stated))
     if unlike:
-        told = "; ".join(f"{where} {first!r} and {second!r}" for where, first, second in unlike[:_SHOWN])
+        told = "; ".join(
+            f"{shortened(where)} {shortened(repr(first))} and {shortened(repr(second))}"
+            for where, first, second in unlike[:_SHOWN]
+        )
         more = f", and {len(unlike) - _SHOWN} more" if len(unlike) > _SHOWN else ""
         raise EvaluationError(
             f"{one.folder} and {other.folder}: were not evaluated by the same rules: {told}{more}; evaluate both in "
@@ -99,7 +104,7 @@ def _cells(bundle: Bundle) -> dict[str, Any]:
 
     How maps lie is not among them, since it changes no number.
     """
-    form = (bundle.summary.get("results") or {}).get("form") or {}
+    form = bundle.summary["results"]["form"] or {}
     return {name: str(form[name]) for name in ("x", "y", "step") if name in form}
 
 
@@ -114,7 +119,17 @@ def _check_truth(one: Bundle, other: Bundle, scenarios: Mapping[str, object]) ->
 
 
 def _counted(bundle: Bundle) -> Evaluator[Any]:
-    return bundle.setup.evaluator().resume(bundle.folder / COUNTS_FILE)
+    """The counts, of which a result can be computed; raises ResultsError or EvaluationError."""
+    path = own_file(bundle.folder / COUNTS_FILE)
+    evaluator = bundle.setup.evaluator().resume(path)
+    try:
+        for token in evaluator.tokens:
+            check_token(token)
+        evaluator.compute()
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        told = f"{type(error).__name__}: {shortened(str(error))}"
+        raise ResultsError(f"{path}: does not hold counts of its protocol ({told}); evaluate again") from error
+    return evaluator
 
 
 def _shared_tokens(
@@ -137,6 +152,6 @@ def _shared_tokens(
 
 
 def _first(names: list[str]) -> Iterator[str]:
-    yield from names[:_SHOWN]
+    yield from map(shortened, names[:_SHOWN])
     if len(names) > _SHOWN:
         yield "…"

@@ -52,7 +52,7 @@ def compare_bundles(
     test = paired_test(
         pair.evaluators[0], pair.clusters(), dict(zip(names, values[1] - values[0], strict=True)), chosen
     )
-    partial = [bundle.summary.get("partial") for bundle in pair.bundles]
+    partial = [bundle.summary["partial"] for bundle in pair.bundles]
     return Comparison(
         a=pair.bundles[0].folder,
         b=pair.bundles[1].folder,

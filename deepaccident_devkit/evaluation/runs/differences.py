@@ -7,12 +7,14 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 from deepaccident_devkit.arrays import ShortRepr
+from deepaccident_devkit.reading import shortened
 
 DifferenceKind = Literal["version", "file", "scenario", "results", "number", "sample", "evaluation"]
 ABSENT: Final = "absent"
 """Stands for a missing value."""
 _LONGEST: Final = 60
 """Characters of a value that a line shows."""
+_LONGEST_PLACE: Final = 300
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,7 +39,8 @@ class Difference(ShortRepr):
         """In a line."""
         if self.kind == "evaluation":
             return f"{self.kind}: {self.where}: cannot be made again: {self.found}"
-        return f"{self.kind}: {self.where}: stored {_short(self.stored)}, found {_short(self.found)}"
+        where = shortened(self.where if self.where.isprintable() else ascii(self.where), _LONGEST_PLACE)
+        return f"{self.kind}: {where}: stored {_short(self.stored)}, found {_short(self.found)}"
 
     def as_dict(self) -> dict[str, Any]:
         """By name."""

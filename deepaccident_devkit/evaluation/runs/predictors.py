@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
 
-from deepaccident_devkit.errors import EvaluationError
+from deepaccident_devkit.errors import EvaluationError, ResultsError
 from deepaccident_devkit.evaluation.metrics.attributes import cluster_of
 from deepaccident_devkit.evaluation.metrics.warning.drives import GIVEN, GROUPS
 from deepaccident_devkit.evaluation.runs.bundles import read_bundle
@@ -109,9 +109,12 @@ def chosen_threshold(folder: Path, by: Chooser, tokens: Iterable[str]) -> float:
             f"{folder}: is an evaluation of {shared[0]} or its twin, too; a threshold that is chosen on the recordings "
             "it is tried on flatters: give one of another split, such as train or val"
         )
-    groups: Mapping[str, Json] = bundle.summary["metrics"]["groups"]
-    group = next((name for name in GROUPS if name in groups), None)
-    threshold = None if group is None else groups[group][by]
+    try:
+        groups: Mapping[str, Json] = bundle.summary["metrics"]["groups"]
+        group = next((name for name in GROUPS if name in groups), None)
+        threshold = None if group is None else groups[group][by]
+    except (LookupError, TypeError) as error:
+        raise ResultsError(f"{folder}: its summary has no metrics of warnings; evaluate again") from error
     if not isinstance(threshold, float) or not math.isfinite(threshold):
         raise EvaluationError(
             f"{folder}: found no threshold by {by}; choose another, or give one with --switch threshold=…"

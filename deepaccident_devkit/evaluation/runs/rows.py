@@ -15,6 +15,8 @@ from deepaccident_devkit.evaluation.metrics.evaluator import Counts
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import plain
 from deepaccident_devkit.evaluation.metrics.motion import MotionResult
 from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
+from deepaccident_devkit.json_text import parsed_json
+from deepaccident_devkit.reading import check_size, fault_text, read_bytes, shortened
 
 Row = dict[str, Any]
 Cells = Iterator[tuple[str, Any]]
@@ -106,6 +108,9 @@ _CELLS: Final[Mapping[str, Callable[[Any, Counts, Any], Cells]]] = {
 }
 STAMP_KEY: Final = b"deepaccident"
 """Of the metadata: one JSON object."""
+_VALUE_BYTES: Final = 32
+"""Of a number as Python holds it."""
+_MOST_TOLD: Final = 300
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], stamp: Mapping[str, Any]) -> None:
@@ -129,15 +134,49 @@ def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], stamp: Mapping[str
 def read_rows(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Rows and stamp that `write_rows` wrote; raises ResultsError."""
     import pyarrow as pa
-    from pyarrow import parquet
 
     try:
-        table = parquet.read_table(path)
-        stamp = json.loads((table.schema.metadata or {})[STAMP_KEY])
-    except (OSError, pa.ArrowException, KeyError, ValueError) as error:
-        raise ResultsError(f"{path}: is no table of samples ({error}); evaluate again") from error
+        table = _table(read_bytes(path, "bundle"))
+        stamp: dict[str, Any] = parsed_json((table.schema.metadata or {})[STAMP_KEY])
+    except (OSError, pa.ArrowException, KeyError, TypeError, ValueError, MemoryError) as error:
+        told = shortened(fault_text(error), _MOST_TOLD)
+        raise ResultsError(f"{path}: is no table of samples ({told}); evaluate again") from error
     rows: list[dict[str, Any]] = table.to_pylist()
     return rows, stamp
+
+
+def _table(content: bytes) -> Any:
+    """The Arrow table in a Parquet file, whose values take no more memory than such a file may.
+
+    Texts stay in dictionaries until their lengths in all rows are known: a few bytes can stand for a long text in
+    millions of rows.
+
+    Raises:
+        OSError: it would take more.
+        ValueError: a column is of another kind than `write_rows` writes.
+        ArrowException: it is damaged.
+    """
+    import pyarrow as pa
+    import pyarrow.compute as pc
+    from pyarrow import parquet
+
+    limits = {"thrift_string_size_limit": len(content), "thrift_container_size_limit": len(content)}
+    schema = parquet.ParquetFile(pa.BufferReader(content), **limits).schema_arrow
+    kinds = (pa.string(), pa.int64(), pa.float64(), pa.bool_(), pa.null())
+    for field in schema:
+        if field.type not in kinds:
+            raise ValueError(f"column {shortened(field.name)} is of {shortened(str(field.type))}")
+    texts = [field.name for field in schema if field.type == pa.string()]
+    file = parquet.ParquetFile(pa.BufferReader(content), read_dictionary=texts, **limits)
+    check_size(file.metadata.num_rows * len(schema) * _VALUE_BYTES, "bundle", "its table")
+    table = file.read(use_threads=False)
+    lengths = 0
+    for name in texts:
+        for chunk in table.column(name).chunks:
+            each = pc.take(pc.binary_length(chunk.dictionary), chunk.indices)
+            lengths += pc.sum(each).as_py() or 0
+    check_size(lengths, "bundle", "its text")
+    return table
 
 
 def _column(values: Sequence[Any]) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
@@ -48,6 +47,10 @@ TASK_RESULTS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
 """Task → the kinds of results that it is evaluated from."""
 
 
+_LONGEST_HORIZON: Final = 100
+"""Seconds; recordings are shorter."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluationSetup:
     """What is evaluated, and by which rules; two of equal ones give comparable numbers.
@@ -69,8 +72,8 @@ class EvaluationSetup:
         settle_choices(self, {"task": get_args(TaskName)})
         protocol = choice(f"protocol of {self.task}", self.protocol, TASK_PROTOCOLS[self.task])
         object.__setattr__(self, "protocol", protocol)
-        if not 0 < self.horizon < math.inf:
-            raise ConfigError(f"horizon: expected seconds above 0, found {self.horizon!r}")
+        if not 0 < self.horizon <= _LONGEST_HORIZON:
+            raise ConfigError(f"horizon: expected seconds above 0, at most {_LONGEST_HORIZON}, found {self.horizon!r}")
         object.__setattr__(self, "switches", MappingProxyType(dict(self.switches)))
         switched(TASK_PROTOCOLS[self.task][self.protocol], self.switches)  # refuses impossible choices
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, Final
@@ -23,6 +24,7 @@ from deepaccident_devkit.evaluation.runs.bundles import (
     SUMMARY_FILE,
     Bundle,
     checksums_of,
+    own_file,
     read_bundle,
     read_json,
 )
@@ -30,6 +32,7 @@ from deepaccident_devkit.evaluation.runs.differences import ABSENT, Difference, 
 from deepaccident_devkit.evaluation.runs.evaluate import evaluate_results
 from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
 from deepaccident_devkit.evaluation.runs.rows import read_rows, sample_rows
+from deepaccident_devkit.evaluation.runs.selection import SampleSelection
 from deepaccident_devkit.release.fingerprints import scenario_hashes
 
 _SHOWN: Final = 10
@@ -99,28 +102,35 @@ def verify_bundle(
     dataset: Dataset,
     *,
     results: Results | str | os.PathLike[str] | None = None,
+    split: str | os.PathLike[str] | None = None,
     workers: int | None = None,
     progress: bool = False,
 ) -> Verification:
     """Evaluate again what a bundle is of, and compare everything with it; numbers must be equal to the bit.
 
+    A bundle may come from anyone. So no path in it that leads out of it is opened (`Bundle.outside_paths`), and no link
+    in it is followed; files that do not belong to it are named, not opened.
+
     Args:
         folder: of the bundle.
         dataset: the release; where `read_bundle(folder).dataroot` says, or another copy of it.
-        results: the predictions; None for the bundle's own copy, or where they were.
+        results: the predictions; None for the bundle's own copy.
+        split: the split file, if the bundle is of one; else None.
         workers: processes; None takes what the work is worth.
         progress: whether to show bars.
 
     Raises:
-        ResultsError: there is no bundle of this devkit's format, or no results to evaluate.
+        ResultsError: there is no bundle of this devkit's format, no results to evaluate, or a path must be given.
     """
     bundle = read_bundle(Path(folder).expanduser())
+    check_repeated(bundle, {"dataroot": dataset.dataroot, "results": results, "split": split})
     given = bundle.results_path if results is None else results
     opened = given if isinstance(given, Results) else read_results(given)
     found = [*_version(bundle), *_files(bundle), *_scenarios(bundle, dataset, workers), *_results(bundle, opened)]
     run: EvaluationRun | None = None
     try:
-        run = _again(bundle, dataset, opened, workers=workers, progress=progress)
+        selection = bundle.selection if split is None else replace(bundle.selection, split=os.fspath(split))
+        run = _again(bundle, dataset, opened, selection, workers=workers, progress=progress)
     except DeepAccidentError as error:
         found.append(Difference(kind="evaluation", where="all numbers", stored="evaluated", found=str(error)))
     if run is not None:
@@ -133,24 +143,42 @@ def verify_bundle(
     )
 
 
-def _again(bundle: Bundle, dataset: Dataset, results: Results, *, workers: int | None, progress: bool) -> EvaluationRun:
-    counts = bundle.summary.get("counts")
-    left_out = isinstance(counts, Mapping) and bool(counts.get("left_out"))
+def check_repeated(bundle: Bundle, given: Mapping[str, object]) -> None:
+    """Raise ResultsError unless all `Bundle.outside_paths` are given; it says how to give them as they are there."""
+    outside = bundle.outside_paths()
+    if all(given[name] is not None for name in outside):
+        return
+    options = " ".join(f"--{name} {shlex.quote(path)}" for name, path in outside.items())
+    raise ResultsError(
+        f"{bundle.folder}: names paths outside of it, which are opened only if you give them: deepaccident evaluate "
+        f"verify {shlex.quote(os.fspath(bundle.folder))} {options}"
+    )
+
+
+def _again(
+    bundle: Bundle,
+    dataset: Dataset,
+    results: Results,
+    selection: SampleSelection,
+    *,
+    workers: int | None,
+    progress: bool,
+) -> EvaluationRun:
     run = evaluate_results(
         dataset,
         results,
         bundle.setup,
-        bundle.selection,
-        allow_partial=bundle.summary.get("partial") is not None or left_out,
+        selection,
+        allow_partial=bundle.summary["partial"] is not None or bool(bundle.summary["counts"]["left_out"]),
         workers=workers,
         progress=progress,
     )
-    breakdowns = bundle.summary.get("breakdowns")
-    if not isinstance(breakdowns, Mapping) or not breakdowns:
+    breakdowns = bundle.summary["breakdowns"]
+    if not breakdowns:
         return run
     try:
         resampling = Resampling(**next(iter(breakdowns.values()))["resampling"])
-    except (TypeError, KeyError) as error:
+    except TypeError as error:
         raise ResultsError(f"{SUMMARY_FILE}: does not say how intervals were made ({error})") from error
     return run.broken_down(list(breakdowns), resampling, workers=workers)
 
@@ -167,7 +195,7 @@ def _files(bundle: Bundle) -> Iterator[Difference]:
     except ResultsError as error:
         yield Difference(kind="file", where=FILES_FILE, stored="a list of all files", found=str(error))
         return
-    for name, one, other in differing(stored, checksums_of(bundle.folder)):
+    for name, one, other in differing(stored, checksums_of(bundle.folder, stored)):
         yield Difference(kind="file", where=name, stored=one, found=other)
 
 
@@ -197,15 +225,15 @@ def _unlisted(bundle: Bundle, run: EvaluationRun) -> Iterator[Difference]:
 
 
 def _results(bundle: Bundle, results: Results) -> Iterator[Difference]:
-    about = bundle.summary.get("results")
-    stored = about.get("fingerprint", ABSENT) if isinstance(about, Mapping) else ABSENT
+    stored = bundle.summary["results"].get("fingerprint", ABSENT)
     if stored != results.fingerprint:
         where = f"fingerprint of {results.path}"
         yield Difference(kind="results", where=where, stored=stored, found=results.fingerprint)
 
 
 def _numbers(bundle: Bundle, run: EvaluationRun) -> Iterator[Difference]:
-    for where, stored, found in differing(bundle.summary, run.summary(), without=_NOT_COMPARED):
+    elsewhere = ("split",) if "split" in bundle.outside_paths() else ()
+    for where, stored, found in differing(bundle.summary, run.summary(), without=(*_NOT_COMPARED, *elsewhere)):
         yield Difference(kind="number", where=where, stored=stored, found=found)
 
 
@@ -222,7 +250,7 @@ def _counts(bundle: Bundle, run: EvaluationRun) -> Iterator[Difference]:
 
 def _rows(bundle: Bundle, run: EvaluationRun) -> Iterator[Difference]:
     try:
-        rows, _ = read_rows(bundle.folder / ROWS_FILE)
+        rows, _ = read_rows(own_file(bundle.folder / ROWS_FILE))
         stored = {row["token"]: row for row in rows}
     except (ResultsError, KeyError) as error:
         yield Difference(kind="file", where=ROWS_FILE, stored="rows", found=str(error))
@@ -243,5 +271,5 @@ def _notes(bundle: Bundle, run: EvaluationRun | None, found: Sequence[Difference
     if run is None:
         return
     here = run.summary()["environment"]
-    for name, stored, now in differing(bundle.summary.get("environment", {}), here):
+    for name, stored, now in differing(bundle.summary["environment"], here):
         yield f"evaluated with {name} {stored}, verified with {now}"

@@ -13,6 +13,7 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.render.evaluation import sections
 from deepaccident_devkit.render.evaluation.figures import RunFigure, run_figures, save_figure
 from deepaccident_devkit.render.evaluation.markup import Markup, breakable, document, joined, tag
@@ -87,7 +88,7 @@ def report_html(run: EvaluationRun, figures: Sequence[tuple[RunFigure, Path]]) -
 
 
 def _figure(drawn: RunFigure, path: Path) -> Markup:
-    content = base64.b64encode(path.read_bytes()).decode("ascii")
+    content = base64.b64encode(read_bytes(path, "image")).decode("ascii")
     image = tag("img", src=f"data:image/png;base64,{content}", alt=drawn.alt)
     return tag("figure", image, tag("figcaption", breakable(drawn.caption)))
 

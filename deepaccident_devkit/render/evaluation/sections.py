@@ -201,7 +201,7 @@ def checking() -> Markup:
                 "This report is one file of a bundle. Anyone who has the bundle, the results and the release can "
                 "compute all numbers again, and the command lists all that differ:",
             ),
-            tag("p", tag("code", "deepaccident evaluate verify DIR")),
+            tag("p", tag("code", "deepaccident evaluate verify DIR --dataroot DATAROOT --results RESULTS")),
             tag(
                 "p",
                 "The release's hash is made of the label, meta and calib files of each scenario evaluated "

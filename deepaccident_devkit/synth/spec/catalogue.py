@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.reading import fault_text, read_bytes
 from deepaccident_devkit.synth.spec.checks import check_scenario
 from deepaccident_devkit.synth.spec.choices import default_of, key_of
 from deepaccident_devkit.synth.spec.model import ScenarioSpec
@@ -30,12 +31,12 @@ def read_spec(path: str | os.PathLike[str]) -> SpecTemplate:
         ConfigError: there is no such file, or it is no possible scenario; the message names line, field and remedy.
     """
     try:
-        with Path(path).open(encoding="utf-8") as file:
-            text = file.read(_MOST_CHARACTERS + 1)
+        text = read_bytes(Path(path), "spec").decode()
     except FileNotFoundError as error:
         raise ConfigError(f"{path}: no such file; give the path of a scenario file (docs/scenarios.md)") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read ({error}); give a YAML file in UTF-8") from error
+    except (OSError, ValueError) as error:  # a ValueError also of a name with a null character
+        told = fault_text(error) if isinstance(error, OSError) else f"cannot be read ({error})"
+        raise ConfigError(f"{path}: {told}; give a YAML file in UTF-8") from error
     if len(text) > _MOST_CHARACTERS:
         raise ConfigError(
             f"{path}: has more than {_MOST_CHARACTERS} characters; give a scenario file, it has a few dozen lines"

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.reading import shortened
 from deepaccident_devkit.synth.spec.choices import Choice, Fixed, Items, OneOf, Part, Range, key_of
 from deepaccident_devkit.synth.spec.model import Bounds
 from deepaccident_devkit.synth.spec.yaml_nodes import Node
@@ -71,7 +72,7 @@ def read_part(node: Node, kind: type[Any], path: str = "") -> Part:
     for key, entry in entries.items():
         if key not in names:
             possible = f"possible: {', '.join(names)}{meant_text(key, names)}"
-            raise ConfigError(f"{entry.where}: {prefix}{key}: no such field; {possible}")
+            raise ConfigError(f"{entry.where}: {prefix}{shortened(key)}: no such field; {possible}")
     for name in required_fields(kind):
         if key_of(name) not in entries:
             raise ConfigError(f"{node.where}: {prefix}{key_of(name)}: is missing; add it")

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.reading import shortened
 
 if TYPE_CHECKING:
     import yaml
@@ -59,7 +60,8 @@ def parse_yaml(text: str, source: str) -> Node:
     except yaml.MarkedYAMLError as error:
         raise ConfigError(f"{source}:{_fault(error)}") from error
     except (yaml.YAMLError, RecursionError) as error:
-        raise ConfigError(f"{source}: no YAML: {str(error).splitlines()[0]}; write it again as plain text") from error
+        told = shortened(str(error).splitlines()[0])
+        raise ConfigError(f"{source}: no YAML: {told}; write it again as plain text") from error
 
 
 def _fault(error: yaml.MarkedYAMLError) -> str:
@@ -67,7 +69,8 @@ def _fault(error: yaml.MarkedYAMLError) -> str:
     marks = [mark for mark in (error.problem_mark, error.context_mark) if mark]
     lines = list(dict.fromkeys(mark.line + 1 for mark in marks)) or [1]
     began = f", or line {lines[-1]}, where the faulty part begins" if len(lines) > 1 else ""
-    return f"{lines[0]}: no YAML: {error.problem}; correct that line{began}: its quotes, brackets or indent (no tabs)"
+    told = shortened(str(error.problem))
+    return f"{lines[0]}: no YAML: {told}; correct that line{began}: its quotes, brackets or indent (no tabs)"
 
 
 class _Tree:
@@ -87,7 +90,7 @@ class _Tree:
             raise self._error(line, path, "aliases (*name) are not read here; write the value out")
         self._seen.add(id(raw))
         if not raw.tag.startswith(_PLAIN_TAGS):
-            raise self._error(line, path, f"tags ({raw.tag}) are not read here; leave the tag out")
+            raise self._error(line, path, f"tags ({shortened(raw.tag)}) are not read here; leave the tag out")
         if isinstance(raw, yaml.MappingNode):
             return Node(where, self._entries(raw, path))
         if isinstance(raw, yaml.SequenceNode):
@@ -99,12 +102,13 @@ class _Tree:
     def _scalar(self, raw: yaml.Node, line: int, path: str) -> Scalar:
         try:
             value = self._loader.construct_object(raw)
-        except (ValueError, LookupError, AttributeError) as error:  # PyYAML raises these if a tag does not fit
-            sentence = f"{raw.value[:40]!r} cannot be read ({error}); put it in quotes if it is a word"
+        except (ValueError, LookupError, AttributeError, OverflowError) as error:  # of PyYAML, if a tag does not fit
+            told = shortened(str(error))
+            sentence = f"{raw.value[:40]!r} cannot be read ({told}); put it in quotes if it is a word"
             raise self._error(line, path, sentence) from error
         if isinstance(value, int | float) and not isinstance(value, bool) and not _DECIMAL.fullmatch(raw.value):
-            sentence = f"{raw.value!r} is not a plain decimal number; write one, or put it in quotes if it is a word"
-            raise self._error(line, path, sentence)
+            found = f"{shortened(raw.value)!r} is not a plain decimal number"
+            raise self._error(line, path, f"{found}; write one, or put it in quotes if it is a word")
         return value
 
     def _entries(self, raw: yaml.MappingNode, path: str) -> dict[str, Node]:
@@ -120,4 +124,5 @@ class _Tree:
         return entries
 
     def _error(self, line: int, path: str, sentence: str) -> ConfigError:
-        return ConfigError(": ".join(part for part in (f"{self._source}:{line + 1}", path, sentence) if part))
+        parts = (f"{self._source}:{line + 1}", shortened(path), sentence)
+        return ConfigError(": ".join(part for part in parts if part))

@@ -300,7 +300,7 @@ class TestRefusing:
             "": "found an empty path; give '.' for the current one",
             tmp_path / "file": "file: is a file; give a folder",
             tmp_path / "photos": "photos: is not empty and holds no motion labels; choose a new folder",
-            tmp_path / "odd": "holds no motion labels",
+            tmp_path / "odd": r"manifest.json: not a regular file \(a folder\)",
             tmp_path / "file" / "below": "below: no labels can be written there .*; choose another folder",
             "/proc/nowhere": "nowhere: no labels can be written there .*; choose another folder",
         }.items():
@@ -527,6 +527,24 @@ class TestDamage:
         path = folder / MANIFEST
         path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
         with pytest.raises(LabelFilesError, match=r"manifest\.json: cannot be read"):
+            LabelFiles(folder)
+
+    def test_a_manifest_that_is_a_pipe_or_a_giant(self, folder: Path) -> None:
+        path = folder / MANIFEST
+        content = path.read_bytes()
+        path.unlink()
+        os.mkfifo(path)
+        with pytest.raises(LabelFilesError, match=r"not a regular file \(a named pipe\)"):
+            LabelFiles(folder)
+        path.unlink()
+        with path.open("wb") as file:
+            file.truncate(3 << 30)
+        with pytest.raises(LabelFilesError, match="has 3,221,225,472 bytes"):
+            LabelFiles(folder)
+        told = json.loads(content)
+        config = MotionLabelConfig(grid=BevGrid((-1000.0, 1000.0, 0.1), (-1000.0, 1000.0, 0.1)))
+        path.write_text(json.dumps({**told, "config": config.as_dict(), "config_digest": config.digest}))
+        with pytest.raises(LabelFilesError, match="a sample takes 32,000,000,000 bytes"):
             LabelFiles(folder)
 
     def test_a_configuration_changed_by_hand(self, folder: Path) -> None:

@@ -126,6 +126,8 @@ def exact_parts(numbers: Iterable[Iterable[float]]) -> list[float]:
     rest, parts = [*chain.from_iterable(numbers)], []
     while part := math.fsum(rest):
         parts.append(part)
+        if not math.isfinite(part):  # nothing remains of it, and nothing makes it 0
+            break
         rest.append(-part)
     return parts
 

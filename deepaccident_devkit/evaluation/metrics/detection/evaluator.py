@@ -181,6 +181,10 @@ class Ledger:
         self.truths: IntArray = _joined([each["truths"] for each in counts], np.int64).reshape(-1, groups)
         self._events = {name: self._by_key([each[name] for each in counts]) for name in _EVENTS}
         group, row, _ = self._events["detections"]
+        if len(group) and not 0 <= group[0] <= group[-1] < groups:  # else one number could ask for gigabytes
+            raise EvaluationError(
+                f"detections: expected groups from 0 to {groups - 1}, found {group[0]} to {group[-1]}"
+            )
         cells = np.bincount(self._sample[row] * groups + group, minlength=len(counts) * groups)
         self.detections: IntArray = cells.reshape(-1, groups)
 

@@ -24,6 +24,8 @@ _CHOICES: Final = {
     "curve": get_args(Curve),
     "area_of": ("center", "footprint"),
 }
+_MOST_POINTS: Final = 10_000_000
+"""Of all curves together."""
 _EVERY_CATEGORY: Final = tuple((name, (name,)) for name in CATEGORIES)
 
 
@@ -126,6 +128,12 @@ class DetectionProtocol:
             raise ConfigError(f"small_thresholds: expected as many as thresholds, found {self.small_thresholds}")
         if not (self.points > 1 and 0 <= self.min_recall < 1 and 0 <= self.min_precision < 1):
             raise ConfigError("points, min_recall, min_precision: expected at least 2, and shares from 0 and below 1")
+        curves = len(self.classes) * len(self.ranges) * len(self.thresholds)
+        if curves * self.points > _MOST_POINTS:
+            raise ConfigError(
+                f"points: {self.points} for each class, range and threshold ({curves}) are more than {_MOST_POINTS:,} "
+                "together; choose fewer"
+            )
         if not self.global_sort and self.curve != "voc":
             raise ConfigError(
                 f"global_sort: the curve {self.curve!r} is by the order of all scores; choose curve='voc'"

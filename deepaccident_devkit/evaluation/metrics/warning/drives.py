@@ -13,6 +13,7 @@ from typing import Final, Literal, get_args
 import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray, FrozenArrays, IntArray
+from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.alarms.truth import REFERENCES, Involvement
 from deepaccident_devkit.evaluation.metrics.attributes import cluster_of
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts
@@ -28,6 +29,8 @@ PREDICTORS: Final = (GIVEN, *TRIVIAL, *REFERENCES)
 """Rows of every table: the predictions, four predictors that know nothing, and two that know the present."""
 GROUPS: Final = (*get_args(Involvement), "unknown")
 """Of recordings, never pooled: by `Involvement`; `unknown` where no context says it."""
+_MOST_FRAMES: Final = 10_000
+"""Of a recording; the longest have some hundred."""
 _PLACE: Final = itemgetter("recording", "frame")
 _COLUMN: Final[Mapping[ScoresOf, int]] = {name: column for column, name in enumerate(get_args(ScoresOf))}
 
@@ -116,6 +119,8 @@ def _drive(name: str, samples: Sequence[Counts], part: int) -> Drive:
     first = samples[0]
     scenario, _, agent = name.rpartition("/")
     frame = np.array([each["frame"] for each in samples], dtype=np.int64)
+    if not (frame.min() >= 0 and frame.max() <= _MOST_FRAMES):  # a column each: else one could ask for gigabytes
+        raise EvaluationError(f"{name}: expected frames up to {_MOST_FRAMES:,}, found {frame.min()} to {frame.max()}")
     kind: Kind = first["kind"]
     ends = [each["frame"] + each["to_end"] for each in samples if each["to_end"] is not None]
     given = [[*each["alarms"], *([score, 0] for score in each["unjudged"])] for each in samples]

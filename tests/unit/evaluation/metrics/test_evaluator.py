@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from itertools import permutations
 from pathlib import Path
 from typing import Any
@@ -127,6 +128,24 @@ def test_a_damaged_state_is_refused(tmp_path: Path, text: str) -> None:
         Sums().resume(path)
     with pytest.raises(EvaluationError, match="nowhere"):
         Sums().resume(tmp_path / "nowhere")
+
+
+def test_a_hostile_state_is_refused_in_few_words(tmp_path: Path) -> None:
+    path = tmp_path / "state.json"
+    long = "x" * 10**6
+    for state in (
+        "[" * 10**6,
+        json.dumps({"made_by": long, "settings": {}, "counts": {}, "repeated": []}),
+        json.dumps({"made_by": filled("a")._maker, "settings": {long: 1}, "counts": {}, "repeated": []}),
+    ):
+        path.write_text(state)
+        with pytest.raises(EvaluationError, match="begin again") as raised:
+            Sums().resume(path)
+        assert len(str(raised.value)) < 1000
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(EvaluationError, match="a named pipe"):
+        Sums().resume(path)
 
 
 def test_a_place_that_cannot_be_written_is_our_error(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import json
 import pickle
 import re
 import struct
+import tracemalloc
 import warnings
 import zipfile
 from collections.abc import Callable
@@ -100,7 +101,7 @@ TEXTS: dict[str, tuple[str, str, tuple[str, ...]]] = {
         ("meta: expected a name of characters, found half of one",),
     ),
     "nested deeper than reports show": ('"plain"', f"{'[' * 40}{']' * 40}", ("meta: is nested more than 30 levels",)),
-    "nested a million deep": ('"plain"', "[" * 10**6, ("is nested too deeply",)),
+    "nested a million deep": ('"plain"', "[" * 10**6, ("is nested more than 64 levels deep",)),
 }
 
 
@@ -468,6 +469,61 @@ def test_members(tmp_path: Path, kind: str) -> None:
     refused(folder, f"shards/00000.npz: {FIRST}: {words}")
     with pytest.raises(ResultsError, match=re.escape(words)):
         read_results(folder).prediction(FIRST)
+
+
+def test_links_in_a_loop(tmp_path: Path) -> None:
+    (tmp_path / "loop.json").symlink_to("loop.json")
+    refused(tmp_path / "loop.json", "loop.json: cannot be read (", "symbolic links")
+    folder = plain.write_motion(tmp_path / "motion")
+    shard = folder / "shards" / "00000.npz"
+    shard.unlink()
+    shard.symlink_to(shard.name)
+    refused(folder, "file: shards/00000.npz cannot be opened (", "symbolic links")
+    (folder / "results.json").unlink()
+    (folder / "results.json").symlink_to("results.json")
+    refused(folder, "cannot be read (", "symbolic links")
+
+
+def test_giants(tmp_path: Path) -> None:
+    with (tmp_path / "giant.json").open("wb") as file:
+        file.truncate(3 << 30)
+    refused(
+        tmp_path / "giant.json", "giant.json: has 3,221,225,472 bytes, more than 1,073,741,824, the limit for results"
+    )
+    folder = plain.write_motion(tmp_path / "motion")
+    with (folder / "shards" / "00000.npz").open("r+b") as file:
+        file.truncate(3 << 30)
+    refused(folder, "shards/00000.npz takes 3,221,225,472 bytes")
+
+
+@pytest.mark.parametrize("way", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_members_that_are_packed_otherwise(tmp_path: Path, way: int) -> None:
+    folder = plain.write_motion(tmp_path / "motion")
+    path = folder / "shards" / "00000.npz"
+    with zipfile.ZipFile(path) as archive:
+        contents = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w", way) as archive:
+        for name, content in contents.items():
+            archive.writestr(name, content)
+    plain.relist(folder)
+    refused(folder, "instance: cannot be read (a member is encrypted or compressed by an unknown method)")
+
+
+def test_a_bomb_is_not_unpacked(tmp_path: Path) -> None:
+    folder = plain.write_motion(tmp_path / "motion")
+    rewritten(folder, {MEMBER: npy(np.zeros(100_000_000, dtype=np.uint8))})
+    tracemalloc.start()
+    refused(folder, "instance: expected shape (1 to 2, 3, 6, 8), which has at most", "found 100,000,128 bytes")
+    assert tracemalloc.get_traced_memory()[1] < 10 << 20
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize("change", [{"x" * 10**6: 1}, {"task": "y" * 10**6}, {"results": {"z" * 10**6: []}}])
+def test_long_words_are_cut_in_messages(tmp_path: Path, change: dict[str, Any]) -> None:
+    path = plain.write_json(tmp_path / "long.json", plain.accidents() | change)
+    with pytest.raises(ResultsError, match=r"long\.json: ") as raised:
+        read_results(path)
+    assert len(str(raised.value)) < 1000
 
 
 def test_a_member_that_is_too_much(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,28 @@ from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.files import file_checksum
 
 FILES = {"metrics_summary.json", "counts.json", "samples.parquet", "scenarios.json", "files.json"}
+MISFITS: dict[str, tuple[Callable[[Any], object], str]] = {
+    "no task": (lambda summary: summary.pop("task"), "task is missing"),
+    "agents": (lambda summary: summary.update(agents=3), "agents: expected a list, found int 3"),
+    "an agent": (lambda summary: summary.update(agents=["ego_vehicle", 1]), "agents/1: expected a printable text"),
+    "a dataroot": (lambda summary: summary["release"].update(dataroot=3), "release/dataroot: expected a printable"),
+    "a long path": (lambda summary: summary["results"].update(path="x" * 5000), "results/path: .*x … x{3}"),
+    "no number": (
+        lambda summary: summary["counts"].update(left_out=True),
+        "counts/left_out: expected a whole number",
+    ),
+    "a partial one": (
+        lambda summary: summary.update(partial={"mark": "\x1b[2J"}),
+        "partial/mark: expected a printable",
+    ),
+    "breakdowns": (lambda summary: summary["breakdowns"].update(all=[]), "breakdowns/all: expected an object"),
+    "a task": (lambda summary: summary.update(task="x" * 900), "task: expected one of"),
+    "a horizon of years": (
+        lambda summary: summary.update(horizon=1e9),
+        "horizon: expected seconds above 0, at most 100",
+    ),
+    "a switch": (lambda summary: summary.update(switches={"x" * 900: 1}), "BoxAccidents has no switch"),
+}
 JSON_FILES = sorted(name for name in FILES if name.endswith(".json"))
 
 
@@ -170,12 +193,12 @@ class TestDamaged:
         ("content", "sentence"),
         [
             (None, r"metrics_summary.json: is missing; give a folder that"),
-            ("{", r"metrics_summary.json: cannot be read \(Expecting"),
+            ("{", r"metrics_summary.json: is no JSON \(Expecting"),
             ("[]", r"metrics_summary.json: expected an object, found list"),
             ('{"format": "nuScenes"}', r"expected the format 'DeepAccident metrics summary', found 'nuScenes'"),
             (
                 '{"format": "DeepAccident metrics summary", "version": 9, "devkit_version": "7.0"}',
-                r"is of version 9, this devkit reads 1; use the devkit that wrote it \(7.0\)",
+                r"is of version 9, this devkit reads 1; use the devkit that wrote it \('7.0'\)",
             ),
         ],
     )
@@ -188,13 +211,16 @@ class TestDamaged:
         with pytest.raises(ResultsError, match=sentence):
             read_bundle(path.parent)
 
-    @pytest.mark.parametrize("part", ["setup", "selection", "dataroot", "results_path"])
-    def test_a_summary_without_parts(self, tmp_path: Path, part: str) -> None:
-        head = {"format": "DeepAccident metrics summary", "version": 1, "agents": 3, "release": {"dataroot": 3}}
-        (tmp_path / "metrics_summary.json").write_text(json.dumps(head))
-        bundle = read_bundle(tmp_path)
-        with pytest.raises(ResultsError, match=r"metrics_summary.json: does not say what was evaluated"):
-            getattr(bundle, part)
+    @pytest.mark.parametrize("fault", MISFITS)
+    def test_a_summary_against_its_schema(self, run: EvaluationRun, tmp_path: Path, fault: str) -> None:
+        change, told = MISFITS[fault]
+        path = save_run(run.broken_down(["all"]), tmp_path / "bundle") / "metrics_summary.json"
+        summary = read(path)
+        change(summary)
+        path.write_text(json.dumps(summary), encoding="utf-8")
+        with pytest.raises(ResultsError, match=rf"metrics_summary.json: does not say what was evaluated \({told}") as e:
+            _ = read_bundle(path.parent).setup, read_bundle(path.parent).selection
+        assert len(str(e.value)) < 1000
 
     def test_no_folder(self, tmp_path: Path) -> None:
         with pytest.raises(ResultsError, match=r"nowhere: no such folder"):
@@ -206,5 +232,5 @@ def test_scenarios_without_hashes_are_no_bundle_s(run: EvaluationRun, tmp_path: 
     path = bundle.folder / "scenarios.json"
     stated = read(path)
     path.write_text(json.dumps({**stated, "scenarios": ["s"]}), encoding="utf-8")
-    with pytest.raises(ResultsError, match="expected scenarios with their hashes"):
+    with pytest.raises(ResultsError, match=r"scenarios.json: scenarios: expected an object, found list"):
         bundle.scenarios()

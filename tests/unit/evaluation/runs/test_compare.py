@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -17,6 +18,7 @@ from scipy.stats import binom
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError, ResultsError
 from deepaccident_devkit.evaluation import Resampling
+from deepaccident_devkit.evaluation.metrics.accident.scoring import exact_parts
 from deepaccident_devkit.evaluation.metrics.numbers import numbers_of
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import (
@@ -32,6 +34,16 @@ from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 Write = Callable[..., Results]
 Save = Callable[..., Path]
 FEW = Resampling(resamples=40)
+FIRST = "type1_subtype1_accident/Town03_000/ego_vehicle/001"
+COUNT_FAULTS: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
+    "nothing": (lambda counts: counts[FIRST].clear(), "KeyError: 'vpq'"),
+    "a text": (lambda counts: counts[FIRST].update(cells="x"), "ValueError"),
+    "a short list": (lambda counts: counts[FIRST].update(cells=[]), "IndexError"),
+    "a number": (lambda counts: counts[FIRST].update(paths=1), "TypeError"),
+    "giants": (lambda counts: counts[FIRST].update(vpq=[[[10**400]] * 4] * 2), "OverflowError"),
+    "infinity": (lambda counts: counts[FIRST].update(vpq=[[[math.inf]] * 4] * 2), "OverflowError"),
+    "no token": (lambda counts: counts.update({"x" * 10**6: counts[FIRST]}), "expected a sample's token"),
+}
 
 
 @pytest.fixture(scope="module")
@@ -289,3 +301,39 @@ def test_equally_good_runs_are_rarely_called_really_different(tmp_path: Path, cl
         real += by_name(compare_bundles(*folders, Resampling(resamples=200, seed=pair)))[MAIN].real
     assert real <= binom.ppf(0.995, pairs, 0.05)
     assert real > 0
+
+
+@pytest.mark.parametrize("fault", COUNT_FAULTS)
+def test_counts_that_are_none_are_a_fault_of_the_bundle(tmp_path: Path, fault: str) -> None:
+    change, told = COUNT_FAULTS[fault]
+    folder = write_bundle(tmp_path / "a", [(3, 1)] * 3)
+    state = json.loads((folder / "counts.json").read_text())
+    change(state["counts"])
+    (folder / "counts.json").write_text(json.dumps(state))
+    with pytest.raises(ResultsError, match=rf"counts.json: does not hold counts of its protocol \(.*{told}") as raised:
+        compare_bundles(folder, folder)
+    assert len(str(raised.value)) < 1000
+
+
+class TestNumbersThatAskForMemory:
+    """In stored counts that a stranger sends: such as a frame of a recording, which has a column each."""
+
+    def test_of_detections(self) -> None:
+        evaluator = EvaluationSetup(task="detection").evaluator()
+        columns = {name: [[], []] for name in ("tp", "spent", "matches")}
+        counts = {"token": "a", "truths": [], "scores": [0.5], "detections": [[10**12], [0]], "excused": [[]] * 3}
+        evaluator.add("a", counts | columns | {"errors": [[]] * 6})
+        with pytest.raises(EvaluationError, match=r"detections: expected groups from 0 to \d+, found 10{12} to 10{12}"):
+            evaluator.compute()
+
+    def test_of_warnings(self) -> None:
+        evaluator = EvaluationSetup(task="warning", protocol="clean").evaluator()
+        nothing = {"alarms": [], "unjudged": [], "references": [], "involvement": None, "ahead": None, "to_end": None}
+        evaluator.add("a", {"recording": "s/t/a", "frame": 10**9, "kind": "others", "beyond": 0} | nothing)
+        with pytest.raises(EvaluationError, match="s/t/a: expected frames up to 10,000, found 1000000000"):
+            evaluator.compute()
+
+    @pytest.mark.parametrize("value", [math.nan, math.inf])
+    def test_of_accidents(self, value: float) -> None:
+        """Of which the remainders never end."""
+        assert len(exact_parts([[1.0, value]])) == 1

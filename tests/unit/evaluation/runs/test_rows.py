@@ -1,6 +1,7 @@
 """Rows of single samples: their sums are the result's, of every task."""
 
 import math
+import os
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +19,27 @@ from deepaccident_devkit.evaluation.runs.rows import write_rows
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 
 Write = Callable[..., Results]
+
+
+def _arrow(values: list[Any], kind: str) -> Any:
+    import pyarrow as pa
+
+    return pa.array(values, pa.type_for_alias(kind))
+
+
+def _repeated(value: str, times: int) -> Any:
+    import pyarrow as pa
+
+    return pa.DictionaryArray.from_arrays(np.zeros(times, dtype=np.int32), [value])
+
+
+BOMBS: dict[str, tuple[Callable[[], Any], str]] = {
+    "a long text in each of many rows": (lambda: _repeated("x" * 10**6, 10**5), "its text takes 100,000,000,000 bytes"),
+    "many rows": (lambda: _arrow([7] * (5 * 10**6), "int64"), "its table takes 160,000,000 bytes"),
+    "rows of nothing": (lambda: _arrow([None] * (5 * 10**6), "null"), "its table takes 160,000,000 bytes"),
+    "bytes": (lambda: _arrow([b"a"], "binary"), "column token is of binary"),
+    "whole numbers of another size": (lambda: _arrow([7], "int32"), "column token is of int32"),
+}
 
 
 def column(rows: list[dict[str, Any]], name: str) -> list[Any]:
@@ -109,3 +131,28 @@ class TestParquet:
         parquet.write_table(pa.table({"token": ["a"]}), tmp_path / "rows.parquet")
         with pytest.raises(ResultsError, match=r"rows.parquet: is no table of samples \(b'deepaccident'\)"):
             read_rows(tmp_path / "rows.parquet")
+
+    @pytest.mark.parametrize("kind", BOMBS)
+    def test_what_would_not_fit_into_memory(self, tmp_path: Path, kind: str) -> None:
+        import pyarrow as pa
+        from pyarrow import parquet
+
+        column, told = BOMBS[kind]
+        table = pa.table({"token": column()}).replace_schema_metadata({"deepaccident": "{}"})
+        parquet.write_table(table, tmp_path / "rows.parquet", compression="zstd", store_schema=False)
+        del table
+        pool = pa.default_memory_pool()
+        before = pool.bytes_allocated()
+        with pytest.raises(ResultsError, match=rf"rows.parquet: is no table of samples \({told}") as raised:
+            read_rows(tmp_path / "rows.parquet")
+        assert len(str(raised.value)) < 1000
+        assert pool.bytes_allocated() - before < 100 << 20
+
+    def test_a_pipe_and_a_giant(self, tmp_path: Path) -> None:
+        os.mkfifo(tmp_path / "pipe")
+        with pytest.raises(ResultsError, match=r"not a regular file \(a named pipe\)"):
+            read_rows(tmp_path / "pipe")
+        with (tmp_path / "giant").open("wb") as file:
+            file.truncate(3 << 30)
+        with pytest.raises(ResultsError, match="has 3,221,225,472 bytes"):
+            read_rows(tmp_path / "giant")

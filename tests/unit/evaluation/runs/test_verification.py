@@ -1,6 +1,7 @@
 """Bundles made again: the same, or every difference named."""
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -34,7 +35,9 @@ def bundle(run: EvaluationRun, tmp_path: Path) -> Path:
 
 
 def verify(bundle: Path, dataset: DeepAccident, **named: Any) -> Verification:
-    return verify_bundle(bundle, dataset, workers=1, **named)
+    """With the results beside the bundle, unless others are given, or a copy is in it."""
+    beside = None if (bundle / "results").exists() else bundle.with_name("accidents.json")
+    return verify_bundle(bundle, dataset, workers=1, **{"results": beside, **named})
 
 
 def changed(path: Path, change: Callable[[Any], object]) -> None:
@@ -66,7 +69,7 @@ class TestSame:
     ) -> None:
         results = write_accidents(tmp_path / "some.json", selection.tokens(da_b)[1:])
         part = evaluate_results(da_b, results, run.setup, selection, allow_partial=True, workers=1)
-        assert verify(save_run(part, tmp_path / "bundle"), da_b).is_same
+        assert verify(save_run(part, tmp_path / "bundle"), da_b, results=results).is_same
 
     def test_one_whose_results_have_other_samples_too(
         self, da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, results: Results, run: EvaluationRun
@@ -234,3 +237,102 @@ def test_differing(stored: Any, found: Any, expected: list[tuple[str, Any, Any]]
 def test_long_values_are_cut_in_a_line() -> None:
     text = Difference(kind="number", where="x", stored="y" * 100, found=ABSENT).text()
     assert text == f"number: x: stored '{'y' * 58}…, found absent"
+
+
+class TestStrangers:
+    """Bundles that somebody sent: faults are one ResultsError, findings are named, and nothing outside is opened."""
+
+    def test_what_does_not_belong_is_named_and_not_opened(
+        self, bundle: Path, da_b: DeepAccident, tmp_path: Path
+    ) -> None:
+        os.mkfifo(bundle / "a pipe")
+        (bundle / "loop").symlink_to("loop")
+        (bundle / "a link").symlink_to(tmp_path)
+        (bundle / "extra\x1b.bin").write_bytes(b"1")
+        (bundle / "scenarios.json").rename(tmp_path / "scenarios.json")
+        (bundle / "scenarios.json").symlink_to(tmp_path / "scenarios.json")
+        with (bundle / "counts.json").open("r+b") as file:
+            file.truncate(5 << 30)
+        verification = verify(bundle, da_b)
+        named = {each.where: each.found for each in verification.differences if each.kind == "file"}
+        assert named["a pipe"] == "not a regular file (a named pipe)"
+        assert named["loop"] == named["a link"] == "a link"
+        assert named["extra\x1b.bin"] == "a file that is not listed"
+        assert "is a link, which is not followed" in named["scenarios.json"]
+        assert "has 5,368,709,120 bytes" in named["counts.json"]
+        assert "\x1b" not in verification.to_text()
+
+    @pytest.mark.parametrize(
+        "name", ["metrics_summary.json", "files.json", "scenarios.json", "counts.json", "samples.parquet"]
+    )
+    def test_a_pipe_in_the_place_of_a_file(self, bundle: Path, da_b: DeepAccident, name: str) -> None:
+        (bundle / name).unlink()
+        os.mkfifo(bundle / name)
+        if name == "metrics_summary.json":
+            with pytest.raises(ResultsError, match=r"metrics_summary.json: not a regular file \(a named pipe\)"):
+                verify(bundle, da_b)
+        else:
+            assert ("file", name) in found(verify(bundle, da_b))
+
+    def test_paths_that_lead_out_are_opened_only_if_they_are_given(
+        self, bundle: Path, da_b: DeepAccident, results: Results, tmp_path: Path
+    ) -> None:
+        command = f"evaluate verify {bundle} --dataroot {da_b.dataroot} --results {results.path}"
+        with pytest.raises(ResultsError, match=f"are opened only if you give them: deepaccident {command}$"):
+            verify(bundle, da_b, results=None)
+        splits = tmp_path / "mine.txt"
+        os.mkfifo(splits)
+        changed(bundle / "metrics_summary.json", lambda summary: summary.update(split=str(splits)))
+        with pytest.raises(ResultsError, match=f"{command} --split {splits}$"):
+            verify(bundle, da_b)
+        splits.unlink()
+        scenarios = sorted({token.rsplit("/", 2)[0] for token in results.tokens})
+        splits.write_text("".join(f"{token.replace('/', ' ')}\n" for token in scenarios))
+        assert found(verify(bundle, da_b, split=splits)) == [("file", "metrics_summary.json")]
+
+    @pytest.mark.parametrize("kind", ["the folder", "the file", "a loop", "a pipe"])
+    def test_a_copy_of_the_results_that_leads_out_is_refused(
+        self, run: EvaluationRun, da_b: DeepAccident, tmp_path: Path, kind: str
+    ) -> None:
+        bundle = save_run(run, tmp_path / "bundle", include_results=True)
+        copy = bundle / "results" / "accidents.json"
+        if kind == "the folder":
+            (bundle / "results").rename(tmp_path / "moved")
+            (bundle / "results").symlink_to(tmp_path / "moved")
+        else:
+            copy.rename(tmp_path / "elsewhere.json")
+            copy.symlink_to({"the file": tmp_path / "elsewhere.json"}.get(kind, copy))
+        if kind == "a pipe":
+            copy.unlink()
+            os.mkfifo(copy)
+        with pytest.raises(ResultsError, match=r"bundle: results(/accidents.json)? is (a link|not a regular file)"):
+            verify(bundle, da_b)
+
+    @pytest.mark.parametrize(
+        "resampling",
+        [
+            {"resamples": 10**9},
+            {"resamples": "9"},
+            {"seed": -1},
+            {"seed": []},
+            {"confidence": "x"},
+            {"depth": 1},
+            {"seed": 0.5},
+        ],
+    )
+    def test_counts_of_resamples_are_bounded(
+        self, bundle: Path, da_b: DeepAccident, resampling: dict[str, Any]
+    ) -> None:
+        changed(
+            bundle / "metrics_summary.json",
+            lambda summary: summary["breakdowns"]["all"].update(resampling=resampling),
+        )
+        assert ("evaluation", "all numbers") in found(verify(bundle, da_b))
+
+    def test_deep_nesting_is_refused(self, bundle: Path, da_b: DeepAccident) -> None:
+        path = bundle / "counts.json"
+        path.write_text('{"counts": ' + "[" * 900 + "]" * 900 + "}")
+        assert ("file", "counts.json") in found(verify(bundle, da_b))
+        (bundle / "metrics_summary.json").write_text("[" * 900 + "]" * 900)
+        with pytest.raises(ResultsError, match="is nested more than 64 levels deep"):
+            verify(bundle, da_b)

@@ -1,3 +1,5 @@
+import os
+
 import pytest
 
 from deepaccident_devkit.errors import ConfigError
@@ -99,6 +101,27 @@ def test_a_file_is_read_in_utf8_and_named_in_its_errors(tmp_path, small):
         read_spec(path)
     with pytest.raises(ConfigError, match=r"other.yaml: no such file; give the path of a scenario file"):
         read_spec(tmp_path / "other.yaml")
+
+
+def test_what_is_no_regular_file_is_not_opened(tmp_path):
+    os.mkfifo(tmp_path / "pipe.yaml")
+    (tmp_path / "loop.yaml").symlink_to("loop.yaml")
+    with (tmp_path / "giant.yaml").open("wb") as file:
+        file.truncate(3 << 30)
+    for name, told in {"pipe": "a named pipe", "loop": "symbolic links", "giant": "has 3,221,225,472 bytes"}.items():
+        with pytest.raises(ConfigError, match=rf"{name}.yaml: .*{told}"):
+            read_spec(tmp_path / f"{name}.yaml")
+
+
+@pytest.mark.parametrize(
+    "text", ["x" * 190_000 + ": 1", "actors: {" + "y" * 190_000 + ": 1}", "name: *" + "z" * 190_000]
+)
+def test_long_words_are_cut_in_messages(tmp_path, text):
+    path = tmp_path / "long.yaml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"long.yaml:1: ") as raised:
+        read_spec(path)
+    assert len(str(raised.value)) < 1000
 
 
 def test_what_is_too_large_for_a_scenario_is_not_parsed(tmp_path, small):

@@ -29,6 +29,8 @@ def test_every_value_knows_the_line_of_its_key_or_item():
         ("a: !!timestamp x", "f.yaml:1: a: 'x' cannot be read"),
         ("a: 010", "f.yaml:1: a: '010' is not a plain decimal number; write one, or put it in quotes if it is a word"),
         ("a: 1:30", "f.yaml:1: a: '1:30' is not a plain decimal number"),
+        ("a: 1" + ":59" * 300 + ".5", "f.yaml:1: a: '1:59:59.*cannot be read"),
+        ("a: " + "1" * 5000, r"f.yaml:1: a: '1{40}' cannot be read"),
         ("a: 1_0", "f.yaml:1: a: '1_0' is not a plain decimal number"),
         ("a: 0x1F", "f.yaml:1: a: '0x1F' is not a plain decimal number"),
         ("a: 2020-13-40", r"f.yaml:1: a: '2020-13-40' cannot be read \(.*\); put it in quotes if it is a word"),

@@ -1,0 +1,119 @@
+"""`parsed_json`: JSON of strangers, read strictly and within bounds.
+
+Python's reader silently accepts a name that stands twice in an object, NaN, and half a character; and a value nested
+1,000 levels deep, which no function that calls itself can walk through afterwards.
+"""
+
+import json
+import math
+import re
+from collections.abc import Iterator
+from typing import Any, Final
+
+import numpy as np
+
+from deepaccident_devkit.reading import shortened
+
+MOST_LEVELS: Final = 64
+"""The largest depth of nested objects and lists; the devkit's files have some ten."""
+_BLOCK: Final = 1 << 20
+_QUOTE: Final = ord('"')
+_OTHERS: Final = bytes(set(range(256)) - set(b'[]{}"'))
+_STEPS: Final = np.zeros(256, dtype=np.int64)
+_STEPS[list(b"[{")], _STEPS[list(b"]}")] = 1, -1
+_GZIP: Final = b"\x1f\x8b"
+_PICKLE: Final = b"\x80"
+_SURROGATE: Final = re.compile("[\ud800-\udfff]")
+"""Half of a character: JSON can write it alone, UTF-8 cannot."""
+_WRITTEN_SURROGATE: Final = re.compile(r"\\u[dD][89a-fA-F]")
+
+
+class _Repeated(dict[str, Any]):
+    """An object in which `name` stands twice."""
+
+    name: str
+
+
+class _Constant(float):
+    """NaN or an infinity that was written as a word."""
+
+
+def parsed_json(content: bytes, *, constants: bool = False) -> Any:
+    """The value of JSON text, nested at most `MOST_LEVELS` levels deep.
+
+    A number too large for a float is infinite; callers check the numbers that they use.
+
+    Args:
+        content: of a file.
+        constants: whether NaN and Infinity may stand there, which are no JSON, and which Python writes.
+
+    Raises:
+        ValueError: it is no JSON, or against these rules; half a sentence, which names the place of the fault.
+    """
+    faults: list[object] = []
+
+    def made(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        result = dict(pairs)
+        return result if len(result) == len(pairs) else noted(_repeated(pairs))
+
+    def noted(fault: Any) -> Any:
+        faults.append(fault)
+        return fault
+
+    if content.startswith(_GZIP):
+        raise ValueError("is compressed with gzip; unpack it")
+    if content.startswith(_PICKLE):
+        raise ValueError("is a pickle; write JSON")
+    _check_levels(content)
+    told = None if constants else lambda word: noted(_Constant(word))
+    try:
+        text = content.decode("utf-8")
+        value = json.loads(text, object_pairs_hook=made, parse_constant=told)
+    except ValueError as error:  # also of other bytes than UTF-8, and of numbers with thousands of digits
+        raise ValueError(f"is no JSON ({error})") from error
+    fault = next(_faults(value, ""), None) if faults or _WRITTEN_SURROGATE.search(text) else None
+    if faults or fault:
+        raise ValueError(fault or "holds a name twice in one object")
+    return value
+
+
+def _check_levels(content: bytes) -> None:
+    """Raise ValueError if brackets outside texts are nested too deeply."""
+    if b"\\" in content:  # of an escaped quote nothing must be left
+        content = content.replace(b"\\\\", b"").replace(b'\\"', b"")
+    level, inside = 0, False
+    for first in range(0, len(content), _BLOCK):
+        marks = np.frombuffer(content[first : first + _BLOCK].translate(None, _OTHERS), dtype=np.uint8)
+        in_text = np.logical_xor.accumulate(np.concatenate([[inside], marks == _QUOTE]))
+        levels = level + np.cumsum(_STEPS[marks] * ~in_text[1:])
+        if levels.max(initial=0) > MOST_LEVELS:
+            raise ValueError(f"is nested more than {MOST_LEVELS} levels deep")
+        level, inside = levels[-1] if len(levels) else level, in_text[-1]
+
+
+def _repeated(pairs: list[tuple[str, Any]]) -> _Repeated:
+    result, seen = _Repeated(pairs), set[str]()
+    for name, _ in pairs:
+        if name in seen:
+            result.name = name
+        seen.add(name)
+    return result
+
+
+def _faults(value: object, place: str) -> Iterator[str]:
+    """What is wrong in a value, in the order of the text; `place` ends in a colon and a blank."""
+    if isinstance(value, _Repeated):
+        yield f"{place}{shortened(value.name)}: stands there twice"
+    if isinstance(value, _Constant):
+        word = "NaN" if math.isnan(value) else "Infinity"
+        yield f"{place}expected a finite number, found {word}; write null for an optional value that is not known"
+    if isinstance(value, str) and _SURROGATE.search(value):
+        yield f"{place}expected characters, found half of one: {shortened(value)!a}"
+    if isinstance(value, dict):
+        for name, each in value.items():
+            if _SURROGATE.search(name):
+                yield f"{place}expected a name of characters, found half of one: {shortened(name)!a}"
+            yield from _faults(each, f"{place}{shortened(name)}: ")
+    if isinstance(value, list):
+        for number, each in enumerate(value):
+            yield from _faults(each, f"{place}entry {number}: ")

@@ -1,0 +1,72 @@
+"""JSON of strangers: strict, bounded in depth, and told in few words."""
+
+import json
+import time
+from typing import Any
+
+import pytest
+
+from deepaccident_devkit.json_text import MOST_LEVELS, parsed_json
+
+
+@pytest.mark.parametrize("value", [None, 1, "a", [], {}, {"a": [1.5, {"b": '[[[\\"{'}], "[": "\\"}, '\\"' * 3, "é😀"])
+def test_json_is_read(value: Any) -> None:
+    assert parsed_json(json.dumps(value).encode()) == value
+    assert parsed_json(json.dumps(value, ensure_ascii=False, indent=1).encode()) == value
+
+
+def test_brackets_in_texts_are_no_levels() -> None:
+    texts = ["[" * 100, '"' + "{" * 100, "\\" * 99 + '"' + "[" * 100, "]" * 100]
+    for text in texts:
+        assert parsed_json(json.dumps({"a": text}).encode()) == {"a": text}
+    after = b'["\\\\", "\\"", ' + b"[" * MOST_LEVELS
+    with pytest.raises(ValueError, match=f"is nested more than {MOST_LEVELS} levels deep"):
+        parsed_json(after + b"]" * (MOST_LEVELS + 1))
+
+
+@pytest.mark.parametrize("far", [0, 3 << 20])
+def test_levels_are_counted(far: int) -> None:
+    """Also across the blocks that are looked at one after another."""
+    blanks = b" " * far
+    deepest = b"[" + blanks + b"[" * (MOST_LEVELS - 1) + b"]" * MOST_LEVELS
+    assert parsed_json(deepest)
+    with pytest.raises(ValueError, match="nested more than"):
+        parsed_json(b"[" + deepest + b"]")
+    with pytest.raises(ValueError, match="nested more than"):
+        parsed_json(b'{"a":' * 1_000_000)
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (b"", "is no JSON"),
+        (b'{"a"', "is no JSON"),
+        (b"\x1f\x8b", "is compressed with gzip"),
+        (b"\x80\x04", "is a pickle"),
+        (b'"\xff"', "is no JSON"),
+        (b'{"a": [{"b": 1, "b": 2}]}', "a: entry 0: b: stands there twice"),
+        (b'{"a": NaN}', "a: expected a finite number, found NaN"),
+        (b"[-Infinity]", "entry 0: expected a finite number, found Infinity"),
+        (b'["\\ud800"]', r"entry 0: expected characters, found half of one: '\\ud800'"),
+        (b'{"\\udfff": 1}', "expected a name of characters"),
+        (b'{"' + b"x" * 10_000 + b'": NaN}', "x … x"),
+        (b'["' + b"y" * 10_000 + b'\\ud800"]', r"y \\u2026 y"),
+        (b'{"' + b"z" * 10_000 + b'": 1, "' + b"z" * 10_000 + b'": 2}', "z … z"),
+    ],
+)
+def test_what_is_none_is_told_in_few_words(content: bytes, told: str) -> None:
+    with pytest.raises(ValueError, match=told) as raised:
+        parsed_json(content)
+    assert len(str(raised.value)) < 300
+
+
+def test_words_that_python_writes_may_be_allowed() -> None:
+    assert parsed_json(b"[Infinity, 1e999]", constants=True) == [float("inf")] * 2
+
+
+@pytest.mark.parametrize("content", [b"9" * 5_000_000, b'"' * 5_000_000, b'{"a":[' * 20 + b"1," * 2_000_000])
+def test_the_time_is_linear(content: bytes) -> None:
+    began = time.monotonic()
+    with pytest.raises(ValueError, match="is no JSON"):
+        parsed_json(content)
+    assert time.monotonic() - began < 5
