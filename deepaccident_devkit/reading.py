@@ -37,7 +37,7 @@ LIMITS: Final[Mapping[str, int]] = MappingProxyType(
         "label": 48 * _MIB,
         "meta": _MIB,
         "calib": _MIB,
-        "split": 16 * _MIB,
+        "split": _MIB,
         "image": 32 * _MIB,
         "lidar": 32 * _MIB,
         "bev": 16 * _MIB,

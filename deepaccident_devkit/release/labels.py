@@ -7,8 +7,7 @@ this call cannot read (CRLF, blanks at line ends, one-token lines, faults) are t
 import codecs
 import math
 import os
-import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,9 @@ from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.errors import LabelError
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.geometry import Boxes, handedness, quaternions
+from deepaccident_devkit.reading import LIMITS_VARIABLE, limit_of, shortened
 from deepaccident_devkit.release._content import read_content
+from deepaccident_devkit.release._words import integer_of, number_of
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 FIELDS = ("class", "x", "y", "z", "l", "w", "h", "yaw", "vx", "vy", "id", "num_lidar_pts", "camera_visible")
@@ -30,8 +31,10 @@ _INTEGER_FIELDS = ("id", "num_lidar_pts")
 _HEADER = ("speed_x", "speed_y")
 _FILES_A_CALL = 250
 _MOST_THREADS = 4
-_NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
-_INTEGER = re.compile(r"-?\d+", re.ASCII)
+_BYTES_A_LINE = 192
+"""Of the longest lines; a file that is as large as it may be has so many lines at the most."""
+_LINES_A_STEP = 1000
+"""Lines among which a fault is looked for one by one."""
 _REMEDY = "restore the file from its archive, or leave the scenario out with on_error='skip'"
 
 
@@ -108,7 +111,8 @@ def read_label(path: Path, *, raw: bool = False) -> Labels:
 def read_labels(paths: Sequence[Path], *, raw: bool = False) -> Labels:
     """The boxes of several label files.
 
-    Lines with one token or none are skipped, blanks at line ends and CRLF are read, a file with only line 1 is valid.
+    Lines with one token or none are skipped (`read_lone_words` tells them), blanks at line ends and CRLF are read, a
+    file with only line 1 is valid.
 
     Args:
         paths: the files.
@@ -116,8 +120,8 @@ def read_labels(paths: Sequence[Path], *, raw: bool = False) -> Labels:
 
     Raises:
         MissingFileError: a file is not there.
-        LabelError: a file is truncated or a line has another number of fields, a word where a number belongs, an
-            unknown class, NaN or infinity in a position, size or yaw; the message names file and line.
+        LabelError: a file is truncated or too large, or a line has another number of fields, a word where a number
+            belongs, an unknown class, NaN or infinity in a position, size or yaw; the message names file and line.
     """
     parts = _parse_batches([paths[start : start + _FILES_A_CALL] for start in range(0, len(paths), _FILES_A_CALL)])
     parts = parts or [_columns_of(_parse_body(b""), _parse_header(b""), np.zeros(0, dtype=np.int64))]
@@ -141,6 +145,24 @@ def read_label_to_fault(path: Path, *, raw: bool = False) -> tuple[Labels, Label
         if columns is None:
             raise
         return _labels(columns, raw=raw), error
+
+
+def read_lone_words(path: Path) -> list[tuple[int, str, bool]]:
+    """The lines of one label file that are skipped since they have one word, as its reference reader skips them.
+
+    Returns:
+        The number of each line, its word, and whether the file ends within it.
+
+    Raises as `read_label` does, if the file cannot be read.
+    """
+    content = _content(path, ended=False)
+    lines = content.splitlines(keepends=True)
+    words = ((number, line.split(maxsplit=1)) for number, line in enumerate(lines, start=1))
+    return [
+        (number, shortened(found[0].decode(errors="replace")), lines[number - 1] == found[0])
+        for number, found in words
+        if len(found) == 1
+    ]
 
 
 def write_label(path: Path, labels: Labels) -> None:
@@ -202,10 +224,14 @@ def _parse_files(paths: Sequence[Path], contents: Sequence[bytes]) -> dict[str, 
     return parsed
 
 
-def _content(path: Path) -> bytes:
-    """A file's bytes, ending in a line end."""
+def _content(path: Path, *, ended: bool = True) -> bytes:
+    """A file's bytes, of not too many lines, ending in a line end if `ended`."""
     content = read_content(path, "label", LabelError, _REMEDY).removeprefix(codecs.BOM_UTF8)
-    return content if content.endswith(b"\n") else content + b"\n"
+    lines = max(content.count(b"\n"), content.count(b"\r"))
+    if lines > (most := limit_of("label") // _BYTES_A_LINE):
+        sound = f"if it is sound, set {LIMITS_VARIABLE}=label={_BYTES_A_LINE * lines}"
+        raise LabelError(f"{path}: has {lines:,} lines, more than {most:,}; {sound}; {_REMEDY}")
+    return content if content.endswith(b"\n") or not ended else content + b"\n"
 
 
 def _parse_joined(contents: Sequence[bytes]) -> dict[str, AnyArray] | None:
@@ -218,7 +244,9 @@ def _parse_joined(contents: Sequence[bytes]) -> dict[str, AnyArray] | None:
     body = b"".join([memoryview(content)[start:] for content, start in zip(contents, body_starts, strict=True)])
     # Arrow would take a carriage return for a line end, read hexadecimal integers and drop a byte order mark; a line
     # of zero bytes would be skipped as one token
-    if any(odd in body for odd in (b"\r", b"x", b"X", b"\0")) or b"\r" in header or body.startswith(codecs.BOM_UTF8):
+    if any(odd in body for odd in (b"\r", b"x", b"X", b"\0")) or b"\r" in header:
+        return None
+    if header.startswith(codecs.BOM_UTF8) or body.startswith(codecs.BOM_UTF8):
         return None
     try:
         header_table, body_table = _parse_header(header), _parse_body(body)
@@ -301,8 +329,13 @@ def _has_fault(columns: dict[str, AnyArray]) -> bool:
 
 def _tidied(content: bytes) -> bytes:
     """The same label without blank lines, one-token lines, CRLF and superfluous blanks."""
-    words = [line.split() for line in content.splitlines()]
-    return b"".join([b" ".join(line) + b"\n" for line in words if len(line) > 1]) or b"\n"
+    lines = (b" ".join(words) for words in map(_split, content.splitlines()) if len(words) > 1)
+    return b"\n".join([*lines, b""]) or b"\n"
+
+
+def _split(line: bytes) -> list[bytes]:
+    """The words of a line; of one with too many, the last is all the rest."""
+    return line.split(maxsplit=len(FIELDS))
 
 
 def _first_fault(paths: Sequence[Path], contents: Sequence[bytes]) -> LabelError:
@@ -316,12 +349,12 @@ def _first_fault(paths: Sequence[Path], contents: Sequence[bytes]) -> LabelError
 
 
 def _faulty_line(content: bytes) -> tuple[int, str] | None:
-    """Walk the lines: the number of the first one that is wrong, and what is."""
+    """The number of the first line that is wrong, and what is."""
     header_seen = False
-    for number, line in enumerate(content.splitlines(), start=1):
+    for number, line in _suspicious_lines(content.splitlines()):
         if b"\0" in line:
             return number, "holds zero bytes, as a full disk leaves them"
-        words = [word.decode("utf-8", errors="replace") for word in line.split()]
+        words = [word.decode("utf-8", errors="replace") for word in _split(line)]
         if len(words) < 2:
             continue
         fault = _line_fault(words) if header_seen else _header_fault(words)
@@ -331,15 +364,25 @@ def _faulty_line(content: bytes) -> tuple[int, str] | None:
     return None if header_seen else (1, "expected '<speed_x> <speed_y>', found an empty file")
 
 
+def _suspicious_lines(lines: Sequence[bytes]) -> Iterator[tuple[int, bytes]]:
+    """Lines and their numbers, without stretches after the first that are read in bulk and hold no fault."""
+    for start in range(0, len(lines), _LINES_A_STEP):
+        stretch = lines[start : start + _LINES_A_STEP]
+        joined = b"\n".join(stretch)
+        parsed = _parse_joined([b"0 0\n" + _tidied(joined)]) if start and b"\0" not in joined else None
+        if parsed is None or _has_fault(parsed):
+            yield from enumerate(stretch, start=start + 1)
+
+
 def _header_fault(words: Sequence[str]) -> str | None:
     if len(words) != len(_HEADER):
-        return f"expected '<speed_x> <speed_y>', found {len(words)} fields: '{_shortened(words)}'"
-    return next((f"{word!r} is no number" for word in words if _number(word) is None), None)
+        return f"expected '<speed_x> <speed_y>', found {_counted(words)} fields: {_quoted(words)}"
+    return next((f"{shortened(word)!r} is no number" for word in words if number_of(word) is None), None)
 
 
 def _line_fault(words: Sequence[str]) -> str | None:
     if len(words) != len(FIELDS):
-        return f"expected {len(FIELDS)} fields, found {len(words)}: '{_shortened(words)}'"
+        return f"expected {len(FIELDS)} fields, found {_counted(words)}: {_quoted(words)}"
     return next(
         (fault for fault in (_field_fault(name, word) for name, word in zip(FIELDS, words, strict=True)) if fault), None
     )
@@ -351,25 +394,20 @@ def _field_fault(name: str, word: str) -> str | None:
         expected = f"one of {', '.join(CATEGORIES)}"
     elif name == "camera_visible" and word not in ("True", "False"):
         expected = "True or False"
-    elif name in _INTEGER_FIELDS and not _is_integer(word):
+    elif name in _INTEGER_FIELDS and integer_of(word) is None:
         expected = "an integer"
     elif name in _FLOAT_FIELDS:
-        number = _number(word)
+        number = number_of(word)
         if number is None:
             expected = "a number"
         elif name in _FINITE_FIELDS and not math.isfinite(number):
             expected = "a finite number"
-    return expected and f"{name} is {word!r}, expected {expected}"
+    return expected and f"{name} is {shortened(word)!r}, expected {expected}"
 
 
-def _number(word: str) -> float | None:
-    return float(word) if _NUMBER.fullmatch(word) else None
+def _counted(words: Sequence[str]) -> str:
+    return str(len(words)) if len(words) <= len(FIELDS) else f"more than {len(FIELDS)}"
 
 
-def _is_integer(word: str) -> bool:
-    return _INTEGER.fullmatch(word) is not None and -(2**63) <= int(word) < 2**63
-
-
-def _shortened(words: Sequence[str]) -> str:
-    text = " ".join(words)
-    return text if len(text) <= 60 else text[:57] + "…"
+def _quoted(words: Sequence[str]) -> str:
+    return repr(shortened(" ".join(words)))

@@ -3,6 +3,7 @@
 import os
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -166,15 +167,21 @@ def frame_numbers(folder: Path, ending: str) -> tuple[list[int], list[str]]:
 
 
 def names_without_calib(layout: ReleaseLayout) -> Iterator[tuple[Path, str]]:
-    """Scenario type folders and the names in them that have labels, meta or sensor files, but no calib of any agent."""
+    """Scenario type folders and the names in them that have labels, meta or sensor files, but no calib of any agent.
+
+    Folders that cannot be listed have none; each scenario of theirs tells that itself.
+    """
     known: dict[Path, set[str]] = {}
     for scenario in layout.scenarios:
         known.setdefault(scenario.root / scenario.folder / scenario.scenario_type, set()).add(scenario.name)
     for folder, names in known.items():
-        found = {path.stem for path in (folder / "meta").glob("*.txt")}
+        found: set[str] = set()
+        with suppress(DatarootError):
+            found = {entry.name[:-4] for entry in _entries(folder / "meta") if entry.name.endswith(".txt")}
         for agent in AGENTS:
             for kind in ("label", *CHANNEL_FORMAT):
-                found.update(_subfolders(folder / agent / kind))
+                with suppress(DatarootError):
+                    found.update(_subfolders(folder / agent / kind))
         for name in sorted(found - names):
             yield folder, name
 
@@ -224,7 +231,15 @@ def _subfolders(folder: Path) -> list[str]:
         if isinstance(error.__cause__, NotADirectoryError):
             return []
         raise
-    return [entry.name for entry in entries if entry.is_dir() and not entry.name.startswith(".")]
+    return [entry.name for entry in entries if not entry.name.startswith(".") and _may_be_folder(entry)]
+
+
+def _may_be_folder(entry: os.DirEntry[str]) -> bool:
+    """Whether an entry is a folder, or a link whose end cannot be found; listing that one tells why."""
+    try:
+        return entry.is_dir()
+    except OSError:
+        return True
 
 
 def _entries(folder: Path) -> list[os.DirEntry[str]]:
@@ -242,7 +257,7 @@ def _split_files(root: Path) -> dict[str, Path]:
     for split in (*SPLITS, *MINI_SPLITS):
         for folder in (root, root / SPLIT_FILE_FOLDER):
             path = folder / f"{split}.txt"
-            if path.is_file():
+            if os.path.lexists(path) and not path.is_dir():  # a pipe, or a link to itself, is the reader's error
                 found[split] = path
                 break
     return found

@@ -9,7 +9,9 @@ from typing import Literal, overload
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import MetaError
 from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.reading import shortened
 from deepaccident_devkit.release._content import read_lines
+from deepaccident_devkit.release._words import integer_of, number_of
 from deepaccident_devkit.taxonomy import META_AGENTS, TIMES_OF_DAY, UNTRACKED_ID, WARM_UP_FRAMES, AgentName
 
 _FIRST_LINE = "<weather+time> <id1> <class1> <id2> <class2> <impact> <spawn relation> <contact side> <frames>"
@@ -128,7 +130,7 @@ def _entries(path: Path, lines: Sequence[tuple[int, str]]) -> dict[str, tuple[in
     for number, line in lines:
         key, colon, value = line.partition(":")
         if not colon:
-            raise MetaError(f"{path}:{number}: expected '<key>: <value>', found '{line}'; {_REMEDY}")
+            raise MetaError(f"{path}:{number}: expected '<key>: <value>', found {shortened(line)!r}; {_REMEDY}")
         entries[key.strip()] = (number, value.strip())
     return entries
 
@@ -137,7 +139,9 @@ def _parse(path: Path, first: tuple[int, str], entries: dict[str, tuple[int, str
     number, line = first
     words = line.split()
     if len(words) != 9:
-        raise MetaError(f"{path}:{number}: expected 9 words '{_FIRST_LINE}', found {len(words)}: '{line}'; {_REMEDY}")
+        raise MetaError(
+            f"{path}:{number}: expected 9 words '{_FIRST_LINE}', found {len(words)}: {shortened(line)!r}; {_REMEDY}"
+        )
     where = f"{path}:{number}"
     weather, time_of_day = _weather_and_time(words[0])
     agents = _colliding_agents(path, entries)
@@ -187,7 +191,8 @@ def _colliding_agents(
     number, value = entries["colliding agents"]
     names = value.split()
     if len(names) != 2 or not set(names) <= set(META_AGENTS):
-        raise MetaError(f"{path}:{number}: expected two of {', '.join(META_AGENTS)}, found '{value}'; {_REMEDY}")
+        known = ", ".join(META_AGENTS)
+        raise MetaError(f"{path}:{number}: expected two of {known}, found {shortened(value)!r}; {_REMEDY}")
     return META_AGENTS[names[0]], META_AGENTS[names[1]]
 
 
@@ -197,7 +202,7 @@ def _agent_ids(path: Path, entries: dict[str, tuple[int, str]]) -> tuple[int, in
     number, value = entries["agents id"]
     ids = [_integer(f"{path}:{number}", "agent's id", word) for word in value.split()]
     if len(ids) != 4:
-        raise MetaError(f"{path}:{number}: expected four agents' ids, found '{value}'; {_REMEDY}")
+        raise MetaError(f"{path}:{number}: expected four agents' ids, found {shortened(value)!r}; {_REMEDY}")
     return ids[0], ids[1], ids[2], ids[3]
 
 
@@ -207,17 +212,14 @@ def _text(entries: dict[str, tuple[int, str]], key: str) -> str | None:
 
 
 def _integer(where: str, what: str, word: str) -> int:
-    try:
-        return int(word)
-    except ValueError:
-        raise MetaError(f"{where}: {what}: expected an integer, found '{word}'; {_REMEDY}") from None
+    value = integer_of(word)
+    if value is None:
+        raise MetaError(f"{where}: {what}: expected an integer, found {shortened(word)!r}; {_REMEDY}")
+    return value
 
 
 def _finite(where: str, what: str, word: str) -> float:
-    try:
-        value = float(word)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise MetaError(f"{where}: {what}: expected a finite number, found '{word}'; {_REMEDY}")
+    value = number_of(word)
+    if value is None or not math.isfinite(value):
+        raise MetaError(f"{where}: {what}: expected a finite number, found {shortened(word)!r}; {_REMEDY}")
     return value

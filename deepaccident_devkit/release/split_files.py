@@ -6,6 +6,7 @@ from typing import Literal, overload
 
 from deepaccident_devkit.errors import SplitFileError
 from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.reading import shortened
 from deepaccident_devkit.release._content import read_lines
 
 
@@ -28,11 +29,11 @@ def read_split_file(path: Path, *, raw: bool = False, unique: bool = False) -> l
         SplitFileError: a line has not two words, the file is no text, or a scenario stands twice and `unique` is set.
     """
     lines = read_lines(path, "split", SplitFileError, "restore it from the release")
-    words = [(number, tuple(line.split())) for number, line in enumerate(lines, start=1) if line.strip()]
+    words = [(number, tuple(line.split(maxsplit=2))) for number, line in enumerate(lines, start=1) if line.strip()]
     for number, line_words in words:
         if len(line_words) != 2:
             raise SplitFileError(
-                f"{path}:{number}: expected '<scenario_type> <scenario>', found '{' '.join(line_words)}'; "
+                f"{path}:{number}: expected '<scenario_type> <scenario>', found {shortened(' '.join(line_words))!r}; "
                 "mend or remove the line"
             )
     if unique:
@@ -53,7 +54,7 @@ def _check_unique(path: Path, words: Sequence[tuple[int, tuple[str, ...]]]) -> N
     for number, line_words in words:
         if line_words in first_line:
             raise SplitFileError(
-                f"{path}:{number}: '{' '.join(line_words)}' stands in line {first_line[line_words]} already; "
-                "remove one of the two lines"
+                f"{path}:{number}: {shortened(' '.join(line_words))!r} stands in line {first_line[line_words]} "
+                "already; remove one of the two lines"
             )
         first_line[line_words] = number

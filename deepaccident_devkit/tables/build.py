@@ -68,8 +68,11 @@ def read_scenario(scenario: ScenarioFolder, scan: ScenarioScan) -> tuple[Scenari
             if len(paths) == 1:
                 faults.append(finding_of(error, code, scenario.token))
             else:
+                known = len(faults)
                 for path in paths:  # each by itself: the reader stops at the first
                     attempt(read, code, [path])
+                if len(faults) == known:  # good alone, and not together
+                    faults.append(finding_of(error, code, scenario.token))
             return None
 
     frames = range(1, scan.num_frames + 1)

@@ -9,7 +9,7 @@ import numpy as np
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.taxonomy import UNTRACKED_ID
-from deepaccident_devkit.validation.subject import Subject, actors_text, frames_text, place_tree
+from deepaccident_devkit.validation.subject import Subject, actors_text, frames_text, near_pairs
 
 POSITION = 0.05
 """Metres between two agents' views of an actor."""
@@ -152,18 +152,20 @@ def _ids(subject: Subject) -> Iterator[Finding]:
     """Boxes of two agents in the same place at the same moment that carry different ids."""
     boxes = subject.boxes
     rows = np.flatnonzero(subject.seen | (subject.own & (boxes.actor != UNTRACKED_ID)))
-    tree = place_tree(subject.centers[rows], boxes.frame[rows], OWN_APART)
-    first, second = rows[tree.query_pairs(OWN_APART, output_type="ndarray")].reshape(-1, 2).T
+    near_ones, _ = near_pairs(subject.centers[rows], boxes.frame[rows], OWN_APART)
+    first, second = rows[near_ones].T
+    differ = (boxes.actor[first] != boxes.actor[second]) & (boxes.agent[first] != boxes.agent[second])
+    first, second = first[differ], second[differ]
     near = np.linalg.norm(subject.centers[first] - subject.centers[second], axis=1) < SAME_PLACE
     alike = boxes.labels.category[first] == boxes.labels.category[second]
     near |= (subject.own[first] | subject.own[second]) & alike  # an own row lies up to 0.3 m off
-    bad = near & (boxes.actor[first] != boxes.actor[second]) & (boxes.agent[first] != boxes.agent[second])
-    pairs = np.sort(np.column_stack([boxes.agent[first[bad]], boxes.agent[second[bad]]]), axis=1)
+    first, second = first[near], second[near]
+    pairs = np.sort(np.column_stack([boxes.agent[first], boxes.agent[second]]), axis=1)
     for agent, other in np.unique(pairs, axis=0).tolist():
         of_pair = (pairs == (agent, other)).all(axis=1)
-        actors = np.concatenate([boxes.actor[first[bad][of_pair]], boxes.actor[second[bad][of_pair]]])
+        actors = np.concatenate([boxes.actor[first[of_pair]], boxes.actor[second[of_pair]]])
         where = f"{subject.token}: {subject.agents[agent]} and {subject.agents[other]}"
-        what = f"{actors_text(actors)} stand in the same places, {frames_text(boxes.frame[first[bad][of_pair]])}"
+        what = f"{actors_text(actors)} stand in the same places, {frames_text(boxes.frame[first[of_pair]])}"
         yield subject.finding("ids-differ", where, what)
 
 

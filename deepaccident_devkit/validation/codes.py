@@ -79,6 +79,9 @@ CODES: dict[str, Code] = {
     "sensor-frames-extra": Code("warning", "A sensor folder has frames that no calib file has.", _RESTORE),
     "sensor-odd-name": Code("warning", "A sensor file has no frame number in its name.", "rename or remove it"),
     "sensor-empty": Code("error", "A sensor file has no bytes.", _RESTORE_ONE),
+    "sensor-irregular": Code(
+        "error", "A pipe, a folder or a link that leads nowhere is among a sensor's files.", _RESTORE_ONE
+    ),
     # calibration and poses
     "intrinsic-form": Code(
         "error", "A raw K is not [[cx, f, 0], [cy, 0, -f], [1, 0, 0]]: pixels would be wrong.", _RESTORE_ONE
@@ -92,6 +95,8 @@ CODES: dict[str, Code] = {
     "pose-jump": Code("warning", "An agent's path has a jump that no vehicle can make.", _RESTORE),
     # labels
     "label-cut": Code("warning", "A label ends within a class: boxes may be missing.", _RESTORE_ONE),
+    "label-line-skipped": Code("note", "A label has lines of one word, which readers skip.", _RESTORE_ONE),
+    "label-crowded": Code("warning", "A label has more boxes than any scene: points are not counted.", _RESTORE_ONE),
     "own-row-missing": Code("warning", "A vehicle's label lacks its own row (id −100).", _RESTORE_ONE),
     "own-row-odd": Code("warning", "A label has several own rows, or a pole has one.", _RESTORE_ONE),
     "own-box-off": Code(

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from deepaccident_devkit.errors import ReleaseError
+from deepaccident_devkit.reading import fault_text, irregular_text
 from deepaccident_devkit.release import ScenarioFolder
 from deepaccident_devkit.release.layout import frame_numbers
 from deepaccident_devkit.tables import Finding
@@ -88,6 +89,14 @@ def _frame_findings(
     if extra:
         what = f"has frames {frame_ranges(extra)} beyond {scan.num_frames}"
         yield make_finding("sensor-frames-extra", scenario.token, str(folder), what)
-    empty = [entry.name for entry in os.scandir(folder) if entry.is_file() and not entry.stat().st_size]
-    for name in sorted(empty):
-        yield make_finding("sensor-empty", scenario.token, str(folder / name), "has no bytes")
+    for entry in sorted(os.scandir(folder), key=lambda entry: entry.name):
+        path = folder / entry.name
+        try:
+            status = entry.stat()
+            irregular = irregular_text(status.st_mode)
+        except OSError as error:
+            status, irregular = None, fault_text(error)
+        if status and not irregular and not status.st_size:
+            yield make_finding("sensor-empty", scenario.token, str(path), "has no bytes")
+        elif irregular and entry.name.endswith(f".{CHANNEL_FORMAT[channel]}"):
+            yield make_finding("sensor-irregular", scenario.token, str(path), irregular)

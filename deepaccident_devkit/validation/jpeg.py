@@ -1,7 +1,13 @@
-"""Stretches of zero bytes in JPEG files, as a full disk or a broken download leaves them; decoders pass over them."""
+"""What decoders pass over in JPEG files: zero bytes, as a full disk leaves them, and data that end early."""
 
 import re
 from collections.abc import Iterator
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+
+from deepaccident_devkit.arrays import ByteArray
 
 ZEROS = 64
 """Zero bytes in a row from which on they are a fault."""
@@ -14,6 +20,12 @@ _HUFFMAN_TABLES, _SCAN, _END = 0xC4, 0xDA, 0xD9
 _ALONE = (0x01, 0xD8, *range(0xD0, 0xD8))
 """Markers without a length."""
 _END_OF_BLOCK = 0x00
+_GREY = (126.0, 130.0)
+"""The brightness that decoders give to blocks whose data are missing: 128, and what rounding does to it."""
+_SHARES = (0.299, 0.587, 0.114)
+"""Of red, green and blue in the brightness."""
+_MORE = bytes(range(1, 251)) * 40
+"""Data that a decoder of a whole picture does not look at."""
 
 
 def zero_stretch(content: bytes) -> tuple[int, int] | None:
@@ -30,16 +42,39 @@ def zero_stretch(content: bytes) -> tuple[int, int] | None:
     """
     if not content.startswith(b"\xff\xd8"):
         return None
-    for start, stop in _telling_scans(content):
-        zeros = content.find(bytes(ZEROS), start, stop)
+    for start, stop, even in _scans(content):
+        zeros = -1 if even else content.find(bytes(ZEROS), start, stop)
         if zeros >= 0:
             data = content[zeros:stop]
             return zeros, len(data) - len(data.lstrip(b"\0"))
     return None
 
 
-def _telling_scans(content: bytes) -> Iterator[tuple[int, int]]:
-    """Where the coded data of those scans begin and end in which zero bytes are a fault."""
+def ends_early(content: bytes, image: ByteArray) -> bool:
+    """Whether the coded data of a sequential JPEG end before its picture (H, W, 3) does: the rest of it is grey.
+
+    More data before the end then change the picture, which needs them.
+    """
+    least, most = _GREY
+    if not least < image[-1, -1] @ _SHARES < most:
+        return False
+    stop = max((stop for _, stop, _ in _scans(content)), default=None)
+    return stop is not None and not np.array_equal(_decoded(content[:stop] + _MORE + content[stop:]), image)
+
+
+def _decoded(content: bytes) -> Any:
+    """The picture in a file's bytes; None if it is damaged."""
+    from PIL import Image
+
+    try:
+        with Image.open(BytesIO(content), formats=("JPEG",)) as image:
+            return np.asarray(image.convert("RGB"))
+    except (OSError, ValueError, SyntaxError):
+        return None
+
+
+def _scans(content: bytes) -> Iterator[tuple[int, int, bool]]:
+    """Where the coded data of each scan of a sequential JPEG begin and end, and whether zero bytes may be in them."""
     first_symbols: dict[int, int] = {}
     sequential, place = False, _MARKER_LENGTH
     while (found := _MARKER.match(content, place)) is not None:
@@ -56,8 +91,8 @@ def _telling_scans(content: bytes) -> Iterator[tuple[int, int]]:
         elif marker == _SCAN:
             end = _SCAN_END.search(content, place)
             stop = end.start() if end else len(content)
-            if sequential and _cannot_be_even(body, first_symbols):
-                yield place, stop
+            if sequential:
+                yield place, stop, not _cannot_be_even(body, first_symbols)
             place = stop
 
 

@@ -5,9 +5,10 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray
+from deepaccident_devkit.release.labels import read_lone_words
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID, UNTRACKED_ID
-from deepaccident_devkit.validation.subject import Subject, frames_text, place_tree
+from deepaccident_devkit.validation.subject import MOST_BOXES, Subject, frames_text, near_pairs
 
 MOST_ACTOR_ID = 2_000_000
 """The released code drops ids from here on."""
@@ -50,14 +51,30 @@ def check_labels(subject: Subject) -> Iterator[Finding]:
         yield from check(subject)
 
 
-def _cut_files(subject: Subject) -> Iterator[Finding]:
-    """Labels that end within a class: readers skip lines of one word, so that nothing else shows the cut."""
+def _lone_words(subject: Subject) -> Iterator[Finding]:
+    """Lines of one word, which readers skip; nothing else shows that a label ends within a class."""
     for agent in subject.files.scan.labelled:
         for frame in range(1, subject.num_frames + 1):
             path = subject.files.scenario.label_path(agent, frame)
-            words = path.read_bytes().rpartition(b"\n")[2].decode("ascii", errors="replace").split()
-            if len(words) == 1 and any(name.startswith(words[0]) for name in CATEGORIES):
-                yield subject.finding("label-cut", str(path), f"its last line is cut off after '{words[0]}'")
+            skipped = read_lone_words(path)
+            if not skipped:
+                continue
+            _, word, ends = skipped[-1]
+            if ends and any(name.startswith(word) for name in CATEGORIES):
+                yield subject.finding("label-cut", str(path), f"its last line is cut off after '{word}'")
+                skipped.pop()
+            if skipped:
+                number, word, _ = skipped[0]
+                what = f"skipped are {len(skipped)} lines of one word, the first is {word!r}"
+                yield subject.finding("label-line-skipped", f"{path}:{number}", what)
+
+
+def _crowds(subject: Subject) -> Iterator[Finding]:
+    for agent, counts in enumerate(subject.box_counts):
+        frames = np.flatnonzero(counts > MOST_BOXES) + 1
+        if len(frames):
+            what = f"up to {counts.max():,} boxes in a label, more than {MOST_BOXES:,}, {frames_text(frames)}"
+            yield subject.finding("label-crowded", subject.label_where(agent), what)
 
 
 def _ids(subject: Subject) -> Iterator[Finding]:
@@ -70,9 +87,8 @@ def _ids(subject: Subject) -> Iterator[Finding]:
 
 def _same_places(subject: Subject) -> Iterator[Finding]:
     labels, sample = subject.boxes.labels, subject.boxes.sample
-    tree = place_tree(labels.center, sample * len(CATEGORIES) + labels.category, SAME_PLACE)
-    doubled = np.zeros(len(sample), dtype=bool)
-    doubled[tree.query_pairs(SAME_PLACE, output_type="ndarray").ravel()] = True
+    pairs, doubled = near_pairs(labels.center, sample * len(CATEGORIES) + labels.category, SAME_PLACE)
+    doubled[pairs.ravel()] = True
     yield from subject.label_findings("duplicate-box", doubled, "two boxes stand in the same place")
 
 
@@ -193,7 +209,8 @@ def _repeated(keys: AnyArray) -> BoolArray:
 
 
 _CHECKS: tuple[Callable[[Subject], Iterator[Finding]], ...] = (
-    _cut_files,
+    _lone_words,
+    _crowds,
     _ids,
     _same_places,
     _sizes_and_points,

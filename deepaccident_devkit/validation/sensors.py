@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
-from deepaccident_devkit.errors import ReleaseError
+from deepaccident_devkit.errors import ReleaseError, SensorFileError
 from deepaccident_devkit.files import file_checksum
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.release import read_bev, read_image, read_lidar
+from deepaccident_devkit.release._content import read_content
 from deepaccident_devkit.release.bev_camera import TAGS
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.findings import finding_of
@@ -25,8 +26,8 @@ from deepaccident_devkit.taxonomy import (
     OWN_ACTOR_ID,
 )
 from deepaccident_devkit.validation.inventory import Inventory
-from deepaccident_devkit.validation.jpeg import zero_stretch
-from deepaccident_devkit.validation.subject import Subject, frames_text
+from deepaccident_devkit.validation.jpeg import ends_early, zero_stretch
+from deepaccident_devkit.validation.subject import MOST_BOXES, Subject, frames_text
 
 LIDAR_RANGE = 75.0
 """Metres; the real LiDAR ends at 70."""
@@ -100,11 +101,11 @@ def _images(
     for frame, path in paths.items():
         try:
             image = read_image(path)
+            content = read_content(path, "image", SensorFileError, "restore the file from its archive")
         except ReleaseError as error:
             yield finding_of(error, "sensor-unreadable", subject.token)
             continue
-        if (zeros := zero_stretch(path.read_bytes())) is not None:
-            what = f"holds {zeros[1]} zero bytes in a row from byte {zeros[0]} on: part of the picture is lost"
+        if (what := _lost_part(content, image)) is not None:
             yield subject.finding("sensor-unreadable", str(path), what)
             continue
         sizes[frame] = (image.shape[1], image.shape[0])
@@ -118,6 +119,13 @@ def _images(
         folder = subject.files.scenario.kind_folder(subject.agents[agent], channel)
         what = f"does not fit between its neighbours, {frames_text(odd)}"
         yield subject.finding("image-out-of-sequence", str(folder), what)
+
+
+def _lost_part(content: bytes, image: ByteArray) -> str | None:
+    """What shows that a part of a picture is lost, though it can be decoded."""
+    if (zeros := zero_stretch(content)) is not None:
+        return f"holds {zeros[1]} zero bytes in a row from byte {zeros[0]} on: part of the picture is lost"
+    return "its data end early: the rest of the picture is lost" if ends_early(content, image) else None
 
 
 def _collides(subject: Subject, agent: int) -> bool:
@@ -181,8 +189,8 @@ def _clouds(subject: Subject, agent: int, paths: Mapping[int, Path], telling: li
         ):
             odd.append(frame)
         boxes = _sample_boxes(subject, agent, frame)
-        if len(boxes):
-            counted = boxes.contains(points).sum(axis=1)
+        if 0 < len(boxes) <= MOST_BOXES:
+            counted = boxes.count_points(points)
             off = np.abs(counted - boxes.num_lidar_pts)
             walks = boxes.category == CATEGORIES.index("pedestrian")
             least, share = np.where(walks[:, None], WALKER_POINT_COUNT, POINT_COUNT).T

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from deepaccident_devkit.errors import ReleaseError
+from deepaccident_devkit.reading import shortened
 from deepaccident_devkit.release import ReleaseLayout, read_split_file
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.findings import finding_of
@@ -34,7 +35,7 @@ def check_splits(layout: ReleaseLayout) -> tuple[SplitAssignment, list[Finding]]
 
 def _repeated(path: Path, lines: list[tuple[str, ...]]) -> Iterator[Finding]:
     """Scenarios that a file lists more than once; reading takes them once."""
-    repeated = [" ".join(words) for words, count in Counter(lines).items() if count > 1]
+    repeated = [shortened(" ".join(words)) for words, count in Counter(lines).items() if count > 1]
     if repeated:
         more = f" and {len(repeated) - _NAMED} more" if len(repeated) > _NAMED else ""
         what = f"lists more than once: {', '.join(repeated[:_NAMED])}{more}"

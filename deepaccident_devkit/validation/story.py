@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray, IntArray
+from deepaccident_devkit.reading import shortened
 from deepaccident_devkit.release import Collision, Meta
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.taxonomy import (
@@ -56,9 +57,9 @@ def _words(subject: Subject, meta: Meta) -> Iterator[Finding]:
     }
     for name, (word, known) in said.items():
         if word is not None and word not in known:
-            yield _at_meta(subject, "meta-word", f"{name} is {word!r}, expected one of {', '.join(known)}")
+            yield _at_meta(subject, "meta-word", f"{name} is {shortened(word)!r}, expected one of {', '.join(known)}")
     if meta.time_of_day is None:
-        yield _at_meta(subject, "meta-word", f"{meta.weather!r} does not end in a time of day")
+        yield _at_meta(subject, "meta-word", f"{shortened(meta.weather)!r} does not end in a time of day")
     absent = [name for name, (word, _) in said.items() if word is None]
     absent += ["agents id"] if meta.agent_ids is None else []
     if absent:
@@ -109,7 +110,8 @@ def _pair(subject: Subject, meta: Meta) -> Iterator[Finding]:
         if not len(rows):
             yield _at_meta(subject, "pair-not-seen", f"nobody annotated actor {actor}")
         elif found != [name]:
-            yield _at_meta(subject, "meta-pair", f"actor {actor} is a {name}, the labels say {', '.join(found)}")
+            what = f"actor {actor} is a {shortened(name)}, the labels say {', '.join(found)}"
+            yield _at_meta(subject, "meta-pair", what)
 
 
 def _impact(subject: Subject, meta: Meta) -> Iterator[Finding]:
@@ -124,12 +126,13 @@ def _impact(subject: Subject, meta: Meta) -> Iterator[Finding]:
 def pair_gap(subject: Subject, collision: Collision) -> float | None:
     """Metres between the pair's boxes seen from above at the last frame; None if one is not annotated there.
 
-    Of an actor that several annotated, the two boxes that are nearest count.
+    Of an actor that several agents annotated, the two boxes that are nearest count; each agent's first.
     """
     from shapely import distance, polygons
 
     last = subject.boxes.frame == subject.num_frames
     rows = [np.flatnonzero(last & (subject.boxes.actor == actor)) for actor in collision.ids]
+    rows = [found[np.unique(subject.boxes.agent[found], return_index=True)[1]] for found in rows]
     if UNTRACKED_ID in collision.ids or not all(len(found) for found in rows):
         return None
     first, second = (np.asarray(polygons(_footprints(subject, found))) for found in rows)

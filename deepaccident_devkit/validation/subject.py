@@ -26,6 +26,10 @@ _SURE_REACH = 35.0
 """Metres at the most within which a label is taken to be complete."""
 _SHARE_OF_FURTHEST = 0.8
 _FURTHEST = 1e7
+MOST_BOXES = 500
+"""Boxes in a label, of which real ones have less than a hundred."""
+_MOST_TOGETHER = 32
+"""Boxes at one place and moment that are compared pair by pair."""
 _UNTRACKED_PLACE = 2.0
 """Metres between an untracked row and where the actor should be."""
 
@@ -116,6 +120,12 @@ class Subject:
         return found
 
     @cached_property
+    def box_counts(self) -> IntArray:
+        """(A, F) boxes of each label."""
+        counts: IntArray = np.bincount(self.boxes.sample, minlength=self.files.num_samples)
+        return counts.reshape(len(self.agents), self.num_frames)
+
+    @cached_property
     def lidar_boxes(self) -> Boxes:
         """All N boxes, each in the LiDAR frame it was recorded in."""
         return self.boxes.labels.boxes()
@@ -174,14 +184,30 @@ def subject_of(files: ScenarioFiles) -> Subject:
 
 
 def place_tree(places: FloatArray, moments: AnyArray, radius: float) -> cKDTree:
-    """A tree over places (M, 3) in which those of different moments (M,) are further apart than `radius`."""
+    """A tree over places (M, 3), each once; those of different moments (M,) are further apart than `radius`."""
     from scipy.spatial import cKDTree
 
-    return cKDTree(tree_points(places, moments, radius))
+    return cKDTree(np.unique(tree_points(places, moments, radius), axis=0))
+
+
+def near_pairs(places: FloatArray, moments: AnyArray, radius: float) -> tuple[IntArray, BoolArray]:
+    """Which places (M, 3) of a moment (M,) are no further apart than `radius`.
+
+    Returns:
+        (P, 2) pairs of them; (M,) those in crowds, which are in no pair: pairs of many at one place would have no end.
+    """
+    from scipy.spatial import cKDTree
+
+    points = tree_points(places, moments, radius)
+    _, cell, count = np.unique(np.floor(points / radius), axis=0, return_inverse=True, return_counts=True)
+    crowded: BoolArray = count[cell.reshape(-1)] > _MOST_TOGETHER
+    rows = np.flatnonzero(~crowded)
+    pairs: IntArray = rows[cKDTree(points[rows]).query_pairs(radius, output_type="ndarray")].reshape(-1, 2)
+    return pairs, crowded
 
 
 def tree_points(places: FloatArray, moments: AnyArray, radius: float) -> FloatArray:
-    """(M, 4) what `place_tree` is made of and asked for; absurd places are cut off, which would overflow."""
+    """(M, 4) points for a tree; absurd places are cut off, which would overflow."""
     return np.column_stack([np.clip(places, -_FURTHEST, _FURTHEST), moments * (10 * radius)])
 
 

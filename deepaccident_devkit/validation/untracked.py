@@ -8,7 +8,7 @@ from deepaccident_devkit.arrays import BoolArray, IntArray
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.taxonomy import CATEGORIES, UNTRACKED_ID
 from deepaccident_devkit.validation.agreement import SAME_PLACE
-from deepaccident_devkit.validation.subject import Subject, frames_text, place_tree, tree_points
+from deepaccident_devkit.validation.subject import Subject, frames_text, near_pairs
 
 NEAR = 15.0
 """Metres within which a vehicle that the agent saw is not too far away to be tracked."""
@@ -42,9 +42,10 @@ def _trackable(subject: Subject, rows: IntArray) -> BoolArray:
     found: BoolArray = np.isin(labels.category[rows], _VEHICLES) & (distance[rows] < NEAR)
     others = np.flatnonzero(subject.seen)
     if len(rows) and len(others):
-        tree = place_tree(subject.centers[others], boxes.frame[others], SAME_PLACE)
-        alike = tree.query_ball_point(tree_points(subject.centers[rows], boxes.frame[rows], SAME_PLACE), SAME_PLACE)
-        found |= [
-            bool((distance[others[same]] >= near).any()) for near, same in zip(distance[rows], alike, strict=True)
-        ]
+        both = np.concatenate([rows, others])
+        pairs, _ = near_pairs(subject.centers[both], boxes.frame[both], SAME_PLACE)
+        pairs = np.sort(pairs, axis=1)
+        pairs = pairs[(pairs[:, 0] < len(rows)) & (pairs[:, 1] >= len(rows))]
+        no_nearer = distance[both[pairs[:, 1]]] >= distance[both[pairs[:, 0]]]
+        found[pairs[no_nearer, 0]] = True
     return found & ((labels.num_lidar_pts[rows] > 0) | labels.camera_visible[rows])

@@ -22,6 +22,8 @@ _NUMBER = re.compile(r"[+-]?[\d.]+(e[+-]?\d+)?|nan", re.ASCII | re.IGNORECASE)
 _META_KEY = re.compile(
     r"(colliding agents|agents id|road_type|another_vehicle_spawn_side|(ego|other)_vehicle_direction):"
 )
+_HEAD = 1 << 16
+"""Bytes of a text that show what it is."""
 _IMAGES = (b"\xff\xd8\xff", b"\x89PNG")
 """How JPEG and PNG files begin."""
 
@@ -74,7 +76,7 @@ def _kind_of(path: Path, content: bytes) -> str:
         return "sensor"
     if content.startswith(b"\x80") or path.suffix == ".pkl":
         return "calib"
-    lines = [line.split() for line in content.decode("utf-8-sig", errors="replace").splitlines()]
+    lines = [line.split() for line in content[:_HEAD].decode("utf-8-sig", errors="replace").splitlines()]
     kind = _kind_of_text([words for words in lines if words]) or _kind_of_folder(path)
     if kind is None:
         raise ReleaseError(f"{path}: is no file that can be explained; {_REMEDY}")

@@ -31,8 +31,6 @@ Pixel of a point in the file's camera frame, in m: u = cx + f·y/x, v = cy − f
 _AFTERWORD = """\
 In Python: release.read_calib(path) gives right-handed transforms and optical cameras (x right, y down, z forward),
 with raw=True the matrices of the file."""
-_MOST_UNKNOWN = 300
-"""Characters of keys that the devkit does not know."""
 
 
 def calib_text(path: Path) -> tuple[str, CalibError | None]:
@@ -54,7 +52,7 @@ def calib_text(path: Path) -> tuple[str, CalibError | None]:
         "\n".join([*_transform_notes(raw), _devkit_text(raw)]),
         "Cameras: intrinsic_<camera>, shape (3, 3), [[cx, f, 0], [cy, 0, −f], [1, 0, 0]], and lidar_to_<camera>\n"
         + "\n".join([columns_text(_camera_rows(raw)), _CAMERA_LEGEND, *_intrinsic_notes(raw)]),
-        *([f"Not known to the devkit: {shortened(', '.join(unknown), _MOST_UNKNOWN)}"] if unknown else []),
+        *([f"Not known to the devkit: {shortened(', '.join(unknown))}"] if unknown else []),
         _AFTERWORD,
     ]
     return "\n\n".join(parts), fault

@@ -82,3 +82,13 @@ def test_fingerprint_of_all_in_any_order() -> None:
     assert fingerprint({"x": one, "y": other}) == fingerprint({"y": other, "x": one})
     assert fingerprint({"x": one, "y": other}) != fingerprint({"x": other, "y": one})
     assert digest_of({"a": 1, "b": [2.5]}) == digest_of({"b": [2.5], "a": 1})
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes")
+def test_a_pipe_is_an_error(own_release: Path, scenario: str) -> None:
+    opened = DeepAccident(dataroot=own_release, verbose=False)
+    path = first(own_release, "label", "txt")
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(ReleaseError, match=rf"^{path}: not a regular file"):
+        scenario_hashes(opened, [scenario])

@@ -9,7 +9,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from strategies import mutations
 
 from deepaccident_devkit.errors import LabelError, MissingFileError
+from deepaccident_devkit.reading import LIMITS_VARIABLE
 from deepaccident_devkit.release import Labels, read_label, read_labels, write_label
+from deepaccident_devkit.release.labels import read_lone_words
 
 # lines of real labels; docs/format.md, Label, says what each value is
 HEADER = "0.0034441 -5.6166797"
@@ -219,7 +221,7 @@ def test_arrays_are_read_only(write) -> None:
     [
         (f"{HEADER}\n{PARKED}\n{WALKER[:30]}", r":3: expected 13 fields, found 5: 'pedestrian 21.8"),
         (f"{HEADER}\n{PARKED[: -len(' True')]}\n", r":2: expected 13 fields, found 12: 'car -38"),
-        (f"{HEADER}\n{PARKED} 1\n", r":2: expected 13 fields, found 14"),
+        (f"{HEADER}\n{PARKED} 1\n", r":2: expected 13 fields, found more than 13: 'car"),
         (f"{HEADER}\n\n{OWN}\nx\n{PARKED[:-2]}", r":5: camera_visible is 'Tr', expected True or False"),
         (f"{HEADER}\n{PARKED.replace('True', 'true')}", r":2: camera_visible is 'true', expected True or False"),
         (f"{HEADER}\n{PARKED.replace('-38.698', 'nan')}", r":2: x is 'nan', expected a finite number"),
@@ -279,11 +281,12 @@ def test_integers_are_what_int_says(write, number: str) -> None:
     assert_array_equal(labels.actor_id, [int(number)])
 
 
+@pytest.mark.parametrize("marks", [1, 2])
 @pytest.mark.parametrize("place", [0, len(HEADER) + 1])
-def test_a_byte_order_mark_means_the_same_alone_and_among_others(write, outcome, place: int) -> None:
+def test_a_byte_order_mark_means_the_same_alone_and_among_others(write, outcome, place: int, marks: int) -> None:
     """Arrow drops one at the start of what it is given, which is only the first file's."""
     text = f"{HEADER}\n{PARKED}\n"
-    marked = write(text[:place].encode() + b"\xef\xbb\xbf" + text[place:].encode(), "marked.txt")
+    marked = write(text[:place].encode() + b"\xef\xbb\xbf" * marks + text[place:].encode(), "marked.txt")
 
     def read_alone_or_last(paths: list[Path]) -> int:
         return read_labels(paths).actor_id[-1]
@@ -330,3 +333,60 @@ def test_zero_bytes_are_a_fault_wherever_they_stand(tmp_path: Path) -> None:
         path.write_bytes(content)
         with pytest.raises(LabelError, match=rf"label\.txt:{line}: holds zero bytes"):
             read_label(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1 " * 100_000, r":1: expected '<speed_x> <speed_y>', found more than 13 fields: '1 1 "),
+        (f"{'9' * 5000}x 1", r":1: '9+ … 9+x' is no number"),
+        (f"{HEADER}\n" + "1 " * 100_000, r":2: expected 13 fields, found more than 13: '1 1 "),
+        (f"{HEADER}\n{PARKED.replace('car', 'c' * 5000)}", r":2: class is 'c+ … c+', expected one of"),
+        (f"{HEADER}\n{PARKED.replace('-38.698', '9' * 5000)}", r":2: x is '9+ … 9+', expected a finite number"),
+        (f"{HEADER}\n{PARKED.replace('20001', '9' * 5000)}", r":2: id is '9+ … 9+', expected an integer"),
+        (f"{HEADER}\n{PARKED.replace('True', chr(27) + '[2J')}", r":2: camera_visible is '\\x1b\[2J', expected"),
+    ],
+)
+def test_a_message_quotes_little(write, text: str, message: str) -> None:
+    path = write(text)
+    with pytest.raises(LabelError, match=rf"^{path}{message}.*{REMEDY}$") as raised:
+        read_label(path)
+    assert len(str(raised.value)) < len(str(path)) + 400
+
+
+def test_a_file_of_too_many_lines_is_refused(write, monkeypatch: pytest.MonkeyPatch) -> None:
+    for ends in ("\n", "\r"):
+        path = write(HEADER + ends * 300_000)
+        with pytest.raises(LabelError, match=r"has 300,00\d lines, more than 262,144; if it is sound") as raised:
+            read_label(path)
+        word = str(raised.value).split("set ")[1].split(";")[0]
+        monkeypatch.setenv(LIMITS_VARIABLE, word.removeprefix(f"{LIMITS_VARIABLE}="))
+        assert len(read_label(path)) == 0
+        monkeypatch.delenv(LIMITS_VARIABLE)
+
+
+@pytest.mark.parametrize("ends", ["\n", "\r\n"])
+@pytest.mark.parametrize("line", [2, 1000, 1001, 2500, 5001])
+def test_the_first_fault_among_many_boxes_is_named(write, line: int, ends: str) -> None:
+    lines = [HEADER, *[PARKED] * 5000]
+    lines[-1] = "van 1"
+    lines[line - 1] = "bus 1"
+    with pytest.raises(LabelError, match=rf"label\.txt:{line}: expected 13 fields, found 2: 'bus 1'"):
+        read_label(write(ends.join([*lines, "bus 2"])))
+
+
+@pytest.mark.slow
+def test_200_000_boxes(write) -> None:
+    lines = [HEADER, *[BEHIND] * 200_000]
+    for ends in ("\n", "\r\n"):
+        assert len(read_label(write(ends.join(lines)))) == 200_000
+    with pytest.raises(LabelError, match=r"label\.txt:200002: expected 13 fields, found 2"):
+        read_label(write("\n".join([*lines, "car 1"])))
+
+
+def test_words_alone_on_a_line_are_told(write) -> None:
+    assert read_lone_words(write(REAL)) == []
+    text = f"one\n{HEADER}\n\n{PARKED}\n two \n{OWN}\ncar"
+    assert len(read_label(write(text))) == 2
+    assert read_lone_words(write(text)) == [(1, "one", False), (5, "two", False), (7, "car", True)]
+    assert read_lone_words(write(text + "\n"))[-1] == (7, "car", False)

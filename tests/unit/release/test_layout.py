@@ -177,3 +177,18 @@ def test_a_frame_number_that_leads_to_no_path_is_odd(root: Path) -> None:
     assert all(each.calib_path("ego_vehicle", frame).exists() for frame in frames)
     assert frames == [7, 1000]
     assert odd == sorted([f"{NAME}_0007.pkl", f"{NAME}_٠٠٩.pkl"])
+
+
+def test_a_link_to_itself_is_an_error_that_names_it(root: Path) -> None:
+    scenario(root)
+    for name in ("notes", "train.txt", "type2_subtype1_accident"):
+        (root / name).symlink_to(name)
+    with pytest.raises(DatarootError, match=r"type2_subtype1_accident: cannot be listed \(.*\); unpack"):
+        find_release(root)
+    (root / "type2_subtype1_accident").unlink()
+    assert find_release(root).split_files == {"train": root / "train.txt"}
+    link = root / ACCIDENT / "ego_vehicle" / "calib" / "loop"
+    link.symlink_to(link.name)
+    assert [found.name for found in find_release(root).scenarios] == [NAME, "loop"]
+    with pytest.raises(DatarootError, match=r"loop: cannot be listed"):
+        frame_numbers(link, "pkl")

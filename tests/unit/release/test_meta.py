@@ -204,3 +204,26 @@ def test_damage_raises_our_error_or_nothing(
     path.write_bytes(data.draw(mutations(ACCIDENT.encode())))
     _, message = outcome(MetaError, read_meta, path)
     assert message is None or (message.startswith(f"{path}:") and message.endswith(REMEDY))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("four-way junction", "x" * 200_000, None),
+        (" agents id: ", " " + "x" * 200_000, r"expected '<key>: <value>', found 'x+ … "),
+        (" agents id: ", f" agents id: {'7 ' * 100_000}", r"expected four agents' ids, found '7 7 "),
+        (" agents id: ", f" agents id: {'7' * 5000}", r"agent's id: expected an integer, found '7+ … 7+1223'"),
+        (" agents id: ", " agents id: ٧", r"agent's id: expected an integer, found '٧"),
+        (" agents id: ", " agents id: 1_0", r"agent's id: expected an integer, found '1_0"),
+        (" agents id: ", f" agents id: {2**63}", r"agent's id: expected an integer, found '9223"),
+    ],
+)
+def test_a_message_quotes_little(write, old: str, new: str, message: str | None) -> None:
+    assert old in ACCIDENT
+    path = write(ACCIDENT.replace(old, new))
+    if message is None:
+        assert read_meta(path).road_type == new
+        return
+    with pytest.raises(MetaError, match=message) as raised:
+        read_meta(path)
+    assert len(str(raised.value)) < len(str(path)) + 300

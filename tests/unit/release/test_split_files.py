@@ -74,3 +74,10 @@ def test_unique_names_both_lines(path: Path) -> None:
             read_split_file(path, raw=raw, unique=True)
     path.write_text(f"{TYPE} {NAME}\n{TWIN} {NAME}\n")
     assert read_split_file(path, unique=True) == [f"{TYPE}/{NAME}", f"{TWIN}/{NAME}"]
+
+
+def test_a_message_quotes_little(path: Path) -> None:
+    path.write_text("word " * 100_000)
+    with pytest.raises(SplitFileError, match=r":1: expected '<scenario_type> <scenario>', found 'word word") as raised:
+        read_split_file(path)
+    assert len(str(raised.value)) < len(str(path)) + 250

@@ -9,13 +9,18 @@ import pytest
 from PIL import Image
 
 from deepaccident_devkit.validation import validate_release
-from deepaccident_devkit.validation.jpeg import ZEROS, zero_stretch
+from deepaccident_devkit.validation.jpeg import ZEROS, ends_early, zero_stretch
 
 
 def jpeg(image: np.ndarray, **options: object) -> bytes:
     file = io.BytesIO()
     Image.fromarray(image).save(file, "JPEG", **options)
     return file.getvalue()
+
+
+def decoded(content: bytes) -> np.ndarray:
+    with Image.open(io.BytesIO(content)) as image:
+        return np.asarray(image.convert("RGB"))
 
 
 def scene(seed: int = 0) -> np.ndarray:
@@ -115,3 +120,34 @@ def test_damaged_headers_end_nothing() -> None:
         for place in rng.integers(2, 700, 4).tolist():
             damaged[place] = int(rng.integers(256))
         zero_stretch(bytes(damaged))
+
+
+@pytest.mark.parametrize("size", [(180, 320), (177, 313)])
+@pytest.mark.parametrize("options", [{"subsampling": 0}, {"subsampling": 1}, {"subsampling": 2, "optimize": True}])
+def test_data_that_end_before_an_end_marker_are_told(size: tuple[int, int], options: dict[str, object]) -> None:
+    """Decoders fill the rest with grey and say nothing; the last block alone may lose some bits."""
+    content = jpeg(scene()[: size[0], : size[1]], quality=90, **options)
+    assert not ends_early(content, decoded(content))
+    first = content.index(b"\xff\xda") + 14
+    for stop in np.linspace(first, len(content) - 40, 20, dtype=int).tolist():
+        short = content[:stop] + b"\xff\xd9"
+        assert ends_early(short, decoded(short))
+
+
+def test_a_grey_corner_is_no_lost_part() -> None:
+    picture = scene()
+    picture[-40:, -40:] = 128
+    for image in (picture, np.full_like(picture, 128)):
+        for options in ({}, {"progressive": True}, {"restart_marker_blocks": 5}):
+            content = jpeg(image, **options)
+            assert not ends_early(content, decoded(content))
+
+
+def test_a_picture_that_ends_early_is_a_finding(small: Path) -> None:
+    path = next(small.glob("*/*/Camera_Front/*/*_002.jpg"))
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2] + b"\xff\xd9")
+    found = [one for one in validate_release(small, deep=True, workers=1).findings if one.code == "sensor-unreadable"]
+    assert [(one.where, one.what) for one in found] == [
+        (str(path), "its data end early: the rest of the picture is lost")
+    ]

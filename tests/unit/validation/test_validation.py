@@ -5,6 +5,7 @@ Planted faults are in tests/fault_injection; here are the rules behind them and 
 
 import json
 import shutil
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,10 +18,12 @@ from scripts import loaded_script
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.errors import DatarootError, TokenError
+from deepaccident_devkit.errors import DatarootError, LabelError, TokenError
 from deepaccident_devkit.overview import overview
+from deepaccident_devkit.release import read_labels
 from deepaccident_devkit.release.npz import read_npz
-from deepaccident_devkit.validation import CODES, ValidationReport, validate_release
+from deepaccident_devkit.tables import build
+from deepaccident_devkit.validation import CODES, Finding, ValidationReport, validate_release
 from deepaccident_devkit.validation.sensors import ORIENTATIONS, out_of_sequence
 
 DOCS = Path(__file__).parents[3] / "docs"
@@ -336,3 +339,55 @@ def test_the_docs_list_every_finding() -> None:
     module = loaded_script("docs/make_validation_page.py")
     assert module.PAGE.read_text() == module.page(), "run: python docs/make_validation_page.py"
     assert all(f"`{code}`" in module.page() for code in CODES)
+
+
+def test_words_alone_on_a_line_are_a_notice(small: Path) -> None:
+    path = labels_of(small, "ego_vehicle")[2]
+    first, *lines = path.read_text().splitlines()
+    path.write_text("\n".join([first, "word" * 100, *lines, "another", ""]))
+    (finding,) = validate_new(small)
+    assert (finding.code, finding.severity, finding.where) == ("label-line-skipped", "note", f"{path}:2")
+    assert finding.what.startswith("skipped are 2 lines of one word, the first is 'wordword")
+    assert len(finding.what) < 200
+
+
+def test_a_label_with_two_byte_order_marks_is_a_finding(small: Path) -> None:
+    """Alone, Arrow would drop one of them."""
+    path = labels_of(small, "ego_vehicle")[2]
+    path.write_bytes(b"\xef\xbb\xbf" * 2 + path.read_bytes())
+    (finding,) = validate_new(small)
+    assert (finding.code, finding.where) == ("label-unreadable", f"{path}:1")
+
+
+def test_labels_that_are_good_alone_but_not_together_are_a_finding(
+    small: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def read(paths: list[Path]) -> object:
+        if len(paths) > 1:
+            raise LabelError("the labels: do not go together; mend them")
+        return read_labels(paths)
+
+    monkeypatch.setattr(build, "read_labels", read)
+    (finding,) = validate_new(small)
+    assert (finding.code, str(finding)) == ("label-unreadable", "the labels: do not go together; mend them")
+
+
+@pytest.mark.parametrize("actor", ["-1", "{row}"])
+def test_a_crowd_at_one_place_is_told_in_time_that_grows_with_it(small: Path, actor: str) -> None:
+    """20,000 boxes would be 200 million pairs."""
+    path = labels_of(small, "ego_vehicle")[2]
+    box = "car 9.0 9.0 -1.0 4.0 2.0 1.5 0.0 0.0 0.0 {actor} 5 True"
+    rows = [box.format(actor=actor.format(row=row)) for row in range(40_000, 60_000)]
+    lines = [*path.read_text().splitlines(), *rows]
+    path.write_text("\n".join(lines))
+    tracemalloc.start()
+    found = {finding.code: finding.what for finding in validate_new(small)}
+    assert tracemalloc.get_traced_memory()[1] < 100 * 2**20
+    tracemalloc.stop()
+    assert found["label-crowded"] == f"up to {len(lines) - 1:,} boxes in a label, more than 500, frame 3"
+    assert found["duplicate-box"].startswith("two boxes stand in the same place")
+
+
+def validate_new(root: Path) -> list[Finding]:
+    """Findings but for the four agents that a small release lacks, and what follows from it."""
+    return [one for one in validate_release(root, workers=1).findings if one.code != "agent-missing"]

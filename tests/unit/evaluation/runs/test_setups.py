@@ -67,8 +67,8 @@ class TestSetup:
                 ChoiceError,
                 r"protocol of motion: expected one of released, paper, found 'boxes'",
             ),
-            ({"task": "motion", "horizon": 0.0}, ConfigError, r"horizon: expected seconds above 0, at most 100, found 0.0"),
-            ({"task": "motion", "horizon": float("nan")}, ConfigError, r"horizon: expected seconds above 0, at most 100, found nan"),
+            ({"task": "motion", "horizon": 0.0}, ConfigError, "above 0, at most 100, found 0.0"),
+            ({"task": "motion", "horizon": float("nan")}, ConfigError, "above 0, at most 100, found nan"),
             ({"task": "motion", "switches": {"gap": 1}}, ChoiceError, r"MotionProtocol has no switch 'gap'"),
         ],
     )

@@ -1,0 +1,19 @@
+"""Numbers in text files: their words as the release writes them, of any length."""
+
+import re
+from typing import Final
+
+_NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE)
+_INTEGER: Final = re.compile(r"(-?)0*(\d{1,19})", re.ASCII)
+
+
+def number_of(word: str) -> float | None:
+    """The number that a word says, NaN and infinity included; None if it says none."""
+    return float(word) if _NUMBER.fullmatch(word) else None
+
+
+def integer_of(word: str) -> int | None:
+    """The integer of 64 bits that a word says; None if it says none. Python itself reads no more than 4,300 digits."""
+    found = _INTEGER.fullmatch(word)
+    value = int(found[1] + found[2]) if found else 2**63
+    return value if -(2**63) <= value < 2**63 else None
