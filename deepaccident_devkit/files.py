@@ -1,35 +1,13 @@
-"""Files: written so that a reader sees either the old or the whole new one; opened only if they are regular files."""
+"""Files, written so that a reader sees either the old or the whole new one."""
 
 import hashlib
 import os
 import shutil
-import stat
-import struct
 import tempfile
-import tokenize
-import zipfile
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-DAMAGED_ARCHIVE = (
-    OSError,
-    ValueError,
-    EOFError,
-    KeyError,
-    MemoryError,
-    OverflowError,
-    RuntimeError,  # an encrypted member
-    SyntaxError,  # a damaged array header
-    NotImplementedError,  # an unknown compression
-    UnicodeError,
-    struct.error,  # a directory of the archive that ends early
-    tokenize.TokenError,  # an array header with an open bracket
-    zipfile.BadZipFile,
-    zlib.error,
-)
-"""What reading a damaged `.npz` archive can raise."""
 _BLOCK = 1 << 20
 
 
@@ -76,17 +54,6 @@ def file_checksum(path: Path) -> str:
         while block := file.read(_BLOCK):
             checksum.update(block)
     return checksum.hexdigest()
-
-
-def irregular_text(mode: int) -> str | None:
-    """What is in a file's place, by the mode that `stat` gives: `not a regular file (a named pipe)`; else None.
-
-    Opening a pipe waits for its writer, and a device may have no end.
-    """
-    if stat.S_ISREG(mode):
-        return None
-    kind = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket"}.get(stat.S_IFMT(mode))
-    return f"not a regular file ({kind or 'a device'})"
 
 
 def is_writable_folder(path: Path) -> bool:

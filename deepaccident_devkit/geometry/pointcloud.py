@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from deepaccident_devkit.archives import DAMAGED_ARCHIVE, open_zip, read_array
 from deepaccident_devkit.arrays import (
     AnyArray,
     BoolArray,
@@ -22,7 +23,7 @@ from deepaccident_devkit.arrays import (
     readonly,
 )
 from deepaccident_devkit.errors import GeometryError, MissingFileError, SensorFileError
-from deepaccident_devkit.files import DAMAGED_ARCHIVE, replacing
+from deepaccident_devkit.files import replacing
 from deepaccident_devkit.geometry.bev_grid import BevGrid
 from deepaccident_devkit.geometry.frames import checked_frame
 from deepaccident_devkit.geometry.se3 import SE3, checked_transform
@@ -184,11 +185,11 @@ class LidarPointCloud(FrozenArrays, Pictured):
             SensorFileError: it cannot be read, or is another kind of file.
         """
         try:
-            # never unpickles; release.npz, which reads the release's own arrays, is in a higher layer
-            with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:  # noqa: TID251
-                xyz, intensity, frame = (archive[name] for name in _FIELDS)
-                sources = {name: archive[name] for name in _SOURCES if name in archive}
-            return cls(xyz, intensity, str(frame), **sources)
+            with open_zip(Path(path)) as archive:
+                there = {*_FIELDS, *archive.namelist()}
+                names = [name for name in (*_FIELDS, *_SOURCES) if name in there or f"{name}.npy" in there]
+                arrays: dict[str, Any] = {name: read_array(archive, name, "cloud") for name in names}
+            return cls(**arrays | {"frame": str(arrays["frame"])})
         except FileNotFoundError:
             raise MissingFileError(f"{path}: no such file; LidarPointCloud.save writes one") from None
         except _FAULTS as error:

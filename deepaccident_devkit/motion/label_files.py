@@ -18,14 +18,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from deepaccident_devkit.archives import DAMAGED_ARCHIVE, open_zip, read_array
 from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.errors import ChoiceError, LabelFilesError, NotAvailableError, TokenError
-from deepaccident_devkit.files import DAMAGED_ARCHIVE, replacing
+from deepaccident_devkit.files import replacing
 from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
 from deepaccident_devkit.motion.label_folder import FORMAT_VERSION, Manifest, folder_path, label_path, writing_to
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.sample_labels import motion_labels
-from deepaccident_devkit.motion.stored_labels import StoredLabels, read_array, write_array
+from deepaccident_devkit.motion.stored_labels import StoredLabels, write_array
 from deepaccident_devkit.parallel import run_batch
 from deepaccident_devkit.tables.tokens import parse_number
 from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, LIDAR
@@ -183,8 +184,8 @@ class LabelFiles(Mapping[str, MotionLabels]):
             self._open, self._process = OrderedDict(), os.getpid()
         archive = self._open.get(recording)
         if archive is None:
-            archive = zipfile.ZipFile(label_path(self.folder, recording))
-            if read_array(archive, "config").item() != self._digest:
+            archive = open_zip(label_path(self.folder, recording))
+            if read_array(archive, "config", "motion_labels").item() != self._digest:
                 raise ValueError("holds labels of another configuration")
             self._open[recording] = archive
             while len(self._open) > _OPEN_FILES:
@@ -248,8 +249,8 @@ def _scenario_arrays(dataset: Dataset, scenario: str) -> Iterator[AnyArray]:
 def _source_of(path: Path) -> str | None:
     """The digest that a file was made with; None if there is no whole file."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            return str(read_array(archive, "source"))
+        with open_zip(path) as archive:
+            return str(read_array(archive, "source", "motion_labels"))
     except DAMAGED_ARCHIVE:
         return None
 

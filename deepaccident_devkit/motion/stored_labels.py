@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 
+from deepaccident_devkit.archives import read_array
 from deepaccident_devkit.arrays import AnyArray, IntArray, ShortRepr, checked
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.motion.config import MotionLabelConfig
@@ -120,7 +121,8 @@ class StoredLabels(ShortRepr):
     @classmethod
     def read(cls, archive: zipfile.ZipFile, folder: str) -> StoredLabels:
         """The arrays of a folder of an archive; raises what zipfile and numpy raise for damaged ones."""
-        return cls(**{field.name: read_array(archive, f"{folder}/{field.name}") for field in fields(cls)})
+        names = [field.name for field in fields(cls)]
+        return cls(**{name: read_array(archive, f"{folder}/{name}", "motion_labels") for name in names})
 
 
 def write_array(archive: zipfile.ZipFile, name: str, array: AnyArray) -> None:
@@ -130,9 +132,3 @@ def write_array(archive: zipfile.ZipFile, name: str, array: AnyArray) -> None:
     entry = zipfile.ZipInfo(f"{name}.npy", _FIRST_DATE)
     entry.external_attr = 0o644 << 16
     archive.writestr(entry, buffer.getvalue(), zipfile.ZIP_DEFLATED, compresslevel=1)
-
-
-def read_array(archive: zipfile.ZipFile, name: str) -> AnyArray:
-    """The array `<name>.npy` of an archive; never unpickles."""
-    array: AnyArray = np.lib.format.read_array(io.BytesIO(archive.read(f"{name}.npy")), allow_pickle=False)
-    return array

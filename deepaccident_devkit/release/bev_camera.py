@@ -54,7 +54,7 @@ def read_bev(path: Path, *, raw: bool = False) -> BevImage | ByteArray:
         MissingFileError: there is no such file.
         SensorFileError: the archive cannot be read or its array has another shape or type.
     """
-    data = read_npz(path)
+    data = read_npz(path, "bev")
     if data.shape != (*BEV_SHAPE, 3) or data.dtype != np.uint8:
         raise SensorFileError(
             f"{path}: expected shape {(*BEV_SHAPE, 3)} of uint8, found {data.shape} of {data.dtype}; "

@@ -143,7 +143,7 @@ def read_unchecked_calib(path: Path) -> dict[str, AnyArray]:
 
     Raises as `read_calib` does, but not for NaN and transforms that are not rigid.
     """
-    content = read_content(path, CalibError, _REMEDY)
+    content = read_content(path, "calib", CalibError, _REMEDY)
     try:
         loaded = load_arrays(content)
     except UNPICKLE_FAULTS as error:

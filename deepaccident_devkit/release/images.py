@@ -1,15 +1,27 @@
 """`Camera_*/*.jpg`: the camera images."""
 
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from deepaccident_devkit.arrays import ByteArray
-from deepaccident_devkit.errors import MissingFileError, SensorFileError
+from deepaccident_devkit.errors import SensorFileError
 from deepaccident_devkit.files import write_bytes
-from deepaccident_devkit.release._content import check_regular
+from deepaccident_devkit.reading import check_size, fault_text, shortened
+from deepaccident_devkit.release._content import read_content
 
 JPEG_QUALITY = 90
+_DAMAGED = (OSError, SyntaxError, ValueError, struct.error, EOFError, MemoryError, OverflowError, zlib.error)
+"""What decoding a damaged image can raise."""
+_FORMATS = ("JPEG", "PNG")
+"""Others have decoders that start programs."""
+_BYTES_A_PIXEL = 3
 _REMEDY = "restore the file from its archive"
 
 
@@ -22,21 +34,21 @@ def read_image(path: Path, *, raw: bool = False) -> ByteArray:
 
     Raises:
         MissingFileError: there is no such file.
-        SensorFileError: it is truncated, no image or no file. (Of a truncated one, OpenCV returns a half-grey
-            picture.)
+        SensorFileError: it is truncated, neither JPEG nor PNG, too large, or no file. (Of a truncated one, OpenCV
+            returns a half-grey picture.)
     """
-    from PIL import Image
+    with _opened(path, _content(path), _FORMATS) as image:
+        return np.array(image if raw else image.convert("RGB"))
 
-    check_regular(path, SensorFileError, _REMEDY)
-    bombs = (Image.DecompressionBombError, Image.DecompressionBombWarning)  # a damaged header names a giant size
 
-    try:
-        with Image.open(path) as image:
-            return np.array(image if raw else image.convert("RGB"))
-    except FileNotFoundError:
-        raise MissingFileError(f"{path}: no such file; unpack the archive that holds this camera") from None
-    except (OSError, SyntaxError, ValueError, *bombs) as error:
-        raise SensorFileError(f"{path}: not a readable image ({error}); {_REMEDY}") from error
+def read_jpeg(path: Path) -> tuple[bytes, tuple[int, int]]:
+    """A JPEG file's bytes, and the width and height that its head says; the picture itself is not decoded.
+
+    Raises as `read_image` does.
+    """
+    content = _content(path)
+    with _opened(path, content, _FORMATS[:1]) as image:
+        return content, image.size
 
 
 def write_image(path: Path, image: ByteArray) -> None:
@@ -49,3 +61,23 @@ def write_image(path: Path, image: ByteArray) -> None:
     if not done:
         raise SensorFileError(f"{path}: an image of shape {image.shape} cannot be encoded as JPEG")
     write_bytes(path, encoded.tobytes())
+
+
+def _content(path: Path) -> bytes:
+    return read_content(path, "image", SensorFileError, _REMEDY)
+
+
+@contextmanager
+def _opened(path: Path, content: bytes, formats: tuple[str, ...]) -> Iterator[Any]:
+    """Pillow's image of a file's bytes, which is not too large; what it raises becomes SensorFileError."""
+    from PIL import Image, UnidentifiedImageError
+
+    bombs = (Image.DecompressionBombError, Image.DecompressionBombWarning)
+    try:
+        with Image.open(BytesIO(content), formats=formats) as image:
+            check_size(_BYTES_A_PIXEL * image.width * image.height, "image", "its picture")
+            yield image
+    except (*_DAMAGED, *bombs) as error:
+        known = not isinstance(error, UnidentifiedImageError)
+        detail = fault_text(error) if known else f"expected {' or '.join(formats)}"
+        raise SensorFileError(f"{path}: not a readable image ({shortened(detail)}); {_REMEDY}") from error

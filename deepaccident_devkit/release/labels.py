@@ -204,7 +204,7 @@ def _parse_files(paths: Sequence[Path], contents: Sequence[bytes]) -> dict[str, 
 
 def _content(path: Path) -> bytes:
     """A file's bytes, ending in a line end."""
-    content = read_content(path, LabelError, _REMEDY).removeprefix(codecs.BOM_UTF8)
+    content = read_content(path, "label", LabelError, _REMEDY).removeprefix(codecs.BOM_UTF8)
     return content if content.endswith(b"\n") else content + b"\n"
 
 

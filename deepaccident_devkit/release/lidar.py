@@ -31,7 +31,7 @@ def read_lidar(path: Path, *, raw: bool = False) -> LidarPointCloud | AnyArray:
         MissingFileError: there is no such file.
         SensorFileError: the archive cannot be read or its array is not (N, 4) of floats.
     """
-    data = read_npz(path)
+    data = read_npz(path, "lidar")
     if data.ndim != 2 or data.shape[1] != 4 or data.dtype.kind != "f":
         raise SensorFileError(
             f"{path}: expected points (N, 4) of floats, found shape {data.shape} of {data.dtype}; "

@@ -89,7 +89,7 @@ def read_meta(path: Path, *, raw: bool = False) -> Meta | tuple[str, ...]:
         MetaError: the first line has not nine words or a word where a number belongs, or another line's ids are
             no numbers.
     """
-    lines = read_lines(path, MetaError, _REMEDY)
+    lines = read_lines(path, "meta", MetaError, _REMEDY)
     if raw:
         return tuple(lines)
     filled = [(number, line.strip()) for number, line in enumerate(lines, start=1) if line.strip()]

@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
+from deepaccident_devkit.archives import DAMAGED_ARCHIVE, array_of, open_zip, read_member
 from deepaccident_devkit.arrays import AnyArray
-from deepaccident_devkit.errors import MissingFileError, SensorFileError
-from deepaccident_devkit.files import DAMAGED_ARCHIVE, write_bytes
-from deepaccident_devkit.release._content import check_regular
+from deepaccident_devkit.errors import SensorFileError
+from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.reading import FileKind, fault_text, shortened
+from deepaccident_devkit.release._content import read_content
 
 KEY = "data"
 _ENDING = ".npy"
@@ -20,24 +22,24 @@ FAST = 1
 _REMEDY = "restore the file from its archive"
 
 
-def read_npz(path: Path) -> AnyArray:
-    """The array under `data`, or the only one in the file.
+def read_npz(path: Path, kind: FileKind) -> AnyArray:
+    """The array under `data`, or the only one in the file, of numbers.
 
     Raises:
         MissingFileError: there is no such file.
-        SensorFileError: it is no file, empty, truncated, holds several arrays and none of them `data`, or objects.
+        SensorFileError: it is no file, empty, truncated, too large for its kind, disagrees with its sizes or checksum,
+            holds several arrays and none of them `data`, or objects.
     """
-    check_regular(path, SensorFileError, _REMEDY)
+    content = read_content(path, kind, SensorFileError, _REMEDY)
     try:
-        with zipfile.ZipFile(path) as archive, archive.open(_array_member(path, archive)) as file:
-            array: AnyArray = np.lib.format.read_array(file, allow_pickle=False)
-            return array
-    except FileNotFoundError:
-        raise MissingFileError(f"{path}: no such file; unpack the archive that holds it") from None
+        with open_zip(content) as archive:
+            return array_of(read_member(archive, _array_member(path, archive), kind), kind)
     except DAMAGED_ARCHIVE as error:
         if isinstance(error, SensorFileError):
             raise
-        raise SensorFileError(f"{path}: {_fault(path, error)}; {_REMEDY}") from error
+        detail = "expected an npz archive, found a bare array" if content.startswith(_BARE_ARRAY) else ""
+        detail = detail or f"not a readable npz archive ({shortened(fault_text(error))})"
+        raise SensorFileError(f"{path}: {detail}; {_REMEDY}") from error
 
 
 def write_npz(path: Path, array: AnyArray, *, level: int = FAST) -> None:
@@ -50,22 +52,10 @@ def write_npz(path: Path, array: AnyArray, *, level: int = FAST) -> None:
     write_bytes(path, archive.getvalue())
 
 
-def _array_member(path: Path, archive: zipfile.ZipFile) -> str:
-    names = [name for name in archive.namelist() if name.endswith(_ENDING)]
-    if f"{KEY}{_ENDING}" in names:
-        return f"{KEY}{_ENDING}"
-    if len(names) != 1:
-        found = ", ".join(name.removesuffix(_ENDING) for name in names) or "no array"
-        raise SensorFileError(f"{path}: expected an array named '{KEY}', found {found}; {_REMEDY}")
-    return names[0]
-
-
-def _fault(path: Path, error: Exception) -> str:
-    try:
-        with path.open("rb") as file:
-            start = file.read(len(_BARE_ARRAY))
-    except OSError:
-        return f"not a readable npz archive ({error})"
-    if start == _BARE_ARRAY:
-        return "expected an npz archive, found a bare array"
-    return f"not a readable npz archive ({error if start else 'the file is empty'})"
+def _array_member(path: Path, archive: zipfile.ZipFile) -> zipfile.ZipInfo:
+    entries = [entry for entry in archive.infolist() if entry.filename.endswith(_ENDING)]
+    named = [entry for entry in entries if entry.filename == f"{KEY}{_ENDING}"] or entries
+    if len(named) != 1:
+        found = ", ".join(entry.filename.removesuffix(_ENDING) for entry in entries) or "no array"
+        raise SensorFileError(f"{path}: expected an array named '{KEY}', found {shortened(found)}; {_REMEDY}")
+    return named[0]

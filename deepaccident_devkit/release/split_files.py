@@ -27,7 +27,7 @@ def read_split_file(path: Path, *, raw: bool = False, unique: bool = False) -> l
         MissingFileError: there is no such file.
         SplitFileError: a line has not two words, the file is no text, or a scenario stands twice and `unique` is set.
     """
-    lines = read_lines(path, SplitFileError, "restore it from the release")
+    lines = read_lines(path, "split", SplitFileError, "restore it from the release")
     words = [(number, tuple(line.split())) for number, line in enumerate(lines, start=1) if line.strip()]
     for number, line_words in words:
         if len(line_words) != 2:

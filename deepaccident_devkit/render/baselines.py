@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.render.axes import axes_or_new, detached_figure, figure_or_new, with_light_grid
 from deepaccident_devkit.render.colors import CONFIGURATION_COLORS, OWN_COLOR, PREDICTED_COLOR
+from deepaccident_devkit.render.legends import draw_legend
 from deepaccident_devkit.render.pictures import write_figure
 
 if TYPE_CHECKING:
@@ -84,7 +85,7 @@ def render_panels(panels: Sequence[Sequence[Panel]], title: str, *, fig: Figure 
         for panel, ax in zip(row, line, strict=True):
             render_panel(panel, ax=ax)
     handles, names = axes[0, 0].get_legend_handles_labels()
-    fig.legend(handles, names, loc="outside lower center", ncols=len(names))
+    draw_legend(fig, handles, columns=len(names), loc="outside lower center")
     fig.suptitle(title)
     return fig
 

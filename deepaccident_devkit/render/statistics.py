@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final, Literal, get_args
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.render.axes import detached_figure, figure_or_new
+from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import SPLIT_COLORS
 from deepaccident_devkit.render.pictures import write_figure
 from deepaccident_devkit.render.statistics_panels import (
@@ -67,40 +68,41 @@ def _actors(statistics: DatasetStatistics, fig: Figure) -> None:
 
 
 def _boxes(statistics: DatasetStatistics, fig: Figure) -> None:
-    axes = fig.subplots(1, 3)
-    for field, ax in zip(("length", "width", "height"), axes, strict=True):
+    axes = fig.subplot_mosaic([["length", "width"], ["height", "."]])
+    for field, ax in axes.items():
         render_quantiles(statistics.quantiles["box_sizes"], field, ax=ax)
 
 
 def _motion(statistics: DatasetStatistics, fig: Figure) -> None:
-    axes = fig.subplots(2, 2)
+    axes = fig.subplots(2, 2, width_ratios=(4, 5))
     for row, (name, field) in enumerate((("distances", "distance"), ("speeds", "speed"))):
         render_histogram(statistics.histograms[name], ax=axes[row, 0])
         render_quantiles(statistics.quantiles[f"{field}_quantiles"], field, ax=axes[row, 1])
 
 
 def _collisions(statistics: DatasetStatistics, fig: Figure) -> None:
-    fig.suptitle("The colliding pair at the last frame: the other actor, seen from the first\n")
+    fig.suptitle("The colliding pair at the last frame: the other actor, seen from the first")
     angles = fig.add_subplot(1, 3, 1, projection="polar")
     bearings = fig.add_subplot(1, 3, 2, projection="polar")
     render_angles(statistics.histograms["collision_angles"], ax=angles)
     render_angles(statistics.histograms["collision_bearings"], ax=bearings)
-    angles.set_xlabel(
-        "collisions by the other's heading: 0° the same,\n90° to the left, 180° head-on, 270° to the right", fontsize=8
-    )
-    bearings.set_xlabel("collisions by where the other is:\n0° ahead, 90° left, 270° right\n", fontsize=8)
+    headings = "collisions by the other's heading: 0° the same,\n90° to the left, 180° head-on, 270° to the right"
+    angles.set_xlabel(headings, fontsize=SMALLEST_TEXT)
+    bearings.set_xlabel("collisions by where the other is:\n0° ahead, 90° left, 270° right", fontsize=SMALLEST_TEXT)
     render_relative_positions(statistics.collisions, ax=fig.add_subplot(1, 3, 3))
 
 
 _Draw = Callable[[DatasetStatistics, "Figure"], None]
+_WIDTH: Final = 10.7
+"""Inches of a page of A4 in landscape."""
 _FIGURES: Mapping[str, tuple[tuple[float, float], _Draw]] = {
-    "scenarios": ((13, 11), _scenarios),
-    "ends": ((13, 5.5), _ends),
-    "ego": ((12, 4.5), _ego),
-    "actors": ((13, 7.5), _actors),
-    "boxes": ((14, 4.5), _boxes),
-    "motion": ((13, 8), _motion),
-    "collisions": ((15, 6.5), _collisions),
+    "scenarios": ((_WIDTH, 10.5), _scenarios),
+    "ends": ((_WIDTH, 5.5), _ends),
+    "ego": ((_WIDTH, 4.5), _ego),
+    "actors": ((_WIDTH, 7.5), _actors),
+    "boxes": ((_WIDTH, 7.5), _boxes),
+    "motion": ((_WIDTH, 8), _motion),
+    "collisions": ((_WIDTH, 5.2), _collisions),
 }
 STATISTICS_FIGURES: Final = tuple(_FIGURES)
 """The groups that `render_statistics` renders."""
@@ -134,7 +136,7 @@ def render_statistics(statistics: DatasetStatistics, group: str, *, fig: Figure 
     shown = [name for name in SPLIT_COLORS if name in handles]
     if shown:
         chosen = [handles[name] for name in shown]
-        fig.legend(chosen, shown, loc="outside lower center", ncols=len(shown), title="split", fontsize=9)
+        fig.legend(chosen, shown, loc="outside lower center", ncols=len(shown), title="split", fontsize=SMALLEST_TEXT)
     return fig
 
 

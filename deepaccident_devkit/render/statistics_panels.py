@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render.axes import axes_or_new, figure_or_new, with_light_grid
-from deepaccident_devkit.render.colors import CATEGORY_COLORS, COLLIDER_COLOR, GRID_COLOR, SPLIT_COLORS
+from deepaccident_devkit.render.chips import SMALLEST_TEXT
+from deepaccident_devkit.render.colors import (
+    CATEGORY_COLORS,
+    CATEGORY_MARKERS,
+    COLLIDER_COLOR,
+    GRID_COLOR,
+    SPLIT_COLORS,
+)
+from deepaccident_devkit.render.legends import draw_legend
 from deepaccident_devkit.statistics import (
     GROUPS,
     PROBABILITIES,
@@ -49,7 +57,8 @@ def render_counts(table: CountTable, *, ax: Axes | None = None) -> Axes:
         starts = [start + width for start, width in zip(starts, widths, strict=True)]
     for position, total in enumerate(starts):
         share = f" ({100 * total / whole:.0f} %)" if whole else ""
-        ax.annotate(f"{total:,}{share}", (total, position), (4, 0), textcoords="offset points", va="center", fontsize=8)
+        how: Any = {"textcoords": "offset points", "va": "center", "fontsize": SMALLEST_TEXT}
+        ax.annotate(f"{total:,}{share}", (total, position), (4, 0), **how)
     ax.set_yticks(range(len(values)), values)
     ax.invert_yaxis()
     ax.set(xlabel=table.counted, title=table.title, xlim=(0, 1.3 * max([1, *starts])))
@@ -93,7 +102,7 @@ def render_quantiles(table: QuantileTable, field: str, *, ax: Axes | None = None
     rows = [row for row in table.quantiles if row.field == field and row.group == GROUPS[0] and row.values]
     draw_quantile_boxes({row.category: row for row in rows}, ax)
     ax.set(ylabel=f"{field} ({table.unit})", title=f"{field.capitalize()} by category", ylim=(0, None))
-    ax.tick_params(axis="x", labelrotation=20)
+    ax.tick_params(axis="x", labelsize=SMALLEST_TEXT)
     return ax
 
 
@@ -121,7 +130,7 @@ def render_angles(histogram: Histogram, *, ax: Axes | None = None) -> Axes:
     middles = [radians((low + high) / 2) for low, high in pairwise(edges)]
     _draw_stacked(histogram, ax, middles, radians(edges[1] - edges[0]))
     ax.set_xticks([radians(angle) for angle in range(0, 360, 30)])
-    ax.tick_params(labelsize=8)
+    ax.tick_params(labelsize=SMALLEST_TEXT)
     counts = histogram.counts[GROUPS[0]]
     lowest = min(range(len(counts)), key=lambda bar: counts[bar - 1] + counts[bar])
     ax.set_rlabel_position(edges[lowest])  # beside the bars
@@ -151,16 +160,18 @@ def render_relative_positions(pairs: Sequence[CollisionPair], *, ax: Axes | None
         others = [pair for pair in pairs if pair.other_category == category]
         if others:
             positions = ([pair.y for pair in others], [pair.x for pair in others])
-            color = CATEGORY_COLORS[category]
-            ax.scatter(*positions, s=16, color=color, alpha=0.75, linewidths=0, label=category, zorder=3)
+            color, marker = CATEGORY_COLORS[category], CATEGORY_MARKERS.get(category, "s")
+            how: Any = {"s": 30, "marker": marker, "alpha": 0.75, "linewidths": 0}
+            ax.scatter(*positions, color=color, label=category, zorder=3, **how)
     ax.add_patch(Rectangle((-0.97, -2.3), 1.94, 4.6, fill=False, edgecolor=COLLIDER_COLOR, linewidth=1.2))
     ax.annotate("", (0, 2.3), (0, 0.4), arrowprops={"arrowstyle": "->", "color": COLLIDER_COLOR})
     reach = max([6.0, *(1.1 * max(abs(pair.x), abs(pair.y)) for pair in pairs)])
     ax.set(xlim=(reach, -reach), ylim=(-reach, reach), aspect="equal")
     ax.set(xlabel="to the left of the first (m)", ylabel="forward of the first (m)")
-    ax.set_title("Centre of the other actor (red: the first, as a median car)", fontsize=10)
+    ax.set_title("Centre of the other actor\n(red: the first, as a median car)", fontsize=10)
     if pairs:
-        ax.legend(fontsize=8, loc="upper right", title="the other", title_fontsize=8)
+        handles, _ = ax.get_legend_handles_labels()
+        draw_legend(ax, handles, columns=3, loc="upper center", bbox_to_anchor=(0.5, -0.22))  # below the axis' label
     return with_light_grid(ax, "both")
 
 
@@ -172,15 +183,15 @@ def draw_quantile_boxes(rows: Mapping[str, QuantileRow], ax: Axes) -> None:
         if (q := row.values)
     ]
     if boxes:
-        parts = ax.bxp(boxes, showfliers=False, patch_artist=True, widths=0.6, medianprops={"color": "black"})
+        parts = ax.bxp(boxes, showfliers=False, patch_artist=True, widths=0.45, medianprops={"color": "black"})
         for patch, row in zip(parts["boxes"], rows.values(), strict=True):
             patch.set(facecolor=CATEGORY_COLORS.get(row.category, SPLIT_COLORS["unknown"]), alpha=0.75)
         medians = [row.values[PROBABILITIES.index(0.5)] for row in rows.values() if row.values]
         for position, median in enumerate(medians, 1):
             text = f"{median:.{1 if median >= 10 else 2}f}"
-            ax.annotate(text, (position + 0.33, median), va="center", fontsize=8)
-        ax.set_xlim(0.4, len(boxes) + 0.9)
-    ax.set_xlabel("line: median; box: 25–75 %; whiskers: 5–95 %", fontsize=8)
+            ax.annotate(text, (position + 0.25, median), va="center", fontsize=SMALLEST_TEXT)
+        ax.set_xlim(0.6, len(boxes) + 0.75)
+    ax.set_xlabel("line: median; box: 25–75 %; whiskers: 5–95 %", fontsize=SMALLEST_TEXT)
     with_light_grid(ax, "y")
 
 

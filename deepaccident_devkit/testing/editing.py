@@ -118,7 +118,7 @@ class ScenarioEditor:
 
     def array(self, agent: str, channel: str, frame: int) -> AnyArray:
         """The array of an npz file, unchanged."""
-        return read_npz(self.file(agent, channel, frame))
+        return read_npz(self.file(agent, channel, frame), "lidar")
 
     def write_array(self, agent: str, channel: str, frame: int, array: Any, *, key: str = KEY) -> None:
         """Replace an npz file by one with any array, of objects too, under any key."""

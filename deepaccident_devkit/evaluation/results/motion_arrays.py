@@ -13,13 +13,13 @@ from typing import IO, Final
 
 import numpy as np
 
+from deepaccident_devkit.archives import DAMAGED_ARCHIVE
 from deepaccident_devkit.arrays import AnyArray, FloatArray
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
 from deepaccident_devkit.evaluation.metrics.trajectories import instance_paths
 from deepaccident_devkit.evaluation.results.faults import ContentError, at
 from deepaccident_devkit.evaluation.results.header import MotionForm
-from deepaccident_devkit.files import DAMAGED_ARCHIVE
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import LinkedInstances, predict_instances, trajectories
 

@@ -22,8 +22,9 @@ from deepaccident_devkit.evaluation.results.faults import at, parsed_json, told_
 from deepaccident_devkit.evaluation.results.header import RESULTS_FILE, Header, MotionForm, ResultsTask, read_header
 from deepaccident_devkit.evaluation.results.motion_arrays import paths_of, stored_output, stored_paths
 from deepaccident_devkit.evaluation.results.shards import OpenShards, ShardCheck, check_shard, read_manifest
-from deepaccident_devkit.files import file_checksum, irregular_text
+from deepaccident_devkit.files import file_checksum
 from deepaccident_devkit.parallel import run_batch
+from deepaccident_devkit.reading import irregular_text
 
 Prediction = MotionOutput | list[Accident] | DetectedBoxes
 

@@ -14,6 +14,7 @@ from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 from typing import Any, Final
 
+from deepaccident_devkit.archives import DAMAGED_ARCHIVE, open_zip
 from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput
@@ -35,8 +36,9 @@ from deepaccident_devkit.evaluation.results.motion_arrays import (
     members,
     put_array,
 )
-from deepaccident_devkit.files import DAMAGED_ARCHIVE, file_checksum, irregular_text
+from deepaccident_devkit.files import file_checksum
 from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.reading import irregular_text
 
 SHARD_FIELDS: Final = ("file", "tokens", "bytes", "checksum")
 
@@ -212,7 +214,7 @@ def check_shard(task: ShardCheck) -> None:
 def opened(root: Path, shard: Shard) -> zipfile.ZipFile:
     """A shard's archive; raises ContentError."""
     try:
-        return zipfile.ZipFile(root / shard.file)
+        return open_zip(root / shard.file)
     except DAMAGED_ARCHIVE as error:
         raise ContentError(f"is no npz archive that can be read ({error}); copy it again") from error
 

@@ -21,7 +21,8 @@ from deepaccident_devkit.evaluation.runs.evaluation_run import (
 from deepaccident_devkit.evaluation.runs.rows import sample_rows, write_rows
 from deepaccident_devkit.evaluation.runs.selection import SampleSelection
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.files import file_checksum, irregular_text, replacing_folder
+from deepaccident_devkit.files import file_checksum, replacing_folder
+from deepaccident_devkit.reading import irregular_text
 
 SUMMARY_FILE: Final = "metrics_summary.json"
 COUNTS_FILE: Final = "counts.json"

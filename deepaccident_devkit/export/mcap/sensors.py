@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,12 +10,11 @@ from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.errors import SensorFileError
 from deepaccident_devkit.export.mcap.config import McapConfig
 from deepaccident_devkit.export.mcap.messages import cloud_message, frame_id
 from deepaccident_devkit.export.mcap.moment import Moment
 from deepaccident_devkit.export.mcap.recording import Recording, frame_timestamp
-from deepaccident_devkit.files import irregular_text
+from deepaccident_devkit.release.images import read_jpeg
 from deepaccident_devkit.release.missing_files import MissingFiles
 from deepaccident_devkit.taxonomy import LIDAR
 from deepaccident_devkit.v2x.projection import camera_of
@@ -51,10 +49,10 @@ class Sensors:
         self._files.tell()
 
     def _write_image(self, agent: str, token: str, path: Path, index: int, recording: Recording) -> None:
-        content, channel = _content(path), token.rsplit("/", 1)[1]
+        (content, size), channel = read_jpeg(path), token.rsplit("/", 1)[1]
         frame = frame_id(agent, channel)
         image = CompressedImage(timestamp=frame_timestamp(index), frame_id=frame, data=content, format="jpeg")
-        calibration = _calibration(self._dataset, token, _image_size(path, content), frame, index)
+        calibration = _calibration(self._dataset, token, size, frame, index)
         recording.write(f"/{frame}/calibration", calibration, index)
         recording.write(f"/{frame}/image", image, index)
 
@@ -83,26 +81,3 @@ def _calibration(dataset: Dataset, token: str, size: tuple[int, int], frame: str
         R=np.eye(3).ravel().tolist(),
         P=np.column_stack([scaled, np.zeros(3)]).ravel().tolist(),
     )
-
-
-def _content(path: Path) -> bytes:
-    """An image file's bytes; raises SensorFileError."""
-    try:
-        irregular = irregular_text(path.stat().st_mode)
-        if irregular:
-            raise SensorFileError(f"{path}: {irregular}; restore the file from its archive")
-        return path.read_bytes()
-    except OSError as error:
-        raise SensorFileError(f"{path}: cannot be read ({error}); restore the file from its archive") from error
-
-
-def _image_size(path: Path, content: bytes) -> tuple[int, int]:
-    """Width and height from the image's header, without decoding it; raises SensorFileError."""
-    from PIL import Image
-
-    bombs = (Image.DecompressionBombError, Image.DecompressionBombWarning)
-    try:
-        with Image.open(BytesIO(content), formats=("JPEG",)) as image:
-            return image.size
-    except (OSError, SyntaxError, ValueError, *bombs) as error:
-        raise SensorFileError(f"{path}: not a readable image ({error}); restore the file from its archive") from error

@@ -54,7 +54,7 @@ def explain_file(path: Path, *, rows: int | None = 10) -> Explanation:
         MissingFileError: there is no such file.
         ReleaseError: it is of none of these kinds, or so damaged that nothing of it can be said.
     """
-    kind = _kind_of(path, read_content(path, ReleaseError, _REMEDY))
+    kind = _kind_of(path, read_content(path, "label", ReleaseError, _REMEDY))
     fault: ReleaseError | None = None
     if kind == "label":
         text, fault = label_text(path, rows)

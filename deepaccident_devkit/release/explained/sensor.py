@@ -32,7 +32,7 @@ def sensor_text(path: Path) -> str:
         MissingFileError: there is no such file.
         SensorFileError: it cannot be read, or holds neither points nor the picture of the BEV camera.
     """
-    data = read_npz(path)
+    data = read_npz(path, "lidar")
     if data.ndim == 2 and data.shape[1] == len(_LIDAR_COLUMNS):
         return _lidar_text(read_lidar(path, raw=True))
     if data.ndim == 3 and data.dtype == np.uint8:

@@ -14,8 +14,11 @@ from deepaccident_devkit.evaluation.metrics.accident.paper import PaperAccidents
 from deepaccident_devkit.evaluation.metrics.accident.scoring import DISTANCES, AccidentResult, Alarm
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, ratio
 from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
+from deepaccident_devkit.render.boxes import write_beside
+from deepaccident_devkit.render.chips import SMALLEST_TEXT, keep_free
 from deepaccident_devkit.render.colors import ESTIMATE_COLOR, GRID_COLOR, OUTCOME_COLORS
 from deepaccident_devkit.render.evaluation.panels import PANEL, draw_nothing
+from deepaccident_devkit.render.titles import set_title
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,15 +45,16 @@ def render_accuracy(evaluator: AccidentEvaluator, *, ax: Axes | None = None) -> 
     curve = accuracy_by_distance(evaluator, allowed)
     if curve is not None:
         ax.plot(allowed, curve, drawstyle="steps-post", color=ESTIMATE_COLOR, linewidth=1.6)
+        keep_free(ax, np.column_stack([allowed, curve])[:, None])
     for distance, within in result.within.items():
         ax.axvline(distance, color=GRID_COLOR, linewidth=1, linestyle="--", zorder=0)
         if np.isfinite(within.accuracy):
             ax.plot(distance, within.accuracy, "o", color=ESTIMATE_COLOR, markersize=6)
-            ax.annotate(f"{within.accuracy:.3f}", (distance, within.accuracy), (6, -13), textcoords="offset points")
+            write_beside(ax, f"{within.accuracy:.3f}", (distance, within.accuracy), GRID_COLOR)
     ax.set(xlim=(0, _FARTHEST), ylim=(0, 1.04), xlabel="distance allowed (m)", ylabel="tp / (tp + fp/2 + fn/2)")
     apa = "nothing to count" if np.isnan(result.apa) else f"APA {result.apa:.3f}"
     positives = f"{result.positives:,} of {result.samples:,} samples have an accident"
-    ax.set_title(f"{apa}: mean of the three distances; {positives}", fontsize=10)
+    set_title(ax, f"{apa}: mean of the three distances; {positives}", fontsize="medium")
     return with_light_grid(ax, "y")
 
 
@@ -73,13 +77,13 @@ def render_outcomes(result: AccidentResult, *, ax: Axes | None = None) -> Axes:
         heights = [getattr(each, field) for each in result.within.values()]
         places = [place + 0.27 * (offset - 1) for place in range(len(heights))]
         parts = ax.bar(places, heights, width=0.25, color=OUTCOME_COLORS[kind], label=label)
-        ax.bar_label(parts, fontsize=8, padding=1)
+        ax.bar_label(parts, fontsize=SMALLEST_TEXT, padding=1)
         highest = max(highest, *heights)
     ax.set_xticks(range(len(result.within)), [f"within {distance:g} m" for distance in result.within])
     ax.set(ylabel="accidents", ylim=(0, 1.25 * highest))
     ax.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
-    ax.legend(fontsize=8, ncols=3, loc="upper center")
-    ax.set_title(f"Outcomes: {result.positives:,} accidents, {result.negatives:,} samples without", fontsize=10)
+    ax.legend(fontsize=SMALLEST_TEXT, ncols=3, loc="upper center")
+    set_title(ax, f"Outcomes: {result.positives:,} accidents, {result.negatives:,} samples without", fontsize="medium")
     return with_light_grid(ax, "y")
 
 
@@ -103,7 +107,7 @@ def render_errors(evaluator: AccidentEvaluator, error: Literal["position", "time
             ax.axvline(distance, color=GRID_COLOR, linestyle="--", zorder=0)
     else:
         edges, label = _TIME_EDGES, "predicted moment minus true moment (s): late to the right"
-    ax.set_title(f"Errors of {error}: {len(values):,} accidents with a prediction", fontsize=10)
+    set_title(ax, f"Errors of {error}: {len(values):,} accidents with a prediction", fontsize="medium")
     if not len(values):
         return draw_nothing(ax, "no accident has a prediction")
     middles = (edges[:-1] + edges[1:]) / 2
@@ -125,7 +129,7 @@ def render_alarms(evaluator: AccidentEvaluator, *, ax: Axes | None = None) -> Ax
         The axes: each point is all alarms of at least some score.
     """
     ax = axes_or_new(ax, PANEL)
-    ax.set_title("Alarms, the surest first", fontsize=10)
+    set_title(ax, "Alarms, the surest first", fontsize="medium")
     recall, precision = alarm_precision_recall(evaluator)
     if not len(recall):
         return draw_nothing(ax, "no alarms, or no accidents")

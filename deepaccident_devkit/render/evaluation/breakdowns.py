@@ -10,6 +10,7 @@ from deepaccident_devkit.evaluation.metrics.headlines import LIMITS, Headline, h
 from deepaccident_devkit.render.axes import axes_or_new
 from deepaccident_devkit.render.colors import AGENT_COLORS, ESTIMATE_COLOR
 from deepaccident_devkit.render.evaluation.panels import PANEL, Bar, draw_bars
+from deepaccident_devkit.render.titles import set_title
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,7 +36,7 @@ def render_breakdown(task: str, broken: Breakdown[Any], number: str, *, ax: Axes
         shown = headline or shown
         bars.append(_bar(group, headline, AGENT_COLORS.get(group.value or "", ESTIMATE_COLOR)))
     draw_bars(bars, ax, None if shown is None else LIMITS.get(shown.unit))
-    ax.set_title(f"{number if shown is None else shown.name} by {broken.by.replace('_', ' ')}", fontsize=10)
+    set_title(ax, f"{number if shown is None else shown.name} by {broken.by.replace('_', ' ')}", fontsize="medium")
     ax.set_xlabel("" if shown is None else _with_unit(shown))
     return ax
 

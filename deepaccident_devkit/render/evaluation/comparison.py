@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Final
 
 from deepaccident_devkit.evaluation.runs import ComparedNumber, Comparison
 from deepaccident_devkit.render.axes import figure_or_new, with_light_grid
+from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import ESTIMATE_COLOR, MUTED_COLOR, WARNING_COLOR
 from deepaccident_devkit.render.evaluation.panels import draw_nothing
+from deepaccident_devkit.render.titles import set_title
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,11 +45,11 @@ def render_comparison(comparison: Comparison, *, fig: Figure | None = None) -> F
         f"{comparison.task}, protocol {comparison.protocol}: {comparison.samples:,} samples of "
         f"{comparison.scenarios:,} scenarios"
     )
-    fig.suptitle(
-        "\n".join([title, *comparison.partial]), fontsize=11, color=WARNING_COLOR if comparison.partial else None
-    )
+    color = WARNING_COLOR if comparison.partial else None
+    set_title(fig, "\n".join([title, *comparison.partial]), fontsize=11, color=color)
     interval = f"whiskers: {100 * comparison.resampling.confidence:g} % intervals; full dots: significant"
-    fig.supxlabel(f"a: {comparison.a.name}; b: {comparison.b.name}\n{interval}", fontsize=9, color=MUTED_COLOR)
+    names = f"a: {comparison.a.name}; b: {comparison.b.name}"
+    fig.supxlabel(f"{names}\n{interval}", fontsize=SMALLEST_TEXT, color=MUTED_COLOR)
     axes = fig.subplots(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
     for ax, (unit, rows) in zip(axes, panels.items(), strict=False):
         _draw_differences(ax, rows)
@@ -68,11 +70,11 @@ def _draw_differences(ax: Axes, rows: Sequence[tuple[ComparedNumber, float]]) ->
         face = ESTIMATE_COLOR if each.real else "white"
         ax.plot(difference, row, "o", markersize=6.5, markerfacecolor=face, markeredgecolor=ESTIMATE_COLOR)
         text = _text(difference, each, "+") + (f", {each.better} is better" if each.better else "")
-        ax.annotate(text, (1.015, row), xycoords=("axes fraction", "data"), va="center", fontsize=9)
+        ax.annotate(text, (1.015, row), xycoords=("axes fraction", "data"), va="center", fontsize=SMALLEST_TEXT)
         least = 10.0 ** -_decimals(each)  # smaller differences are none to the reader
         ax.update_datalim([(-least, row), (least, row)])
     labels = [f"{each.headline}\n{_text(each.a, each)} → {_text(each.b, each)}" for each, _ in rows]
-    ax.set_yticks(range(len(rows)), labels, fontsize=9, linespacing=1.15)
+    ax.set_yticks(range(len(rows)), labels, fontsize=SMALLEST_TEXT, linespacing=1.15)
     ax.set_ylim(len(rows) - 0.5, -0.5)
     ax.margins(x=0.08)
     ax.xaxis.set_major_locator(MaxNLocator(nbins=6))

@@ -11,8 +11,10 @@ import numpy as np
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.metrics.detection import DetectionResult
 from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
+from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import CATEGORY_COLORS, ESTIMATE_COLOR, SERIES_COLORS
 from deepaccident_devkit.render.evaluation.panels import PANEL, Bar, draw_bars, draw_nothing
+from deepaccident_devkit.render.titles import set_title
 from deepaccident_devkit.text import choice
 
 if TYPE_CHECKING:
@@ -42,7 +44,7 @@ def render_precision_recall(result: DetectionResult, name: str, *, ring: int = 0
         raise ChoiceError(f"ring: expected 0 to {len(result.ranges) - 1}, found {ring!r}")
     ax, row = axes_or_new(ax, PANEL), result.classes.index(name)
     truths, found = int(result.truths[row, ring]), int(result.detections[row, ring])
-    ax.set_title(f"{name}: {truths:,} true, {found:,} detected{_ring_text(result, ring)}", fontsize=10)
+    set_title(ax, f"{name}: {truths:,} true, {found:,} detected{_ring_text(result, ring)}", fontsize="medium")
     if not truths:
         return draw_nothing(ax, "none in the truth")
     count = result.thresholds.shape[1]
@@ -55,7 +57,7 @@ def render_precision_recall(result: DetectionResult, name: str, *, ring: int = 0
         width = 1.2 + 0.8 * (count - 1 - level)  # so that all of several equal curves are seen
         ax.plot(recall[reached], precision[reached], dash, color=color, label=label, linewidth=width)
     ax.set(xlim=(0, 1.02), ylim=(0, 1.02), xlabel="recall", ylabel="precision")
-    ax.legend(title="threshold", fontsize=8, title_fontsize=8, loc="best")
+    ax.legend(title="threshold", fontsize=SMALLEST_TEXT, title_fontsize=SMALLEST_TEXT, loc="best")
     return with_light_grid(ax, "both")
 
 
@@ -83,7 +85,7 @@ def render_average_precisions(result: DetectionResult, *, ax: Axes | None = None
     ]
     ax = draw_bars(bars, axes_or_new(ax, PANEL), 100.0)
     ax.set(xlabel="average precision (%)")
-    ax.set_title("Average precision by class, mean over thresholds", fontsize=10)
+    set_title(ax, "Average precision by class, mean over thresholds", fontsize="medium")
     return ax
 
 

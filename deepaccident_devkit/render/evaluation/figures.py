@@ -26,13 +26,19 @@ from deepaccident_devkit.render.evaluation import accident, detection, motion, w
 from deepaccident_devkit.render.evaluation.breakdowns import UNKNOWN, render_breakdown
 from deepaccident_devkit.render.evaluation.panels import PANEL
 from deepaccident_devkit.render.pictures import write_figure
+from deepaccident_devkit.render.titles import set_title
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
-_DPI: Final = 130
-_ROW: Final = 0.36
+_DPI: Final = 160
+_ROW: Final = 0.38
 """The least height of a bar in inches."""
+_AROUND_BARS: Final = 1.1
+"""Inches of a title, ticks and labels."""
+_GID: Final = "token"
+"""Marks what a figure is made of: words to be copied, not to be read, may be small."""
 MAIN_NUMBERS: Final = {
     "motion": ("ranges/100x100/pq", "ranges/100x100/iou"),
     "accident": ("apa", "position_error"),
@@ -60,14 +66,14 @@ class RunFigure:
         caption: what the figure shows, for the reader of the report.
         alt: the same in words and numbers, for readers who cannot see it.
         draw: renders it on axes.
-        rows: how many bars are below each other; with many bars the figure is higher.
+        height: in inches.
     """
 
     name: str
     caption: str
     alt: str
     draw: Draw
-    rows: int = 0
+    height: float = PANEL[1]
 
 
 def save_figure(run: EvaluationRun, drawn: RunFigure, folder: Path) -> Path:
@@ -79,20 +85,28 @@ def save_figure(run: EvaluationRun, drawn: RunFigure, folder: Path) -> Path:
         folder: where; it is made if it is not there.
 
     Returns:
-        The file's path. The figure names its task, protocol, devkit and release, and what a partial run lacks.
+        The file's path.
     """
-    path = folder / f"{drawn.name}.png"
-    figure = detached_figure((PANEL[0], max(PANEL[1], _ROW * drawn.rows + 1.2)))
+    said = {"Title": drawn.name, "Description": " ".join(filter(None, (_mark(run), _made_of(run))))}
+    return write_figure(complete_figure(run, drawn), folder / f"{drawn.name}.png", dpi=_DPI, words=said)
+
+
+def complete_figure(run: EvaluationRun, drawn: RunFigure) -> Figure:
+    """A figure that names its task, protocol, devkit and release, and what a partial run lacks."""
+    figure = detached_figure((PANEL[0], drawn.height))
     drawn.draw(ax=figure.add_subplot())
-    made_of = (
-        f"{run.setup.task}, protocol {run.setup.protocol}, devkit {__version__}, release {run.release.fingerprint}"
-    )
-    figure.supxlabel(made_of, fontsize=6, color=MUTED_COLOR)
-    mark = "" if run.partial is None else run.partial.text()
-    if mark:
-        figure.suptitle(mark, color=WARNING_COLOR, fontsize=10, fontweight="bold")
-    said = {"Title": drawn.name, "Description": f"{mark} {made_of}".strip()}
-    return write_figure(figure, path, dpi=_DPI, words=said)
+    figure.supxlabel(_made_of(run), fontsize=6, color=MUTED_COLOR, gid=_GID)
+    if _mark(run):
+        set_title(figure, _mark(run), color=WARNING_COLOR, fontsize=10, fontweight="bold")
+    return figure
+
+
+def _made_of(run: EvaluationRun) -> str:
+    return f"{run.setup.task}, protocol {run.setup.protocol}, devkit {__version__}, release {run.release.fingerprint}"
+
+
+def _mark(run: EvaluationRun) -> str:
+    return "" if run.partial is None else run.partial.text()
 
 
 def run_figures(run: EvaluationRun) -> tuple[RunFigure, ...]:
@@ -250,7 +264,7 @@ def _by(task: str, broken: Breakdown[Any], path: str) -> RunFigure:
         caption=f"{name} by {by}; whiskers: {percent:g} % intervals over clusters of scenarios, if there are enough.",
         alt=f"{name} by {by}: {words}.",
         draw=partial(render_breakdown, task, broken, path),
-        rows=len(broken.groups),
+        height=max(PANEL[1], _ROW * len(broken.groups) + _AROUND_BARS),
     )
 
 

@@ -170,10 +170,11 @@ footer {{ margin-top: 3rem; color: #555; font-size: .88rem; }}
   .wide td {{ white-space: normal; }}
   table {{ font-size: 7.5pt; }}
   th, td {{ padding-right: .5rem; }}
+  figcaption {{ font-size: 9pt; }}
   figure, tr, .partial {{ break-inside: avoid; }}
   h2, h3 {{ break-after: avoid; }}
   .partial {{ print-color-adjust: exact; -webkit-print-color-adjust: exact; }}
-  .figures {{ grid-template-columns: 1fr 1fr 1fr; gap: .8rem; }}
+  .figures {{ grid-template-columns: 1fr 1fr; gap: .8rem; }}
   .big td, .big td ~ td {{ font-size: inherit; }}
 }}
 """

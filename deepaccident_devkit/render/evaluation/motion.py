@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Final
 from deepaccident_devkit.evaluation.metrics.motion import MotionEvaluator, MotionResult
 from deepaccident_devkit.evaluation.metrics.motion.overlaps import panoptic_quality
 from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
+from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import SERIES_COLORS
 from deepaccident_devkit.render.evaluation.panels import PANEL, draw_nothing
+from deepaccident_devkit.render.titles import set_title
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,12 +38,12 @@ def render_ranges(result: MotionResult, *, ax: Axes | None = None) -> Axes:
         places = [place + 0.8 / count * (offset - (count - 1) / 2) for place in range(len(_PARTS))]
         heights = [0.0 if math.isnan(value) else value for value in values]
         parts = ax.bar(places, heights, width=0.76 / count, color=color, label=f"{name} m")
-        labels = ["–" if math.isnan(value) else f"{value:.1f}" for value in values]
-        ax.bar_label(parts, labels, fontsize=8, padding=1)
+        labels = ["–" if math.isnan(value) else f"{value:.3g}" for value in values]
+        ax.bar_label(parts, labels, fontsize=SMALLEST_TEXT, padding=1)
     ax.set_xticks(range(len(_PARTS)), list(_PARTS.values()))
     ax.set(ylabel="%", ylim=(0, 118), yticks=range(0, 101, 20))
-    ax.legend(fontsize=8, ncols=max(1, count), loc="upper center")
-    ax.set_title(f"Within each range, {result.samples:,} samples, {result.frames:,} frames", fontsize=10)
+    ax.legend(fontsize=SMALLEST_TEXT, ncols=max(1, count), loc="upper center")
+    set_title(ax, f"Within each range, {result.samples:,} samples, {result.frames:,} frames", fontsize="medium")
     return with_light_grid(ax, "y")
 
 
@@ -58,7 +60,7 @@ def render_quality_by_time(evaluator: MotionEvaluator, step: float = 0.5, *, ax:
         all frames.
     """
     ax, counts = axes_or_new(ax, PANEL), evaluator.counts.values()
-    ax.set_title("Panoptic quality by time ahead", fontsize=10)
+    set_title(ax, "Panoptic quality by time ahead", fontsize="medium")
     frames = max((each["frames"] for each in counts), default=0)
     if not frames:
         return draw_nothing(ax)
@@ -68,7 +70,7 @@ def render_quality_by_time(evaluator: MotionEvaluator, step: float = 0.5, *, ax:
         ax.plot([step * frame for frame in range(frames)], quality, marker="o", color=color, label=f"{name} m")
     ax.set(xlabel="seconds from the present", ylabel="PQ (%)", ylim=(0, 104))
     ax.set_xticks([step * frame for frame in range(frames)])
-    ax.legend(fontsize=8, loc="lower left")
+    ax.legend(fontsize=SMALLEST_TEXT, loc="lower left")
     return with_light_grid(ax, "y")
 
 

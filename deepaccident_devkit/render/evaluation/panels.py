@@ -8,14 +8,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from deepaccident_devkit.render.axes import with_light_grid
+from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import ESTIMATE_COLOR, MUTED_COLOR
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-PANEL: Final = (6.4, 4.2)
-"""Width and height of one panel in inches."""
-_BESIDE: Final = 1.22
+PANEL: Final = (5.2, 3.0)
+"""Width and height of one panel in inches: a page of a printed report has two rows of two."""
+_BESIDE: Final = 1.3
 """The axis' length in lengths of the longest bar, so that the words beside the bars have room."""
 
 
@@ -69,7 +70,7 @@ def draw_bars(bars: Sequence[Bar], ax: Axes, limit: float | None = None) -> Axes
             (5, 0),
             textcoords="offset points",
             va="center",
-            fontsize=8,
+            fontsize=SMALLEST_TEXT,
             bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5},  # over a line that marks a value
         )
         ends.append(end)
@@ -77,7 +78,8 @@ def draw_bars(bars: Sequence[Bar], ax: Axes, limit: float | None = None) -> Axes
     ax.set(xlim=(min([0.0, *(bar.value or 0.0 for bar in bars)]), _BESIDE * (reach or 1.0)))
     if limit is not None:
         ax.set_xticks([limit * part / 5 for part in range(6)])
-    ax.set_yticks(range(len(bars)), [f"{bar.label}\n{bar.below}".strip() for bar in bars], fontsize=8, linespacing=1.15)
+    labels = [f"{bar.label}\n{bar.below}".strip() for bar in bars]
+    ax.set_yticks(range(len(bars)), labels, fontsize=SMALLEST_TEXT, linespacing=1.15)
     ax.set_ylim(len(bars) - 0.4, -0.6)
     return with_light_grid(ax, "x")
 

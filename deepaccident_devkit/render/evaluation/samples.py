@@ -24,6 +24,7 @@ from deepaccident_devkit.render.evaluation.figures import MAIN_NUMBERS, RunFigur
 from deepaccident_devkit.render.evaluation.panels import PANEL
 from deepaccident_devkit.render.legends import draw_legend_of_fills
 from deepaccident_devkit.render.outcomes import draw_accident_outcome, draw_detection_outcome
+from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 if TYPE_CHECKING:
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 
 _EACH: Final = 3
 """How many of the worst, and of the best, samples are shown."""
+_HEIGHT: Final = 5.6
+"""Inches of a view from above with its title."""
 
 
 def sample_figures(run: EvaluationRun, dataset: Dataset, results: Results) -> tuple[RunFigure, ...]:
@@ -55,6 +58,7 @@ def sample_figures(run: EvaluationRun, dataset: Dataset, results: Results) -> tu
             caption=f"One of the {kind} samples: {token}, {text}.",
             alt=f"Seen from above: the prediction for sample {token} over the truth; {text}.",
             draw=partial(_draw, load, token, text),
+            height=_HEIGHT,
         )
         for kind, chosen in (("worst", worst), ("best", best[::-1]))
         for number, (token, text) in enumerate(chosen, 1)
@@ -99,8 +103,7 @@ def _draw(load: SampleLoader, token: str, text: str, *, ax: Axes) -> Axes:
     else:
         compared = compared_accidents(prediction, truth, more[0], load.setup.rules)
         draw_accident_outcome(compared, more[0].truth, ax=ax)
-    *_, scenario, agent, frame = token.split("/")
-    ax.set_title(f"{scenario}\n{agent} {frame}: {text}", fontsize=8)
+    set_scene_title(ax, load.dataset, token, below=f"{text}: {ax.get_title()}")
     return ax
 
 

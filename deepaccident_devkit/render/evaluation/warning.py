@@ -9,8 +9,10 @@ import numpy as np
 
 from deepaccident_devkit.evaluation.metrics.warning import AnticipationResult, WarningResult
 from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
+from deepaccident_devkit.render.chips import SMALLEST_TEXT, place_chips
 from deepaccident_devkit.render.colors import ESTIMATE_COLOR, OUTCOME_COLORS, TRUE_PLACE_COLOR
 from deepaccident_devkit.render.evaluation.panels import PANEL, Bar, draw_bars, draw_nothing
+from deepaccident_devkit.render.titles import set_title
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,7 +35,7 @@ def render_warning_times(result: WarningResult, *, ax: Axes | None = None) -> Ax
 
     ax, seconds = axes_or_new(ax, PANEL), result.warning_seconds
     accidents = result.recordings.get("accident", 0)
-    ax.set_title(f"{len(seconds):,} of {accidents:,} recordings of accidents have a right alarm", fontsize=10)
+    set_title(ax, f"{len(seconds):,} of {accidents:,} recordings of accidents have a right alarm", fontsize="medium")
     if not len(seconds):
         return draw_nothing(ax, "no recording has a right alarm")
     bins = max(1, math.ceil(float(seconds.max()) / _BIN + 1e-6))
@@ -43,7 +45,7 @@ def render_warning_times(result: WarningResult, *, ax: Axes | None = None) -> Ax
     )
     ax.set(xlabel="seconds from the first right alarm to the impact", ylabel="recordings", xlim=(0, bins * _BIN))
     ax.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
-    ax.legend(fontsize=8)
+    ax.legend(fontsize=SMALLEST_TEXT)
     return with_light_grid(ax, "y")
 
 
@@ -73,7 +75,7 @@ def render_predictors(result: AnticipationResult, *, ax: Axes | None = None) -> 
     ax = draw_bars(bars, ax, 1.0)
     ax.axvline(0.5, color="black", linestyle="--", linewidth=1)
     ax.set(xlabel="chance that an accident's score is above\nanother recording's at the same moment")
-    ax.set_title(f"Accidents distinguished from other recordings: {group}", fontsize=10)
+    set_title(ax, f"Accidents distinguished from other recordings\n{group}", fontsize="medium")
     return ax
 
 
@@ -98,7 +100,7 @@ def render_detection_rates(result: WarningResult, *, ax: Axes | None = None) -> 
     ]
     ax = draw_bars(bars, axes_or_new(ax, PANEL), 1.0)
     ax.set(xlabel="share of the recordings of accidents")
-    ax.set_title("A right alarm is raised in time", fontsize=10)
+    set_title(ax, "A right alarm is raised in time", fontsize="medium")
     return ax
 
 
@@ -124,7 +126,7 @@ def render_false_alarms(result: WarningResult, *, ax: Axes | None = None) -> Axe
     ]
     ax = draw_bars(bars, axes_or_new(ax, PANEL))
     ax.set(xlabel="false alarms a minute")
-    ax.set_title("False alarms by kind of recording", fontsize=10)
+    set_title(ax, "False alarms by kind of recording", fontsize="medium")
     return ax
 
 
@@ -139,16 +141,17 @@ def render_warning_curve(result: WarningResult, *, ax: Axes | None = None) -> Ax
         The axes; some points have their score beside them.
     """
     ax, curve = axes_or_new(ax, PANEL), result.curve
-    ax.set_title("Results if alarms need at least a score", fontsize=10)
+    set_title(ax, "Results if alarms need at least a score", fontsize="medium")
     known = np.isfinite(curve.detection_rate) & np.isfinite(curve.false_alarms_per_minute)
     if not known.any():
         return draw_nothing(ax, "needs alarms, accidents and normal scenarios")
     false, rate = curve.false_alarms_per_minute[known], curve.detection_rate[known]
     ax.plot(false, rate, color=ESTIMATE_COLOR, marker="o", markersize=4)
     score = curve.threshold[known]
-    for row in sorted({0, len(score) // 2, len(score) - 1}):
-        where = (false[row], rate[row])
-        ax.annotate(f"≥ {score[row]:.2g}", where, (6, -11), textcoords="offset points", fontsize=8)
+    points = np.column_stack([false, rate])
+    named = sorted({0, len(score) // 2, len(score) - 1})
+    lines = np.stack([points[:-1], points[1:]], axis=1)
+    place_chips(ax, [(f"≥ {score[row]:.2g}", points[row]) for row in named], avoid=lines)
     ax.set(xlabel="false alarms a minute, where nobody collides", ylabel="accidents detected in time", ylim=(0, 1.04))
     ax.set_xlim(0, 1.12 * max(float(false.max()), 0.1))
     return with_light_grid(ax, "both")

@@ -15,6 +15,7 @@ from deepaccident_devkit.evaluation.metrics.predictions import Accident
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.render.axes import axes_or_new, titled_from_above
 from deepaccident_devkit.render.boxes import draw_boxes_from_above, draw_ids_from_above, write_beside
+from deepaccident_devkit.render.chips import keep_free
 from deepaccident_devkit.render.colors import COLLIDER_COLOR, OUTCOME_COLORS
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import INSIDE, draw_legend
@@ -28,6 +29,8 @@ _SHOWN: Final[tuple[Layer, ...]] = ("boxes", "trajectories", "grid")
 _LEAST: Final = 20.0
 _MOST: Final = 60.0
 """Metres around an accident that are shown, at least and at most."""
+_MARK: Final = (-7.0, -7.0, 7.0, 7.0)
+"""Points around circles, crosses and the lines between them that no words cover: left, low, right and high."""
 _FORESEEN: Final = "black"
 """Whether it is right is what the picture shows."""
 
@@ -61,9 +64,11 @@ def draw_accident_outcome(
         x, y = compared.true.positions.T
         (line,) = ax.plot(x, y, "o-", markersize=12, fillstyle="none", color=COLLIDER_COLOR, linewidth=1.6, zorder=5)
         line.set_label("to come")
+        _keep_line_free(*compared.true.positions, ax=ax)
     for alarm in compared.predicted:
         (line,) = ax.plot(*alarm.positions.T, "x--", color=_FORESEEN, markersize=9, markeredgewidth=2, zorder=6)
         line.set_label("foreseen" if alarm is compared.predicted[0] else "")
+        _keep_line_free(*alarm.positions, ax=ax)
         place = alarm.positions.mean(axis=0)
         write_beside(
             ax, f"in {alarm.time:.1f} s, score {alarm.score:.2g}", (float(place[0]), float(place[1])), _FORESEEN
@@ -77,7 +82,7 @@ def draw_accident_outcome(
 
 
 def difference_words(compared: ComparedAccidents) -> str:
-    """The true accident, and the errors of the surest alarm: of both places in sum, and of the time."""
+    """The true accident, and on another line the errors of the surest alarm: of both places in sum, of the time."""
     true = compared.true
     comes = "no accident comes" if true is None else f"an accident comes in {true.time:.1f} s"
     if not compared.predicted:
@@ -86,7 +91,7 @@ def difference_words(compared: ComparedAccidents) -> str:
     if true is None:
         return f"{comes}, one is foreseen in {alarm.time:.1f} s"
     off = position_difference(alarm.positions, true.positions)
-    return f"{comes}; foreseen {off:.1f} m off in sum, {alarm.time - true.time:+.1f} s"
+    return f"{comes};\nforeseen {off:.1f} m off in sum, {alarm.time - true.time:+.1f} s"
 
 
 def verdict_words(result: AccidentResult) -> str:
@@ -129,8 +134,14 @@ def _draw_differences(alarm: Accident, true: Accident, ax: Axes) -> None:
     """Dotted lines with metres from the two foreseen places to the two true ones, paired so that they are nearest."""
     for start, end in _pairs(alarm.positions, true.positions):
         ax.plot(*np.stack([start, end]).T, ":", color="black", linewidth=1.2, zorder=4)
+        _keep_line_free(start, end, ax=ax)
         x, y = ((start + end) / 2).tolist()
         write_beside(ax, f"{np.linalg.norm(start - end):.1f} m", (x, y), "black")
+
+
+def _keep_line_free(start: FloatArray, end: FloatArray, *, ax: Axes) -> None:
+    """Let no words cover a line between two places, and the marks at its ends."""
+    keep_free(ax, np.linspace(start, end, 9)[:, None], margin=_MARK)
 
 
 def _pairs(places: FloatArray, others: FloatArray) -> list[tuple[FloatArray, FloatArray]]:

@@ -93,7 +93,7 @@ def detection_words(
     if not len(matches.detection):
         return counts
     apart = prediction.boxes.center[matches.detection, :2] - truth.center[matches.truth, :2]
-    return f"{counts}; centres off by {np.linalg.norm(apart, axis=1).mean():.2f} m on average"
+    return f"{counts};\ncentres off by {np.linalg.norm(apart, axis=1).mean():.2f} m on average"
 
 
 def _draw(boxes: Boxes, rows: IntArray, color: str, ax: Axes) -> None:

@@ -28,6 +28,7 @@ from deepaccident_devkit.evaluation.metrics.predictions import MotionOutput, Pre
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, MotionLabels, motion_labels
 from deepaccident_devkit.render.axes import figure_or_new, settled, titled_from_above
 from deepaccident_devkit.render.boxes import draw_boxes_from_above
+from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import COLLIDER_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.motion_cells import draw_edge
@@ -171,7 +172,7 @@ def _draw_accident(
     limits = right.get_xlim(), right.get_ylim()
     draw_accident_outcome(ComparedAccidents(true=compared.true, predicted=()), context.truth, layers=shown, ax=left)
     left.set(xlim=limits[0], ylim=limits[1])
-    left.set_title("truth" if compared.true else "truth: no accident comes", fontsize=9)
+    left.set_title("truth" if compared.true else "truth: no accident comes", fontsize=SMALLEST_TEXT)
     return fig, f"accident: {verdict_words(judge.compute())}"
 
 

@@ -50,7 +50,7 @@ def test_what_is_read_is_the_callers(path: Path, quarters: np.ndarray) -> None:
 
 @pytest.mark.parametrize("raw", [False, True])
 def test_truncated_garbage_empty_and_missing(path: Path, quarters: np.ndarray, raw: bool) -> None:
-    with pytest.raises(MissingFileError, match=r"image\.jpg: no such file; unpack the archive that holds this camera"):
+    with pytest.raises(MissingFileError, match=r"image\.jpg: no such file; unpack the archive that holds it"):
         read_image(path, raw=raw)
     write_image(path, quarters)
     whole = path.read_bytes()

@@ -37,17 +37,17 @@ def npy(array: np.ndarray) -> bytes:
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
 def test_the_array_named_data_or_the_only_one(path: Path, save) -> None:
     save(path, data=DATA)
-    np.testing.assert_array_equal(read_npz(path), DATA, strict=True)
+    np.testing.assert_array_equal(read_npz(path, "lidar"), DATA, strict=True)
     save(path, arr_0=DATA)
-    np.testing.assert_array_equal(read_npz(path), DATA, strict=True)
+    np.testing.assert_array_equal(read_npz(path, "lidar"), DATA, strict=True)
     save(path, other=DATA + 1, data=DATA)
-    np.testing.assert_array_equal(read_npz(path), DATA, strict=True)
+    np.testing.assert_array_equal(read_npz(path, "lidar"), DATA, strict=True)
 
 
 @pytest.mark.parametrize("array", [DATA, DATA.T, DATA[:0], DATA.astype(">f8"), np.arange(3, dtype=np.uint8), DATA[::2]])
 def test_written_arrays_come_back_and_bytes_are_the_same_twice(path: Path, array: np.ndarray) -> None:
     write_npz(path, array)
-    np.testing.assert_array_equal(read_npz(path), array, strict=True)
+    np.testing.assert_array_equal(read_npz(path, "lidar"), array, strict=True)
     with np.load(path) as archive:
         assert archive.files == ["data"]
     first = path.read_bytes()
@@ -59,37 +59,37 @@ def test_two_arrays_none_named_data(path: Path) -> None:
     np.savez(path, points=DATA, intensity=DATA)
     message = f"^{path}: expected an array named 'data', found points, intensity{REMEDY}$"
     with pytest.raises(SensorFileError, match=message):
-        read_npz(path)
+        read_npz(path, "lidar")
     write_members(path, {})
     with pytest.raises(SensorFileError, match=f"^{path}: expected an array named 'data', found no array{REMEDY}$"):
-        read_npz(path)
+        read_npz(path, "lidar")
 
 
 def test_objects_are_never_unpickled(path: Path) -> None:
     for save in (lambda: np.savez(path, data=np.array([{"a": 1}])), lambda: path.write_bytes(pickle.dumps([1]))):
         save()
         with pytest.raises(SensorFileError, match=rf"^{path}: not a readable npz archive \(.*\){REMEDY}$"):
-            read_npz(path)
+            read_npz(path, "lidar")
 
 
 def test_a_bare_array(path: Path) -> None:
     path.write_bytes(npy(DATA))
     with pytest.raises(SensorFileError, match=f"^{path}: expected an npz archive, found a bare array{REMEDY}$"):
-        read_npz(path)
+        read_npz(path, "lidar")
 
 
 def test_empty_truncated_garbage_and_missing(path: Path) -> None:
     with pytest.raises(MissingFileError, match=r"points\.npz: no such file; unpack the archive that holds it"):
-        read_npz(path)
+        read_npz(path, "lidar")
     path.write_bytes(b"")
     with pytest.raises(SensorFileError, match=rf"^{path}: not a readable npz archive \(the file is empty\){REMEDY}$"):
-        read_npz(path)
+        read_npz(path, "lidar")
     np.savez(path, data=DATA)
     whole = path.read_bytes()
     for content in (b"garbage", bytes(1000), *(whole[:end] for end in range(1, len(whole), 7))):
         path.write_bytes(content)
         with pytest.raises(SensorFileError, match=rf"(?s)^{path}: not a readable npz archive \(.*\){REMEDY}$"):
-            read_npz(path)
+            read_npz(path, "lidar")
 
 
 def with_field(content: bytes, local: int, central: int, value: int) -> bytes:
@@ -121,10 +121,10 @@ def huge_header() -> bytes:
 def test_archives_that_are_not_numpys(path: Path, members: dict[str, bytes], fields: tuple | None) -> None:
     write_members(path, members)
     if fields:
-        assert read_npz(path).shape == DATA.shape
+        assert read_npz(path, "lidar").shape == DATA.shape
         path.write_bytes(with_field(path.read_bytes(), *fields))
     with pytest.raises(SensorFileError, match=rf"^{path}: .*{REMEDY}$"):
-        read_npz(path)
+        read_npz(path, "lidar")
 
 
 @settings(max_examples=300)
@@ -135,7 +135,7 @@ def test_damage_raises_our_error_or_the_array_is_whole(
     path = tmp_path_factory.getbasetemp() / "damaged.npz"
     write_npz(path, DATA)
     path.write_bytes(data.draw(mutations(path.read_bytes())))
-    array, message = outcome(SensorFileError, read_npz, path)
+    array, message = outcome(SensorFileError, read_npz, path, "lidar")
     if message is None:
         np.testing.assert_array_equal(array, DATA)
     else:

@@ -1,6 +1,7 @@
 from dataclasses import replace
 
 import pytest
+from picture_texts import text_faults
 
 from deepaccident_devkit.render import detached_figure
 from deepaccident_devkit.render.baselines import Panel, render_panel, render_panels
@@ -56,6 +57,17 @@ def test_panels_share_a_title_and_a_legend() -> None:
     assert len(figure.axes) == 4
     assert figure.get_suptitle() == "both"
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["single", "all"]
+
+
+@pytest.mark.slow
+def test_words_of_all_configurations_are_apart() -> None:
+    bars = replace(BARS, values=dict.fromkeys(AGENT_CONFIGS, BARS.values["all"]))
+    lines = replace(LINES, values=dict.fromkeys(AGENT_CONFIGS, LINES.values["all"]))
+    for columns in (1, 2, 5):
+        figure = render_panels([[bars] * columns, [lines] * columns], "accuracy")
+        assert text_faults(figure) == []
+        drawn = figure.get_tightbbox()
+        assert min(*drawn.min, *(figure.get_size_inches() - drawn.max)) > -0.01
 
 
 def test_the_papers_configurations_have_colours_of_their_own() -> None:

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from picture_texts import text_faults
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError
@@ -23,6 +24,11 @@ def test_every_group_is_drawn_on_the_figure_given(statistics: DatasetStatistics)
         render_statistics(statistics, "weather")
     with pytest.raises(ChoiceError, match="expected polar axes"):
         render_angles(statistics.histograms["collision_angles"], ax=figure.add_subplot())
+
+
+@pytest.mark.parametrize("group", STATISTICS_FIGURES)
+def test_words_are_apart_and_large(statistics: DatasetStatistics, group: str) -> None:
+    assert text_faults(render_statistics(statistics, group)) == []
 
 
 def test_files_are_the_same_bytes_each_time(statistics: DatasetStatistics, tmp_path: Path) -> None:

@@ -1,6 +1,12 @@
 """Panels of statistics: what they draw is what was counted."""
 
+from dataclasses import replace
+
+import numpy as np
+from matplotlib.markers import MarkerStyle
+
 from deepaccident_devkit.render import detached_figure
+from deepaccident_devkit.render.colors import CATEGORY_MARKERS
 from deepaccident_devkit.render.statistics_panels import (
     render_angles,
     render_counts,
@@ -9,6 +15,7 @@ from deepaccident_devkit.render.statistics_panels import (
     render_relative_positions,
 )
 from deepaccident_devkit.statistics import DatasetStatistics
+from deepaccident_devkit.taxonomy import CATEGORIES
 
 
 def test_bars_add_up_to_the_counts(statistics: DatasetStatistics) -> None:
@@ -32,3 +39,13 @@ def test_bars_add_up_to_the_counts(statistics: DatasetStatistics) -> None:
     ax = render_relative_positions(statistics.collisions)
     assert sum(len(points.get_offsets()) for points in ax.collections) == len(statistics.collisions)
     assert render_quantiles(statistics.quantiles["box_sizes"], "width").get_ylabel() == "width (m)"
+
+
+def test_classes_have_their_marks(statistics: DatasetStatistics) -> None:
+    pairs = [replace(statistics.collisions[0], other_category=category) for category in CATEGORIES]
+    drawn = render_relative_positions(pairs, ax=detached_figure((5, 5)).add_subplot()).collections
+    assert [str(points.get_label()) for points in drawn] == list(CATEGORIES)
+    for points, category in zip(drawn, CATEGORIES, strict=True):
+        mark = MarkerStyle(CATEGORY_MARKERS.get(category, "s"))
+        shape = mark.get_path().transformed(mark.get_transform()).vertices
+        assert np.array_equal(points.get_paths()[0].vertices, shape), category

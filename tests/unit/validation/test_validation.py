@@ -237,7 +237,7 @@ def test_a_turned_bev_camera_is_recognised(release_root: Path, tmp_path: Path, o
         "anti-transposed": lambda picture: np.rot90(picture, 2).swapaxes(0, 1),
     }
     for path in root.glob("*/ego_vehicle/BEV_instance_camera/*/*.npz"):
-        picture = read_npz(path)
+        picture = read_npz(path, "bev")
         np.savez(path, data=turns[orientation](picture))
     report = validate_release(root, deep=True)
     found = [finding for finding in report.findings if finding.code == "bev-orientation"]

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from numpy.testing import assert_array_equal
+from picture_texts import text_faults
 
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.runs import ComparedNumber, Comparison
@@ -50,7 +51,7 @@ def test_a_number_is_at_its_difference() -> None:
 def test_no_words_are_cut_and_partial_runs_are_marked() -> None:
     numbers = [compared(f"quite_a_long_name_{row}", real=True, better="b") for row in range(6)]
     fig = render_comparison(comparison(*numbers, partial=("a: PARTIAL",)), fig=detached_figure(SIZE))
-    fig.draw_without_rendering()
+    assert text_faults(fig) == []
     drawn = fig.get_tightbbox()
     assert min(*drawn.min, *(SIZE - drawn.max)) > -0.01
     assert "\na: PARTIAL" in fig.get_suptitle()

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drawing import new_axes, rendered
 from evaluation_runs import PARTIAL, evaluation_run
 from matplotlib.colors import to_rgb
+from picture_texts import text_faults
 from PIL import Image
 from report_page import page_of
 
@@ -20,8 +20,7 @@ from deepaccident_devkit.evaluation.metrics.headlines import headlines
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.render.colors import WARNING_COLOR
 from deepaccident_devkit.render.evaluation import save_report
-from deepaccident_devkit.render.evaluation.figures import run_figures
-from deepaccident_devkit.render.evaluation.panels import PANEL
+from deepaccident_devkit.render.evaluation.figures import complete_figure, run_figures
 
 pytestmark = pytest.mark.slow
 
@@ -73,13 +72,14 @@ def test_a_report_holds_all_and_asks_for_nothing(
 
 
 @pytest.mark.parametrize("setup", SETUPS, ids=lambda setup: f"{setup.task} {setup.protocol}")
-def test_no_words_of_a_figure_are_cut(setup: EvaluationSetup, da_motion: DeepAccident, tokens: list[str]) -> None:
-    for each in run_figures(evaluation_run(da_motion, setup, tokens)):
-        ax = new_axes(PANEL)
-        each.draw(ax=ax)
-        rendered(ax)
-        drawn = ax.figure.get_tightbbox()
-        assert min(*drawn.min, *(PANEL - drawn.max)) > -0.01, each.name
+def test_words_of_figures_are_apart(setup: EvaluationSetup, da_motion: DeepAccident, tokens: list[str]) -> None:
+    for partial in (None, PARTIAL):
+        run = evaluation_run(da_motion, setup, tokens, partial=partial)
+        for each in run_figures(run):
+            figure = complete_figure(run, each)
+            assert text_faults(figure) == [], each.name
+            drawn = figure.get_tightbbox()
+            assert min(*drawn.min, *(figure.get_size_inches() - drawn.max)) > -0.01, each.name
 
 
 def test_a_class_without_true_boxes_has_a_dash(da_motion: DeepAccident, tokens: list[str], tmp_path: Path) -> None:

@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from drawing import title_of, tokens_of
 from evaluation_runs import META, stored_run
 from matplotlib.colors import to_rgb
+from picture_texts import text_faults
 from report_page import page_of
 
 from deepaccident_devkit import DeepAccident
@@ -17,8 +19,9 @@ from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.render import detached_figure
 from deepaccident_devkit.render.colors import OUTCOME_COLORS
 from deepaccident_devkit.render.evaluation import draw_motion_outcome, save_report
-from deepaccident_devkit.render.evaluation.figures import run_figures
+from deepaccident_devkit.render.evaluation.figures import complete_figure, run_figures
 from deepaccident_devkit.render.evaluation.samples import sample_figures
+from deepaccident_devkit.render.titles import moment_words, scene_words
 
 pytestmark = pytest.mark.slow
 
@@ -59,7 +62,12 @@ def test_samples_of_stored_results_are_ranked_and_drawn(task: Any, da_motion: De
     assert values[3:] == sorted(values[3:], reverse=True)
     assert max(values[:3]) <= min(values[3:])
     for each in figures:
-        assert each.draw(ax=detached_figure((5, 4)).add_subplot()).get_title()
+        figure = complete_figure(run, each)
+        assert text_faults(figure) == []
+        [token] = tokens_of(figure)
+        assert token in each.caption
+        scene = scene_words(da_motion, token.rsplit("/", 2)[0])
+        assert title_of(figure.axes[0]).startswith(f"{scene}: {moment_words(da_motion, token)} ")
     if task == "accident":
         page = page_of(save_report(run, tmp_path / "report", dataset=da_motion, results=results))
         assert len(page.all("img")) == len(run_figures(run)) + 6

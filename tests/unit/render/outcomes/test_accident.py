@@ -3,7 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-from drawing import new_axes, title_of
+import pytest
+from drawing import new_axes, rendered, title_of
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import Accident, AccidentEvaluator, box_truth
@@ -31,3 +32,16 @@ def test_the_verdict_names_several_of_a_kind(da_motion: DeepAccident, sample: st
     far = Accident(positions=np.array([[40.0, 40.0], [42.0, 40.0]]), time=1.0)
     evaluator.update(sample, [far, replace(far, score=0.5)], box_truth(da_motion, sample))
     assert verdict_words(evaluator.compute()) == "5 m: 2 FP + FN, 10 m: 2 FP + FN, 15 m: 2 FP + FN"
+
+
+@pytest.mark.parametrize("off", [0.0, 0.5, 1.0, 2.0, 4.0])
+def test_words_cover_neither_circles_nor_crosses(da_motion: DeepAccident, sample: str, off: float) -> None:
+    truth = box_truth(da_motion, sample)
+    assert truth.accident is not None
+    alarm = replace(truth.accident, positions=truth.accident.positions + np.array([off, -off]))
+    ax = draw_accident_outcome(ComparedAccidents(true=truth.accident, predicted=(alarm,)), truth, ax=new_axes())
+    rendered(ax)
+    chips = [text.get_window_extent() for text in ax.texts if text.get_visible()]
+    assert len(chips) == 3
+    for place in ax.transData.transform(np.concatenate([truth.accident.positions, alarm.positions])):
+        assert not any(chip.padded(3).contains(*place) for chip in chips)

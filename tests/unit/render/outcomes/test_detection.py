@@ -38,7 +38,7 @@ def test_detections_are_coloured_by_their_matches(da_motion: DeepAccident, sampl
     missed = [path.vertices[:4].mean(axis=0) for path in shapes[OUTCOME_COLORS["missed"]]]
     assert_allclose(missed, truth.center[:2, :2], atol=1e-6)
     assert len(shapes[OUTCOME_COLORS["right"]]) == len(some)
-    assert ax.get_title() == f"at 2 m: {len(some)} TP, 1 FP, 2 FN; centres off by 0.30 m on average"
+    assert ax.get_title() == f"at 2 m: {len(some)} TP, 1 FP, 2 FN;\ncentres off by 0.30 m on average"
     ego_from_lidar = da_motion.ego_from(sample, "lidar01")
     moved = DetectedBoxes(boxes=detected.boxes.transform(ego_from_lidar, "ego"), scores=detected.scores)
     figure = render_evaluation(da_motion, sample, moved, protocol="paper", fig=detached_figure((10, 6)))

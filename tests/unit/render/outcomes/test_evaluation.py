@@ -1,12 +1,17 @@
 """Predictions beside labels, with the verdict of a protocol."""
 
+from contextlib import nullcontext
+from typing import Any
+
 import numpy as np
 import pytest
 from drawing import title_of
+from matplotlib import pyplot as plt
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex
 from matplotlib.contour import ContourSet
 from numpy.testing import assert_allclose
+from picture_texts import text_faults
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError
@@ -21,7 +26,7 @@ from deepaccident_devkit.evaluation import (
 from deepaccident_devkit.evaluation.metrics.accident.compared import compared_accidents
 from deepaccident_devkit.evaluation.metrics.accident.evaluator import PROTOCOLS
 from deepaccident_devkit.motion import MotionLabels
-from deepaccident_devkit.render import detached_figure
+from deepaccident_devkit.render import detached_figure, style
 from deepaccident_devkit.render.colors import COLLIDER_COLOR
 from deepaccident_devkit.render.outcomes.accident import verdict_words
 from deepaccident_devkit.render.outcomes.evaluation import render_evaluation
@@ -35,7 +40,7 @@ def test_accidents_have_their_metres_and_verdict(da_motion: DeepAccident, sample
     figure = render_evaluation(da_motion, sample, [near], fig=detached_figure((10, 6)))
     left, right = figure.axes
     assert title_of(figure).endswith("accident: 5 m: FP + FN, 10 m: TP, 15 m: TP")
-    assert right.get_title() == f"an accident comes in {true.time:.1f} s; foreseen 6.0 m off in sum, +0.5 s"
+    assert right.get_title() == f"an accident comes in {true.time:.1f} s;\nforeseen 6.0 m off in sum, +0.5 s"
     assert [text.get_text() for text in right.texts] == [f"in {near.time:.1f} s, score 0.9", "3.0 m", "3.0 m"]
     assert_allclose(left.lines[0].get_xydata(), true.positions)
     assert_allclose(right.lines[1].get_xydata(), near.positions)
@@ -95,3 +100,36 @@ def test_the_pair_that_collides_is_red_in_every_task(
         edges = [each for each in left.collections if isinstance(each, (ContourSet, PolyCollection))]
         red = [color for each in edges for color in each.get_edgecolor() if to_hex(color) == COLLIDER_COLOR]
         assert len(red) == 2
+
+
+def faults_of_predictions(dataset: DeepAccident, token: str) -> list[str]:
+    """What is wrong with the words of detections, and of accidents that are foreseen exactly, nearly and not at all."""
+    boxes, accident = dataset.boxes(token), box_truth(dataset, token).accident
+    assert accident is not None
+    near = Accident(positions=accident.positions + 1.5, time=accident.time, score=0.9)
+    detected = DetectedBoxes(boxes=boxes, scores=np.ones(len(boxes)))
+    faults = []
+    for given in (detected, [accident], [near], []):
+        picture = render_evaluation(dataset, token, given)
+        faults += text_faults(picture)
+        plt.close(picture)
+    return faults
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("where", [None, "paper"])
+def test_words_are_in_the_picture_and_apart(
+    da_motion: DeepAccident, sample: str, labels: MotionLabels, where: Any
+) -> None:
+    with style(where) if where else nullcontext():
+        assert faults_of_predictions(da_motion, sample) == []
+        output = instances_of(labels.instance, labels.config.grid)
+        assert text_faults(render_evaluation(da_motion, sample, output)) == []
+
+
+@pytest.mark.slow
+def test_words_of_twelve_scenes_are_apart(da_designs: DeepAccident) -> None:
+    tokens = [f"{scenario['token']}/ego_vehicle/001" for scenario in da_designs.scenario if scenario["collision"]]
+    assert len(tokens) == 12
+    found = {token: faults_of_predictions(da_designs, token) for token in tokens}
+    assert {token: faults for token, faults in found.items() if faults} == {}

@@ -1,0 +1,150 @@
+"""Archives of strangers: bombs are refused before they grow, and bytes that do not agree are told."""
+
+import io
+import struct
+import tracemalloc
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit.archives import DAMAGED_ARCHIVE, array_of, open_zip, read_array
+
+ARRAY = np.arange(12, dtype=np.float32).reshape(3, 4)
+MOST_MEMORY = 100 << 20
+
+
+def npz(array: np.ndarray = ARRAY, way: int = zipfile.ZIP_DEFLATED) -> bytes:
+    return zipped(npy(array), way)
+
+
+def npy(array: np.ndarray) -> bytes:
+    content = io.BytesIO()
+    np.lib.format.write_array(content, array)
+    return content.getvalue()
+
+
+def zipped(member: bytes, way: int = zipfile.ZIP_DEFLATED) -> bytes:
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", way) as archive:
+        archive.writestr("data.npy", member)
+    return content.getvalue()
+
+
+def headed(shape: str, dtype: str = "<f4", body: bytes = b"") -> bytes:
+    head = f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape}}}".encode()
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head + body
+
+
+def patched(content: bytes, place: int, number: int, length: int = 4) -> bytes:
+    """A number written at a place of the entry in the directory."""
+    start = content.rindex(b"PK\x01\x02") + place
+    return content[:start] + number.to_bytes(length, "little") + content[start + length :]
+
+
+def flipped(content: bytes, place: int) -> bytes:
+    return content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :]
+
+
+def read(content: bytes) -> np.ndarray:
+    with open_zip(content) as archive:
+        return read_array(archive, "data", "lidar")
+
+
+@pytest.mark.parametrize("way", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+@pytest.mark.parametrize(
+    "array", [ARRAY, ARRAY.T, ARRAY[:0], np.array(3), np.array("words"), ARRAY.astype(">i8"), ARRAY > 3]
+)
+def test_a_sound_array_is_read_as_numpy_reads_it(array: np.ndarray, way: int) -> None:
+    content = npz(array, way)
+    found = read(content)
+    np.testing.assert_array_equal(found, np.load(io.BytesIO(content))["data"], strict=True)
+    assert found.flags.writeable
+    assert found.flags.f_contiguous == array.flags.f_contiguous
+
+
+def test_an_archive_is_read_from_its_file_and_closes_it(tmp_path: Path) -> None:
+    (tmp_path / "some.npz").write_bytes(npz())
+    with open_zip(tmp_path / "some.npz") as archive:
+        np.testing.assert_array_equal(read_array(archive, "data", "lidar"), ARRAY)
+
+
+HOSTILE = {
+    "zeros that unpack to a gigabyte": lambda: zipped(b"\x93NUMPY" + bytes(1 << 30)),
+    "a shape of a gigabyte": lambda: zipped(headed("(268435456,)")),
+    "a shape of many exabytes": lambda: zipped(headed("(4611686018427387904, 4611686018427387904)")),
+    "a shape below zero": lambda: zipped(headed("(-1, 4)")),
+    "a shape that is no number": lambda: zipped(headed("('x',)")),
+    "a nested head": lambda: zipped(headed("(" * 5000 + ")" * 5000)),
+    "objects": lambda: zipped(headed("(1,)", "|O", bytes(8))),
+    "fields": lambda: zipped(headed("(1,)", "<f4', '<f8", bytes(8))),
+    "bytes after the array": lambda: zipped(npy(ARRAY) + b"more"),
+    "too few bytes": lambda: zipped(npy(ARRAY)[:-1]),
+    "a stored size that is too small": lambda: patched(npz(), 24, 100),
+    "a stored size that is too large": lambda: patched(npz(), 24, 10**6),
+    "a stored size of gigabytes": lambda: patched(npz(), 24, 0xFFFFFFF0),
+    "compressed bytes that end early": lambda: patched(npz(), 20, 30),
+    "compressed bytes that go on": lambda: patched(npz(), 20, len(npz()) - 60),
+    "another checksum": lambda: patched(npz(), 16, 7),
+    "another byte": lambda: flipped(npz(way=zipfile.ZIP_STORED), 180),
+    "an unknown compression": lambda: patched(npz(), 10, 14, 2),
+    "LZMA": lambda: npz(way=zipfile.ZIP_LZMA),
+    "encrypted": lambda: patched(npz(), 8, 1, 2),
+    "a place outside": lambda: patched(npz(), 42, 10**6),
+    "bytes after the archive": lambda: npz() + b"more",
+    "bytes before the archive": lambda: b"more" + npz(),
+    "a directory of a gigabyte": lambda: npz()[:-10] + struct.pack("<L", 1 << 30) + npz()[-6:],
+    "no archive": lambda: b"PK\x03\x04" + bytes(100),
+    "nothing": lambda: b"",
+    "an end alone": lambda: npz()[-22:],
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_hostile_archive_is_refused_in_little_memory(name: str) -> None:
+    content = HOSTILE[name]()
+    tracemalloc.start()
+    with pytest.raises((*DAMAGED_ARCHIVE,)) as raised:
+        read(content)
+    assert tracemalloc.get_traced_memory()[1] < MOST_MEMORY
+    tracemalloc.stop()
+    assert len(str(raised.value)) < 500
+
+
+def test_an_archive_of_many_members_is_refused() -> None:
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        for number in range(90_000):
+            archive.writestr(f"{number}", b"")
+    with pytest.raises(OSError, match="directory has"):
+        open_zip(content.getvalue())
+
+
+def test_an_end_that_leads_to_a_larger_directory_is_refused() -> None:
+    content = npz()
+    end = content.rindex(b"PK\x05\x06")
+    large = b"PK\x06\x06" + struct.pack("<QHHLLQQQQ", 44, 45, 45, 0, 0, 1, 1, 1 << 32, 0)
+    locator = b"PK\x06\x07" + struct.pack("<LQL", 0, end, 1)
+    with pytest.raises(OSError, match="directory has 4,294,967,296 bytes"):
+        open_zip(content[:end] + large + locator + content[end:])
+    with pytest.raises(zipfile.BadZipFile, match="its end is damaged"):
+        open_zip(content[:end] + large[:-1] + locator + content[end:])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_any_flipped_byte_is_told_or_changes_nothing(seed: int) -> None:
+    """Some bytes are not read, such as dates; none of the array's own changes unseen."""
+    rng, content = np.random.default_rng(seed), npz(np.random.default_rng(seed).random((50, 4)))
+    expected = read(content)
+    for place in rng.integers(0, len(content), size=200).tolist():
+        try:
+            found = read(flipped(content, place))
+        except DAMAGED_ARCHIVE:
+            continue
+        np.testing.assert_array_equal(found, expected, strict=True)
+
+
+def test_a_version_of_numpy_s_format_that_is_unknown_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"version \(9, 0\)"):
+        array_of(b"\x93NUMPY\x09\x00" + bytes(20), "lidar")
