@@ -39,8 +39,8 @@ def make_healthy(folder: Path) -> Path:
     opened(folder / "sensors", folder / "index_of_sensors")
     for task in SETUPS:
         _write_results(dataset, folder / "results" / task, task)
-    for task in SETUPS:
-        run = evaluate_results(dataset, folder / "results" / task, SETUPS[task], selection(task), workers=1)
+    for task, setup in SETUPS.items():
+        run = evaluate_results(dataset, folder / "results" / task, setup, selection(task), workers=1)
         run = run.broken_down(("all", "agent"), Resampling(resamples=20))
         save_run(run, folder / "bundles" / task, include_results=True)
     write_label_files(dataset, folder / "labels", tokens(dataset), LABELS, workers=1)

@@ -16,8 +16,8 @@ tried, and what became of it. 5 minutes. [SECURITY.md](../SECURITY.md) says what
 
 ## Changed files
 
-{count:,} times, one file of a healthy tree was changed in one way and then read, as a user would read it: by opening the
-release, by `validate` and `explain`, by evaluating the results, by verifying and comparing the bundle, and so on. A
+{count:,} times, one file of a healthy tree was changed in one way and then read, as a user would read it: by opening
+the release, by `validate` and `explain`, by evaluating the results, by verifying and comparing the bundle, and so on. A
 case is *read* if all that was read equals what a plain reader finds in the same bytes (Python's `json` and `split`,
 numpy, Pillow) or what a checksum says. It is *refused* if the devkit raises its own error, which names the file in at
 most 2,000 characters. Anything else *failed*: other values, another exception, more than {seconds:g} s, more than
@@ -37,8 +37,11 @@ Each cell of the table has three numbers: read, refused, **failed**. The columns
 _STOPS = """## Killed processes and full disks
 
 {kills} times, a command that writes was ended by `kill -9` at a random moment, and {full} times the disk was full (a
-limit on the size of files). Then the same command ran again. *Half-written*: a file under its final name is not whole after
-the stop. *Unequal*: after the next run, a file differs from that of an undisturbed run, or a temporary file is left.
+limit on the size of files). Then the same command ran again.
+
+- *half-written*: after the stop, a file under its final name is not whole
+- *unequal or left*: after the next run, a file differs from that of an undisturbed run, or a temporary file is left
+- *not told*: a full disk, or the next run, ended in anything but what it should: one line and exit status 2, or 0
 
 """
 _END = """

@@ -59,10 +59,10 @@ def calib(path: Path) -> dict[str, Any]:
     return loaded
 
 
-def archive(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an `.npz` file, by name."""
+def array(path: Path, name: str = "data") -> np.ndarray:
+    """An array of an `.npz` file, or the only one."""
     with np.load(path, allow_pickle=False) as found:
-        return dict(found)
+        return found[name if name in found.files else found.files[0]]
 
 
 def image(path: Path) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Every verb that writes, killed at any moment or on a full disk, then run again and compared with an undisturbed run."""
+"""Every verb that writes, killed at any moment or on a full disk, then run again: as if nothing had happened."""
 
 import json
 import subprocess
@@ -23,10 +23,12 @@ class Verb:
     Attributes:
         name: in the table.
         words: its arguments; {home} is the folder of healthy files, {out} a new folder.
+        progress: a file that is whole at each moment, and says how far the work is.
     """
 
     name: str
     words: str
+    progress: str = ""
 
     def words_for(self, home: Path, out: Path) -> list[str]:
         """Its arguments for a folder to write into."""
@@ -38,15 +40,15 @@ _SENSORS = f"{{home}}/sensors {SCENARIO} --index-dir {{home}}/index_of_sensors -
 _EVALUATE = f"{_RELEASE} --split train --samples all"
 VERBS = (
     Verb("index", "index {home}/release --index-dir {out} --workers 1"),
-    Verb("labels", f"labels {_RELEASE} --split train --out {{out}}/labels"),
+    Verb("labels", f"labels {_RELEASE} --split train --out {{out}}/labels", progress="labels/manifest.json"),
     Verb("synth", "synth {out}/made --scenarios 2 --frames 3 --no-sensors --seed 1 --workers 1"),
     Verb("split", f"split {_RELEASE} --out {{out}} --overwrite"),
     Verb("split --save", f"split {_RELEASE} --save {{out}}/mine.txt --overwrite"),
     Verb("stats", f"stats {_RELEASE} --out {{out}}/statistics --format png"),
     Verb(
         "evaluate",
-        f"evaluate accident {_EVALUATE} --scope accident --horizon 0.5 --protocol boxes --resamples 20 --include-results "
-        "--results {home}/results/accident --out {out}/bundle --overwrite",
+        f"evaluate accident {_EVALUATE} --scope accident --horizon 0.5 --protocol boxes --resamples 20 "
+        "--results {home}/results/accident --out {out}/bundle --include-results --overwrite",
     ),
     Verb(
         "evaluate compare",
@@ -109,7 +111,10 @@ class Stopper:
         largest = max(map(len, healthy.files.values()))
         how = {"delay": stop.share * healthy.seconds} if stop.kind == "kill" else {"limit": int(stop.share * largest)}
         first = self._run(verb, out, **how)
-        faults = [*(_told(first) if stop.kind == "full disk" else ()), *_unwhole(files_in(out), healthy.files)]
+        faults = [
+            *(_told(first) if stop.kind == "full disk" else ()),
+            *_unwhole(files_in(out), healthy.files, verb.progress),
+        ]
         again = self._run(verb, out)
         if again["status"] != 0:
             faults.append(f"the next run: status {again['status']}: {again['message'][-300:]}")
@@ -184,11 +189,13 @@ def _told(run: Mapping[str, Any]) -> Iterator[str]:
         yield f"status {run['status']}: {run['message'][-300:]}"
 
 
-def _unwhole(found: Mapping[str, bytes], healthy: Mapping[str, bytes]) -> Iterator[str]:
+def _unwhole(found: Mapping[str, bytes], healthy: Mapping[str, bytes], progress: str) -> Iterator[str]:
     """Files under a final name that are not those of an undisturbed run; what an evaluation resumes from has none."""
     for name, content in found.items():
         own = any(part.startswith(".") or part.endswith(".unfinished") for part in name.split("/"))
-        if not own and healthy.get(name) != content:
+        if name == progress:
+            json.loads(content)
+        elif not own and healthy.get(name) != content:
             yield f"{name} is not whole"
 
 

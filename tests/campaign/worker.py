@@ -238,7 +238,9 @@ def _of_error(error: BaseException, room: Room) -> tuple[str, str]:
     if any(isinstance(each, MemoryError) for each in causes):
         return "memory", f"ran into the limit: {short}"
     if not isinstance(error, DeepAccidentError):
-        return "foreign", short
+        frames = [each for each in traceback.extract_tb(error.__traceback__) if "deepaccident_devkit" in each.filename]
+        where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
+        return "foreign", short + where
     if len(str(error)) > LONGEST_MESSAGE:
         return "message", f"{len(str(error))} characters: {short}"
     if room.victim.name not in detail and str(room.tree) not in detail:
