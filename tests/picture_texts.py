@@ -44,7 +44,8 @@ def _drawn(figure: Any) -> list[Any]:
         for axis in (axes.xaxis, axes.yaxis):
             ticks = axis._update_ticks()
             shown = {axis.label, axis.offsetText, *(each for tick in ticks for each in (tick.label1, tick.label2))}
-            hidden.update(each for each in axis.findobj(Text) if not axes.axison or each not in shown)
+            off = not (axes.axison and axis.get_visible())
+            hidden.update(each for each in axis.findobj(Text) if off or each not in shown)
         clipped = [text for text in axes.texts if text.get_clip_on()]
         hidden.update(text for text in clipped if not axes.bbox.overlaps(text.get_window_extent()))
     return [text for text in figure.findobj(Text) if text not in hidden]

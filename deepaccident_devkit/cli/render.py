@@ -216,7 +216,8 @@ _PICTURES = {
         draw=render_accident,
         default="the first accident",
         of="scenario",
-        help="Render the countdown to an accident: one column per moment, one row per agent.",
+        help="Render the countdown to an accident: one column per moment, one row per agent. Where there is little "
+        "room, as on a slide, it shows the agents that see the pair best; --agents all shows all.",
         options=(
             _AGENTS,
             click.option(

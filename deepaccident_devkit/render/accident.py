@@ -10,9 +10,8 @@ import numpy as np
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
 from deepaccident_devkit.render.axes import figure_or_new, settled, with_light_grid
-from deepaccident_devkit.render.boxes import write_beside
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
-from deepaccident_devkit.render.colors import AGENT_COLORS, COLLIDER_COLOR
+from deepaccident_devkit.render.colors import AGENT_COLORS, CASING_COLOR, COLLIDER_COLOR, GRID_COLOR
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.pair import PAIR_LAYERS, Pair, draw_pair_from_above, draw_pair_in_camera, number_words
 from deepaccident_devkit.render.roles import in_drawing_order, short_name
@@ -32,6 +31,10 @@ COUNTDOWN: Final = (2.0, 1.0, 0.5, 0.0)
 _SHOWN: Final[tuple[Layer, ...]] = ("image", "bev", "boxes", "trajectories", "grid")
 _WIDTH: Final = 3.3
 """Width of a panel in inches."""
+_LEAST_WIDTH: Final = 1.6
+"""Inches of a camera's panel below which agents are left out."""
+_TITLE: Final = 1.0
+"""Inches of the height that titles take, about."""
 _MOSAIC: Final[list[Any]] = [[*AGENTS[:3]], ["above", *AGENTS[3:]], ["above", "speeds", "speeds"]]
 """The panels of a video's picture."""
 _DASHES: Final = ("-", "--")
@@ -58,7 +61,8 @@ def render_accident(
         dataset: the release.
         scenario: token or record of one with a collision.
         seconds: before the impact, which is the recording's last frame; moments before the first are left out.
-        agents: whose images are shown; None for all that are there, and an empty list for none.
+        agents: whose images are shown; an empty list for none. None is for all that are there or, where their images
+            would be narrower than 1.6 inches, as on a slide, for those that see the pair best; the title says so.
         layers: `image`, `bev` (the road), `boxes`, `trajectories` and `grid` are the default; also
             `points` (of the LiDAR, in images), `ids` and `velocities`. Without `image` no image file is read.
         fig: an empty figure to render on; a new one if None.
@@ -82,12 +86,16 @@ def render_accident(
     first = sample_token(record["token"], there[0], record["num_frames"])
     names = in_drawing_order([] if agents == [] else cooperating_agents(dataset, first, agents))
     fig = figure_or_new(fig, (_WIDTH * len(moments) + 0.8, 1.95 * len(names) + _WIDTH + 1.1))
+    pair, best = Pair.of(dataset, contact), ""
+    room = _agents_with_room(fig, len(names), len(moments)) if agents is None else len(names)
+    if room < len(names):
+        best = f"the {room} of {len(names)} agents that see the pair best"
+        names = _best_agents(pair, names, [index for _, index in moments], room)
     axes, across = _panels(fig, len(names), len(moments))
-    pair = Pair.of(dataset, contact)
     for column, (left, index) in enumerate(moments):
         for agent, ax in zip(names, axes[:, column], strict=False):
             channel = draw_pair_in_camera(pair, agent, index, shown, ax)
-            write_beside(ax, channel, (ax.get_xlim()[0], ax.get_ylim()[0]), "black")
+            _write_name(channel, ax)
         draw_pair_from_above(pair, index, shown, axes[-1, column])
         end = "the last frame" if cut else "the impact"
         _write_head(end if left == 0 else f"{left:g} s before", "black", axes[0, column], above=not across)
@@ -95,7 +103,7 @@ def render_accident(
         _write_head(short_name(agent), AGENT_COLORS[agent], ax, above=across)
     _write_head("from above", "black", axes[-1, 0], above=across)
     words = "\n".join(filter(None, [accident_words(dataset, contact), cut]))
-    set_scene_title(fig, dataset, record["token"], below=words, fontsize=11)
+    set_scene_title(fig, dataset, record["token"], best, below=words, fontsize=11)
     return settled(fig)
 
 
@@ -189,13 +197,33 @@ def _moments(seconds: Sequence[float], last: int) -> list[tuple[float, int]]:
     return recorded
 
 
+def _width(fig: Figure, agents: int, moments: int) -> tuple[float, bool]:
+    """Inches of a panel of the first row or column, about, and whether rows are columns because it is then wider."""
+    width, height = fig.bbox.width / fig.dpi, fig.bbox.height / fig.dpi - _TITLE
+    down = min(width / moments, height / (agents * 9 / 16 + 1))
+    across = (16 / 9 if agents else 1) * min(height / moments, width / (agents * 16 / 9 + 1))
+    return max(down, across), across > down
+
+
 def _panels(fig: Figure, agents: int, moments: int) -> tuple[Any, bool]:
-    """Axes (agents + 1, moments), and whether an agent's are a column because that fills the figure better."""
-    figure = fig.bbox.width / fig.bbox.height
-    down, across = moments / (agents * 9 / 16 + 1), (agents * 16 / 9 + 1) / moments
-    if abs(np.log(figure / across)) < abs(np.log(figure / down)):
+    """Axes (agents + 1, moments), and whether rows are columns."""
+    if _width(fig, agents, moments)[1]:
         return fig.subplots(moments, agents + 1, squeeze=False, width_ratios=(*[16 / 9] * agents, 1)).T, True
     return fig.subplots(agents + 1, moments, squeeze=False, height_ratios=(*[9 / 16] * agents, 1)), False
+
+
+def _agents_with_room(fig: Figure, agents: int, moments: int) -> int:
+    """How many of the agents can be shown so large that one can see what happens, or as large as they can be."""
+    widths = {number: _width(fig, number, moments)[0] for number in range(1, agents + 1)}
+    return max(number for number, width in widths.items() if width >= min(_LEAST_WIDTH, 0.9 * max(widths.values())))
+
+
+def _best_agents(pair: Pair, agents: Sequence[str], frames: Sequence[int], number: int) -> list[str]:
+    """So many of the agents: those in whose images most of the pair is, and of equal ones where it is largest."""
+    views = {agent: [pair.view(agent, index)[1] for index in frames] for agent in agents}
+    seen = {agent: [(view.shown, view.area) for view in views[agent] if view is not None] for agent in agents}
+    ranked = sorted(agents, key=lambda agent: np.sum([(0, 0), *seen[agent]], axis=0).tolist(), reverse=True)
+    return in_drawing_order(ranked[:number])
 
 
 def _write_head(words: str, color: str, ax: Axes, *, above: bool) -> None:
@@ -205,6 +233,22 @@ def _write_head(words: str, color: str, ax: Axes, *, above: bool) -> None:
         return
     style: dict[str, Any] = {"rotation": 90, "ha": "right", "va": "center", "fontweight": "bold"}
     ax.text(-0.02, 0.5, words, color=color, transform=ax.transAxes, **style)
+
+
+def _write_name(words: str, ax: Axes) -> None:
+    """Write a camera's name into the lower left corner of its panel, whatever is there."""
+    paper = {"facecolor": CASING_COLOR, "edgecolor": GRID_COLOR, "linewidth": 0.7, "pad": 1.5}
+    ax.annotate(
+        words,
+        (0, 0),
+        (3, 3),
+        xycoords="axes fraction",
+        textcoords="offset points",
+        fontsize=SMALLEST_TEXT,
+        bbox=paper,
+        zorder=5,
+        in_layout=False,
+    )
 
 
 def _draw_speeds(pair: Pair, index: int, ax: Axes) -> None:

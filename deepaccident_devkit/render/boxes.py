@@ -17,6 +17,7 @@ from deepaccident_devkit.taxonomy import OWN_ACTOR_ID, UNTRACKED_ID
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.patches import PathPatch
 
 EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
 """The twelve edges of a box between its corners, in `Box.corners` order; the first four are its front."""
@@ -24,6 +25,8 @@ SMALLEST_MARK = 6.0
 """Points: the size of the mark of a small actor from above."""
 _KEY_SPEED = 10
 """Metres a second of the arrow in a corner that gives the scale of the others."""
+_EDGE, _CASING = 1.2, 1.2
+"""Points: the width of an edge in an image, and by how much its casing is wider."""
 NEAREST_DRAWN = 0.1
 """Metres in front of the camera at which edges are cut off."""
 
@@ -90,8 +93,8 @@ def draw_actors_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str], layers
         draw_ids_from_above(boxes, ax, colors)
 
 
-def draw_boxes_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Sequence[str], **how: Any) -> None:
-    """Render the edges of boxes given in the camera's optical frame, and fill their fronts.
+def draw_boxes_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Sequence[str], **how: Any) -> BoolArray:
+    """Render the edges of boxes given in the camera's optical frame, with a white casing, and fill their fronts.
 
     What is not in front of the camera is cut off.
 
@@ -100,35 +103,50 @@ def draw_boxes_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: S
         camera: whose image it is.
         ax: axes to render on, in pixels.
         colors: one colour for each box.
-        how: matplotlib's arguments for the edges, such as `linestyle` or `linewidths`.
+        how: matplotlib's arguments for the edges, such as `linestyle`.
+
+    Returns:
+        Which boxes (N,) have a part in the image.
     """
     from matplotlib.collections import LineCollection, PolyCollection
     from matplotlib.colors import to_rgba_array
 
     pixels, row, edge = _edges_in_image(boxes, camera)
     faces = to_rgba_array(list(colors))
-    if not len(row):
-        return
-    lines = LineCollection(list(pixels), **{"colors": faces[row], "linewidths": 1.2, **how})
-    ax.add_collection(lines, autolim=False)  # the image has set the limits
-    faces[:, 3] *= 0.25
-    front = edge < 4  # going round, the ends of what is left of the edges are the corners of what is left of the face
-    rows, starts = np.unique(row[front], return_index=True)
-    fronts = np.split(pixels[front].reshape(-1, 2), 2 * starts[1:])
-    filled = PolyCollection(fronts if len(rows) else [], facecolors=faces[rows], edgecolors="none")
-    ax.add_collection(filled, autolim=False)
-
-
-def boxes_in_image(boxes: Boxes, camera: PinholeCamera) -> BoolArray:
-    """Which boxes (N,) of the camera's frame have a part in its image."""
-    bounds = bounds_in_image(boxes, camera)
+    if len(row):
+        ax.add_artist(_casing(pixels))
+        lines = LineCollection(list(pixels), **{"colors": faces[row], "linewidths": _EDGE, **how})
+        ax.add_collection(lines, autolim=False)  # the image has set the limits
+        faces[:, 3] *= 0.25
+        # going round, the ends of what is left of the edges are the corners of what is left of the face
+        front = edge < 4
+        rows, starts = np.unique(row[front], return_index=True)
+        fronts = np.split(pixels[front].reshape(-1, 2), 2 * starts[1:])
+        filled = PolyCollection(fronts if len(rows) else [], facecolors=faces[rows], edgecolors="none")
+        ax.add_collection(filled, autolim=False)
+    bounds = _bounds(pixels, row, len(boxes), camera)
     return np.asarray((bounds[:, 2:] > bounds[:, :2]).all(axis=1))
+
+
+def _casing(pixels: FloatArray) -> PathPatch:
+    """White below edges (V, 2, 2), which are dark on asphalt; one shape, as this takes least time."""
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path
+
+    codes = np.tile(np.array([Path.MOVETO, Path.LINETO], dtype=Path.code_type), len(pixels))
+    path = Path(pixels.reshape(-1, 2), codes)
+    return PathPatch(path, fill=False, edgecolor=CASING_COLOR, alpha=0.5, linewidth=_EDGE + _CASING)
 
 
 def bounds_in_image(boxes: Boxes, camera: PinholeCamera) -> FloatArray:
     """Left, top, right and bottom (N, 4) of the part of each box that is in the image; no area if none is."""
     pixels, row, _ = _edges_in_image(boxes, camera)
-    bounds = np.zeros((len(boxes), 4))
+    return _bounds(pixels, row, len(boxes), camera)
+
+
+def _bounds(pixels: FloatArray, row: IntArray, count: int, camera: PinholeCamera) -> FloatArray:
+    """`bounds_in_image` of so many boxes, from their edges."""
+    bounds = np.zeros((count, 4))
     if len(row):
         rows, starts = np.unique(row, return_index=True)
         bounds[rows, :2] = np.minimum.reduceat(pixels.min(axis=1), starts)

@@ -14,7 +14,6 @@ from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.render.axes import axes_or_new
 from deepaccident_devkit.render.bev import BEV_LAYERS, BevView, draw_bev
 from deepaccident_devkit.render.boxes import (
-    boxes_in_image,
     draw_boxes_in_image,
     draw_ids_in_image,
     draw_velocities_in_image,
@@ -137,8 +136,8 @@ def draw_image(dataset: Dataset, camera: Any, ax: Axes, *, image: bool = True) -
     elif image:
         ax.imshow(dataset.load_image(camera), extent=(0, lens.width, lens.height, 0))
     ax.set(xlim=(0, lens.width), ylim=(lens.height, 0), aspect="equal", anchor="N", title=camera["channel"])
-    ax.set(xticks=(), yticks=())
-    ax.spines[:].set_visible(False)
+    for scale in (ax.xaxis, ax.yaxis, *ax.spines.values()):
+        scale.set_visible(False)
 
 
 def draw_points_in_image(pixels: FloatArray, ax: Axes, *, size: float = 2.0, **colors: Any) -> PathCollection:
@@ -165,15 +164,17 @@ def draw_camera_boxes(
         The colours of the rendered boxes that are in the image.
     """
     lens = camera_of(dataset, camera)
+    boxes = boxes.select(np.argsort(-boxes.center[:, 2]))  # the nearest are on top
     colors = role_colors(dataset, camera["sample_token"], boxes)
+    drawn: frozenset[str] = frozenset()
     if "boxes" in layers:
-        draw_boxes_in_image(boxes, lens, ax, colors)
+        seen = draw_boxes_in_image(boxes, lens, ax, colors).tolist()
+        drawn = frozenset(color for color, inside in zip(colors, seen, strict=True) if inside)
     if "velocities" in layers:
         draw_velocities_in_image(boxes, lens, ax, colors)
     if "ids" in layers:
         draw_ids_in_image(boxes, lens, ax, colors)
-    inside = boxes_in_image(boxes, lens).tolist()
-    return frozenset(color for color, seen in zip(colors, inside, strict=True) if seen and "boxes" in layers)
+    return drawn
 
 
 def render_pointcloud_in_image(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -19,8 +19,8 @@ from deepaccident_devkit.render.boxes import (
     draw_boxes_in_image,
 )
 from deepaccident_devkit.render.camera import CAMERA_LAYERS, draw_camera
-from deepaccident_devkit.render.chips import SMALLEST_TEXT
-from deepaccident_devkit.render.colors import COLLIDER_COLOR, GRID_COLOR
+from deepaccident_devkit.render.chips import SMALLEST_TEXT, keep_free, place_chips
+from deepaccident_devkit.render.colors import CASING_COLOR, COLLIDER_COLOR, GRID_COLOR
 from deepaccident_devkit.render.layers import Layer
 from deepaccident_devkit.render.missing import is_there
 from deepaccident_devkit.render.roles import actor_tags, camera_name, role_colors
@@ -46,8 +46,12 @@ _PAST: Final = 3.0
 """Seconds of the paths that led to the contact."""
 _LEAST_CROP: Final = 0.4
 """Share of an image's width that is shown at least: who looks must still see where it is."""
-_EDGE: Final = 0.1
-"""Share of a panel's width and height that tags keep to its edges."""
+_CROSS: Final = 9.0
+"""Points: the size of the cross at the place of contact."""
+_EDGE: Final = 0.01
+"""Share of a panel's width and height that the places of tags keep to its edges."""
+_FREE: Final = 22.0
+"""Points, about, at the top of an image in which tags may cover a car: it may fill the image."""
 _HIDDEN: Final = (0, (3, 2))
 
 
@@ -128,10 +132,8 @@ def draw_pair_in_camera(pair: Pair, agent: str, index: int, layers: Collection[L
     if "boxes" not in layers:
         return name
     both = pair.at(index, agent).transform(dataset.world_from(sample, channel).inverse(), channel)
-    seen = np.isin(both.actor_id, dataset.boxes(sample, visible="camera").actor_id)
-    for rows, how in ((seen, "-"), (~seen, _HIDDEN)):
-        red = [COLLIDER_COLOR] * int(rows.sum())
-        draw_boxes_in_image(both.select(rows), lens, ax, red, linewidths=1.8, linestyle=how)
+    hidden = both.select(~np.isin(both.actor_id, dataset.boxes(sample, visible="camera").actor_id))
+    draw_boxes_in_image(hidden, lens, ax, [COLLIDER_COLOR] * len(hidden), linestyle=_HIDDEN)
     _write_tags_in_image(pair, both.actor_id.tolist(), bounds_in_image(both, lens), ax)
     return name
 
@@ -158,9 +160,10 @@ def draw_pair_from_above(pair: Pair, index: int, layers: Collection[Layer], ax: 
     if "trajectories" in layers:
         seconds, red = (_PAST, sample["time_to_impact"] or 0.0), [COLLIDER_COLOR] * len(both)
         draw_trails(dataset, sample, both, red, target_from_world=SE3.identity(), seconds=seconds, ax=ax)
+    _write_tags_from_above(pair, both, ax)  # before the ids, which have what room is left
     draw_actors_from_above(boxes, ax, role_colors(dataset, sample, boxes), layers)
-    ax.plot(x, y, "x", color="black", markersize=9, markeredgewidth=1.8, zorder=5)
-    _write_tags_from_above(pair, both, reach, ax)
+    ax.plot(x, y, "x", color="black", markersize=_CROSS, markeredgewidth=1.8, zorder=5)
+    keep_free(ax, [[place]], margin=(-_CROSS / 2, -_CROSS / 2, _CROSS / 2, _CROSS / 2))
     _draw_scale(reach, ax, grid="grid" in layers)
     speeds = [
         f"{pair.tags[actor]} {number_words(float(np.linalg.norm(velocity)))}"
@@ -191,51 +194,50 @@ def _draw_scale(reach: float, ax: Axes, *, grid: bool) -> None:
     """Render a bar of 5 or 10 m, and cells of that size, in place of numbers at the axes."""
     from matplotlib.ticker import MultipleLocator
 
-    metres = 5.0 if reach < _LEAST + _EDGE * _MOST else 10.0
+    metres = 5.0 if reach < 1.25 * _LEAST else 10.0
     if grid:
         ax.grid(color=GRID_COLOR, linewidth=0.4)
         ax.set_axisbelow(True)
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_locator(MultipleLocator(metres))
     ax.tick_params(labelbottom=False, labelleft=False, length=0)
-    ax.plot([0.05, 0.05 + metres / (2 * reach)], [0.05] * 2, color="black", linewidth=2, transform=ax.transAxes)
-    ax.text(0.05, 0.07, f"{metres:.0f} m", fontsize=SMALLEST_TEXT, va="bottom", transform=ax.transAxes, zorder=6)
+    left, low = (each + 0.1 * reach for each in ax.viewLim.min)
+    ax.plot([left, left + metres], [low, low], color="black", linewidth=2)
+    paper = {"facecolor": CASING_COLOR, "edgecolor": "none", "alpha": 0.7, "pad": 0.5}
+    ax.text(left, low + 0.06 * reach, f"{metres:.0f} m", fontsize=SMALLEST_TEXT, va="bottom", zorder=6, bbox=paper)
+    keep_free(ax, [[(left, low), (left + metres, low)]], margin=(-2, -2, 2, 2 * SMALLEST_TEXT))
 
 
 def _write_tags_in_image(pair: Pair, actors: list[int], bounds: FloatArray, ax: Axes) -> None:
-    """Write tags above what is in the panel of boxes' bounds (N, 4), pixels; of two, towards the outer sides."""
+    """Write tags above what the panel shows of boxes with bounds (N, 4), pixels; of two, at their outer sides."""
     (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
-    low, high = bounds[:, :2].clip((left, top), (right, bottom)), bounds[:, 2:].clip((left, top), (right, bottom))
-    shown = np.flatnonzero((high > low).all(axis=1))
-    shown = shown[np.argsort((low + high)[shown, 0])]
-    places = (low + high)[shown, 0] / 2
-    margin = _EDGE * (right - left)
-    if len(shown) > 1:
-        places = np.array([low[shown[0], 0], high[shown[1], 0]])
-        middle, half = places.mean(), max(float(np.ptp(places)) / 2, margin)
-        middle = np.clip(middle, left + margin + half, right - margin - half)
-        places = np.array([middle - half, middle + half])
-    for row, u in zip(shown.tolist(), places.clip(left + margin, right - margin).tolist(), strict=True):
-        near_top = low[row, 1] < top + 2.5 * _EDGE * (bottom - top)
-        v, side = (top, "top") if near_top else (float(low[row, 1]), "bottom")
-        _write_tag(pair.tags[actors[row]], (u, v), (0, -5 if near_top else 5), ax, va=side)
+    cars = bounds.reshape(-1, 2, 2).clip((left, top), (right, bottom))
+    shown = np.flatnonzero((cars[:, 1] > cars[:, 0]).all(axis=1))
+    shown = shown[np.argsort(cars[shown, :, 0].mean(axis=1))]
+    cars = cars[shown]
+    places = np.column_stack([cars[..., 0].mean(axis=1), cars[:, 0, 1]])
+    if len(cars) > 1:
+        places[:, 0] = cars[0, 0, 0], cars[1, 1, 0]
+    free = top + (bottom - top) * min(0.5, _FREE * ax.figure.dpi / 72 / ax.bbox.height)
+    places[places[:, 1] < free, 1] = top
+    cars[..., 1] = cars[..., 1].clip(free)
+    _write_tags([pair.tags[actors[row]] for row in shown.tolist()], places, ax)
+    keep_free(ax, cars)
 
 
-def _write_tags_from_above(pair: Pair, both: Boxes, reach: float, ax: Axes) -> None:
-    """Write tags beside boxes of the pair, each on the side that is away from the other."""
+def _write_tags_from_above(pair: Pair, both: Boxes, ax: Axes) -> None:
+    """Write tags beside boxes of the pair, each at the end that is away from the other."""
     middle = both.center[:, :2].mean(axis=0) if len(both) > 1 else pair.contact.point[:2]
-    for row, actor in enumerate(both.actor_id.tolist()):
-        away = both.center[row, :2] - middle
-        away = away / np.linalg.norm(away) if np.linalg.norm(away) > 0 else np.array([0.0, 1.0])
-        corners = both.bottom_corners()[row, :, :2] - both.center[row, :2]
-        place = both.center[row, :2] + away * float((corners @ away).max())
-        low, high = pair.contact.point[:2] - reach * (1 - 2 * _EDGE), pair.contact.point[:2] + reach * (1 - 2 * _EDGE)
-        low[1] += 2 * _EDGE * reach  # above the scale
-        place = place.clip(low, high)
-        _write_tag(pair.tags[actor], (float(place[0]), float(place[1])), (10 * away[0], 10 * away[1]), ax, va="center")
+    away = both.center[:, :2] - middle
+    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
+    ends = both.bottom_corners()[..., :2] - both.center[:, None, :2]
+    places = both.center[:, :2] + away * (ends @ away[..., None]).max(axis=1)
+    _write_tags([pair.tags[actor] for actor in both.actor_id.tolist()], places, ax)
 
 
-def _write_tag(words: str, place: tuple[float, float], offset: tuple[float, float], ax: Axes, *, va: str) -> None:
-    chip = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": COLLIDER_COLOR, "linewidth": 0.8}
-    style: dict[str, Any] = {"ha": "center", "va": va, "fontsize": SMALLEST_TEXT, "fontweight": "bold", "zorder": 7}
-    ax.annotate(words, place, offset, textcoords="offset points", color="black", bbox=chip, gid="tag", **style)
+def _write_tags(tags: list[str], places: FloatArray, ax: Axes) -> None:
+    """Write tags near places (N, 2) or, if these are not in the panel, at its edge."""
+    low, high = np.array(ax.viewLim.min), np.array(ax.viewLim.max)
+    edge = _EDGE * (high - low)
+    places = places.clip(low + edge, high - edge)
+    place_chips(ax, zip(tags, places, strict=True), colors=[COLLIDER_COLOR] * len(tags))

@@ -20,7 +20,7 @@ from deepaccident_devkit.render.accident import accident_words, draw_countdown, 
 from deepaccident_devkit.render.best_view import best_view
 from deepaccident_devkit.render.colors import COLLIDER_COLOR
 from deepaccident_devkit.render.pair import Pair
-from deepaccident_devkit.render.roles import camera_name
+from deepaccident_devkit.render.roles import camera_name, short_name
 from deepaccident_devkit.render.video import render_scenario_video
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 from deepaccident_devkit.v2x import collision
@@ -50,8 +50,8 @@ def test_a_column_a_moment_and_a_row_an_agent(da: DeepAccident) -> None:
     assert [ax.get_title() for ax in figure.axes[:2]] == ["0.4 s before", "the impact"]
     assert [figure.axes[row * 2].texts[-1].get_text() for row in range(2)] == ["ego", "infrastructure"]
     assert all(ax.images for ax in figure.axes[:4])
-    names = {text.get_text().split(":")[0] for ax in figure.axes[:4] for text in ax.texts if text.get_gid() != "tag"}
-    assert names - {"ego", "infrastructure"} <= {camera_name(channel) for channel in CAMERAS}
+    names = {text.get_text().split(":")[0] for ax in figure.axes[:4] for text in ax.texts}
+    assert names - {"ego", "infrastructure", "E", "O"} <= {camera_name(channel) for channel in CAMERAS}
     assert title_of(figure).endswith(" ".join(accident_words(da, da.collision(scenario)).split()))
     assert tokens_of(figure) == [scenario["token"]]
     plain = drawn(da, scenario, seconds=[0.0], layers=["boxes", "ids"])
@@ -177,27 +177,31 @@ def test_nothing_to_count_down_to_is_said(da: DeepAccident, tmp_path: Path) -> N
     assert not list(tmp_path.iterdir())
 
 
-def seen_pixels(ax: Any) -> float:
-    """The smaller side, in pixels, of the red lines that a panel shows."""
+def red_size(ax: Any) -> Any:
+    """Width and height, in pixels, of the red lines that a panel shows."""
     low, high = ax.get_window_extent().get_points()
-    lines = [each for each in ax.collections if isinstance(each, LineCollection) and len(each.get_segments())]
-    red = [each for each in lines if to_hex(each.get_color()[0], keep_alpha=False) == COLLIDER_COLOR]
-    ends = [ax.transData.transform(np.concatenate(each.get_segments())).clip(low, high) for each in red]
-    return float(np.ptp(np.concatenate(ends), axis=0).min()) if ends else 0.0
+    lines = [each for each in ax.collections if isinstance(each, LineCollection)]
+    kinds = [kind for each in lines for kind in zip(each.get_segments(), each.get_color(), strict=True)]
+    red = [ends for ends, color in kinds if to_hex(color) == COLLIDER_COLOR]
+    return np.ptp(ax.transData.transform(np.concatenate(red)).clip(low, high), axis=0) if red else np.zeros(2)
 
 
-def assert_pair_is_seen(da: DeepAccident, scenario: Any, seconds: Sequence[float]) -> None:
-    """At every moment: in the cameras of three agents or more, and from above with both tags."""
+def assert_pair_is_seen(da: DeepAccident, scenario: Any, seconds: Sequence[float], width: float = 3.3) -> None:
+    """At every moment: in the cameras of three agents or more, and from above with both tags; no tag is left out."""
     contact = da.collision(scenario)
     assert contact is not None
-    tags, figure = Pair.of(da, contact).tags.values(), detached_figure((3.3 * len(seconds), 14))
-    render_accident(da, scenario, seconds=seconds, fig=figure)
+    tags, figure = Pair.of(da, contact).tags.values(), detached_figure((width * len(seconds), 4.2 * width))
+    render_accident(da, scenario, seconds=seconds, agents=AGENTS, fig=figure)
     figure.draw_without_rendering()
     panels = np.array(figure.axes).reshape(6, len(seconds))
     for column in panels.T:
-        assert sum(seen_pixels(ax) > 12 for ax in column[:-1]) >= 3
-        assert {text.get_text() for text in column[-1].texts if text.get_gid() == "tag"} == {*tags}
-        assert seen_pixels(column[-1]) > 30
+        assert sum(red_size(ax).min() > 4 * width for ax in column[:-1]) >= 3
+        assert {*tags} <= {text.get_text() for text in column[-1].texts}
+        assert red_size(column[-1]).max() > 9 * width
+    for ax in figure.axes:
+        named = [text for text in ax.texts if text.get_text() in tags]
+        assert all(text.get_visible() and ax.bbox.overlaps(text.get_window_extent()) for text in named)
+        assert len(named) >= (red_size(ax).min() > 4 * width)
 
 
 def test_the_pair_is_seen_up_to_the_impact(da_b: DeepAccident) -> None:
@@ -208,6 +212,7 @@ def test_the_pair_is_seen_up_to_the_impact(da_b: DeepAccident) -> None:
 def test_the_pair_of_each_design_is_seen_up_to_the_impact(da_designs: DeepAccident) -> None:
     for scenario in [scenario for scenario in da_designs.scenario if scenario["collision"]]:
         assert_pair_is_seen(da_designs, scenario, (0.4, 0.3, 0.2, 0.1, 0.0))
+        assert_pair_is_seen(da_designs, scenario, (0.4, 0.2, 0.1, 0.0), width=1.8)  # in two columns of a paper
 
 
 def test_a_camera_that_saw_the_pair_is_kept(da: DeepAccident, accident: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -233,3 +238,26 @@ def test_rows_are_columns_in_a_wide_figure(da: DeepAccident, accident: str) -> N
     render_accident(da, accident, seconds=(0.3, 0.2, 0.1, 0.0), fig=figure)
     heads = [ax.get_title().split("\n")[0] for ax in figure.axes[:6]]
     assert heads == ["ego", "ego behind", "other", "other behind", "infrastructure", "from above"]
+
+
+def test_where_there_is_little_room_the_agents_that_see_the_pair_best_are_shown(
+    da: DeepAccident, accident: str
+) -> None:
+    contact = da.collision(accident)
+    assert contact is not None
+    pair, slide, seconds = Pair.of(da, contact), (8.0, 4.5), (0.3, 0.2, 0.1, 0.0)
+    figure = detached_figure(slide)
+    render_accident(da, accident, seconds=seconds, fig=figure)
+    named = [ax.texts[-1].get_text() for ax in figure.axes[::4]]
+    assert "the 2 of 5 agents that see the pair best" in title_of(figure)
+    shares = {}
+    for agent in AGENTS:
+        views = [pair.view(agent, index)[1] for index in (3, 4, 5, 6)]
+        shares[short_name(agent)] = sum(view.shown for view in views if view is not None)
+    assert len(named) == 3
+    assert named[-1] == "from above"
+    assert min(shares[name] for name in named[:2]) >= sorted(shares.values())[-2]
+    asked = detached_figure(slide)
+    render_accident(da, accident, seconds=seconds, agents=AGENTS, fig=asked)
+    assert len(asked.axes) == 4 * 6
+    assert "best" not in title_of(asked)

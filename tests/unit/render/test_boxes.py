@@ -15,7 +15,6 @@ from deepaccident_devkit.render import draw_box
 from deepaccident_devkit.render.boxes import (
     NEAREST_DRAWN,
     bounds_in_image,
-    boxes_in_image,
     draw_boxes_from_above,
     draw_boxes_in_image,
     draw_ids_from_above,
@@ -74,6 +73,15 @@ def test_in_an_image_the_edges_pass_within_two_pixels_of_the_projected_corners()
     for place in on_canvas(ax, pixels):
         assert has_color(picture, place, RED)
     assert not has_color(picture, on_canvas(ax, [[200, 290]])[0], RED)
+
+
+def test_edges_in_an_image_have_a_pale_casing_on_dark_ground() -> None:
+    seen, ax, dark = boxes().select([0]).transform(OPTICAL_FROM_EGO, "Camera_Front"), image_axes(), "#303030"
+    ax.set_facecolor(dark)
+    assert draw_boxes_in_image(seen, CAMERA, ax, [dark], linestyle="--").tolist() == [True]
+    picture = rendered(ax, 200)
+    middle = CAMERA.project(seen.corners()[:, :2].mean(axis=1))[0]  # of an edge
+    assert has_color(picture, on_canvas(ax, middle)[0], "#979797", within=6, tolerance=30)
 
 
 def test_a_line_leads_to_the_front_and_each_box_has_its_colour() -> None:
@@ -201,9 +209,8 @@ def test_a_box_beside_the_camera_is_cut_off_at_the_camera() -> None:
     standing = Boxes.from_arrays([[0.0, -3, 0], [-9, -3, 0]], [[2.0, 8, 1]] * 2, [np.pi / 2] * 2, frame="ego")
     both = standing.transform(OPTICAL_FROM_EGO, "Camera_Front")
     assert_allclose(bounds_in_image(both, CAMERA)[0], [200 + 200 * 2 / 4, 0, 400, 300])
-    assert boxes_in_image(both, CAMERA).tolist() == [True, False]
     ax = new_axes()
-    draw_boxes_in_image(both, CAMERA, ax, [RED, RED])
+    assert draw_boxes_in_image(both, CAMERA, ax, [RED, RED]).tolist() == [True, False]
     (front,) = next(each for each in ax.collections if isinstance(each, PolyCollection)).get_paths()
     reach = front.vertices[:, 0].min(), front.vertices[:, 0].max()
     assert reach == pytest.approx((300, 200 + 200 * 2 / NEAREST_DRAWN))
