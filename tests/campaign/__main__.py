@@ -25,19 +25,10 @@ def main(count: int, kills: int, seed: int, out: Path) -> None:
     from campaign.stops import Stopped, drawn_stops, run_stops
     from campaign.worker import Outcome
 
-    failed = 0
-
     def tell(each: Outcome | Stopped) -> None:
-        nonlocal failed
-        if isinstance(each, Outcome):
-            bar.update(1)
-            text = f"{each.case}: {each.verdict}: {each.detail}" if each.failed else ""
-        else:
-            bar.update(1)
-            text = f"{each.stop}: {each.fault}" if each.fault else ""
-        if text:
-            failed += 1
-            click.echo(f"\r{text}")
+        bar.update(1)
+        if each.failed:
+            click.echo(f"\r{each}")
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -47,6 +38,7 @@ def main(count: int, kills: int, seed: int, out: Path) -> None:
         stops = drawn_stops(kills, seed) if kills else []
         with click.progressbar(length=len(stops), label="kills and full disks") as bar:
             stopped = run_stops(stops, healthy, folder / "out", tell)
+    failed = sum(each.failed for each in (*outcomes, *stopped))
     command = f"--count {count} --kills {kills} --seed {seed}"
     out.write_text(page(outcomes, stopped, f"`{command}`"), encoding="utf-8")
     click.echo(f"{failed} failed; written: {out}")

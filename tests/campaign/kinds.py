@@ -11,12 +11,14 @@ import numpy as np
 
 from campaign import plain
 from campaign.healthy import SETUPS, opened, selection
+from campaign.mutations import HTML
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.evaluation.runs import compare_bundles, evaluate_results, verify_bundle
 from deepaccident_devkit.files import file_checksum
 from deepaccident_devkit.motion import LabelFiles
 from deepaccident_devkit.release import explain_file, find_release, read_calib
+from deepaccident_devkit.render.evaluation.report import report_html
 from deepaccident_devkit.synth.spec import draw, read_spec
 from deepaccident_devkit.synth.spec.choices import Items, Part
 from deepaccident_devkit.tables.manifest import MANIFEST_FILE, read_manifest
@@ -280,7 +282,7 @@ def _judge_boxes(room: Room, read: Mapping[str, Any]) -> str | None:
 
 
 def _judge_motion(room: Room, read: Mapping[str, Any]) -> str | None:
-    shards = sorted((room.tree / "motion" / "shards").glob("*.npz"))
+    shards = [path for path in (room.tree / "motion" / "shards").glob("*.npz") if path.is_file()]
     for token, output in read.items():
         if not any(np.array_equal(output.instances, plain.array(shard, f"{token}/instance")) for shard in shards):
             return f"{token}: other instances"
@@ -288,13 +290,19 @@ def _judge_motion(room: Room, read: Mapping[str, Any]) -> str | None:
 
 
 def _evaluation(task: str) -> Action:
-    def read(room: Room) -> Any:
-        run = evaluate_results(
-            _dataset(room.home), _top(room), SETUPS[task], selection(task), workers=1, allow_partial=True
-        )
-        return run.summary()
+    """The numbers, and the page that shows them."""
 
-    return Action(read, lambda _room, summary: _json_fault(summary))
+    def read(room: Room) -> Any:
+        dataset = _dataset(room.home)
+        run = evaluate_results(dataset, _top(room), SETUPS[task], selection(task), workers=1, allow_partial=True)
+        return run.summary(), report_html(run, [])
+
+    def judge(_room: Room, read: tuple[Any, str]) -> str | None:
+        summary, page = read
+        foreign = next((text for text in HTML if text in page), None)
+        return _json_fault(summary) or (None if foreign is None else f"a page that has {foreign}")
+
+    return Action(read, judge)
 
 
 def _json_fault(content: Any) -> str | None:

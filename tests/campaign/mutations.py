@@ -25,7 +25,8 @@ FORMS = ("text", "json", "yaml", "pickle", "npz", "image", "arrow", "parquet", "
 GROUPS = ("bytes", "numbers", "types", "bombs", "links", "names")
 MARKER = "a pickle has run"
 """The folder beside the changed files that a pickle makes whose code is run."""
-HTML = "<script>alert(1)</script>"
+HTML = ("<script>alert(1)</script>", '"><img src=x onerror=alert(1)>')
+"""Texts that must not become part of a page."""
 _SPARSE = 3 << 30
 """Bytes of a file that is mostly a hole."""
 _MOST_ROWS, _MOST_BYTES = 40, 200_000
@@ -427,7 +428,7 @@ def table_of_other_columns(content: bytes, rng: Rng) -> bytes:
         lambda: table.set_column(at, name, _any(rng, odd)),
         lambda: table.slice(0, rows // 2),
         lambda: table.slice(0, 0),
-        lambda: table.rename_columns([f"{HTML}{each}" for each in table.column_names]),
+        lambda: table.rename_columns([f"{HTML[0]}{each}" for each in table.column_names]),
         lambda: pa.concat_tables([table, table]),
     )
     return _stored(_any(rng, edits)(), content)
@@ -601,8 +602,7 @@ def folder_is_a_link(path: Path, rng: Rng) -> None:
 # ---- names
 
 _NAMES = (
-    HTML,
-    '"><img src=x onerror=alert(1)>',
+    *HTML,
     "a\nb",
     "\x1b[31mred",
     "x" * 250,

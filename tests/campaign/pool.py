@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -92,8 +92,3 @@ def _server(healthy: Path, number: int, kinds: str) -> Iterator[tuple[IO[str], I
         assert process.stdout
         yield process.stdin, process.stdout
         process.stdin.close()
-
-
-def failures(outcomes: Sequence[Outcome]) -> list[Outcome]:
-    """Those that should not be."""
-    return [outcome for outcome in outcomes if outcome.failed]

@@ -79,6 +79,13 @@ class Stopped:
     stop: Stop
     fault: str = ""
 
+    def __str__(self) -> str:
+        return f"{self.stop.verb} / {self.stop.kind} at {self.stop.share:.3f}: {self.fault}"
+
+    @property
+    def failed(self) -> bool:
+        return bool(self.fault)
+
 
 @dataclass(frozen=True, slots=True)
 class _Healthy:

@@ -4,7 +4,6 @@ import re
 from pathlib import Path
 
 import pytest
-from deepaccident_devkit.reading import LIMITS
 
 from campaign import planted
 from campaign.healthy import make_healthy
@@ -12,8 +11,9 @@ from campaign.kinds import KINDS
 from campaign.mutations import FORMS, GROUPS, MUTATIONS, fitting
 from campaign.page import numbers, page
 from campaign.pool import drawn, run
-from campaign.stops import VERBS, Stop, drawn_stops, run_stops
+from campaign.stops import VERBS, Stop, drawn_stops, files_in, run_stops
 from campaign.worker import Bench, Case, Outcome
+from deepaccident_devkit.reading import LIMITS
 
 TOP = Path(__file__).parents[2]
 PAGE = TOP / "docs" / "reliability.md"
@@ -50,16 +50,15 @@ def test_every_way_to_fail_is_noticed(healthy: Path) -> None:
 
 def test_a_case_depends_on_its_seed_alone(healthy: Path, tmp_path: Path) -> None:
     bench = Bench(healthy, tmp_path / "home", KINDS)
+    before = files_in(healthy)
 
     def changed(case: Case) -> dict[str, bytes]:
-        tree = bench.room(case).tree
-        return {path.relative_to(tree).as_posix(): path.read_bytes() for path in tree.rglob("*") if path.is_file()}
+        return files_in(bench.room(case).tree)
 
     for name in ("bits_flipped", "number_replaced", "word_with_an_odd_name"):
         first, other = Case("label", name, 3), Case("label", name, 4)
         assert changed(first) == changed(first) != changed(other)
-    before = {path: path.read_bytes() for path in healthy.rglob("*") if path.is_file()}
-    assert all(path.stat().st_nlink >= 1 and path.read_bytes() == content for path, content in before.items())
+    assert files_in(healthy) == before
 
 
 def test_every_mutation_can_change_every_form(healthy: Path, tmp_path: Path) -> None:
@@ -83,7 +82,7 @@ def test_cases_are_of_every_kind_and_group() -> None:
 @pytest.mark.slow
 def test_every_verb_is_killed_and_meets_a_full_disk(healthy: Path, tmp_path: Path) -> None:
     stops = [Stop(verb.name, kind, 0.6) for verb in VERBS for kind in ("kill", "full disk")]
-    assert [stopped for stopped in run_stops(stops, healthy, tmp_path) if stopped.fault] == []
+    assert [stopped for stopped in run_stops(stops, healthy, tmp_path) if stopped.failed] == []
 
 
 def test_kills_are_of_every_verb() -> None:

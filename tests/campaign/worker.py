@@ -69,6 +69,9 @@ class Outcome:
     detail: str = ""
     megabytes: float = 0.0
 
+    def __str__(self) -> str:
+        return f"{self.case}: {self.verdict}: {self.detail}"
+
     @property
     def failed(self) -> bool:
         return self.verdict not in ("read", "refused")
