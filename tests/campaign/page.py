@@ -49,9 +49,9 @@ _END = """
 
     python -m tests.campaign
 
-at the top of a checkout repeats all of it and writes this page ({command}). The same seed makes the same
-cases. `pytest tests/campaign` tries 300 of them; a test compares the numbers of this page with each other and with the
-kinds of files. What fails is printed with its kind, mutation and seed.
+at the top of a checkout repeats all of it and writes this page, which is of {command}. The same seed makes the
+same cases. `pytest tests/campaign` tries 300 others; a test compares the numbers of this page with each other and with
+the kinds of files. What fails is printed with its kind, mutation and seed.
 """
 
 
