@@ -283,27 +283,15 @@ def yaml_value_replaced(content: bytes, rng: Rng) -> bytes:
     return yaml.safe_dump(tree).encode("utf-8", "surrogatepass")
 
 
-@_content("types", "yaml")
-def yaml_tags(content: bytes, rng: Rng) -> bytes:
-    tags = (
-        b"!!python/object/apply:os.mkdir [../" + MARKER.encode() + b"]",
-        b"!!python/name:os.system",
-        b"!!binary aGk=",
-    )
-    odd = (
-        b"!!set {a, b}",
-        b"!!timestamp 2001-01-01",
-        b"*unknown",
-        b"&a [*a]",
-        b"{? [a] : b}",
-        b"!!int x",
-        b"0o7",
-        b"1:30",
-    )
-    lines = content.splitlines()
+@_place("types", "yaml")
+def yaml_tags(path: Path, rng: Rng) -> None:
+    made = json.dumps(str(path.parent / MARKER)).encode()
+    tags = (b"!!python/object/apply:os.mkdir [" + made + b"]", b"!!python/name:os.system", b"!!binary aGk=", b"!!int x")
+    odd = (b"!!set {a, b}", b"!!timestamp 2001-01-01", b"*unknown", b"&a [*a]", b"{? [a] : b}", b"0o7", b"1:30")
+    lines = path.read_bytes().splitlines()
     at = _any(rng, [number for number, line in enumerate(lines) if b": " in line and b"{" not in line])
     lines[at] = lines[at].split(b": ")[0] + b": " + _any(rng, (*tags, *odd))
-    return b"\n".join(lines) + b"\n"
+    replace(path, b"\n".join(lines) + b"\n")
 
 
 @_place("types", "pickle")
