@@ -22,7 +22,7 @@ from deepaccident_devkit.tables.index import INDEX_FOLDER
 from deepaccident_devkit.tables.indexing import table_file_states
 from deepaccident_devkit.tables.manifest import SCHEMA_VERSION, Manifest, write_manifest
 from deepaccident_devkit.tables.scan import ScenarioScan, folder_digest
-from deepaccident_devkit.tables.shards import join_tables, write_shard
+from deepaccident_devkit.tables.shards import ShardState, join_tables, write_shard
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, OWN_ACTOR_ID
 
 SCENARIOS, FRAMES, BOXES = 691, 83, 30
@@ -124,7 +124,9 @@ def write_whole_release(root: Path) -> Path:
                 scenario.kind_folder(agent, kind).mkdir(parents=True)
         write_meta(scenario.meta_path, META)
         shard = index / "shards" / f"{number}.arrow"
-        write_shard(shard, {**tables, "scenario": {**tables["scenario"], "name": [name]}}, "")
+        write_shard(
+            shard, {**tables, "scenario": {**tables["scenario"], "name": [name]}}, ShardState(times="", contents="")
+        )
         shards.append(shard)
     folder = index / "tables-scale"
     folder.mkdir()

@@ -17,6 +17,7 @@ from deepaccident_devkit.geometry.se3 import stored_transforms, trusted_se3
 from deepaccident_devkit.release import BevImage, read_bev, read_image, read_lidar
 from deepaccident_devkit.tables import OpenTables, RowArgument, displacement_velocities, visible_ids, visible_mask
 from deepaccident_devkit.tables.opened import token_of
+from deepaccident_devkit.tables.store import damaged_value
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     BEV_CAMERA,
@@ -272,7 +273,10 @@ class Dataset(OpenTables):
     def _annotation_slice(self, sample_row: int) -> slice:
         view = self._tables.views["sample"]
         first, count = view["first_annotation_row"].item(sample_row), view["num_annotations"].item(sample_row)
-        return slice(max(first, 0), max(first, 0) + count)
+        rows = slice(max(first, 0), max(first, 0) + count)
+        if not rows.start <= rows.stop <= len(self._tables.views["annotation"]["sample_row"]):
+            raise damaged_value("sample")
+        return rows
 
     def _lidar_boxes(self, sample_row: int, velocity: VelocitySource, token: str | None = None) -> Boxes:
         view, rows = self._tables.views["annotation"], self._annotation_slice(sample_row)

@@ -110,5 +110,9 @@ class ResultsError(DeepAccidentError, ValueError):
     """A results file, or a bundle of an evaluation, cannot be used as it is."""
 
 
+class WorkerError(DeepAccidentError, RuntimeError):
+    """A worker process was killed."""
+
+
 class MissingExtraError(DeepAccidentError, ImportError):
     """An optional dependency is needed and not installed."""

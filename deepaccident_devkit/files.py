@@ -1,21 +1,40 @@
-"""Files, written so that a reader sees either the old or the whole new one."""
+"""Files, written so that a reader sees either the old or the whole new one.
+
+What is being written has a temporary name in the same folder, `.NAME.HOST-PROCESS-START-NUMBER.tmp`. If the writer is
+killed it stays, and the next process that writes into that folder removes it.
+"""
 
 import hashlib
+import itertools
 import os
+import platform
+import re
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import cache, lru_cache
 from pathlib import Path
+from typing import Final
 
 _BLOCK = 1 << 20
+_TEMPORARY: Final = re.compile(
+    r"\.(?P<name>.+?)\.(?:(?P<host>[0-9a-f]{8})-(?P<process>[1-9]\d{0,9})-(?P<start>\d+)-)?\d+\.tmp(?:\.\w+)?",
+    re.DOTALL,
+)
+"""A temporary name. Earlier versions wrote `.NAME.PROCESS.tmp`; a library may add the suffix that it writes by."""
+_NUMBERS: Final = itertools.count()
+_NAME_LENGTH: Final = 50
+"""Characters of the final name that a temporary name has: names of files end at 255 bytes."""
+_ABANDONED_AFTER: Final = 24 * 3600.0
+"""Seconds after the last change of a temporary file of another host, whose processes cannot be seen from here."""
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path in the same folder; rename it to `path` if the block succeeds, else remove it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = _begun(path)
     try:
         yield temporary
         os.replace(temporary, path)  # noqa: PTH105 - the atomic one on every platform
@@ -29,16 +48,101 @@ def replacing_folder(path: Path) -> Iterator[Path]:
 
     `path` itself must be missing or empty, so that nothing is ever deleted for it.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    temporary = _begun(path)
     try:
+        temporary.mkdir()
         yield temporary
-        temporary.chmod(0o777 & ~_umask())
         if path.is_dir():
             path.rmdir()
         os.replace(temporary, path)  # noqa: PTH105
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def temporary_path(path: Path) -> Path:
+    """A path beside `path` that no other thread, process or host uses."""
+    return path.with_name(f".{path.name[:_NAME_LENGTH]}.{_writer(os.getpid())}-{next(_NUMBERS)}.tmp")
+
+
+def temporary_of(name: str) -> str | None:
+    """The (beginning of the) final name that belongs to a temporary name; None if it is no temporary name."""
+    found = _TEMPORARY.fullmatch(name)
+    return found["name"] if found else None
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove the temporary files and folders of dead writers; what cannot be removed is left to the next time.
+
+    A writer on this host is dead if no process has its number and its start time; one on another host if nothing was
+    changed for a day. A name without a host, as earlier versions gave, may be another program's, and is left.
+    """
+    with suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            with suppress(OSError):  # another process removes it too
+                if not _is_abandoned(entry):
+                    continue
+                if entry.is_dir(follow_symlinks=False):
+                    shutil.rmtree(entry.path, ignore_errors=True)
+                else:
+                    Path(entry.path).unlink()
+
+
+def _begun(path: Path) -> Path:
+    """A temporary path, whose folder is there and rid of leftovers."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _rid_of_leftovers(path.parent)
+    return temporary_path(path)
+
+
+@lru_cache(maxsize=1024)
+def _rid_of_leftovers(folder: Path) -> None:
+    """Remove leftovers once a process: a folder may get 100,000 files."""
+    remove_leftovers(folder)
+
+
+def _is_abandoned(entry: os.DirEntry[str]) -> bool:
+    found = _TEMPORARY.fullmatch(entry.name)
+    if found is None or found["host"] is None:
+        return False
+    if found["host"] != _host():
+        return time.time() - entry.stat(follow_symlinks=False).st_mtime > _ABANDONED_AFTER
+    return not _is_running(int(found["process"]), found["start"])
+
+
+def _is_running(process: int, start: str) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:  # another user's
+        pass
+    return _start(process) in (start, None)
+
+
+@lru_cache(maxsize=1)
+def _writer(process: int) -> str:
+    """What names this process among all: `HOST-PROCESS-START`."""
+    return f"{_host()}-{process}-{_start(process) or 0}"
+
+
+@cache
+def _host() -> str:
+    """Eight digits for the host, or for the container: its processes have numbers of their own."""
+    try:
+        numbering = os.readlink("/proc/self/ns/pid")  # noqa: PTH115 - a name, not a file's path
+    except OSError:
+        numbering = ""
+    return hashlib.blake2b(f"{platform.node()} {numbering}".encode(), digest_size=4).hexdigest()
+
+
+def _start(process: int) -> str | None:
+    """When a process began, in ticks of the system's clock; "" if it has ended, None if the system does not say."""
+    try:
+        status = Path(f"/proc/{process}/stat").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return None
+    state, *facts = status.rpartition(")")[2].split()  # after its name, which may have brackets itself
+    return "" if state in "ZX" else facts[18]  # a killed process whose parent does not ask for it is there still
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -64,9 +168,3 @@ def is_writable_folder(path: Path) -> bool:
             return True
     except OSError:
         return False
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

@@ -41,6 +41,11 @@ same text in the terminal.
 DATAROOT is the folder of a release: your download, a synthetic release, or `deepaccident_demo/release`. The exit status
 is 0 if all is well, 1 if the command found something wrong, and 2 if it could not run.
 
+Ctrl-C and SIGTERM end a command and its workers within two seconds, with exit status 130 and 143, at any moment: no
+file is half-written, and the same command can be run again. While a file is written, it has a hidden name that ends in
+`.tmp`. If a command is killed, such files stay; the next command that writes into their folder removes them, and keeps
+those that others are writing. Files from other hosts are kept for a day.
+
 ## Options of a release
 
 Every command with a DATAROOT and a link to this section has these options:

@@ -44,10 +44,6 @@ def number_and_trace(folder: Path, task: float) -> Sequence[Any]:
     return number(task)
 
 
-def killed(task: float) -> Sequence[Any]:
-    os._exit(9)
-
-
 def labels_as_maps(dataset: DeepAccident, token: str) -> Sequence[Any]:
     """What MotionEvaluator takes: the labels of another moment, and the labels."""
     label = dataset.motion_labels(token).to_present("bilinear")

@@ -63,4 +63,4 @@ def test_stored_columns_do_not_change_without_a_new_schema_version() -> None:
         for field in arrow_schema(spec)
     ]
     digest = hashlib.blake2b(repr(stored).encode(), digest_size=8).hexdigest()
-    assert (SCHEMA_VERSION, digest) == (2, "a56005d98bcb9522")
+    assert (SCHEMA_VERSION, digest) == (3, "a56005d98bcb9522")

@@ -103,6 +103,7 @@ def predict_results(
         ChoiceError: no such task.
         ResultsError: a token comes twice, or the file cannot be written.
         DeepAccidentError: a sample cannot be predicted.
+        WorkerError: a worker was killed.
     """
     task = choice("task", task, get_args(ResultsTask))
     chosen = baseline or Baseline()

@@ -1,6 +1,7 @@
 """The command line: `deepaccident <verb>`, one module for each verb.
 
-A verb parses, makes one library call and prints. Exit status: 0 good, 1 findings, 2 error.
+A verb parses, makes one library call and prints. Exit status: 0 good, 1 findings, 2 error; 130 after Ctrl-C, 143 after
+SIGTERM.
 """
 
 import logging
@@ -12,7 +13,7 @@ from typing import Any
 import click
 
 from deepaccident_devkit.cli.groups import ModuleVerbs
-from deepaccident_devkit.cli.versions import version_text
+from deepaccident_devkit.cli.interruption import run_interruptibly
 from deepaccident_devkit.deprecations import DEPRECATED
 from deepaccident_devkit.errors import DeepAccidentError
 
@@ -51,6 +52,8 @@ _VERBS = (
 def deepaccident(context: click.Context, version: bool, every: bool) -> None:
     """Tools for the DeepAccident V2X accident dataset."""
     if version:
+        from deepaccident_devkit.cli.versions import version_text  # here: it takes longer to import than all the rest
+
         click.echo(version_text(every=every))
         context.exit()
     if every:
@@ -62,7 +65,7 @@ def main() -> None:
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     _show_deprecations()
     try:
-        deepaccident()
+        run_interruptibly(deepaccident)
     except (DeepAccidentError, OSError) as error:  # an OSError: a full disk, a folder without permission
         click.echo(f"error: {error}", err=True)
         sys.exit(_ERROR_STATUS)

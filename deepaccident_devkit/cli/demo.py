@@ -22,7 +22,7 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.files import remove_leftovers, write_bytes
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.render import detached_figure, render_replay
 from deepaccident_devkit.render.evaluation import save_report
@@ -131,6 +131,7 @@ def _claim(out: Path) -> None:
     mark, version = out / _MARK, f"{__version__}\n".encode()
     if mark.is_file() and mark.read_bytes() == version:
         return
+    remove_leftovers(out)  # of a demo that was killed before it had marked the folder
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(
             f"{out}: exists, and was not made by the demo of version {__version__}; name a folder that does not exist "

@@ -10,10 +10,14 @@ from deepaccident_devkit.release import find_release
 from deepaccident_devkit.tables import Tables, clear_index, index_report, open_index
 from deepaccident_devkit.taxonomy import VERSIONS, OnError
 
+_check = click.option(
+    "--check", is_flag=True, help="Compare the content of each label, calib and meta file and of the tables, not times."
+)
+
 
 @click.group(cls=VerbGroup)
 @release_parameters
-@click.option("--check", is_flag=True, help="Compare each label, calib and meta file, not only the folders' times.")
+@_check
 def index(
     dataroot: Path, version: str, index_dir: Path | None, workers: int | None, on_error: OnError, check: bool
 ) -> None:
@@ -35,7 +39,7 @@ def index(
 @click.argument("dataroot", type=click.Path(path_type=Path))
 @click.option("--version", type=WordChoice(VERSIONS), help="Version of the release.  [default: all]")
 @click.option("--index-dir", type=click.Path(path_type=Path), help="Folder to look in, in place of the usual ones.")
-@click.option("--check", is_flag=True, help="Compare each label, calib and meta file, not only the folders' times.")
+@_check
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
 def info(dataroot: Path, version: str | None, index_dir: Path | None, check: bool, as_json: bool) -> None:
     """Print where the indexes of DATAROOT are, what they hold, and whether they are up to date. Nothing is changed."""

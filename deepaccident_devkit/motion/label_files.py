@@ -85,6 +85,7 @@ def write_label_files(
         TokenError: no such sample.
         ChoiceError: no sample at all, or no such agent or configuration of agents.
         NotAvailableError: a sample has no label, or an agent whose sight counts is not in this (partial) release.
+        WorkerError: a worker was killed.
     """
     root, chosen = folder_path(folder), label_config(config)
     wanted = _by_recording(dataset, tokens)

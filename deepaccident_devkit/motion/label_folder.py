@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from deepaccident_devkit.errors import ConfigError, DeepAccidentError, LabelFilesError
-from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.files import temporary_of, write_bytes
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.taxonomy import AGENTS
 
@@ -24,7 +24,7 @@ FORMAT_VERSION: Final = 1
 """Increased when the files' contents change, or the labels of the same configuration and release."""
 MANIFEST: Final = "manifest.json"
 _LOCK: Final = ".lock"
-_HALF_WRITTEN: Final = re.compile(rf"\.({re.escape(MANIFEST)}|({'|'.join(AGENTS)})\.npz)\.\d+\.tmp")
+_WRITTEN: Final = (MANIFEST, *(f"{agent}.npz" for agent in AGENTS))
 _RECORDING: Final = re.compile(rf"(?!\.)[^/\\\0]+/(?!\.)[^/\\\0]+/({'|'.join(AGENTS)})")
 
 
@@ -115,10 +115,8 @@ def writing_to(root: Path) -> Iterator[None]:
     The system releases the lock when the process ends, even if it is killed.
 
     Raises:
-        LabelFilesError: the folder cannot be made, locked or written to, or a worker was killed.
+        LabelFilesError: the folder cannot be made, locked or written to.
     """
-    from concurrent.futures import BrokenExecutor
-
     from filelock import FileLock
 
     lock = FileLock(root / _LOCK)
@@ -135,9 +133,6 @@ def writing_to(root: Path) -> Iterator[None]:
     except OSError as error:
         remedy = "make room there, or choose another folder, and run it again"
         raise LabelFilesError(f"{root}: labels cannot be written ({error}); {remedy}") from error
-    except BrokenExecutor as error:
-        remedy = "if memory ran out, give fewer workers, and run it again"
-        raise LabelFilesError(f"{root}: a process that wrote labels was killed ({error}); {remedy}") from error
     finally:
         _remove_half_written(root)
         lock.release()
@@ -166,16 +161,19 @@ def _acquire(lock: Any, root: Path) -> None:
 
 
 def _remove_half_written(root: Path) -> None:
-    """Remove the temporary files of stopped processes; what cannot be removed stays until the next call."""
+    """Remove the temporary files of stopped processes; what cannot be removed stays until the next call.
+
+    The lock is held, so that no living process has one, on whatever host.
+    """
     with suppress(OSError):
         for path in [*root.glob(".*.tmp"), *root.glob("*/*/.*.tmp")]:
-            if _HALF_WRITTEN.fullmatch(path.name):
+            if temporary_of(path.name) in _WRITTEN:
                 path.unlink(missing_ok=True)
 
 
 def _is_own(name: str) -> bool:
     """Whether a call that was killed before it wrote a manifest may have left a file of this name."""
-    return name == _LOCK or _HALF_WRITTEN.fullmatch(name) is not None
+    return name == _LOCK or temporary_of(name) in _WRITTEN
 
 
 def _check_version(path: Path, form: object, version: object) -> None:

@@ -14,7 +14,7 @@ from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.geometry import SE3, handedness
 from deepaccident_devkit.geometry.se3 import RIGID_TOLERANCE, rigid_fault
 from deepaccident_devkit.release._content import read_content
-from deepaccident_devkit.release._unpickle import UNPICKLE_FAULTS, load_arrays
+from deepaccident_devkit.release._unpickle import load_arrays
 from deepaccident_devkit.taxonomy import CAMERAS
 
 _EGO_KEYS = ("lidar_to_ego", "ego_to_world")
@@ -146,8 +146,8 @@ def read_unchecked_calib(path: Path) -> dict[str, AnyArray]:
     content = read_content(path, "calib", CalibError, _REMEDY)
     try:
         loaded = load_arrays(content)
-    except UNPICKLE_FAULTS as error:
-        detail = (str(error) or type(error).__name__) if content else "the file is empty"
+    except pickle.UnpicklingError as error:
+        detail = str(error) if content else "the file is empty"
         raise CalibError(f"{path}: not a readable calibration ({detail}); {_REMEDY}") from error
     return _checked_raw(path, loaded)
 

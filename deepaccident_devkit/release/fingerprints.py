@@ -9,12 +9,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Protocol
 
+from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.parallel import run_batch
+from deepaccident_devkit.reading import FileKind
+from deepaccident_devkit.release._content import read_content
 from deepaccident_devkit.release.layout import ScenarioFolder, find_release, frame_numbers
 from deepaccident_devkit.taxonomy import AGENTS
 
 _DIGEST_BYTES: Final = 16
-_ENDINGS: Final = {"label": "txt", "calib": "pkl"}
+_ENDINGS: Final[Mapping[FileKind, str]] = {"label": "txt", "calib": "pkl"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,6 +67,7 @@ def scenario_hashes(
 
     Raises:
         DatarootError: the release's folder is gone, or one of its folders cannot be listed.
+        ReleaseError: a file cannot be read.
     """
     folders = {each.token: each for each in reversed(find_release(dataset.dataroot, dataset.version).scenarios)}
     here = [token for token in sorted(set(scenarios)) if token in folders]
@@ -85,12 +89,12 @@ def digest_of(value: Any) -> str:
 def _hashes(scenario: ScenarioFolder) -> ScenarioHashes:
     meta = [scenario.meta_path] if scenario.meta_path.is_file() else []
     return ScenarioHashes(
-        meta=_digest(meta, scenario.meta_path.parent),
-        **{kind: _digest(_files(scenario, kind), _base(scenario)) for kind in _ENDINGS},
+        meta=_digest(meta, "meta", scenario.meta_path.parent),
+        **{kind: _digest(_files(scenario, kind), kind, _base(scenario)) for kind in _ENDINGS},
     )
 
 
-def _files(scenario: ScenarioFolder, kind: str) -> list[Path]:
+def _files(scenario: ScenarioFolder, kind: FileKind) -> list[Path]:
     ending = _ENDINGS[kind]
     return [
         scenario.file(agent, kind, frame, ending)
@@ -103,12 +107,12 @@ def _base(scenario: ScenarioFolder) -> Path:
     return scenario.root / scenario.folder / scenario.scenario_type
 
 
-def _digest(paths: Collection[Path], base: Path) -> str | None:
+def _digest(paths: Collection[Path], kind: FileKind, base: Path) -> str | None:
     if not paths:
         return None
     digest = hashlib.blake2b(digest_size=_DIGEST_BYTES)
     for path in paths:
-        content = path.read_bytes()
+        content = read_content(path, kind, ReleaseError, "restore the file from its archive")
         digest.update(f"{path.relative_to(base).as_posix()} {len(content)}\n".encode())
         digest.update(content)
     return digest.hexdigest()

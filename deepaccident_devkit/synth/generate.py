@@ -39,6 +39,7 @@ def make_release(
         ConfigError: `out` is a file, is not empty or cannot be made; an unfinished release of another
             configuration is there; the scenario file cannot be read or simulated.
         MissingExtraError: sensors are wanted and the package embreex is not installed.
+        WorkerError: a worker was killed.
     """
     wanted = config or SynthConfig()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):

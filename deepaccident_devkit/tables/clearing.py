@@ -7,14 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from deepaccident_devkit.errors import IndexStoreError, VersionError
+from deepaccident_devkit.files import temporary_of
 from deepaccident_devkit.tables.index import index_folders
-from deepaccident_devkit.tables.indexing import (
-    MARK_FILE,
-    SHARDS_FOLDER,
-    TABLES_PREFIX,
-)
+from deepaccident_devkit.tables.indexing import MARK_FILE, SHARDS_FOLDER
 from deepaccident_devkit.tables.locking import LOCK_FILE, index_lock
-from deepaccident_devkit.tables.manifest import MANIFEST_FILE, SCHEMA_VERSION, stored_schema_version
+from deepaccident_devkit.tables.manifest import MANIFEST_FILE, SCHEMA_VERSION, TABLES_PREFIX, stored_schema_version
 from deepaccident_devkit.taxonomy import VERSIONS
 from deepaccident_devkit.text import choice
 
@@ -119,9 +116,7 @@ def _is_own(path: Path) -> bool:
         return False
     if path.is_dir():
         return name == SHARDS_FOLDER or name.startswith((TABLES_PREFIX, f".{TABLES_PREFIX}"))
-    return name in (MANIFEST_FILE, MARK_FILE, LOCK_FILE) or (
-        name.startswith(f".{MANIFEST_FILE}.") and name.endswith(".tmp")
-    )
+    return name in (MANIFEST_FILE, MARK_FILE, LOCK_FILE) or temporary_of(name) == MANIFEST_FILE
 
 
 def _remove(folder: Path) -> Cleared:

@@ -8,9 +8,9 @@
       .unfinished          there while it is made; the next process finishes the work of a stopped one
 
 Opening compares the times of folders, meta and split files and the sizes of the tables with the manifest; making it
-compares every label and calib file, reads only the scenarios that changed, and compares the checksums of shards and
-tables. Everything is written under a temporary name and renamed, the manifest last, so that a reader sees the old index
-or the new one.
+compares the times of every label and calib file (with `check_files` their contents), reads only the scenarios that
+changed, and compares the checksums of shards and tables. Everything is written under a temporary name and renamed, the
+manifest last, so that a reader sees the old index or the new one.
 """
 
 import hashlib
@@ -25,8 +25,9 @@ from typing import get_args
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import BrokenReleaseError, DatarootError, IndexStoreError
 from deepaccident_devkit.files import is_writable_folder
+from deepaccident_devkit.reading import RefusedFileError, fault_text, limit_of
 from deepaccident_devkit.release import ReleaseLayout
-from deepaccident_devkit.tables.indexing import is_unfinished, make_index, scenario_state
+from deepaccident_devkit.tables.indexing import is_unfinished, make_index
 from deepaccident_devkit.tables.locking import index_lock
 from deepaccident_devkit.tables.manifest import (
     MANIFEST_FILE,
@@ -36,7 +37,7 @@ from deepaccident_devkit.tables.manifest import (
     read_manifest,
     stored_schema_version,
 )
-from deepaccident_devkit.tables.scan import folder_digest
+from deepaccident_devkit.tables.scan import contents_digest, folder_digest
 from deepaccident_devkit.taxonomy import OnError
 from deepaccident_devkit.text import choice
 
@@ -81,14 +82,17 @@ def open_index(
         workers: processes to read with; see `parallel.run_batch`.
         on_error: `raise` lists every broken scenario and raises; `skip` leaves them out and logs them.
         progress: whether to show a progress bar.
-        check_files: compare every label, calib and meta file with the index, not only the folders' times.
+        check_files: compare the content of every label, calib and meta file, and of every file of the index, with
+            the checksums of the indexing; else only times and sizes are compared (schema/README.md).
 
     Raises:
         BrokenReleaseError: some scenarios are broken and `on_error` is `raise`, or all of them are.
         DatarootError: no scenario has any file.
-        IndexStoreError: the index cannot be written, or is a newer devkit's.
+        IndexStoreError: the index cannot be written, or is a newer devkit's; or the limits of files' sizes that the
+            environment gives cannot be understood.
     """
     on_error = choice("on_error", on_error, get_args(OnError))
+    _refuse_wrong_limits()
     index = None if check_files else _current_index(layout, index_dir)
     make = partial(_found_or_made, layout, index_dir, check_files=check_files, workers=workers, progress=progress)
     if index is None:
@@ -99,6 +103,14 @@ def open_index(
         index = _finished(index, make)
     _accept(layout, index, on_error)
     return index
+
+
+def _refuse_wrong_limits() -> None:
+    """Raise IndexStoreError before every file counts as broken, and a good index is made again of what is left."""
+    try:
+        limit_of("index")
+    except RefusedFileError as error:
+        raise IndexStoreError(fault_text(error)) from None
 
 
 def find_indexes(layout: ReleaseLayout, index_dir: Path | None = None) -> Iterator[Index]:
@@ -142,7 +154,7 @@ def _found_or_made(
         return index
     _refuse_newer(folder)
     fingerprint = folder_digest(layout.scenarios, layout.split_files.values())
-    manifest = make_index(layout, folder, fingerprint, workers=workers, progress=progress)
+    manifest = make_index(layout, folder, fingerprint, check_files=check_files, workers=workers, progress=progress)
     return Index(folder=folder, manifest=manifest)
 
 
@@ -180,13 +192,14 @@ def _writable_folder(layout: ReleaseLayout, index_dir: Path | None) -> Path:
 def is_current(layout: ReleaseLayout, index: Index, fingerprint: str) -> bool:
     """Whether nothing was added or removed, and no broken scenario was changed.
 
-    Broken scenarios are looked at file by file: a file mended in place leaves its folder's time alone.
+    Broken scenarios are read: a file mended in place leaves its folder's time alone, and one that is restored from an
+    archive may have the damaged one's size and time.
     """
     if index.manifest.fingerprint != fingerprint or not _is_whole(index):
         return False
-    broken = {problem.scenario: problem.digest for problem in index.manifest.problems if problem.digest}
+    broken = {problem.scenario: problem.contents for problem in index.manifest.problems if problem.contents}
     return all(
-        scenario_state(scenario) == broken[scenario.token] for scenario in layout.scenarios if scenario.token in broken
+        contents_digest(scenario) == broken[scenario.token] for scenario in layout.scenarios if scenario.token in broken
     )
 
 

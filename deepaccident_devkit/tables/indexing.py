@@ -1,9 +1,9 @@
 """Making an index: read the scenarios that changed, join all of them, put the result in place."""
 
 import hashlib
+import os
 import shutil
 from collections.abc import Iterator, Sequence
-from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -12,23 +12,30 @@ from pathlib import Path
 from deepaccident_devkit.errors import DeepAccidentError, IndexStoreError
 from deepaccident_devkit.files import file_checksum, replacing_folder
 from deepaccident_devkit.parallel import run_batch
+from deepaccident_devkit.reading import observed
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, read_meta
-from deepaccident_devkit.tables.build import read_scenario, scenario_rows
+from deepaccident_devkit.tables.build import ScenarioFiles, read_scenario, scenario_rows
 from deepaccident_devkit.tables.findings import Finding
 from deepaccident_devkit.tables.manifest import (
     SCHEMA_VERSION,
+    TABLES_PREFIX,
     Manifest,
     Problem,
     read_manifest,
     stored_tables,
     write_manifest,
 )
-from deepaccident_devkit.tables.scan import ScenarioScan, scan_scenario, scenario_digest
-from deepaccident_devkit.tables.shards import join_tables, shard_digest, shard_path, write_shard
+from deepaccident_devkit.tables.scan import (
+    ScenarioScan,
+    content_words,
+    contents_digest,
+    scan_scenario,
+    times_digest,
+)
+from deepaccident_devkit.tables.shards import ShardState, join_tables, shard_path, shard_state, write_shard
 from deepaccident_devkit.tables.split_assignment import SplitAssignment, assign_splits
 
 SHARDS_FOLDER = "shards"
-TABLES_PREFIX = "tables-"
 MARK_FILE = ".unfinished"
 """There while an index is made; if no process makes it, one was stopped."""
 
@@ -39,36 +46,46 @@ class Outcome:
 
     Attributes:
         token: the scenario's.
-        digest: of its files.
+        contents: digest of its files.
         indexed: whether its shard is there.
         messages: what is wrong with it, a sentence each; then it has no shard.
         notices: what was left aside.
     """
 
     token: str
-    digest: str
+    contents: str
     indexed: bool
     messages: tuple[str, ...] = ()
     notices: tuple[str, ...] = ()
 
 
 def make_index(
-    layout: ReleaseLayout, folder: Path, fingerprint: str, *, workers: int | None = None, progress: bool = False
+    layout: ReleaseLayout,
+    folder: Path,
+    fingerprint: str,
+    *,
+    check_files: bool = False,
+    workers: int | None = None,
+    progress: bool = False,
 ) -> Manifest:
     """Bring the index in `folder` up to date with the release and return its manifest.
 
+    Files of the size and time that they had are taken for the same, unless `check_files` has their contents compared.
     Broken scenarios do not stop it: they are listed in the manifest. Damaged shards and tables are made again. The
     caller holds the folder's lock.
 
     Raises:
-        IndexStoreError: something cannot be written; the index that was there stays as it was.
+        IndexStoreError: something cannot be written; the index that was there stays as it was. Or shards lie behind
+            a link.
         SplitFileError: a split file cannot be read.
+        WorkerError: a worker was killed.
     """
     splits = assign_splits(layout)
     candidates = [scenario for scenario in layout.scenarios if scenario.token not in splits.problems]
+    _refuse_links(folder / SHARDS_FOLDER)
     with _store_errors(folder), _marked_unfinished(folder):
         outcomes = run_batch(
-            partial(index_scenario, folder / SHARDS_FOLDER),
+            partial(index_scenario, folder / SHARDS_FOLDER, check_files=check_files),
             candidates,
             workers=workers,
             label="indexing scenarios",
@@ -93,23 +110,37 @@ def is_unfinished(folder: Path) -> bool:
     return (folder / MARK_FILE).exists()
 
 
-def index_scenario(shards: Path, scenario: ScenarioFolder) -> Outcome:
+def index_scenario(shards: Path, scenario: ScenarioFolder, *, check_files: bool = False) -> Outcome:
     """Write the shard of one scenario, unless it is there and its files are as they were."""
-    digest = scenario_state(scenario)
+    times = f"{SCHEMA_VERSION}:{times_digest(scenario)}"  # before anything is read: a later edit is noticed
     path = shard_path(shards, scenario.token)
     scan = scan_scenario(scenario)
     if scan.problems:
-        return _broken(scenario, digest, scan, scan.problems)
+        return _broken(scenario, contents_digest(scenario), scan, scan.problems)
     if not scan.agents:
         notice = f"{scenario.token}: its calib folders hold no files; left out"
-        return Outcome(token=scenario.token, digest=digest, indexed=False, notices=(*scan.notices, notice))
-    if shard_digest(path) != digest:
-        files, faults = read_scenario(scenario, scan)
+        return Outcome(token=scenario.token, contents="", indexed=False, notices=(*scan.notices, notice))
+    state = shard_state(path)
+    if state is None or state.times != times or (check_files and state.contents != contents_digest(scenario)):
+        files, faults, contents = _read(scenario, scan)
         if files is None:
-            return _broken(scenario, digest, scan, faults)
-        write_shard(path, scenario_rows(files), digest)
+            return _broken(scenario, contents, scan, faults)
+        state = ShardState(times=times, contents=contents)
+        write_shard(path, scenario_rows(files), state)
     notices = (*scan.notices, *_end_notices(scenario, scan))
-    return Outcome(token=scenario.token, digest=digest, indexed=True, notices=notices)
+    return Outcome(token=scenario.token, contents=state.contents, indexed=True, notices=notices)
+
+
+def _read(scenario: ScenarioFolder, scan: ScenarioScan) -> tuple[ScenarioFiles | None, list[Finding], str]:
+    """What `read_scenario` returns, and the digest of the contents that it was made from."""
+    words: dict[str, bytes] = {}
+
+    def note(path: Path, content: bytes) -> None:
+        words[os.fspath(path)] = content_words(content)
+
+    with observed(note):
+        files, faults = read_scenario(scenario, scan)
+    return files, faults, contents_digest(scenario, words)
 
 
 def _end_notices(scenario: ScenarioFolder, scan: ScenarioScan) -> Iterator[str]:
@@ -122,46 +153,41 @@ def _end_notices(scenario: ScenarioFolder, scan: ScenarioScan) -> Iterator[str]:
         )
 
 
-def _broken(scenario: ScenarioFolder, digest: str, scan: ScenarioScan, faults: Sequence[Finding]) -> Outcome:
+def _broken(scenario: ScenarioFolder, contents: str, scan: ScenarioScan, faults: Sequence[Finding]) -> Outcome:
     messages = tuple(str(fault) for fault in faults)
-    return Outcome(token=scenario.token, digest=digest, indexed=False, messages=messages, notices=scan.notices)
-
-
-def scenario_state(scenario: ScenarioFolder) -> str:
-    """The digest that an `Outcome` of this scenario would have now."""
-    return f"{SCHEMA_VERSION}:{scenario_digest(scenario)}"
+    return Outcome(token=scenario.token, contents=contents, indexed=False, messages=messages, notices=scan.notices)
 
 
 def edited_scenarios(layout: ReleaseLayout, folder: Path, manifest: Manifest) -> tuple[list[str], bool]:
-    """Compare every label, calib and meta file with the index in `folder`; changes nothing.
+    """Compare the content of every label, calib and meta file with the index in `folder`; changes nothing.
 
     Returns:
         The tokens of the scenarios whose files are not those the index was made from, or whose shard is damaged; and
-        whether the tables are made from what the other scenarios' shards hold.
+        whether the tables are whole, and made from what the other scenarios' shards hold.
 
     Raises:
         SplitFileError: a split file cannot be read.
     """
     splits = assign_splits(layout)
-    broken = {problem.scenario: problem.digest for problem in manifest.problems}
+    broken = {problem.scenario: problem.contents for problem in manifest.problems}
+    candidates = [scenario for scenario in layout.scenarios if scenario.token not in splits.problems]
     same, edited = [], []
-    for scenario in layout.scenarios:
+    for scenario, contents in zip(candidates, run_batch(contents_digest, candidates), strict=True):
         token = scenario.token
-        if token in splits.problems:
-            continue
-        state = scenario_state(scenario)
-        kept = broken[token] if token in broken else shard_digest(shard_path(folder / SHARDS_FOLDER, token))
-        if kept == state:
-            same.append(Outcome(token=token, digest=state, indexed=token not in broken))
+        state = None if token in broken else shard_state(shard_path(folder / SHARDS_FOLDER, token))
+        kept = state.contents if state else broken.get(token)
+        if kept == contents:
+            same.append(Outcome(token=token, contents=contents, indexed=token not in broken))
         elif kept is not None or scan_scenario(scenario).agents:  # without agents it has no shard
             edited.append(token)
     name = _tables_name([outcome for outcome in same if outcome.indexed], splits)
-    return edited, bool(edited) or name == manifest.tables
+    made_from_these = bool(edited) or name == manifest.tables
+    return edited, made_from_these and table_file_states(folder / manifest.tables) == manifest.table_files
 
 
 def _problems(outcomes: Sequence[Outcome], splits: SplitAssignment) -> tuple[Problem, ...]:
     broken = [
-        Problem(scenario=outcome.token, messages=outcome.messages, digest=outcome.digest)
+        Problem(scenario=outcome.token, messages=outcome.messages, contents=outcome.contents)
         for outcome in outcomes
         if outcome.messages
     ]
@@ -193,14 +219,22 @@ def _write_tables(
 
 def _tables_name(outcomes: Sequence[Outcome], splits: SplitAssignment) -> str:
     """The name of the folder of tables made from these scenarios; empty if there are none."""
-    made_from = [(outcome.token, outcome.digest, splits.split_of.get(outcome.token)) for outcome in outcomes]
-    return TABLES_PREFIX + hashlib.blake2b(repr(made_from).encode(), digest_size=8).hexdigest() if made_from else ""
+    made_from = [(outcome.token, outcome.contents, splits.split_of.get(outcome.token)) for outcome in outcomes]
+    text = repr((SCHEMA_VERSION, made_from))
+    return TABLES_PREFIX + hashlib.blake2b(text.encode(), digest_size=8).hexdigest() if made_from else ""
 
 
 def table_file_states(folder: Path) -> dict[str, tuple[int, str]]:
     """Size and checksum of each file of a folder of tables, by name; nothing if there is no such folder."""
     paths = sorted(path for path in folder.glob("*.arrow") if path.is_file())
     return {path.name: (path.stat().st_size, file_checksum(path)) for path in paths}
+
+
+def _refuse_links(shards: Path) -> None:
+    """Raise IndexStoreError if a link leads out of the folder of shards, where files are written and removed."""
+    for path in (shards, *shards.glob("*")):
+        if path.is_symlink():
+            raise IndexStoreError(f"{path}: a symbolic link, which no devkit makes; remove it")
 
 
 def _remove_stale_shards(folder: Path, indexed: set[str]) -> None:
@@ -245,7 +279,7 @@ def _marked_unfinished(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def _store_errors(folder: Path) -> Iterator[None]:
-    """Turn errors of files and workers into errors that name the folder and the remedy."""
+    """Turn errors of files into errors that name the folder and the remedy."""
     import pyarrow as pa
 
     try:
@@ -255,6 +289,3 @@ def _store_errors(folder: Path) -> Iterator[None]:
     except (OSError, pa.ArrowException) as error:
         remedy = "make room there or give another index_dir="
         raise IndexStoreError(f"{folder}: the index cannot be written ({error}); {remedy}") from error
-    except BrokenExecutor as error:
-        remedy = "if memory ran out, give fewer workers="
-        raise IndexStoreError(f"{folder}: a process that made the index was killed ({error}); {remedy}") from error

@@ -28,10 +28,12 @@ def index_lock(folder: Path, *, wait: bool = True) -> Iterator[bool]:
         Whether it is held; always so after waiting.
 
     Raises:
-        IndexStoreError: there can be no lock in this folder.
+        IndexStoreError: there can be no lock in this folder, or its lock is a link.
     """
     from filelock import FileLock, Timeout
 
+    if (folder / LOCK_FILE).is_symlink():  # it would be emptied
+        raise IndexStoreError(f"{folder / LOCK_FILE}: a symbolic link, which no devkit makes; remove it")
     lock = FileLock(folder / LOCK_FILE)
     try:
         _acquire(lock, folder, wait=wait)

@@ -1,16 +1,28 @@
 """The manifest of an index: what it was made from, and what is broken."""
 
+import hashlib
 import json
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.reading import read_bytes
+from deepaccident_devkit.tables.specs import table_specs
+from deepaccident_devkit.tables.store import table_path
 
-SCHEMA_VERSION = 2
-"""Counts up whenever the stored columns or their meaning change."""
+SCHEMA_VERSION = 3
+"""Counts up whenever the stored columns, their meaning or the form of the index change."""
 MANIFEST_FILE = "manifest.json"
+TABLES_PREFIX = "tables-"
+"""How the name of the tables' folder begins."""
+_TABLES_FOLDER = re.compile(rf"{TABLES_PREFIX}\w+", re.ASCII)
+_CHECKSUM = "checksum"
+_LONGEST_TEXT = 20_000
+"""Of a message or a name; a path has at most 4,096 bytes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -20,12 +32,12 @@ class Problem(ShortRepr):
     Attributes:
         scenario: its token.
         messages: a sentence each, naming file, line and remedy.
-        digest: of its files as they were when this was found; empty if they are not the cause.
+        contents: digest of its files as they were when this was found; empty if they are not the cause.
     """
 
     scenario: str
     messages: tuple[str, ...]
-    digest: str = ""
+    contents: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,34 +83,53 @@ def stored_tables(folder: Path) -> str:
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write the manifest: from then on the tables that it names are the index."""
-    write_bytes(folder / MANIFEST_FILE, json.dumps(asdict(manifest), indent=1).encode())
+    content = asdict(manifest)
+    content[_CHECKSUM] = _checksum(content)
+    write_bytes(folder / MANIFEST_FILE, json.dumps(content, indent=1).encode())
 
 
 def _content(folder: Path) -> Mapping[str, object]:
     """The manifest's JSON object, empty if there is none."""
     try:
-        content = json.loads((folder / MANIFEST_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        content = json.loads(read_bytes(folder / MANIFEST_FILE, "index"))
+    except (OSError, ValueError, RecursionError, MemoryError):
         return {}
     return content if isinstance(content, dict) else {}
 
 
-def _parsed(content: Mapping[str, object]) -> Manifest:
-    problems = content["problems"]
-    notices = content["notices"]
-    table_files = content["table_files"]
-    if not isinstance(problems, list) or not isinstance(notices, list) or not isinstance(table_files, dict):
-        raise TypeError("not a manifest")
-    if content["tables"] and not table_files:
-        raise ValueError("tables without files")
+def _checksum(content: Mapping[str, object]) -> str:
+    """A checksum of all that a manifest says but its checksum."""
+    rest = {name: value for name, value in content.items() if name != _CHECKSUM}
+    return hashlib.blake2b(json.dumps(rest, sort_keys=True).encode(), digest_size=16).hexdigest()
+
+
+def _parsed(content: Mapping[str, Any]) -> Manifest:
+    if content[_CHECKSUM] != _checksum(content):
+        raise ValueError("damaged")
+    tables, table_files = _text(content["tables"]), content["table_files"]
+    names = {table_path(Path(), table).name for table in table_specs()} if tables else set()
+    if set(table_files) != names or (tables and not _TABLES_FOLDER.fullmatch(tables)):
+        raise ValueError("not the tables of an index")
     return Manifest(
         schema_version=SCHEMA_VERSION,
-        fingerprint=str(content["fingerprint"]),
-        tables=str(content["tables"]),
-        table_files={str(name): (int(size), str(checksum)) for name, (size, checksum) in table_files.items()},
+        fingerprint=_text(content["fingerprint"]),
+        tables=tables,
+        table_files={name: (int(size), _text(checksum)) for name, (size, checksum) in table_files.items()},
         problems=tuple(
-            Problem(scenario=entry["scenario"], messages=tuple(entry["messages"]), digest=entry["digest"])
-            for entry in problems
+            Problem(
+                scenario=_text(entry["scenario"]), messages=_texts(entry["messages"]), contents=_text(entry["contents"])
+            )
+            for entry in content["problems"]
         ),
-        notices=tuple(map(str, notices)),
+        notices=_texts(content["notices"]),
     )
+
+
+def _texts(values: Iterable[object]) -> tuple[str, ...]:
+    return tuple(map(_text, values))
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, str) or len(value) > _LONGEST_TEXT:
+        raise TypeError("expected a text")
+    return value

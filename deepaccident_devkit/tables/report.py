@@ -11,8 +11,14 @@ from deepaccident_devkit.errors import DatarootError, IndexStoreError, VersionEr
 from deepaccident_devkit.release import ReleaseLayout, find_release
 from deepaccident_devkit.tables.clearing import holds_index, megabytes, sizes_in
 from deepaccident_devkit.tables.index import Index, index_folders, is_current
-from deepaccident_devkit.tables.indexing import SHARDS_FOLDER, TABLES_PREFIX, edited_scenarios, is_unfinished
-from deepaccident_devkit.tables.manifest import MANIFEST_FILE, SCHEMA_VERSION, read_manifest, stored_schema_version
+from deepaccident_devkit.tables.indexing import SHARDS_FOLDER, edited_scenarios, is_unfinished
+from deepaccident_devkit.tables.manifest import (
+    MANIFEST_FILE,
+    SCHEMA_VERSION,
+    TABLES_PREFIX,
+    read_manifest,
+    stored_schema_version,
+)
 from deepaccident_devkit.tables.scan import folder_digest
 from deepaccident_devkit.tables.specs import table_specs
 from deepaccident_devkit.tables.store import StoredTable
@@ -121,7 +127,7 @@ def index_report(
         dataroot: the release's folder.
         version: whose indexes; None looks for every version's.
         index_dir: the only place to look in, where given.
-        check_files: compare every label, calib and meta file with the index.
+        check_files: compare the content of every label, calib and meta file, and of the tables, with the index.
 
     Raises:
         DatarootError: the folder is missing, or holds neither a release nor an index.

@@ -11,6 +11,7 @@ import numpy as np
 
 from deepaccident_devkit.errors import TokenError
 from deepaccident_devkit.tables import tokens
+from deepaccident_devkit.tables.store import damaged_value
 from deepaccident_devkit.tables.tokens import Parts, parse_number, unknown_token
 from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, CHANNEL_FORMAT, CHANNELS
 from deepaccident_devkit.text import meant_text
@@ -67,8 +68,11 @@ class Resolver:
         }
 
     def row(self, table: str, token: str) -> int:
-        """The row of a token; raises TokenError."""
-        return self._row_finders[table](token)
+        """The row of a token; raises TokenError, and IndexStoreError if the index is damaged."""
+        try:
+            return self._row_finders[table](token)
+        except IndexError as error:
+            raise damaged_value(table) from error
 
     def token(self, table: str, row: int) -> str:
         """The token of a row."""

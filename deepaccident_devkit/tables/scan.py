@@ -1,12 +1,14 @@
-"""What file names say of a scenario: its frames, missing files, and a digest that changes with any file."""
+"""What file names say of a scenario: its frames, missing files, and digests that change with any file."""
 
 import hashlib
 import os
-from collections.abc import Iterable, Sequence
+import zlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from deepaccident_devkit.errors import ReleaseError
+from deepaccident_devkit.reading import FileKind, fault_text, read_bytes
 from deepaccident_devkit.release import ScenarioFolder
 from deepaccident_devkit.release.layout import frame_numbers
 from deepaccident_devkit.tables.findings import Finding, finding_of
@@ -110,19 +112,48 @@ def folder_digest(scenarios: Iterable[ScenarioFolder], files: Iterable[Path]) ->
     return digest.hexdigest()
 
 
-def scenario_digest(scenario: ScenarioFolder) -> str:
-    """A digest of name, size and time of every label, calib and meta file of a scenario."""
-    digest = hashlib.blake2b(os.fsencode(scenario.token), digest_size=16)
+def times_digest(scenario: ScenarioFolder) -> str:
+    """A digest of name, size and time of every label, calib and meta file of a scenario; opens none of them."""
+    return _digest(scenario, lambda path, _kind: _stat_words(path))
+
+
+def contents_digest(scenario: ScenarioFolder, known: Mapping[str, bytes] | None = None) -> str:
+    """A digest of name and content of every label, calib and meta file of a scenario.
+
+    Args:
+        scenario: where they lie.
+        known: path → `content_words` of files that were read already; the others are read now.
+    """
+    found = known or {}
+    return _digest(scenario, lambda path, kind: found.get(path) or _words_of_file(path, kind))
+
+
+def content_words(content: bytes) -> bytes:
+    """What a file's content adds to `contents_digest`; a CRC, as it tells damage at a tenth of a hash's time."""
+    return f" {len(content)} {zlib.crc32(content):08x}\n".encode()
+
+
+def _digest(scenario: ScenarioFolder, words_of: Callable[[str, FileKind], bytes]) -> str:
+    """A digest of where a scenario lies, and of each small file's name and what `words_of` its path and kind gives."""
+    digest = hashlib.blake2b(os.fsencode(f"{scenario.folder}/{scenario.token}"), digest_size=16)
+    kinds: tuple[FileKind, ...] = ("calib", "label")
     for agent in AGENTS:
-        for kind in ("calib", "label"):
-            folder = scenario.kind_folder(agent, kind)
+        for kind in kinds:
+            folder = os.fspath(scenario.kind_folder(agent, kind))
             for name in _names(folder):
-                digest.update(os.fsencode(f"{agent}/{kind}/{name}") + _stat_words(f"{folder}/{name}"))
-    digest.update(_stat_words(os.fspath(scenario.meta_path)))
+                digest.update(os.fsencode(f"{agent}/{kind}/{name}") + words_of(f"{folder}{os.sep}{name}", kind))
+    digest.update(words_of(os.fspath(scenario.meta_path), "meta"))
     return digest.hexdigest()
 
 
-def _names(folder: Path) -> list[str]:
+def _words_of_file(path: str, kind: FileKind) -> bytes:
+    try:
+        return content_words(read_bytes(Path(path), kind))
+    except OSError as error:
+        return f" {fault_text(error)}\n".encode()
+
+
+def _names(folder: str) -> list[str]:
     try:
         return sorted(os.listdir(folder))  # noqa: PTH208 - names alone
     except OSError:

@@ -6,16 +6,18 @@ A shard is a compressed Arrow stream a table, one after the other, and at its en
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray
+from deepaccident_devkit.errors import IndexStoreError
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.geometry import quaternions
-from deepaccident_devkit.tables.arrow import Columns, arrow_schema, record_batch, unpacked, views
+from deepaccident_devkit.reading import read_bytes
+from deepaccident_devkit.tables.arrow import Columns, arrow_schema, fault_of, record_batch, unpacked, views
 from deepaccident_devkit.tables.columns import NULL_INTEGER, Key, TableSpec
 from deepaccident_devkit.tables.sensor_rows import sensor_rows
 from deepaccident_devkit.tables.specs import table_specs
@@ -28,8 +30,20 @@ _FROM_OTHERS: Mapping[str, Mapping[str, Callable[[Columns], AnyArray]]] = {
     "annotation": {"rotation": lambda rows: quaternions.from_yaw(rows["yaw"])}
 }
 """Table → column that a shard does without, since it follows from others: a twentieth of the index."""
-_DIGEST = b"digest"
 _CHECKSUM_SIZE = 16
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShardState:
+    """What a shard was made from.
+
+    Attributes:
+        times: digest of the scenario's files by name, size and time.
+        contents: digest of them by name and content.
+    """
+
+    times: str
+    contents: str
 
 
 def shard_path(folder: Path, scenario_token: str) -> Path:
@@ -48,14 +62,14 @@ def shard_specs() -> list[TableSpec]:
     ]
 
 
-def write_shard(path: Path, tables: Mapping[str, Columns], digest: str) -> None:
+def write_shard(path: Path, tables: Mapping[str, Columns], state: ShardState) -> None:
     """Write the rows of every table as compressed Arrow streams, one after the other."""
     import pyarrow as pa
 
     options = pa.ipc.IpcWriteOptions(compression="zstd")
     sink = pa.BufferOutputStream()
     for spec in shard_specs():
-        schema = arrow_schema(spec).with_metadata({_DIGEST: digest})
+        schema = arrow_schema(spec).with_metadata(asdict(state))
         with pa.ipc.new_stream(sink, schema, options=options) as writer:
             writer.write_batch(record_batch(spec, tables[spec.name]))
     content = sink.getvalue().to_pybytes()
@@ -63,30 +77,36 @@ def write_shard(path: Path, tables: Mapping[str, Columns], digest: str) -> None:
 
 
 def read_shard(path: Path) -> dict[str, dict[str, Any]]:
-    """Table → stored column → its values, as `write_shard` took them."""
+    """Table → stored column → its values, as `write_shard` took them.
+
+    Raises IndexStoreError if the streams, whose checksum is right, are not those of a shard.
+    """
     import pyarrow as pa
 
     tables = {}
     with pa.OSFile(str(path), "rb") as source:
         for spec in shard_specs():
-            (batch,) = list(pa.ipc.open_stream(source))  # to the stream's end, where the next one starts
+            batches = list(pa.ipc.open_stream(source))  # to the stream's end, where the next one starts
+            if len(batches) != 1 or fault_of(spec, batches[0]):
+                raise IndexStoreError(f"{path}: not a shard; remove the index with: deepaccident index clear DATAROOT")
+            batch = batches[0]
             rows = {name: unpacked(view) for name, view in views(spec, batch).items()}
             tables[spec.name] = rows | {name: of(rows) for name, of in _FROM_OTHERS.get(spec.name, {}).items()}
     return tables
 
 
-def shard_digest(path: Path) -> str | None:
-    """The digest a shard was written with, None if there is no whole shard."""
+def shard_state(path: Path) -> ShardState | None:
+    """What a shard was made from, None if there is no whole shard."""
     import pyarrow as pa
 
     try:
-        content = path.read_bytes()
-    except OSError:
+        content = read_bytes(path, "index")
+        if content[-_CHECKSUM_SIZE:] != _checksum(content[:-_CHECKSUM_SIZE]):
+            return None
+        metadata = pa.ipc.open_stream(content).schema.metadata or {}
+        return ShardState(**{name.decode(): value.decode() for name, value in metadata.items()})
+    except (OSError, pa.ArrowException, TypeError, ValueError):  # an older devkit's
         return None
-    if content[-_CHECKSUM_SIZE:] != _checksum(content[:-_CHECKSUM_SIZE]):
-        return None
-    metadata: Mapping[bytes, bytes] = pa.ipc.open_stream(content).schema.metadata
-    return metadata[_DIGEST].decode()
 
 
 def _checksum(content: bytes) -> bytes:

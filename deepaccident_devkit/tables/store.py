@@ -1,6 +1,7 @@
 """Tables on disk: one Arrow file a table with one uncompressed batch, written by streaming, read memory-mapped."""
 
 from contextlib import ExitStack
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
@@ -9,16 +10,27 @@ import numpy as np
 
 from deepaccident_devkit.errors import IndexStoreError
 from deepaccident_devkit.files import replacing
+from deepaccident_devkit.reading import irregular_text, shortened
 from deepaccident_devkit.tables.arrow import (
     Columns,
     arrow_schema,
+    fault_of,
     is_streamable,
     numpy_dtype,
     record_batch,
+    value_fault_of,
     views,
     width,
 )
 from deepaccident_devkit.tables.columns import TableSpec
+
+REMEDY = "mend it with: deepaccident index DATAROOT --check"
+"""What to do with a damaged table."""
+
+
+def damaged_value(table: str) -> IndexStoreError:
+    """The error for a row key, a count or a code beyond what it counts: only damage to a file makes one."""
+    return IndexStoreError(f"the index is damaged: table '{table}' holds a value out of its range; {REMEDY}")
 
 
 def table_path(folder: Path, table: str) -> Path:
@@ -108,7 +120,6 @@ class StoredTable:
 
     Attributes:
         spec: its columns.
-        table: the `pyarrow.Table` over the mapped memory.
         views: stored column name → view of it (numpy arrays are read-only).
         num_rows: its length.
     """
@@ -119,14 +130,27 @@ class StoredTable:
 
         path = table_path(folder, spec.name)
         try:
-            reader = pa.ipc.open_file(pa.memory_map(str(path)))
-            batch = reader.get_batch(0)
+            if fault := irregular_text(path.stat().st_mode):
+                raise OSError(fault)
+            batch = pa.ipc.open_file(pa.memory_map(str(path))).get_batch(0)
+            if fault := fault_of(spec, batch):
+                raise OSError(fault)
+            self.views = views(spec, batch)
         except FileNotFoundError:
             raise IndexStoreError(f"{path}: no such file: the index was made again; open the release again") from None
         except (OSError, pa.ArrowException, IndexError, ValueError) as error:
-            remedy = "mend it with: deepaccident index DATAROOT --check"
-            raise IndexStoreError(f"{path}: cannot be read ({error}); {remedy}") from error
+            raise IndexStoreError(f"{path}: cannot be read ({shortened(str(error))}); {REMEDY}") from error
         self.spec = spec
-        self.table = pa.Table.from_batches([batch])
-        self.views = views(spec, batch)
+        self._path = path
+        self._batch = batch
         self.num_rows = int(batch.num_rows)
+
+    @cached_property
+    def table(self) -> Any:
+        """The `pyarrow.Table` over the mapped memory; raises IndexStoreError if Arrow could not read a value."""
+        import pyarrow as pa
+
+        table = pa.Table.from_batches([self._batch])
+        if fault := value_fault_of(self.spec, table):
+            raise IndexStoreError(f"{self._path}: damaged ({shortened(fault)}); {REMEDY}")
+        return table

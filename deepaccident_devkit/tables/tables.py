@@ -6,12 +6,12 @@ from typing import Any, Generic, NoReturn, TypeVar, cast, overload
 
 import numpy as np
 
-from deepaccident_devkit.errors import FieldError, TableError, TokenError
+from deepaccident_devkit.errors import FieldError, IndexStoreError, TableError, TokenError
 from deepaccident_devkit.nuscenes_names import field_remedy
 from deepaccident_devkit.tables.columns import NULL_INTEGER, Choice, Column, Key, Number, Subset, Vector
 from deepaccident_devkit.tables.resolve import Resolver
 from deepaccident_devkit.tables.specs import table_spec, table_specs
-from deepaccident_devkit.tables.store import StoredTable
+from deepaccident_devkit.tables.store import REMEDY, StoredTable, damaged_value
 from deepaccident_devkit.text import meant_text, spelled
 
 Record = TypeVar("Record")
@@ -27,7 +27,10 @@ class Tables:
         self._stored = {name: StoredTable(folder, spec) for name, spec in table_specs().items()}
         self._tables: dict[str, Table[Any]] = {}
         self.views = {name: stored.views for name, stored in self._stored.items()}
-        self.resolver = Resolver(self.views)
+        try:
+            self.resolver = Resolver(self.views)
+        except (IndexError, TypeError, ValueError) as error:
+            raise IndexStoreError(f"{folder}: its scenarios and agents do not fit together; {REMEDY}") from error
 
     def __repr__(self) -> str:
         return f"Tables({str(self.folder)!r})"
@@ -72,7 +75,10 @@ class Table(Sequence[Record], Generic[Record]):
 
     @property
     def arrow(self) -> Any:
-        """The table as a `pyarrow.Table` over the mapped memory, with row keys instead of tokens."""
+        """The table as a `pyarrow.Table` over the mapped memory, with row keys instead of tokens.
+
+        Raises IndexStoreError where the file is so damaged that Arrow would read beyond its memory.
+        """
         return self._stored.table
 
     def __len__(self) -> int:
@@ -110,10 +116,16 @@ class Table(Sequence[Record], Generic[Record]):
 
     def tokens_where(self, field: str, value: Any) -> list[str]:
         """The tokens of the rows whose field equals `value`, in order; raises FieldError."""
-        return [self._resolver.token(self.name, int(row)) for row in self._rows_where(field, value)]
+        try:
+            return [self._resolver.token(self.name, int(row)) for row in self._rows_where(field, value)]
+        except IndexError as error:
+            raise damaged_value(self.name) from error
 
     def _record(self, row: int) -> Record:
-        return cast(Record, RecordDict({field: getter(row) for field, getter in self._getters}))
+        try:
+            return cast(Record, RecordDict({field: getter(row) for field, getter in self._getters}))
+        except IndexError as error:
+            raise damaged_value(self.name) from error
 
     def _rows_where(self, field: str, value: Any) -> Sequence[int]:
         column = self._stored.spec.column(field)

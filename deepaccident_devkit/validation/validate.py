@@ -81,6 +81,7 @@ def validate_release(
         DatarootError: the folder is missing, holds no release, or a part of it cannot be listed.
         VersionError: the version is unknown or not under this folder.
         TokenError: one of `scenarios` is not there.
+        WorkerError: a worker was killed.
     """
     layout = find_release(root, version)
     chosen = [folder for folder in layout.scenarios if scenarios is None or folder.token in scenarios]

@@ -21,7 +21,7 @@ from deepaccident_devkit.evaluation.runs.evaluation_run import (
 from deepaccident_devkit.evaluation.runs.rows import sample_rows, write_rows
 from deepaccident_devkit.evaluation.runs.selection import SampleSelection
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.files import file_checksum, replacing_folder
+from deepaccident_devkit.files import file_checksum, replacing_folder, temporary_path
 from deepaccident_devkit.reading import irregular_text
 
 SUMMARY_FILE: Final = "metrics_summary.json"
@@ -247,7 +247,7 @@ def _moved_aside(target: Path) -> Path | None:
     """Where an earlier bundle now lies, beside its place; None if there is none."""
     if not target.is_dir() or not any(target.iterdir()):
         return None
-    aside = target.with_name(f".{target.name}.{os.getpid()}.old")
+    aside = temporary_path(target)
     target.rename(aside)
     return aside
 

@@ -96,6 +96,7 @@ def evaluate_results(
             the meta that the task needs, or a sample cannot be evaluated.
         ChoiceError: no such split.
         NotAvailableError: the release has no such samples.
+        WorkerError: a worker was killed.
     """
     chosen = selection if isinstance(selection, SampleSelection) else default_selection(setup, selection)
     opened = results if isinstance(results, Results) else read_results(results)

@@ -53,7 +53,8 @@ def evaluate_samples(
 
     Raises:
         EvaluationError: a sample cannot be evaluated (the message begins with its token), the checkpoint is of other
-            settings or samples or cannot be read or written, workers cannot import `load`, or one was killed.
+            settings or samples or cannot be read or written, or workers cannot import `load`.
+        WorkerError: a worker was killed.
         ChoiceError: `workers` is less than 1.
     """
     saved = None if checkpoint is None else Path(checkpoint).expanduser()
@@ -77,7 +78,7 @@ def evaluate_samples(
         progress=progress,
         sizes=[len(batch.samples) for batch in batches],
     )
-    with _killed_workers_told(), _saved_now_and_then(evaluator, saved) as save, closing(done):
+    with _saved_now_and_then(evaluator, saved) as save, closing(done):
         for _, part in done:
             evaluator.merge(part)
             save()
@@ -154,15 +155,3 @@ def _saved_now_and_then(evaluator: Evaluator[Any], path: Path | None) -> Iterato
         yield save
     finally:
         evaluator.save(path)
-
-
-@contextmanager
-def _killed_workers_told() -> Iterator[None]:
-    from concurrent.futures import BrokenExecutor
-
-    try:
-        yield
-    except BrokenExecutor as error:
-        raise EvaluationError(
-            f"evaluation: a worker process was killed ({error}); if memory ran out, give fewer workers"
-        ) from error

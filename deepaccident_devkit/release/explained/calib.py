@@ -10,6 +10,7 @@ from deepaccident_devkit.arrays import AnyArray, FloatArray
 from deepaccident_devkit.errors import CalibError
 from deepaccident_devkit.geometry import handedness
 from deepaccident_devkit.geometry.se3 import rigid_fault
+from deepaccident_devkit.reading import shortened
 from deepaccident_devkit.release.calib import KEYS, read_calib, read_unchecked_calib
 from deepaccident_devkit.taxonomy import CAMERAS
 from deepaccident_devkit.text import columns_text, fixed_text
@@ -30,6 +31,8 @@ Pixel of a point in the file's camera frame, in m: u = cx + f·y/x, v = cy − f
 _AFTERWORD = """\
 In Python: release.read_calib(path) gives right-handed transforms and optical cameras (x right, y down, z forward),
 with raw=True the matrices of the file."""
+_MOST_UNKNOWN = 300
+"""Characters of keys that the devkit does not know."""
 
 
 def calib_text(path: Path) -> tuple[str, CalibError | None]:
@@ -51,7 +54,7 @@ def calib_text(path: Path) -> tuple[str, CalibError | None]:
         "\n".join([*_transform_notes(raw), _devkit_text(raw)]),
         "Cameras: intrinsic_<camera>, shape (3, 3), [[cx, f, 0], [cy, 0, −f], [1, 0, 0]], and lidar_to_<camera>\n"
         + "\n".join([columns_text(_camera_rows(raw)), _CAMERA_LEGEND, *_intrinsic_notes(raw)]),
-        *([f"Not known to the devkit: {', '.join(unknown)}"] if unknown else []),
+        *([f"Not known to the devkit: {shortened(', '.join(unknown), _MOST_UNKNOWN)}"] if unknown else []),
         _AFTERWORD,
     ]
     return "\n\n".join(parts), fault

@@ -64,6 +64,7 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
         NotAvailableError: an agent is not in this release, the sample has no label, or nobody collides and the view
             is `accident`.
         MissingExtraError: nothing here can write MP4.
+        WorkerError: a worker was killed.
     """
     target, (width, height) = Path(path).expanduser(), size
     check_target(target, size=(width, height), fps=fps)

@@ -9,11 +9,8 @@ import re
 import shutil
 import subprocess
 import sys
-import time
 import zipfile
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
@@ -21,9 +18,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny
+from processes import wait_for
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, LabelFilesError, NotAvailableError, TokenError
+from deepaccident_devkit.files import temporary_path
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import (
     LABEL_PROTOCOLS,
@@ -662,16 +661,6 @@ class TestStops:
         write(small, out, tokens_of(small, 3))
         assert len(LabelFiles(out)) == 5
 
-    def test_a_killed_worker_is_our_error(
-        self, small: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        def broken(*_arguments: object, **_options: object) -> None:
-            raise BrokenProcessPool("a child process terminated abruptly")
-
-        monkeypatch.setattr(label_files, "run_batch", broken)
-        with pytest.raises(LabelFilesError, match=r"was killed .*if memory ran out, give fewer workers"):
-            write(small, tmp_path / "labels", tokens_of(small, 3))
-
     def test_a_folder_that_cannot_be_locked(self, small: DeepAccident, tmp_path: Path) -> None:
         (tmp_path / "labels" / ".lock").mkdir(parents=True)
         with pytest.raises(LabelFilesError, match=r"no labels can be written there .*; choose another folder"):
@@ -680,7 +669,7 @@ class TestStops:
     def test_only_its_own_leftovers_are_removed(self, small: DeepAccident, out: Path) -> None:
         write(small, out, tokens_of(small, 3))
         folder = out / tiny.TOKEN
-        own = [out / f".{MANIFEST}.123.tmp", folder / ".ego_vehicle.npz.456.tmp"]
+        own = [out / f".{MANIFEST}.123.tmp", temporary_path(folder / "ego_vehicle.npz")]
         foreign = [out / ".mine.tmp", folder / ".notes.npz.456.tmp", folder / "ego_vehicle.npz.456.tmp"]
         for path in (*own, *foreign):
             path.touch()
@@ -705,13 +694,6 @@ class TestStops:
         tokens = {token for purpose in purposes for token in da_motion.samples("train", purpose)}
         write(da_motion, tmp_path / "fresh", sorted(tokens))
         assert contents(tmp_path / "labels") == contents(tmp_path / "fresh")
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.001)
 
 
 def test_a_disk_that_fails_while_writing_is_our_error(tmp_path: Path) -> None:

@@ -203,6 +203,13 @@ def test_a_calib_file_that_is_not_rigid_is_told_and_is_a_fault(tiny: Path, tmp_p
     assert "ego_to_world: its last row is" in str(explanation.fault)
 
 
+def test_many_unknown_keys_of_a_calib_file_are_cut_short(tiny: Path, tmp_path: Path) -> None:
+    raw = read_calib(tiny_file(tiny, "calib"), raw=True) | {f"key {number}": np.zeros(2) for number in range(100)}
+    text = explain_file(copied(tmp_path / "odd", old_pickle(raw))).text
+    (line,) = [line for line in text.splitlines() if line.startswith("Not known to the devkit: key 0, key 1, ")]
+    assert len(line) < 400
+
+
 class Shout:
     """A pickle that would make a file."""
 

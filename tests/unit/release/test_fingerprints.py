@@ -1,11 +1,13 @@
 """Hashes of a scenario's label, meta and calib files."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, digest_of, fingerprint, scenario_hashes
 
 Find = Callable[[Path], Path]
@@ -46,6 +48,15 @@ def test_bytes_that_move_to_the_next_file_are_a_change(own_release: Path, scenar
     one.write_bytes(joined[:10])
     other.write_bytes(joined[10:])
     assert scenario_hashes(opened, [scenario])[scenario].label != before.label
+
+
+def test_a_file_that_cannot_be_read_is_named(own_release: Path, scenario: str) -> None:
+    opened = DeepAccident(dataroot=own_release, verbose=False)
+    path = first(own_release, "label", "txt")
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(ReleaseError, match=rf"{path}: not a regular file \(a named pipe\); restore the file"):
+        scenario_hashes(opened, [scenario])
 
 
 def test_no_meta_and_no_such_scenario(own_release: Path, scenario: str) -> None:

@@ -194,17 +194,6 @@ def test_a_disk_that_is_full_at_the_manifest(root: Path, tmp_path: Path, monkeyp
     assert index_alone(root / ".deepaccident") == before
 
 
-def test_a_killed_worker_is_our_error(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from concurrent.futures.process import BrokenProcessPool
-
-    def broken(*_arguments: object, **_options: object) -> None:
-        raise BrokenProcessPool("a child process terminated abruptly")
-
-    monkeypatch.setattr(indexing, "run_batch", broken)
-    with pytest.raises(IndexStoreError, match=r"was killed .*if memory ran out, give fewer workers="):
-        opened(root)
-
-
 def test_an_index_folder_that_cannot_be_locked(root: Path, tmp_path: Path) -> None:
     (tmp_path / "index" / "v1" / ".lock").mkdir(parents=True)
     with pytest.raises(IndexStoreError, match=r"cannot be locked .*; give another index_dir="):

@@ -14,6 +14,7 @@ import pytest
 import tiny
 from click.testing import CliRunner
 from filelock import FileLock
+from processes import is_running
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
@@ -233,7 +234,7 @@ def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
     parent.kill()
     parent.wait()
     deadline = time.monotonic() + 20
-    while any(_is_running(worker) for worker in workers):
+    while any(map(is_running, workers)):
         assert time.monotonic() < deadline, "a worker outlived its parent"
         time.sleep(0.05)
 
@@ -241,13 +242,6 @@ def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
 def wait_and_tell(path: str) -> None:
     Path(path).write_text(str(os.getpid()))
     time.sleep(60)
-
-
-def _is_running(process: int) -> bool:
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
 
 
 def test_run_batch_needs_no_items() -> None:

@@ -93,11 +93,6 @@ class TestWorkers:
         assert lines[0] == "100.0"
         assert "something of the script or notebook that runs" in lines[1]
 
-    @pytest.mark.slow
-    def test_a_killed_worker_is_our_error(self) -> None:
-        with pytest.raises(EvaluationError, match=r"a worker process was killed .*; if memory ran out, give fewer"):
-            evaluate_samples(Sums(), VALUES, evaluating.killed, workers=2)
-
 
 class TestFaults:
     @pytest.mark.slow

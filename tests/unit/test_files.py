@@ -1,0 +1,167 @@
+"""Temporary names: whose they are, and what becomes of those of dead writers."""
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from processes import wait_for
+
+from deepaccident_devkit.files import (
+    remove_leftovers,
+    replacing,
+    replacing_folder,
+    temporary_of,
+    temporary_path,
+    write_bytes,
+)
+from deepaccident_devkit.render import detached_figure
+from deepaccident_devkit.render.pictures import write_figure
+
+WRITER = """
+import sys, time
+from pathlib import Path
+from deepaccident_devkit.files import replacing, replacing_folder
+folder = Path(sys.argv[1])
+with replacing(folder / "table.json") as path, replacing_folder(folder / "run") as run:
+    (run / "half").touch()
+    path.touch()
+    time.sleep(60)
+"""
+DAY = 24 * 3600
+
+
+@pytest.fixture
+def writer(tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """A process that is writing a file and a folder."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    with subprocess.Popen([sys.executable, "-c", WRITER, tmp_path], env=environment) as process:
+        wait_for(lambda: list(tmp_path.glob(".table.json.*")))
+        yield process
+        process.kill()
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def left_by(folder: Path, change: Callable[[str], str] = str, *, age: float = 0.0) -> Path:
+    """A temporary file of this process, or with a changed name of another one."""
+    path = folder / change(temporary_path(folder / "table.json").name)
+    path.touch()
+    os.utime(path, (time.time() - age, time.time() - age))
+    return path
+
+
+def test_threads_that_write_one_picture(tmp_path: Path) -> None:
+    def save(_: int) -> None:
+        figure = detached_figure((1.0, 1.0))
+        figure.add_subplot().set_axis_off()
+        write_figure(figure, tmp_path / "new" / "picture.png", dpi=50)
+
+    with ThreadPoolExecutor(24) as threads:
+        list(threads.map(save, range(48)))
+    assert names(tmp_path / "new") == ["picture.png"]
+    with Image.open(tmp_path / "new" / "picture.png") as picture:
+        assert picture.size == (50, 50)
+
+
+def test_a_name_says_of_what_and_by_whom() -> None:
+    path = temporary_path(Path("folder/table.json"))
+    assert path != temporary_path(Path("folder/table.json"))
+    assert re.fullmatch(rf"\.table\.json\.[0-9a-f]{{8}}-{os.getpid()}-\d+-\d+\.tmp", path.name)
+    assert temporary_of(path.name) == temporary_of(f"{path.name}.mp4") == "table.json"
+    assert temporary_of(".table.json.123.tmp") == "table.json"  # an earlier devkit's
+    assert temporary_of(".table.json.tmp") is temporary_of(path.name[1:]) is None
+
+
+def test_the_longest_name_can_be_written(tmp_path: Path) -> None:
+    name = "ö" * 127
+    write_bytes(tmp_path / name, b"whole")
+    assert names(tmp_path) == [name]
+
+
+def test_a_block_that_fails_leaves_nothing(tmp_path: Path) -> None:
+    def fail() -> None:
+        with replacing(tmp_path / "a") as path, replacing_folder(tmp_path / "b") as folder:
+            path.touch()
+            (folder / "half").touch()
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fail()
+    assert names(tmp_path) == []
+
+
+def test_a_folder_has_the_permissions_of_others(tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    with replacing_folder(tmp_path / "made"):
+        pass
+    assert (tmp_path / "made").stat().st_mode == (tmp_path / "other").stat().st_mode
+
+
+def test_the_next_run_removes_what_a_killed_one_left(writer: subprocess.Popen[bytes], tmp_path: Path) -> None:
+    process = writer.pid
+    remove_leftovers(tmp_path)
+    assert [temporary_of(name) for name in names(tmp_path)] == ["run", "table.json"]  # it lives
+    os.kill(process, signal.SIGKILL)
+    wait_for(lambda: Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z")
+    write_bytes(tmp_path / "other.json", b"")  # nobody has asked for its status yet
+    assert names(tmp_path) == ["other.json"]
+
+
+def test_a_folder_is_looked_through_once_a_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_bytes(tmp_path / "first", b"")
+    monkeypatch.setattr(os, "scandir", lambda *_: pytest.fail("looked through again"))
+    write_bytes(tmp_path / "second", b"")
+
+
+def test_the_number_of_a_dead_writer_given_to_another_process(tmp_path: Path) -> None:
+    own = left_by(tmp_path)
+    left_by(tmp_path, lambda name: re.sub(r"-\d+-(\d+)\.tmp", r"-1-\1.tmp", name))
+    remove_leftovers(tmp_path)
+    assert names(tmp_path) == [own.name]
+
+
+def test_writers_on_other_hosts_are_given_a_day(tmp_path: Path) -> None:
+    def elsewhere(name: str) -> str:
+        return re.sub(r"[0-9a-f]{8}-\d+", "0123abcd-999999999", name)
+
+    fresh = left_by(tmp_path, elsewhere, age=0.9 * DAY)
+    left_by(tmp_path, elsewhere, age=1.1 * DAY)
+    remove_leftovers(tmp_path)
+    assert names(tmp_path) == [fresh.name]
+
+
+def test_what_may_be_of_others_is_left(tmp_path: Path) -> None:
+    kept = {".table.json.123.tmp", ".mine.tmp", "table.json", ".tables-0a1b.tmp"}
+    for name in kept:
+        left_by(tmp_path, lambda _, name=name: name, age=9 * DAY)
+    remove_leftovers(tmp_path)
+    assert set(names(tmp_path)) == kept
+
+
+def test_a_link_is_removed_and_not_what_it_leads_to(tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "file").touch()
+    dead = left_by(tmp_path, lambda name: name.replace(f"-{os.getpid()}-", "-4194305-"))
+    dead.unlink()
+    dead.symlink_to(tmp_path / "data")
+    remove_leftovers(tmp_path)
+    assert names(tmp_path) == ["data"]
+    assert names(tmp_path / "data") == ["file"]
+
+
+def test_a_folder_that_is_gone(tmp_path: Path) -> None:
+    shutil.rmtree(tmp_path)
+    remove_leftovers(tmp_path)
+    write_bytes(tmp_path / "file", b"whole")
+    assert names(tmp_path) == ["file"]
