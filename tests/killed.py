@@ -1,8 +1,10 @@
 """A server of processes that index and are stopped: `python killed.py` reads a job a line, and answers with a line.
 
-A job forks this process, which has everything imported, so that a kill costs no interpreter's start.
+A job forks this process, which has everything imported, so that a kill costs no interpreter's start. A job that has
+`words` runs them as a command line in place of indexing. The arguments of the server are further modules to import.
 """
 
+import importlib
 import json
 import os
 import resource
@@ -16,6 +18,7 @@ from typing import Any
 
 import pyarrow.csv
 
+from deepaccident_devkit import cli
 from deepaccident_devkit.errors import DeepAccidentError
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.tables import open_index
@@ -25,6 +28,8 @@ assert pyarrow.csv  # what the work imports lazily is there before the clock sta
 
 
 def main() -> None:
+    for name in sys.argv[1:]:
+        importlib.import_module(name)
     for line in sys.stdin:
         print(json.dumps(run(json.loads(line))), flush=True)
 
@@ -54,19 +59,32 @@ def _work(job: dict[str, Any], writing: int) -> None:
             _kill_at(job["step"], after=job["after"])
         if job.get("limit") is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (job["limit"], job["limit"]))
-        open_index(
-            find_release(Path(job["root"])),
-            index_dir=Path(job["index_dir"]),
-            workers=job.get("workers", 1),
-            check_files=job.get("check", False),
-        )
+        if "words" in job:
+            _command(job["words"], writing)
+        else:
+            open_index(
+                find_release(Path(job["root"])),
+                index_dir=Path(job["index_dir"]),
+                workers=job.get("workers", 1),
+                check_files=job.get("check", False),
+            )
         status = 0
+    except SystemExit as end:
+        status = int(end.code or 0)
     except DeepAccidentError as error:
         os.write(writing, f"{type(error).__name__}: {error}".encode())
     except BaseException as error:  # noqa: BLE001 - a fork must not return into the server
         os.write(writing, f"not ours: {error!r}".encode())
     finally:
         os._exit(status)
+
+
+def _command(words: list[str], errors: int) -> None:
+    """Run the command line; what it prints is dropped, except its errors."""
+    os.dup2(errors, 2)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    sys.argv = ["deepaccident", *words]
+    cli.main()
 
 
 def _kill_at(step: int, *, after: bool) -> None:

@@ -355,7 +355,7 @@ def test_the_page_says_which_pictures_are_axes_and_which_figures() -> None:
         assert parameter in signature.parameters, name
 
 
-@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "ARCHITECTURE.md"])
+@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "ARCHITECTURE.md", "SECURITY.md"])
 def test_the_links_of_pages_that_are_not_on_the_site_lead_somewhere(page: str) -> None:
     links = re.findall(r"\]\((?!http)([^)#]+)", (TOP / page).read_text(encoding="utf-8"))
     assert [link for link in links if not (TOP / link).exists()] == []

@@ -23,7 +23,10 @@ from deepaccident_devkit.cli import deepaccident
 CI = (TOP / ".ci" / "run").read_text(encoding="utf-8")
 PYPROJECT = (TOP / "pyproject.toml").read_text(encoding="utf-8")
 TEMPLATES = sorted((TOP / ".github" / "ISSUE_TEMPLATE").glob("*.yml"))
-BUILT = ("pyproject.toml", "setup.py", "MANIFEST.in", "README.md", "LICENSE", "CHANGELOG.md", "CITATION.cff")
+BUILT = (
+    *("pyproject.toml", "setup.py", "MANIFEST.in", "README.md", "LICENSE", "CHANGELOG.md", "CITATION.cff"),
+    "SECURITY.md",
+)
 
 
 def parsed(path: Path) -> dict:

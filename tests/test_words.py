@@ -11,7 +11,7 @@ TOP = Path(__file__).parents[1]
 KNOWN = TOP / "tests" / "data" / "words" / "known.txt"
 MODULES = [*(TOP / "deepaccident_devkit").rglob("*.py"), *(TOP / "docs").glob("*.py")]
 PAGES = [
-    *(TOP / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "ARCHITECTURE.md")),
+    *(TOP / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "ARCHITECTURE.md", "SECURITY.md")),
     *(path for folder in ("docs", "schema", "benchmarks", "tutorials") for path in (TOP / folder).rglob("*.md")),
 ]
 NOTEBOOKS = [*(TOP / "tutorials").glob("*.ipynb")]

@@ -1,0 +1,508 @@
+"""Kinds of files: where the healthy ones lie, how a user reads them, and when what was read is wrong."""
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from campaign import plain
+from campaign.healthy import SETUPS, opened, selection
+from campaign.mutations import HTML
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.evaluation.results import read_results
+from deepaccident_devkit.evaluation.runs import compare_bundles, evaluate_results, verify_bundle
+from deepaccident_devkit.files import file_checksum
+from deepaccident_devkit.motion import LabelFiles
+from deepaccident_devkit.release import explain_file, find_release, read_calib
+from deepaccident_devkit.render.evaluation.report import report_html
+from deepaccident_devkit.synth.spec import draw, read_spec
+from deepaccident_devkit.synth.spec.choices import Items, Part
+from deepaccident_devkit.tables.manifest import MANIFEST_FILE, read_manifest
+from deepaccident_devkit.validation import validate_release
+
+
+@dataclass(frozen=True, slots=True)
+class Room:
+    """Where a case happens.
+
+    Attributes:
+        home: the copies of all healthy files; only the case's folder is changed.
+        tree: the case's folder in it.
+        victim: the file that is changed.
+        scratch: an empty folder.
+        healthy: the path of the unchanged file.
+    """
+
+    home: Path
+    tree: Path
+    victim: Path
+    scratch: Path
+    healthy: Path
+
+
+Read = Callable[[Room], Any]
+Judge = Callable[[Room, Any], "str | None"]
+
+
+@dataclass(frozen=True, slots=True)
+class Action:
+    """One thing that a user does with a file.
+
+    Attributes:
+        read: does it.
+        judge: what is wrong with what was read, None if nothing; it is asked only if something was read.
+    """
+
+    read: Read
+    judge: Judge = lambda _room, _read: None
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """One kind of file.
+
+    Attributes:
+        name: in the table.
+        form: which mutations are made for it.
+        folder: of the healthy tree; a case has a copy of it.
+        pattern: of the files in it, of which a case changes one.
+        actions: what is done with it, one after another; a refusal does not end them.
+    """
+
+    name: str
+    form: str
+    folder: str
+    pattern: str
+    actions: tuple[Action, ...] = field(repr=False)
+
+    def files(self, tree: Path) -> list[Path]:
+        """The files of this kind."""
+        return sorted(path for path in tree.glob(self.pattern) if path.is_file())
+
+
+# ---- a release's small files
+
+
+def _opened(room: Room, on_error: Any) -> DeepAccident:
+    return DeepAccident("v1", room.tree, index_dir=room.scratch / "index", workers=1, verbose=False, on_error=on_error)
+
+
+def _tables(dataset: DeepAccident) -> dict[str, Any]:
+    """All that the tables say of small files, by the token of the sample or scenario."""
+    read: dict[str, Any] = {
+        each["token"]: (each["velocity"], dataset.boxes(each["token"], frame="lidar", velocity="label"), pose)
+        for each, pose in zip(dataset.sample, dataset.columns("ego_pose")["matrix"], strict=True)
+    }
+    return read | {each["token"]: each for each in dataset.scenario}
+
+
+def _judge_tables(room: Room, read: Mapping[str, Any]) -> str | None:
+    """Compare the scenarios that were read with their files."""
+    for token, value in read.items():
+        scenario_type, name, *sample = token.split("/")
+        folder = room.tree / scenario_type
+        if not sample:
+            meta = folder / "meta" / f"{name}.txt"
+            fault = _meta_fault(value, plain.meta(meta)) if meta.is_file() else _known(value["weather"])
+        else:
+            stem = f"{name}/{name}_{sample[1]}"
+            velocity, boxes, pose = value
+            label = folder / sample[0] / "label" / f"{stem}.txt"
+            fault = _label_fault(velocity, boxes, *plain.label(label)) if label.is_file() else _known(velocity)
+            calib = plain.calib(folder / sample[0] / "calib" / f"{stem}.pkl")
+            flipped = plain.LEFT_TO_RIGHT @ calib["ego_to_world"] @ plain.LEFT_TO_RIGHT
+            fault = fault or (None if np.array_equal(pose, flipped.ravel()) else "ego_to_world")
+        if fault:
+            return f"{token}: {fault}"
+    return None
+
+
+def _known(value: Any) -> str | None:
+    """A fault if something is known of a file that is not there."""
+    return None if value is None else f"{value}, though the file is not there"
+
+
+def _label_fault(velocity: Any, boxes: Any, speed: tuple[float, ...], rows: list[tuple[Any, ...]]) -> str | None:
+    if not np.array_equal(velocity, [speed[0], -speed[1]], equal_nan=True):
+        return f"speed {velocity} and not {speed}"
+    if len(boxes) != len(rows):
+        return f"{len(boxes)} boxes and not {len(rows)}"
+    for box, row in zip(boxes, rows, strict=True):
+        same = np.array_equal([*box.center, *box.size], [row[1], -row[2], *row[3:7]])
+        turn = np.angle(np.exp(1j * (box.yaw + row[7])))
+        facts = (box.category, box.actor_id, box.num_lidar_pts, box.camera_visible)
+        if not same or abs(turn) > 1e-6 or facts != (row[0], *row[10:]):
+            return f"{box!r} and not {row}"
+    return None
+
+
+def _meta_fault(scenario: Mapping[str, Any], said: Mapping[str, Any]) -> str | None:
+    first, collision = said["first"], scenario["collision"]
+    expected = None if "-1" in (first[1], first[3]) else ([int(first[1]), int(first[3])], float(first[5]))
+    found = None if collision is None else (collision["ids"], collision["impact"])
+    if expected != found:
+        return f"collision {found} and not {expected}"
+    if f"{scenario['weather']}{scenario['time_of_day'] or ''}" != first[0]:
+        return f"weather {scenario['weather']} and not {first[0]}"
+    road = (scenario["road_type"] or "", said.get("road_type", ""))
+    return None if road[0] == road[1] else f"road type {road[0]} and not {road[1]}"
+
+
+def _validate(room: Room, *, deep: bool = False) -> Any:
+    report = validate_release(room.tree, workers=1, deep=deep)
+    return [str(finding) for finding in report.findings]
+
+
+def _judge_sentences(_room: Room, sentences: list[str]) -> str | None:
+    return next((f"a sentence of {len(each)} characters" for each in sentences if len(each) > 2000), None)
+
+
+_SMALL = (
+    Action(lambda room: _tables(_opened(room, "raise")), _judge_tables),
+    Action(lambda room: _tables(_opened(room, "skip")), _judge_tables),
+    Action(_validate, _judge_sentences),
+)
+_DEEP = Action(lambda room: _validate(room, deep=True), _judge_sentences)
+_EXPLAINED = Action(lambda room: [explain_file(room.victim).text])
+
+
+def _same_arrays(found: Mapping[str, Any], expected: Mapping[str, Any]) -> str | None:
+    for name, array in found.items():
+        if not np.array_equal(array, expected[name], equal_nan=True):
+            return f"{name} differs from what numpy reads"
+    return None
+
+
+_CALIB = Action(
+    lambda room: read_calib(room.victim, raw=True),
+    lambda room, read: _same_arrays(read, plain.calib(room.victim)),
+)
+
+
+def _judge_splits(room: Room, read: Mapping[str, Any]) -> str | None:
+    listed = plain.split_file(room.victim) if room.victim.is_file() else []
+    wrong = [
+        each["token"]
+        for each in read.values()
+        if isinstance(each, dict) and each["split"] and each["token"] not in listed
+    ]
+    return f"{wrong[0]} is not listed" if wrong else None
+
+
+_SPLITS = (
+    Action(lambda room: _tables(_opened(room, "raise")), _judge_splits),
+    Action(lambda room: sorted(_opened(room, "skip").split_scenarios("train"))),
+    Action(_validate, _judge_sentences),
+)
+
+
+# ---- a release's sensors
+
+
+@cache
+def _dataset(home: Path) -> DeepAccident:
+    """What results are evaluated with; it is never changed."""
+    return opened(home / "release", home / "index")
+
+
+@cache
+def _sensors(tree: Path) -> DeepAccident:
+    """The release whose sensors' files are changed; opened once, while they are healthy."""
+    return opened(tree, tree.parents[1] / "index_of_sensors")
+
+
+def _token(room: Room) -> str:
+    scenario_type, agent, _, name, file = room.victim.relative_to(room.tree).parts
+    return f"{scenario_type}/{name}/{agent}/{file[-7:-4]}"
+
+
+def _image(room: Room) -> Any:
+    return _sensors(room.tree).load_image(f"{_token(room)}/Camera_Front")
+
+
+def _judge_image(room: Room, read: Any) -> str | None:
+    return None if np.array_equal(read, plain.image(room.victim)) else "other pixels than Pillow reads"
+
+
+def _judge_lidar(room: Room, read: Any) -> str | None:
+    points = plain.array(room.victim)
+    same = np.array_equal(read.xyz, points[:, :3] * (1, -1, 1), equal_nan=True)
+    return None if same else "other points than numpy reads"
+
+
+def _judge_bev(room: Room, read: Any) -> str | None:
+    pixels = plain.array(room.victim).astype(int)
+    same = np.array_equal(read.semantic, pixels[..., 2]) and np.array_equal(
+        read.instance, pixels[..., 1] + 256 * pixels[..., 0]
+    )
+    return None if same else "other pixels than numpy reads"
+
+
+# ---- results
+
+
+def _predictions(room: Room) -> Any:
+    results = read_results(_top(room))
+    results.check()
+    return {token: results.prediction(token) for token in results.tokens}
+
+
+def _top(room: Room) -> Path:
+    """The results' file or folder."""
+    return room.tree / room.victim.relative_to(room.tree).parts[0] if room.tree.name == "results" else room.tree
+
+
+def _judge_accidents(room: Room, read: Mapping[str, Any]) -> str | None:
+    said = plain.json_file(room.victim)["results"]
+    if list(read) != list(said):
+        return "other samples"
+    for token, accidents in read.items():
+        found = [(each.positions.tolist(), each.time, each.score, each.ids and list(each.ids)) for each in accidents]
+        if found != [(each["positions"], each["time"], each["score"], each.get("ids")) for each in said[token]]:
+            return f"{token}: other accidents"
+    return None
+
+
+def _judge_boxes(room: Room, read: Mapping[str, Any]) -> str | None:
+    said = plain.json_file(room.victim)["results"]
+    if list(read) != list(said):
+        return "other samples"
+    for token, detected in read.items():
+        found = np.column_stack([detected.boxes.center, detected.boxes.size, detected.scores])
+        rows = [
+            (*each["translation"], *np.take(each["size"], [1, 0, 2]), each["detection_score"]) for each in said[token]
+        ]
+        if not np.array_equal(found, np.reshape(rows, (-1, 7))):
+            return f"{token}: other boxes"
+    return None
+
+
+def _judge_motion(room: Room, read: Mapping[str, Any]) -> str | None:
+    shards = [path for path in (room.tree / "motion" / "shards").glob("*.npz") if path.is_file()]
+    for token, output in read.items():
+        if not any(np.array_equal(output.instances, plain.array(shard, f"{token}/instance")) for shard in shards):
+            return f"{token}: other instances"
+    return None
+
+
+def _evaluation(task: str) -> Action:
+    """The numbers, and the page that shows them."""
+
+    def read(room: Room) -> Any:
+        dataset = _dataset(room.home)
+        run = evaluate_results(dataset, _top(room), SETUPS[task], selection(task), workers=1, allow_partial=True)
+        return run.summary(), report_html(run, [])
+
+    def judge(_room: Room, read: tuple[Any, str]) -> str | None:
+        summary, page = read
+        foreign = next((text for text in HTML if text in page), None)
+        return _json_fault(summary) or (None if foreign is None else f"a page that has {foreign}")
+
+    return Action(read, judge)
+
+
+def _json_fault(content: Any) -> str | None:
+    try:
+        json.dumps(content, allow_nan=False)
+    except ValueError as error:
+        return f"a summary that is no JSON: {error}"
+    return None
+
+
+# ---- bundles
+
+
+def _verify(room: Room) -> Any:
+    verified = verify_bundle(room.tree, _dataset(room.home), workers=1)
+    return verified.is_same, verified.to_text()
+
+
+def _judge_verified(room: Room, read: tuple[bool, str]) -> str | None:
+    same, text = read
+    if len(text) > 20_000:
+        return f"a text of {len(text)} characters"
+    if not same or room.victim.name == "files.json":
+        return None
+    before, now = _checksum(room.healthy), _checksum(room.victim)
+    return None if before == now else "said to be the same, though the file has another checksum"
+
+
+def _checksum(path: Path) -> str:
+    return file_checksum(path) if path.is_file() else "none"
+
+
+def _compare(room: Room) -> Any:
+    comparison = compare_bundles(room.tree, room.home / "kept" / "bundles" / room.tree.name)
+    return comparison.to_text(), comparison.as_dict()
+
+
+_BUNDLE = (
+    Action(_verify, _judge_verified),
+    Action(_compare, lambda _room, read: _json_fault(read[1])),
+)
+
+
+# ---- written labels
+
+
+def _labels(room: Room) -> Any:
+    files = LabelFiles(room.tree)
+    return {token: files[token] for token in files}
+
+
+def _judge_labels(room: Room, read: Mapping[str, Any]) -> str | None:
+    for token, labels in read.items():
+        recording, _, frame = token.rpartition("/")
+        path = room.tree / f"{recording}.npz"
+        for name, found in (("instance", labels.instance), ("future_egomotion", labels.future_egomotion)):
+            if not np.array_equal(found, plain.array(path, f"{frame}/{name}"), equal_nan=True):
+                return f"{token}: other {name} than numpy reads"
+    return None
+
+
+# ---- scenario files
+
+
+def _spec(room: Room) -> Any:
+    template = read_spec(room.victim)
+    draw(template, np.random.default_rng(0))
+    return template.root
+
+
+def _judge_spec(room: Room, read: Part) -> str | None:
+    return _part_fault(read, plain.yaml_file(room.victim), "")
+
+
+def _part_fault(part: Part, said: Any, path: str) -> str | None:
+    """The first value that differs; keys of a file have their field's name, `from` alone another one."""
+    for name, choice in part.fields.items():
+        value = next(said[key] for key in (name, name.removesuffix("_arm"), name.replace("_", "-")) if key in said)
+        if isinstance(choice, Part):
+            faults: Iterator[str | None] = iter([_part_fault(choice, value, f"{path}.{name}")])
+        elif isinstance(choice, Items):
+            pairs = zip(choice.items, value, strict=True)
+            faults = (_part_fault(item, each, name) if isinstance(item, Part) else None for item, each in pairs)
+        else:
+            found = list(choice.alternatives())
+            expected = value if isinstance(value, list) else [value]
+            plain_values = all(isinstance(each, str | int | float | bool | None) for each in [*found, *expected])
+            faults = iter(
+                [f"{path}.{name}: {found} and not {expected}" if plain_values and found != expected else None]
+            )
+        if fault := next(filter(None, faults), None):
+            return fault
+    return None
+
+
+# ---- the index
+
+
+def _index(room: Room, *, check: bool = False) -> Any:
+    if check:
+        from deepaccident_devkit.tables import open_index
+
+        open_index(find_release(room.home / "release"), index_dir=room.tree, workers=1, check_files=True)
+    dataset = DeepAccident("v1", room.home / "release", index_dir=room.tree, workers=1, verbose=False)
+    dataset.table_names.sort()
+    return {name: dataset.arrow(name).to_pydict() for name in dataset.table_names}
+
+
+@cache
+def _healthy_tables(home: Path) -> Any:
+    dataset = DeepAccident("v1", home / "release", index_dir=home / "kept" / "index", workers=1, verbose=False)
+    return {name: dataset.arrow(name).to_pydict() for name in dataset.table_names}
+
+
+def _same_tables(room: Room, read: Any) -> bool:
+    return repr(read) == repr(_healthy_tables(room.home))
+
+
+def _judge_opened(room: Room, read: Any) -> str | None:
+    """Other values are there only where a table's checksum says so."""
+    if _same_tables(room, read):
+        return None
+    manifest = read_manifest(room.tree / "v1")
+    kept = {} if manifest is None else manifest.table_files
+    folder = room.tree / "v1" / (manifest.tables if manifest else "")
+    damaged = [name for name, (_, checksum) in kept.items() if _checksum(folder / name) != checksum]
+    return None if damaged else "other values, and all checksums are right"
+
+
+_INDEX = (
+    Action(_index, _judge_opened),
+    Action(
+        lambda room: _index(room, check=True),
+        lambda room, read: None if _same_tables(room, read) else "other values after --check",
+    ),
+)
+
+KINDS = {
+    kind.name: kind
+    for kind in (
+        Kind("label", "text", "small", "*/*/label/*/*.txt", (*_SMALL, _EXPLAINED)),
+        Kind("calib", "pickle", "small", "*/*/calib/*/*.pkl", (*_SMALL, _CALIB, _EXPLAINED)),
+        Kind("meta", "text", "small", "*/meta/*.txt", (*_SMALL, _EXPLAINED)),
+        Kind("split file", "text", "small", "train.txt", _SPLITS),
+        Kind("image", "image", "sensors", "*/*/Camera_Front/*/*.jpg", (Action(_image, _judge_image), _DEEP)),
+        Kind(
+            "LiDAR",
+            "npz",
+            "sensors",
+            "*/*/lidar01/*/*.npz",
+            (
+                Action(lambda room: _sensors(room.tree).load_point_cloud(_token(room), frame="lidar"), _judge_lidar),
+                _EXPLAINED,
+                _DEEP,
+            ),
+        ),
+        Kind(
+            "BEV camera",
+            "npz",
+            "sensors",
+            "*/*/BEV_instance_camera/*/*.npz",
+            (Action(lambda room: _sensors(room.tree).load_bev(_token(room)), _judge_bev), _EXPLAINED, _DEEP),
+        ),
+        Kind(
+            "accident results",
+            "json",
+            "results",
+            "accident",
+            (Action(_predictions, _judge_accidents), _evaluation("accident")),
+        ),
+        Kind(
+            "detection results",
+            "json",
+            "results",
+            "detection",
+            (Action(_predictions, _judge_boxes), _evaluation("detection")),
+        ),
+        Kind(
+            "motion results",
+            "json",
+            "results",
+            "motion/results.json",
+            (Action(_predictions, _judge_motion), _evaluation("motion")),
+        ),
+        Kind(
+            "motion shard",
+            "npz",
+            "results",
+            "motion/shards/*.npz",
+            (Action(_predictions, _judge_motion), _evaluation("motion")),
+        ),
+        Kind("bundle", "json", "bundles/accident", "*.json", _BUNDLE),
+        Kind("bundle's samples", "parquet", "bundles/accident", "*.parquet", _BUNDLE),
+        Kind("bundle's results", "npz", "bundles/motion", "results/motion/shards/*.npz", _BUNDLE),
+        Kind("labels' list", "json", "labels", "manifest.json", (Action(_labels, _judge_labels),)),
+        Kind("labels", "npz", "labels", "*/*/*.npz", (Action(_labels, _judge_labels),)),
+        Kind("scenario file", "yaml", "specs", "*.yaml", (Action(_spec, _judge_spec),)),
+        Kind("index's list", "json", "index", f"v1/{MANIFEST_FILE}", _INDEX),
+        Kind("index's tables", "arrow", "index", "v1/tables-*/*.arrow", _INDEX),
+        Kind("index's shards", "shard", "index", "v1/shards/*/*.arrow", _INDEX),
+    )
+}
+"""By name."""

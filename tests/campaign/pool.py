@@ -1,0 +1,94 @@
+"""Cases spread over several workers; each worker's process has a thread here that feeds it."""
+
+import json
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import IO
+
+import numpy as np
+
+from campaign import worker
+from campaign.kinds import KINDS
+from campaign.mutations import GROUPS, fitting
+from campaign.worker import SECONDS, Case, Outcome
+
+WORKERS = 2
+KINDS_MODULE = "campaign.kinds"
+_TESTS = Path(__file__).parents[1]
+
+
+def drawn(count: int, seed: int) -> list[Case]:
+    """So many cases: kinds and groups of mutations by turns, the mutation of a group by chance."""
+    rng = np.random.default_rng(seed)
+    groups = [(kind.name, names) for group in GROUPS for kind in KINDS.values() if (names := fitting(kind.form, group))]
+    return [
+        Case(kind, names[int(rng.integers(len(names)))], number // len(groups) + 1000 * seed)
+        for number, (kind, names) in zip(range(count), groups * (count // len(groups) + 1), strict=False)
+    ]
+
+
+def run(
+    cases: Iterable[Case],
+    healthy: Path,
+    *,
+    seconds: float = SECONDS,
+    workers: int = WORKERS,
+    kinds: str = KINDS_MODULE,
+    tell: Callable[[Outcome], object] = lambda _: None,
+) -> list[Outcome]:
+    """The outcomes of the cases, in their order.
+
+    Args:
+        cases: of kinds of files in the module `kinds`.
+        healthy: the files that are changed; each worker makes a copy beside them.
+        seconds: that a case may take.
+        workers: how many processes.
+        kinds: the module of the kinds of files.
+        tell: is called with each outcome.
+    """
+    waiting: SimpleQueue[tuple[int, Case]] = SimpleQueue()
+    for entry in enumerate(cases):
+        waiting.put(entry)
+    outcomes: dict[int, Outcome] = {}
+
+    def feed(number: int) -> None:
+        with _server(healthy, number, kinds) as (asked, answered):
+            while True:
+                try:
+                    position, case = waiting.get_nowait()
+                except Empty:
+                    return
+                asked.write(json.dumps([asdict(case), seconds]) + "\n")
+                asked.flush()
+                outcomes[position] = Outcome(**{**json.loads(answered.readline()), "case": case})
+                tell(outcomes[position])
+
+    threads = [threading.Thread(target=feed, args=(number,)) for number in range(workers)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return [outcomes[number] for number in sorted(outcomes)]
+
+
+@contextmanager
+def _server(healthy: Path, number: int, kinds: str) -> Iterator[tuple[IO[str], IO[str]]]:
+    """A process that answers cases, with its input and its output."""
+    home = healthy.with_name(f"{healthy.name} of worker {number}")
+    command = [sys.executable, "-W", "ignore", worker.__file__, str(healthy), str(home), kinds]
+    paths = os.pathsep.join([str(_TESTS), str(_TESTS.parent), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
+    environment.pop("DEEPACCIDENT_LIMITS", None)
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment) as process:
+        assert process.stdin
+        assert process.stdout
+        yield process.stdin, process.stdout
+        process.stdin.close()
