@@ -157,11 +157,10 @@ def read_lone_words(path: Path) -> list[tuple[int, str, bool]]:
     """
     content = _content(path, ended=False)
     lines = content.splitlines(keepends=True)
-    words = ((number, line.split(maxsplit=1)) for number, line in enumerate(lines, start=1))
     return [
-        (number, shortened(found[0].decode(errors="replace")), lines[number - 1] == found[0])
-        for number, found in words
-        if len(found) == 1
+        (number, shortened(words[0].decode(errors="replace")), not line.endswith((b"\n", b"\r")))
+        for number, line in enumerate(lines, start=1)
+        if len(words := line.split(maxsplit=1)) == 1
     ]
 
 

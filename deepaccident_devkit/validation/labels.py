@@ -70,7 +70,8 @@ def _lone_words(subject: Subject) -> Iterator[Finding]:
 
 
 def _crowds(subject: Subject) -> Iterator[Finding]:
-    for agent, counts in enumerate(subject.box_counts):
+    count = np.bincount(subject.boxes.sample, minlength=subject.files.num_samples)
+    for agent, counts in enumerate(count.reshape(len(subject.agents), -1)):
         frames = np.flatnonzero(counts > MOST_BOXES) + 1
         if len(frames):
             what = f"up to {counts.max():,} boxes in a label, more than {MOST_BOXES:,}, {frames_text(frames)}"

@@ -120,12 +120,6 @@ class Subject:
         return found
 
     @cached_property
-    def box_counts(self) -> IntArray:
-        """(A, F) boxes of each label."""
-        counts: IntArray = np.bincount(self.boxes.sample, minlength=self.files.num_samples)
-        return counts.reshape(len(self.agents), self.num_frames)
-
-    @cached_property
     def lidar_boxes(self) -> Boxes:
         """All N boxes, each in the LiDAR frame it was recorded in."""
         return self.boxes.labels.boxes()

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from deepaccident_devkit.reading import shortened
 from deepaccident_devkit.release.meta import Meta, read_meta
 from deepaccident_devkit.taxonomy import META_AGENTS, UNTRACKED_ID, VEHICLE_AGENTS, WARM_UP_FRAMES
 from deepaccident_devkit.text import columns_text
@@ -13,6 +14,7 @@ _TEXTS = {
     "ego_vehicle_direction": ("direction of ego", "where the ego vehicle goes at the junction"),
     "other_vehicle_direction": ("direction of other", "where the other vehicle goes at the junction"),
 }
+_WIDEST = 120
 _NOBODY = str(UNTRACKED_ID)
 _AFTERWORD = "In Python: release.read_meta(path), with raw=True for its lines."
 
@@ -23,20 +25,26 @@ def meta_text(path: Path) -> str:
     numbered = [(number, line.strip()) for number, line in enumerate(read_meta(path, raw=True), start=1)]
     (first, words), *others = [(number, line) for number, line in numbered if line]
     rows = [["line", "token", "name", "meaning"]]
-    rows += [[str(first), *cells] for cells in _first_line(meta, words.split())]
+    rows += [[str(first), *map(_cell, cells)] for cells in _first_line(meta, words.split())]
     for number, line in others:
         key, _, value = line.partition(":")
-        rows += [[str(number), *cells] for cells in _entry(meta, key.strip(), value.strip())]
+        rows += [[str(number), *map(_cell, cells)] for cells in _entry(meta, key.strip(), value.strip())]
     return (
         f"A meta file: how a scenario was set up and how it ended. {_ending(meta)}\n\n"
         f"{columns_text(rows, left=4)}\n\n{_AFTERWORD}"
     )
 
 
+def _cell(text: str) -> str:
+    return shortened(text, _WIDEST)
+
+
 def _ending(meta: Meta) -> str:
     if meta.collision is None:
         return "It ended without a collision."
-    return f"It ended with a collision of a {' and a '.join(meta.collision.classes)}, at its last frame."
+    return (
+        f"It ended with a collision of a {' and a '.join(map(shortened, meta.collision.classes))}, at its last frame."
+    )
 
 
 def _first_line(meta: Meta, words: Sequence[str]) -> list[tuple[str, str, str]]:

@@ -92,6 +92,17 @@ def image_cut(place: Place, rng: np.random.Generator) -> str:
 
 
 @IMAGES.kind()
+def image_ends_early(place: Place, rng: np.random.Generator) -> str:
+    """A part of an image's coded data before its end marker is gone; decoders do not report this."""
+
+    def change(content: bytes) -> bytes:
+        start = content.index(b"\xff\xda") + 14
+        return content[: rng.integers(start, start + (len(content) - start) * 9 // 10)] + b"\xff\xd9"
+
+    return _replace_file(place, rng, _camera(rng), change)
+
+
+@IMAGES.kind()
 def image_emptied(place: Place, rng: np.random.Generator) -> str:
     """An image file is empty."""
     return _replace_file(place, rng, _camera(rng), lambda _: b"")
@@ -197,6 +208,12 @@ def image_mirrored(place: Place, rng: np.random.Generator) -> str:
 def lidar_cut(place: Place, rng: np.random.Generator) -> str:
     """A point cloud's file ends at a random byte."""
     return _replace_file(place, rng, LIDAR, lambda content: cut(content, rng))
+
+
+@LIDARS.kind()
+def lidar_with_more_bytes(place: Place, rng: np.random.Generator) -> str:
+    """Bytes follow the end of a point cloud's file."""
+    return _replace_file(place, rng, LIDAR, lambda content: content + garbage(rng, 100))
 
 
 @LIDARS.kind()

@@ -293,3 +293,11 @@ def test_the_verb_prints_it(tiny: Path, tmp_path: Path) -> None:
     assert isinstance(result.exception, LabelError)
     assert "3 boxes" in result.output
     assert "FILE" in runner.invoke(deepaccident, ["explain", "--help"]).output
+
+
+@pytest.mark.parametrize("place", [0, 2])
+def test_a_long_word_of_meta_is_shortened(tmp_path: Path, place: int) -> None:
+    words = ["ClearNoon", *["-1"] * 7, "110"]
+    words[place] = "x" * 20_000
+    path = copied(tmp_path / "meta.txt", f"{' '.join(words)}\n {'key' * 9999}: {'x' * 9999}".encode())
+    assert len(explain_file(path).text) < 6000

@@ -375,11 +375,10 @@ def test_the_first_fault_among_many_boxes_is_named(write, line: int, ends: str) 
         read_label(write(ends.join([*lines, "bus 2"])))
 
 
-@pytest.mark.slow
 def test_200_000_boxes(write) -> None:
-    lines = [HEADER, *[BEHIND] * 200_000]
-    for ends in ("\n", "\r\n"):
-        assert len(read_label(write(ends.join(lines)))) == 200_000
+    """A second; a walk over their words would take ten."""
+    lines = [HEADER, *[PARKED] * 200_000]
+    assert len(read_label(write("\r\n".join(lines)))) == 200_000
     with pytest.raises(LabelError, match=r"label\.txt:200002: expected 13 fields, found 2"):
         read_label(write("\n".join([*lines, "car 1"])))
 
@@ -389,4 +388,5 @@ def test_words_alone_on_a_line_are_told(write) -> None:
     text = f"one\n{HEADER}\n\n{PARKED}\n two \n{OWN}\ncar"
     assert len(read_label(write(text))) == 2
     assert read_lone_words(write(text)) == [(1, "one", False), (5, "two", False), (7, "car", True)]
+    assert read_lone_words(write(text + " "))[-1] == (7, "car", True)
     assert read_lone_words(write(text + "\n"))[-1] == (7, "car", False)
