@@ -23,6 +23,8 @@ _LONGEST_END: Final = _LARGE_END_LENGTH + _LOCATOR_LENGTH + _END_LENGTH + (1 << 
 """Bytes at the end of a file among which its archive's end is: the last of it is a comment."""
 _MOST_DIRECTORY: Final = 4 << 20
 """Bytes of an archive's directory: Python needs some twenty times as many for it."""
+_UTF8: Final = 1 << 11
+"""Of a member's flags: its name is not in code page 437."""
 _HEADER_READERS: Final = {(1, 0): "read_array_header_1_0", (2, 0): "read_array_header_2_0"}
 DAMAGED_ARCHIVE: Final = (
     OSError,
@@ -145,10 +147,13 @@ def _stored(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
         head = file.read(_LOCAL_LENGTH)
         if not head.startswith(_LOCAL) or len(head) < _LOCAL_LENGTH:
             raise zipfile.BadZipFile("a member's head is damaged")
-        file.seek(_number(head, 26, 2) + _number(head, 28, 2), os.SEEK_CUR)
+        name = file.read(_number(head, 26, 2))
+        file.seek(_number(head, 28, 2), os.SEEK_CUR)
         content: bytes = file.read(entry.compress_size)
     if len(content) < entry.compress_size:
         raise zipfile.BadZipFile("a member ends early")
+    if name != entry.orig_filename.encode("utf-8" if entry.flag_bits & _UTF8 else "cp437"):
+        raise zipfile.BadZipFile("a member's head has another name than the directory")
     return content
 
 

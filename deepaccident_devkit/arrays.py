@@ -136,9 +136,12 @@ def checked_number(
     """A single number, numpy's scalars among them, as Python's float; or raise `error`, which says what is expected."""
     if isinstance(value, np.ndarray) and value.ndim == 0:
         value = value.item()
-    if not isinstance(value, Real):
-        raise error(f"{name}: expected {expected}, found {value!r}")
-    return float(value)
+    try:
+        if isinstance(value, Real):
+            return float(value)
+    except OverflowError:  # a whole number of hundreds of digits
+        pass
+    raise error(f"{name}: expected {expected}, found {value!r}")
 
 
 def checked_whole(

@@ -162,7 +162,7 @@ def _with_orientation(grid: BevGrid, orientation: Orientation) -> BevGrid:
 def _axis(name: str, given: Axis) -> Axis:
     try:
         low, high, size = (float(number) for number in given)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ConfigError(f"{name}: expected start, end and cell size in metres, found {given!r}") from error
     if not (low < high and 0 < size < math.inf and math.isfinite((high - low) / size)):
         raise ConfigError(f"{name}: expected start < end and a cell size above 0 in metres, found {given!r}")

@@ -29,7 +29,7 @@ _CELL_BYTES: Final = 16
 """Of the maps of a sample, in memory, at least."""
 _LOCK: Final = ".lock"
 _WRITTEN: Final = (MANIFEST, *(f"{agent}.npz" for agent in AGENTS))
-_RECORDING: Final = re.compile(rf"(?!\.)[^/\\\0]+/(?!\.)[^/\\\0]+/({'|'.join(AGENTS)})")
+_RECORDING: Final = re.compile(rf"(?!\.)[^/\\\0]{{1,255}}/(?!\.)[^/\\\0]{{1,255}}/({'|'.join(AGENTS)})")
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,7 +198,7 @@ def _samples(read: Mapping[str, Any]) -> dict[str, list[int]]:
     for recording, frames in read.items():
         good = _RECORDING.fullmatch(recording) and isinstance(frames, list)
         if not good or not all(type(frame) is int and frame > 0 for frame in frames):
-            raise ValueError(f"samples of {recording!r}: expected a scenario, agent and frame numbers")
+            raise ValueError(f"samples of {shortened(recording)!r}: expected a scenario, agent and frame numbers")
     return {recording: list(frames) for recording, frames in read.items()}
 
 

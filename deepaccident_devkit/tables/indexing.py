@@ -3,7 +3,7 @@
 import hashlib
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -182,7 +182,7 @@ def edited_scenarios(layout: ReleaseLayout, folder: Path, manifest: Manifest) ->
             edited.append(token)
     name = _tables_name([outcome for outcome in same if outcome.indexed], splits)
     made_from_these = bool(edited) or name == manifest.tables
-    return edited, made_from_these and table_file_states(folder / manifest.tables) == manifest.table_files
+    return edited, made_from_these and _are_whole(folder / manifest.tables, manifest.table_files)
 
 
 def _problems(outcomes: Sequence[Outcome], splits: SplitAssignment) -> tuple[Problem, ...]:
@@ -206,7 +206,7 @@ def _write_tables(
     if not name:
         return "", {}
     before = read_manifest(folder)
-    if before and before.tables == name and table_file_states(folder / name) == before.table_files:
+    if before and before.tables == name and _are_whole(folder / name, before.table_files):
         return name, dict(before.table_files)
     shards = [shard_path(folder / SHARDS_FOLDER, outcome.token) for outcome in outcomes]
     assigned = [splits.split_of.get(outcome.token) for outcome in outcomes]
@@ -226,8 +226,16 @@ def _tables_name(outcomes: Sequence[Outcome], splits: SplitAssignment) -> str:
 
 def table_file_states(folder: Path) -> dict[str, tuple[int, str]]:
     """Size and checksum of each file of a folder of tables, by name; nothing if there is no such folder."""
-    paths = sorted(path for path in folder.glob("*.arrow") if path.is_file())
-    return {path.name: (path.stat().st_size, file_checksum(path)) for path in paths}
+    return {name: (size, file_checksum(folder / name)) for name, size in _sizes(folder).items()}
+
+
+def _are_whole(folder: Path, states: Mapping[str, tuple[int, str]]) -> bool:
+    """Whether the tables in a folder have these sizes and checksums; of another size nothing is read."""
+    return _sizes(folder) == {name: size for name, (size, _) in states.items()} and table_file_states(folder) == states
+
+
+def _sizes(folder: Path) -> dict[str, int]:
+    return {path.name: path.stat().st_size for path in sorted(folder.glob("*.arrow")) if path.is_file()}
 
 
 def _refuse_links(shards: Path) -> None:

@@ -10,7 +10,6 @@ from typing import Any
 
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.files import write_bytes
-from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.tables.specs import table_specs
 from deepaccident_devkit.tables.store import table_path
@@ -92,8 +91,8 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 def _content(folder: Path) -> Mapping[str, object]:
     """The manifest's JSON object, empty if there is none."""
     try:
-        content = parsed_json(read_bytes(folder / MANIFEST_FILE, "index"))
-    except (OSError, ValueError, MemoryError):
+        content = json.loads(read_bytes(folder / MANIFEST_FILE, "index"))  # names of files may have half characters
+    except (OSError, ValueError, RecursionError, MemoryError):
         return {}
     return content if isinstance(content, dict) else {}
 

@@ -85,10 +85,11 @@ def displacement_velocities(centers: FloatArray, agent: IntArray, label_id: IntA
     after = np.concatenate([follows, [False]])[: len(steps)]
     index = np.arange(len(steps))
     span = (before.astype(np.float64) + after) * FRAME_PERIOD
-    moved = position[index + after] - position[index - before]
     known = (before | after) & (steps[:, 1] != UNTRACKED_ID)
     velocity = np.full((len(steps), 3), np.nan)
-    velocity[known] = moved[known] / span[known, None]
+    with np.errstate(over="ignore"):  # labels may hold the largest numbers
+        moved = position[index + after] - position[index - before]
+        velocity[known] = moved[known] / span[known, None]
     return velocity[step_of.reshape(-1)]
 
 

@@ -133,9 +133,9 @@ def _label_fault(velocity: Any, boxes: Any, speed: tuple[float, ...], rows: list
         return f"{len(boxes)} boxes and not {len(rows)}"
     for box, row in zip(boxes, rows, strict=True):
         same = np.array_equal([*box.center, *box.size], [row[1], -row[2], *row[3:7]])
-        turn = np.angle(np.exp(1j * (box.yaw + row[7])))
+        turn = abs(np.exp(1j * box.yaw) - np.exp(-1j * row[7]))
         facts = (box.category, box.actor_id, box.num_lidar_pts, box.camera_visible)
-        if not same or abs(turn) > 1e-6 or facts != (row[0], *row[10:]):
+        if not same or turn > 1e-6 or facts != (row[0], *row[10:]):
             return f"{box!r} and not {row}"
     return None
 

@@ -610,6 +610,8 @@ def neighbour_with_an_odd_name(path: Path, rng: Rng) -> None:
     )
     name = name.replace("/", "∕")
     beside = _any(rng, (path.parent, path.parent.parent))
+    if (beside / name).exists():
+        name += "~"
     kind = int(rng.integers(4))
     if kind == 0:
         (beside / name).mkdir()

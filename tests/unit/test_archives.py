@@ -92,6 +92,7 @@ HOSTILE = {
     "an unknown compression": lambda: patched(npz(), 10, 14, 2),
     "LZMA": lambda: npz(way=zipfile.ZIP_LZMA),
     "encrypted": lambda: patched(npz(), 8, 1, 2),
+    "another name": lambda: npz().replace(b"data.npy", b"date.npy", 1),
     "a place outside": lambda: patched(npz(), 42, 10**6),
     "bytes after the archive": lambda: npz() + b"more",
     "bytes before the archive": lambda: b"more" + npz(),

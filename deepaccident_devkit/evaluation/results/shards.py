@@ -205,7 +205,7 @@ def check_shard(task: ShardCheck) -> None:
     """Read all of a shard; raises ResultsError that names shard, token and array."""
     shard, path = task.shard, task.root / task.shard.file
     with told_of(task.root / RESULTS_FILE), at(shard.file):
-        if file_checksum(path) != shard.checksum:
+        if path.stat().st_size != shard.bytes or file_checksum(path) != shard.checksum:
             raise ContentError("its bytes are not those that the checksum is of; copy it again from where it was made")
         with opened(task.root, shard) as archive:
             _check_members(archive, shard, task.form)

@@ -138,10 +138,10 @@ def read_rows(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     try:
         table = _table(read_bytes(path, "bundle"))
         stamp: dict[str, Any] = parsed_json((table.schema.metadata or {})[STAMP_KEY])
+        rows: list[dict[str, Any]] = table.to_pylist()
     except (OSError, pa.ArrowException, KeyError, TypeError, ValueError, MemoryError) as error:
         told = shortened(fault_text(error), _MOST_TOLD)
         raise ResultsError(f"{path}: is no table of samples ({told}); evaluate again") from error
-    rows: list[dict[str, Any]] = table.to_pylist()
     return rows, stamp
 
 

@@ -148,6 +148,13 @@ class TestParquet:
         assert len(str(raised.value)) < 1000
         assert pool.bytes_allocated() - before < 100 << 20
 
+    def test_a_text_that_is_none(self, tmp_path: Path) -> None:
+        path = tmp_path / "rows.parquet"
+        write_rows(path, [{"token": "é" * 20}], {})
+        path.write_bytes(path.read_bytes().replace("é".encode(), b"\xff\xff"))
+        with pytest.raises(ResultsError, match="is no table of samples"):
+            read_rows(path)
+
     def test_a_pipe_and_a_giant(self, tmp_path: Path) -> None:
         os.mkfifo(tmp_path / "pipe")
         with pytest.raises(ResultsError, match=r"not a regular file \(a named pipe\)"):
