@@ -18,7 +18,6 @@ from functools import cache, lru_cache
 from pathlib import Path
 from typing import Final
 
-_BLOCK = 1 << 20
 _TEMPORARY: Final = re.compile(
     r"\.(?P<name>.+?)\.(?:(?P<host>[0-9a-f]{8})-(?P<process>[1-9]\d{0,9})-(?P<start>\d+)-)?\d+\.tmp(?:\.\w+)?",
     re.DOTALL,
@@ -149,15 +148,6 @@ def write_bytes(path: Path, content: bytes) -> None:
     """Write `content` to `path` atomically, making its folder where needed."""
     with replacing(path) as temporary:
         temporary.write_bytes(content)
-
-
-def file_checksum(path: Path) -> str:
-    """A checksum of a file's bytes; 1.8 GB of tables take 2 s."""
-    checksum = hashlib.blake2b(digest_size=16)
-    with path.open("rb") as file:
-        while block := file.read(_BLOCK):
-            checksum.update(block)
-    return checksum.hexdigest()
 
 
 def is_writable_folder(path: Path) -> bool:

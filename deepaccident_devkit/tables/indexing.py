@@ -10,9 +10,9 @@ from functools import partial
 from pathlib import Path
 
 from deepaccident_devkit.errors import DeepAccidentError, IndexStoreError
-from deepaccident_devkit.files import file_checksum, replacing_folder
+from deepaccident_devkit.files import replacing_folder
 from deepaccident_devkit.parallel import run_batch
-from deepaccident_devkit.reading import observed
+from deepaccident_devkit.reading import file_checksum, observed
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, read_meta
 from deepaccident_devkit.tables.build import ScenarioFiles, read_scenario, scenario_rows
 from deepaccident_devkit.tables.findings import Finding

@@ -9,8 +9,8 @@ import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
 from deepaccident_devkit.errors import ReleaseError, SensorFileError
-from deepaccident_devkit.files import file_checksum
 from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.reading import file_checksum
 from deepaccident_devkit.release import read_bev, read_image, read_lidar
 from deepaccident_devkit.release._content import read_content
 from deepaccident_devkit.release.bev_camera import TAGS

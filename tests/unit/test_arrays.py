@@ -137,7 +137,7 @@ def test_single_numbers_of_python_and_numpy() -> None:
     for value in (2, np.int64(2), np.uint8(2)):
         whole = checked_whole("x", value)
         assert (type(whole), whole) == (int, 2)
-    for wrong in ("2", None, [2], np.zeros(1), 2j):
+    for wrong in ("2", None, [2], np.zeros(1), 2j, 10**400):
         with pytest.raises(ConfigError, match="x: expected metres, found"):
             checked_number("x", wrong, "metres", ConfigError)
     for wrong in (2.0, "2", None, [2]):

@@ -1,6 +1,7 @@
 """The gate: regular files only, none above its kind's limit, no waiting, messages of bounded length."""
 
 import os
+import re
 import stat
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -8,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+import deepaccident_devkit
 from deepaccident_devkit.reading import LIMITS, LIMITS_VARIABLE, check_size, limit_of, open_file, read_bytes, shortened
 
 
@@ -89,3 +91,31 @@ def test_a_long_text_loses_its_middle() -> None:
     assert len(shortened("x" * 10**6)) <= 100
     assert shortened("begin" + "x" * 1000 + "end").startswith("begin")
     assert shortened("begin" + "x" * 1000 + "end").endswith("end")
+
+
+OTHER_WAYS_TO_READ = re.compile(
+    r"""\.read_(bytes|text)\(|\bnp\.load\(
+    |\.open\((?!BytesIO|.*["'][wa]b?["'])|\bZipFile\((?!.*"w")""",
+    re.VERBOSE,
+)
+NOT_OF_STRANGERS = {
+    "reading.py": "the gate",
+    "archives.py": "its archives, of which the end was checked",
+    "files.py": "the system's processes",
+    "cli/demo.py": "the mark of the demo's own folder",
+    "evaluation/runs/bundles.py": "counts that were written a line before",
+    "render/replay/replay.py": "the package's own page",
+    "synth/spec/catalogue.py": "the package's own designs",
+}
+
+
+def test_files_are_opened_by_the_gate_alone() -> None:
+    package = Path(deepaccident_devkit.__file__).parent
+    found = {
+        path.relative_to(package).as_posix()
+        for path in package.rglob("*.py")
+        if path.parts[-2] != "testing" and "breakages" not in path.parts
+        for line in path.read_text(encoding="utf-8").splitlines()
+        if OTHER_WAYS_TO_READ.search(line)
+    }
+    assert found == set(NOT_OF_STRANGERS)

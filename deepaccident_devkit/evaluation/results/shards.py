@@ -36,9 +36,8 @@ from deepaccident_devkit.evaluation.results.motion_arrays import (
     members,
     put_array,
 )
-from deepaccident_devkit.files import file_checksum
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.reading import check_size, irregular_text
+from deepaccident_devkit.reading import check_size, file_checksum, irregular_text
 
 SHARD_FIELDS: Final = ("file", "tokens", "bytes", "checksum")
 
@@ -51,7 +50,7 @@ class Shard:
         file: its path in the folder of the results, with `/`.
         tokens: of its samples, in order.
         bytes: its size.
-        checksum: BLAKE2b of its bytes, 16 bytes as hexadecimal digits (`files.file_checksum`).
+        checksum: BLAKE2b of its bytes, 16 bytes as hexadecimal digits (`reading.file_checksum`).
     """
 
     file: str

@@ -23,9 +23,9 @@ from deepaccident_devkit.evaluation.runs.rows import sample_rows, write_rows
 from deepaccident_devkit.evaluation.runs.selection import SampleSelection
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.evaluation.runs.shapes import FILES, SCENARIOS, SUMMARY, misfits
-from deepaccident_devkit.files import file_checksum, replacing_folder, temporary_path
+from deepaccident_devkit.files import replacing_folder, temporary_path
 from deepaccident_devkit.json_text import parsed_json
-from deepaccident_devkit.reading import check_size, fault_text, irregular_text, read_bytes, shortened
+from deepaccident_devkit.reading import check_size, fault_text, file_checksum, irregular_text, read_bytes, shortened
 from deepaccident_devkit.taxonomy import MINI_SPLITS, SPLITS
 
 SUMMARY_FILE: Final = "metrics_summary.json"

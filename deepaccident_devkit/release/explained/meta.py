@@ -72,13 +72,13 @@ def _first_line(meta: Meta, words: Sequence[str]) -> list[tuple[str, str, str]]:
 def _entry(meta: Meta, key: str, value: str) -> list[tuple[str, str, str]]:
     """The tokens of a later line."""
     words = value.split()
-    if key == "colliding agents":
+    if key == "colliding agents" and len(words) == 2:  # of a key that stands twice, only the last line was checked
         pair = "of those who collided" if meta.collision else "of those who were to collide"
         return [
-            (word, f"{which} {pair}", META_AGENTS[word] or "a road user that records nothing, or nobody")
+            (word, f"{which} {pair}", META_AGENTS.get(word) or "a road user that records nothing, or nobody")
             for word, which in zip(words, ("first", "second"), strict=True)
         ]
-    if key == "agents id":
+    if key == "agents id" and len(words) == len(VEHICLE_AGENTS):
         return [
             (word, f"actor id of {agent}", "its rows in the other agents' labels have this id")
             for word, agent in zip(words, VEHICLE_AGENTS, strict=True)

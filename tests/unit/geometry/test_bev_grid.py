@@ -86,6 +86,7 @@ def test_decimal_resolutions_are_whole() -> None:
         ((0, 1, 1e-320), r"x: expected start < end and a cell size above 0"),
         ((-50, 50), r"x: expected start, end and cell size in metres, found \(-50, 50\)"),
         (7, r"x: expected start, end and cell size in metres, found 7"),
+        ((0, 10**400, 1), r"x: expected start, end and cell size in metres, found \(0, 10+, 1\)"),
     ],
 )
 def test_ranges_that_are_no_cells_are_refused(x: object, message: str) -> None:

@@ -168,6 +168,15 @@ def test_no_collision_an_outsider_and_unknown_lines_are_told(tmp_path: Path) -> 
     assert "– road type unsaid" in told
 
 
+def test_of_a_key_that_stands_twice_any_line_is_told(tiny: Path, tmp_path: Path) -> None:
+    first, *lines = tiny_file(tiny, "meta").read_text("ascii").split("\n")
+    doubled = "\n".join(
+        [first, " agents id: 7", " colliding agents: nobody here at all", " colliding agents: x y", *lines]
+    )
+    told = explain_file(copied(tmp_path / "meta.txt", doubled.encode())).text
+    assert "nobody here at all" in told
+
+
 def test_a_broken_meta_file_is_the_readers_error(tmp_path: Path) -> None:
     path = copied(tmp_path / "meta.txt", META.replace("1223 1236 1212 1237", "1 2 3").encode())
     with pytest.raises(MetaError, match=r"meta\.txt:3: expected four agents' ids"):

@@ -24,7 +24,7 @@ from deepaccident_devkit.evaluation.runs import (
     save_run,
 )
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.files import file_checksum
+from deepaccident_devkit.reading import file_checksum
 
 FILES = {"metrics_summary.json", "counts.json", "samples.parquet", "scenarios.json", "files.json"}
 MISFITS: dict[str, tuple[Callable[[Any], object], str]] = {
