@@ -168,8 +168,8 @@ def test_no_collision_an_outsider_and_unknown_lines_are_told(tmp_path: Path) -> 
     assert "– road type unsaid" in told
 
 
-def test_of_a_key_that_stands_twice_any_line_is_told(tiny: Path, tmp_path: Path) -> None:
-    first, *lines = tiny_file(tiny, "meta").read_text("ascii").split("\n")
+def test_of_a_key_that_stands_twice_any_line_is_told(tmp_path: Path) -> None:
+    first, *lines = META.split("\n")
     doubled = "\n".join(
         [first, " agents id: 7", " colliding agents: nobody here at all", " colliding agents: x y", *lines]
     )
