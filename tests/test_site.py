@@ -13,15 +13,18 @@ import deepaccident_devkit
 DOCS = Path(__file__).parents[1] / "docs"
 NOT_FOR_USERS = {
     *(
+        "archives",
         "arrays",
         "cli",
         "dataset",
         "deepaccident",
         "deprecations",
         "files",
+        "json_text",
         "nuscenes_names",
         "overview",
         "parallel",
+        "reading",
         "tables",
         "text",
     ),
