@@ -20,7 +20,15 @@ version = release = __version__
 
 extensions = ["myst_parser", "markdown_docstrings", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 root_doc = "docs/index"
-include_patterns = ["docs/*.md", "docs/api/*.md", "schema/**.md", "tutorials/*.md", "benchmarks/*.md", "CHANGELOG.md"]
+include_patterns = [
+    "docs/*.md",
+    "docs/api/*.md",
+    "schema/**.md",
+    "tutorials/*.md",
+    "benchmarks/*.md",
+    "CHANGELOG.md",
+    "SECURITY.md",
+]
 templates_path = ["templates"]
 html_theme = "furo"
 html_title = project
