@@ -122,6 +122,8 @@ class Stopper:
             *(_told(first) if stop.kind == "full disk" else ()),
             *_unwhole(files_in(out), healthy.files, verb.progress),
         ]
+        if stop.kind == "kill" and not faults and files_in(out) == healthy.files:
+            return Stopped(stop, "")  # killed when all was written; some verbs refuse to write it again
         again = self._run(verb, out)
         if again["status"] != 0:
             faults.append(f"the next run: status {again['status']}: {again['message'][-300:]}")

@@ -17,7 +17,7 @@ def label_windows_lines(victim: Victim) -> Path:
     return victim.replace("label", lambda content: content.replace(b"\n", b" \r\n"))
 
 
-@GROUP.enter()
+@GROUP.enter("label-line-skipped")
 def label_short_lines(victim: Victim) -> Path:
     """A label file has blank lines and lines of one word, which the reference reader skips."""
     return victim.replace("label", lambda content: content.replace(b"\n", b"\n\ncar\n", 3))
