@@ -58,6 +58,8 @@ LIMITS_VARIABLE: Final = "DEEPACCIDENT_LIMITS"
 """The environment variable that changes limits, here and in worker processes: `label=200M lidar=1G`."""
 MOST_QUOTED: Final = 100
 """Characters of a stranger's text in a message."""
+MOST_TOLD: Final = 300
+"""Characters of what a library or the gate says of a fault: numbers, a remedy, perhaps a stranger's text."""
 _LIMIT: Final = re.compile(r"([a-z_]+)=([1-9][0-9]{0,11})([KMGT]?)")
 _FACTORS: Final = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 _FLAGS: Final = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)  # no waiting for a pipe

@@ -13,7 +13,7 @@ import numpy as np
 from deepaccident_devkit.arrays import ByteArray
 from deepaccident_devkit.errors import SensorFileError
 from deepaccident_devkit.files import write_bytes
-from deepaccident_devkit.reading import check_size, fault_text, shortened
+from deepaccident_devkit.reading import MOST_TOLD, check_size, fault_text, shortened
 from deepaccident_devkit.release._content import read_content
 
 JPEG_QUALITY = 90
@@ -80,4 +80,4 @@ def _opened(path: Path, content: bytes, formats: tuple[str, ...]) -> Iterator[An
     except (*_DAMAGED, *bombs) as error:
         known = not isinstance(error, UnidentifiedImageError)
         detail = fault_text(error) if known else f"expected {' or '.join(formats)}"
-        raise SensorFileError(f"{path}: not a readable image ({shortened(detail)}); {_REMEDY}") from error
+        raise SensorFileError(f"{path}: not a readable image ({shortened(detail, MOST_TOLD)}); {_REMEDY}") from error

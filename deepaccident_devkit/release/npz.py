@@ -10,7 +10,7 @@ from deepaccident_devkit.archives import DAMAGED_ARCHIVE, array_of, open_zip, re
 from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.errors import SensorFileError
 from deepaccident_devkit.files import write_bytes
-from deepaccident_devkit.reading import FileKind, fault_text, shortened
+from deepaccident_devkit.reading import MOST_TOLD, FileKind, fault_text, shortened
 from deepaccident_devkit.release._content import read_content
 
 KEY = "data"
@@ -38,7 +38,7 @@ def read_npz(path: Path, kind: FileKind) -> AnyArray:
         if isinstance(error, SensorFileError):
             raise
         detail = "expected an npz archive, found a bare array" if content.startswith(_BARE_ARRAY) else ""
-        detail = detail or f"not a readable npz archive ({shortened(fault_text(error))})"
+        detail = detail or f"not a readable npz archive ({shortened(fault_text(error), MOST_TOLD)})"
         raise SensorFileError(f"{path}: {detail}; {_REMEDY}") from error
 
 

@@ -16,7 +16,7 @@ from deepaccident_devkit.evaluation.metrics.frozen_mappings import plain
 from deepaccident_devkit.evaluation.metrics.motion import MotionResult
 from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
 from deepaccident_devkit.json_text import parsed_json
-from deepaccident_devkit.reading import check_size, fault_text, read_bytes, shortened
+from deepaccident_devkit.reading import MOST_TOLD, check_size, fault_text, read_bytes, shortened
 
 Row = dict[str, Any]
 Cells = Iterator[tuple[str, Any]]
@@ -110,7 +110,6 @@ STAMP_KEY: Final = b"deepaccident"
 """Of the metadata: one JSON object."""
 _VALUE_BYTES: Final = 32
 """Of a number as Python holds it."""
-_MOST_TOLD: Final = 300
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], stamp: Mapping[str, Any]) -> None:
@@ -140,7 +139,7 @@ def read_rows(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
         stamp: dict[str, Any] = parsed_json((table.schema.metadata or {})[STAMP_KEY])
         rows: list[dict[str, Any]] = table.to_pylist()
     except (OSError, pa.ArrowException, KeyError, TypeError, ValueError, MemoryError) as error:
-        told = shortened(fault_text(error), _MOST_TOLD)
+        told = shortened(fault_text(error), MOST_TOLD)
         raise ResultsError(f"{path}: is no table of samples ({told}); evaluate again") from error
     return rows, stamp
 

@@ -1,3 +1,4 @@
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -99,3 +100,28 @@ def test_damage_raises_our_error_or_nothing(
     path.write_bytes(data.draw(mutations(path.read_bytes())))
     image, message = outcome(SensorFileError, read_image, path)
     assert image.dtype == np.uint8 if message is None else str(path) in message
+
+
+@pytest.mark.parametrize("kind", ["GIF", "TIFF", "BMP", "EPS", "PPM", "WEBP"])
+def test_other_formats_are_refused_whatever_their_name(path: Path, quarters: np.ndarray, kind: str) -> None:
+    """Decoders of some start programs: EPS starts Ghostscript."""
+    Image.fromarray(quarters).save(path, kind)
+    with pytest.raises(SensorFileError, match=r"not a readable image \(expected JPEG or PNG\)"):
+        read_image(path)
+
+
+def test_a_png_is_read(path: Path, quarters: np.ndarray) -> None:
+    Image.fromarray(quarters).save(path, "PNG")
+    np.testing.assert_array_equal(read_image(path), quarters)
+
+
+def test_a_picture_of_too_many_pixels_is_refused_before_it_is_decoded(path: Path) -> None:
+    Image.new("1", (9000, 9000)).save(path, "PNG")  # a few kilobytes
+    tracemalloc.start()
+    with pytest.raises(
+        SensorFileError,
+        match=r"its picture takes 243,000,000 bytes, more than 33,554,432, .* set DEEPACCIDENT_LIMITS=image=232M",
+    ):
+        read_image(path)
+    assert tracemalloc.get_traced_memory()[1] < 10 << 20
+    tracemalloc.stop()
