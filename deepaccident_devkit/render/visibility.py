@@ -97,6 +97,7 @@ def render_visibility(
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", anchor="N")
     words = axis_words(frame)
     ax.set(xlabel=words[0], ylabel=words[1])
+    ax.locator_params(nbins=6)  # each tick costs time
     set_scene_title(ax, dataset, dataset.get("sample", known.sample)["frame_token"], "who sees whom")
     if "points" in shown:
         _draw_points(dataset, known, frame, ax)
