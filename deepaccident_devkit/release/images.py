@@ -37,7 +37,17 @@ def read_image(path: Path, *, raw: bool = False) -> ByteArray:
         SensorFileError: it is truncated, neither JPEG nor PNG, too large, or no file. (Of a truncated one, OpenCV
             returns a half-grey picture.)
     """
-    with _opened(path, _content(path), _FORMATS) as image:
+    return decode_image(path, read_image_bytes(path), raw=raw)
+
+
+def read_image_bytes(path: Path) -> bytes:
+    """An image file's bytes; raises MissingFileError, and SensorFileError if it is no file or too large."""
+    return read_content(path, "image", SensorFileError, _REMEDY)
+
+
+def decode_image(path: Path, content: bytes, *, raw: bool = False) -> ByteArray:
+    """The image in the bytes of a file, which errors name; as `read_image` returns it."""
+    with _opened(path, content, _FORMATS) as image:
         return np.array(image if raw else image.convert("RGB"))
 
 
@@ -46,7 +56,7 @@ def read_jpeg(path: Path) -> tuple[bytes, tuple[int, int]]:
 
     Raises as `read_image` does.
     """
-    content = _content(path)
+    content = read_image_bytes(path)
     with _opened(path, content, _FORMATS[:1]) as image:
         return content, image.size
 
@@ -61,10 +71,6 @@ def write_image(path: Path, image: ByteArray) -> None:
     if not done:
         raise SensorFileError(f"{path}: an image of shape {image.shape} cannot be encoded as JPEG")
     write_bytes(path, encoded.tobytes())
-
-
-def _content(path: Path) -> bytes:
-    return read_content(path, "image", SensorFileError, _REMEDY)
 
 
 @contextmanager

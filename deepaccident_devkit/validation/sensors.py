@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
-from deepaccident_devkit.errors import ReleaseError, SensorFileError
+from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.reading import file_checksum
-from deepaccident_devkit.release import read_bev, read_image, read_lidar
-from deepaccident_devkit.release._content import read_content
+from deepaccident_devkit.release import read_bev, read_lidar
+from deepaccident_devkit.release.images import decode_image, read_image_bytes
 from deepaccident_devkit.release.bev_camera import TAGS
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.findings import finding_of
@@ -100,8 +100,8 @@ def _images(
     sizes: dict[int, tuple[int, int]] = {}
     for frame, path in paths.items():
         try:
-            image = read_image(path)
-            content = read_content(path, "image", SensorFileError, "restore the file from its archive")
+            content = read_image_bytes(path)
+            image = decode_image(path, content)
         except ReleaseError as error:
             yield finding_of(error, "sensor-unreadable", subject.token)
             continue

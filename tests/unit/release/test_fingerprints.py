@@ -50,12 +50,13 @@ def test_bytes_that_move_to_the_next_file_are_a_change(own_release: Path, scenar
     assert scenario_hashes(opened, [scenario])[scenario].label != before.label
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes")
 def test_a_file_that_cannot_be_read_is_named(own_release: Path, scenario: str) -> None:
     opened = DeepAccident(dataroot=own_release, verbose=False)
     path = first(own_release, "label", "txt")
     path.unlink()
     os.mkfifo(path)
-    with pytest.raises(ReleaseError, match=rf"{path}: not a regular file \(a named pipe\); restore the file"):
+    with pytest.raises(ReleaseError, match=rf"^{path}: not a regular file \(a named pipe\); restore the file"):
         scenario_hashes(opened, [scenario])
 
 
@@ -82,13 +83,3 @@ def test_fingerprint_of_all_in_any_order() -> None:
     assert fingerprint({"x": one, "y": other}) == fingerprint({"y": other, "x": one})
     assert fingerprint({"x": one, "y": other}) != fingerprint({"x": other, "y": one})
     assert digest_of({"a": 1, "b": [2.5]}) == digest_of({"b": [2.5], "a": 1})
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes")
-def test_a_pipe_is_an_error(own_release: Path, scenario: str) -> None:
-    opened = DeepAccident(dataroot=own_release, verbose=False)
-    path = first(own_release, "label", "txt")
-    path.unlink()
-    os.mkfifo(path)
-    with pytest.raises(ReleaseError, match=rf"^{path}: not a regular file"):
-        scenario_hashes(opened, [scenario])
