@@ -12,8 +12,8 @@ from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.reading import file_checksum
 from deepaccident_devkit.release import read_bev, read_lidar
-from deepaccident_devkit.release.images import decode_image, read_image_bytes
 from deepaccident_devkit.release.bev_camera import TAGS
+from deepaccident_devkit.release.images import decode_image, read_image_bytes
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.findings import finding_of
 from deepaccident_devkit.taxonomy import (
