@@ -1,5 +1,6 @@
 """Other processes, as Linux shows them: what they wait for and whom they started."""
 
+import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -24,9 +25,22 @@ def workers_of(process: int) -> list[int]:
 
 def catches(process: int, number: int) -> bool:
     """Whether a process has a handler for a signal."""
-    lines = Path(f"/proc/{process}/status").read_text().splitlines()
-    caught = next(line.split()[1] for line in lines if line.startswith("SigCgt"))
-    return bool(int(caught, 16) >> (number - 1) & 1)
+    return _has(process, "SigCgt", number)
+
+
+def works(process: int) -> bool:
+    """Whether a process of the pool has begun: it leaves Ctrl-C to its parent."""
+    return _has(process, "SigIgn", signal.SIGINT)
+
+
+def _has(process: int, signals: str, number: int) -> bool:
+    """Whether a signal is in one of the sets that the system keeps of a process; one that has ended has none."""
+    try:
+        lines = Path(f"/proc/{process}/status").read_text().splitlines()
+    except OSError:
+        return False
+    found = next((line.split()[1] for line in lines if line.startswith(signals)), "0")
+    return bool(int(found, 16) >> (number - 1) & 1)
 
 
 def wait_for(condition: Callable[[], object], seconds: float = 60.0) -> None:

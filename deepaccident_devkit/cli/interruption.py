@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import sys
@@ -38,6 +39,7 @@ class _Signals:
         threading.Thread(target=self._watch, args=(reading,), name="signals", daemon=True).start()
         for number in _ENDING:
             signal.signal(number, self._handle)
+        atexit.register(_ignore)  # amid its own ending Python would let a signal kill a verb that has done its work
 
     def verb_ended(self) -> None:
         """Raise no more: Python's own ending would print a traceback."""
@@ -75,6 +77,11 @@ def run_interruptibly(verb: Callable[[], None]) -> None:
         _kill_children()
         _say_so()
         sys.exit(128 + signals.first)
+
+
+def _ignore() -> None:
+    for number in _ENDING:
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _end_now(number: int) -> NoReturn:

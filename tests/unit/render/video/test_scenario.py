@@ -4,10 +4,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from video_views import SIZE, decoded, grey, greys
 
+from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.render.video.views import Scene, views_of
+from deepaccident_devkit.render.video.writers import write_video
+from deepaccident_devkit.tables.tokens import frame_token
 
 pytestmark = pytest.mark.slow
 
@@ -23,6 +28,18 @@ def test_a_video_has_all_frames_in_order_at_its_size(video: Callable[..., Path],
 def test_two_workers_write_the_same_bytes_as_one(video: Callable[..., Path]) -> None:
     one, two = (video(f"{count}.mp4", what=[grey, "bev"], frames=slice(0, 3), workers=count) for count in (1, 2))
     assert one.read_bytes() == two.read_bytes()
+
+
+def test_the_same_pictures_are_the_same_bytes(da: DeepAccident, accident: str, tmp_path: Path) -> None:
+    """Whatever the memory held that the encoder gets; rare, hence many times."""
+    scene = Scene(dataset=da, views=views_of([grey, "bev"], None), agents=None, width=SIZE[0], height=SIZE[1])
+    pictures = [scene.picture(frame_token(accident, number)) for number in (1, 2, 3)]
+    rng = np.random.default_rng(0)
+    for number in range(400):
+        used = [np.full(size, number % 256, np.uint8) for size in rng.integers(1, 3_000_000, size=8)]
+        del used[::2]
+        write_video(tmp_path / f"{number}.mp4", pictures, fps=10)
+    assert len({path.read_bytes() for path in tmp_path.iterdir()}) == 1
 
 
 def test_frames_are_numbers_in_any_order_or_a_slice_of_all(video: Callable[..., Path]) -> None:
