@@ -62,6 +62,10 @@ class LabelFilesError(DeepAccidentError, OSError):
     """A folder of written motion labels is missing, damaged or something else."""
 
 
+class ExportError(DeepAccidentError, OSError):
+    """A folder of an export cannot be made, written to or read, or it holds something else."""
+
+
 class LookupFailedError(DeepAccidentError, KeyError):
     """A table, token, field or channel that does not exist was asked for."""
 

@@ -1,0 +1,94 @@
+"""What the verbs of `deepaccident export` on many scenarios share: their options, the plan and the counts they print."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar, get_args
+
+import click
+
+from deepaccident_devkit.cli.options import (
+    WordChoice,
+    agent_names,
+    agents_parameter,
+    release_parameters,
+    where_parameter,
+)
+from deepaccident_devkit.deepaccident import DeepAccident
+from deepaccident_devkit.export.bulk import Exported, Format, Link, Plan, export_release
+
+Verb = TypeVar("Verb", bound=Callable[..., Any])
+_OPTIONS = (
+    click.option(
+        "--out", required=True, type=click.Path(path_type=Path), metavar="FOLDER", help="Folder to write into."
+    ),
+    click.option("--split", help="Only this split: train, val, test, …, or a split file (.txt).  [default: all]"),
+    where_parameter,
+    agents_parameter,
+    click.option(
+        "--link",
+        type=WordChoice(get_args(Link)),
+        default="hard",
+        show_default=True,
+        help="How images are put there: hard links, else symbolic ones, else copies.",
+    ),
+    click.option("--dry-run", is_flag=True, help="Only say how much would be written."),
+)
+
+
+def export_parameters(verb: Verb) -> Verb:
+    """Give a verb the arguments of a release, and --out, --split, --where, --agents, --link and --dry-run."""
+    for option in reversed(_OPTIONS):
+        verb = option(verb)
+    return release_parameters(verb)
+
+
+def run_export(  # noqa: PLR0913 - the options of `export_parameters`
+    kind: Callable[..., Format],
+    own: dict[str, Any],
+    *,
+    out: Path,
+    split: str | None,
+    where: tuple[str, ...],
+    agents: tuple[str, ...],
+    link: Link,
+    dry_run: bool,
+    **release: Any,
+) -> Exported:
+    """Export in a format with its `own` settings; says how much it will be, then what was written and left out."""
+    form = kind(split=split, where=where, agents=agent_names(agents), link=link, **own)  # before the release is indexed
+    done = export_release(
+        DeepAccident(**release),
+        out,
+        form,
+        workers=release["workers"],
+        progress=True,
+        dry_run=dry_run,
+        on_plan=_say_plan,
+    )
+    if dry_run:
+        return done
+    tally = done.tally
+    linked = ", ".join(f"{count:,} files as {_WAYS[way]}" for way, count in sorted(tally.linked.items()))
+    click.echo(
+        f"{done.folder}: {tally.files:,} files written ({size_text(tally.bytes)})"
+        f"{f', {linked}' if linked else ''}; {done.written} written now, {done.kept} were there already"
+    )
+    for what, count in sorted(tally.left_out.items()):
+        click.echo(f"left out: {count:,} {what}")
+    return done
+
+
+_WAYS = {"hard": "hard links", "symbolic": "symbolic links", "copy": "copies"}
+
+
+def size_text(count: int) -> str:
+    """Bytes in GB, or in MB if there are few."""
+    return f"{count / 1e9:,.1f} GB" if count >= 1e9 else f"{count / 1e6:,.1f} MB"
+
+
+def _say_plan(plan: Plan, free: int) -> None:
+    linked = f", {plan.linked_files:,} files to link ({size_text(plan.linked_bytes)})" if plan.linked_files else ""
+    click.echo(
+        f"{plan.samples:,} samples: about {plan.files:,} files to write ({size_text(plan.bytes)}){linked}; "
+        f"{size_text(free)} free"
+    )

@@ -1,0 +1,118 @@
+"""What a format is: its settings, and how a unit of scenarios is planned and written."""
+
+from __future__ import annotations
+
+import os
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, get_args
+
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.export.bulk.output import Link, Output
+from deepaccident_devkit.taxonomy import AGENTS
+from deepaccident_devkit.text import choice
+
+if TYPE_CHECKING:
+    from deepaccident_devkit.dataset import Dataset
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Unit:
+    """What one worker writes at once.
+
+    Attributes:
+        name: of its folder of parts: letters, digits, `_`, `-` and dots; unique.
+        scenarios: tokens, in order.
+    """
+
+    name: str
+    scenarios: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """How much will be written, about.
+
+    Attributes:
+        samples: agents at moments.
+        files: to be made.
+        bytes: in them.
+        linked_files: files of the release that will be linked, or copied.
+        linked_bytes: in those.
+    """
+
+    samples: int = 0
+    files: int = 0
+    bytes: int = 0
+    linked_files: int = 0
+    linked_bytes: int = 0
+
+    def __add__(self, other: Plan) -> Plan:
+        """Both together."""
+        return Plan(**{name: getattr(self, name) + getattr(other, name) for name in Plan.__slots__})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Format(ABC):
+    """A format with its settings; cheap to pickle. Each format adds settings of its own.
+
+    Attributes:
+        split: only scenarios of this split, or of a split file of your own; None for all.
+        where: only scenarios that match all of these filters (`deepaccident_devkit.selection`).
+        agents: only what these recorded.
+        link: how files of the release are put there where the format takes them as they are: `hard` links, else
+            `symbolic` ones, else copies.
+
+    Raises:
+        ChoiceError: no such agent, or no such way.
+    """
+
+    split: str | os.PathLike[str] | None = None
+    where: tuple[str, ...] = ()
+    agents: tuple[str, ...] = AGENTS
+    link: Link = "hard"
+
+    name: ClassVar[str]
+    """One word, as on the command line."""
+    beside: ClassVar[tuple[str, ...]] = ()
+    """Formats whose exports may lie in the same folder already."""
+
+    def __post_init__(self) -> None:
+        """Check the choices, and put the agents in their usual order."""
+        choice("link", self.link, get_args(Link))
+        for name in self.agents:
+            choice("agents", name, AGENTS)
+        if not self.agents:
+            raise ChoiceError(f"agents: expected some of {', '.join(AGENTS)}, found none")
+        object.__setattr__(self, "agents", tuple(name for name in AGENTS if name in self.agents))
+        object.__setattr__(self, "where", tuple(self.where))
+
+    def settings(self) -> dict[str, Any]:
+        """Everything that decides what is written, but the release; for JSON. Links show the same as copies."""
+        found = asdict(self)
+        del found["link"]
+        return {**found, "split": None if self.split is None else os.fspath(self.split)}
+
+    def units(self, dataset: Dataset, scenarios: Sequence[str]) -> list[Unit]:  # noqa: ARG002 - for those that ask it
+        """The chosen scenarios as units: one each."""
+        return [Unit(name=flat_name(token), scenarios=(token,)) for token in scenarios]
+
+    @abstractmethod
+    def plan(self, dataset: Dataset, unit: Unit) -> Plan:
+        """About how much a unit is; fast, so it reads at most a few sensor files."""
+
+    @abstractmethod
+    def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
+        """Write a unit; called again for the same unit after an interruption."""
+
+    @abstractmethod
+    def finish(self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]) -> None:
+        """Write what spans units, from the parts that they left; called again after an interruption."""
+
+
+def flat_name(token: str) -> str:
+    """A scenario's token as the name of one folder: `<type>__<scenario>`."""
+    return re.sub(r"[^\w.-]", "_", token.replace("/", "__"))

@@ -1,0 +1,186 @@
+"""The manifest of an export's folder, which fixes what is in it, and its lock."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from deepaccident_devkit._version import __version__
+from deepaccident_devkit.errors import ConfigError, DeepAccidentError, ExportError
+from deepaccident_devkit.export.bulk.output import Tally
+from deepaccident_devkit.files import remove_leftovers, temporary_of, write_bytes
+from deepaccident_devkit.json_text import parsed_json
+from deepaccident_devkit.reading import fault_text, read_bytes, shortened
+
+logger = logging.getLogger(__name__)
+
+_FORMAT: Final = "DeepAccident export"
+_LOCK: Final = ".deepaccident.lock"
+PARTS: Final = ".deepaccident-parts"
+"""Folder of what is not complete: a record and the parts of each unit that is done."""
+
+
+@dataclass(slots=True, kw_only=True)
+class Manifest:
+    """What a folder holds.
+
+    Attributes:
+        name: of the format; the file is `<name>.manifest.json`.
+        settings: everything that decides what is written.
+        fingerprint: of the truth of the exported scenarios (`release.fingerprints`); None until it is complete.
+        scenarios: token → hash of its label, meta and calib files; empty until it is complete.
+        tally: counts of all that is there.
+    """
+
+    name: str
+    settings: Mapping[str, Any]
+    fingerprint: str | None = None
+    scenarios: Mapping[str, str] = field(default_factory=dict)
+    tally: Tally = field(default_factory=Tally)
+
+    @property
+    def complete(self) -> bool:
+        """Whether everything has been written."""
+        return self.fingerprint is not None
+
+    @classmethod
+    def of(cls, folder: Path, name: str, settings: Mapping[str, Any], beside: tuple[str, ...] = ()) -> Manifest:
+        """The manifest of a folder into which an export will be written; changes nothing.
+
+        Args:
+            folder: it need not exist.
+            name: of the format.
+            settings: of the export.
+            beside: formats whose exports may be there already.
+
+        Raises:
+            ConfigError: the folder holds an export with other settings.
+            ExportError: it holds something else, is a file, or its manifest cannot be read.
+        """
+        try:
+            if manifest_path(folder, name).exists():
+                found = cls.read(folder, name)
+                found.check(folder, settings)
+                return found
+            if folder.exists() and not folder.is_dir():
+                raise ExportError(f"{folder}: is a file; give a folder")
+            others = [] if not folder.exists() else sorted(each.name for each in folder.iterdir())
+        except OSError as error:
+            if isinstance(error, ExportError):
+                raise
+            raise ExportError(f"{folder}: cannot be read ({error}); choose another folder") from error
+        welcome = any(manifest_path(folder, each).name in others for each in beside)
+        strange = [each for each in others if not _is_own(each)]
+        if strange and not welcome:
+            raise ExportError(
+                f"{folder}: is not empty ({shortened(strange[0])}) and holds no {name} export; choose a new folder"
+            )
+        return cls(name=name, settings=settings)
+
+    @classmethod
+    def read(cls, folder: Path, name: str) -> Manifest:
+        """The manifest that a folder has; raises ExportError."""
+        path = manifest_path(folder, name)
+        try:
+            told = parsed_json(read_bytes(path, "bundle"))
+            if (told["what"], told["format"]) != (_FORMAT, name):
+                raise ValueError(f"expected a manifest of a {name} export")
+            release = told["release"]
+            return cls(
+                name=name,
+                settings=dict(told["settings"]),
+                fingerprint=None if release is None else str(release["fingerprint"]),
+                scenarios={} if release is None else {str(key): str(one) for key, one in release["scenarios"].items()},
+                tally=Tally.of(told["written"]),
+            )
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            told = fault_text(error) if isinstance(error, OSError) else f"cannot be read ({shortened(str(error))})"
+            raise ExportError(f"{path}: {told}; export again into an empty folder") from error
+
+    def write(self, folder: Path) -> None:
+        """Write it into its folder."""
+        release = (
+            None
+            if self.fingerprint is None
+            else {
+                "fingerprint": self.fingerprint,
+                "scenarios": dict(sorted(self.scenarios.items())),
+            }
+        )
+        content = {
+            "what": _FORMAT,
+            "format": self.name,
+            "devkit": __version__,
+            "settings": self.settings,
+            "release": release,
+            "written": self.tally.as_dict(),
+        }
+        write_bytes(manifest_path(folder, self.name), f"{json.dumps(content, indent=1)}\n".encode())
+
+    def check(self, folder: Path, settings: Mapping[str, Any]) -> None:
+        """Refuse other settings; raises ConfigError that names what differs."""
+        asked = json.loads(json.dumps(settings))  # tuples become lists, as in the file
+        changed = sorted(name for name in {*self.settings, *asked} if self.settings.get(name) != asked.get(name))
+        if changed:
+            text = "; ".join(
+                f"{name}: {shortened(repr(self.settings.get(name)))}, asked for {shortened(repr(asked.get(name)))}"
+                for name in changed
+            )
+            raise ConfigError(
+                f"{folder}: holds a {self.name} export with other settings ({text}); choose another folder"
+            )
+
+
+def manifest_path(folder: Path, name: str) -> Path:
+    """The manifest of a format's export."""
+    return folder / f"{name}.manifest.json"
+
+
+@contextmanager
+def writing_to(folder: Path) -> Iterator[None]:
+    """Hold the lock of a folder while an export is written into it; make it where needed.
+
+    Raises:
+        ExportError: the folder cannot be made, locked or written to.
+    """
+    from filelock import FileLock, Timeout
+
+    lock = FileLock(folder / _LOCK)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            logger.warning("%s: another process writes an export there; waiting for it", folder)
+            lock.acquire()
+        remove_leftovers(folder)
+    except (OSError, NotImplementedError) as error:  # the latter: a file system without locks
+        raise ExportError(f"{folder}: no export can be written there ({error}); choose another folder") from error
+    try:
+        yield
+    except DeepAccidentError:
+        raise
+    except OSError as error:
+        remedy = "make room there, or choose another folder, and run it again"
+        raise ExportError(f"{folder}: the export cannot be written ({error}); {remedy}") from error
+    finally:
+        lock.release()
+
+
+def remove_parts(folder: Path, name: str) -> None:
+    """Remove what a complete export needs no more."""
+    shutil.rmtree(folder / PARTS / name, ignore_errors=True)
+    parts = folder / PARTS
+    if parts.is_dir() and not any(parts.iterdir()):
+        parts.rmdir()
+
+
+def _is_own(name: str) -> bool:
+    """Whether an export that was killed before it wrote its manifest may have left a file of this name."""
+    return name in (_LOCK, PARTS) or temporary_of(name) is not None

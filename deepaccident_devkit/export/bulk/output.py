@@ -1,0 +1,147 @@
+"""What a format writes into an export's folder, and the counts of it."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import stat
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from deepaccident_devkit.errors import SensorFileError
+from deepaccident_devkit.files import replacing, temporary_path, write_bytes
+
+Link = Literal["hard", "symbolic", "copy"]
+_NO_LINKS: Final = (errno.EXDEV, errno.EPERM, errno.EACCES, errno.EMLINK, errno.ENOTSUP, errno.ENOSYS)
+"""What a file system answers that cannot make a link; a full disk is another matter."""
+
+
+@dataclass(slots=True, kw_only=True)
+class Tally:
+    """Counts of what was written.
+
+    Attributes:
+        files: written anew.
+        bytes: in them.
+        linked: way → files of the release that were linked or copied.
+        left_out: what → how much of it the format cannot hold, or is not in this (partial) release.
+    """
+
+    files: int = 0
+    bytes: int = 0
+    linked: Counter[str] = field(default_factory=Counter)
+    left_out: Counter[str] = field(default_factory=Counter)
+
+    def add(self, other: Tally) -> None:
+        """Count what another one counts."""
+        self.files += other.files
+        self.bytes += other.bytes
+        self.linked += other.linked
+        self.left_out += other.left_out
+
+    def as_dict(self) -> dict[str, Any]:
+        """For a manifest; names in order."""
+        return {
+            "files": self.files,
+            "bytes": self.bytes,
+            "linked": dict(sorted(self.linked.items())),
+            "left_out": dict(sorted(self.left_out.items())),
+        }
+
+    @classmethod
+    def of(cls, read: Mapping[str, Any]) -> Tally:
+        """Of `as_dict`; raises KeyError, TypeError or ValueError for anything else."""
+        return cls(
+            files=int(read["files"]),
+            bytes=int(read["bytes"]),
+            linked=Counter({str(name): int(count) for name, count in read["linked"].items()}),
+            left_out=Counter({str(name): int(count) for name, count in read["left_out"].items()}),
+        )
+
+
+class Output:
+    """The folder that a unit is written into. Each file is complete or absent, and counted.
+
+    Attributes:
+        folder: where paths begin.
+        parts: a folder of the unit's own for what `finish` puts together; gone when the export is complete.
+        tally: the counts so far.
+    """
+
+    def __init__(self, folder: Path, parts: Path, link: Link, tally: Tally | None = None) -> None:
+        """Write below `folder`, and link the release's files in this way or, where that cannot be, in the next one."""
+        self.folder, self.parts, self.tally = folder, parts, Tally() if tally is None else tally
+        self._link = link
+
+    def write(self, path: str, content: bytes) -> None:
+        """Write a file; the path is relative to the folder."""
+        write_bytes(self.folder / path, content)
+        self._count(len(content))
+
+    @contextmanager
+    def file(self, path: str) -> Iterator[Path]:
+        """Yield a temporary path for a file that is written piece by piece."""
+        with replacing(self.folder / path) as temporary:
+            yield temporary
+            size = temporary.stat().st_size
+        self._count(size)
+
+    @contextmanager
+    def whole_folder(self, path: str) -> Iterator[Output]:
+        """Yield the output of a folder whose files all appear at once, in the place of an older one."""
+        target = self.folder / path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        temporary = temporary_path(target)
+        try:
+            temporary.mkdir()
+            yield Output(temporary, self.parts, self._link, self.tally)
+            shutil.rmtree(target, ignore_errors=True)
+            temporary.replace(target)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+    def link(self, source: Path, path: str) -> None:
+        """Link a file of the release: hard, else symbolic, else copied; raises SensorFileError if it is no file."""
+        target = self.folder / path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        real = source.resolve()
+        if not stat.S_ISREG(real.stat().st_mode):
+            raise SensorFileError(f"{source}: not a regular file; restore it from its archive")
+        with replacing(target) as temporary:
+            self.tally.linked[_linked(real, temporary, self._link)] += 1
+
+    def leave_out(self, what: str, count: int = 1) -> None:
+        """Count what is not written; `what` is a plural in plain words, such as `untracked boxes`."""
+        if count:
+            self.tally.left_out[what] += count
+
+    def _count(self, size: int) -> None:
+        self.tally.files += 1
+        self.tally.bytes += size
+
+
+def _linked(source: Path, target: Path, link: Link) -> Link:
+    """Make `target` show `source`, and say how."""
+    if link == "hard":
+        try:
+            os.link(source, target)
+        except OSError as error:
+            if error.errno not in _NO_LINKS:
+                raise
+        else:
+            return "hard"
+    if link in ("hard", "symbolic"):
+        try:
+            target.symlink_to(source)
+        except OSError as error:
+            if error.errno not in _NO_LINKS:
+                raise
+        else:
+            return "symbolic"
+    shutil.copyfile(source, target)
+    return "copy"

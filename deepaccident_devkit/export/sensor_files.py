@@ -1,0 +1,42 @@
+"""The sensor files of a recording that are there, with their sizes, by one look into their folder."""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from pathlib import Path
+
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.release import read_lidar
+from deepaccident_devkit.tables.tokens import sample_token
+from deepaccident_devkit.taxonomy import LIDAR
+
+
+def sensor_files(dataset: Dataset, scenario: str, agent: str, channel: str) -> dict[int, tuple[Path, int]]:
+    """Frame number → path and bytes of the files of a channel that are in this (partial) release.
+
+    Raises:
+        TokenError: no such scenario, agent or channel.
+    """
+    count = dataset.scenario[dataset.getind("scenario", scenario)]["num_frames"]
+    paths = [
+        dataset.get_sample_data_path(f"{sample_token(scenario, agent, number)}/{channel}")
+        for number in range(1, count + 1)
+    ]
+    sizes: dict[str, int] = {}
+    with suppress(FileNotFoundError, NotADirectoryError), os.scandir(paths[0].parent) as entries:
+        for entry in entries:
+            with suppress(OSError):  # a link to nothing is a file that is not there
+                sizes[entry.name] = entry.stat().st_size
+    return {number: (path, sizes[path.name]) for number, path in enumerate(paths, 1) if path.name in sizes}
+
+
+def points_of(dataset: Dataset, scenario: str, agent: str) -> int:
+    """About how many LiDAR points a recording has, all frames together: as many in each as in its first file.
+
+    Raises:
+        SensorFileError: that file cannot be read.
+    """
+    files = sensor_files(dataset, scenario, agent, LIDAR)
+    first = next(iter(files.values()), None)
+    return 0 if first is None else len(read_lidar(first[0], raw=True)) * len(files)
