@@ -1,4 +1,4 @@
-"""What the verbs of `deepaccident export` on many scenarios share: their options, the plan and the counts they print."""
+"""What the verbs of `deepaccident export` on many scenarios share: options, the plan, the counts that they print."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -42,7 +42,7 @@ def export_parameters(verb: Verb) -> Verb:
     return release_parameters(verb)
 
 
-def run_export(  # noqa: PLR0913 - the options of `export_parameters`
+def run_export(
     kind: Callable[..., Format],
     own: dict[str, Any],
     *,

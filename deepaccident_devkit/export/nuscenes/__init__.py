@@ -1,0 +1,1 @@
+"""The nuScenes format, which the nuScenes devkit and mmdet3d read."""
