@@ -1,10 +1,11 @@
-"""`deepaccident export`: a scenario in another tool's format."""
+"""`deepaccident export`: the data in other tools' formats."""
 
 from pathlib import Path
 from typing import Any, get_args
 
 import click
 
+from deepaccident_devkit.cli.export_formats import opencood
 from deepaccident_devkit.cli.options import (
     WordChoice,
     agent_names,
@@ -26,6 +27,10 @@ from deepaccident_devkit.v2x.collisions import default_scenario
 @click.group()
 def export() -> None:
     """Write data in the formats of other tools."""
+
+
+for verb in (opencood,):
+    export.add_command(verb)
 
 
 def _points(context: click.Context, parameter: click.Parameter, value: str) -> str | int:

@@ -27,7 +27,8 @@ CAMERA_CHANNELS: Final = MappingProxyType(
 CHANNEL_NAMES: Final = MappingProxyType({**CAMERA_CHANNELS, LIDAR: LIDAR_CHANNEL})
 ENDINGS: Final = MappingProxyType({**dict.fromkeys(CAMERAS, "jpg"), LIDAR: "pcd.bin"})
 _EPOCH: Final = 1_600_000_000_000_000
-_HOUR, _PERIOD: Final = 3_600_000_000, 100_000
+_HOUR: Final = 3_600_000_000
+_PERIOD: Final = 100_000
 
 
 def token(kind: str, *parts: object) -> str:

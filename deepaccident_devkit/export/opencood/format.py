@@ -1,0 +1,105 @@
+"""The export itself: which scenarios, agents and frames, and which file is what."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Final
+
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.export.bulk import Format, Output, Plan, Unit
+from deepaccident_devkit.export.opencood.cloud import POINT_BYTES, pcd_bytes
+from deepaccident_devkit.export.opencood.moments import CAMERA_NAMES, Moments
+from deepaccident_devkit.export.opencood.recording import Recording
+from deepaccident_devkit.export.sensor_files import points_of
+from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.release import read_lidar
+from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES, LIDAR, VEHICLE_AGENTS
+from deepaccident_devkit.text import choice
+
+_SPLITS: Final[Mapping[str | None, str]] = {"train": "train", "val": "validate", "test": "test", None: "unknown"}
+"""Our split → their folder."""
+_AGENTS: Final = "agents.json"
+_FACTS_BYTES, _BOX_BYTES = 6000, 450
+"""Of the yaml and the json of a moment, about: of its poses and cameras, and of each box."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpenCood(Format):
+    """OPV2V's folders. Loaders take the first vehicle by name for the ego; agents are therefore 1 to 4, the pole −1.
+
+    Attributes:
+        classes: which boxes are vehicles; OpenCOOD has one class, so all of these become it.
+        ego: the vehicle that is 1; the others follow in their usual order.
+    """
+
+    classes: tuple[str, ...] = ("car", "truck", "van")
+    ego: str = "ego_vehicle"
+    name: ClassVar[str] = "opencood"
+
+    def __post_init__(self) -> None:
+        """Check the choices."""
+        super().__post_init__()
+        for each in self.classes:
+            choice("classes", each, CATEGORIES)
+        if not self.classes:
+            raise ChoiceError(f"classes: expected some of {', '.join(CATEGORIES)}, found none")
+        choice("ego", self.ego, VEHICLE_AGENTS)
+        object.__setattr__(self, "classes", tuple(each for each in CATEGORIES if each in self.classes))
+
+    def plan(self, dataset: Dataset, unit: Unit) -> Plan:
+        """About how much a scenario is."""
+        recording = Recording(dataset, unit.scenarios[0], self)
+        total = Plan()
+        for agent in recording.agents:
+            images = [size for camera in CAMERAS for _, size in recording.files[agent][camera].values()]
+            first = dataset.get_sample(recording.token, agent, 1)
+            boxes, frames = first["num_annotations"], len(recording.frames)
+            total += Plan(
+                samples=frames,
+                files=2 * frames + len(recording.files[agent][LIDAR]),
+                bytes=frames * (_FACTS_BYTES + boxes * _BOX_BYTES)
+                + points_of(dataset, recording.token, agent) * POINT_BYTES,
+                linked_files=len(images),
+                linked_bytes=sum(images),
+            )
+        return total
+
+    def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
+        """Write a scenario's folder, which appears when it is whole."""
+        recording = Recording(dataset, unit.scenarios[0], self)
+        recording.count_left_out(output)
+        with output.whole_folder(f"{_SPLITS[recording.record['split']]}/{unit.name}") as folder:
+            folder.write("data_protocol.yaml", _yaml(recording.protocol()))
+            for agent in recording.agents:
+                self._write_agent(recording, agent, folder)
+        folders = [recording.folders[agent] for agent in recording.agents]
+        write_bytes(output.parts / _AGENTS, json.dumps(folders).encode())
+
+    def finish(self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]) -> None:  # noqa: ARG002 - others need the release
+        """Write HEAL's assignment, by which all agents have the same sensors."""
+        found = {unit.name: dict.fromkeys(json.loads((parts(unit) / _AGENTS).read_bytes()), "m1") for unit in units}
+        output.write("heter_modality_assign.json", f"{json.dumps(found, indent=1)}\n".encode())
+
+    def _write_agent(self, recording: Recording, agent: str, output: Output) -> None:
+        moments = Moments(recording.dataset, recording.token, agent, self.classes)
+        files = recording.files[agent]
+        for number in recording.frames:
+            stem, facts = f"{recording.folders[agent]}/{number:06d}", moments.facts(number, output)
+            output.write(f"{stem}.yaml", _yaml(facts))
+            output.write(f"{stem}.json", json.dumps(facts).encode())  # CoAlign and HEAL read it in place of the yaml
+            if number in files[LIDAR]:
+                output.write(f"{stem}.pcd", pcd_bytes(read_lidar(files[LIDAR][number][0], raw=True)))
+            for camera, name in CAMERA_NAMES.items():
+                if number in files[camera]:
+                    output.link(files[camera][number][0], f"{stem}_{name}.png")
+
+
+def _yaml(content: Mapping[str, Any]) -> bytes:
+    import yaml
+
+    dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # the one in C is there with most builds
+    return str(yaml.dump(content, Dumper=dumper, default_flow_style=None)).encode()

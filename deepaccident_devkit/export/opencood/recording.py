@@ -1,0 +1,79 @@
+"""A scenario as it will be exported: its agents, their files, and what is left out."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Protocol
+
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.export.bulk import Output
+from deepaccident_devkit.export.sensor_files import sensor_files
+from deepaccident_devkit.tables.tokens import frame_token
+from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, CHANNELS, INFRASTRUCTURE, LIDAR, VEHICLE_AGENTS
+
+if TYPE_CHECKING:
+    from deepaccident_devkit.tables.records import ScenarioRecord
+
+
+class _Chosen(Protocol):
+    """The settings that decide it."""
+
+    @property
+    def agents(self) -> tuple[str, ...]:
+        """Those to write."""
+
+    @property
+    def ego(self) -> str:
+        """The vehicle that is 1."""
+
+
+class Recording:
+    """A scenario's agents, their folders and their sensor files.
+
+    Attributes:
+        dataset: the release.
+        token: the scenario's.
+        record: the scenario's.
+        agents: that are written.
+        frames: numbers of its frames.
+        folders: agent → name of its folder; loaders sort them as words and take the first for the ego.
+        files: agent → channel → frame → path and bytes of what is there.
+    """
+
+    def __init__(self, dataset: Dataset, token: str, chosen: _Chosen) -> None:
+        """Look which files are there; raises TokenError."""
+        self.dataset, self.token = dataset, token
+        self.record: ScenarioRecord = dataset.scenario[dataset.getind("scenario", token)]
+        self.frames = range(1, self.record["num_frames"] + 1)
+        here = [sample["agent"] for sample in dataset.samples_of(frame_token(token, 1))]
+        self.agents = [agent for agent in chosen.agents if agent in here]
+        self._absent = len(chosen.agents) - len(self.agents)
+        self.files = {
+            agent: {channel: sensor_files(dataset, token, agent, channel) for channel in CHANNELS}
+            for agent in self.agents
+        }
+        order = sorted(VEHICLE_AGENTS, key=lambda agent: agent != chosen.ego)
+        self.folders: dict[str, str] = {
+            **{agent: str(number) for number, agent in enumerate(order, 1)},
+            INFRASTRUCTURE: "-1",
+        }
+
+    def protocol(self) -> dict[str, Any]:
+        """Where the scenario comes from; no loader reads it."""
+        actors = {agent: self.dataset.get("agent", f"{self.token}/{agent}")["actor_id"] for agent in self.agents}
+        return {
+            "source": "DeepAccident",
+            "scenario": self.token,
+            "agents": {self.folders[agent]: {"name": agent, "actor_id": actor} for agent, actor in actors.items()},
+        }
+
+    def count_left_out(self, output: Output) -> None:
+        """Count what of the scenario is not written, but for boxes."""
+        samples = len(self.frames) * len(self.agents)
+        images = sum(map(self._count, CAMERAS))
+        output.leave_out("agents of scenarios that are not in this release", self._absent)
+        output.leave_out("images that are not in this release", len(CAMERAS) * samples - images)
+        output.leave_out("point clouds that are not in this release", samples - self._count(LIDAR))
+        output.leave_out("files of the BEV camera", self._count(BEV_CAMERA))
+
+    def _count(self, channel: str) -> int:
+        return sum(len(files[channel]) for files in self.files.values())
