@@ -1,0 +1,192 @@
+"""OPV2V's folders, read back by a reader that knows OpenCOOD's conventions and not the devkit."""
+
+import copy
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from opencood_reader import agents_of, counts_of, facts_of, points_of, timestamps_of, world_from
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.export.bulk import Exported, export_release
+from deepaccident_devkit.export.opencood import OpenCood
+from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID, UNTRACKED_ID
+
+PLACES = dict(zip(("1", "2", "3", "4", "-1"), AGENTS, strict=True))
+
+
+@pytest.fixture(scope="module")
+def exported(da: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Exported:
+    return export_release(da, tmp_path_factory.mktemp("opencood") / "out", OpenCood(), workers=1)
+
+
+@pytest.fixture(scope="module")
+def scenario(da: DeepAccident, exported: Exported) -> Path:
+    """The folder of an accident."""
+    record = next(record for record in da.scenario if record["collision"])
+    (found,) = exported.folder.glob(f"*/{record['token'].replace('/', '__')}")
+    return found
+
+
+def expected_counts(da: DeepAccident, sample: str) -> dict[int, int]:
+    """Vehicle → points, as the labels count them."""
+    boxes = da.boxes(sample)
+    kept = (boxes.num_lidar_pts > 0) & ~np.isin(boxes.actor_id, (OWN_ACTOR_ID, UNTRACKED_ID))
+    kept &= np.isin(boxes.category_names, ("car", "truck", "van"))
+    return dict(zip(boxes.actor_id[kept].tolist(), boxes.num_lidar_pts[kept].tolist(), strict=True))
+
+
+def disagreement(da: DeepAccident, scenario: Path, change: Callable[[dict[str, Any]], None]) -> float:
+    """The share of boxes in which a reader finds another number of points than the labels say, after a change."""
+    token, wrong, total = scenario.name.replace("__", "/", 1), 0, 0
+    for place, agent in PLACES.items():
+        for timestamp in timestamps_of(scenario, place):
+            facts = copy.deepcopy(dict(facts_of(scenario, place, timestamp)))
+            change(facts)
+            expected = expected_counts(da, f"{token}/{agent}/{int(timestamp):03d}")
+            found = counts_of(facts, points_of(scenario, place, timestamp))
+            assert found.keys() == expected.keys()
+            wrong += sum(abs(found[actor] - count) > 1 + 0.02 * count for actor, count in expected.items())
+            total += len(expected)
+    assert total > 100
+    return wrong / total
+
+
+def flip_y(facts: dict[str, Any]) -> None:
+    for vehicle in facts["vehicles"].values():
+        vehicle["location"][1] *= -1
+        vehicle["angle"][1] *= -1
+
+
+def radians(facts: dict[str, Any]) -> None:
+    for vehicle in facts["vehicles"].values():
+        vehicle["angle"] = np.radians(vehicle["angle"]).tolist()
+
+
+def full_extents(facts: dict[str, Any]) -> None:
+    for vehicle in facts["vehicles"].values():
+        vehicle["extent"] = [2 * length for length in vehicle["extent"]]
+
+
+def test_boxes_hold_the_points_that_their_labels_count(da: DeepAccident, scenario: Path) -> None:
+    assert disagreement(da, scenario, lambda _: None) == 0
+
+
+@pytest.mark.parametrize("planted", [flip_y, radians, full_extents])
+def test_the_reader_sees_a_wrong_convention(da: DeepAccident, scenario: Path, planted: Callable[..., None]) -> None:
+    assert disagreement(da, scenario, planted) > 0.2
+
+
+def test_agents_share_a_world(scenario: Path) -> None:
+    """The same vehicle is at the same place in the files of all agents that see it."""
+    places: dict[int, list[list[float]]] = {}
+    for place in PLACES:
+        for actor, vehicle in facts_of(scenario, place, "000006")["vehicles"].items():
+            places.setdefault(actor, []).append(vehicle["location"])
+    shared = [found for found in places.values() if len(found) > 1]
+    assert len(shared) > 3
+    assert max(np.ptp(found, axis=0).max() for found in shared) < 0.5
+
+
+def test_ego_is_the_first_folder_and_the_pole_the_last(scenario: Path) -> None:
+    assert agents_of(scenario) == ["1", "2", "3", "4", "-1"]
+
+
+def test_every_moment_has_all_files(scenario: Path) -> None:
+    for place in PLACES:
+        names = {path.name for path in (scenario / place).iterdir()}
+        stems = [f"{number:06d}" for number in range(1, 7)]
+        cameras = [f"_camera{number}.png" for number in range(6)]
+        assert names == {f"{stem}{end}" for stem in stems for end in (".yaml", ".json", ".pcd", *cameras)}
+
+
+def test_json_says_the_same_with_ids_as_words(scenario: Path) -> None:
+    told, again = facts_of(scenario, "1", "000003"), facts_of(scenario, "1", "000003", "json")
+    assert again == {**told, "vehicles": {str(actor): vehicle for actor, vehicle in told["vehicles"].items()}}
+
+
+def test_cameras_are_where_their_extrinsics_say(da: DeepAccident, scenario: Path) -> None:
+    """A point before the front camera is in the middle of its image, by either of the two poses."""
+    facts = facts_of(scenario, "1", "000001")
+    camera = facts["camera0"]
+    ahead = world_from(camera["cords"]) @ [10.0, 0, 0, 1]
+    x, y, z, _ = np.array(camera["extrinsic"]) @ np.linalg.inv(world_from(facts["lidar_pose"])) @ ahead
+    u, v, depth = np.array(camera["intrinsic"]) @ [y, -z, x]
+    assert np.allclose([x, y, z], [10, 0, 0], atol=1e-9)
+    assert np.allclose([u / depth, v / depth], [camera["intrinsic"][0][2], camera["intrinsic"][1][2]])
+
+
+def test_images_are_links_to_those_of_the_release(da: DeepAccident, scenario: Path, exported: Exported) -> None:
+    token = scenario.name.replace("__", "/", 1)
+    source = da.get_sample_data_path(f"{token}/ego_vehicle/002/Camera_BackRight")
+    assert (scenario / "1" / "000002_camera1.png").samefile(source)
+    assert exported.tally.linked == {"hard": exported.plan.linked_files}
+
+
+def test_assignment_of_heal_names_every_folder(exported: Exported) -> None:
+    found = json.loads((exported.folder / "heter_modality_assign.json").read_text())
+    assert sorted(found) == sorted(path.parent.name for path in exported.folder.glob("*/*/data_protocol.yaml"))
+    assert all(agents == dict.fromkeys(PLACES, "m1") for agents in found.values())
+
+
+def test_splits_have_their_folders(da: DeepAccident, exported: Exported) -> None:
+    theirs = {"train": "train", "val": "validate", "test": "test"}
+    for record in da.scenario:
+        assert record["split"]
+        folder = exported.folder / theirs[record["split"]] / record["token"].replace("/", "__")
+        assert (folder / "data_protocol.yaml").is_file()
+
+
+def test_ego_can_be_another_vehicle_and_classes_more(da: DeepAccident, tmp_path: Path) -> None:
+    form = OpenCood(ego="other_vehicle", classes=("pedestrian", "car"), agents=("other_vehicle", "ego_vehicle"))
+    record = next(record for record in da.scenario if record["split"] == "train")
+    made = export_release(da, tmp_path / "out", OpenCood(**{**vars(form), "where": (f"token={record['token']}",)}))
+    (folder,) = made.folder.glob("train/*")
+    protocol = folder / "data_protocol.yaml"
+    assert agents_of(folder) == ["1", "2"]
+    assert "name: other_vehicle" in protocol.read_text().split("'2'")[0]
+    actors = {actor for sample in (1, 2) for actor in facts_of(folder, str(sample), "000006")["vehicles"]}
+    walkers = da.boxes(f"{record['token']}/ego_vehicle/006")
+    seen = walkers.actor_id[(np.array(walkers.category_names) == "pedestrian") & (walkers.num_lidar_pts > 0)]
+    assert set(seen.tolist()) - {UNTRACKED_ID} <= actors
+
+
+def test_a_partial_release_is_written_and_counted(da_partial: DeepAccident, tmp_path: Path) -> None:
+    made = export_release(da_partial, tmp_path / "out", OpenCood())
+    frames = 6 * len(da_partial.scenario)
+    assert made.tally.left_out["agents of scenarios that are not in this release"] == len(da_partial.scenario)
+    assert made.tally.left_out["images that are not in this release"] == frames
+    assert made.tally.left_out["point clouds that are not in this release"] == frames
+
+
+def test_without_labels_there_are_poses_and_clouds(own_release: Path, tmp_path: Path) -> None:
+    labels = sorted(own_release.rglob("label/*/*.txt"))
+    for path in labels:
+        path.unlink()
+    dataset = DeepAccident("v1", own_release, verbose=False)
+    made = export_release(dataset, tmp_path / "out", OpenCood(agents=("ego_vehicle",)))
+    assert made.tally.left_out["labels that are not in this release"] == len(dataset.scenario) * 4
+    (folder, *_) = made.folder.glob("*/*/1")
+    facts = facts_of(folder.parent, "1", "000002")
+    assert facts["vehicles"] == {}
+    before, after = (facts_of(folder.parent, "1", name)["true_ego_pos"][:2] for name in ("000001", "000003"))
+    assert facts["ego_speed"] == pytest.approx(np.hypot(*np.subtract(after, before)) / 0.2 * 3.6)
+
+
+@pytest.mark.parametrize(
+    ("choices", "sentence"),
+    [
+        ({"ego": "infrastructure"}, "ego: expected one of ego_vehicle"),
+        ({"classes": ()}, "classes: expected some of car"),
+        ({"classes": ("bus",)}, "classes: expected one of car"),
+        ({"agents": ()}, "agents: expected some of ego_vehicle"),
+        ({"link": "soft"}, "link: expected one of hard"),
+    ],
+)
+def test_impossible_choices(choices: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ChoiceError, match=sentence):
+        OpenCood(**choices)
