@@ -43,7 +43,7 @@ class TinyFormat(Format):
         output.leave_out("clouds", len(pictures))
         write_bytes(output.parts / "count.txt", str(len(pictures)).encode())
 
-    def finish(self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]) -> None:
+    def finish(self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]) -> None:  # noqa: ARG002
         counts = {unit.name: int((parts(unit) / "count.txt").read_text()) for unit in units}
         output.write("counts.json", json.dumps(counts).encode())
         output.leave_out("maps")
@@ -62,7 +62,7 @@ class TinyFormat(Format):
 class KilledFormat(TinyFormat):
     """Its worker is killed, as by a system whose memory has run out."""
 
-    def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
+    def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:  # noqa: ARG002
         with output.whole_folder(f"folders/{unit.name}") as folder:
             folder.write("names.json", b"[]")
             os.kill(os.getpid(), signal.SIGKILL)
