@@ -45,7 +45,7 @@ def box_rows(scene: Scene, van: Van, output: Output) -> Rows:
         if not scene.is_key(number):
             output.leave_out("boxes between keyframes, which readers interpolate", sample["num_annotations"])
             continue
-        output.leave_out("keyframes without a label", not sample["labelled"])
+        output.leave_out("labels that are not in this release", not sample["labelled"])
         for row in _annotations(scene, number, output):
             rows.append(row)
             tracks.setdefault(row["instance_token"], []).append(row)

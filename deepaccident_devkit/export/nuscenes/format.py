@@ -66,7 +66,7 @@ class NuScenes(Format):
             files = write_sensors(scene, self.lidar_axes, output)
             rows.append({**scene.rows(), **files, **box_rows(scene, self.van, output)})
             output.leave_out("frames between keyframes", scene.last - len(scene.frames))
-        output.leave_out("recordings of agents that are not there", len(self.agents) - len(rows))
+        output.leave_out("agents of scenarios that are not in this release", len(self.agents) - len(rows))
         write_part(output.parts, rows)
 
     def finish(

@@ -55,9 +55,9 @@ def write_sensors(scene: Scene, axes: LidarAxes, output: Output) -> Rows:
             else:
                 output.link(files[number][0], path)
         data += linked(rows)
-        missing = len(scene.frames) - len(files) - len(empty)
-        output.leave_out("missing LiDAR clouds of sweeps" if channel == LIDAR else "missing images", missing)
-        output.leave_out("missing LiDAR clouds of keyframes (an empty cloud stands for each)", len(empty))
+        what = "point clouds" if channel == LIDAR else "images"
+        output.leave_out(f"{what} that are not in this release", len(scene.frames) - len(files))
+        output.leave_out("point clouds of keyframes (empty files stand for them)", len(empty))
     bev = sensor_files(scene.dataset, scene.scenario, scene.agent, BEV_CAMERA)
     output.leave_out("files of the BEV camera", len(bev))
     return {"sample_data": data, "calibrated_sensor": list(calibrated.values())}
