@@ -320,7 +320,7 @@ class TestBatches:
             LabelFilesError, match=r"holds batches of fiery, which np\.load opens .* without --names on"
         ):
             LabelFiles(tmp_path / "fiery")
-        with pytest.raises(ChoiceError, match="names: expected one of fiery, beverse, deepaccident, or None, found 'lss'"):
+        with pytest.raises(ChoiceError, match="expected one of fiery, beverse, deepaccident, or None, found 'lss'"):
             write_label_files(small, tmp_path / "lss", tokens, names="lss")
 
     def test_a_manifest_without_names_is_of_label_files(self, small: DeepAccident, out: Path) -> None:
