@@ -83,6 +83,8 @@ class Parquet(Format):
         for table, found in rows.items():
             if len(found):
                 _write(output, f"{table}/{unit.name}.parquet", _pieces(maker, table, found, split))
+        absent = len(unit.scenarios) * len(self.agents) - len(rows["agent"])
+        output.leave_out("agents of scenarios that are not in this release", absent)
         output.leave_out("samples of other agents", len(maker.rows(unit.scenarios)["sample"]) - len(rows["sample"]))
 
     def finish(
