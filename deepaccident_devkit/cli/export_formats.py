@@ -10,6 +10,8 @@ from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.export.nuscenes.boxes import Van
 from deepaccident_devkit.export.nuscenes.sensors import LidarAxes
 from deepaccident_devkit.export.opencood import OpenCood
+from deepaccident_devkit.export.parquet import Parquet
+from deepaccident_devkit.export.webdataset import Frames, WebDataset
 from deepaccident_devkit.taxonomy import CATEGORIES, VEHICLE_AGENTS
 
 
@@ -59,3 +61,38 @@ def opencood(classes: str, ego: str, **options: Any) -> None:
     If a run is interrupted, the same command continues it.
     """
     run_export(OpenCood, {"classes": tuple(classes.split(",")), "ego": ego}, **options)
+
+
+@click.command(short_help="Write all tables as Parquet files, for datasets, DuckDB, Polars and pandas.")
+@export_parameters
+def parquet(**options: Any) -> None:
+    """Write all tables of the release in DATAROOT as Parquet files by split, with tokens in place of row numbers.
+
+    If a run is interrupted, the same command continues it.
+    """
+    run_export(Parquet, {}, **options)
+
+
+@click.command(short_help="Write samples with images, LiDAR and boxes as tar files, for webdataset.")
+@export_parameters
+@click.option(
+    "--frames",
+    type=WordChoice(get_args(Frames)),
+    default="every",
+    show_default=True,
+    help="every frame, or keyframes: two a second, counted back from the last.",
+)
+@click.option(
+    "--shard-size",
+    type=click.IntRange(min=1),
+    default=1000,
+    show_default=True,
+    metavar="MB",
+    help="Size of a tar file, about.",
+)
+def webdataset(frames: Frames, shard_size: int, **options: Any) -> None:
+    """Write samples of the release in DATAROOT as tar files: the images, the LiDAR points, and the rest as JSON.
+
+    If a run is interrupted, the same command continues it.
+    """
+    run_export(WebDataset, {"frames": frames, "shard_size": shard_size * 10**6}, **options)
