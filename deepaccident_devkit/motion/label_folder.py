@@ -185,13 +185,17 @@ def _remove_half_written(root: Path) -> None:
     """
     with suppress(OSError):
         for path in [path for folder in ("", "*/*/", "*/*/*/") for path in root.glob(f"{folder}.*.tmp")]:
-            if _WRITTEN.fullmatch(temporary_of(path.name) or ""):
+            if _is_half_written(path.name):
                 path.unlink(missing_ok=True)
 
 
 def _is_own(name: str) -> bool:
     """Whether a call that was killed before it wrote a manifest may have left a file of this name."""
-    return name == _LOCK or _WRITTEN.fullmatch(temporary_of(name) or "") is not None
+    return name == _LOCK or _is_half_written(name)
+
+
+def _is_half_written(name: str) -> bool:
+    return _WRITTEN.fullmatch(temporary_of(name) or "") is not None
 
 
 def _check_version(path: Path, form: object, version: object) -> None:

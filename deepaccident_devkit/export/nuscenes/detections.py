@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -32,8 +31,6 @@ from deepaccident_devkit.taxonomy import CATEGORIES
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset
 
-OUR_CLASSES: Final[Mapping[str, str]] = MappingProxyType({**{name: name for name in CATEGORIES}, "bicycle": "cyclist"})
-"""nuScenes' detection class → ours. A detector that learned our own classes may write those."""
 OTHER_CLASSES: Final = ("bus", "trailer", "construction_vehicle", "barrier", "traffic_cone")
 """nuScenes' detection classes that this dataset does not have."""
 _MOST_TOLD: Final = 600
@@ -58,7 +55,8 @@ class NuScenesDetections:
 def results_from_nuscenes(dataset: Dataset, path: str | os.PathLike[str]) -> NuScenesDetections:
     """Read a nuScenes detection file, `{"meta": …, "results": {sample token: [box, …]}}`, of our nuScenes export.
 
-    nuScenes has no vans: a detector of its ten classes calls them cars or trucks, and so does what this returns.
+    nuScenes has no class for vans: of its ten classes none becomes `van`. A detector that learned our own classes may
+    write those.
 
     Args:
         dataset: the release that was exported, or one that contains it.
@@ -115,8 +113,8 @@ def _take_our_classes(results: object) -> dict[str, dict[int, str]]:
             if name in OTHER_CLASSES:
                 left_out.setdefault(theirs, {})[number] = name
                 entry["detection_name"] = CATEGORIES[0]
-            elif isinstance(name, str):
-                entry["detection_name"] = OUR_CLASSES.get(name, name)
+            elif name == "bicycle":  # the others have our names
+                entry["detection_name"] = "cyclist"
             if isinstance(velocity, list) and any(isinstance(each, float) and math.isnan(each) for each in velocity):
                 entry["velocity"] = None  # the nuScenes devkit writes it so where it is not known
     return left_out
