@@ -241,7 +241,9 @@ def test_the_code_on_the_format_runs(in_demo: Path) -> None:
     assert run_page(DOCS / "format.md")["meta"].collision is not None
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/index.md", "docs/queries.md", "docs/validation.md"])
+@pytest.mark.parametrize(
+    "page", ["README.md", "docs/exports.md", "docs/index.md", "docs/queries.md", "docs/validation.md"]
+)
 def test_the_code_on_other_pages_runs(page: str, in_demo: Path) -> None:
     run_page(TOP / page)
 

@@ -5,7 +5,7 @@ from typing import Any, get_args
 import click
 
 from deepaccident_devkit.cli.export_bulk import export_parameters, run_export
-from deepaccident_devkit.cli.options import WordChoice
+from deepaccident_devkit.cli.options import WordChoice, refuse_unused
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.export.nuscenes.boxes import Van
 from deepaccident_devkit.export.nuscenes.sensors import LidarAxes
@@ -70,6 +70,7 @@ def parquet(**options: Any) -> None:
 
     If a run is interrupted, the same command continues it.
     """
+    refuse_unused("here: all files are written anew", "link")
     run_export(Parquet, {}, **options)
 
 
@@ -95,4 +96,5 @@ def webdataset(frames: Frames, shard_size: int, **options: Any) -> None:
 
     If a run is interrupted, the same command continues it.
     """
+    refuse_unused("here: all files are written anew", "link")
     run_export(WebDataset, {"frames": frames, "shard_size": shard_size * 10**6}, **options)

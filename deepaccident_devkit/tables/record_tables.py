@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray, IntArray
+from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.tables.columns import Choice, Column, Key, Struct, Subset, Vector
 from deepaccident_devkit.tables.specs import table_spec
+from deepaccident_devkit.tables.store import damaged_value
 from deepaccident_devkit.tables.tokens import ACTOR
 from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, CHANNEL_FORMAT, CHANNELS
 
@@ -85,11 +86,15 @@ class RecordTables:
 
         Raises:
             TableError: no such table.
+            IndexStoreError: the index is damaged.
         """
         import pyarrow as pa
 
         columns = table_spec(name).columns
-        arrays = [self._values(name, column, rows) for column in columns]
+        try:
+            arrays = [self._values(name, column, rows) for column in columns]
+        except IndexError as error:
+            raise damaged_value(name) from error
         return pa.table(arrays, names=[column.field for column in columns])
 
     def tokens(self, table: str, rows: IntArray) -> Any:
@@ -122,10 +127,8 @@ class RecordTables:
 
     def _keys(self, table: str, targets: IntArray) -> Any:
         """Tokens of rows of another table; null for −1."""
-        import pyarrow as pa
-
         known = targets >= 0
-        return self.tokens(table, targets[known]).take(pa.array(np.cumsum(known) - 1, mask=~known))
+        return _spread(self.tokens(table, targets[known]), known)
 
     def _agent_tokens(self, rows: IntArray) -> Any:
         agent = self._tables.columns("agent")
@@ -148,13 +151,11 @@ class RecordTables:
         return _joined(self._sample_tokens(sample), _words(CHANNELS, channel))
 
     def _calibrated_sensor_tokens(self, rows: IntArray) -> Any:
-        import pyarrow as pa
+        import pyarrow.compute as pc
 
         view = self._tables.columns("calibrated_sensor")
-        number = view["number"][rows]
-        endings = _joined("", pa.array(number).cast(pa.string()))
         first = _joined(self._agent_tokens(view["agent_row"][rows]), _words(CHANNELS, view["sensor_row"][rows]))
-        return _joined(first, pa.compute.if_else(number == 1, "", endings), separator="")
+        return pc.if_else(view["number"][rows] == 1, first, _joined(first, _digits(view["number"][rows])))
 
     def _instance_tokens(self, rows: IntArray) -> Any:
         return self._actor_tokens("scenario", self._tables.columns("instance")["scenario_row"][rows], rows)
@@ -165,21 +166,17 @@ class RecordTables:
 
     def _actor_tokens(self, table: str, rows: IntArray, instances: IntArray) -> Any:
         """The tokens of actors in what the rows of a table are."""
-        import pyarrow as pa
-
-        actor = pa.array(self._tables.columns("instance")["actor_id"][instances]).cast(pa.string())
-        return _joined(self.tokens(table, rows), ACTOR, actor)
+        actors = self._tables.columns("instance")["actor_id"][instances]
+        return _joined(self.tokens(table, rows), ACTOR, _digits(actors))
 
     def _annotation_tokens(self, rows: IntArray) -> Any:
-        import pyarrow as pa
-
         sample = self._tables.columns("annotation")["sample_row"][rows]
         number = rows - self._tables.columns("sample")["first_annotation_row"][sample]
-        return _joined(self._sample_tokens(sample), pa.array(number).cast(pa.string()))
+        return _joined(self._sample_tokens(sample), _digits(number))
 
     def _filenames(self, rows: IntArray) -> Any:
         """The paths of sensor files below the dataroot."""
-        import pyarrow as pa
+        import pyarrow.compute as pc
 
         sample, channel = np.divmod(rows, len(CHANNELS))
         agent = self._tables.columns("sample")["agent_row"][sample]
@@ -190,7 +187,7 @@ class RecordTables:
         file = _joined(name, self._number_words(sample, agent), separator="_")
         file = _joined(file, _words([CHANNEL_FORMAT[each] for each in CHANNELS], channel), separator=".")
         path = _joined(words["scenario_type"].take(scenario), agents, _words(CHANNELS, channel), name, file)
-        return pa.compute.if_else(pa.compute.equal(folder, ""), path, _joined(folder, path))
+        return pc.if_else(pc.equal(folder, ""), path, _joined(folder, path))
 
 
 def _joined(*words: Any, separator: str = _SEPARATOR) -> Any:
@@ -204,6 +201,19 @@ def _words(values: Sequence[str], codes: IntArray) -> Any:
     import pyarrow as pa
 
     return pa.array(values).take(pa.array(codes, mask=codes < 0))
+
+
+def _digits(numbers: IntArray) -> Any:
+    import pyarrow as pa
+
+    return pa.array(numbers).cast(pa.string())
+
+
+def _spread(values: Any, known: BoolArray) -> Any:
+    """The values of the rows that are known, each at its row; null at the others."""
+    import pyarrow as pa
+
+    return values.take(pa.array(np.cumsum(known) - 1, mask=~known))
 
 
 def _subsets(values: Sequence[str], masks: IntArray) -> Any:
@@ -231,7 +241,7 @@ def _nullable_lists(data: FloatArray, shape: Sequence[int]) -> Any:
     array = pa.array(data[known].reshape(-1))
     for length in reversed(shape):
         array = pa.ListArray.from_arrays(np.arange(0, len(array) + 1, length, dtype=np.int32), array)
-    return array.take(pa.array(np.cumsum(known) - 1, mask=~known))
+    return _spread(array, known)
 
 
 def _of_open_lists(structs: Any) -> Any:
