@@ -17,13 +17,7 @@ from deepaccident_devkit.taxonomy import CATEGORIES, VEHICLE_AGENTS
 
 @click.command(short_help="Write nuScenes tables and their sensor files.")
 @export_parameters
-@click.option(
-    "--van",
-    type=WordChoice(get_args(Van)),
-    default="car",
-    show_default=True,
-    help="What vans become.",
-)
+@click.option("--van", type=WordChoice(get_args(Van)), default="car", show_default=True, help="What vans become.")
 @click.option(
     "--lidar-axes",
     type=WordChoice(get_args(LidarAxes)),
@@ -35,10 +29,11 @@ from deepaccident_devkit.taxonomy import CATEGORIES, VEHICLE_AGENTS
     "--sweeps/--no-sweeps", default=True, show_default=True, help="Whether to write the frames between keyframes."
 )
 def nuscenes(van: str, lidar_axes: str, sweeps: bool, **options: Any) -> None:
-    """Write scenarios of the release in DATAROOT for the nuScenes devkit 1.2 and for what reads nuScenes.
+    """Write scenarios of the release in DATAROOT for the nuScenes devkit 1.2 and all that reads nuScenes.
 
-    Keyframes are at 2 Hz, sweeps at 10 Hz. Images are linked, clouds are written anew: those of a whole release take
-    some 210 GB, and 42 GB with --no-sweeps. A first call with --dry-run says how much it will be.
+    Keyframes are at 2 Hz, sweeps at 10 Hz. Images are linked, clouds are written: those of a whole release take about
+    210 GB, and 42 GB with --no-sweeps; the nuScenes devkit holds its tables in 6 GB of memory, or 4 GB. --dry-run says
+    how large yours are. If a run is interrupted, the same command continues it.
     """
     run_export(NuScenes, {"van": van, "lidar_axes": lidar_axes, "sweeps": sweeps}, **options)
 

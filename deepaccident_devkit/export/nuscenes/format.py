@@ -28,7 +28,7 @@ _FRAME_ROW_BYTES: Final = 360
 
 @dataclass(frozen=True, kw_only=True)
 class NuScenes(Format):
-    """Tables and sensor files for nuscenes-devkit 1.2 and all that reads nuScenes.
+    """Tables and sensor files for the nuScenes devkit 1.2 and all that reads nuScenes.
 
     A scene is what one agent recorded of a scenario. The last frame is a keyframe, and every fifth one before it; those
     between are sweeps.
