@@ -112,6 +112,9 @@ class Format(ABC):
         """The chosen scenarios as units: one each."""
         return [Unit(name=flat_name(token), scenarios=(token,)) for token in scenarios]
 
+    def check(self, dataset: Dataset, folder: Path) -> None:  # noqa: B027 - most formats add to nothing
+        """Refuse a folder that lacks what the format adds to; raises ExportError or ConfigError."""
+
     @abstractmethod
     def plan(self, dataset: Dataset, unit: Unit) -> Plan:
         """About how much a unit is; fast, so it reads at most a few sensor files."""

@@ -100,6 +100,7 @@ def export_release(
         _check_room(task, dict(zip(units, plans, strict=True)), free)
     if dry_run:
         return exported(written=0, kept=0, tally=Tally())
+    form.check(dataset, root)
     folders = _folders(dataset, scenarios)
     if not manifest.complete:
         with writing_to(root):

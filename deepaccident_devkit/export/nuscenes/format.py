@@ -57,12 +57,12 @@ class NuScenes(Format):
 
     def plan(self, dataset: Dataset, unit: Unit) -> Plan:
         """About how much a scenario is, by the size of its first clouds."""
-        return sum((_plan_of(scene) for scene in self._scenes(dataset, unit)), Plan())
+        return sum((_plan_of(scene) for scene in self.scenes(dataset, unit)), Plan())
 
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
         """Write the sensor files of a scenario, and keep its rows."""
         rows = []
-        for scene in self._scenes(dataset, unit):
+        for scene in self.scenes(dataset, unit):
             files = write_sensors(scene, self.lidar_axes, output)
             rows.append({**scene.rows(), **files, **box_rows(scene, self.van, output)})
             output.leave_out("frames between keyframes", scene.last - len(scene.frames))
@@ -79,7 +79,8 @@ class NuScenes(Format):
         """Write the tables."""
         write_tables([parts(unit) for unit in units], output)
 
-    def _scenes(self, dataset: Dataset, unit: Unit) -> list[Scene]:
+    def scenes(self, dataset: Dataset, unit: Unit) -> list[Scene]:
+        """The scenes of a unit."""
         return [
             scene for token in unit.scenarios for scene in scenes_of(dataset, token, self.agents, sweeps=self.sweeps)
         ]

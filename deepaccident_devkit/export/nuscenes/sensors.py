@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -16,12 +17,14 @@ from deepaccident_devkit.release.images import read_jpeg
 from deepaccident_devkit.taxonomy import BEV_CAMERA, LIDAR
 
 if TYPE_CHECKING:
+    from deepaccident_devkit.arrays import FloatArray
+    from deepaccident_devkit.dataset import Dataset
     from deepaccident_devkit.export.bulk import Output
 
 LidarAxes = Literal["ego", "nuscenes"]
 POINT_BYTES: Final = 20
 """Of a point in a cloud: x, y, z, intensity and ring, float32."""
-_TURNS: Final = {
+TURNS: Final = {
     "ego": np.eye(3),
     "nuscenes": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
 }
@@ -41,7 +44,7 @@ def write_sensors(scene: Scene, axes: LidarAxes, output: Output) -> Rows:
     calibrated: dict[str, Row] = {}
     for channel, files in scene.files.items():
         empty = {number for number in scene.frames if channel == LIDAR and scene.is_key(number)} - files.keys()
-        size = (0, 0) if channel == LIDAR or not files else read_jpeg(next(iter(files.values()))[0])[1]
+        size = (0, 0) if channel == LIDAR else image_size(files)
         rows = []
         for number in sorted({*files, *empty}):
             record = scene.dataset.sample_data.get(f"{scene.sample(number)}/{channel}")
@@ -61,6 +64,17 @@ def write_sensors(scene: Scene, axes: LidarAxes, output: Output) -> Rows:
     bev = sensor_files(scene.dataset, scene.scenario, scene.agent, BEV_CAMERA)
     output.leave_out("files of the BEV camera", len(bev))
     return {"sample_data": data, "calibrated_sensor": list(calibrated.values())}
+
+
+def image_size(files: Mapping[int, tuple[Path, int]]) -> tuple[int, int]:
+    """Width and height of the first of a camera's files, as `Scene.files` has them; 0, 0 without one."""
+    return read_jpeg(next(iter(files.values()))[0])[1] if files else (0, 0)
+
+
+def scaled_intrinsic(dataset: Dataset, data: str, size: tuple[int, int]) -> FloatArray:
+    """K (3, 3) of a camera's file for images of `size` (width, height): they may be smaller than calib says."""
+    lens = dataset.camera(data)
+    return np.diag([size[0] / lens.width, size[1] / lens.height, 1.0]) @ lens.intrinsic
 
 
 def _data_row(scene: Scene, number: int, channel: str, size: tuple[int, int], path: str, sensor: str) -> Row:
@@ -85,11 +99,9 @@ def _calibrated_row(scene: Scene, data: str, size: tuple[int, int], axes: LidarA
     record = scene.dataset.calibrated_sensor.get(sensor)
     rotation, intrinsic = record["rotation"], []
     if record["camera_intrinsic"] is None:
-        rotation = quaternions.from_matrix(quaternions.to_matrix(rotation) @ _TURNS[axes].T).tolist()
+        rotation = quaternions.from_matrix(quaternions.to_matrix(rotation) @ TURNS[axes].T).tolist()
     else:
-        lens = scene.dataset.camera(data)
-        scale = np.diag([size[0] / lens.width, size[1] / lens.height, 1.0])  # images may be smaller than calib says
-        intrinsic = (scale @ lens.intrinsic).tolist()
+        intrinsic = scaled_intrinsic(scene.dataset, data, size).tolist()
     return {
         "token": token("calibrated_sensor", sensor),
         "sensor_token": token("sensor", CHANNEL_NAMES[record["sensor_token"]]),
@@ -103,6 +115,6 @@ def _cloud(path: Path, axes: LidarAxes) -> bytes:
     """The content of a `.pcd.bin`: x, y, z, intensity, ring (0), in the LiDAR's frame with these axes."""
     cloud = read_lidar(path)
     points = np.zeros((len(cloud), 5), dtype="<f4")
-    points[:, :3] = cloud.xyz @ _TURNS[axes].T
+    points[:, :3] = cloud.xyz @ TURNS[axes].T
     points[:, 3] = cloud.intensity
     return points.tobytes()
