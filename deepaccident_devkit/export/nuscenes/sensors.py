@@ -13,6 +13,7 @@ from deepaccident_devkit.export.sensor_files import sensor_files
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.release import read_lidar
 from deepaccident_devkit.release.images import read_jpeg
+from deepaccident_devkit.tables.tokens import sample_data_token
 from deepaccident_devkit.taxonomy import BEV_CAMERA, LIDAR
 
 if TYPE_CHECKING:
@@ -41,15 +42,17 @@ def write_sensors(scene: Scene, axes: LidarAxes, output: Output) -> Rows:
     calibrated: dict[str, Row] = {}
     for channel, files in scene.files.items():
         empty = {number for number in scene.frames if channel == LIDAR and scene.is_key(number)} - files.keys()
-        size = (0, 0) if channel == LIDAR or not files else read_jpeg(next(iter(files.values()))[0])[1]
+        size = (0, 0)
+        if channel != LIDAR and files:  # images of a recording are equally large; to read all would take hours
+            size = read_jpeg(next(iter(files.values()))[0])[1]
         rows = []
         for number in sorted({*files, *empty}):
-            record = scene.dataset.sample_data.get(f"{scene.sample(number)}/{channel}")
-            sensor = record["calibrated_sensor_token"]
+            source = sample_data_token(scene.sample(number), channel)
+            sensor = scene.dataset.sample_data.get(source)["calibrated_sensor_token"]
             if sensor not in calibrated:
-                calibrated[sensor] = _calibrated_row(scene, f"{scene.sample(number)}/{channel}", size, axes)
+                calibrated[sensor] = _calibrated_row(scene, sensor, source, size, axes)
             path = sensor_path(scene.name, channel, scene.stamp(number), key=scene.is_key(number))
-            rows.append(_data_row(scene, number, channel, size, path, sensor))
+            rows.append(_data_row(scene, number, channel, sensor, path, size))
             if channel == LIDAR:
                 output.write(path, b"" if number in empty else _cloud(files[number][0], axes))
             else:
@@ -63,7 +66,7 @@ def write_sensors(scene: Scene, axes: LidarAxes, output: Output) -> Rows:
     return {"sample_data": data, "calibrated_sensor": list(calibrated.values())}
 
 
-def _data_row(scene: Scene, number: int, channel: str, size: tuple[int, int], path: str, sensor: str) -> Row:
+def _data_row(scene: Scene, number: int, channel: str, sensor: str, path: str, size: tuple[int, int]) -> Row:
     sample = scene.sample(number)
     return {
         "token": token("sample_data", sample, channel),
@@ -79,15 +82,14 @@ def _data_row(scene: Scene, number: int, channel: str, size: tuple[int, int], pa
     }
 
 
-def _calibrated_row(scene: Scene, data: str, size: tuple[int, int], axes: LidarAxes) -> Row:
-    """The row of the calibrated sensor of a sensor file of the devkit, with K for images of `size` (width, height)."""
-    sensor = scene.dataset.sample_data.get(data)["calibrated_sensor_token"]
+def _calibrated_row(scene: Scene, sensor: str, source: str, size: tuple[int, int], axes: LidarAxes) -> Row:
+    """The row of a calibrated sensor, which made the file `source`, with K for images of `size` (width, height)."""
     record = scene.dataset.calibrated_sensor.get(sensor)
     rotation, intrinsic = record["rotation"], []
     if record["camera_intrinsic"] is None:
         rotation = quaternions.from_matrix(quaternions.to_matrix(rotation) @ _TURNS[axes].T).tolist()
     else:
-        lens = scene.dataset.camera(data)
+        lens = scene.dataset.camera(source)
         scale = np.diag([size[0] / lens.width, size[1] / lens.height, 1.0])  # images may be smaller than calib says
         intrinsic = (scale @ lens.intrinsic).tolist()
     return {
