@@ -26,7 +26,7 @@ CATEGORIES: Final = MappingProxyType(
     }
 )
 """Our class → nuScenes' category; vans are said to be one of the first two."""
-SEEN: Final = MappingProxyType({True: "4", False: "1"})
+_SEEN: Final = MappingProxyType({True: "4", False: "1"})
 """Whether a camera of the agent sees a box → nuScenes' visibility; the levels between cannot be known."""
 _MOVING: Final = 0.2
 """m/s, above which an actor moves."""
@@ -75,7 +75,7 @@ def _annotations(scene: Scene, number: int, output: Output) -> Iterator[Row]:
             "token": own,
             "sample_token": token("sample", sample),
             "instance_token": token("instance", *((own,) if alone else (scene.scenario, scene.agent, actor))),
-            "visibility_token": SEEN[boxes.camera_visible.item(index)],
+            "visibility_token": _SEEN[boxes.camera_visible.item(index)],
             "attribute_tokens": [token("attribute", name) for name in _attributes(category, actor, speed[index])],
             "translation": boxes.center[index].tolist(),
             "size": [width, length, height],
@@ -88,7 +88,7 @@ def _annotations(scene: Scene, number: int, output: Output) -> Iterator[Row]:
 
 
 def _attributes(category: str, actor: int, speed: float) -> list[str]:
-    """NuScenes' word for what an actor of our class does, as a list; none where its speed is NaN and would decide."""
+    """The word of nuScenes for what an actor of our class does, as a list; none where an unknown speed would decide."""
     if category in ("motorcycle", "cyclist"):
         return ["cycle.with_rider"]
     if category != "pedestrian" and actor >= STATIC_ACTOR_ID:

@@ -69,7 +69,7 @@ class Scene:
     def key_of(self, number: int) -> str:
         """The devkit's token of the sample that a frame belongs to: the keyframe's that it leads to.
 
-        The client's `get_boxes` interpolates from the keyframe before a sample to the sample.
+        The nuScenes devkit interpolates boxes of a sweep from the keyframe before its sample to its sample.
         """
         return self.sample(keyframe_after(number, self.last))
 
@@ -83,36 +83,30 @@ class Scene:
 
     def rows(self) -> Rows:
         """The rows of `scene`, `log`, `sample` and `ego_pose`."""
-        samples = [self.sample(number) for number in keyframes(self.last)]
         about = self.dataset.scenario.get(self.scenario)
-        own = token("scene", agent_token(self.scenario, self.agent))
-        log = token("log", agent_token(self.scenario, self.agent))
+        scene, log = (token(table, agent_token(self.scenario, self.agent)) for table in ("scene", "log"))
+        samples = linked([self._sample_row(number, scene) for number in keyframes(self.last)])
         facts = (about["town"], about["weather"], about["time_of_day"], about["road_type"])
-        scene = {
-            "token": own,
+        scene_row = {
+            "token": scene,
             "log_token": log,
             "nbr_samples": len(samples),
-            "first_sample_token": token("sample", samples[0]),
-            "last_sample_token": token("sample", samples[-1]),
+            "first_sample_token": samples[0]["token"],
+            "last_sample_token": samples[-1]["token"],
             "name": self.name,
             "description": ", ".join(filter(None, (*facts, "collision" if about["collision"] else None))),
             "agent": self.agent,
             "split": about["split"],
         }
-        return {
-            "scene": [scene],
-            "log": [
-                {
-                    "token": log,
-                    "logfile": self.scenario,
-                    "vehicle": self.agent,
-                    "date_captured": "",
-                    "location": about["town"],
-                }
-            ],
-            "sample": linked([self._sample_row(number, own) for number in keyframes(self.last)]),
-            "ego_pose": [self._pose_row(number) for number in self.frames],
+        log_row = {
+            "token": log,
+            "logfile": self.scenario,
+            "vehicle": self.agent,
+            "date_captured": "",
+            "location": about["town"],
         }
+        poses = [self._pose_row(number) for number in self.frames]
+        return {"scene": [scene_row], "log": [log_row], "sample": samples, "ego_pose": poses}
 
     def _sample_row(self, number: int, scene: str) -> Row:
         sample = self.sample(number)

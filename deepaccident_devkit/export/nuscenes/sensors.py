@@ -14,6 +14,7 @@ from deepaccident_devkit.export.sensor_files import sensor_files
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.release import read_lidar
 from deepaccident_devkit.release.images import read_jpeg
+from deepaccident_devkit.tables.tokens import sample_data_token
 from deepaccident_devkit.taxonomy import BEV_CAMERA, LIDAR
 
 if TYPE_CHECKING:
@@ -47,12 +48,12 @@ def write_sensors(scene: Scene, axes: LidarAxes, output: Output) -> Rows:
         size = (0, 0) if channel == LIDAR else image_size(files)
         rows = []
         for number in sorted({*files, *empty}):
-            record = scene.dataset.sample_data.get(f"{scene.sample(number)}/{channel}")
-            sensor = record["calibrated_sensor_token"]
+            source = sample_data_token(scene.sample(number), channel)
+            sensor = scene.dataset.sample_data.get(source)["calibrated_sensor_token"]
             if sensor not in calibrated:
-                calibrated[sensor] = _calibrated_row(scene, f"{scene.sample(number)}/{channel}", size, axes)
+                calibrated[sensor] = _calibrated_row(scene, sensor, source, size, axes)
             path = sensor_path(scene.name, channel, scene.stamp(number), key=scene.is_key(number))
-            rows.append(_data_row(scene, number, channel, size, path, sensor))
+            rows.append(_data_row(scene, number, channel, sensor, path, size))
             if channel == LIDAR:
                 output.write(path, b"" if number in empty else _cloud(files[number][0], axes))
             else:
@@ -77,7 +78,7 @@ def scaled_intrinsic(dataset: Dataset, data: str, size: tuple[int, int]) -> Floa
     return np.diag([size[0] / lens.width, size[1] / lens.height, 1.0]) @ lens.intrinsic
 
 
-def _data_row(scene: Scene, number: int, channel: str, size: tuple[int, int], path: str, sensor: str) -> Row:
+def _data_row(scene: Scene, number: int, channel: str, sensor: str, path: str, size: tuple[int, int]) -> Row:
     sample = scene.sample(number)
     return {
         "token": token("sample_data", sample, channel),
@@ -93,15 +94,14 @@ def _data_row(scene: Scene, number: int, channel: str, size: tuple[int, int], pa
     }
 
 
-def _calibrated_row(scene: Scene, data: str, size: tuple[int, int], axes: LidarAxes) -> Row:
-    """The row of the calibrated sensor of a sensor file of the devkit, with K for images of `size` (width, height)."""
-    sensor = scene.dataset.sample_data.get(data)["calibrated_sensor_token"]
+def _calibrated_row(scene: Scene, sensor: str, source: str, size: tuple[int, int], axes: LidarAxes) -> Row:
+    """The row of a calibrated sensor, which made the file `source`, with K for images of `size` (width, height)."""
     record = scene.dataset.calibrated_sensor.get(sensor)
     rotation, intrinsic = record["rotation"], []
     if record["camera_intrinsic"] is None:
         rotation = quaternions.from_matrix(quaternions.to_matrix(rotation) @ TURNS[axes].T).tolist()
     else:
-        intrinsic = scaled_intrinsic(scene.dataset, data, size).tolist()
+        intrinsic = scaled_intrinsic(scene.dataset, source, size).tolist()
     return {
         "token": token("calibrated_sensor", sensor),
         "sensor_token": token("sensor", CHANNEL_NAMES[record["sensor_token"]]),

@@ -31,7 +31,7 @@ _VISIBILITIES: Final = {"1": "v0-40", "2": "v40-60", "3": "v60-80", "4": "v80-10
 def write_part(folder: Path, scenes: Sequence[Rows]) -> None:
     """Keep the rows of a unit's scenes for `write_tables`, a row a line."""
     for table in _OF_UNITS:
-        lines = "".join(f"{json.dumps(row)}\n" for rows in scenes for row in rows.get(table, ()))
+        lines = "".join(f"{json.dumps(row)}\n" for rows in scenes for row in rows[table])
         write_bytes(_part(folder, table), lines.encode())
 
 
