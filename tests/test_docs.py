@@ -75,6 +75,7 @@ NOT_RUN = {
     "synth ": "tests/test_cli_synth.py has them; some take minutes",
     "render accident OUT": "tests/unit/synth/test_own_files.py has it, on a release of a scenario file",
     "baseline v2x": "tests/test_cli_baseline.py has it, on smaller releases",
+    "results from": "tests/unit/export/test_nuscenes_detections.py has it, and makes the file",
     "export mcap": "tests/unit/export has it, which has the extra",
 }
 """Command lines of pages that begin so are parsed alone, and why."""
@@ -240,7 +241,9 @@ def test_the_code_on_the_format_runs(in_demo: Path) -> None:
     assert run_page(DOCS / "format.md")["meta"].collision is not None
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/index.md", "docs/queries.md", "docs/validation.md"])
+@pytest.mark.parametrize(
+    "page", ["README.md", "docs/exports.md", "docs/index.md", "docs/queries.md", "docs/validation.md"]
+)
 def test_the_code_on_other_pages_runs(page: str, in_demo: Path) -> None:
     run_page(TOP / page)
 

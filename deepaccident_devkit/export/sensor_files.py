@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -37,11 +38,15 @@ def sensor_files(dataset: Dataset, scenario: str, agent: str, channel: str) -> d
 
 
 def points_of(dataset: Dataset, scenario: str, agent: str) -> int:
-    """About how many LiDAR points a recording has, all frames together: as many in each as in its first file.
+    """About how many LiDAR points a recording has; raises as `points_in` and `sensor_files` do."""
+    return points_in(sensor_files(dataset, scenario, agent, LIDAR))
+
+
+def points_in(files: Mapping[int, tuple[Path, int]]) -> int:
+    """About how many points LiDAR files have together: as many in each as in the first.
 
     Raises:
         SensorFileError: that file cannot be read.
     """
-    files = sensor_files(dataset, scenario, agent, LIDAR)
     first = next(iter(files.values()), None)
     return 0 if first is None else len(read_lidar(first[0], raw=True)) * len(files)

@@ -1,0 +1,225 @@
+"""Samples with their sensor files as tar files of about equal size, to be read as a stream (docs/exports.md)."""
+
+from __future__ import annotations
+
+import io
+import tarfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, get_args
+
+import numpy as np
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.export.bulk import Format, Output, Plan, Unit
+from deepaccident_devkit.export.keyframes import keyframes
+from deepaccident_devkit.export.sample_json import CAMERA_NAMES, JSON_FIELDS, JSON_TYPES, sample_json
+from deepaccident_devkit.export.sensor_files import sensor_files
+from deepaccident_devkit.export.shards import README, readme, remove_others, shards
+from deepaccident_devkit.release import read_lidar
+from deepaccident_devkit.tables.tokens import frame_token, sample_token
+from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, CHANNELS, LIDAR
+from deepaccident_devkit.text import choice
+
+if TYPE_CHECKING:
+    from deepaccident_devkit.dataset import Dataset
+
+Frames = Literal["every", "keyframes"]
+
+_POINT_BYTES: Final = 16
+_FACTS_BYTES: Final = 20_000
+"""Of a sample's JSON and of the headers of its files, about."""
+_IN_SHARDS: Final = (*CAMERAS, LIDAR)
+_TYPES: Final[Mapping[str, Any]] = {
+    **{f"{name}.jpg": "image" for name in CAMERA_NAMES.values()},
+    "lidar.npy": [["float32"]],
+    "json": JSON_TYPES,
+    **dict.fromkeys(("__key__", "__url__"), "string"),
+}
+"""Without these `datasets` guesses by five samples: wrongly if one of them lacks an image or an impact."""
+_BODY: Final = """\
+A sample is one agent at one frame. The names of its files begin with `<type>/<scenario>/<agent>/<NNN>`, in which a dot
+is written as %2E. Samples are ordered by scenario, then frame, then agent: those of one moment follow each other. The
+agents of a scenario are in one shard.
+
+| file | what |
+|---|---|
+| `camera_front.jpg`, … | the six cameras' images, byte by byte those of the release |
+| `lidar.npy` | float32 (N, 4): x, y, z in the LiDAR frame, intensity |
+| `json` | the fields below |
+
+A file that the release at hand lacks is missing in the sample, too.
+
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WebDataset(Format):
+    """Shards for `webdataset` and `datasets`: `<split>-000000.tar`, and a README.md.
+
+    Attributes:
+        frames: `every` one, or the `keyframes`: two a second, counted back from the last one, the impact.
+        shard_size: bytes of a shard, about; the agents of a scenario stay together, so it can be larger.
+
+    Raises:
+        ChoiceError: no such choice of frames.
+        ConfigError: `shard_size` is less than 1.
+    """
+
+    frames: Frames = "every"
+    shard_size: int = 10**9
+
+    name: ClassVar[str] = "webdataset"
+
+    def __post_init__(self) -> None:
+        """Check the choice and the size too."""
+        super().__post_init__()
+        choice("frames", self.frames, get_args(Frames))
+        if self.shard_size < 1:
+            raise ConfigError(f"shard_size: expected a number of bytes from 1, found {self.shard_size}")
+
+    def units(self, dataset: Dataset, scenarios: Sequence[str]) -> list[Unit]:
+        """A shard each, by the sizes of the first files: all would take minutes, and plan looks at them."""
+        sizes = {scenario: _Recording(dataset, scenario, self).quick_size() for scenario in scenarios}
+        return [
+            Unit(name=f"{split}-{number:06d}", scenarios=group)
+            for split, groups in shards(dataset, sizes, self.shard_size).items()
+            for number, group in enumerate(groups)
+        ]
+
+    def plan(self, dataset: Dataset, unit: Unit) -> Plan:
+        """By the sizes of the images and the number of points of each first cloud."""
+        total = Plan(files=1)
+        for scenario in unit.scenarios:
+            recording = _Recording(dataset, scenario, self)
+            total += Plan(samples=recording.samples, bytes=recording.size())
+        return total
+
+    def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
+        """Write a shard."""
+        with (
+            output.file(f"{unit.name}.tar") as path,
+            tarfile.open(path, "w", format=tarfile.GNU_FORMAT, encoding="utf-8") as archive,
+        ):
+            for scenario in unit.scenarios:
+                recording = _Recording(dataset, scenario, self)
+                recording.count_left_out(output)
+                recording.write(archive)
+
+    def finish(
+        self,
+        dataset: Dataset,
+        units: Sequence[Unit],
+        output: Output,
+        parts: Callable[[Unit], Path],  # noqa: ARG002 - units are whole files
+    ) -> None:
+        """Write the README.md."""
+        remove_others(output.folder, "*.tar", {f"{unit.name}.tar" for unit in units})
+        splits = dict.fromkeys(unit.name.split("-")[0] for unit in units)
+        files = [{"split": split, "path": f"{split}-*.tar"} for split in splits]
+        head = {
+            "configs": [{"config_name": "default", "data_files": files}],
+            "dataset_info": {"features": _features(_TYPES)},
+        }
+        text = readme(self, dataset, f"DeepAccident {dataset.version}: samples", head, _BODY + JSON_FIELDS)
+        output.write(README, text)
+
+
+class _Recording:
+    """What of a scenario goes into a shard.
+
+    Attributes:
+        samples: how many.
+    """
+
+    def __init__(self, dataset: Dataset, scenario: str, form: WebDataset) -> None:
+        """Look which agents are there."""
+        self._dataset, self._scenario, self._wanted = dataset, scenario, form.agents
+        self._last = dataset.scenario.get(scenario)["num_frames"]
+        self._numbers = keyframes(self._last) if form.frames == "keyframes" else range(1, self._last + 1)
+        self._here = [sample["agent"] for sample in dataset.samples_of(frame_token(scenario, 1))]
+        self._agents = [agent for agent in self._here if agent in form.agents]
+        self.samples = len(self._agents) * len(self._numbers)
+
+    @cached_property
+    def _files(self) -> dict[tuple[str, str], dict[int, tuple[Path, int]]]:
+        """Agent and channel → frame → path and bytes of what is there."""
+        found = {}
+        for agent, channel in product(self._agents, CHANNELS):
+            files = sensor_files(self._dataset, self._scenario, agent, channel)
+            found[agent, channel] = {number: files[number] for number in self._numbers if number in files}
+        return found
+
+    def quick_size(self) -> int:
+        """Bytes, as if all files were as large as the first ones."""
+        size = self.samples * _FACTS_BYTES
+        for agent, channel in product(self._agents, _IN_SHARDS):
+            path = self._dataset.get_sample_data_path(sample_token(self._scenario, agent, self._numbers[0]), channel)
+            size += path.stat().st_size * len(self._numbers) if path.is_file() else 0
+        return size
+
+    def size(self) -> int:
+        """Bytes, as if all clouds of an agent had as many points as its first one."""
+        size = self.samples * _FACTS_BYTES
+        for (_, channel), files in self._files.items():
+            if channel in CAMERAS:
+                size += sum(each for _, each in files.values())
+            elif channel == LIDAR and files:
+                first, _ = next(iter(files.values()))
+                size += len(read_lidar(first, raw=True)) * _POINT_BYTES * len(files)
+        return size
+
+    def count_left_out(self, output: Output) -> None:
+        """Count what is not written."""
+        absent = [agent for agent in self._wanted if agent not in self._here]
+        counts = {channel: sum(len(self._files[agent, channel]) for agent in self._agents) for channel in CHANNELS}
+        images = sum(counts[camera] for camera in CAMERAS)
+        output.leave_out("agents of scenarios that are not in this release", len(absent))
+        output.leave_out("samples of other agents", (len(self._here) - len(self._agents)) * len(self._numbers))
+        output.leave_out("samples between keyframes", (self._last - len(self._numbers)) * len(self._agents))
+        output.leave_out("images that are not in this release", len(CAMERAS) * self.samples - images)
+        output.leave_out("point clouds that are not in this release", self.samples - counts[LIDAR])
+        output.leave_out("files of the BEV camera", counts[BEV_CAMERA])
+
+    def write(self, archive: tarfile.TarFile) -> None:
+        """Add the samples, those of a moment together."""
+        for number, agent in product(self._numbers, self._agents):
+            token = sample_token(self._scenario, agent, number)
+            key = token.replace("%", "%25").replace(".", "%2E")  # readers cut a name at its first dot
+            for camera, name in CAMERA_NAMES.items():
+                if number in self._files[agent, camera]:
+                    _add(archive, f"{key}.{name}.jpg", self._files[agent, camera][number][0].read_bytes())
+            if number in self._files[agent, LIDAR]:
+                _add(archive, f"{key}.lidar.npy", _npy(self._files[agent, LIDAR][number][0]))
+            _add(archive, f"{key}.json", sample_json(self._dataset, token))
+
+
+def _add(archive: tarfile.TarFile, name: str, content: bytes) -> None:
+    """Add a file; its time is 0 and its owner nobody, so that equal samples make equal shards."""
+    entry = tarfile.TarInfo(name)
+    entry.size = len(content)
+    archive.addfile(entry, io.BytesIO(content))
+
+
+def _npy(path: Path) -> bytes:
+    """A LiDAR file as the bytes of a `.npy` file."""
+    cloud, content = read_lidar(path), io.BytesIO()
+    np.save(content, cloud.points.astype(np.float32), allow_pickle=False)
+    return content.getvalue()
+
+
+def _features(types: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Types as the heads of README.md files have them."""
+    return [{"name": name, **_feature(kind)} for name, kind in types.items()]
+
+
+def _feature(kind: Any) -> dict[str, Any]:
+    if isinstance(kind, str):
+        return {"dtype": kind}
+    if isinstance(kind, list):
+        (inner,) = kind
+        return {"list": inner if isinstance(inner, str) else _feature(inner)}
+    return {"struct": _features(kind)}

@@ -1,0 +1,189 @@
+"""The tables as Parquet files: their rows are the records, whatever the shards."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import yaml
+from click.testing import CliRunner
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.export import parquet
+from deepaccident_devkit.export.bulk import Exported, export_release
+from deepaccident_devkit.export.parquet import Parquet
+from deepaccident_devkit.export.shards import SPLIT_NAMES
+from deepaccident_devkit.tables.tables import table_names
+
+RECORDED = ("agent", "sample", "sample_data", "calibrated_sensor", "ego_pose", "annotation")
+"""Tables of what agents recorded."""
+
+
+def rows_of(folder: Path, table: str, split: str = "*") -> list[dict[str, Any]]:
+    """The rows of a table, in the order of its files."""
+    paths = sorted((folder / table).glob(f"{split}-*.parquet"))
+    return [row for path in paths for row in pq.read_table(path).to_pylist()]
+
+
+def told(dataset: DeepAccident, table: str) -> dict[str, list[str]]:
+    """Name of a split → the table's records as text, in which NaN equals NaN, with the column that is added."""
+    splits = {record["token"]: record["split"] for record in dataset.scenario}
+    found: dict[str, list[str]] = {name: [] for name in SPLIT_NAMES.values()}
+    for record in getattr(dataset, table):
+        split = splits["/".join(record["token"].split("/")[:2])]
+        found[SPLIT_NAMES[split]].append(repr({**record, "split": split}))
+    return found
+
+
+def export(dataset: DeepAccident, folder: Path, form: Parquet = Parquet()) -> Exported:  # noqa: B008 - frozen
+    return export_release(dataset, folder, form, workers=1)
+
+
+def assert_all_rows(dataset: DeepAccident, folder: Path) -> None:
+    """Every table has all records, in order."""
+    for table in table_names():
+        if table in ("sensor", "category"):
+            assert rows_of(folder, table) == [dict(record) for record in getattr(dataset, table)]
+            continue
+        for split, rows in told(dataset, table).items():
+            assert list(map(repr, rows_of(folder, table, split))) == rows
+
+
+@pytest.mark.parametrize("shard_scenarios", [1, 2, 32])
+def test_rows_are_the_records_in_shards_of_any_size(
+    both_layouts: DeepAccident, tmp_path: Path, shard_scenarios: int
+) -> None:
+    made = export(both_layouts, tmp_path / "out", Parquet(shard_scenarios=shard_scenarios))
+    assert_all_rows(both_layouts, made.folder)
+    for split, rows in told(both_layouts, "scenario").items():
+        assert len(list((made.folder / "scenario").glob(f"{split}-*"))) == -(-len(rows) // shard_scenarios)
+    assert made.plan.samples == len(both_layouts.sample)
+    assert made.plan.files == made.tally.files - 3  # the two tables without splits, and the README.md
+
+
+def test_groups_of_rows_bound_the_memory(da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parquet, "_ROWS", 100)
+    folder = export(da, tmp_path / "out").folder
+    assert_all_rows(da, folder)
+    footers = [pq.read_metadata(path) for path in (folder / "annotation").iterdir()]
+    sizes = [footer.row_group(group).num_rows for footer in footers for group in range(footer.num_row_groups)]
+    assert max(sizes) == 100
+    assert sum(sizes) == len(da.annotation)
+
+
+def test_columns_are_plain(da: DeepAccident, tmp_path: Path) -> None:
+    folder = export(da, tmp_path / "out").folder
+    for table in table_names():
+        for field in pq.read_schema(next((folder / table).iterdir())):
+            assert not pa.types.is_dictionary(field.type), (table, field)
+            assert not field.name.endswith("_row"), (table, field)
+    schema = pq.read_schema(next((folder / "ego_pose").iterdir()))
+    assert schema.field("translation").type.list_size == 3
+    assert schema.field("matrix").type.value_type.list_size == 4
+    scenario = pq.read_schema(next((folder / "scenario").iterdir()))
+    assert pa.types.is_list(scenario.field("collision").type.field("ids").type)  # can be null: of no fixed size
+
+
+def test_only_what_the_agents_recorded(da: DeepAccident, tmp_path: Path) -> None:
+    chosen = ("ego_vehicle", "infrastructure")
+    made = export(da, tmp_path / "out", Parquet(agents=chosen))
+    assert made.tally.left_out == {"samples of other agents": len(da.sample) * 3 // 5}
+    for table in set(table_names()) - {"sensor", "category"}:
+        wanted = {record["token"] for record in getattr(da, table)}
+        if table in RECORDED:
+            wanted = {token for token in wanted if token.split("/")[2] in chosen}
+        assert {row["token"] for row in rows_of(made.folder, table)} == wanted
+    assert "as recorded by ego_vehicle, infrastructure." in (made.folder / "README.md").read_text()
+
+
+def test_a_partial_release_has_the_rows_that_are_there(da_partial: DeepAccident, tmp_path: Path) -> None:
+    made = export(da_partial, tmp_path / "out")
+    assert_all_rows(da_partial, made.folder)
+    assert made.tally.left_out["agents of scenarios that are not in this release"] == len(da_partial.scenario)
+
+
+def test_a_table_without_rows_has_no_file(own_release: Path, tmp_path: Path) -> None:
+    for path in own_release.rglob("label/*/*.txt"):
+        path.unlink()
+    dataset = DeepAccident("v1", own_release, verbose=False)
+    folder = export(dataset, tmp_path / "out").folder
+    assert not any((folder / table).exists() for table in ("annotation", "instance", "track"))
+    assert_all_rows(dataset, folder)
+    _, head, body = (folder / "README.md").read_text().split("---\n", maxsplit=2)
+    assert {config["config_name"] for config in yaml.safe_load(head)["configs"]} == set(table_names()) - {
+        "annotation",
+        "instance",
+        "track",
+    }
+    assert "Here: no rows." in body
+
+
+def test_scenarios_without_a_split_are_called_unknown(da: DeepAccident, tmp_path: Path) -> None:
+    root = tmp_path / "release"
+    shutil.copytree(da.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident", "*.jpg", "*.npz"))
+    for path in root.glob("*.txt"):
+        path.unlink()
+    dataset = DeepAccident("v1", root, verbose=False)
+    folder = export(dataset, tmp_path / "out").folder
+    assert_all_rows(dataset, folder)
+    assert {path.name for path in (folder / "track").iterdir()} == {"unknown-00000-of-00001.parquet"}
+
+
+def test_readme_names_the_files_of_every_table(da: DeepAccident, tmp_path: Path) -> None:
+    folder = export(da, tmp_path / "out").folder
+    _, head, body = (folder / "README.md").read_text().split("---\n", maxsplit=2)
+    named = []
+    for config in yaml.safe_load(head)["configs"]:
+        found = config["data_files"]
+        patterns = [found] if isinstance(found, str) else [each["path"] for each in found]
+        named += [path for pattern in patterns for path in folder.glob(pattern)]
+    assert sorted(named) == sorted(folder.glob("*/*.parquet"))
+    for table in table_names():
+        assert f"\n## {table}\n" in body
+        assert all(f"\n| `{field}` | " in body for field in getattr(da, table)[0])
+    assert f"{len(told(da, 'sample')['train'])} rows in train" in body
+
+
+def test_the_same_bytes_again_and_nothing_of_an_unfinished_export_of_others(
+    da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = export(da, tmp_path / "once").folder
+
+    def stop(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Parquet, "finish", stop)
+        with pytest.raises(KeyboardInterrupt):
+            export(da, tmp_path / "twice")
+    again = tmp_path / "twice"
+    shutil.copy(again / "track" / "train-00000-of-00001.parquet", again / "track" / "train-00001-of-00002.parquet")
+    assert export(da, again).written == 0
+    files = {path.relative_to(made): path.read_bytes() for path in made.rglob("*") if path.is_file()}
+    assert {path.relative_to(again): path.read_bytes() for path in again.rglob("*") if path.is_file()} == files
+
+
+def test_the_size_of_a_shard_is_checked() -> None:
+    with pytest.raises(ConfigError, match="shard_scenarios: expected a number from 1, found 0"):
+        Parquet(shard_scenarios=0)
+
+
+def test_on_the_command_line(da: DeepAccident, tmp_path: Path) -> None:
+    words = [
+        "export",
+        "parquet",
+        str(da.dataroot),
+        "--out",
+        str(tmp_path / "out"),
+        "--split",
+        "train",
+        "--workers",
+        "1",
+    ]
+    result = CliRunner().invoke(deepaccident, words, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert list(map(repr, rows_of(tmp_path / "out", "annotation"))) == told(da, "annotation")["train"]

@@ -1,0 +1,227 @@
+"""Samples in tar files, read back by Python's own tarfile."""
+
+import io
+import itertools
+import json
+import tarfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.errors import ChoiceError, ConfigError
+from deepaccident_devkit.export.bulk import Exported, export_release
+from deepaccident_devkit.export.sample_json import JSON_FIELDS
+from deepaccident_devkit.export.shards import SPLIT_NAMES
+from deepaccident_devkit.export.webdataset import WebDataset
+from deepaccident_devkit.json_text import parsed_json
+from deepaccident_devkit.taxonomy import CAMERAS
+
+FILES = [f"camera_{side}.jpg" for side in ("front", "front_left", "front_right", "back", "back_left", "back_right")]
+FILES += ["lidar.npy", "json"]
+
+
+def samples_in(path: Path) -> dict[str, dict[str, bytes]]:
+    """Key → files of a shard. A key begins a sample only once: its files lie together."""
+    found: dict[str, dict[str, bytes]] = {}
+    with tarfile.open(path) as archive:
+        for key, entries in itertools.groupby(archive, lambda entry: entry.name[: entry.name.index(".")]):
+            assert key not in found
+            members = [(entry.name[len(key) + 1 :], archive.extractfile(entry)) for entry in entries]
+            found[key] = {name: file.read() for name, file in members if file is not None}
+    return found
+
+
+def samples_of(folder: Path) -> dict[str, dict[str, bytes]]:
+    shards = [samples_in(path) for path in sorted(folder.glob("*.tar"))]
+    found = {key: files for shard in shards for key, files in shard.items()}
+    assert len(found) == sum(map(len, shards))
+    return found
+
+
+def points_of(files: Mapping[str, bytes]) -> Any:
+    return np.lib.format.read_array(io.BytesIO(files["lidar.npy"]), allow_pickle=False)
+
+
+def export(dataset: DeepAccident, folder: Path, form: WebDataset = WebDataset()) -> Exported:  # noqa: B008 - frozen
+    return export_release(dataset, folder, form, workers=1)
+
+
+@pytest.fixture(scope="module")
+def exported(da: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Exported:
+    return export(da, tmp_path_factory.mktemp("webdataset") / "out")
+
+
+@pytest.fixture(scope="module")
+def samples(exported: Exported) -> dict[str, dict[str, bytes]]:
+    return samples_of(exported.folder)
+
+
+def test_every_sample_has_the_bytes_of_its_files(da: DeepAccident, samples: dict[str, dict[str, bytes]]) -> None:
+    assert set(samples) == {record["token"] for record in da.sample}
+    for token, files in samples.items():
+        assert list(files) == FILES
+        for camera, name in zip(CAMERAS, FILES, strict=False):
+            assert files[name] == da.get_sample_data_path(token, camera).read_bytes()
+        points = points_of(files)
+        assert points.dtype == np.float32
+        assert (points == da.load_point_cloud(token, "lidar").points.astype(np.float32)).all()
+
+
+def test_the_json_places_points_boxes_and_cameras(da: DeepAccident, samples: dict[str, dict[str, bytes]]) -> None:
+    for token, files in samples.items():
+        facts, record = parsed_json(files["json"]), da.sample.get(token)  # which refuses NaN
+        assert (facts["token"], facts["scenario"]) == (token, record["scenario_token"])
+        assert f"{facts['scenario']}/{facts['agent']}/{facts['frame']:03d}" == token
+        for name in ("timestamp", "time_to_end", "time_to_impact", "velocity", "labelled"):
+            assert facts[name] == record[name]
+        world_from_lidar = np.array(facts["world_from_ego"]) @ facts["ego_from_lidar"]
+        assert np.allclose(world_from_lidar, da.world_from(token, "lidar").matrix)
+        boxes, columns = da.boxes(token, "lidar"), facts["boxes"]
+        for name in ("center", "size", "actor_id", "num_lidar_pts", "camera_visible"):
+            assert np.array_equal(columns[name], getattr(boxes, name))
+        assert np.array_equal(np.array(columns["velocity"], dtype=float), boxes.velocity, equal_nan=True)
+        assert columns["category"] == list(boxes.category_names)
+        for name in ("yaw", "is_collider"):
+            assert columns[name] == [record[name] for record in da.annotation[da.annotation_rows(token)]]
+        camera, told = da.camera(token, "Camera_FrontLeft"), facts["cameras"]["camera_front_left"]
+        assert (told["intrinsic"], told["width"], told["height"]) == (camera.intrinsic.tolist(), 64, 36)
+        assert np.allclose(told["ego_from_camera"], da.ego_from(token, "Camera_FrontLeft").matrix)
+
+
+def test_a_moment_is_together_and_a_split_in_its_files(da: DeepAccident, exported: Exported) -> None:
+    for path in exported.folder.glob("*.tar"):
+        keys = list(samples_in(path))
+        wanted = [
+            sample["token"]
+            for record in da.scenario
+            if SPLIT_NAMES[record["split"]] == path.name.split("-")[0]
+            for number in range(1, record["num_frames"] + 1)
+            for sample in da.samples_of(f"{record['token']}/{number:03d}")
+        ]
+        assert keys == wanted
+
+
+@pytest.mark.parametrize("shard_size", [1, 25_000_000])
+def test_shards_of_any_size_hold_the_same_samples(
+    da: DeepAccident, samples: dict[str, dict[str, bytes]], tmp_path: Path, shard_size: int
+) -> None:
+    made = export(da, tmp_path / "out", WebDataset(shard_size=shard_size))
+    assert samples_of(made.folder) == samples
+    shards = list(made.folder.glob("*.tar"))
+    assert len(shards) == len(da.scenario)  # two of these do not fit into either size
+    for path in shards:
+        assert len({key.rsplit("/", maxsplit=2)[0] for key in samples_in(path)}) == 1
+
+
+def test_the_plan_is_about_what_is_written(da: DeepAccident, exported: Exported) -> None:
+    assert exported.plan.samples == len(da.sample)
+    assert exported.plan.files == exported.tally.files - 1
+    assert exported.plan.bytes == pytest.approx(exported.tally.bytes, rel=0.05)
+    assert exported.tally.left_out == {"files of the BEV camera": len(da.sample)}
+
+
+def test_keyframes_end_at_the_last_frame(da: DeepAccident, tmp_path: Path) -> None:
+    made = export(da, tmp_path / "out", WebDataset(frames="keyframes", agents=("infrastructure",)))
+    wanted = {f"{record['token']}/infrastructure/{number:03d}" for record in da.scenario for number in (1, 6)}
+    assert set(samples_of(made.folder)) == wanted
+    assert made.tally.left_out == {
+        "samples of other agents": 2 * 4 * len(da.scenario),
+        "samples between keyframes": 4 * len(da.scenario),
+        "files of the BEV camera": 2 * len(da.scenario),
+    }
+
+
+def test_a_partial_release_lacks_and_counts_what_is_missing(da_partial: DeepAccident, tmp_path: Path) -> None:
+    made = export(da_partial, tmp_path / "out")
+    frames = 6 * len(da_partial.scenario)
+    for token, files in samples_of(made.folder).items():
+        missing = {"ego_vehicle": {"camera_front.jpg"}, "infrastructure": {"lidar.npy"}}.get(token.split("/")[2], set())
+        assert set(FILES) - set(files) == missing
+    assert made.tally.left_out["images that are not in this release"] == frames
+    assert made.tally.left_out["point clouds that are not in this release"] == frames
+    assert made.tally.left_out["agents of scenarios that are not in this release"] == len(da_partial.scenario)
+
+
+def test_without_labels_there_are_poses_and_no_boxes(own_release: Path, tmp_path: Path) -> None:
+    for path in own_release.rglob("label/*/*.txt"):
+        path.unlink()
+    dataset = DeepAccident("v1", own_release, verbose=False)
+    found = samples_of(export(dataset, tmp_path / "out").folder)
+    assert len(found) == len(dataset.sample)
+    for files in found.values():
+        facts = json.loads(files["json"])
+        assert not facts["labelled"]
+        assert set(map(len, facts["boxes"].values())) == {0}
+        assert np.shape(facts["world_from_ego"]) == (4, 4)
+
+
+def test_a_dot_in_a_name_does_not_cut_the_key(own_release: Path, tmp_path: Path) -> None:
+    name = DeepAccident("v1", own_release, verbose=False).scenario[0]["name"]
+    for path in sorted(own_release.rglob(f"{name}*"), reverse=True):
+        path.rename(path.with_name(path.name.replace(name, f"{name}.5")))
+    for path in own_release.rglob("*.txt"):
+        if path.parent in (own_release, *own_release.glob("split_txt_files")):
+            path.write_text(path.read_text().replace(name, f"{name}.5"))
+    dataset = DeepAccident("v1", own_release, verbose=False)
+    found = samples_of(export(dataset, tmp_path / "out").folder)
+    assert len(found) == len(dataset.sample)
+    renamed = [json.loads(files["json"])["scenario"] for key, files in found.items() if f"{name}%2E5/" in key]
+    assert len(renamed) > 0
+    assert all(scenario.endswith(f"/{name}.5") for scenario in renamed)
+
+
+def test_types_in_the_readme_are_those_of_the_samples(exported: Exported, samples: dict[str, dict[str, bytes]]) -> None:
+    _, head, body = (exported.folder / "README.md").read_text().split("---\n", maxsplit=2)
+    features = {each["name"]: each for each in yaml.safe_load(head)["dataset_info"]["features"]}
+    assert list(features) == [*FILES, "__key__", "__url__"]
+    for files in samples.values():
+        check_type(json.loads(files["json"]), features["json"])
+        assert all(f"`{name}`" in body for name in json.loads(files["json"]))
+    assert JSON_FIELDS in body
+
+
+def check_type(value: Any, feature: Mapping[str, Any]) -> None:
+    """Check that a value is of a type as the head of a README.md has it."""
+    if "struct" in feature:
+        assert list(value) == [each["name"] for each in feature["struct"]]
+        for each in feature["struct"]:
+            check_type(value[each["name"]], each)
+    elif "list" in feature and value is not None:
+        inner = feature["list"]
+        for each in value:
+            check_type(each, {"dtype": inner} if isinstance(inner, str) else inner)
+    elif value is not None:
+        kinds = {"string": str, "int64": int, "float64": float, "bool": bool}
+        assert type(value) is kinds[feature["dtype"]]
+
+
+def test_the_same_bytes_again(da: DeepAccident, exported: Exported, tmp_path: Path) -> None:
+    again = export(da, tmp_path / "again")
+    for path in exported.folder.iterdir():
+        assert (again.folder / path.name).read_bytes() == path.read_bytes()
+    with tarfile.open(next(again.folder.glob("*.tar"))) as archive:
+        assert {(entry.mtime, entry.uid, entry.gid, entry.uname, entry.mode) for entry in archive} == {
+            (0, 0, 0, "", 0o644)
+        }
+
+
+def test_impossible_choices() -> None:
+    with pytest.raises(ConfigError, match="shard_size: expected a number of bytes from 1, found 0"):
+        WebDataset(shard_size=0)
+    with pytest.raises(ChoiceError, match="frames: expected one of every, keyframes"):
+        WebDataset(frames="2hz")  # type: ignore[arg-type]
+
+
+def test_on_the_command_line(da: DeepAccident, tmp_path: Path) -> None:
+    words = ["export", "webdataset", str(da.dataroot), "--out", str(tmp_path / "out"), "--frames", "keyframes"]
+    result = CliRunner().invoke(deepaccident, [*words, "--shard-size", "1", "--workers", "1"], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert len(samples_of(tmp_path / "out")) == 2 * 5 * len(da.scenario)
+    assert len(list((tmp_path / "out").glob("*.tar"))) == len(da.scenario)

@@ -1,0 +1,46 @@
+"""Whole columns of what records show."""
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import IndexStoreError, TableError, TokenError
+from deepaccident_devkit.tables.record_tables import RecordTables
+from deepaccident_devkit.tables.tables import table_names
+
+
+@pytest.mark.parametrize("table", table_names())
+def test_rows_in_any_order_are_the_records(both_layouts: DeepAccident, table: str) -> None:
+    records = getattr(both_layouts, table)
+    rows = np.random.default_rng(0).permutation(len(records))[:300]
+    found = RecordTables(both_layouts).table(table, rows).to_pylist()
+    assert list(map(repr, found)) == [repr(dict(records[row])) for row in rows]  # in which NaN equals NaN
+
+
+def test_the_rows_of_scenarios_and_agents(both_layouts: DeepAccident) -> None:
+    scenarios = [record["token"] for record in both_layouts.scenario[1:3]]
+    maker = RecordTables(both_layouts)
+    found = maker.rows(scenarios, ("other_vehicle",))
+    for table, rows in found.items():
+        tokens = [record["token"] for record in getattr(both_layouts, table)]
+        wanted = [token for token in tokens if "/".join(token.split("/")[:2]) in scenarios]
+        if table not in ("scenario", "frame", "instance", "track"):
+            wanted = [token for token in wanted if token.split("/")[2] == "other_vehicle"]
+        assert maker.tokens(table, rows).to_pylist() == wanted
+
+
+def test_no_rows(da: DeepAccident) -> None:
+    for table in table_names():
+        assert len(RecordTables(da).table(table, np.arange(0))) == 0
+
+
+def test_a_row_that_only_a_damaged_index_holds(da: DeepAccident) -> None:
+    with pytest.raises(IndexStoreError, match="table 'annotation' holds a value out of its range"):
+        RecordTables(da).table("annotation", np.array([len(da.annotation)]))
+
+
+def test_unknown_names(da: DeepAccident) -> None:
+    with pytest.raises(TableError, match="no table 'box'"):
+        RecordTables(da).table("box", np.arange(1))
+    with pytest.raises(TokenError, match="has no token 'nowhere'"):
+        RecordTables(da).rows(["nowhere"])
