@@ -37,7 +37,7 @@ class TinyFormat(Format):
                 folder.link(path, f"pictures/{name}.jpg")
             folder.write("names.json", json.dumps(list(pictures)).encode())
         for number in range(1, record["num_frames"] + 1):
-            output.write(f"frames/{unit.name}_{number}.txt", self.greeting.encode())
+            output.write(f"frames/{unit.name}/{number}.txt", self.greeting.encode())
         with output.file(f"weather/{unit.name}.txt") as path:
             path.write_text(str(record["weather"]))
         output.leave_out("clouds", len(pictures))

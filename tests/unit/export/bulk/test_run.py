@@ -442,16 +442,20 @@ class TestDamage:
         done = written(small, tmp_path / "out")
         assert (done.written, contents(done.folder)) == (2, contents(whole))
 
-    def test_strange_paths_in_a_journal_remove_nothing(self, small: DeepAccident, tmp_path: Path) -> None:
+    @pytest.mark.parametrize("path", ["../kept.txt", "{root}/kept.txt", ".", "", "frames/../../kept.txt", "\udcff"])
+    def test_a_strange_path_in_a_journal_removes_nothing(
+        self, small: DeepAccident, whole: Path, tmp_path: Path, path: str
+    ) -> None:
         """Somebody may have sent this folder."""
         stopped(small, tmp_path / "out", 1)
-        (tmp_path / "kept.txt").touch()
+        kept = tmp_path / "kept.txt"
+        kept.touch()
         for journal in (tmp_path / "out" / ".deepaccident-parts" / "tiny").glob("*.paths"):
-            journal.write_bytes("\0".join(["../kept.txt", str(tmp_path / "kept.txt"), ".", "", "\udcff"]).encode(
-                errors="surrogateescape") + b"\0")  # fmt: skip
+            with journal.open("ab") as file:
+                file.write(f"{path.format(root=tmp_path)}\0".encode(errors="surrogateescape"))
             shutil.rmtree(journal.with_name(journal.name.removesuffix(".paths")), ignore_errors=True)
-        written(small, tmp_path / "out")
-        assert (tmp_path / "kept.txt").exists()
+        assert contents(written(small, tmp_path / "out").folder) == contents(whole)
+        assert kept.exists()
 
 
 def test_wrong_workers_make_no_folder(small: DeepAccident, tmp_path: Path) -> None:
