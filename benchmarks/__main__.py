@@ -18,6 +18,7 @@ NAMES = (
     "coverage",
     "render",
     "synth",
+    "export",
 )
 
 
@@ -26,7 +27,7 @@ NAMES = (
 @click.option("--json", "as_json", is_flag=True, help="One flat JSON object (name: number) and nothing else.")
 def main(names: tuple[str, ...], as_json: bool) -> None:  # noqa: FBT001 - click's flag
     """Measure the devkit; NAME is one of parsing, indexing, scale, validation, geometry, labels, evaluation,
-    coverage, render, synth.
+    coverage, render, synth, export.
     """
     figures = []
     for name in names or NAMES:

@@ -19,18 +19,22 @@ def index_share_of_raw(index_bytes: float, samples: int) -> float:
 def labels_only_release(root: Path, *, scenarios: int, frames: int) -> Path:
     """A release without sensor files: one accident and its twin, copied under other names."""
     made = make_release(root / "made", SynthConfig(scenarios=2, frames=frames, sensors=False), workers=2)
-    out = root / "release"
+    return copied_release(made, root / "release", scenarios=scenarios)
+
+
+def copied_release(made: Path, out: Path, *, scenarios: int) -> Path:
+    """So many scenarios: those of a release by turns, copied under other names."""
     originals = find_release(made).scenarios
     for number in range(scenarios):
-        original = originals[number % 2]
+        original = originals[number % len(originals)]
         name = f"{original.name[:-5]}{number:05d}"
         target = out / original.scenario_type
         target.joinpath("meta").mkdir(parents=True, exist_ok=True)
         shutil.copyfile(original.meta_path, target / "meta" / f"{name}.txt")
-        for agent in AGENTS:
-            for kind in ("calib", "label"):
-                folder = target / agent / kind / name
+        for kind in original.kind_folder(AGENTS[0], "").parent.iterdir():
+            for agent in AGENTS:
+                folder = target / agent / kind.name / name
                 folder.mkdir(parents=True)
-                for file in original.kind_folder(agent, kind).iterdir():
+                for file in original.kind_folder(agent, kind.name).iterdir():
                     shutil.copyfile(file, folder / file.name.replace(original.name, name))
     return out

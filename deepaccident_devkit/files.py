@@ -69,16 +69,20 @@ def temporary_of(name: str) -> str | None:
     return found["name"] if found else None
 
 
-def remove_leftovers(folder: Path) -> None:
+def remove_leftovers(folder: Path, *, locked: bool = False) -> None:
     """Remove the temporary files and folders of dead writers; what cannot be removed is left to the next time.
 
     A writer on this host is dead if no process has its number and its start time; one on another host if nothing was
     changed for a day. A name without a host, as earlier versions gave, may be another program's, and is left.
+
+    Args:
+        folder: whose own entries are looked through.
+        locked: whether the caller holds a lock without which nobody may write there: then all writers are dead.
     """
     with suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
             with suppress(OSError):  # another process removes it too
-                if not _is_abandoned(entry):
+                if not _is_abandoned(entry, locked=locked):
                     continue
                 if entry.is_dir(follow_symlinks=False):
                     shutil.rmtree(entry.path, ignore_errors=True)
@@ -99,10 +103,12 @@ def _rid_of_leftovers(folder: Path) -> None:
     remove_leftovers(folder)
 
 
-def _is_abandoned(entry: os.DirEntry[str]) -> bool:
+def _is_abandoned(entry: os.DirEntry[str], *, locked: bool) -> bool:
     found = _TEMPORARY.fullmatch(entry.name)
     if found is None or found["host"] is None:
         return False
+    if locked:
+        return True
     if found["host"] != _host():
         return time.time() - entry.stat(follow_symlinks=False).st_mtime > _ABANDONED_AFTER
     return not _is_running(int(found["process"]), found["start"])

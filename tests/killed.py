@@ -1,7 +1,8 @@
 """A server of processes that index and are stopped: `python killed.py` reads a job a line, and answers with a line.
 
-A job forks this process, which has everything imported, so that a kill costs no interpreter's start. A job that has
-`words` runs them as a command line in place of indexing. The arguments of the server are further modules to import.
+A job forks this process, which has everything imported, so that a kill costs no interpreter's start. In place of
+indexing, a job with `words` runs them as a command line, and one with a `function` (module and name) calls it with
+`arguments`. The arguments of the server are further modules to import.
 """
 
 import importlib
@@ -61,6 +62,9 @@ def _work(job: dict[str, Any], writing: int) -> None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (job["limit"], job["limit"]))
         if "words" in job:
             _command(job["words"], writing)
+        elif "function" in job:
+            module, name = job["function"]
+            getattr(importlib.import_module(module), name)(*job["arguments"])
         else:
             open_index(
                 find_release(Path(job["root"])),

@@ -259,7 +259,16 @@ def test_labels_writes_a_split_and_goes_on_where_it_stopped(own_release: Path, t
     assert (other.returncode, other.stdout) == (2, "")
     assert other.stderr.startswith(f"error: {out}: holds labels of another configuration (")
     assert "drawn_when: 'present', asked for 'since'" in other.stderr
+    batches = run(*verb, "--agents", "infrastructure", "--names", "fiery")
+    assert "names: None, asked for 'fiery'" in batches.stderr
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+    verb = ("labels", own_release, "--split", "train", "--out", tmp_path / "batches", "--names", "fiery")
+    made = run(*verb, "--preset", "fiery", "--samples", "all", "--agents", "infrastructure")
+    assert made.returncode == 0, made.stderr
+    token = release.samples("train", "all")[-1]
+    with np.load(tmp_path / "batches" / f"{token}.npz", allow_pickle=False) as file:
+        for name, array in release.motion_labels(token, "fiery").as_batch("fiery").items():
+            np.testing.assert_array_equal(file[name], array)
 
 
 @pytest.mark.slow
@@ -282,12 +291,17 @@ def test_labels_writes_a_split_and_goes_on_where_it_stopped(own_release: Path, t
         (("--workers", "0"), "0 is not in the range"),
         (("--split", "tset"), "error: split: expected one of train, val, test, train_mini, val_mini, found 'tset'"),
         (("--split", "mine.txt"), "error: mine.txt: "),
+        (("--names", "lss"), "'lss' is not one of 'fiery', 'beverse', 'deepaccident'"),
+        (
+            ("--names", "fiery", "--orientation", "fiery"),
+            "--orientation changes nothing with --names: the code",
+        ),
         (("--out", ""), "error: expected a folder of motion labels, found an empty path; give '.' for the current one"),
         (("--out", "/proc/nowhere"), "no labels can be written there"),
     ],
 )
 def test_labels_says_what_is_wrong_and_writes_nothing(
-    own_release: Path, tmp_path: Path, options: tuple[str, str], told: str
+    own_release: Path, tmp_path: Path, options: tuple[str, ...], told: str
 ) -> None:
     failed = run("labels", own_release, "--split", "train", "--out", tmp_path / "labels", *options)
     assert (failed.returncode, failed.stdout) == (2, "")

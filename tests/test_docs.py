@@ -75,6 +75,7 @@ NOT_RUN = {
     "synth ": "tests/test_cli_synth.py has them; some take minutes",
     "render accident OUT": "tests/unit/synth/test_own_files.py has it, on a release of a scenario file",
     "baseline v2x": "tests/test_cli_baseline.py has it, on smaller releases",
+    "results from": "tests/unit/export/test_nuscenes_detections.py has it, and makes the file",
     "export mcap": "tests/unit/export has it, which has the extra",
 }
 """Command lines of pages that begin so are parsed alone, and why."""

@@ -31,6 +31,7 @@ _VERBS = (
     "stats",
     "validate",
     "evaluate",
+    "results",
     "baseline",
     "render",
     "replay",

@@ -89,6 +89,7 @@ def size_text(count: int) -> str:
 def _say_plan(plan: Plan, free: int) -> None:
     linked = f", {plan.linked_files:,} files to link ({size_text(plan.linked_bytes)})" if plan.linked_files else ""
     click.echo(
-        f"{plan.samples:,} samples: about {plan.files:,} files to write ({size_text(plan.bytes)}){linked}; "
+        f"{plan.samples:,} samples: {f'about {plan.files:,}' if plan.files else 'a few'} files to write "
+        f"({size_text(plan.bytes)}){linked}; "
         f"{size_text(free)} free"
     )

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
 from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import DatarootError
+from deepaccident_devkit.reading import fault_text
 from deepaccident_devkit.release import read_lidar
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import LIDAR
@@ -17,26 +20,33 @@ def sensor_files(dataset: Dataset, scenario: str, agent: str, channel: str) -> d
 
     Raises:
         TokenError: no such scenario, agent or channel.
+        DatarootError: their folder cannot be listed.
     """
     count = dataset.scenario[dataset.getind("scenario", scenario)]["num_frames"]
-    paths = [
-        dataset.get_sample_data_path(f"{sample_token(scenario, agent, number)}/{channel}")
-        for number in range(1, count + 1)
-    ]
+    first = dataset.get_sample_data_path(f"{sample_token(scenario, agent, 1)}/{channel}")
+    folder, (stem, ending) = first.parent, first.name.rsplit("_001.", 1)
     sizes: dict[str, int] = {}
-    with suppress(FileNotFoundError, NotADirectoryError), os.scandir(paths[0].parent) as entries:
-        for entry in entries:
-            with suppress(OSError):  # a link to nothing is a file that is not there
-                sizes[entry.name] = entry.stat().st_size
-    return {number: (path, sizes[path.name]) for number, path in enumerate(paths, 1) if path.name in sizes}
+    try:
+        with suppress(FileNotFoundError, NotADirectoryError), os.scandir(folder) as entries:
+            for entry in entries:
+                with suppress(OSError):  # a link to nothing is a file that is not there
+                    sizes[entry.name] = entry.stat().st_size
+    except OSError as error:
+        raise DatarootError(f"{folder}: {fault_text(error)}; unpack its archive again, or make it readable") from error
+    names = ((number, f"{stem}_{number:03d}.{ending}") for number in range(1, count + 1))
+    return {number: (folder / name, sizes[name]) for number, name in names if name in sizes}
 
 
 def points_of(dataset: Dataset, scenario: str, agent: str) -> int:
-    """About how many LiDAR points a recording has, all frames together: as many in each as in its first file.
+    """About how many LiDAR points a recording has; raises as `points_in` and `sensor_files` do."""
+    return points_in(sensor_files(dataset, scenario, agent, LIDAR))
+
+
+def points_in(files: Mapping[int, tuple[Path, int]]) -> int:
+    """About how many points LiDAR files have together: as many in each as in the first.
 
     Raises:
         SensorFileError: that file cannot be read.
     """
-    files = sensor_files(dataset, scenario, agent, LIDAR)
     first = next(iter(files.values()), None)
     return 0 if first is None else len(read_lidar(first[0], raw=True)) * len(files)

@@ -1,7 +1,8 @@
 """Motion labels of many samples in one folder: one npz file for each scenario and agent, read sample by sample.
 
 schema/motion_labels.md describes the files. Maps that follow from instance maps are not stored: segmentation,
-centerness and offset are made from the instances' centres, flow from one vector for each instance.
+centerness and offset are made from the instances' centres, flow from one vector for each instance. For loops without
+the devkit there is another form: all maps of a sample as another code's loader gives them, one plain npz file each.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, get_args
 
 import numpy as np
 
@@ -22,14 +24,23 @@ from deepaccident_devkit.archives import DAMAGED_ARCHIVE, open_zip, read_array
 from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.errors import ChoiceError, LabelFilesError, NotAvailableError, TokenError
 from deepaccident_devkit.files import replacing
+from deepaccident_devkit.motion.batch_names import BatchNames
 from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
-from deepaccident_devkit.motion.label_folder import FORMAT_VERSION, Manifest, folder_path, label_path, writing_to
+from deepaccident_devkit.motion.label_folder import (
+    FORMAT_VERSION,
+    Manifest,
+    batch_path,
+    folder_path,
+    label_path,
+    writing_to,
+)
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.sample_labels import motion_labels
 from deepaccident_devkit.motion.stored_labels import StoredLabels, write_array
 from deepaccident_devkit.parallel import run_batch
 from deepaccident_devkit.tables.tokens import parse_number
 from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, LIDAR
+from deepaccident_devkit.text import choice
 from deepaccident_devkit.v2x import cooperating_agents
 
 if TYPE_CHECKING:
@@ -61,6 +72,7 @@ def write_label_files(
     tokens: Iterable[RowArgument],
     config: MotionLabelConfig | str | None = None,
     *,
+    names: BatchNames | None = None,
     workers: int | None = None,
     executor: Executor | None = None,
     progress: bool = False,
@@ -75,32 +87,38 @@ def write_label_files(
         folder: made where needed; or one with labels of the same configuration.
         tokens: tokens or records of labelled samples.
         config: what labels show, or the name of a preset; None for the released ones in the devkit's orientation.
+        names: `fiery`, `beverse` or `deepaccident` writes `MotionLabels.as_batch(names)` of each sample into a file of
+            its own, some 0.1 MB, for loops with numpy alone; None writes files for `LabelFiles`, 25 times smaller.
         workers: processes; None chooses by the amount of work.
         executor: any executor of `concurrent.futures` to run on, in place of own workers.
         progress: whether to show a bar.
 
     Raises:
-        ConfigError: the folder holds labels of another configuration; it is left as it is.
+        ConfigError: the folder holds labels of another configuration, or with other names; it is left as it is.
         LabelFilesError: the folder holds something else, its manifest cannot be read, or it cannot be written to.
         TokenError: no such sample.
-        ChoiceError: no sample at all, or no such agent or configuration of agents.
+        ChoiceError: no sample at all, or no such agent, configuration of agents, or code.
         NotAvailableError: a sample has no label, or an agent whose sight counts is not in this (partial) release.
         WorkerError: a worker was killed.
     """
     root, chosen = folder_path(folder), label_config(config)
+    names = choice("names", names, (*get_args(BatchNames), None))
     wanted = _by_recording(dataset, tokens)
     _check_agents(dataset, wanted, chosen)
-    Manifest.of(root, chosen)
+    Manifest.of(root, chosen, names)
     with writing_to(root):
-        manifest = Manifest.of(root, chosen)
+        manifest = Manifest.of(root, chosen, names)
         manifest.write(root)
         tasks = [
-            _Task(dataset, root, recording, _with_kept(dataset, root, recording, frames, manifest), manifest.config)
+            _Task(
+                dataset, root, recording, _with_kept(dataset, root, recording, frames, manifest), manifest.config, names
+            )
             for recording, frames in wanted.items()
         ]
-        made = run_batch(
+        made_by_task = run_batch(
             _write_recording, tasks, workers=workers, executor=executor, label="motion labels", progress=progress
         )
+        made = list(chain.from_iterable(made_by_task))
         manifest.samples.update({task.recording: list(task.frames) for task in tasks})
         manifest.write(root)
     return LabelsWritten(samples=sum(map(len, wanted.values())), written=sum(made), kept=len(made) - sum(made))
@@ -121,11 +139,17 @@ class LabelFiles(Mapping[str, MotionLabels]):
             config: what the labels must show, or the name of a preset; None for any.
 
         Raises:
-            LabelFilesError: there is no such folder, its labels are not complete, or its manifest cannot be read.
+            LabelFilesError: there is no such folder, its labels are not complete or are another code's batches, or its
+                manifest cannot be read.
             ConfigError: the labels are of another configuration.
         """
         self.folder = folder_path(folder)
         manifest = Manifest.read(self.folder)
+        if manifest.names is not None:
+            raise LabelFilesError(
+                f"{self.folder}: holds batches of {manifest.names}, which np.load opens (schema/motion_labels.md); for "
+                "LabelFiles run `deepaccident labels` without --names on another folder"
+            )
         if config is not None:
             manifest.check(self.folder, label_config(config))
         if not manifest.samples:
@@ -198,34 +222,49 @@ class LabelFiles(Mapping[str, MotionLabels]):
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """One file to write."""
+    """The files of one scenario and agent."""
 
     dataset: Dataset
     root: Path
     recording: str
     frames: tuple[int, ...]
     config: MotionLabelConfig
+    names: BatchNames | None
 
 
-def _write_recording(task: _Task) -> bool:
-    """Write the labels of one scenario and agent; False if they are there already."""
-    path = label_path(task.root, task.recording)
+def _write_recording(task: _Task) -> list[bool]:
+    """Write the labels of one scenario and agent; for each file, False if it is there already."""
     source = _source(task)
-    if _source_of(path) == source:
+    if task.names is None:
+        return [_write_file(task, label_path(task.root, task.recording), task.frames, source)]
+    return [_write_file(task, batch_path(task.root, task.recording, frame), (frame,), source) for frame in task.frames]
+
+
+def _write_file(task: _Task, path: Path, frames: tuple[int, ...], source: str) -> bool:
+    """Write one file, unless it is there; a batch has its code's arrays alone, and its source as the zip's comment."""
+    if _source_of(path, task.names) == source:
         return False
     with replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-        write_array(archive, "config", np.array(task.config.digest))
-        write_array(archive, "source", np.array(source))
-        for frame in task.frames:
+        if task.names is None:
+            write_array(archive, "config", np.array(task.config.digest))
+            write_array(archive, "source", np.array(source))
+        else:
+            archive.comment = source.encode()
+        for frame in frames:
             labels = motion_labels(task.dataset, f"{task.recording}/{frame:03d}", task.config)
-            StoredLabels.of(labels).write(archive, f"{frame:03d}")
+            if task.names is None:
+                StoredLabels.of(labels).write(archive, f"{frame:03d}")
+            else:
+                for name, array in labels.as_batch(task.names).items():
+                    write_array(archive, name, array)
     return True
 
 
 def _source(task: _Task) -> str:
-    """A digest of all that a file's labels are made from: configuration, samples, and the scenario's rows."""
+    """A digest of all that files are made from: configuration, samples or names, and the scenario's rows."""
     digest = hashlib.blake2b(digest_size=16)
-    digest.update(f"{FORMAT_VERSION} {task.config.digest} {task.recording} {task.frames}".encode())
+    what = task.frames if task.names is None else task.names  # a batch does not depend on the samples beside it
+    digest.update(f"{FORMAT_VERSION} {task.config.digest} {task.recording} {what}".encode())
     for array in _scenario_arrays(task.dataset, task.recording.rsplit("/", 1)[0]):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
@@ -247,10 +286,12 @@ def _scenario_arrays(dataset: Dataset, scenario: str) -> Iterator[AnyArray]:
             yield dataset.columns("annotation")[name][start : start + int(counts.sum())]
 
 
-def _source_of(path: Path) -> str | None:
+def _source_of(path: Path, names: BatchNames | None) -> str | None:
     """The digest that a file was made with; None if there is no whole file."""
     try:
         with open_zip(path) as archive:
+            if names is not None:
+                return archive.comment.decode("ascii", "replace")
             return str(read_array(archive, "source", "motion_labels"))
     except DAMAGED_ARCHIVE:
         return None
@@ -289,8 +330,8 @@ def _with_kept(dataset: Dataset, root: Path, recording: str, frames: list[int], 
             dataset.getind("sample", f"{recording}/{frame:03d}")
     except TokenError as error:
         raise LabelFilesError(
-            f"{label_path(root, recording)}: has frames that are not in {dataset.dataroot} any more ({error}); choose "
-            "another folder"
+            f"{root}: {recording} has frames that are not in {dataset.dataroot} any more ({error}); choose another "
+            "folder"
         ) from error
     return tuple(sorted({*frames, *kept}))
 

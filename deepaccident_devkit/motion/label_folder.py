@@ -10,11 +10,12 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 from deepaccident_devkit.errors import ConfigError, DeepAccidentError, LabelFilesError
 from deepaccident_devkit.files import temporary_of, write_bytes
 from deepaccident_devkit.json_text import parsed_json
+from deepaccident_devkit.motion.batch_names import BatchNames
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.reading import check_size, fault_text, read_bytes, shortened
 from deepaccident_devkit.taxonomy import AGENTS
@@ -28,7 +29,7 @@ MANIFEST: Final = "manifest.json"
 _CELL_BYTES: Final = 16
 """Of the maps of a sample, in memory, at least."""
 _LOCK: Final = ".lock"
-_WRITTEN: Final = (MANIFEST, *(f"{agent}.npz" for agent in AGENTS))
+_WRITTEN: Final = re.compile(rf"{re.escape(MANIFEST)}|({'|'.join(AGENTS)}|\d{{3}})\.npz")
 _RECORDING: Final = re.compile(rf"(?!\.)[^/\\\0]{{1,255}}/(?!\.)[^/\\\0]{{1,255}}/({'|'.join(AGENTS)})")
 
 
@@ -40,23 +41,25 @@ class Manifest:
         config: what its labels show.
         samples: scenario and agent → numbers of the frames whose labels are there for sure; none until the first call
             that writes there has finished.
+        names: the code whose batches they are; None for the devkit's own label files.
     """
 
     config: MotionLabelConfig
     samples: dict[str, list[int]]
+    names: BatchNames | None = None
 
     @classmethod
-    def of(cls, root: Path, config: MotionLabelConfig) -> Manifest:
+    def of(cls, root: Path, config: MotionLabelConfig, names: BatchNames | None = None) -> Manifest:
         """The manifest of a folder into which labels of a configuration will be written; changes nothing.
 
         Raises:
-            ConfigError: the folder holds labels of another configuration.
+            ConfigError: the folder holds labels of another configuration, or with other names.
             LabelFilesError: the folder holds something else, is a file, or cannot be read.
         """
         try:
             if (root / MANIFEST).exists():
                 manifest = cls.read(root)
-                manifest.check(root, config)
+                manifest.check(root, config, names)
                 return manifest
             if root.exists() and not root.is_dir():
                 raise LabelFilesError(f"{root}: is a file; give a folder")
@@ -66,7 +69,7 @@ class Manifest:
             if isinstance(error, LabelFilesError):
                 raise
             raise LabelFilesError(f"{root}: cannot be read ({error}); choose another folder") from error
-        return cls(config, {})
+        return cls(config, {}, names)
 
     @classmethod
     def read(cls, root: Path) -> Manifest:
@@ -80,6 +83,9 @@ class Manifest:
             told = parsed_json(read_bytes(path, "bundle"))
             _check_version(path, told["format"], told["version"])
             config, samples = MotionLabelConfig.from_dict(told["config"]), _samples(told["samples"])
+            names = told.get("names")  # absent in folders of 0.1
+            if names not in (None, *get_args(BatchNames)):
+                raise ValueError(f"names: expected one of {', '.join(get_args(BatchNames))}, or null, found {names!r}")
             if config.digest != told["config_digest"]:
                 raise ValueError("its digest is not that of its configuration")
             check_size(config.grid.cells * config.label_frames * _CELL_BYTES, "motion_labels", "a sample")
@@ -88,11 +94,13 @@ class Manifest:
                 raise
             told = fault_text(error) if isinstance(error, OSError) else f"cannot be read ({shortened(str(error), 600)})"
             raise LabelFilesError(f"{path}: {told}; make the labels again in an empty folder") from error
-        return cls(config, samples)
+        return cls(config, samples, names)
 
-    def check(self, root: Path, config: MotionLabelConfig) -> None:
-        """Refuse another configuration; raises ConfigError that names what differs."""
-        mine, others = (_flat(one.as_dict()) for one in (self.config, config))
+    def check(self, root: Path, config: MotionLabelConfig, names: BatchNames | None = None) -> None:
+        """Refuse another configuration or other names; raises ConfigError that says what differs."""
+        mine, others = (
+            _flat({**one.as_dict(), "names": own}) for one, own in ((self.config, self.names), (config, names))
+        )
         changed = sorted(name for name in {*mine, *others} if mine.get(name) != others.get(name))
         if changed:
             text = "; ".join(f"{name}: {mine.get(name)!r}, asked for {others.get(name)!r}" for name in changed)
@@ -105,6 +113,7 @@ class Manifest:
             "version": FORMAT_VERSION,
             "config_digest": self.config.digest,
             "config": self.config.as_dict(),
+            "names": self.names,
             "samples": dict(sorted(self.samples.items())),
         }
         text = json.dumps(manifest, indent=1)
@@ -150,8 +159,13 @@ def folder_path(folder: str | os.PathLike[str]) -> Path:
 
 
 def label_path(root: Path, recording: str) -> Path:
-    """The file of a scenario and agent."""
+    """The label file of a scenario and agent."""
     return root / f"{recording}.npz"
+
+
+def batch_path(root: Path, recording: str, frame: int) -> Path:
+    """The file of a sample in the names of another code."""
+    return root / recording / f"{frame:03d}.npz"
 
 
 def _acquire(lock: Any, root: Path) -> None:
@@ -170,14 +184,18 @@ def _remove_half_written(root: Path) -> None:
     The lock is held, so that no living process has one, on whatever host.
     """
     with suppress(OSError):
-        for path in [*root.glob(".*.tmp"), *root.glob("*/*/.*.tmp")]:
-            if temporary_of(path.name) in _WRITTEN:
+        for path in [path for folder in ("", "*/*/", "*/*/*/") for path in root.glob(f"{folder}.*.tmp")]:
+            if _is_half_written(path.name):
                 path.unlink(missing_ok=True)
 
 
 def _is_own(name: str) -> bool:
     """Whether a call that was killed before it wrote a manifest may have left a file of this name."""
-    return name == _LOCK or temporary_of(name) in _WRITTEN
+    return name == _LOCK or _is_half_written(name)
+
+
+def _is_half_written(name: str) -> bool:
+    return _WRITTEN.fullmatch(temporary_of(name) or "") is not None
 
 
 def _check_version(path: Path, form: object, version: object) -> None:

@@ -15,6 +15,7 @@ from deepaccident_devkit.geometry import SE3, handedness
 from deepaccident_devkit.geometry.se3 import RIGID_TOLERANCE, rigid_fault
 from deepaccident_devkit.release._content import read_content
 from deepaccident_devkit.release._unpickle import load_arrays
+from deepaccident_devkit.release.pickles import pickled
 from deepaccident_devkit.taxonomy import CAMERAS
 
 _EGO_KEYS = ("lidar_to_ego", "ego_to_world")
@@ -132,10 +133,7 @@ def write_raw_calib(path: Path, raw: Mapping[str, AnyArray]) -> None:
     Old numpy versions can read it too.
     """
     arrays = {key: np.ascontiguousarray(array) + 0.0 for key, array in raw.items()}  # + 0.0: no negative zeros
-    # Protocol 3 names globals in plain text. numpy 2 writes its new private path, which numpy 1 (the reference needs
-    # numpy < 1.20) does not have; numpy 2 still reads the old one.
-    content = pickle.dumps(arrays, protocol=3)
-    write_bytes(path, content.replace(b"cnumpy._core.multiarray\n", b"cnumpy.core.multiarray\n"))
+    write_bytes(path, pickled(arrays))
 
 
 def read_unchecked_calib(path: Path) -> dict[str, AnyArray]:

@@ -69,10 +69,33 @@ def scenario_hashes(
         DatarootError: the release's folder is gone, or one of its folders cannot be listed.
         ReleaseError: a file cannot be read.
     """
+    folders = scenario_folders(dataset, scenarios)
+    found = run_batch(folder_hashes, list(folders.values()), workers=workers)
+    return dict(zip(folders, found, strict=True))
+
+
+def scenario_folders(dataset: Located, scenarios: Collection[str]) -> dict[str, ScenarioFolder]:
+    """Where some scenarios' files lie, by token in order; those that are not in the release are left out.
+
+    Raises:
+        DatarootError: the release's folder is gone, or one of its folders cannot be listed.
+    """
     folders = {each.token: each for each in reversed(find_release(dataset.dataroot, dataset.version).scenarios)}
-    here = [token for token in sorted(set(scenarios)) if token in folders]
-    found = run_batch(_hashes, [folders[token] for token in here], workers=workers)
-    return dict(zip(here, found, strict=True))
+    return {token: folders[token] for token in sorted(set(scenarios)) if token in folders}
+
+
+def folder_hashes(scenario: ScenarioFolder) -> ScenarioHashes:
+    """The hashes of a scenario's files.
+
+    Raises:
+        DatarootError: one of its folders cannot be listed.
+        ReleaseError: a file cannot be read.
+    """
+    meta = [scenario.meta_path] if scenario.meta_path.is_file() else []
+    return ScenarioHashes(
+        meta=_digest(meta, "meta", scenario.meta_path.parent),
+        **{kind: _digest(_files(scenario, kind), kind, _base(scenario)) for kind in _ENDINGS},
+    )
 
 
 def fingerprint(hashes: Mapping[str, ScenarioHashes]) -> str:
@@ -84,14 +107,6 @@ def digest_of(value: Any) -> str:
     """A hash of a JSON value; the order of names does not matter."""
     text = json.dumps(value, sort_keys=True, separators=(",", ":"))
     return hashlib.blake2b(text.encode(), digest_size=_DIGEST_BYTES).hexdigest()
-
-
-def _hashes(scenario: ScenarioFolder) -> ScenarioHashes:
-    meta = [scenario.meta_path] if scenario.meta_path.is_file() else []
-    return ScenarioHashes(
-        meta=_digest(meta, "meta", scenario.meta_path.parent),
-        **{kind: _digest(_files(scenario, kind), kind, _base(scenario)) for kind in _ENDINGS},
-    )
 
 
 def _files(scenario: ScenarioFolder, kind: FileKind) -> list[Path]:

@@ -1,5 +1,6 @@
 """read(write(x)) == x for every kind of file."""
 
+import json
 from dataclasses import fields
 from pathlib import Path
 
@@ -7,10 +8,15 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from numpy.testing import assert_array_equal
-from strategies import calibs, clouds, labels, metas
+from numpy.testing import assert_allclose, assert_array_equal
+from strategies import boxes, calibs, clouds, labels, metas
 
-from deepaccident_devkit.geometry import LidarPointCloud
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.evaluation import DetectedBoxes
+from deepaccident_devkit.evaluation.results.entries import detection_entries
+from deepaccident_devkit.export.nuscenes.detections import results_from_nuscenes
+from deepaccident_devkit.export.nuscenes.names import token
+from deepaccident_devkit.geometry import Boxes, LidarPointCloud, quaternions
 from deepaccident_devkit.release import (
     Calib,
     Labels,
@@ -147,3 +153,25 @@ def test_image_within_jpegs_tolerance(scratch: Path, corners: np.ndarray) -> Non
     # chroma is stored at half resolution, so edges of saturated colours are off by more than the middle
     assert np.abs(read.astype(int) - image).mean() < 4
     assert np.abs(read.astype(int) - image).max() < 40
+
+
+@given(given_boxes=boxes(), number=st.integers(0, 69))
+def test_detections_through_a_nuscenes_file(
+    scratch: Path, da_motion: DeepAccident, given_boxes: Boxes, number: int
+) -> None:
+    """From an agent's LiDAR to the world, through the file, and back."""
+    sample = da_motion.samples("train", "all")[number]
+    world_from_lidar = da_motion.world_from(sample, "lidar")
+    world = given_boxes.transform(world_from_lidar, "world")
+    theirs, scores = token("sample", sample), np.linspace(-1, 2, len(world))
+    entries = detection_entries(theirs, DetectedBoxes(boxes=world, scores=scores))
+    (scratch / "nuscenes.json").write_text(json.dumps({"results": {theirs: entries}}))
+    found = results_from_nuscenes(da_motion, scratch / "nuscenes.json").boxes[sample]
+    assert_array_equal(found.scores, scores)
+    for name in ("center", "size", "category"):
+        assert_array_equal(getattr(found.boxes, name), getattr(world, name), err_msg=name)
+    assert_array_equal(found.boxes.velocity[:, :2], world.velocity[:, :2])
+    back = found.boxes.transform(world_from_lidar.inverse(), "lidar")
+    assert_allclose(back.center, given_boxes.center, rtol=0, atol=1e-9)
+    rotations = (quaternions.to_matrix(each.rotation) for each in (back, given_boxes))
+    assert_allclose(*rotations, rtol=0, atol=1e-9)

@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Final, get_args
 
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.export.bulk.output import Link, Output
-from deepaccident_devkit.taxonomy import AGENTS
-from deepaccident_devkit.text import choice
+from deepaccident_devkit.selection import parse_where
+from deepaccident_devkit.taxonomy import AGENTS, MINI_SPLITS, SPLITS
+from deepaccident_devkit.text import choice, settle_choices
 
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset
 
+_DIGEST: Final = re.compile(r"-[0-9a-f]{16}\Z")
+_MOST_CHARACTERS: Final = 150
+"""Of a name made from a token; the devkit's and the formats' endings come to it, and systems allow 255."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Unit:
-    """What one worker writes at once.
+    """What one worker writes at once. No two units write the same file.
 
     Attributes:
-        name: of its folder of parts: letters, digits, `_`, `-` and dots; unique.
+        name: of its folder of parts: letters, digits, `_`, `-` and dots, no dot first; unique.
         scenarios: tokens, in order.
     """
 
@@ -67,7 +73,7 @@ class Format(ABC):
             `symbolic` ones, else copies.
 
     Raises:
-        ChoiceError: no such agent, or no such way.
+        ChoiceError: no such split, agent or way; or a filter is no text of that form.
     """
 
     split: str | os.PathLike[str] | None = None
@@ -81,14 +87,20 @@ class Format(ABC):
     """Formats whose exports may lie in the same folder already."""
 
     def __post_init__(self) -> None:
-        """Check the choices, and put the agents in their usual order."""
-        choice("link", self.link, get_args(Link))
-        for name in self.agents:
-            choice("agents", name, AGENTS)
-        if not self.agents:
-            raise ChoiceError(f"agents: expected some of {', '.join(AGENTS)}, found none")
-        object.__setattr__(self, "agents", tuple(name for name in AGENTS if name in self.agents))
+        """Check the choices, give them their usual spelling, and put the agents in their usual order."""
+        settle_choices(self, {"link": get_args(Link)})
+        if isinstance(self.split, str) and not self.split.endswith(".txt"):
+            object.__setattr__(self, "split", choice("split", self.split, (*SPLITS, *MINI_SPLITS)))
+        for name in ("where", "agents"):
+            if isinstance(getattr(self, name), str):
+                object.__setattr__(self, name, (getattr(self, name),))
+        for text in self.where:
+            parse_where(text)
         object.__setattr__(self, "where", tuple(self.where))
+        named = {choice("agents", name, AGENTS) for name in self.agents}
+        if not named:
+            raise ChoiceError(f"agents: expected some of {', '.join(AGENTS)}, found none")
+        object.__setattr__(self, "agents", tuple(name for name in AGENTS if name in named))
 
     def settings(self) -> dict[str, Any]:
         """Everything that decides what is written, but the release; for JSON. Links show the same as copies."""
@@ -99,6 +111,9 @@ class Format(ABC):
     def units(self, dataset: Dataset, scenarios: Sequence[str]) -> list[Unit]:  # noqa: ARG002 - for those that ask it
         """The chosen scenarios as units: one each."""
         return [Unit(name=flat_name(token), scenarios=(token,)) for token in scenarios]
+
+    def check(self, dataset: Dataset, folder: Path) -> None:  # noqa: B027 - most formats add to nothing
+        """Refuse a folder that lacks what the format adds to; raises ExportError or ConfigError."""
 
     @abstractmethod
     def plan(self, dataset: Dataset, unit: Unit) -> Plan:
@@ -114,5 +129,13 @@ class Format(ABC):
 
 
 def flat_name(token: str) -> str:
-    """A scenario's token as the name of one folder: `<type>__<scenario>`."""
-    return re.sub(r"[^\w.-]", "_", token.replace("/", "__"))
+    """A scenario's token as the name of one folder: `<type>__<scenario>`; no two tokens have the same.
+
+    A digest of the token stands at the end if characters were replaced (all but ASCII letters, digits, `_`, `-` and
+    dots), if the name was too long, or if it looks as if it had one.
+    """
+    plain = token.replace("/", "__")
+    name = re.sub(r"[^\w.-]", "_", plain, flags=re.ASCII)[:_MOST_CHARACTERS]
+    if name == plain and not _DIGEST.search(name):
+        return name
+    return f"{name}-{hashlib.blake2b(token.encode(), digest_size=8).hexdigest()}"

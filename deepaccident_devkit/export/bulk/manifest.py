@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-import shutil
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -13,7 +13,8 @@ from typing import Any, Final
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import ConfigError, DeepAccidentError, ExportError
-from deepaccident_devkit.export.bulk.output import Tally
+from deepaccident_devkit.export.bulk.output import MALFORMED, Tally
+from deepaccident_devkit.export.bulk.unfinished import FOLDER
 from deepaccident_devkit.files import remove_leftovers, temporary_of, write_bytes
 from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.reading import fault_text, read_bytes, shortened
@@ -22,8 +23,7 @@ logger = logging.getLogger(__name__)
 
 _FORMAT: Final = "DeepAccident export"
 _LOCK: Final = ".deepaccident.lock"
-PARTS: Final = ".deepaccident-parts"
-"""Folder of what is not complete: a record and the parts of each unit that is done."""
+_AGAIN: Final = "export again into an empty folder"
 
 
 @dataclass(slots=True, kw_only=True)
@@ -34,14 +34,14 @@ class Manifest:
         name: of the format; the file is `<name>.manifest.json`.
         settings: everything that decides what is written.
         fingerprint: of the truth of the exported scenarios (`release.fingerprints`); None until it is complete.
-        scenarios: token → hash of its label, meta and calib files; empty until it is complete.
+        scenarios: token → hashes of its label, meta and calib files, by kind; empty until it is complete.
         tally: counts of all that is there.
     """
 
     name: str
     settings: Mapping[str, Any]
     fingerprint: str | None = None
-    scenarios: Mapping[str, str] = field(default_factory=dict)
+    scenarios: Mapping[str, Mapping[str, str | None]] = field(default_factory=dict)
     tally: Tally = field(default_factory=Tally)
 
     @property
@@ -71,9 +71,9 @@ class Manifest:
             if folder.exists() and not folder.is_dir():
                 raise ExportError(f"{folder}: is a file; give a folder")
             others = [] if not folder.exists() else sorted(each.name for each in folder.iterdir())
+        except ExportError:
+            raise
         except OSError as error:
-            if isinstance(error, ExportError):
-                raise
             raise ExportError(f"{folder}: cannot be read ({error}); choose another folder") from error
         welcome = any(manifest_path(folder, each).name in others for each in beside)
         strange = [each for each in others if not _is_own(each)]
@@ -90,18 +90,21 @@ class Manifest:
         try:
             told = parsed_json(read_bytes(path, "bundle"))
             if (told["what"], told["format"]) != (_FORMAT, name):
-                raise ValueError(f"expected a manifest of a {name} export")
+                raise ValueError("another format's")
             release = told["release"]
             return cls(
                 name=name,
                 settings=dict(told["settings"]),
                 fingerprint=None if release is None else str(release["fingerprint"]),
-                scenarios={} if release is None else {str(key): str(one) for key, one in release["scenarios"].items()},
+                scenarios={} if release is None else {token: dict(one) for token, one in release["scenarios"].items()},
                 tally=Tally.of(told["written"]),
             )
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            told = fault_text(error) if isinstance(error, OSError) else f"cannot be read ({shortened(str(error))})"
-            raise ExportError(f"{path}: {told}; export again into an empty folder") from error
+        except OSError as error:
+            raise ExportError(f"{path}: {fault_text(error)}; {_AGAIN}") from error
+        except MALFORMED as error:
+            raise ExportError(
+                f"{path}: is no manifest of a {name} export ({shortened(repr(error))}); {_AGAIN}"
+            ) from error
 
     def write(self, folder: Path) -> None:
         """Write it into its folder."""
@@ -144,7 +147,9 @@ def manifest_path(folder: Path, name: str) -> Path:
 
 @contextmanager
 def writing_to(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder while an export is written into it; make it where needed.
+    """Hold the lock of a folder while an export is written into it; make it, and remove what killed processes left.
+
+    The file of the lock stays, as one who waits for it may have it open already.
 
     Raises:
         ExportError: the folder cannot be made, locked or written to.
@@ -159,11 +164,15 @@ def writing_to(folder: Path) -> Iterator[None]:
         except Timeout:
             logger.warning("%s: another process writes an export there; waiting for it", folder)
             lock.acquire()
-        remove_leftovers(folder)
     except (OSError, NotImplementedError) as error:  # the latter: a file system without locks
         raise ExportError(f"{folder}: no export can be written there ({error}); choose another folder") from error
     try:
-        yield
+        _remove_half_written(folder)
+        try:
+            yield
+        except BaseException:
+            _remove_half_written(folder)
+            raise
     except DeepAccidentError:
         raise
     except OSError as error:
@@ -173,14 +182,12 @@ def writing_to(folder: Path) -> Iterator[None]:
         lock.release()
 
 
-def remove_parts(folder: Path, name: str) -> None:
-    """Remove what a complete export needs no more."""
-    shutil.rmtree(folder / PARTS / name, ignore_errors=True)
-    parts = folder / PARTS
-    if parts.is_dir() and not any(parts.iterdir()):
-        parts.rmdir()
+def _remove_half_written(folder: Path) -> None:
+    """Remove all temporary files; the lock is held, so that no process that lives has one."""
+    for each, _, _ in os.walk(folder):
+        remove_leftovers(Path(each), locked=True)
 
 
 def _is_own(name: str) -> bool:
     """Whether an export that was killed before it wrote its manifest may have left a file of this name."""
-    return name in (_LOCK, PARTS) or temporary_of(name) is not None
+    return name in (_LOCK, FOLDER) or temporary_of(name) is not None

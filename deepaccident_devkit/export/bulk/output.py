@@ -5,20 +5,22 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-import stat
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
 
 from deepaccident_devkit.errors import SensorFileError
-from deepaccident_devkit.files import replacing, temporary_path, write_bytes
+from deepaccident_devkit.files import replacing, replacing_folder, write_bytes
+from deepaccident_devkit.reading import fault_text, open_file
 
 Link = Literal["hard", "symbolic", "copy"]
 _NO_LINKS: Final = (errno.EXDEV, errno.EPERM, errno.EACCES, errno.EMLINK, errno.ENOTSUP, errno.ENOSYS)
 """What a file system answers that cannot make a link; a full disk is another matter."""
+MALFORMED: Final = (ValueError, KeyError, TypeError, AttributeError, ArithmeticError)
+"""What `Tally.of` and other readers of JSON raise for a value that is not as it should be."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -55,7 +57,7 @@ class Tally:
 
     @classmethod
     def of(cls, read: Mapping[str, Any]) -> Tally:
-        """Of `as_dict`; raises KeyError, TypeError or ValueError for anything else."""
+        """Of `as_dict`; raises one of `MALFORMED` for anything else."""
         return cls(
             files=int(read["files"]),
             bytes=int(read["bytes"]),
@@ -73,20 +75,30 @@ class Output:
         tally: the counts so far.
     """
 
-    def __init__(self, folder: Path, parts: Path, link: Link, tally: Tally | None = None) -> None:
-        """Write below `folder`, and link the release's files in this way or, where that cannot be, in the next one."""
+    def __init__(
+        self,
+        folder: Path,
+        parts: Path,
+        link: Link,
+        tally: Tally | None = None,
+        note: Callable[[str], object] = lambda _: None,
+    ) -> None:
+        """Write below `folder`, and link the release's files in this way or, where that cannot be, in the next one.
+
+        `note` is called with each path before something is written there.
+        """
         self.folder, self.parts, self.tally = folder, parts, Tally() if tally is None else tally
-        self._link = link
+        self._link, self._note = link, note
 
     def write(self, path: str, content: bytes) -> None:
         """Write a file; the path is relative to the folder."""
-        write_bytes(self.folder / path, content)
+        write_bytes(self._place(path), content)
         self._count(len(content))
 
     @contextmanager
     def file(self, path: str) -> Iterator[Path]:
         """Yield a temporary path for a file that is written piece by piece."""
-        with replacing(self.folder / path) as temporary:
+        with replacing(self._place(path)) as temporary:
             yield temporary
             size = temporary.stat().st_size
         self._count(size)
@@ -94,31 +106,29 @@ class Output:
     @contextmanager
     def whole_folder(self, path: str) -> Iterator[Output]:
         """Yield the output of a folder whose files all appear at once, in the place of an older one."""
-        target = self.folder / path
-        target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = temporary_path(target)
-        try:
-            temporary.mkdir()
+        target = self._place(path)
+        shutil.rmtree(target, ignore_errors=True)
+        with replacing_folder(target) as temporary:
             yield Output(temporary, self.parts, self._link, self.tally)
-            shutil.rmtree(target, ignore_errors=True)
-            temporary.replace(target)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
 
     def link(self, source: Path, path: str) -> None:
-        """Link a file of the release: hard, else symbolic, else copied; raises SensorFileError if it is no file."""
-        target = self.folder / path
-        target.parent.mkdir(parents=True, exist_ok=True)
-        real = source.resolve()
-        if not stat.S_ISREG(real.stat().st_mode):
-            raise SensorFileError(f"{source}: not a regular file; restore it from its archive")
-        with replacing(target) as temporary:
+        """Link a file of the release: hard, else symbolic, else copied; raises SensorFileError if it cannot be read."""
+        try:
+            real = Path(os.path.realpath(source))
+            open_file(real).close()
+        except OSError as error:
+            raise SensorFileError(f"{source}: {fault_text(error)}; restore it from its archive") from error
+        with replacing(self._place(path)) as temporary:
             self.tally.linked[_linked(real, temporary, self._link)] += 1
 
     def leave_out(self, what: str, count: int = 1) -> None:
         """Count what is not written; `what` is a plural in plain words, such as `untracked boxes`."""
         if count:
             self.tally.left_out[what] += count
+
+    def _place(self, path: str) -> Path:
+        self._note(path)
+        return self.folder / path
 
     def _count(self, size: int) -> None:
         self.tally.files += 1

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
-from deepaccident_devkit.errors import ExportError, NotAvailableError
+from deepaccident_devkit.errors import ExportError, MissingFileError, NotAvailableError
 from deepaccident_devkit.export.bulk.format import Format, Plan, Unit
-from deepaccident_devkit.export.bulk.manifest import PARTS, Manifest, remove_parts, writing_to
-from deepaccident_devkit.export.bulk.output import Output, Tally
-from deepaccident_devkit.files import write_bytes
-from deepaccident_devkit.json_text import parsed_json
+from deepaccident_devkit.export.bulk.manifest import Manifest, writing_to
+from deepaccident_devkit.export.bulk.output import Tally
+from deepaccident_devkit.export.bulk.unfinished import Unfinished
 from deepaccident_devkit.parallel import run_batch
-from deepaccident_devkit.reading import read_bytes
-from deepaccident_devkit.release.fingerprints import digest_of, scenario_hashes
+from deepaccident_devkit.release.fingerprints import digest_of, folder_hashes, scenario_folders
+from deepaccident_devkit.release.layout import ScenarioFolder
 from deepaccident_devkit.selection import find
 
 if TYPE_CHECKING:
@@ -26,7 +25,8 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.dataset import Dataset
 
-_DONE = "done.json"
+Job: TypeAlias = tuple[Unit, tuple[ScenarioFolder, ...]]
+"""A unit, and where its scenarios lie."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,22 +61,25 @@ def export_release(
 ) -> Exported:
     """Write scenarios of a release in another format. If a call is interrupted, the same call continues it.
 
+    What is continued equals an undisturbed call: scenarios whose label, meta or calib files have changed since are
+    written again. A complete export is only compared with the release.
+
     Args:
         dataset: the release.
-        folder: made where needed; or one with an unfinished export with the same settings.
+        folder: made where needed; or one with an export with the same settings.
         form: the format, with which scenarios and agents, and its own settings.
         workers: processes; None chooses by the amount of work.
         executor: any executor of `concurrent.futures` to run on, in place of own workers.
-        progress: whether to show a bar.
-        dry_run: only plan.
+        progress: whether to show bars.
+        dry_run: only plan; nothing is written, and the folder is not made.
         on_plan: called with the plan and the bytes that are free, before anything is written.
 
     Raises:
         ConfigError: the folder holds an export with other settings; it is left as it is.
         ExportError: the folder holds something else, there is too little room, it cannot be written to, or it was made
-            from another state of the release.
-        NotAvailableError: no scenario is left to export.
-        ChoiceError, FieldError: no such split or filter.
+            from other scenarios or another state of them.
+        NotAvailableError: no scenario is left to export, or the release has no such split.
+        ChoiceError, FieldError: no such filter, or `workers` is less than 1.
         ReleaseError: a file of the release cannot be read.
         WorkerError: a worker was killed.
     """
@@ -86,39 +89,43 @@ def export_release(
     scenarios = _chosen(dataset, form)
     settings = {**form.settings(), "version": dataset.version}
     manifest = Manifest.of(root, form.name, settings, form.beside)
-    units = form.units(dataset, scenarios)
-    task = _Work(dataset, root, form)
-    plan = sum(run_batch(task.plan, units, workers=workers, executor=executor, label="planning"), Plan())
-    need, free = plan.bytes + (plan.linked_bytes if form.link == "copy" else 0), _free(root)
+    task, units = _Work(dataset, form, Unfinished(root, form.name)), form.units(dataset, scenarios)
+    run = partial(run_batch, workers=workers, executor=executor, progress=progress)
+    plans = run(task.plan, units, label="planning")
+    free = shutil.disk_usage(next(each for each in (root, *root.parents) if each.exists())).free
+    exported = partial(Exported, folder=root, plan=sum(plans, Plan()))
     if on_plan is not None:
-        on_plan(plan, free)
-    if not manifest.complete and need - _already(root, form.name) > free:
-        raise ExportError(
-            f"{root}: the export needs about {need / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; choose another "
-            "disk, or fewer scenarios or agents"
-        )
+        on_plan(sum(plans, Plan()), free)
+    if not manifest.complete:
+        _check_room(task, dict(zip(units, plans, strict=True)), free)
     if dry_run:
-        return Exported(folder=root, plan=plan, written=0, kept=0, tally=Tally())
-    with writing_to(root):
-        manifest = Manifest.of(root, form.name, settings, form.beside)
-        if manifest.complete:
-            _check_release(dataset, manifest, root, workers)
-            remove_parts(root, form.name)
-            return Exported(folder=root, plan=plan, written=0, kept=len(units), tally=manifest.tally)
-        manifest.write(root)
-        done = run_batch(task.write, units, workers=workers, executor=executor, label=form.name, progress=progress)
-        manifest = _finished(task, units, done, settings)
-        manifest.write(root)
-        remove_parts(root, form.name)
-    written = sum(each.new for each in done)
-    return Exported(folder=root, plan=plan, written=written, kept=len(units) - written, tally=manifest.tally)
+        return exported(written=0, kept=0, tally=Tally())
+    form.check(dataset, root)
+    folders = _folders(dataset, scenarios)
+    if not manifest.complete:
+        with writing_to(root):
+            manifest = Manifest.of(root, form.name, settings, form.beside)  # who held the lock may have completed it
+            if not manifest.complete:
+                manifest.write(root)
+                task.unfinished.remove_others(units)
+                jobs = [(unit, tuple(folders[token] for token in unit.scenarios)) for unit in units]
+                done = run(task.write, jobs, label=form.name)
+                manifest = task.finished(units, done, settings)
+                manifest.write(root)
+                task.unfinished.remove()
+                written = sum(each.new for each in done)
+                return exported(written=written, kept=len(units) - written, tally=manifest.tally)
+    hashes = run(folder_hashes, list(folders.values()), label="comparing")
+    _check_release(manifest, root, {token: each.as_dict() for token, each in zip(folders, hashes, strict=True)})
+    task.unfinished.remove()  # it was killed just before
+    return exported(written=0, kept=len(units), tally=manifest.tally)
 
 
 @dataclass(frozen=True, slots=True)
 class _Done:
     """A unit that was written: the hashes of its scenarios and its counts, and whether that was now."""
 
-    scenarios: Mapping[str, str]
+    scenarios: Mapping[str, Any]
     tally: Tally
     new: bool
 
@@ -128,43 +135,40 @@ class _Work:
     """What workers do; cheap to pickle."""
 
     dataset: Dataset
-    root: Path
     form: Format
-
-    def parts(self, unit: Unit) -> Path:
-        """The folder of a unit's parts."""
-        return self.root / PARTS / self.form.name / unit.name
+    unfinished: Unfinished
 
     def plan(self, unit: Unit) -> Plan:
         """About how much a unit is."""
         return self.form.plan(self.dataset, unit)
 
-    def write(self, unit: Unit) -> _Done:
+    def write(self, job: Job) -> _Done:
         """Write a unit, unless it was written from the same files before."""
-        hashes = _hashes(self.dataset, unit.scenarios)
-        found = self._found(unit, hashes)
-        if found is not None:
-            return _Done(hashes, found, new=False)
-        shutil.rmtree(self.parts(unit), ignore_errors=True)
-        output = Output(self.root, self.parts(unit), self.form.link)
-        self.form.write(self.dataset, unit, output)
-        record = {"scenarios": hashes, "written": output.tally.as_dict()}
-        write_bytes(self.parts(unit) / _DONE, json.dumps(record).encode())
+        unit, folders = job
+        hashes = {each.token: folder_hashes(each).as_dict() for each in folders}
+        found = self.unfinished.done(unit)
+        if found is not None and found[0] == hashes:
+            return _Done(hashes, found[1], new=False)
+        with self.unfinished.output(self.form.link, unit) as output:
+            self.form.write(self.dataset, unit, output)
+        self.unfinished.set_done(unit, hashes, output.tally)
         return _Done(hashes, output.tally, new=True)
 
-    def _found(self, unit: Unit, hashes: Mapping[str, str]) -> Tally | None:
-        """The counts of a unit that was written from files with these hashes; None if there is none."""
-        found = _record(self.parts(unit))
-        return found[1] if found is not None and found[0] == hashes else None
-
-
-def _record(parts: Path) -> tuple[Mapping[str, str], Tally] | None:
-    """The hashes of a unit's scenarios, and the unit's counts; None if it is not done."""
-    try:
-        record = parsed_json(read_bytes(parts / _DONE, "bundle"))
-        return dict(record["scenarios"]), Tally.of(record["written"])
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return None
+    def finished(self, units: Sequence[Unit], done: Sequence[_Done], settings: Mapping[str, Any]) -> Manifest:
+        """Write what spans units; the manifest of the complete export."""
+        with self.unfinished.output(self.form.link) as output:
+            self.form.finish(self.dataset, units, output, self.unfinished.parts)
+        scenarios: dict[str, Any] = {}
+        for each in done:
+            scenarios.update(each.scenarios)
+            output.tally.add(each.tally)
+        return Manifest(
+            name=self.form.name,
+            settings=settings,
+            fingerprint=digest_of(scenarios),
+            scenarios=scenarios,
+            tally=output.tally,
+        )
 
 
 def _chosen(dataset: Dataset, form: Format) -> list[str]:
@@ -173,51 +177,35 @@ def _chosen(dataset: Dataset, form: Format) -> list[str]:
     found = [record["token"] for record in find(dataset, *form.where)]
     chosen = [token for token in found if of_split is None or token in of_split]
     if not chosen:
-        raise NotAvailableError("no scenario of this release has that split and matches; change --split or --where")
+        raise NotAvailableError("no scenario of this release is in that split and matches the filters; change them")
     return chosen
 
 
-def _finished(task: _Work, units: Sequence[Unit], done: Sequence[_Done], settings: Mapping[str, Any]) -> Manifest:
-    """Write what spans units; the manifest of the complete export."""
-    output = Output(task.root, task.root / PARTS / task.form.name, task.form.link)
-    task.form.finish(task.dataset, units, output, task.parts)
-    scenarios: dict[str, str] = {}
-    for each in done:
-        scenarios.update(each.scenarios)
-        output.tally.add(each.tally)
-    return Manifest(
-        name=task.form.name,
-        settings=settings,
-        fingerprint=digest_of(scenarios),
-        scenarios=scenarios,
-        tally=output.tally,
-    )
-
-
-def _hashes(dataset: Dataset, scenarios: Sequence[str], workers: int | None = 1) -> dict[str, str]:
-    """Token → hash of a scenario's label, meta and calib files."""
-    hashes = scenario_hashes(dataset, scenarios, workers=workers)
-    return {token: digest_of(each.as_dict()) for token, each in hashes.items()}
-
-
-def _check_release(dataset: Dataset, manifest: Manifest, root: Path, workers: int | None) -> None:
-    """Raise ExportError if the release is not what a complete export was made from."""
-    now = _hashes(dataset, tuple(manifest.scenarios), workers)
-    changed = sorted(token for token, digest in manifest.scenarios.items() if now.get(token) != digest)
-    if changed:
+def _check_room(task: _Work, plans: Mapping[Unit, Plan], free: int) -> None:
+    """Raise ExportError if what is not written yet needs more bytes than are free."""
+    left = sum((plan for unit, plan in plans.items() if task.unfinished.done(unit) is None), Plan())
+    need = left.bytes + (left.linked_bytes if task.form.link == "copy" else 0)
+    if need > free:
         raise ExportError(
-            f"{root}: was made from another state of the release ({len(changed)} scenarios have changed since, such as "
-            f"{changed[0]}); choose another folder"
+            f"{task.unfinished.root}: the export needs about {need / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; "
+            "choose another disk, or fewer scenarios or agents"
         )
 
 
-def _free(folder: Path) -> int:
-    """Bytes that are free where a folder is or will be."""
-    there = next(each for each in (folder, *folder.parents) if each.exists())
-    return shutil.disk_usage(there).free
+def _folders(dataset: Dataset, scenarios: Sequence[str]) -> dict[str, ScenarioFolder]:
+    """Where scenarios lie."""
+    folders = scenario_folders(dataset, scenarios)
+    for token in scenarios:
+        if token not in folders:
+            raise MissingFileError(f"{dataset.dataroot}: scenario {token} is gone; open the release again")
+    return folders
 
 
-def _already(root: Path, name: str) -> int:
-    """Bytes of an unfinished export, about: those of the units that are done."""
-    records = map(_record, (root / PARTS / name).glob("*"))
-    return sum(tally.bytes for _, tally in filter(None, records))
+def _check_release(manifest: Manifest, root: Path, now: Mapping[str, Any]) -> None:
+    """Raise ExportError if a complete export was made from scenarios with other hashes."""
+    changed = sorted(token for token in {*manifest.scenarios, *now} if manifest.scenarios.get(token) != now.get(token))
+    if changed:
+        raise ExportError(
+            f"{root}: was made from another state of the release, or a split file ({len(changed)} scenarios have "
+            f"changed, come or gone since, such as {changed[0]}); choose another folder"
+        )

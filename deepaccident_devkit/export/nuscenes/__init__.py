@@ -1,1 +1,5 @@
 """The nuScenes format, which the nuScenes devkit and mmdet3d read."""
+
+from deepaccident_devkit.export.nuscenes.format import NuScenes
+
+__all__ = ["NuScenes"]

@@ -10,10 +10,13 @@ import shutil
 import subprocess
 import sys
 import zipfile
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -22,7 +25,7 @@ from processes import wait_for
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, LabelFilesError, NotAvailableError, TokenError
-from deepaccident_devkit.files import temporary_path
+from deepaccident_devkit.files import replacing, temporary_path
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import (
     LABEL_PROTOCOLS,
@@ -39,6 +42,7 @@ from deepaccident_devkit.motion import (
     motion_labels_from_boxes,
     write_label_files,
 )
+from deepaccident_devkit.motion.batch_names import BatchNames
 from deepaccident_devkit.motion.label_folder import FORMAT_VERSION, MANIFEST
 from deepaccident_devkit.motion.stored_labels import NOBODY, NOWHERE, StoredLabels
 from deepaccident_devkit.taxonomy import AGENTS
@@ -208,6 +212,25 @@ class TestPage:
                 assert (ours.dtype, ours.shape) == (theirs.dtype, theirs.shape)
                 assert ours.tobytes() == theirs.tobytes(), f"{one}: {int((ours != theirs).sum())} cells differ"
 
+    @pytest.mark.parametrize("name", get_args(BatchNames))
+    def test_its_loop_reads_batches(self, small: DeepAccident, out: Path, name: BatchNames) -> None:
+        _, _, rest = PAGE.read_text(encoding="utf-8").partition("A training loop")
+        lines = rest.partition("```python\n")[2].partition("```")[0]
+        tokens = tokens_of(small, 3, 12)
+        write_label_files(small, out, tokens, names=name, workers=1)
+        run = {"folder": str(out)}
+        exec(compile(lines, PAGE, "exec"), run)  # noqa: S102 - our own page
+        assert sorted(path.relative_to(out).with_suffix("").as_posix() for path in run["paths"]) == sorted(tokens)
+        expected = motion_labels(small, tokens[0]).as_batch(name)
+        assert {key: (array.dtype, array.shape[1:]) for key, array in run["batch"].items()} == {
+            key: (array.dtype, array.shape) for key, array in expected.items()
+        }
+        axes = {5: "T", 7: "R", 200: "H"}
+        page = PAGE.read_text(encoding="utf-8")
+        for key, array in expected.items():
+            shape = str(tuple(axes.get(length, length) for length in array.shape)).replace("'", "")
+            assert f"`{key}` {shape.replace('H, H', 'H, W')}" in page
+
     def test_it_names_every_member_and_key(self, da_motion: DeepAccident, tmp_path: Path) -> None:
         page, token = PAGE.read_text(encoding="utf-8"), tokens_of(da_motion, 15)[0]
         write(da_motion, tmp_path, [token])
@@ -220,6 +243,92 @@ class TestPage:
         assert f"| `version` | {FORMAT_VERSION};" in page
         assert {str(NOWHERE).replace("-", "−"), "−2⁶³"} <= set(re.split(r"[ ;:,]", page))
         assert NOBODY == -(2**63)
+
+
+class TestBatches:
+    """`names`: a plain file for each sample."""
+
+    @pytest.mark.parametrize("name", get_args(BatchNames))
+    @pytest.mark.parametrize("config", ["deepaccident", "fiery", "clean", "oblong"])
+    def test_every_code_and_sample(self, small: DeepAccident, out: Path, name: BatchNames, config: str) -> None:
+        tokens = tokens_of(small, 1, 12, agents=("ego_vehicle", "infrastructure"))
+        done = write_label_files(small, out, tokens, CONFIGS[config], names=name, workers=1)
+        assert done == LabelsWritten(samples=4, written=4, kept=0)
+        for token in tokens:
+            expected = motion_labels(small, token, CONFIGS[config]).as_batch(name)
+            with np.load(out / f"{token}.npz", allow_pickle=False) as file:
+                assert file.files == list(expected)
+                for key, array in expected.items():
+                    assert (file[key].dtype, file[key].shape) == (array.dtype, array.shape)
+                    assert file[key].tobytes() == array.tobytes(), key
+
+    def test_stopped_after_any_file_it_goes_on_there(
+        self, small: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        tokens = tokens_of(small, 3, 7, agents=("ego_vehicle", "infrastructure"))
+        write_label_files(small, tmp_path / "fresh", tokens, names="fiery", workers=1)
+        for stop in range(4):
+            begun = iter(range(stop))
+
+            @contextmanager
+            def stopping(path: Path, begun: Iterator[int] = begun) -> Iterator[Path]:
+                with replacing(path) as temporary:
+                    yield temporary
+                    if next(begun, None) is None:
+                        raise KeyboardInterrupt
+
+            with monkeypatch.context() as patch:
+                patch.setattr(label_files, "replacing", stopping)
+                with pytest.raises(KeyboardInterrupt):
+                    write_label_files(small, tmp_path / f"{stop}", tokens, names="fiery", workers=1)
+            done = write_label_files(small, tmp_path / f"{stop}", tokens, names="fiery", workers=1)
+            assert done == LabelsWritten(samples=4, written=4 - stop, kept=stop)
+            assert contents(tmp_path / f"{stop}") == contents(tmp_path / "fresh")
+
+    def test_samples_can_be_added_and_damaged_files_are_made_again(self, small: DeepAccident, out: Path) -> None:
+        some, more = tokens_of(small, 2, agents=("ego_vehicle",)), tokens_of(small, 7, agents=("ego_vehicle",))
+        write_label_files(small, out, some, names="beverse", workers=1)
+        done = write_label_files(small, out, more, names="beverse", workers=1)
+        assert (done.written, done.kept) == (1, 1)
+        before = contents(out)
+        file = out / f"{some[0]}.npz"
+        file.write_bytes(file.read_bytes()[:-40])
+        temporary_path(file).touch()  # of a killed process
+        assert write_label_files(small, out, more, names="beverse", workers=1).written == 1
+        assert contents(out) == before
+
+    def test_what_the_release_changed_is_made_again(self, root: Path, out: Path) -> None:
+        tokens = tokens_of(opened(root), 1, 7, agents=("ego_vehicle",))
+        write_label_files(opened(root), out, tokens, names="fiery", workers=1)
+        label = root / tiny.TYPE / "ego_vehicle" / "label" / tiny.NAME / f"{tiny.NAME}_006.txt"
+        label.write_text("\n".join(label.read_text().splitlines()[:-1]) + "\n")
+        os.utime(label.parent)
+        assert write_label_files(opened(root), out, tokens[:1], names="fiery", workers=1).written == 2
+
+    def test_folders_of_other_names_are_refused_and_left(self, small: DeepAccident, tmp_path: Path) -> None:
+        tokens = tokens_of(small, 3)
+        for own, other in ((None, "fiery"), ("fiery", "beverse"), ("beverse", None)):
+            folder = tmp_path / str(own)
+            write_label_files(small, folder, tokens, names=own, workers=1)
+            before = contents(folder)
+            with pytest.raises(
+                ConfigError, match=f"configuration .names: {own!r}, asked for {other!r}.; choose another"
+            ):
+                write_label_files(small, folder, tokens, names=other, workers=1)
+            assert contents(folder) == before
+        with pytest.raises(
+            LabelFilesError, match=r"holds batches of fiery, which np\.load opens .* without --names on"
+        ):
+            LabelFiles(tmp_path / "fiery")
+        with pytest.raises(ChoiceError, match="expected one of fiery, beverse, deepaccident, or None, found 'lss'"):
+            write_label_files(small, tmp_path / "lss", tokens, names="lss")
+
+    def test_a_manifest_without_names_is_of_label_files(self, small: DeepAccident, out: Path) -> None:
+        write(small, out, tokens_of(small, 3))
+        told = json.loads((out / MANIFEST).read_text())
+        assert told.pop("names") is None
+        (out / MANIFEST).write_text(json.dumps(told))
+        assert len(LabelFiles(out)) == 5
 
 
 class TestAdding:
@@ -259,7 +368,7 @@ class TestAdding:
         write(opened(root), tmp_path / "labels", tokens_of(opened(root), 1, 12))
         shorter = opened(tiny.write_tiny_release(tmp_path / "shorter", frames=6))
         before = contents(tmp_path / "labels")
-        with pytest.raises(LabelFilesError, match=r"ego_vehicle\.npz: has frames that are not in .*shorter any more"):
+        with pytest.raises(LabelFilesError, match=r"ego_vehicle has frames that are not in .*shorter any more"):
             write(shorter, tmp_path / "labels", tokens_of(shorter, 1))
         assert contents(tmp_path / "labels") == before
 
@@ -513,6 +622,8 @@ class TestDamage:
             {"config": {}},
             {"config": None},
             {"config_digest": "0" * 16},
+            {"names": "lss"},
+            {"names": []},
             {"samples": []},
             {"samples": {"a/b/ego_vehicle": 3}},
             {"samples": {"a/b/ego_vehicle": [0]}},

@@ -1,0 +1,123 @@
+"""What lies beside an unfinished export: of each unit its parts, the paths that it wrote, and a record that it is done.
+
+By the paths the next call removes what a killed one wrote and would not be written today: of a scenario whose files
+have changed since, or that is not chosen any more.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from deepaccident_devkit._version import __version__
+from deepaccident_devkit.export.bulk.format import Unit
+from deepaccident_devkit.export.bulk.output import MALFORMED, Link, Output, Tally
+from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.json_text import parsed_json
+from deepaccident_devkit.reading import read_bytes
+
+FOLDER: Final = ".deepaccident-parts"
+_DONE: Final = "done.json"
+_PATHS: Final = ".paths"
+_ODD: Final = ("", ".", "..")
+"""Names that would lead out of the export, if somebody else wrote the paths."""
+
+
+@dataclass(frozen=True, slots=True)
+class Unfinished:
+    """The folder of all that, for one format; cheap to pickle.
+
+    Attributes:
+        root: of the export.
+        name: of the format.
+    """
+
+    root: Path
+    name: str
+
+    @property
+    def folder(self) -> Path:
+        """Its place, there or not."""
+        return self.root / FOLDER / self.name
+
+    def parts(self, unit: Unit) -> Path:
+        """The folder of a unit's parts."""
+        return self.folder / unit.name
+
+    def done(self, unit: Unit) -> tuple[Mapping[str, Any], Tally] | None:
+        """The hashes of a unit's scenarios and the unit's counts; None if this devkit has not written it."""
+        try:
+            record = parsed_json(read_bytes(self.parts(unit) / _DONE, "bundle"))
+            if record["devkit"] != __version__:
+                return None
+            return dict(record["scenarios"]), Tally.of(record["written"])
+        except (OSError, *MALFORMED):
+            return None
+
+    def set_done(self, unit: Unit, scenarios: Mapping[str, Any], tally: Tally) -> None:
+        """Record that a unit was written."""
+        record = {"devkit": __version__, "scenarios": scenarios, "written": tally.as_dict()}
+        write_bytes(self.parts(unit) / _DONE, json.dumps(record).encode())
+
+    @contextmanager
+    def output(self, link: Link, unit: Unit | None = None) -> Iterator[Output]:
+        """Yield where to write a unit, or without one what spans units.
+
+        Each path is noted before something is written there; at the end, what only earlier calls wrote is removed.
+        """
+        name = "" if unit is None else unit.name
+        if unit is not None:
+            shutil.rmtree(self.parts(unit), ignore_errors=True)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        journal = self.folder / f"{name}{_PATHS}"
+        earlier, now = _noted(journal), set[str]()
+        with journal.open("ab", buffering=0) as file:
+
+            def note(path: str) -> None:
+                now.add(path)
+                file.write(f"{path}\0".encode())
+
+            yield Output(self.root, self.folder / name, link, note=note)
+        self._remove_paths(earlier - now)
+
+    def remove_others(self, units: Sequence[Unit]) -> None:
+        """Remove what was written of units that are not among these."""
+        names = {"", *(unit.name for unit in units)}
+        for journal in sorted(self.folder.glob(f"*{_PATHS}")):
+            name = journal.name.removesuffix(_PATHS)
+            if name not in names:
+                self._remove_paths(_noted(journal))
+                shutil.rmtree(self.folder / name, ignore_errors=True)
+                journal.unlink()
+
+    def remove(self) -> None:
+        """Remove all of it: the export is complete."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+        with suppress(OSError):  # another format's is there
+            self.folder.parent.rmdir()
+
+    def _remove_paths(self, paths: Collection[str]) -> None:
+        """Remove files or whole folders, and the folders that are empty then."""
+        for path in sorted(paths):
+            place = self.root / path
+            if place.is_dir() and not place.is_symlink():
+                shutil.rmtree(place)
+            else:
+                place.unlink(missing_ok=True)
+            with suppress(OSError):
+                os.removedirs(place.parent)
+
+
+def _noted(journal: Path) -> set[str]:
+    """The paths in a journal; of a killed process the last one may be cut off, and is not written then."""
+    try:
+        paths = read_bytes(journal, "bundle").decode().split("\0")[:-1]
+    except (OSError, ValueError):
+        return set()
+    return {path for path in paths if not set(path.split("/")) & set(_ODD)}

@@ -1,0 +1,197 @@
+"""The infos of mmdet3d from 1.1 on, beside a nuScenes export, whose files they name (docs/exports.md).
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.export.bulk import export_release
+from deepaccident_devkit.export.mmdet3d import Mmdet3d
+from deepaccident_devkit.export.nuscenes import NuScenes
+
+da = DeepAccident(dataroot="data/DeepAccident")
+export_release(da, "data/nuscenes", NuScenes(split="val"))
+export_release(da, "data/nuscenes", Mmdet3d(split="val"))
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, ClassVar, Final
+
+import numpy as np
+
+from deepaccident_devkit.errors import ExportError
+from deepaccident_devkit.export.bulk import Manifest, Plan
+from deepaccident_devkit.export.keyframes import keyframes
+from deepaccident_devkit.export.nuscenes import NuScenes
+from deepaccident_devkit.export.nuscenes.names import CAMERA_CHANNELS, VERSION, sensor_path, token
+from deepaccident_devkit.export.nuscenes.sensors import TURNS, image_size, scaled_intrinsic
+from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.geometry import SE3
+from deepaccident_devkit.release.pickles import pickled_items, write_joined
+from deepaccident_devkit.taxonomy import LIDAR, OWN_ACTOR_ID, SPLITS
+
+if TYPE_CHECKING:
+    from deepaccident_devkit.dataset import Dataset
+    from deepaccident_devkit.export.bulk import Output, Unit
+    from deepaccident_devkit.export.nuscenes.boxes import Van
+    from deepaccident_devkit.export.nuscenes.scenes import Scene
+
+CLASSES: Final = (
+    *("car", "truck", "trailer", "bus", "construction_vehicle", "bicycle", "motorcycle", "pedestrian"),
+    *("traffic_cone", "barrier"),
+)
+"""NuScenes' ten classes, in the order of the client's labels."""
+LABELS: Final = MappingProxyType(
+    {**{name: CLASSES.index(name) for name in ("car", "truck", "motorcycle", "pedestrian")}, "cyclist": 5}
+)
+"""Our class → its label; vans are said to be cars or trucks."""
+_SWEEPS: Final = 10
+"""How many clouds before a keyframe an info names at most: one second."""
+_PART: Final = "infos.jsonl"
+_INFO_BYTES, _BOX_BYTES = 10000, 250
+"""Of an info without boxes, about, and of each box."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mmdet3d(NuScenes):
+    """`deepaccident_infos_train.pkl`, `…_val.pkl` and `…_test.pkl`, with the settings of the nuScenes export there."""
+
+    name: ClassVar[str] = "mmdet3d"
+    beside: ClassVar[tuple[str, ...]] = ("nuscenes",)
+
+    def check(self, dataset: Dataset, folder: Path) -> None:
+        """Refuse a folder without a complete nuScenes export of the same settings.
+
+        Raises:
+            ExportError: there is none.
+            ConfigError: its settings differ.
+        """
+        if not Manifest.of(folder, NuScenes.name, {**self.settings(), "version": dataset.version}).complete:
+            raise ExportError(f"{folder}: holds no complete nuscenes export, whose files infos name; write that first")
+
+    def plan(self, dataset: Dataset, unit: Unit) -> Plan:
+        """About how much the infos of a scenario are."""
+        total = Plan()
+        for scene in self.scenes(dataset, unit):
+            count = len(keyframes(scene.last))
+            boxes = dataset.sample.get(scene.sample(scene.last))["num_annotations"]
+            total += Plan(samples=count, bytes=count * (_INFO_BYTES + boxes * _BOX_BYTES))
+        return total
+
+    def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
+        """Keep the infos of a scenario, a line each."""
+        infos = [info for scene in self.scenes(dataset, unit) for info in _infos(scene, self, output)]
+        write_bytes(output.parts / _PART, "".join(f"{json.dumps(info)}\n" for info in infos).encode())
+
+    def finish(self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]) -> None:
+        """Join the infos of each split that has some; `sample_idx` is an info's place in its file."""
+        folders: dict[str | None, list[Path]] = {}
+        for unit in units:
+            folders.setdefault(dataset.get("scenario", unit.scenarios[0])["split"], []).append(parts(unit))
+        output.leave_out("scenarios that are in no split", len(folders.get(None, ())))
+        about = {
+            "categories": {name: label for label, name in enumerate(CLASSES)},
+            "dataset": "nuscenes",
+            "version": VERSION,
+            "info_version": "1.1",
+        }
+        for split in filter(folders.get, SPLITS):
+            pieces = (pickled_items([info]) for info in _placed(folders[split]))
+            with output.file(f"deepaccident_infos_{split}.pkl") as temporary, temporary.open("wb") as file:
+                write_joined(file, "data_list", pieces, {"metainfo": about})
+
+
+def _placed(folders: Iterable[Path]) -> Iterator[dict[str, Any]]:
+    """The infos that units left in these folders, with their places."""
+    lines = (line for folder in folders for line in (folder / _PART).read_text(encoding="utf-8").splitlines())
+    return ({"sample_idx": place, **json.loads(line)} for place, line in enumerate(lines))
+
+
+def _infos(scene: Scene, form: NuScenes, output: Output) -> Iterator[dict[str, Any]]:
+    """The infos of a scene's keyframes, but for `sample_idx`."""
+    ours_from_theirs = SE3.from_rotation(TURNS[form.lidar_axes]).inverse()
+    sizes = {camera: image_size(scene.files[camera]) for camera in CAMERA_CHANNELS}
+    for number in keyframes(scene.last):
+        sample = scene.sample(number)
+        ego_from_lidar = scene.dataset.ego_from(sample, LIDAR) @ ours_from_theirs
+        lidar_from_world = (scene.dataset.world_from(sample, "lidar") @ ours_from_theirs).inverse()
+        images = {}
+        for camera, channel in CAMERA_CHANNELS.items():
+            if number not in scene.files[camera]:
+                output.leave_out("missing images")
+                continue
+            ego_from_camera = scene.dataset.ego_from(sample, camera)
+            images[channel] = {
+                "img_path": _file(scene, camera, number).name,
+                "cam2img": scaled_intrinsic(scene.dataset, f"{sample}/{camera}", sizes[camera]).tolist(),
+                "lidar2cam": (ego_from_camera.inverse() @ ego_from_lidar).matrix.tolist(),
+                "cam2ego": ego_from_camera.matrix.tolist(),
+                "sample_data_token": token("sample_data", sample, camera),
+                "timestamp": scene.stamp(number) / 1e6,
+            }
+        before = [each for each in range(number - 1, max(number - 1 - _SWEEPS, 0), -1) if each in scene.files[LIDAR]]
+        yield {
+            "token": token("sample", sample),
+            "timestamp": scene.stamp(number) / 1e6,
+            "ego2global": scene.dataset.world_from(sample, "ego").matrix.tolist(),
+            "lidar_points": {
+                "num_pts_feats": 5,
+                "lidar_path": _file(scene, LIDAR, number).name,
+                "lidar2ego": ego_from_lidar.matrix.tolist(),
+            },
+            "images": images,
+            "lidar_sweeps": [_sweep(scene, each, lidar_from_world, ours_from_theirs) for each in before],
+            "instances": list(_instances(scene, sample, form.van, ours_from_theirs.inverse(), output)),
+            "cam_instances": {},
+            "deepaccident": {"scenario": scene.scenario, "agent": scene.agent, "frame": number},
+        }
+
+
+def _sweep(scene: Scene, number: int, lidar_from_world: SE3, ours_from_theirs: SE3) -> dict[str, Any]:
+    """A cloud before a keyframe, whose LiDAR frame is given.
+
+    The client turns points by the transpose of `lidar2sensor` and subtracts its fourth column unturned. So that column
+    is the way of the sensor, and not what the inverse would have.
+    """
+    sample = scene.sample(number)
+    lidar_from_sensor = lidar_from_world @ scene.dataset.world_from(sample, "lidar") @ ours_from_theirs
+    lidar_to_sensor = np.eye(4)
+    lidar_to_sensor[:3, :3], lidar_to_sensor[:3, 3] = lidar_from_sensor.rotation.T, -lidar_from_sensor.translation
+    return {
+        "lidar_points": {
+            "lidar_path": str(_file(scene, LIDAR, number)),  # with its folder, by which the client knows keyframes
+            "lidar2ego": (scene.dataset.ego_from(sample, LIDAR) @ ours_from_theirs).matrix.tolist(),
+            "lidar2sensor": lidar_to_sensor.tolist(),
+        },
+        "ego2global": scene.dataset.world_from(sample, "ego").matrix.tolist(),
+        "timestamp": scene.stamp(number) / 1e6,
+        "sample_data_token": token("sample_data", sample, LIDAR),
+    }
+
+
+def _instances(scene: Scene, sample: str, van: Van, theirs_from_ours: SE3, output: Output) -> Iterator[dict[str, Any]]:
+    """The boxes of a keyframe as in the nuScenes export, without the agent's own; the client makes NaN velocities 0."""
+    boxes = scene.dataset.boxes(sample, "lidar", velocity="derived")
+    others = boxes.select(boxes.actor_id != OWN_ACTOR_ID).transform(theirs_from_ours, "lidar")
+    output.leave_out("boxes of the recording agents themselves", len(boxes) - len(others))
+    numbers = np.column_stack([others.center, others.size, others.yaw]).tolist()
+    points = others.num_lidar_pts.tolist()
+    for index, category in enumerate(others.category_names):
+        label = LABELS[van if category == "van" else category]
+        yield {
+            "bbox_3d": numbers[index],
+            "bbox_label_3d": label,
+            "bbox_label": label,
+            "velocity": others.velocity[index, :2].tolist(),
+            "num_lidar_pts": points[index],
+            "num_radar_pts": 0,
+            "bbox_3d_isvalid": points[index] > 0,
+            "category": category,
+        }
+
+
+def _file(scene: Scene, channel: str, number: int) -> PurePosixPath:
+    """The path of a sensor file in the folder of the nuScenes export."""
+    return PurePosixPath(sensor_path(scene.name, channel, scene.stamp(number), key=scene.is_key(number)))

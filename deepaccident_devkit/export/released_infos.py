@@ -1,0 +1,209 @@
+"""The infos that the released code's own converter makes, which its two dataset classes read (docs/exports.md).
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.export.bulk import export_release
+from deepaccident_devkit.export.released_infos import ReleasedInfos
+
+da = DeepAccident(dataroot="data/DeepAccident")
+export_release(da, "data/carla_infos", ReleasedInfos())
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Final
+
+import numpy as np
+
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import ChoiceError, NotAvailableError
+from deepaccident_devkit.export.bulk import Format, Output, Plan, Unit
+from deepaccident_devkit.export.keyframes import keyframes
+from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.release import Labels, ScenarioFolder, read_calibs, read_label
+from deepaccident_devkit.release.pickles import pickled_items, write_joined
+from deepaccident_devkit.tables.tokens import frame_token
+from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CAMERAS, CATEGORIES, CHANNEL_FORMAT, CHANNELS, LIDAR
+
+logger = logging.getLogger(__name__)
+
+_SPLITS: Final[Mapping[str, str]] = {
+    "train": "v1.0-trainval",
+    "val": "v1.0-trainval",
+    "train_mini": "v1.0-mini",
+    "val_mini": "v1.0-mini",
+}
+"""The splits that have a file, and the version that the converter writes into it."""
+_ENDING: Final = ".infos"
+_EMPTY: Final = "without_boxes.txt"
+_INFO_BYTES, _BOX_BYTES = 7500, 140
+"""Of an info's paths and matrices, about, and of each box."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReleasedInfos(Format):
+    """`carla_infos_train.pkl` and `…_val.pkl`, and `…_mini.pkl` where the release has those split files.
+
+    Values are the files' own, left-handed, but for −yaw and −vy; two keyframes a second; all five agents.
+
+    Attributes:
+        root_prefix: what paths begin with. The released classes find a scenario's meta file by the first four parts of
+            a path, of which the last must be the scenario type: three parts, or, in a release with split folders, two.
+        drop_empty: leave out infos without boxes, at which both released classes stop. The converter keeps them.
+
+    Raises:
+        ChoiceError: the prefix is no path, or some agents are not asked for.
+    """
+
+    root_prefix: str = "./data/DeepAccident_data"
+    drop_empty: bool = False
+    name: ClassVar[str] = "released"
+
+    def __post_init__(self) -> None:
+        """Check the choices."""
+        super().__post_init__()
+        if self.agents != AGENTS:
+            raise ChoiceError("agents: the released classes need all five; leave this choice out")
+        if not self.root_prefix.isprintable():
+            raise ChoiceError(f"root_prefix: expected a path, found {self.root_prefix!r}")
+        object.__setattr__(self, "root_prefix", self.root_prefix.rstrip("/"))
+
+    def units(self, dataset: Dataset, scenarios: Sequence[str]) -> list[Unit]:
+        """The chosen scenarios as units: one each.
+
+        Raises:
+            ChoiceError: the prefix has too many parts or too few.
+        """
+        for folder in sorted({dataset.get("scenario", token)["folder"] for token in scenarios}):
+            start = "/".join(filter(None, (self.root_prefix, folder)))
+            if start.count("/") != 2:
+                fitting = "./DeepAccident" if folder else "./data/DeepAccident_data"
+                raise ChoiceError(
+                    "root_prefix: the released code finds meta files only if a path has three parts before the "
+                    f"scenario type, found {start!r}; give {fitting}, or another one with as many parts, and link the "
+                    "release there"
+                )
+        return super().units(dataset, scenarios)
+
+    def plan(self, dataset: Dataset, unit: Unit) -> Plan:
+        """About how much a scenario is."""
+        token = unit.scenarios[0]
+        if _fault(dataset, token):
+            return Plan()
+        count = len(_keyframes(dataset, token))
+        boxes = sum(sample["num_annotations"] for sample in dataset.samples_of(frame_token(token, 1)))
+        return Plan(samples=count * len(AGENTS), bytes=count * (len(AGENTS) * _INFO_BYTES + boxes * _BOX_BYTES))
+
+    def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
+        """Make the infos of a scenario, an agent a part."""
+        token = unit.scenarios[0]
+        fault = _fault(dataset, token)
+        if fault:
+            output.leave_out(fault)
+            return
+        record = dataset.get("scenario", token)
+        folder = ScenarioFolder(dataset.dataroot, record["folder"], record["scenario_type"], record["name"], AGENTS)
+        empty: list[str] = []
+        for agent in AGENTS:
+            infos = list(_infos(folder, agent, _keyframes(dataset, token), self.root_prefix))
+            boxless = [info["lidar_prefix"] for info in infos if not len(info["gt_boxes"])]
+            if self.drop_empty:
+                infos = [info for info in infos if len(info["gt_boxes"])]
+                output.leave_out("infos without boxes", len(boxless))
+            else:
+                empty += boxless
+            name = f"{folder.scenario_type}_{agent}_{folder.name}_{_ENDING}"
+            write_bytes(output.parts / name, pickled_items(infos))
+        write_bytes(output.parts / _EMPTY, "".join(f"{prefix}\n" for prefix in empty).encode())
+
+    def finish(self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]) -> None:
+        """Join the parts of each split, in the order of `lidar_prefix`."""
+        for split, version in _SPLITS.items():
+            try:
+                scenarios = dataset.split_scenarios(split)
+            except NotAvailableError:
+                continue
+            folders = [parts(unit) for unit in units if unit.scenarios[0] in scenarios]
+            paths = sorted(
+                (path for folder in folders for path in folder.glob(f"*{_ENDING}")), key=lambda path: path.name
+            )
+            if paths:
+                with output.file(f"carla_infos_{split}.pkl") as temporary, temporary.open("wb") as file:
+                    write_joined(
+                        file, "infos", (path.read_bytes() for path in paths), {"metadata": {"version": version}}
+                    )
+        empty = b"".join((parts(unit) / _EMPTY).read_bytes() for unit in units if (parts(unit) / _EMPTY).exists())
+        if empty:
+            output.write(f"carla_infos_{_EMPTY}", empty)
+            logger.warning(
+                "%d infos have no boxes (carla_infos_%s lists them): the released classes stop at them; drop_empty "
+                "(--drop-empty) leaves them out",
+                empty.count(b"\n"),
+                _EMPTY,
+            )
+
+
+def _keyframes(dataset: Dataset, scenario: str) -> range:
+    return keyframes(dataset.get("scenario", scenario)["num_frames"])
+
+
+def _fault(dataset: Dataset, scenario: str) -> str | None:
+    """Why the released code can do nothing with a scenario, as a plural; None if it can."""
+    if dataset.get("scenario", scenario)["split"] not in _SPLITS:
+        return "scenarios that are neither in train nor in val"
+    samples = [dataset.samples_of(frame_token(scenario, number)) for number in _keyframes(dataset, scenario)]
+    if len(samples[0]) < len(AGENTS):
+        return "scenarios without all five agents"
+    if not all(sample["labelled"] for moment in samples for sample in moment):
+        return "scenarios without labels"
+    return None
+
+
+def _infos(folder: ScenarioFolder, agent: str, numbers: range, root_prefix: str) -> Iterator[dict[str, Any]]:
+    """The infos of an agent's keyframes, with the converter's own keys."""
+    calibs = read_calibs([folder.calib_path(agent, number) for number in numbers], raw=True)
+    name, place = folder.name.split("_"), "/".join(filter(None, (root_prefix, folder.folder, folder.scenario_type)))
+    for number, calib in zip(numbers, calibs, strict=True):
+        stem = f"{folder.name}_{number:03d}"
+        paths = {
+            channel: f"{place}/{agent}/{channel}/{folder.name}/{stem}.{CHANNEL_FORMAT[channel]}" for channel in CHANNELS
+        }
+        yield {
+            "scenario_type": folder.scenario_type,
+            "vehicle_name": agent,
+            "scene_name": f"{folder.scenario_type}_{name[0]}_{name[-1]}",
+            "lidar_prefix": f"{folder.scenario_type}_{agent}_{stem}",
+            "lidar_path": paths[LIDAR],
+            "bev_path": paths[BEV_CAMERA],
+            "timestamp": number,
+            "scenario_length": numbers[-1],
+            "cams": {
+                camera: {
+                    "image_path": paths[camera],
+                    "lidar_to_camera_matrix": calib[f"lidar_to_{camera}"],
+                    "camera_intrinsic_matrix": calib[f"intrinsic_{camera}"],
+                    "timestamp": number,
+                }
+                for camera in CAMERAS
+            },
+            "lidar_to_ego_matrix": calib["lidar_to_ego"],
+            "ego_to_world_matrix": calib["ego_to_world"],
+            **_boxes(read_label(folder.label_path(agent, number), raw=True)),
+        }
+
+
+def _boxes(label: Labels) -> dict[str, Any]:
+    speed_x, speed_y = label.agent_velocity[0].tolist()
+    return {
+        "vehicle_speed_x": speed_x,
+        "vehicle_speed_y": speed_y,
+        "gt_names": np.array([CATEGORIES[code] for code in label.category]),
+        "gt_boxes": np.column_stack([label.center, label.size, -label.yaw]),
+        "gt_velocity": label.velocity * (1, -1),
+        "vehicle_id": label.actor_id,
+        "num_lidar_pts": label.num_lidar_pts,
+        "camera_visibility": label.camera_visible.astype(np.int64),
+    }

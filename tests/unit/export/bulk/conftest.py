@@ -1,0 +1,30 @@
+"""A small release with pictures, and what is in a folder."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.testing import SmallRelease, write_small_release
+
+
+@pytest.fixture(scope="session")
+def small_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three scenarios of three frames and two agents; indexed; read-only by agreement."""
+    wanted = SmallRelease(splits=("train", "val"), agents=("ego_vehicle", "other_vehicle"), channels=("Camera_Front",))
+    root = tmp_path_factory.mktemp("small") / "release"
+    write_small_release(root, wanted)
+    DeepAccident(dataroot=root, verbose=False)
+    return root
+
+
+@pytest.fixture(scope="session")
+def small(small_root: Path) -> DeepAccident:
+    return DeepAccident(dataroot=small_root, verbose=False)
+
+
+@pytest.fixture
+def changing(small_root: Path, tmp_path: Path) -> Path:
+    """A copy of it that a test may change."""
+    return shutil.copytree(small_root, tmp_path / "changing")

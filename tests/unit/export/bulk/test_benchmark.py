@@ -1,0 +1,54 @@
+"""`python -m benchmarks export`, on a release that is small enough for a test."""
+
+import importlib
+import pkgutil
+from collections.abc import Iterator
+from inspect import isabstract
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import deepaccident_devkit.export
+from deepaccident_devkit.export.bulk import Format
+from deepaccident_devkit.synth import SynthConfig
+
+TOP = Path(__file__).parents[4]
+
+
+@pytest.fixture
+def benchmark(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The checkout's `benchmarks.export`."""
+    monkeypatch.syspath_prepend(TOP)
+    return importlib.import_module("benchmarks.export")
+
+
+def formats_of(kind: type[Format]) -> Iterator[type[Format]]:
+    for each in kind.__subclasses__():
+        if each.__module__.startswith("deepaccident_devkit.") and not isabstract(each):
+            yield each
+        yield from formats_of(each)
+
+
+@pytest.mark.slow
+def test_every_format_is_measured_with_links_and_with_copies(
+    benchmark: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(benchmark, "RELEASE", SynthConfig(scenarios=1, frames=2, image_size=(64, 36)))
+    for name in ("SCENARIOS", "REPEATS"):
+        monkeypatch.setattr(benchmark, name, 1)
+    found = {figure.name: figure for figure in benchmark.measure()}
+    for name in (form.name for form in benchmark.FORMATS):
+        linked, copied = (found[f"export_{name}{way}_kb_per_sample"].value for way in ("", "_copies"))
+        assert 0 < linked <= copied
+        for way in ("", "_copies"):
+            figure = found[f"export_{name}{way}_samples_per_s"]
+            assert figure.value > 0
+            assert figure.bound is not None
+
+
+def test_no_format_is_forgotten(benchmark: ModuleType) -> None:
+    for module in pkgutil.walk_packages(deepaccident_devkit.export.__path__, "deepaccident_devkit.export."):
+        if module.name.split(".")[2] not in ("mcap", "torch"):  # extras that need not be installed
+            importlib.import_module(module.name)
+    assert {type(form) for form in benchmark.FORMATS} == set(formats_of(Format))

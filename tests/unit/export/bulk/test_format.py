@@ -1,0 +1,80 @@
+"""Settings of a format, plans, and the names that scenarios get."""
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tiny_format import TinyFormat
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.export.bulk import Plan, flat_name
+from deepaccident_devkit.export.bulk.run import _Work
+from deepaccident_devkit.export.bulk.unfinished import Unfinished
+
+TYPE = "type1_subtype1_accident"
+TOKENS = st.text(st.characters(exclude_categories=("Cs",), exclude_characters="/\0"), min_size=1, max_size=250)
+
+
+def test_choices_get_their_usual_spelling_and_order() -> None:
+    form = TinyFormat(
+        agents=("Infrastructure", "EGO_VEHICLE", "ego_vehicle"), link="Copy", split="VAL", where=["length>=3"]
+    )  # type: ignore[arg-type]
+    assert form.agents == ("ego_vehicle", "infrastructure")
+    assert (form.link, form.split, form.where) == ("copy", "val", ("length>=3",))
+    assert form.settings() == TinyFormat(agents=form.agents, split="val", where=form.where).settings()
+
+
+def test_one_agent_or_filter_may_stand_alone() -> None:
+    form = TinyFormat(agents="ego_vehicle", where="town=Town03")  # type: ignore[arg-type]
+    assert (form.agents, form.where) == (("ego_vehicle",), ("town=Town03",))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"agents": ("ego",)}, "agents: expected one of"),
+        ({"agents": ()}, "agents: expected some of .*found none"),
+        ({"link": "soft"}, "link: expected one of hard, symbolic, copy, found 'soft'"),
+        ({"split": "trian"}, "split: expected one of .*did you mean 'train'"),
+        ({"where": ("town",)}, "expected field=value"),
+        ({"where": (len,)}, "expected a text such as"),
+    ],
+)
+def test_a_wrong_choice_is_refused_before_a_release_is_opened(options: dict[str, Any], words: str) -> None:
+    with pytest.raises(ChoiceError, match=words):
+        TinyFormat(**options)
+
+
+def test_plans_add_up() -> None:
+    one = Plan(samples=1, files=2, bytes=3, linked_files=4, linked_bytes=5)
+    assert one + one == Plan(samples=2, files=4, bytes=6, linked_files=8, linked_bytes=10)
+
+
+def test_what_goes_to_workers_is_small(small: DeepAccident, tmp_path: Path) -> None:
+    """A release has 691 scenarios, and each job has it all."""
+    work = _Work(small, TinyFormat(), Unfinished(tmp_path, "tiny"))
+    assert len(pickle.dumps(work.write)) < 3000
+
+
+class TestNames:
+    def test_published_ones_are_plain(self) -> None:
+        name = "Town03_type001_subtype0001_scenario00024"
+        assert flat_name(f"{TYPE}/{name}") == f"{TYPE}__{name}"
+
+    @given(TOKENS, TOKENS)
+    def test_two_tokens_have_two_names_of_few_characters(self, a: str, b: str) -> None:
+        first, second = flat_name(f"{TYPE}/{a}"), flat_name(f"{TYPE}/{b}")
+        assert (first == second) == (a == b)
+        assert first.isascii()
+        assert len(first) < 200
+        assert not set(first) & set('/\\:*?"<>| \n\0')
+
+    @pytest.mark.parametrize("odd", ["a b", "a\nb", "ä_b", "a" * 240])
+    def test_those_that_would_be_alike(self, odd: str) -> None:
+        made = flat_name(f"{TYPE}/{odd}")
+        alike = [made, *(flat_name(f"{TYPE}/{name}") for name in (made.split("__")[1], "a_b", "__b", "a" * 241))]
+        assert len(set(alike)) == len(alike)

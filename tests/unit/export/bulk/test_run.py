@@ -1,0 +1,460 @@
+"""An export as a whole: what is there afterwards, whom a folder refuses, what is kept, and how much room it needs."""
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+from tiny_format import KilledFormat, TinyFormat
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import (
+    ChoiceError,
+    ConfigError,
+    ExportError,
+    MissingFileError,
+    NotAvailableError,
+    WorkerError,
+)
+from deepaccident_devkit.export.bulk import Exported, Plan, export_release, manifest, run
+from deepaccident_devkit.files import temporary_of, temporary_path
+from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
+from deepaccident_devkit.taxonomy import AGENTS
+
+SCENARIOS, PICTURES = 3, 18
+MANIFEST = "tiny.manifest.json"
+
+
+class Usage(NamedTuple):
+    """As of `shutil.disk_usage`."""
+
+    total: int
+    used: int
+    free: int
+
+
+def contents(folder: Path) -> dict[str, bytes | None]:
+    """Path → content; None for a folder."""
+    return {
+        path.relative_to(folder).as_posix(): None if path.is_dir() else path.read_bytes() for path in folder.rglob("*")
+    }
+
+
+def states(folder: Path) -> dict[str, tuple[int, ...]]:
+    """Path → what changes when something is written there."""
+    return {
+        str(path): (path.lstat().st_mtime_ns, path.lstat().st_ino, path.lstat().st_size)
+        for path in [folder, *folder.rglob("*")]
+    }
+
+
+def written(dataset: DeepAccident, folder: Path, form: TinyFormat | None = None, **options: Any) -> Exported:
+    return export_release(dataset, folder, form or TinyFormat(), **{"workers": 1, **options})
+
+
+def reopened(root: Path) -> DeepAccident:
+    return DeepAccident(dataroot=root, verbose=False)
+
+
+def stopped(dataset: DeepAccident, folder: Path, units: int, form: TinyFormat | None = None) -> None:
+    """An export that comes to an end when so many units are done."""
+    with pytest.MonkeyPatch.context() as patch:
+        whole, left = TinyFormat.write, iter(range(units))
+
+        def write(self: TinyFormat, *arguments: Any) -> None:
+            if next(left, None) is None:
+                raise KeyboardInterrupt
+            whole(self, *arguments)
+
+        patch.setattr(TinyFormat, "write", write)
+        with pytest.raises(KeyboardInterrupt):
+            written(dataset, folder, form)
+
+
+@pytest.fixture(scope="module")
+def whole(small: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return written(small, tmp_path_factory.mktemp("whole") / "out").folder
+
+
+def edit_label(root: Path, token: str) -> None:
+    """Take the last box out of a label file, in place."""
+    scenario_type, name = token.split("/")
+    path = root / scenario_type / "ego_vehicle" / "label" / name / f"{name}_002.txt"
+    path.write_text("\n".join(path.read_text().splitlines()[:-1]) + "\n")
+
+
+def remove_scenario(root: Path, token: str) -> None:
+    scenario_type, name = token.split("/")
+    for folder in (root / scenario_type).glob(f"*/*/{name}"):
+        shutil.rmtree(folder)
+
+
+def test_what_is_there(small: DeepAccident, tmp_path: Path) -> None:
+    plans: list[tuple[Plan, int]] = []
+    done = written(small, tmp_path / "deep" / "out", on_plan=lambda plan, free: plans.append((plan, free)))
+    files = {name for name, content in contents(done.folder).items() if content is not None}
+    assert len(files) == PICTURES + SCENARIOS * (1 + 3 + 1) + 1 + 2
+    assert {MANIFEST, ".deepaccident.lock", "counts.json"} < files
+    assert plans == [(done.plan, plans[0][1])]
+    assert plans[0][1] > 0
+    assert (done.plan.samples, done.plan.files, done.plan.linked_files) == (PICTURES, 9, PICTURES)
+    assert (done.written, done.kept, done.tally.files) == (SCENARIOS, 0, SCENARIOS * 5 + 1)
+    told = json.loads((done.folder / MANIFEST).read_bytes())
+    assert told["written"] == done.tally.as_dict()
+    assert told["written"]["left_out"] == {"clouds": PICTURES, "maps": 1}
+    assert told["written"]["bytes"] == sum(
+        (done.folder / name).stat().st_size for name in files - {MANIFEST} if not name.endswith(".jpg")
+    )
+    hashes = scenario_hashes(small, [record["token"] for record in small.scenario])
+    assert told["release"]["fingerprint"] == fingerprint(hashes)
+    assert told["release"]["scenarios"] == {token: each.as_dict() for token, each in hashes.items()}
+    assert told["settings"] == {
+        "split": None,
+        "where": [],
+        "agents": list(AGENTS),
+        "greeting": "hello",
+        "version": "v1",
+    }
+
+
+@pytest.mark.parametrize("workers", [2, pytest.param(None)])
+def test_workers_write_the_same(small: DeepAccident, whole: Path, tmp_path: Path, workers: int | None) -> None:
+    assert contents(written(small, tmp_path / "out", workers=workers).folder) == contents(whole)
+
+
+@pytest.mark.parametrize("kind", [ThreadPoolExecutor, lambda: ProcessPoolExecutor(2, get_context("spawn"))])
+def test_any_executor_writes_the_same(
+    small: DeepAccident, whole: Path, tmp_path: Path, kind: Callable[[], ThreadPoolExecutor]
+) -> None:
+    with kind() as executor:
+        assert contents(written(small, tmp_path / "out", executor=executor).folder) == contents(whole)
+        assert written(small, tmp_path / "out", executor=executor).kept == SCENARIOS
+
+
+def test_a_killed_worker_is_told_and_leaves_nothing_half_written(small: DeepAccident, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(WorkerError, match="was killed"):
+        export_release(small, out, KilledFormat(), workers=2)
+    assert not [name for name in contents(out) if temporary_of(Path(name).name)]
+    assert contents(written(small, out).folder) == contents(written(small, tmp_path / "fresh").folder)
+
+
+def test_a_complete_export_is_kept_as_it_is(small: DeepAccident, tmp_path: Path) -> None:
+    first = written(small, tmp_path / "out")
+    before = states(first.folder)
+    again = written(small, tmp_path / "out")
+    assert (again.written, again.kept, again.tally, again.plan) == (0, SCENARIOS, first.tally, first.plan)
+    assert states(first.folder) == before
+
+
+def test_another_way_of_links_is_the_same_export(small: DeepAccident, tmp_path: Path) -> None:
+    written(small, tmp_path / "out")
+    assert written(small, tmp_path / "out", TinyFormat(link="copy")).kept == SCENARIOS
+
+
+def test_a_dry_run_writes_nothing(small: DeepAccident, tmp_path: Path) -> None:
+    plans: list[Plan] = []
+    done = written(small, tmp_path / "out", dry_run=True, on_plan=lambda plan, _: plans.append(plan))
+    assert (plans, done.written, done.kept, done.tally.files) == ([done.plan], 0, 0, 0)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("form", "names"),
+    [
+        (TinyFormat(greeting="hi"), r"greeting: 'hello', asked for 'hi'"),
+        (TinyFormat(split="train"), r"split: None, asked for 'train'"),
+        (
+            TinyFormat(agents=("ego_vehicle",), where=("length>=1",)),
+            r"agents: \[.*\], asked for \['ego_vehicle'\]; where: \[\], asked for \['length>=1'\]",
+        ),
+    ],
+)
+@pytest.mark.parametrize("units", [1, SCENARIOS])
+def test_a_folder_of_other_settings_is_refused(
+    small: DeepAccident, tmp_path: Path, form: TinyFormat, names: str, units: int
+) -> None:
+    if units < SCENARIOS:
+        stopped(small, tmp_path / "out", units)
+    else:
+        written(small, tmp_path / "out")
+    before = states(tmp_path)
+    with pytest.raises(ConfigError, match=rf"out: holds a tiny export with other settings \({names}\); choose another"):
+        written(small, tmp_path / "out", form)
+    assert states(tmp_path) == before
+
+
+def test_a_folder_with_other_things_is_refused(small: DeepAccident, tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").touch()
+    before = states(tmp_path)
+    with pytest.raises(ExportError, match=r"is not empty \(notes.txt\) and holds no tiny export; choose a new folder"):
+        written(small, tmp_path)
+    with pytest.raises(ExportError, match=r"notes.txt: is a file; give a folder"):
+        written(small, tmp_path / "notes.txt")
+    with pytest.raises(ExportError, match=r"no export can be written there \(.*Not a directory"):
+        written(small, tmp_path / "notes.txt" / "out")
+    assert states(tmp_path) == before
+
+
+def test_what_was_left_before_the_manifest_is_no_other_thing(small: DeepAccident, whole: Path, tmp_path: Path) -> None:
+    (tmp_path / ".deepaccident.lock").touch()
+    (tmp_path / ".deepaccident-parts" / "tiny").mkdir(parents=True)
+    temporary_path(tmp_path / MANIFEST).touch()
+    assert contents(written(small, tmp_path).folder) == contents(whole)
+
+
+def test_an_empty_path_is_refused(small: DeepAccident) -> None:
+    with pytest.raises(ExportError, match="expected a folder for the export, found an empty path"):
+        export_release(small, "", TinyFormat())
+
+
+def test_a_place_that_cannot_be_written_to(
+    small: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run.shutil, "disk_usage", lambda _: Usage(1, 1, 1 << 30))  # the system says none for /proc
+    with pytest.raises(ExportError, match=r"/proc/out: no export can be written there .*; choose another folder"):
+        written(small, Path("/proc/out"))
+    (tmp_path / ".deepaccident.lock").mkdir()
+    with pytest.raises(ExportError, match="no export can be written there"):
+        written(small, tmp_path)
+
+
+def test_an_export_beside_another(small: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Beside(TinyFormat):
+        name = "beside"
+        beside = ("tiny",)
+
+    out = written(small, tmp_path / "out").folder
+    before = contents(out)
+    monkeypatch.setattr(Beside, "write", lambda *_: None)
+    monkeypatch.setattr(Beside, "finish", lambda *_: None)
+    written(small, out, Beside())
+    assert contents(out).keys() - before.keys() == {"beside.manifest.json"}
+    assert written(small, out).kept == SCENARIOS
+    with pytest.raises(ExportError, match="is not empty"):
+        written(small, written(small, tmp_path / "other", Beside()).folder)
+
+
+class TestRelease:
+    """What it was made from has changed since."""
+
+    def test_a_complete_export_is_refused(self, changing: Path, tmp_path: Path) -> None:
+        dataset = reopened(changing)
+        out = written(dataset, tmp_path / "out").folder
+        before = states(out)
+        token = dataset.scenario[1]["token"]
+        edit_label(changing, token)
+        sentence = rf"another state of the release.*\(1 scenarios have changed, come or gone since, such as {token}\)"
+        for _ in range(2):
+            with pytest.raises(ExportError, match=sentence):
+                written(reopened(changing), out)
+        assert states(out) == before
+
+    @pytest.mark.parametrize("grows", [True, False])
+    def test_a_complete_export_of_another_split_file_is_refused(
+        self, small: DeepAccident, tmp_path: Path, grows: bool
+    ) -> None:
+        names = [record["token"].replace("/", " ") for record in small.scenario]
+        mine = tmp_path / "mine.txt"
+        mine.write_text("\n".join(names[: 1 if grows else 3]))
+        form = TinyFormat(split=mine)
+        written(small, tmp_path / "out", form)
+        mine.write_text("\n".join(names[:2]))
+        with pytest.raises(ExportError, match=rf"1 scenarios .*such as {names[1 if grows else 2].replace(' ', '/')}"):
+            written(small, tmp_path / "out", form)
+
+    def test_an_unfinished_export_is_continued_with_the_new_state(self, changing: Path, tmp_path: Path) -> None:
+        dataset = reopened(changing)
+        stopped(dataset, tmp_path / "out", 2)
+        edit_label(changing, dataset.scenario[0]["token"])
+        done = written(reopened(changing), tmp_path / "out")
+        assert (done.written, done.kept) == (2, 1)
+        assert contents(done.folder) == contents(written(reopened(changing), tmp_path / "fresh").folder)
+
+    @pytest.mark.parametrize("units", [0, 1, 2])
+    def test_nothing_is_left_of_what_went(self, changing: Path, tmp_path: Path, units: int) -> None:
+        """Of a whole scenario, and of a frame; whether they were written before or not."""
+        dataset = reopened(changing)
+        stopped(dataset, tmp_path / "out", units)
+        gone, shorter, _ = (record["token"] for record in dataset.scenario)
+        remove_scenario(changing, gone)
+        for path in changing.glob(f"{shorter.replace('/', '/*/*/')}/*_003.*"):
+            path.unlink()
+        dataset = reopened(changing)
+        assert [record["num_frames"] for record in dataset.scenario] == [2, 3]
+        done = written(dataset, tmp_path / "out")
+        assert contents(done.folder) == contents(written(dataset, tmp_path / "fresh").folder)
+
+    def test_nothing_is_left_of_another_selection(self, small: DeepAccident, tmp_path: Path) -> None:
+        names = [record["token"].replace("/", " ") for record in small.scenario]
+        mine = tmp_path / "mine.txt"
+        mine.write_text("\n".join(names[:2]))
+        form = TinyFormat(split=mine)
+        stopped(small, tmp_path / "out", 1, form)
+        mine.write_text("\n".join(names[1:]))
+        done = written(small, tmp_path / "out", form)
+        assert contents(done.folder) == contents(written(small, tmp_path / "fresh", form).folder)
+
+    def test_a_scenario_that_went_after_opening_is_told(self, changing: Path, tmp_path: Path) -> None:
+        dataset = reopened(changing)
+        token = dataset.scenario[2]["token"]
+        remove_scenario(changing, token)
+        with pytest.raises(MissingFileError, match=f"scenario {token} is gone; open the release again"):
+            written(dataset, tmp_path / "out")
+
+
+def test_another_devkits_units_are_written_again(
+    small: DeepAccident, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr("deepaccident_devkit.export.bulk.unfinished.__version__", "0.0.1")
+        stopped(small, tmp_path / "out", 2)
+    done = written(small, tmp_path / "out")
+    assert (done.written, contents(done.folder)) == (SCENARIOS, contents(whole))
+
+
+class TestSelection:
+    def tokens(self, dataset: DeepAccident, tmp_path: Path, **options: Any) -> list[str]:
+        folder = tmp_path / "out"
+        shutil.rmtree(folder, ignore_errors=True)
+        written(dataset, folder, TinyFormat(**options))
+        return list(json.loads((folder / MANIFEST).read_bytes())["release"]["scenarios"])
+
+    def test_splits_filters_and_agents(self, small: DeepAccident, tmp_path: Path) -> None:
+        records = list(small.scenario)
+        train = [record["token"] for record in records if record["split"] == "train"]
+        assert self.tokens(small, tmp_path, split="Train") == train
+        accident = [token for token in train if "accident" in token]
+        assert len(accident) == 1
+        assert self.tokens(small, tmp_path, split="train", where=["designed_accident=true", "length>=3"]) == accident
+        assert self.tokens(small, tmp_path, split="train", where="designed_accident=true") == accident
+        self.tokens(small, tmp_path, agents="Ego_Vehicle")
+        assert {path.name for path in tmp_path.glob("out/folders/*/pictures/*")} == {
+            f"ego_vehicle-{number}.jpg" for number in (1, 2, 3)
+        }
+
+    def test_nothing_left_to_export(self, small: DeepAccident, tmp_path: Path) -> None:
+        with pytest.raises(NotAvailableError, match="no scenario of this release is in that split and matches"):
+            self.tokens(small, tmp_path, split="val", where=("length>=3", "designed_accident=false"))
+        assert not (tmp_path / "out").exists()
+
+
+class TestRoom:
+    def test_too_little_is_refused_before_anything_is_written(
+        self, small: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        need = written(small, tmp_path / "out", dry_run=True).plan
+        monkeypatch.setattr(run.shutil, "disk_usage", lambda _: Usage(1, 1, need.bytes))
+        with pytest.raises(ExportError, match=r"the export needs about 0.0 GB, and 0.0 GB are free; choose another"):
+            written(small, tmp_path / "copies", TinyFormat(link="copy"))
+        monkeypatch.setattr(run.shutil, "disk_usage", lambda _: Usage(1, 1, need.bytes - 1))
+        with pytest.raises(ExportError, match="the export needs about"):
+            written(small, tmp_path / "out")
+        assert not list(tmp_path.iterdir())
+
+    @pytest.mark.parametrize("link", ["hard", "copy"])
+    def test_only_what_is_left_counts(
+        self, small: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, link: Any
+    ) -> None:
+        form = TinyFormat(link=link)
+        plan = written(small, tmp_path / "out", form, dry_run=True).plan
+        stopped(small, tmp_path / "out", 2, form)
+        need = (plan.bytes + (plan.linked_bytes if link == "copy" else 0)) // 2
+        monkeypatch.setattr(run.shutil, "disk_usage", lambda _: Usage(1, 1, need))
+        assert written(small, tmp_path / "out", form).kept == 2
+        monkeypatch.setattr(run.shutil, "disk_usage", lambda _: Usage(1, 1, 0))
+        assert written(small, tmp_path / "out", form).kept == 3
+
+    @pytest.mark.parametrize("after", [0, 7, 14])
+    def test_a_disk_that_is_full_amid_writing(
+        self, small: DeepAccident, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, after: int
+    ) -> None:
+        with monkeypatch.context() as patch:
+            write, left = Path.write_bytes, iter(range(after))
+
+            def filled(path: Path, content: bytes) -> int:
+                if next(left, None) is None:
+                    raise OSError(28, "No space left on device", str(path))
+                return write(path, content)
+
+            patch.setattr(Path, "write_bytes", filled)
+            with pytest.raises(ExportError, match=r"cannot be written \(.*No space left.*make room there, or choose"):
+                written(small, tmp_path / "out")
+        assert not [name for name in contents(tmp_path / "out") if temporary_of(Path(name).name)]
+        assert contents(written(small, tmp_path / "out").folder) == contents(whole)
+
+
+class TestDamage:
+    """What is in the way of a manifest or of a record."""
+
+    TEXTS = ("", "{", "[]", "null", "1e999", "[" * 100_000, '{"what": "DeepAccident export", "format": "other"}')
+
+    @pytest.mark.parametrize("text", TEXTS)
+    def test_a_damaged_manifest_is_our_error(self, small: DeepAccident, tmp_path: Path, text: str) -> None:
+        (tmp_path / MANIFEST).write_text(text)
+        self.refused(small, tmp_path)
+
+    @pytest.mark.parametrize(
+        ("name", "value"),
+        [
+            ("settings", 3),
+            ("settings", "ab"),
+            ("release", {"fingerprint": "a", "scenarios": {"b": 3}}),
+            ("release", {"fingerprint": "a", "scenarios": ["b"]}),
+            ("release", {"scenarios": {}}),
+            ("written", {}),
+            ("written", {"files": "x", "bytes": 0, "linked": {}, "left_out": {}}),
+            ("written", {"files": "INFINITE", "bytes": 0, "linked": {}, "left_out": {}}),
+        ],
+    )
+    def test_a_wrong_entry_is_our_error(
+        self, small: DeepAccident, whole: Path, tmp_path: Path, name: str, value: object
+    ) -> None:
+        told = {**json.loads((whole / MANIFEST).read_bytes()), name: value}
+        (tmp_path / MANIFEST).write_text(json.dumps(told).replace('"INFINITE"', "1e999"))
+        self.refused(small, tmp_path)
+
+    def test_a_pipe_is_our_error(self, small: DeepAccident, tmp_path: Path) -> None:
+        os.mkfifo(tmp_path / MANIFEST)
+        self.refused(small, tmp_path)
+
+    def refused(self, dataset: DeepAccident, out: Path) -> None:
+        with pytest.raises(ExportError, match=rf"{MANIFEST}: .*; export again into an empty folder"):
+            written(dataset, out)
+        assert [path.name for path in out.iterdir()] == [MANIFEST]
+
+    @pytest.mark.parametrize("text", [*TEXTS, None, '{"devkit": "$", "scenarios": 3, "written": {}}'])
+    def test_a_damaged_record_is_written_again(
+        self, small: DeepAccident, whole: Path, tmp_path: Path, text: str | None
+    ) -> None:
+        stopped(small, tmp_path / "out", 2)
+        record = next((tmp_path / "out").glob(".deepaccident-parts/tiny/*/done.json"))
+        if text is None:
+            record.unlink()
+            os.mkfifo(record)
+        else:
+            record.write_text(text.replace("$", manifest.__version__))
+        done = written(small, tmp_path / "out")
+        assert (done.written, contents(done.folder)) == (2, contents(whole))
+
+    def test_strange_paths_in_a_journal_remove_nothing(self, small: DeepAccident, tmp_path: Path) -> None:
+        """Somebody may have sent this folder."""
+        stopped(small, tmp_path / "out", 1)
+        (tmp_path / "kept.txt").touch()
+        for journal in (tmp_path / "out" / ".deepaccident-parts" / "tiny").glob("*.paths"):
+            journal.write_bytes("\0".join(["../kept.txt", str(tmp_path / "kept.txt"), ".", "", "\udcff"]).encode(
+                errors="surrogateescape") + b"\0")  # fmt: skip
+            shutil.rmtree(journal.with_name(journal.name.removesuffix(".paths")), ignore_errors=True)
+        written(small, tmp_path / "out")
+        assert (tmp_path / "kept.txt").exists()
+
+
+def test_wrong_workers_make_no_folder(small: DeepAccident, tmp_path: Path) -> None:
+    with pytest.raises(ChoiceError, match="workers: expected a number of at least 1"):
+        written(small, tmp_path / "out", workers=0)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,355 @@
+"""nuScenes' tables, read back by a reader that knows nuScenes' conventions and not the devkit."""
+
+import copy
+import json
+from collections.abc import Callable
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from nuscenes_reader import TABLES, Tables, boxes_in, channel_of, count_points, faults_of, points_of, tables_of
+from pyquaternion import Quaternion
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.export.bulk import Exported, export_release
+from deepaccident_devkit.export.nuscenes import NuScenes
+from deepaccident_devkit.export.nuscenes.names import CHANNEL_NAMES
+from deepaccident_devkit.release.images import write_image
+from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID, UNTRACKED_ID
+
+VERSION = "v1.0-deepaccident"
+KEYS, FRAMES = (1, 6), 6
+
+
+@pytest.fixture(scope="module")
+def exported(da: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Exported:
+    return export_release(da, tmp_path_factory.mktemp("nuscenes") / "out", NuScenes(), workers=1)
+
+
+@pytest.fixture(scope="module")
+def tables(exported: Exported) -> Tables:
+    return tables_of(exported.folder / VERSION)
+
+
+@pytest.fixture
+def one(da: DeepAccident, tmp_path: Path) -> Callable[..., tuple[Exported, Tables]]:
+    """Exports what the ego of the first accident recorded, with other settings."""
+
+    def export(dataset: DeepAccident = da, **settings: Any) -> tuple[Exported, Tables]:
+        chosen = {"where": ("designed_accident=true", "split=train"), "agents": ("ego_vehicle",), **settings}
+        made = export_release(dataset, tmp_path / "out", NuScenes(**chosen), workers=1)
+        return made, tables_of(made.folder / VERSION)
+
+    return export
+
+
+def rows(tables: Tables, table: str, **values: Any) -> list[dict[str, Any]]:
+    return [row for row in tables[table].values() if all(row[name] == value for name, value in values.items())]
+
+
+def frame_of(tables: Tables, data: dict[str, Any]) -> tuple[str, int]:
+    """The scene's name and the number of the frame of a row of sample_data."""
+    scene = tables["scene"][tables["sample"][data["sample_token"]]["scene_token"]]
+    last = tables["sample"][scene["last_sample_token"]]["timestamp"]
+    return scene["name"], FRAMES - (last - data["timestamp"]) // 100_000
+
+
+def test_nothing_leads_nowhere(da: DeepAccident, tables: Tables) -> None:
+    assert list(faults_of(tables)) == []
+    samples = len(da.sample)
+    assert [len(tables[name]) for name in ("scene", "sample", "ego_pose", "sample_data")] == [
+        *(len(da.agent), samples * len(KEYS) // FRAMES, samples, samples * len(CHANNEL_NAMES)),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("table", "field", "value", "fault"),
+    [
+        ("sample_data", "ego_pose_token", "", "sample_data.ego_pose_token"),
+        ("instance", "first_annotation_token", "none", "instance.first_annotation_token"),
+        ("sample_annotation", "attribute_tokens", ["none"], "no such attribute"),
+        ("sample_data", "next", "", "does not lead back"),
+        ("sample", "timestamp", 0, "goes the wrong way in time"),
+        ("map", "log_tokens", [], "is in no map"),
+        ("scene", "nbr_samples", 1, "says other samples"),
+    ],
+)
+def test_the_reader_sees_a_planted_fault(tables: Tables, table: str, field: str, value: object, fault: str) -> None:
+    broken = copy.deepcopy(tables)
+    chosen = list(broken[table].values())
+    row = next((each for each in chosen if each.get("prev") and each.get("next")), chosen[-1])
+    row[field] = value
+    assert any(fault in each for each in faults_of(broken))
+
+
+def test_the_reader_sees_scenes_that_begin_together(tables: Tables) -> None:
+    broken = copy.deepcopy(tables)
+    for row in broken["sample"].values():
+        row["timestamp"] -= row["timestamp"] % 100_000
+    assert any("5 scenes begin at" in each for each in faults_of(broken))
+
+
+def disagreement(folder: Path, tables: Tables, change: Callable[[dict[str, Any]], None] = lambda _: None) -> float:
+    """The share of boxes that hold another number of points than their rows say, in the ego's scenes."""
+    wrong, total = 0, 0
+    for data in rows(tables, "sample_data", is_key_frame=True, fileformat="pcd"):
+        if not data["filename"].split("__")[0].endswith("ego_vehicle"):
+            continue
+        points = points_of(folder / data["filename"])
+        for row, center, rotation in boxes_in(tables, data):
+            box = {"size": list(row["size"]), "center": center.copy(), "rotation": rotation, "points": points}
+            change(box)
+            found = count_points(box["points"], box["size"], box["center"], box["rotation"])
+            wrong += abs(found - row["num_lidar_pts"]) > 1 + 0.02 * row["num_lidar_pts"]
+            total += row["num_lidar_pts"] > 0
+    assert total > 50
+    return wrong / total
+
+
+def flip_y(box: dict[str, Any]) -> None:
+    box["points"] = box["points"] * np.float32([1, -1, 1, 1, 1])
+
+
+def length_first(box: dict[str, Any]) -> None:
+    box["size"][:2] = box["size"][1::-1]
+
+
+def other_axes(box: dict[str, Any]) -> None:
+    box["points"] = box["points"][:, [1, 0, 2, 3, 4]] * np.float32([-1, 1, 1, 1, 1])
+
+
+def test_boxes_hold_the_points_that_their_rows_count(exported: Exported, tables: Tables) -> None:
+    assert disagreement(exported.folder, tables) == 0
+
+
+@pytest.mark.parametrize("planted", [flip_y, length_first, other_axes])
+def test_the_reader_sees_a_wrong_convention(
+    exported: Exported, tables: Tables, planted: Callable[[dict[str, Any]], None]
+) -> None:
+    assert disagreement(exported.folder, tables, planted) > 0.2
+
+
+def test_boxes_are_where_ours_are_in_every_sensor(da: DeepAccident, tables: Tables) -> None:
+    ours = {name: channel for channel, name in CHANNEL_NAMES.items()}
+    for data in rows(tables, "sample_data", is_key_frame=True)[::13]:
+        sample = tables["sample"][data["sample_token"]]["deepaccident_token"]
+        boxes = da.boxes(sample, ours[channel_of(tables, data)])
+        boxes = boxes[boxes.actor_id != OWN_ACTOR_ID]
+        found = list(boxes_in(tables, data))
+        assert np.allclose([center for _, center, _ in found], boxes.center, atol=1e-6)
+        turned = [Quaternion(rotation) for rotation in boxes.rotation]
+        assert max(Quaternion.absolute_distance(a, b) for (_, _, a), b in zip(found, turned, strict=True)) < 1e-6
+
+
+def test_files_are_those_of_the_release(da: DeepAccident, exported: Exported, tables: Tables) -> None:
+    seen = set()
+    for data in rows(tables, "sample_data"):
+        scene, number = frame_of(tables, data)
+        scenario, agent = scene.rsplit("-", 1)
+        sample, channel = f"{scenario.replace('-', '/', 1)}/{agent}/{number:03d}", channel_of(tables, data)
+        path = exported.folder / data["filename"]
+        assert path.parent.name == channel
+        assert path.parents[1].name == ("samples" if number in KEYS else "sweeps")
+        seen.add(path)
+        if channel != "LIDAR_TOP":
+            ours = next(each for each, name in CHANNEL_NAMES.items() if name == channel)
+            assert path.samefile(da.get_sample_data_path(sample, ours))
+            assert (data["width"], data["height"]) == (64, 36)
+        elif number == 2:
+            cloud, points = da.load_point_cloud(sample, "lidar"), points_of(path)
+            assert np.array_equal(points[:, :4], cloud.points.astype(np.float32))
+            assert not points[:, 4].any()
+    assert seen == {path for path in exported.folder.glob("*/*/*") if path.is_file()}
+    assert exported.tally.linked == {"hard": exported.plan.linked_files}
+
+
+def test_the_plan_is_near(exported: Exported) -> None:
+    assert exported.plan.files <= exported.tally.files <= exported.plan.files + 20
+    assert exported.plan.bytes == pytest.approx(exported.tally.bytes, rel=0.1)
+
+
+def test_sweeps_belong_to_the_keyframe_after_them(tables: Tables) -> None:
+    for data in rows(tables, "sample_data", is_key_frame=False):
+        wait = tables["sample"][data["sample_token"]]["timestamp"] - data["timestamp"]
+        assert 0 < wait < 500_000
+    for sample in tables["sample"].values():
+        if sample["next"]:
+            assert tables["sample"][sample["next"]]["timestamp"] - sample["timestamp"] == 500_000
+
+
+def test_scenes_and_splits(da: DeepAccident, exported: Exported, tables: Tables) -> None:
+    splits = json.loads((exported.folder / VERSION / "splits.json").read_text())
+    expected = {
+        f"deepaccident_{split}": [
+            f"{record['token'].replace('/', '-')}-{agent}"
+            for record in da.scenario
+            if record["split"] == split
+            for agent in AGENTS
+        ]
+        for split in ("train", "val", "test")
+    }
+    assert splits == expected
+    assert sorted(row["name"] for row in tables["scene"].values()) == sorted(chain(*expected.values()))
+    for row in tables["map"].values():
+        assert (exported.folder / row["filename"]).read_bytes().startswith(b"\x89PNG")
+
+
+def test_extra_keys_are_ours(da: DeepAccident, tables: Tables) -> None:
+    for row in tables["sample"].values():
+        record = da.sample.get(row["deepaccident_token"])
+        assert (row["agent"], row["time_to_impact"]) == (record["agent"], record["time_to_impact"])
+    for row in tables["sample_annotation"].values():
+        instance = tables["instance"][row["instance_token"]]
+        assert instance["actor_id"] == row["actor_id"]
+        assert instance["category_deepaccident"] == row["category_deepaccident"]
+
+
+def test_own_rows_are_left_out_and_untracked_ones_stand_alone(
+    da: DeepAccident, exported: Exported, tables: Tables
+) -> None:
+    actors = np.concatenate([da.boxes(row["deepaccident_token"]).actor_id for row in tables["sample"].values()])
+    left_out = exported.tally.left_out
+    assert left_out["boxes of the recording agents themselves"] == np.sum(actors == OWN_ACTOR_ID) > 0
+    untracked = rows(tables, "instance", actor_id=UNTRACKED_ID)
+    assert len(untracked) == np.sum(actors == UNTRACKED_ID) > 0
+    assert left_out["tracks of untracked boxes (each is an instance of its own)"] == len(untracked)
+    assert left_out["boxes between keyframes, which readers interpolate"] == len(da.annotation) - len(actors)
+    assert left_out["files of the BEV camera"] == len(da.sample)
+    assert len(tables["sample_annotation"]) == np.sum(actors != OWN_ACTOR_ID)
+
+
+def test_attributes_say_who_moves(da: DeepAccident, tables: Tables) -> None:
+    seen = set()
+    for row in tables["sample_annotation"].values():
+        (word,) = (tables["attribute"][each]["name"] for each in row["attribute_tokens"])
+        seen.add(word)
+        if row["actor_id"] >= 20000:
+            assert word == "vehicle.parked"
+        elif row["prev"] and row["category_deepaccident"] == "car":
+            before = tables["sample_annotation"][row["prev"]]["translation"]
+            way = np.hypot(*np.subtract(row["translation"], before)[:2])
+            assert way < 0.5 if word == "vehicle.stopped" else way > 0.02
+    assert seen >= {"vehicle.moving", "vehicle.stopped", "vehicle.parked", "cycle.with_rider", "pedestrian.moving"}
+
+
+def test_an_id_that_stands_twice_in_a_label_is_two_instances(own_release: Path, one: Any) -> None:
+    label = next(own_release.glob("train/*accident/ego_vehicle/label/*/*_004.txt"))
+    lines = label.read_text().splitlines()
+    tracked = next(line for line in lines[1:] if int(line.split()[10]) > 0)
+    label.write_text("\n".join([*lines, tracked, ""]))
+    _, tables = one(DeepAccident("v1", own_release, verbose=False))
+    actor = int(tracked.split()[10])
+    assert [row["nbr_annotations"] for row in rows(tables, "instance", actor_id=actor)] == [1, 1]
+    assert list(faults_of(tables)) == []
+
+
+def test_without_sweeps(one: Any) -> None:
+    made, tables = one(sweeps=False)
+    assert len(tables["sample_data"]) == len(KEYS) * len(CHANNEL_NAMES)
+    assert not (made.folder / "sweeps").exists()
+    assert made.tally.left_out["frames between keyframes"] == FRAMES - len(KEYS)
+    assert list(faults_of(tables)) == []
+
+
+def test_axes_of_nuscenes(da: DeepAccident, one: Any) -> None:
+    """Points turn with the calibration, so that boxes hold them as before."""
+    made, tables = one(lidar_axes="nuscenes", where=())
+    assert disagreement(made.folder, tables) == 0
+    data = rows(tables, "sample_data", is_key_frame=True, fileformat="pcd")[0]
+    sample = tables["sample"][data["sample_token"]]["deepaccident_token"]
+    x, y, z = da.load_point_cloud(sample, "lidar").xyz.T
+    assert np.allclose(points_of(made.folder / data["filename"])[:, :3], np.column_stack([-y, x, z]), atol=1e-4)
+
+
+@pytest.mark.parametrize("van", ["car", "truck"])
+def test_vans_become(one: Any, van: str) -> None:
+    _, tables = one(van=van, where=(), sweeps=False, agents=AGENTS)
+    names = {
+        row["category_deepaccident"]: tables["category"][row["category_token"]]["name"]
+        for row in tables["instance"].values()
+    }
+    assert names["van"] == f"vehicle.{van}"
+    assert (names["car"], names["cyclist"]) == ("vehicle.car", "vehicle.bicycle")
+
+
+def test_a_partial_release(da_partial: DeepAccident, tmp_path: Path) -> None:
+    made = export_release(da_partial, tmp_path / "out", NuScenes(), workers=1)
+    tables = tables_of(made.folder / VERSION)
+    assert list(faults_of(tables)) == []
+    left_out, scenarios = made.tally.left_out, len(da_partial.scenario)
+    assert left_out["agents of scenarios that are not in this release"] == scenarios
+    assert left_out["images that are not in this release"] == scenarios * FRAMES
+    assert left_out["point clouds that are not in this release"] == scenarios * FRAMES
+    assert left_out["point clouds of keyframes (empty files stand for them)"] == scenarios * len(KEYS)
+    for data in rows(tables, "sample_data", fileformat="pcd"):
+        scene, _ = frame_of(tables, data)
+        size = (made.folder / data["filename"]).stat().st_size
+        assert data["is_key_frame"] if scene.endswith("infrastructure") else size > 0
+        assert (size == 0) == scene.endswith("infrastructure")
+    for token in tables["sample"]:
+        channels = {
+            channel_of(tables, row) for row in rows(tables, "sample_data", sample_token=token, is_key_frame=True)
+        }
+        assert "LIDAR_TOP" in channels
+
+
+def test_without_labels_there_are_sensors_and_poses(own_release: Path, one: Any) -> None:
+    for path in own_release.rglob("label/*/*.txt"):
+        path.unlink()
+    made, tables = one(DeepAccident("v1", own_release, verbose=False))
+    assert made.tally.left_out["labels that are not in this release"] == 1
+    assert [len(tables[name]) for name in ("instance", "sample_annotation", "ego_pose", "sample")] == [0, 0, 4, 1]
+    assert list(faults_of(tables)) == []
+
+
+def test_scenes_without_a_split_are_counted(own_release: Path, one: Any) -> None:
+    (own_release / "train").rename(own_release / "moved")
+    flat = own_release / "moved"
+    made, _ = one(DeepAccident("v1", flat, verbose=False), where=())
+    assert made.tally.left_out["scenes that are in no split"] == len(list(flat.glob("*/meta/*.txt")))
+
+
+def test_smaller_images_have_smaller_intrinsics(own_release: Path, one: Any) -> None:
+    dataset = DeepAccident("v1", own_release, verbose=False)
+    (record,) = dataset.find("designed_accident=true", "split=train")
+    data = f"{record['token']}/ego_vehicle/004/Camera_Front"
+    camera = dataset.camera(data)
+    small = np.zeros((camera.height // 2, camera.width // 2, 3), dtype=np.uint8)
+    write_image(dataset.get_sample_data_path(data), small)
+    _, tables = one(dataset)
+    (image,) = rows(tables, "sample_data", fileformat="jpg")
+    assert (image["width"], image["height"]) == (small.shape[1], small.shape[0])
+    lens = tables["calibrated_sensor"][image["calibrated_sensor_token"]]["camera_intrinsic"]
+    assert np.allclose(lens, np.diag([0.5, 0.5, 1]) @ camera.intrinsic)
+
+
+@pytest.mark.parametrize(
+    ("choices", "sentence"),
+    [
+        ({"van": "bus"}, "van: expected one of car, truck"),
+        ({"lidar_axes": "kitti"}, "lidar_axes: expected one of ego, nuscenes"),
+    ],
+)
+def test_impossible_choices(choices: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ChoiceError, match=sentence):
+        NuScenes(**choices)
+
+
+def test_the_command_has_the_settings(da: DeepAccident, tmp_path: Path) -> None:
+    words = ["export", "nuscenes", str(da.dataroot), "--out", str(tmp_path / "out"), "--agents", "infrastructure"]
+    more = ["--van", "truck", "--lidar-axes", "nuscenes", "--no-sweeps", "--where", "split=val", "--workers", "1"]
+    result = CliRunner().invoke(deepaccident, [*words, *more], catch_exceptions=False)
+    assert result.exit_code == 0
+    assert "left out: " in result.output
+    told = json.loads((tmp_path / "out" / "nuscenes.manifest.json").read_text())["settings"]
+    assert {name: told[name] for name in ("van", "lidar_axes", "sweeps")} == {
+        "van": "truck",
+        "lidar_axes": "nuscenes",
+        "sweeps": False,
+    }
+    assert all((tmp_path / "out" / VERSION / f"{name}.json").is_file() for name in TABLES)

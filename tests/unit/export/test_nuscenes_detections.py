@@ -1,0 +1,169 @@
+"""Detections of a nuScenes export: read back under our tokens, classes and rules."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.errors import ResultsError
+from deepaccident_devkit.evaluation import DetectedBoxes
+from deepaccident_devkit.evaluation.metrics.detection import detection_truth
+from deepaccident_devkit.evaluation.results import read_results
+from deepaccident_devkit.evaluation.results.entries import detection_entries
+from deepaccident_devkit.export.nuscenes.detections import OTHER_CLASSES, results_from_nuscenes
+from deepaccident_devkit.export.nuscenes.names import token
+from deepaccident_devkit.taxonomy import CATEGORIES
+
+OURS = {"car": "car", "truck": "truck", "bicycle": "cyclist", "motorcycle": "motorcycle", "pedestrian": "pedestrian"}
+
+
+def entry(name: str = "car", **changes: object) -> dict[str, Any]:
+    """A box as the nuScenes devkit writes it."""
+    return {
+        "translation": [105.0, -33.0, 1.0],
+        "size": [2.0, 4.5, 1.5],
+        "rotation": [0.6, 0.0, 0.0, 0.8],
+        "velocity": [3.0, -4.0],
+        "ego_translation": [0, 0, 0],
+        "num_pts": -1,
+        "detection_name": name,
+        "detection_score": 0.75,
+        "attribute_name": "vehicle.moving",
+        **changes,
+    }
+
+
+def written(path: Path, boxes: dict[str, list[dict[str, Any]]], **more: object) -> Path:
+    """A detection file of our samples → boxes, as a detector on the export writes it."""
+    results = {
+        token("sample", sample): [{"sample_token": token("sample", sample), **each} for each in given]
+        for sample, given in boxes.items()
+    }
+    path.write_text(json.dumps({"meta": {"use_lidar": True}, "results": results, **more}))
+    return path
+
+
+def verb(*words: object) -> Result:
+    return CliRunner().invoke(deepaccident, list(map(str, words)), catch_exceptions=False)
+
+
+@pytest.fixture
+def sample(da_motion: DeepAccident) -> str:
+    return da_motion.samples("train", "all")[0]
+
+
+@pytest.mark.slow
+def test_perfect_detections_of_an_export_evaluate_as_perfect(da_motion: DeepAccident, tmp_path: Path) -> None:
+    """Except vans, which a detector of nuScenes' classes cannot name."""
+    theirs = {ours: name for name, ours in OURS.items()}
+    truth = {}
+    for sample in da_motion.samples("train", "all"):
+        there = detection_truth(da_motion, sample, "paper").transform(da_motion.world_from(sample, "lidar"), "world")
+        entries = detection_entries(token("sample", sample), DetectedBoxes(boxes=there, scores=np.ones(len(there))))
+        named = [(theirs.get(each["detection_name"]), each) for each in entries]
+        truth[sample] = [{**entry(), **each, "detection_name": name} for name, each in named if name]
+    count = sum(map(len, truth.values()))
+    truth[sample].append(entry("barrier"))
+    file, out = written(tmp_path / "nuscenes.json", truth), tmp_path / "ours.json"
+    done = verb("results", "from", "nuscenes", file, da_motion.dataroot, "--out", out)
+    assert done.output == (
+        f"{out}: {count:,} boxes of {len(truth)} samples\n"
+        "left out: 1 boxes of the class barrier, which DeepAccident does not have\n"
+    )
+    assert read_results(out).meta == {"use_lidar": True}
+    listed = ("--split", "train", "--samples", "all", "--protocol", "paper", "--resamples", "0", "--json")
+    summary = json.loads(verb("evaluate", "detection", da_motion.dataroot, "--results", out, *listed).stdout)
+    classes = summary["metrics"]["classes"]
+    found = {name: each["mean_AP"] for name, each in classes.items() if each["truths"] != [0]}
+    assert found == {**dict.fromkeys(("car", "truck", "motorcycle", "pedestrian"), 100.0), "van": 0.0}
+
+
+def test_fields_mean_what_they_mean_in_nuscenes(da_motion: DeepAccident, tmp_path: Path, sample: str) -> None:
+    other = sample.replace("ego_vehicle", "infrastructure")
+    names = [*OURS, "van", "cyclist", *OTHER_CLASSES, "bus"]
+    given = [entry(name, detection_score=number / 16) for number, name in enumerate(names)]
+    given[1]["velocity"] = [float("nan"), float("nan")]
+    file = written(tmp_path / "nuscenes.json", {other: given, sample: []})
+    found = results_from_nuscenes(da_motion, file)
+    assert list(found.boxes) == [other, sample]
+    boxes, scores = found.boxes[other].boxes, found.boxes[other].scores
+    assert boxes.frame == "world"
+    assert boxes.category_names == [*OURS.values(), "van", "cyclist"]
+    assert scores.tolist() == [number / 16 for number in range(7)]
+    assert boxes.center[0].tolist() == [105.0, -33.0, 1.0]
+    assert boxes.size[0].tolist() == [4.5, 2.0, 1.5]
+    assert boxes.yaw[0] == pytest.approx(2 * np.arctan2(0.8, 0.6))
+    assert boxes.velocity[0].tolist() == [3.0, -4.0, 0.0]
+    assert np.isnan(boxes.velocity[1]).any()
+    assert found.left_out == {"barrier": 1, "bus": 2, "construction_vehicle": 1, "traffic_cone": 1, "trailer": 1}
+    assert not len(found.boxes[sample])
+
+
+REMEDY = r"; give nuScenes detections, .* of the nuScenes export of "
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ("", "is no JSON"),
+        ("[]", r"expected a JSON object, found \[\]"),
+        ('{"meta": {}}', "results: expected an object, sample token to list of entries, found null"),
+        ('{"meta": 3, "results": {}}', "meta: expected an object, found 3"),
+        ('{"results": {}}', "results: holds no sample"),
+        ('{"format": "DeepAccident results"}', "is in DeepAccident's own format, which `deepaccident evaluate` takes"),
+        (
+            '{"results": {"fd84": []}}',
+            "results: fd84: is no sample",
+        ),
+        ('{"results": {"fd84": {}}}', "expected a list of entries"),
+        ('{"results": {"fd84": [3]}}', "entry 0: expected an object, found 3"),
+    ],
+)
+def test_what_is_no_file_of_this_export(da_motion: DeepAccident, tmp_path: Path, content: str, told: str) -> None:
+    path = tmp_path / "nuscenes.json"
+    path.write_text(content)
+    with pytest.raises(ResultsError, match=f"nuscenes.json: .*{told}.*{REMEDY}"):
+        results_from_nuscenes(da_motion, path)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"translation": [0.0, float("nan"), 0.0]}, r"translation: expected \[x, y, z\] of finite numbers"),
+        ({"rotation": [2.0, 0.0, 0.0, 0.0]}, "rotation: expected a unit quaternion"),
+        ({"detection_name": "tram"}, f'detection_name: expected one of {", ".join(CATEGORIES)}, found "tram"'),
+        ({"detection_name": ["car"]}, r"detection_name: expected one of .*, found \[\"car\"\]"),
+        ({"velocity": "fast"}, r"velocity: expected \[vx, vy\]"),
+        ({"sample_token": "another"}, "sample_token: expected .*, under which it stands"),
+        ({"tracking_id": 3}, "tracking_id: is no field of the format"),
+    ],
+)
+def test_the_first_wrong_box_is_named(
+    da_motion: DeepAccident, tmp_path: Path, sample: str, change: dict[str, object], told: str
+) -> None:
+    path = written(tmp_path / "nuscenes.json", {sample: [entry("bus"), entry(), entry(**{"name": "car", **change})]})
+    with pytest.raises(ResultsError, match=f"results: {token('sample', sample)}: entry 2: {told}.*{REMEDY}"):
+        results_from_nuscenes(da_motion, path)
+
+
+def test_only_keyframes_are_samples_of_the_export(da_motion: DeepAccident, tmp_path: Path, sample: str) -> None:
+    keys = da_motion.samples("train", "all")
+    file = written(tmp_path / "a.json", {key: [] for key in keys})
+    assert list(results_from_nuscenes(da_motion, file).boxes) == keys
+    between = f"{sample[:-3]}{int(sample[-3:]) + 1:03d}"
+    with pytest.raises(ResultsError, match=f"{token('sample', between)}: is no sample of this release's export"):
+        results_from_nuscenes(da_motion, written(tmp_path / "b.json", {between: []}))
+
+
+def test_the_verb_refuses_before_it_indexes(tmp_path: Path) -> None:
+    (tmp_path / "there.json").write_text("{}")
+    words = ("results", "from", "nuscenes")
+    with pytest.raises(ResultsError, match=r"there\.json: is there already"):
+        verb(*words, tmp_path / "there.json", tmp_path / "no release", "--out", tmp_path / "there.json")
+    missing = verb(*words, tmp_path / "missing.json", tmp_path / "no release", "--out", tmp_path / "new.json")
+    assert (missing.exit_code, "missing.json' does not exist" in missing.output) == (2, True)
