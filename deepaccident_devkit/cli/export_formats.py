@@ -112,7 +112,7 @@ def parquet(**options: Any) -> None:
 
     If a run is interrupted, the same command continues it.
     """
-    refuse_unused("here: all files are written anew", "link")
+    refuse_unused("here: no file is linked", "link")
     run_export(Parquet, {}, **options)
 
 
@@ -138,5 +138,5 @@ def webdataset(frames: Frames, shard_size: int, **options: Any) -> None:
 
     If a run is interrupted, the same command continues it.
     """
-    refuse_unused("here: all files are written anew", "link")
+    refuse_unused("here: no file is linked", "link")
     run_export(WebDataset, {"frames": frames, "shard_size": shard_size * 10**6}, **options)

@@ -99,7 +99,7 @@ class WebDataset(Format):
         return total
 
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
-        """Write a shard."""
+        """Write a shard, in the format of GNU tar: it has names of any length."""
         with (
             output.file(f"{unit.name}.tar") as path,
             tarfile.open(path, "w", format=tarfile.GNU_FORMAT, encoding="utf-8") as archive,

@@ -20,8 +20,6 @@ from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, CHANNEL_FORMAT, CHA
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.opened import OpenTables
 
-_SEPARATOR = "/"
-
 
 class RecordTables:
     """The tables of a release as their records show them."""
@@ -190,7 +188,7 @@ class RecordTables:
         return pc.if_else(pc.equal(folder, ""), path, _joined(folder, path))
 
 
-def _joined(*words: Any, separator: str = _SEPARATOR) -> Any:
+def _joined(*words: Any, separator: str = "/") -> Any:
     import pyarrow.compute as pc
 
     return pc.binary_join_element_wise(*words, separator)
