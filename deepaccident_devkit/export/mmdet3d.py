@@ -112,7 +112,7 @@ def _placed(folders: Iterable[Path]) -> Iterator[dict[str, Any]]:
 def _infos(scene: Scene, form: NuScenes, output: Output) -> Iterator[dict[str, Any]]:
     """The infos of a scene's keyframes, but for `sample_idx`."""
     ours_from_theirs = SE3.from_rotation(TURNS[form.lidar_axes]).inverse()
-    sizes = {camera: image_size(scene.files[camera]) for camera in CAMERA_CHANNELS}
+    sizes = {camera: image_size(scene, camera) for camera in CAMERA_CHANNELS}
     for number in keyframes(scene.last):
         sample = scene.sample(number)
         ego_from_lidar = scene.dataset.ego_from(sample, LIDAR) @ ours_from_theirs

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -35,8 +34,8 @@ TURNS: Final = {
 def write_sensors(scene: Scene, axes: LidarAxes, output: Output) -> Rows:
     """Write the clouds of a scene, link its images, and return the rows of `sample_data` and `calibrated_sensor`.
 
-    A keyframe whose cloud is missing gets an empty one, because nuScenes' evaluation and most readers look up every
-    keyframe's `LIDAR_TOP`. Other missing files have no row.
+    Files that are missing in a partial release have rows too, as those of a partial nuScenes download: evaluations look
+    up every keyframe's `LIDAR_TOP`, but open no cloud.
 
     Raises:
         SensorFileError: a file cannot be read.
@@ -44,32 +43,36 @@ def write_sensors(scene: Scene, axes: LidarAxes, output: Output) -> Rows:
     data: list[Row] = []
     calibrated: dict[str, Row] = {}
     for channel, files in scene.files.items():
-        empty = {number for number in scene.frames if channel == LIDAR and scene.is_key(number)} - files.keys()
-        size = (0, 0) if channel == LIDAR else image_size(files)
+        size = (0, 0) if channel == LIDAR else image_size(scene, channel)
         rows = []
-        for number in sorted({*files, *empty}):
+        for number in scene.frames:
             source = sample_data_token(scene.sample(number), channel)
             sensor = scene.dataset.sample_data.get(source)["calibrated_sensor_token"]
             if sensor not in calibrated:
                 calibrated[sensor] = _calibrated_row(scene, sensor, source, size, axes)
             path = sensor_path(scene.name, channel, scene.stamp(number), key=scene.is_key(number))
             rows.append(_data_row(scene, number, channel, sensor, path, size))
+            if number not in files:
+                continue
             if channel == LIDAR:
-                output.write(path, b"" if number in empty else _cloud(files[number][0], axes))
+                output.write(path, _cloud(files[number][0], axes))
             else:
                 output.link(files[number][0], path)
         data += linked(rows)
         what = "point clouds" if channel == LIDAR else "images"
-        output.leave_out(f"{what} that are not in this release", len(scene.frames) - len(files))
-        output.leave_out("point clouds of keyframes (empty files stand for them)", len(empty))
+        output.leave_out(f"{what} that are not in this release (the tables name them)", len(rows) - len(files))
     bev = sensor_files(scene.dataset, scene.scenario, scene.agent, BEV_CAMERA)
     output.leave_out("files of the BEV camera", len(bev))
     return {"sample_data": data, "calibrated_sensor": list(calibrated.values())}
 
 
-def image_size(files: Mapping[int, tuple[Path, int]]) -> tuple[int, int]:
-    """Width and height of the first of a camera's files, as `Scene.files` has them; 0, 0 without one."""
-    return read_jpeg(next(iter(files.values()))[0])[1] if files else (0, 0)
+def image_size(scene: Scene, camera: str) -> tuple[int, int]:
+    """Width and height of the first of a camera's images, as all of a recording are; without one, as calib says."""
+    files = scene.files[camera]
+    if files:
+        return read_jpeg(next(iter(files.values()))[0])[1]
+    lens = scene.dataset.camera(scene.sample(scene.last), camera)
+    return lens.width, lens.height
 
 
 def scaled_intrinsic(dataset: Dataset, data: str, size: tuple[int, int]) -> FloatArray:
