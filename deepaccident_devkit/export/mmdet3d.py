@@ -110,7 +110,7 @@ def _placed(folders: Iterable[Path]) -> Iterator[dict[str, Any]]:
 
 
 def _infos(scene: Scene, form: NuScenes, output: Output) -> Iterator[dict[str, Any]]:
-    """The infos of a scene's keyframes, but for `sample_idx`."""
+    """The infos of a scene's keyframes, without `sample_idx`."""
     ours_from_theirs = SE3.from_rotation(TURNS[form.lidar_axes]).inverse()
     sizes = {camera: image_size(scene.files[camera]) for camera in CAMERA_CHANNELS}
     for number in keyframes(scene.last):
@@ -120,7 +120,7 @@ def _infos(scene: Scene, form: NuScenes, output: Output) -> Iterator[dict[str, A
         images = {}
         for camera, channel in CAMERA_CHANNELS.items():
             if number not in scene.files[camera]:
-                output.leave_out("missing images")
+                output.leave_out("images that are not in this release")
                 continue
             ego_from_camera = scene.dataset.ego_from(sample, camera)
             images[channel] = {
