@@ -43,9 +43,7 @@ CLASSES: Final = (
     *("traffic_cone", "barrier"),
 )
 """NuScenes' ten classes, in the order of the client's labels."""
-LABELS: Final = MappingProxyType(
-    {**{name: CLASSES.index(name) for name in ("car", "truck", "motorcycle", "pedestrian")}, "cyclist": 5}
-)
+LABELS: Final = MappingProxyType({"car": 0, "truck": 1, "cyclist": 5, "motorcycle": 6, "pedestrian": 7})
 """Our class → its label; vans are said to be cars or trucks."""
 _SWEEPS: Final = 10
 """How many clouds before a keyframe an info names at most: one second."""
@@ -69,7 +67,10 @@ class Mmdet3d(NuScenes):
             ConfigError: its settings differ.
         """
         if not Manifest.of(folder, NuScenes.name, {**self.settings(), "version": dataset.version}).complete:
-            raise ExportError(f"{folder}: holds no complete nuscenes export, whose files infos name; write that first")
+            raise ExportError(
+                f"{folder}: holds no complete nuscenes export, whose files the infos name; write it there first, with "
+                "the same settings"
+            )
 
     def plan(self, dataset: Dataset, unit: Unit) -> Plan:
         """About how much the infos of a scenario are."""
