@@ -14,10 +14,13 @@ from benchmarks.measure import Figure, best_of, one_core
 from benchmarks.releases import copied_release
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.export.bulk import Format, Link, export_release
+from deepaccident_devkit.export.mmdet3d import Mmdet3d
+from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.export.opencood import OpenCood
+from deepaccident_devkit.export.released_infos import ReleasedInfos
 from deepaccident_devkit.synth import SynthConfig, make_release
 
-FORMATS: tuple[Format, ...] = (OpenCood(),)
+FORMATS: tuple[Format, ...] = (OpenCood(), NuScenes(), Mmdet3d(), ReleasedInfos())
 """One of each; a format that lies in another's folder comes after it."""
 RELEASE = SynthConfig(scenarios=1, frames=8, image_size=(800, 450), seed=7)
 SCENARIOS = 3

@@ -43,9 +43,7 @@ CLASSES: Final = (
     *("traffic_cone", "barrier"),
 )
 """NuScenes' ten classes, in the order of the client's labels."""
-LABELS: Final = MappingProxyType(
-    {**{name: CLASSES.index(name) for name in ("car", "truck", "motorcycle", "pedestrian")}, "cyclist": 5}
-)
+LABELS: Final = MappingProxyType({"car": 0, "truck": 1, "cyclist": 5, "motorcycle": 6, "pedestrian": 7})
 """Our class → its label; vans are said to be cars or trucks."""
 _SWEEPS: Final = 10
 """How many clouds before a keyframe an info names at most: one second."""
@@ -69,7 +67,10 @@ class Mmdet3d(NuScenes):
             ConfigError: its settings differ.
         """
         if not Manifest.of(folder, NuScenes.name, {**self.settings(), "version": dataset.version}).complete:
-            raise ExportError(f"{folder}: holds no complete nuscenes export, whose files infos name; write that first")
+            raise ExportError(
+                f"{folder}: holds no complete nuscenes export, whose files the infos name; write it there first, with "
+                "the same settings"
+            )
 
     def plan(self, dataset: Dataset, unit: Unit) -> Plan:
         """About how much the infos of a scenario are."""
@@ -110,7 +111,7 @@ def _placed(folders: Iterable[Path]) -> Iterator[dict[str, Any]]:
 
 
 def _infos(scene: Scene, form: NuScenes, output: Output) -> Iterator[dict[str, Any]]:
-    """The infos of a scene's keyframes, but for `sample_idx`."""
+    """The infos of a scene's keyframes, without `sample_idx`."""
     ours_from_theirs = SE3.from_rotation(TURNS[form.lidar_axes]).inverse()
     sizes = {camera: image_size(scene, camera) for camera in CAMERA_CHANNELS}
     for number in keyframes(scene.last):
@@ -120,7 +121,7 @@ def _infos(scene: Scene, form: NuScenes, output: Output) -> Iterator[dict[str, A
         images = {}
         for camera, channel in CAMERA_CHANNELS.items():
             if number not in scene.files[camera]:
-                output.leave_out("missing images")
+                output.leave_out("images that are not in this release")
                 continue
             ego_from_camera = scene.dataset.ego_from(sample, camera)
             images[channel] = {

@@ -47,7 +47,7 @@ _INFO_BYTES, _BOX_BYTES = 7500, 140
 class ReleasedInfos(Format):
     """`carla_infos_train.pkl` and `…_val.pkl`, and `…_mini.pkl` where the release has those split files.
 
-    Values are the files' own, left-handed, but for −yaw and −vy; two keyframes a second; all five agents.
+    Values are the files' own, left-handed, except −yaw and −vy; two keyframes a second; all five agents.
 
     Attributes:
         root_prefix: what paths begin with. The released classes find a scenario's meta file by the first four parts of

@@ -1,7 +1,7 @@
 """Pickles that old readers open: Python 3.7 and numpy 1.16 or later.
 
 Protocol 3 names globals in plain text. numpy 2 writes its private path there, which numpy 1 does not have; numpy 2
-reads the old one. (A pickler cannot be told another name: it looks up whether the name leads to the very function.)
+reads the old one. (`reducer_override` cannot give a function another name: it must lead to that very function.)
 """
 
 import pickle

@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.cli.export import export
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.export.bulk import Exported, export_release
 from deepaccident_devkit.export.released_infos import ReleasedInfos
@@ -163,6 +165,15 @@ def test_infos_without_boxes(
         assert listed.read_text().splitlines() == boxless == [f"type1_subtype2_accident_other_vehicle_{path.stem}"]
         assert "1 infos have no boxes" in caplog.text
         assert not made.tally.left_out
+
+
+def test_the_command_of_mmdet3d_has_the_style(da: DeepAccident, tmp_path: Path) -> None:
+    words = ("--out", str(tmp_path / "out"), "--split", "val", "--style", "released", "--root-prefix", "./a/b")
+    run = CliRunner().invoke(export, ["mmdet3d", str(da.dataroot), *words, "--workers", "1"])
+    assert run.exit_code == 0, run.output
+    assert "20 samples: a few files to write" in run.output
+    assert infos(tmp_path / "out")[0]["lidar_path"].startswith("./a/b/type1_")
+    assert not (tmp_path / "out" / "v1.0-deepaccident").exists()
 
 
 @pytest.mark.parametrize(
