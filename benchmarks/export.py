@@ -13,19 +13,20 @@ from pathlib import Path
 from benchmarks.measure import Figure, best_of, one_core
 from benchmarks.releases import copied_release
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.export.bulk import Format, Link, export_release
+from deepaccident_devkit.export.bulk import Format, export_release
 from deepaccident_devkit.export.mmdet3d import Mmdet3d
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.export.opencood import OpenCood
+from deepaccident_devkit.export.parquet import Parquet
 from deepaccident_devkit.export.released_infos import ReleasedInfos
+from deepaccident_devkit.export.webdataset import WebDataset
 from deepaccident_devkit.synth import SynthConfig, make_release
 
-FORMATS: tuple[Format, ...] = (OpenCood(), NuScenes(), Mmdet3d(), ReleasedInfos())
+FORMATS: tuple[Format, ...] = (OpenCood(), NuScenes(), Mmdet3d(), ReleasedInfos(), Parquet(), WebDataset())
 """One of each; a format that lies in another's folder comes after it."""
 RELEASE = SynthConfig(scenarios=1, frames=8, image_size=(800, 450), seed=7)
 SCENARIOS = 3
 REPEATS = 3
-LINKS: tuple[Link, ...] = ("hard", "copy")
 
 
 def measure() -> list[Figure]:
@@ -33,7 +34,13 @@ def measure() -> list[Figure]:
         made = make_release(Path(folder) / "made", RELEASE, workers=2)
         root = copied_release(made, Path(folder) / "release", scenarios=SCENARIOS)
         dataset = DeepAccident(dataroot=root, verbose=False)
-        return [figure for form in FORMATS for link in LINKS for figure in exported(dataset, replace(form, link=link))]
+        return [figure for form in FORMATS for each in ways(dataset, form) for figure in exported(dataset, each)]
+
+
+def ways(dataset: DeepAccident, form: Format) -> list[Format]:
+    """The format with links, and if it has any, with copies."""
+    plan = export_release(dataset, dataset.dataroot.parent / "none", form, workers=1, dry_run=True).plan
+    return [form, replace(form, link="copy")] if plan.linked_files else [form]
 
 
 def exported(dataset: DeepAccident, form: Format) -> list[Figure]:

@@ -13,7 +13,7 @@ import numpy as np
 from deepaccident_devkit.arrays import IntArray
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.export.bulk import Format, Output, Plan, Unit
-from deepaccident_devkit.export.shards import README, SPLIT_NAMES, readme, remove_others, shards
+from deepaccident_devkit.export.shards import README, SPLIT_NAMES, readme, shards
 from deepaccident_devkit.tables.columns import Key, Kind, Number, Vector
 from deepaccident_devkit.tables.record_tables import RecordTables
 from deepaccident_devkit.tables.specs import table_specs
@@ -90,13 +90,12 @@ class Parquet(Format):
     def finish(
         self,
         dataset: Dataset,
-        units: Sequence[Unit],
+        units: Sequence[Unit],  # noqa: ARG002
         output: Output,
         parts: Callable[[Unit], Path],  # noqa: ARG002 - units are whole files
     ) -> None:
         """Write the tables that all splits share, and the README.md."""
         maker = RecordTables(dataset)
-        remove_others(output.folder, "*/*.parquet", {f"{unit.name}.parquet" for unit in units})
         for table in _ONCE:
             _write(output, f"{table}/{_ONLY_FILE}", iter([maker.table(table, np.arange(len(dataset.arrow(table))))]))
         rows = {table: _rows_by_split(output.folder / table) for table in dataset.table_names}

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any, Final
 
 from deepaccident_devkit._version import __version__
@@ -52,13 +51,6 @@ def shards(dataset: Dataset, sizes: Mapping[str, int], limit: int) -> dict[str, 
         found[split][-1] = (*found[split][-1], scenario)
         room[split] -= size
     return {split: groups for split, groups in found.items() if groups}
-
-
-def remove_others(folder: Path, pattern: str, names: Collection[str]) -> None:
-    """Remove the shards of an unfinished export of other scenarios: files of a pattern whose names are not these."""
-    for path in folder.glob(pattern):
-        if path.name not in names:
-            path.unlink()
 
 
 def readme(form: Format, dataset: Dataset, title: str, head: Mapping[str, Any], body: str) -> bytes:

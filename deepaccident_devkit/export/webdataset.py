@@ -18,7 +18,7 @@ from deepaccident_devkit.export.bulk import Format, Output, Plan, Unit
 from deepaccident_devkit.export.keyframes import keyframes
 from deepaccident_devkit.export.sample_json import CAMERA_NAMES, JSON_FIELDS, JSON_TYPES, sample_json
 from deepaccident_devkit.export.sensor_files import sensor_files
-from deepaccident_devkit.export.shards import README, readme, remove_others, shards
+from deepaccident_devkit.export.shards import README, readme, shards
 from deepaccident_devkit.release import read_lidar
 from deepaccident_devkit.tables.tokens import frame_token, sample_token
 from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, CHANNELS, LIDAR
@@ -117,7 +117,6 @@ class WebDataset(Format):
         parts: Callable[[Unit], Path],  # noqa: ARG002 - units are whole files
     ) -> None:
         """Write the README.md."""
-        remove_others(output.folder, "*.tar", {f"{unit.name}.tar" for unit in units})
         splits = dict.fromkeys(unit.name.split("-")[0] for unit in units)
         files = [{"split": split, "path": f"{split}-*.tar"} for split in splits]
         head = {

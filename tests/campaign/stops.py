@@ -59,10 +59,13 @@ VERBS = (
     Verb("render bev", f"render bev {_RELEASE} {SCENARIO}/ego_vehicle/003 --out {{out}}/picture.png --dpi 40"),
     Verb("render video", f"render video {_RELEASE} {SCENARIO} --what bev --size 160x90 --out {{out}}/video.gif"),
     Verb("export mcap", f"export mcap {_SENSORS} --out {{out}}/scenario.mcap"),
-    Verb(
-        "export opencood",
-        f"export opencood {_RELEASE} --out {{out}}/opencood",
-        progress="opencood/opencood.manifest.json",
+    *(
+        Verb(
+            f"export {name}",
+            f"export {name} {_RELEASE} --out {{out}}/{name}",
+            progress=f"{name}/{name}.manifest.json",
+        )
+        for name in ("opencood", "nuscenes", "parquet", "webdataset")
     ),
     Verb("replay", f"replay {_SENSORS} --out {{out}}/replay.html"),
 )

@@ -11,9 +11,11 @@ from typing import Any
 
 import killed
 import pytest
+from click.testing import CliRunner
 from tiny_format import TinyFormat
 
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.export.bulk import export_release
 from deepaccident_devkit.export.bulk.manifest import writing_to
 
@@ -32,8 +34,9 @@ def job(small_root: Path) -> Iterator[Job]:
         asked, answers = server.stdin, server.stdout
 
         def run(folder: Path, workers: int = 1, **how: object) -> dict[str, Any]:
+            """Export in the tests' own format, or by the command line that is given as `words`."""
             call = {"function": ["tiny_format", "export_tiny"], "arguments": [str(small_root), str(folder), workers]}
-            asked.write(json.dumps({**call, **how}) + "\n")
+            asked.write(json.dumps({**({} if "words" in how else call), **how}) + "\n")
             asked.flush()
             answer: dict[str, Any] = json.loads(answers.readline())
             return answer
@@ -64,6 +67,26 @@ def test_killed_around_every_renaming_and_removal(
         step += 1
     assert step > 40
     assert contents(tmp_path / str(step)) == whole
+
+
+@pytest.mark.parametrize("name", ["opencood", "nuscenes"])
+def test_a_format_killed_at_twenty_moments(
+    small_root: Path, tmp_path: Path, job: Job, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    def words(out: str) -> list[str]:
+        return ["export", name, str(small_root), "--workers", "1", "--out", str(tmp_path / out)]
+
+    renamed, replace = [], os.replace
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", lambda source, target: (renamed.append(target), replace(source, target)))
+        assert CliRunner().invoke(deepaccident, words("whole"), catch_exceptions=False).exit_code == 0
+    whole = contents(tmp_path / "whole")
+    for moment in range(20):
+        out, step = str(moment), moment * (len(renamed) - 1) // 19
+        assert job(tmp_path / out, words=words(out), step=step, after=bool(moment % 2))["status"] == -9
+        assert contents(tmp_path / out) != whole
+        assert job(tmp_path / out, words=words(out))["status"] == 0
+        assert contents(tmp_path / out) == whole, moment
 
 
 @pytest.mark.parametrize("workers", KILLS)
