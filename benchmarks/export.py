@@ -20,6 +20,7 @@ from deepaccident_devkit.export.opencood import OpenCood
 from deepaccident_devkit.export.parquet import Parquet
 from deepaccident_devkit.export.released_infos import ReleasedInfos
 from deepaccident_devkit.export.webdataset import WebDataset
+from deepaccident_devkit.release import find_release
 from deepaccident_devkit.synth import SynthConfig, make_release
 
 FORMATS: tuple[Format, ...] = (OpenCood(), NuScenes(), Mmdet3d(), ReleasedInfos(), Parquet(), WebDataset())
@@ -33,6 +34,8 @@ def measure() -> list[Figure]:
     with tempfile.TemporaryDirectory() as folder:
         made = make_release(Path(folder) / "made", RELEASE, workers=2)
         root = copied_release(made, Path(folder) / "release", scenarios=SCENARIOS)
+        lines = [scenario.token.replace("/", " ") for scenario in find_release(root).scenarios]
+        (root / "train.txt").write_text("\n".join(lines))
         dataset = DeepAccident(dataroot=root, verbose=False)
         return [figure for form in FORMATS for each in ways(dataset, form) for figure in exported(dataset, each)]
 

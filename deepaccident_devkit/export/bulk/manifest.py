@@ -136,7 +136,7 @@ class Manifest:
                 for name in changed
             )
             raise ConfigError(
-                f"{folder}: holds a {self.name} export with other settings ({text}); choose another folder"
+                f"{folder}: holds an export to {self.name} with other settings ({text}); choose another folder"
             )
 
 

@@ -76,7 +76,7 @@ class Moments:
         }
 
     def _vehicles(self, at: int, output: Output) -> dict[int, dict[str, Any]]:
-        """Those that the agent's LiDAR hits, but for itself, as OPV2V has them; agents' boxes are merged by id."""
+        """Those that the agent's LiDAR hits, without the agent itself, as in OPV2V, which merges boxes by id."""
         if not self._labelled[at]:
             output.leave_out("labels that are not in this release")
         boxes = self._dataset.boxes(self.samples[at], "world")
@@ -88,7 +88,7 @@ class Moments:
         pose[:, :3, :3], pose[:, :3, 3], pose[:, 3, 3] = to_matrix(boxes.rotation), boxes.center, 1
         six = carla_six(pose)
         half = boxes.size / 2
-        # loaders add location and center without turning the latter
+        # loaders add `center` to `location` without turning it
         center = np.column_stack([np.zeros((len(boxes), 2)), half[:, 2]])
         speed = np.linalg.norm(np.nan_to_num(boxes.velocity), axis=1) * _KMH
         return {

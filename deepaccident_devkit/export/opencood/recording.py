@@ -67,7 +67,7 @@ class Recording:
         }
 
     def count_left_out(self, output: Output) -> None:
-        """Count what of the scenario is not written, but for boxes."""
+        """Count what of the scenario is not written; boxes are counted one moment after the other."""
         samples = len(self.frames) * len(self.agents)
         images = sum(map(self._count, CAMERAS))
         output.leave_out("agents of scenarios that are not in this release", self._absent)

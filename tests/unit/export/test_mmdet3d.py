@@ -193,7 +193,7 @@ def test_a_folder_without_that_nuscenes_export_is_refused(da: DeepAccident, tmp_
         export_release(da, tmp_path / "new", Mmdet3d())
     assert not (tmp_path / "new").exists()
     export_release(da, tmp_path / "other", NuScenes(agents=("ego_vehicle",), sweeps=False))
-    with pytest.raises(ConfigError, match="holds a nuscenes export with other settings"):
+    with pytest.raises(ConfigError, match="holds an export to nuscenes with other settings"):
         export_release(da, tmp_path / "other", Mmdet3d(agents=("ego_vehicle",)))
 
 

@@ -184,7 +184,9 @@ def test_a_folder_of_other_settings_is_refused(
     else:
         written(small, tmp_path / "out")
     before = states(tmp_path)
-    with pytest.raises(ConfigError, match=rf"out: holds a tiny export with other settings \({names}\); choose another"):
+    with pytest.raises(
+        ConfigError, match=rf"out: holds an export to tiny with other settings \({names}\); choose another"
+    ):
         written(small, tmp_path / "out", form)
     assert states(tmp_path) == before
 
