@@ -28,7 +28,7 @@ class Tally:
     """Counts of what was written.
 
     Attributes:
-        files: that were written, links not among them.
+        files: written, not linked or copied.
         bytes: in them.
         linked: way → files of the release that were linked or copied.
         left_out: what → how much of it the format cannot hold, or is not in this (partial) release.
