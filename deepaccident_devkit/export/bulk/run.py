@@ -117,7 +117,7 @@ def export_release(
                 return exported(written=written, kept=len(units) - written, tally=manifest.tally)
     hashes = run(folder_hashes, list(folders.values()), label="comparing")
     _check_release(manifest, root, {token: each.as_dict() for token, each in zip(folders, hashes, strict=True)})
-    task.unfinished.remove()  # it was killed just before
+    task.unfinished.remove()  # left by a call that was killed after the manifest was complete
     return exported(written=0, kept=len(units), tally=manifest.tally)
 
 
