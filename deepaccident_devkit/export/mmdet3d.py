@@ -22,13 +22,15 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 import numpy as np
 
 from deepaccident_devkit.errors import ExportError
-from deepaccident_devkit.export.bulk import Manifest, Plan
+from deepaccident_devkit.export.bulk import Plan
+from deepaccident_devkit.export.bulk.manifest import Manifest
 from deepaccident_devkit.export.keyframes import keyframes
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.export.nuscenes.names import CAMERA_CHANNELS, VERSION, sensor_path, token
 from deepaccident_devkit.export.nuscenes.sensors import TURNS, image_size, scaled_intrinsic
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.geometry import SE3
+from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.release.pickles import pickled_items, write_joined
 from deepaccident_devkit.taxonomy import LIDAR, OWN_ACTOR_ID, SPLITS
 
@@ -106,7 +108,7 @@ class Mmdet3d(NuScenes):
 
 def _placed(folders: Iterable[Path]) -> Iterator[dict[str, Any]]:
     """The infos that units left in these folders, with their places."""
-    lines = (line for folder in folders for line in (folder / _PART).read_text(encoding="utf-8").splitlines())
+    lines = (line for folder in folders for line in read_bytes(folder / _PART, "bundle").decode().splitlines())
     return ({"sample_idx": place, **json.loads(line)} for place, line in enumerate(lines))
 
 

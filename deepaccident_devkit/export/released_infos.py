@@ -23,6 +23,7 @@ from deepaccident_devkit.errors import ChoiceError, NotAvailableError
 from deepaccident_devkit.export.bulk import Format, Output, Plan, Unit
 from deepaccident_devkit.export.keyframes import keyframes
 from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.release import Labels, ScenarioFolder, read_calibs, read_label
 from deepaccident_devkit.release.pickles import pickled_items, write_joined
 from deepaccident_devkit.tables.tokens import frame_token
@@ -133,9 +134,14 @@ class ReleasedInfos(Format):
             if paths:
                 with output.file(f"carla_infos_{split}.pkl") as temporary, temporary.open("wb") as file:
                     write_joined(
-                        file, "infos", (path.read_bytes() for path in paths), {"metadata": {"version": version}}
+                        file,
+                        "infos",
+                        (read_bytes(path, "bundle") for path in paths),
+                        {"metadata": {"version": version}},
                     )
-        empty = b"".join((parts(unit) / _EMPTY).read_bytes() for unit in units if (parts(unit) / _EMPTY).exists())
+        empty = b"".join(
+            read_bytes(parts(unit) / _EMPTY, "bundle") for unit in units if (parts(unit) / _EMPTY).exists()
+        )
         if empty:
             output.write(f"carla_infos_{_EMPTY}", empty)
             logger.warning(

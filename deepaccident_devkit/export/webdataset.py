@@ -20,6 +20,7 @@ from deepaccident_devkit.export.sample_json import CAMERA_NAMES, JSON_FIELDS, JS
 from deepaccident_devkit.export.sensor_files import sensor_files
 from deepaccident_devkit.export.shards import README, readme, shards
 from deepaccident_devkit.release import read_lidar
+from deepaccident_devkit.release.images import read_image_bytes
 from deepaccident_devkit.tables.tokens import frame_token, sample_token
 from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, CHANNELS, LIDAR
 from deepaccident_devkit.text import choice
@@ -77,7 +78,7 @@ class WebDataset(Format):
     def __post_init__(self) -> None:
         """Check the choice and the size too."""
         super().__post_init__()
-        choice("frames", self.frames, get_args(Frames))
+        object.__setattr__(self, "frames", choice("frames", self.frames, get_args(Frames)))
         if self.shard_size < 1:
             raise ConfigError(f"shard_size: expected a number of bytes from 1, found {self.shard_size}")
 
@@ -190,7 +191,7 @@ class _Recording:
             key = token.replace("%", "%25").replace(".", "%2E")  # readers cut a name at its first dot
             for camera, name in CAMERA_NAMES.items():
                 if number in self._files[agent, camera]:
-                    _add(archive, f"{key}.{name}.jpg", self._files[agent, camera][number][0].read_bytes())
+                    _add(archive, f"{key}.{name}.jpg", read_image_bytes(self._files[agent, camera][number][0]))
             if number in self._files[agent, LIDAR]:
                 _add(archive, f"{key}.lidar.npy", _npy(self._files[agent, LIDAR][number][0]))
             _add(archive, f"{key}.json", sample_json(self._dataset, token))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -12,6 +12,7 @@ from deepaccident_devkit.export.nuscenes.boxes import CATEGORIES
 from deepaccident_devkit.export.nuscenes.names import CHANNEL_NAMES, LIDAR_CHANNEL, VERSION, token
 from deepaccident_devkit.export.nuscenes.scenes import Row, Rows
 from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.taxonomy import SPLITS
 
 if TYPE_CHECKING:
@@ -58,9 +59,8 @@ def _part(folder: Path, table: str) -> Path:
     return folder / f"{table}.jsonl"
 
 
-def _lines(folder: Path, table: str) -> Iterator[str]:
-    with _part(folder, table).open(encoding="utf-8") as file:
-        yield from map(str.rstrip, file)
+def _lines(folder: Path, table: str) -> list[str]:
+    return read_bytes(_part(folder, table), "bundle").decode().splitlines()
 
 
 def _write_table(table: str, rows: Iterable[str], output: Output) -> None:

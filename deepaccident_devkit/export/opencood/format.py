@@ -16,6 +16,8 @@ from deepaccident_devkit.export.opencood.moments import CAMERA_NAMES, Moments
 from deepaccident_devkit.export.opencood.recording import Recording
 from deepaccident_devkit.export.sensor_files import points_of
 from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.json_text import parsed_json
+from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.release import read_lidar
 from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES, LIDAR, VEHICLE_AGENTS
 from deepaccident_devkit.text import choice
@@ -43,12 +45,11 @@ class OpenCood(Format):
     def __post_init__(self) -> None:
         """Check the choices."""
         super().__post_init__()
-        for each in self.classes:
-            choice("classes", each, CATEGORIES)
-        if not self.classes:
+        chosen = {choice("classes", each, CATEGORIES) for each in self.classes}
+        if not chosen:
             raise ChoiceError(f"classes: expected some of {', '.join(CATEGORIES)}, found none")
-        choice("ego", self.ego, VEHICLE_AGENTS)
-        object.__setattr__(self, "classes", tuple(each for each in CATEGORIES if each in self.classes))
+        object.__setattr__(self, "classes", tuple(each for each in CATEGORIES if each in chosen))
+        object.__setattr__(self, "ego", choice("ego", self.ego, VEHICLE_AGENTS))
 
     def plan(self, dataset: Dataset, unit: Unit) -> Plan:
         """About how much a scenario is."""
@@ -81,7 +82,8 @@ class OpenCood(Format):
 
     def finish(self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]) -> None:  # noqa: ARG002 - others need the release
         """Write HEAL's assignment, by which all agents have the same sensors."""
-        found = {unit.name: dict.fromkeys(json.loads((parts(unit) / _AGENTS).read_bytes()), "m1") for unit in units}
+        agents = {unit.name: parsed_json(read_bytes(parts(unit) / _AGENTS, "bundle")) for unit in units}
+        found = {name: dict.fromkeys(folders, "m1") for name, folders in agents.items()}
         output.write("heter_modality_assign.json", f"{json.dumps(found, indent=1)}\n".encode())
 
     def _write_agent(self, recording: Recording, agent: str, output: Output) -> None:
