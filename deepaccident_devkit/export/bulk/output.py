@@ -90,6 +90,9 @@ class Output:
         self.folder, self.parts, self.tally = folder, parts, Tally() if tally is None else tally
         self._link, self._note = link, note
 
+    def __repr__(self) -> str:
+        return f"<output in {self.folder}>"
+
     def write(self, path: str, content: bytes) -> None:
         """Write a file; the path is relative to the folder."""
         write_bytes(self._place(path), content)
