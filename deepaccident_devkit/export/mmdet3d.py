@@ -32,7 +32,7 @@ from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.release.pickles import pickled_items, write_joined
-from deepaccident_devkit.taxonomy import LIDAR, OWN_ACTOR_ID, SPLITS
+from deepaccident_devkit.taxonomy import LIDAR, OWN_ACTOR_ID
 
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset
@@ -90,18 +90,18 @@ class Mmdet3d(NuScenes):
 
     def finish(self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]) -> None:
         """Join the infos of each split that has some; `sample_idx` is an info's place in its file."""
-        folders: dict[str | None, list[Path]] = {}
+        folders: dict[str, list[Path]] = {}
         for unit in units:
-            folders.setdefault(dataset.get("scenario", unit.scenarios[0])["split"], []).append(parts(unit))
-        output.leave_out("scenarios that are in no split", len(folders.get(None, ())))
+            split = dataset.get("scenario", unit.scenarios[0])["split"] or "unknown"
+            folders.setdefault(split, []).append(parts(unit))
         about = {
             "categories": {name: label for label, name in enumerate(CLASSES)},
             "dataset": "nuscenes",
             "version": VERSION,
             "info_version": "1.1",
         }
-        for split in filter(folders.get, SPLITS):
-            pieces = (pickled_items([info]) for info in _placed(folders[split]))
+        for split, places in sorted(folders.items()):
+            pieces = (pickled_items([info]) for info in _placed(places))
             with output.file(f"deepaccident_infos_{split}.pkl") as temporary, temporary.open("wb") as file:
                 write_joined(file, "data_list", pieces, {"metainfo": about})
 

@@ -50,9 +50,10 @@ def write_tables(parts: Sequence[Path], output: Output) -> None:
         _write_table(table, map(json.dumps, rows), output)
     for row in _maps(logs):
         output.write(row["filename"], _blank_mask())
-    splits = {f"deepaccident_{split}": [row["name"] for row in scenes if row["split"] == split] for split in SPLITS}
+    splits: dict[str, list[str]] = {f"deepaccident_{split}": [] for split in SPLITS}
+    for row in scenes:
+        splits.setdefault(f"deepaccident_{row['split'] or 'unknown'}", []).append(row["name"])
     output.write(f"{VERSION}/splits.json", json.dumps(splits, indent=1).encode())
-    output.leave_out("scenes that are in no split", sum(row["split"] is None for row in scenes))
 
 
 def _part(folder: Path, table: str) -> Path:

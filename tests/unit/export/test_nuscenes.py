@@ -303,11 +303,13 @@ def test_without_labels_there_are_sensors_and_poses(own_release: Path, one: Any)
     assert list(faults_of(tables)) == []
 
 
-def test_scenes_without_a_split_are_counted(own_release: Path, one: Any) -> None:
+def test_scenes_without_a_split_have_a_list_of_their_own(own_release: Path, one: Any) -> None:
     (own_release / "train").rename(own_release / "moved")
     flat = own_release / "moved"
-    made, _ = one(DeepAccident("v1", flat, verbose=False), where=())
-    assert made.tally.left_out["scenes that are in no split"] == len(list(flat.glob("*/meta/*.txt")))
+    made, tables = one(DeepAccident("v1", flat, verbose=False), where=())
+    splits = json.loads((made.folder / VERSION / "splits.json").read_text())
+    assert splits.pop("deepaccident_unknown") == [row["name"] for row in tables["scene"].values()]
+    assert not any(splits.values())
 
 
 def test_smaller_images_have_smaller_intrinsics(own_release: Path, one: Any) -> None:
