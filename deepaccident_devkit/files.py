@@ -4,8 +4,11 @@ What is being written has a temporary name in the same folder, `.NAME.HOST-PROCE
 killed it stays, and the next process that writes into that folder removes it.
 """
 
+from __future__ import annotations
+
 import hashlib
 import itertools
+import logging
 import os
 import platform
 import re
@@ -16,7 +19,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from filelock import BaseFileLock
+
+logger = logging.getLogger(__name__)
 
 _TEMPORARY: Final = re.compile(
     r"\.(?P<name>.+?)\.(?:(?P<host>[0-9a-f]{8})-(?P<process>[1-9]\d{0,9})-(?P<start>\d+)-)?\d+\.tmp(?:\.\w+)?",
@@ -148,6 +156,26 @@ def _start(process: int) -> str | None:
         return None
     state, *facts = status.rpartition(")")[2].split()  # after its name, which may have brackets itself
     return "" if state in "ZX" else facts[18]  # a killed process whose parent does not ask for it is there still
+
+
+def held_lock(path: Path, task: str) -> BaseFileLock:
+    """The lock of a file, held until it is released or the process ends, however; its folder is made.
+
+    While another process holds it, this waits and says so: the other one does the `task`, such as `writes labels`.
+
+    Raises:
+        OSError, NotImplementedError: the folder cannot be made or written to, or its file system has no locks.
+    """
+    from filelock import FileLock, Timeout
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(path)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        logger.warning("%s: another process %s there; waiting for it", path.parent, task)
+        lock.acquire()
+    return lock
 
 
 def write_bytes(path: Path, content: bytes) -> None:

@@ -1,13 +1,15 @@
-"""The infos of mmdet3d from 1.1 on, beside a nuScenes export, whose files they name (docs/exports.md).
+"""The infos of mmdet3d from 1.1 on, beside a nuScenes export, whose files they name.
 
-from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.export.bulk import export_release
-from deepaccident_devkit.export.mmdet3d import Mmdet3d
-from deepaccident_devkit.export.nuscenes import NuScenes
+    from deepaccident_devkit import DeepAccident
+    from deepaccident_devkit.export.bulk import export_release
+    from deepaccident_devkit.export.mmdet3d import Mmdet3d
+    from deepaccident_devkit.export.nuscenes import NuScenes
 
-da = DeepAccident(dataroot="data/DeepAccident")
-export_release(da, "data/nuscenes", NuScenes(split="val"))
-export_release(da, "data/nuscenes", Mmdet3d(split="val"))
+    da = DeepAccident(dataroot="data/DeepAccident")
+    export_release(da, "data/nuscenes", NuScenes(split="val"))
+    export_release(da, "data/nuscenes", Mmdet3d(split="val"))
+
+docs/exports.md says what becomes what, and what is lost.
 """
 
 from __future__ import annotations

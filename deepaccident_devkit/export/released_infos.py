@@ -1,11 +1,13 @@
-"""The infos that the released code's own converter makes, which its two dataset classes read (docs/exports.md).
+"""The infos that the released code's own converter makes, which its two dataset classes read.
 
-from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.export.bulk import export_release
-from deepaccident_devkit.export.released_infos import ReleasedInfos
+    from deepaccident_devkit import DeepAccident
+    from deepaccident_devkit.export.bulk import export_release
+    from deepaccident_devkit.export.released_infos import ReleasedInfos
 
-da = DeepAccident(dataroot="data/DeepAccident")
-export_release(da, "data/carla_infos", ReleasedInfos())
+    da = DeepAccident(dataroot="data/DeepAccident")
+    export_release(da, "data/carla_infos", ReleasedInfos())
+
+docs/exports.md says what is left out, and where the classes look for files.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from deepaccident_devkit.release import Labels, ScenarioFolder, read_calibs, rea
 from deepaccident_devkit.release.pickles import pickled_items, write_joined
 from deepaccident_devkit.tables.tokens import frame_token
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CAMERAS, CATEGORIES, CHANNEL_FORMAT, CHANNELS, LIDAR
+from deepaccident_devkit.v2x.configurations import agents_of
 
 logger = logging.getLogger(__name__)
 
@@ -160,9 +163,9 @@ def _fault(dataset: Dataset, scenario: str) -> str | None:
     """Why the released code can do nothing with a scenario, as a plural; None if it can."""
     if dataset.get("scenario", scenario)["split"] not in _SPLITS:
         return "scenarios that are neither in train nor in val"
-    samples = [dataset.samples_of(frame_token(scenario, number)) for number in _keyframes(dataset, scenario)]
-    if len(samples[0]) < len(AGENTS):
+    if agents_of(dataset, scenario) != AGENTS:
         return "scenarios without all five agents"
+    samples = [dataset.samples_of(frame_token(scenario, number)) for number in _keyframes(dataset, scenario)]
     if not all(sample["labelled"] for moment in samples for sample in moment):
         return "scenarios without labels"
     return None

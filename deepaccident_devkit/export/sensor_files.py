@@ -12,7 +12,6 @@ from deepaccident_devkit.errors import DatarootError
 from deepaccident_devkit.reading import fault_text
 from deepaccident_devkit.release import read_lidar
 from deepaccident_devkit.tables.tokens import sample_token
-from deepaccident_devkit.taxonomy import LIDAR
 
 
 def sensor_files(dataset: Dataset, scenario: str, agent: str, channel: str) -> dict[int, tuple[Path, int]]:
@@ -35,11 +34,6 @@ def sensor_files(dataset: Dataset, scenario: str, agent: str, channel: str) -> d
         raise DatarootError(f"{folder}: {fault_text(error)}; unpack its archive again, or make it readable") from error
     names = ((number, f"{stem}_{number:03d}.{ending}") for number in range(1, count + 1))
     return {number: (folder / name, sizes[name]) for number, name in names if name in sizes}
-
-
-def points_of(dataset: Dataset, scenario: str, agent: str) -> int:
-    """About how many LiDAR points a recording has; raises as `points_in` and `sensor_files` do."""
-    return points_in(sensor_files(dataset, scenario, agent, LIDAR))
 
 
 def points_in(files: Mapping[int, tuple[Path, int]]) -> int:

@@ -17,13 +17,14 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.export.bulk import Format, Output, Plan, Unit
 from deepaccident_devkit.export.keyframes import keyframes
 from deepaccident_devkit.export.sample_json import CAMERA_NAMES, JSON_FIELDS, JSON_TYPES, sample_json
-from deepaccident_devkit.export.sensor_files import sensor_files
+from deepaccident_devkit.export.sensor_files import points_in, sensor_files
 from deepaccident_devkit.export.shards import README, readme, shards
 from deepaccident_devkit.release import read_lidar
 from deepaccident_devkit.release.images import read_image_bytes
-from deepaccident_devkit.tables.tokens import frame_token, sample_token
+from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, CHANNELS, LIDAR
 from deepaccident_devkit.text import choice
+from deepaccident_devkit.v2x.configurations import agents_of
 
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset
@@ -140,8 +141,8 @@ class _Recording:
         self._dataset, self._scenario, self._wanted = dataset, scenario, form.agents
         self._last = dataset.scenario.get(scenario)["num_frames"]
         self._numbers = keyframes(self._last) if form.frames == "keyframes" else range(1, self._last + 1)
-        self._here = [sample["agent"] for sample in dataset.samples_of(frame_token(scenario, 1))]
-        self._agents = [agent for agent in self._here if agent in form.agents]
+        self._here = agents_of(dataset, scenario)
+        self._agents: list[str] = [agent for agent in self._here if agent in form.agents]
         self.samples = len(self._agents) * len(self._numbers)
 
     @cached_property
@@ -167,9 +168,8 @@ class _Recording:
         for (_, channel), files in self._files.items():
             if channel in CAMERAS:
                 size += sum(each for _, each in files.values())
-            elif channel == LIDAR and files:
-                first, _ = next(iter(files.values()))
-                size += len(read_lidar(first, raw=True)) * _POINT_BYTES * len(files)
+            elif channel == LIDAR:
+                size += points_in(files) * _POINT_BYTES
         return size
 
     def count_left_out(self, output: Output) -> None:

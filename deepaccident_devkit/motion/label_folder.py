@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import re
 from collections.abc import Iterator, Mapping
@@ -13,14 +12,12 @@ from pathlib import Path
 from typing import Any, Final, get_args
 
 from deepaccident_devkit.errors import ConfigError, DeepAccidentError, LabelFilesError
-from deepaccident_devkit.files import temporary_of, write_bytes
+from deepaccident_devkit.files import held_lock, temporary_of, write_bytes
 from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.motion.batch_names import BatchNames
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.reading import check_size, fault_text, read_bytes, shortened
 from deepaccident_devkit.taxonomy import AGENTS
-
-logger = logging.getLogger(__name__)
 
 FORMAT: Final = "DeepAccident motion labels"
 FORMAT_VERSION: Final = 1
@@ -130,12 +127,8 @@ def writing_to(root: Path) -> Iterator[None]:
     Raises:
         LabelFilesError: the folder cannot be made, locked or written to.
     """
-    from filelock import FileLock
-
-    lock = FileLock(root / _LOCK)
     try:
-        root.mkdir(parents=True, exist_ok=True)
-        _acquire(lock, root)
+        lock = held_lock(root / _LOCK, "writes labels")
     except (OSError, NotImplementedError) as error:  # the latter: a file system without locks
         raise LabelFilesError(f"{root}: no labels can be written there ({error}); choose another folder") from error
     try:
@@ -166,16 +159,6 @@ def label_path(root: Path, recording: str) -> Path:
 def batch_path(root: Path, recording: str, frame: int) -> Path:
     """The file of a sample in the names of another code."""
     return root / recording / f"{frame:03d}.npz"
-
-
-def _acquire(lock: Any, root: Path) -> None:
-    from filelock import Timeout
-
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        logger.warning("%s: another process writes labels there; waiting for it", root)
-        lock.acquire()
 
 
 def _remove_half_written(root: Path) -> None:

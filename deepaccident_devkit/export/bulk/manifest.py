@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -15,11 +14,9 @@ from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import ConfigError, DeepAccidentError, ExportError
 from deepaccident_devkit.export.bulk.output import MALFORMED, Tally
 from deepaccident_devkit.export.bulk.unfinished import FOLDER
-from deepaccident_devkit.files import remove_leftovers, temporary_of, write_bytes
+from deepaccident_devkit.files import held_lock, remove_leftovers, temporary_of, write_bytes
 from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.reading import fault_text, read_bytes, shortened
-
-logger = logging.getLogger(__name__)
 
 _FORMAT: Final = "DeepAccident export"
 _LOCK: Final = ".deepaccident.lock"
@@ -154,16 +151,8 @@ def writing_to(folder: Path) -> Iterator[None]:
     Raises:
         ExportError: the folder cannot be made, locked or written to.
     """
-    from filelock import FileLock, Timeout
-
-    lock = FileLock(folder / _LOCK)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        try:
-            lock.acquire(timeout=0)
-        except Timeout:
-            logger.warning("%s: another process writes an export there; waiting for it", folder)
-            lock.acquire()
+        lock = held_lock(folder / _LOCK, "writes an export")
     except (OSError, NotImplementedError) as error:  # the latter: a file system without locks
         raise ExportError(f"{folder}: no export can be written there ({error}); choose another folder") from error
     try:

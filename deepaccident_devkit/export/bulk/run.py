@@ -92,10 +92,11 @@ def export_release(
     task, units = _Work(dataset, form, Unfinished(root, form.name)), form.units(dataset, scenarios)
     run = partial(run_batch, workers=workers, executor=executor, progress=progress)
     plans = run(task.plan, units, label="planning")
+    plan = sum(plans, Plan())
     free = shutil.disk_usage(next(each for each in (root, *root.parents) if each.exists())).free
-    exported = partial(Exported, folder=root, plan=sum(plans, Plan()))
+    exported = partial(Exported, folder=root, plan=plan)
     if on_plan is not None:
-        on_plan(sum(plans, Plan()), free)
+        on_plan(plan, free)
     if not manifest.complete:
         _check_room(task, dict(zip(units, plans, strict=True)), free)
     if dry_run:

@@ -12,6 +12,7 @@ from deepaccident_devkit.export.keyframes import keyframe_after, keyframes
 from deepaccident_devkit.export.nuscenes.names import CHANNEL_NAMES, scene_name, timestamp, token
 from deepaccident_devkit.export.sensor_files import sensor_files
 from deepaccident_devkit.tables.tokens import agent_token, sample_token
+from deepaccident_devkit.v2x.configurations import agents_of
 
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset
@@ -131,8 +132,7 @@ class Scene:
 
 def scenes_of(dataset: Dataset, scenario: str, agents: Sequence[str], *, sweeps: bool) -> Iterator[Scene]:
     """The scenes of those of the agents that recorded a scenario."""
-    there = {name.rsplit("/", 1)[1] for name in dataset.field2token("agent", "scenario_token", scenario)}
-    return (Scene(dataset, scenario, agent, sweeps) for agent in agents if agent in there)
+    return (Scene(dataset, scenario, agent, sweeps) for agent in agents_of(dataset, scenario) if agent in agents)
 
 
 def linked(rows: list[Row]) -> list[Row]:

@@ -14,7 +14,7 @@ from deepaccident_devkit.export.bulk import Format, Output, Plan, Unit
 from deepaccident_devkit.export.opencood.cloud import POINT_BYTES, pcd_bytes
 from deepaccident_devkit.export.opencood.moments import CAMERA_NAMES, Moments
 from deepaccident_devkit.export.opencood.recording import Recording
-from deepaccident_devkit.export.sensor_files import points_of
+from deepaccident_devkit.export.sensor_files import points_in
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.reading import read_bytes
@@ -53,7 +53,7 @@ class OpenCood(Format):
 
     def plan(self, dataset: Dataset, unit: Unit) -> Plan:
         """About how much a scenario is."""
-        recording = Recording(dataset, unit.scenarios[0], self)
+        recording = Recording(dataset, unit.scenarios[0], self.agents, self.ego)
         total = Plan()
         for agent in recording.agents:
             images = [size for camera in CAMERAS for _, size in recording.files[agent][camera].values()]
@@ -63,7 +63,7 @@ class OpenCood(Format):
                 samples=frames,
                 files=2 * frames + len(recording.files[agent][LIDAR]),
                 bytes=frames * (_FACTS_BYTES + boxes * _BOX_BYTES)
-                + points_of(dataset, recording.token, agent) * POINT_BYTES,
+                + points_in(recording.files[agent][LIDAR]) * POINT_BYTES,
                 linked_files=len(images),
                 linked_bytes=sum(images),
             )
@@ -71,7 +71,7 @@ class OpenCood(Format):
 
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
         """Write a scenario's folder, which appears when it is whole."""
-        recording = Recording(dataset, unit.scenarios[0], self)
+        recording = Recording(dataset, unit.scenarios[0], self.agents, self.ego)
         recording.count_left_out(output)
         with output.whole_folder(f"{_SPLITS[recording.record['split']]}/{unit.name}") as folder:
             folder.write("data_protocol.yaml", _yaml(recording.protocol()))

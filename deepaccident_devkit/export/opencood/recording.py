@@ -2,28 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.export.bulk import Output
 from deepaccident_devkit.export.sensor_files import sensor_files
-from deepaccident_devkit.tables.tokens import frame_token
 from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, CHANNELS, INFRASTRUCTURE, LIDAR, VEHICLE_AGENTS
+from deepaccident_devkit.v2x.configurations import agents_of
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
-
-
-class _Chosen(Protocol):
-    """The settings that decide it."""
-
-    @property
-    def agents(self) -> tuple[str, ...]:
-        """Those to write."""
-
-    @property
-    def ego(self) -> str:
-        """The vehicle that is 1."""
 
 
 class Recording:
@@ -39,19 +28,18 @@ class Recording:
         files: agent → channel → frame → path and bytes of what is there.
     """
 
-    def __init__(self, dataset: Dataset, token: str, chosen: _Chosen) -> None:
-        """Look which files are there; raises TokenError."""
+    def __init__(self, dataset: Dataset, token: str, agents: Sequence[str], ego: str) -> None:
+        """Look which files of these agents are there; the ego is the vehicle that is 1. Raises TokenError."""
         self.dataset, self.token = dataset, token
         self.record: ScenarioRecord = dataset.scenario[dataset.getind("scenario", token)]
         self.frames = range(1, self.record["num_frames"] + 1)
-        here = [sample["agent"] for sample in dataset.samples_of(frame_token(token, 1))]
-        self.agents = [agent for agent in chosen.agents if agent in here]
-        self._absent = len(chosen.agents) - len(self.agents)
+        self.agents: list[str] = [agent for agent in agents_of(dataset, token) if agent in agents]
+        self._absent = len(agents) - len(self.agents)
         self.files = {
             agent: {channel: sensor_files(dataset, token, agent, channel) for channel in CHANNELS}
             for agent in self.agents
         }
-        order = sorted(VEHICLE_AGENTS, key=lambda agent: agent != chosen.ego)
+        order = sorted(VEHICLE_AGENTS, key=lambda agent: agent != ego)
         self.folders: dict[str, str] = {
             **{agent: str(number) for number, agent in enumerate(order, 1)},
             INFRASTRUCTURE: "-1",
