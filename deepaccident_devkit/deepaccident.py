@@ -53,6 +53,8 @@ class _Package:
 
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from deepaccident_devkit import motion, render, validation
 else:
     motion, render, validation = map(_Package, ("motion", "render", "validation"))
@@ -78,6 +80,8 @@ class DeepAccident(Dataset):
         workers: int | None = None,
         on_error: OnError = "raise",
         verbose: bool = True,  # noqa: FBT001, FBT002 - the nuScenes devkit's signature
+        *,
+        executor: Executor | None = None,
     ) -> None:
         """Open a release, indexing it first where needed.
 
@@ -89,6 +93,7 @@ class DeepAccident(Dataset):
             workers: processes to index with; None chooses by the amount of work.
             on_error: `raise` lists every broken scenario and raises; `skip` leaves them out and says so.
             verbose: whether to show a progress bar while indexing.
+            executor: any executor of `concurrent.futures` to index on, in place of own processes.
 
         Raises:
             DatarootError: the folder is missing or holds no release.
@@ -102,6 +107,7 @@ class DeepAccident(Dataset):
                 layout,
                 index_dir=None if index_dir is None else _absolute(index_dir),
                 workers=workers,
+                executor=executor,
                 on_error=on_error,
                 progress=verbose,
             )

@@ -115,7 +115,15 @@ class ResultsError(DeepAccidentError, ValueError):
 
 
 class WorkerError(DeepAccidentError, RuntimeError):
-    """A worker process was killed."""
+    """A worker was killed or cannot do the work, or no scheduler answers."""
+
+
+class SomeFailedError(DeepAccidentError, RuntimeError):
+    """Some items of bulk work failed, and the others are done; the message lists every one that failed."""
+
+
+class UnfinishedError(DeepAccidentError, RuntimeError):
+    """Shards of bulk work cannot be merged, since some are not done."""
 
 
 class MissingExtraError(DeepAccidentError, ImportError):

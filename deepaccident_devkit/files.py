@@ -15,11 +15,13 @@ import re
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
+
+from deepaccident_devkit.errors import ConfigError
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
@@ -77,7 +79,7 @@ def temporary_of(name: str) -> str | None:
     return found["name"] if found else None
 
 
-def remove_leftovers(folder: Path, *, locked: bool = False) -> None:
+def remove_leftovers(folder: Path, dead: Collection[str] = ()) -> None:
     """Remove the temporary files and folders of dead writers; what cannot be removed is left to the next time.
 
     A writer on this host is dead if no process has its number and its start time; one on another host if nothing was
@@ -85,12 +87,14 @@ def remove_leftovers(folder: Path, *, locked: bool = False) -> None:
 
     Args:
         folder: whose own entries are looked through.
-        locked: whether the caller holds a lock without which nobody may write there: then all writers are dead.
+        dead: final names whose writers are dead, on whatever host: the caller holds a lock without which nobody writes
+            these.
     """
+    beginnings = {name[:_NAME_LENGTH] for name in dead}
     with suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
             with suppress(OSError):  # another process removes it too
-                if not _is_abandoned(entry, locked=locked):
+                if temporary_of(entry.name) not in beginnings and not _is_abandoned(entry):
                     continue
                 if entry.is_dir(follow_symlinks=False):
                     shutil.rmtree(entry.path, ignore_errors=True)
@@ -111,12 +115,10 @@ def _rid_of_leftovers(folder: Path) -> None:
     remove_leftovers(folder)
 
 
-def _is_abandoned(entry: os.DirEntry[str], *, locked: bool) -> bool:
+def _is_abandoned(entry: os.DirEntry[str]) -> bool:
     found = _TEMPORARY.fullmatch(entry.name)
     if found is None or found["host"] is None:
         return False
-    if locked:
-        return True
     if found["host"] != _host():
         return time.time() - entry.stat(follow_symlinks=False).st_mtime > _ABANDONED_AFTER
     return not _is_running(int(found["process"]), found["start"])
@@ -158,24 +160,60 @@ def _start(process: int) -> str | None:
     return "" if state in "ZX" else facts[18]  # a killed process whose parent does not ask for it is there still
 
 
-def held_lock(path: Path, task: str) -> BaseFileLock:
+class SharedLock:
+    """A file's lock, held together with others who share it, and never while somebody has it alone (`held_lock`)."""
+
+    def __init__(self, path: Path, task: str, *, wait: bool) -> None:
+        """Take it, waiting as `held_lock` does; raises OSError."""
+        import fcntl
+
+        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if not wait:
+                self.release()
+                raise
+            say_waiting(path.parent, task)
+            fcntl.flock(self._file, fcntl.LOCK_SH)
+
+    def release(self) -> None:
+        """Give it back."""
+        os.close(self._file)
+
+
+def held_lock(path: Path, task: str, *, shared: bool = False, wait: bool = True) -> BaseFileLock | SharedLock:
     """The lock of a file, held until it is released or the process ends, however; its folder is made.
 
-    While another process holds it, this waits and says so: the other one does the `task`, such as `writes labels`.
+    Args:
+        path: the file, which stays.
+        task: what that process does, such as `writes labels`.
+        shared: whether others may hold it too, but nobody alone.
+        wait: whether to wait, saying so, while another process holds it.
 
     Raises:
+        BlockingIOError: another process holds it, and `wait` is false.
         OSError, NotImplementedError: the folder cannot be made or written to, or its file system has no locks.
     """
     from filelock import FileLock, Timeout
 
     path.parent.mkdir(parents=True, exist_ok=True)
+    if shared:
+        return SharedLock(path, task, wait=wait)
     lock = FileLock(path)
     try:
         lock.acquire(timeout=0)
-    except Timeout:
-        logger.warning("%s: another process %s there; waiting for it", path.parent, task)
+    except Timeout as error:
+        if not wait:
+            raise BlockingIOError(f"{path}: another process {task}") from error
+        say_waiting(path.parent, task)
         lock.acquire()
     return lock
+
+
+def say_waiting(folder: Path, task: str) -> None:
+    """Log that another process does something in a folder until which this one waits."""
+    logger.warning("%s: another process %s there; waiting for it", folder, task)
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -192,3 +230,20 @@ def is_writable_folder(path: Path) -> bool:
             return True
     except OSError:
         return False
+
+
+def writable_folder(folder: str | os.PathLike[str]) -> Path:
+    """A folder that files can be written to, made if it is not there.
+
+    Raises:
+        ConfigError: the path is empty, it or a folder above it is a file, or it may not be written to.
+    """
+    if not os.fspath(folder):
+        raise ConfigError("expected a folder to write to, found an empty path; give '.' for the current one")
+    path = Path(folder)
+    if is_writable_folder(path):
+        return path
+    for part in (path, *path.parents):
+        if os.path.isfile(part):  # noqa: PTH113 - Path.is_file raises where it may not look
+            raise ConfigError(f"{path}: no file can be written there, {part} is a file; give a folder")
+    raise ConfigError(f"{path}: no file can be written there; give a folder that you may write to")

@@ -15,6 +15,7 @@ minutes.
     deepaccident validate DATAROOT --deep     # also decodes every image and array: hours for the whole release
     deepaccident validate DATAROOT --all      # lists all findings of a scenario, not only the first eight
     deepaccident validate DATAROOT --json     # one JSON document
+    deepaccident validate DATAROOT --deep --parts found  # goes on where it was stopped
 
 ```python
 from deepaccident_devkit import DeepAccident

@@ -151,6 +151,26 @@ def test_a_bundle_with_all_there_is(bundle: Path, accidents: Path, da_motion: De
     assert not bundle.with_name("bundle.unfinished").exists()
 
 
+def test_parts_write_what_one_run_does(da_motion: DeepAccident, accidents: Path, bundle: Path, tmp_path: Path) -> None:
+    words = ("accident", da_motion.dataroot, "--results", accidents, *LIST, "--protocol", "boxes")
+    words = (*words, "--sanity", "--explain", "--include-results", "--out", tmp_path / "parts")
+    assert evaluate(*words, "--shard", "1/2").stdout == "part 1/2: 8 samples; next: the same with --merge\n"
+    done = evaluate(*words, "--shard", "2/2", "--json")
+    assert (done.stdout, done.stderr.splitlines()[-1]) == ("", "part 2/2: 0 samples; next: the same with --merge")
+    assert "samples      8 of 1 scenarios: split train" in evaluate(*words, "--merge").stdout
+    names = [path.relative_to(bundle) for path in bundle.rglob("*") if path.is_file()]
+    assert Path("report.html") in names
+    for name in names:
+        assert (tmp_path / "parts" / name).read_bytes() == (bundle / name).read_bytes(), name
+    assert [each.name for each in tmp_path.iterdir()] == ["parts"]
+
+
+@pytest.mark.parametrize("part", [("--shard", "1/2"), ("--merge",)])
+def test_parts_need_a_folder(da_motion: DeepAccident, accidents: Path, part: tuple[str, ...]) -> None:
+    done = evaluate("accident", da_motion.dataroot, "--results", accidents, *LIST, *part, status=2)
+    assert "--shard and --merge keep their counts beside the folder --out; give it" in done.output
+
+
 def test_json_is_the_summary(da_motion: DeepAccident, accidents: Path, tmp_path: Path) -> None:
     words = ("accident", da_motion.dataroot, "--results", accidents, *LIST, "--protocol", "boxes")
     done = evaluate(*words, "--by", "town", "--switch", "scoring.limit_counts=true", "--json", "--out", tmp_path / "b")

@@ -54,6 +54,7 @@ COUNTERPARTS = sorted(
 WORDS_A_MINUTE = 200
 PAGES = [TOP / "README.md", *sorted(DOCS.glob("*.md")), *sorted((TOP / "schema").glob("**/*.md"))]
 RUN_ELSEWHERE = {
+    "docs/clusters.md": "tests/engines/test_page.py",
     "docs/interactive_3d.md": "tests/unit/export/test_mcap_choices.py",
     "docs/scenarios.md": "tests/unit/synth/spec/test_catalogue.py",
     "docs/synth.md": "tests/unit/synth/test_synth_page.py",

@@ -34,3 +34,7 @@ def told_or_broken(path: str) -> None:
         raise ValueError("broken")
     time.sleep(0.2)
     Path(path).touch()
+
+
+def following(item: int) -> int:
+    return item + 1

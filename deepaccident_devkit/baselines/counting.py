@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.baselines.collisions import accidents_ahead
 from deepaccident_devkit.baselines.conditions import Condition
@@ -24,10 +24,13 @@ from deepaccident_devkit.evaluation import (
     detection_truth,
 )
 from deepaccident_devkit.motion import motion_labels
-from deepaccident_devkit.parallel import run_unordered
+from deepaccident_devkit.parallel import Places, run_unordered
 from deepaccident_devkit.taxonomy import LIDAR
 
-_BATCH: Final = 4
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+BATCH: Final = 4
 """Samples that a worker counts before it reports."""
 _DETECTION: Final = "paper"
 """The protocol of detections: all that any agent sees must be found in every row, so that rows compare."""
@@ -62,10 +65,18 @@ class Evaluators:
 
     def merge(self, other: Evaluators) -> None:
         """Take all samples of others of the same condition."""
-        self.motion.merge(other.motion)
-        self.maps.merge(other.maps)
-        self.boxes.merge(other.boxes)
-        self.detection.merge(other.detection)
+        for each in fields(self):
+            getattr(self, each.name).merge(getattr(other, each.name))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Name of an evaluator → token → counts, as JSON holds them."""
+        return {each.name: dict(getattr(self, each.name).counts) for each in fields(self)}
+
+    def add(self, counts: Mapping[str, Any]) -> None:
+        """Take what `as_dict` gave of others of the same condition; KeyError if an evaluator is missing."""
+        for each in fields(self):
+            for token, found in counts[each.name].items():
+                getattr(self, each.name).add(token, found)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,6 +101,7 @@ def counted(
     samples: Mapping[str, Sequence[Condition]],
     *,
     workers: int | None = None,
+    executor: Executor | None = None,
     progress: bool = False,
 ) -> dict[Condition, Evaluators]:
     """Evaluate samples under conditions; the numbers do not depend on the number of workers.
@@ -98,13 +110,24 @@ def counted(
         counting: how.
         samples: token → its conditions.
         workers: processes; None takes what the work is worth.
+        executor: any executor of `concurrent.futures` to run on, in place of own workers.
         progress: whether to show a bar.
     """
     items = list(samples.items())
-    jobs = [_Job(counting, tuple(items[at : at + _BATCH])) for at in range(0, len(items), _BATCH)]
+    jobs = [CountJob(counting, tuple(items[at : at + BATCH])) for at in range(0, len(items), BATCH)]
     sizes = [len(job.samples) for job in jobs]
     result: dict[Condition, Evaluators] = {}
-    done = run_unordered(_count, jobs, workers=workers, label="samples", progress=progress, sizes=sizes)
+    places = Places(reads=counting.dataset.places)
+    done = run_unordered(
+        count_samples,
+        jobs,
+        workers=workers,
+        executor=executor,
+        label="samples",
+        progress=progress,
+        sizes=sizes,
+        places=places,
+    )
     with closing(done):
         for _, part in done:
             for condition, evaluators in part.items():
@@ -113,12 +136,20 @@ def counted(
 
 
 @dataclass(frozen=True, slots=True)
-class _Job:
+class CountJob:
+    """Samples to count.
+
+    Attributes:
+        counting: how.
+        samples: each with its conditions.
+    """
+
     counting: Counting
     samples: tuple[tuple[str, Sequence[Condition]], ...]
 
 
-def _count(job: _Job) -> dict[Condition, Evaluators]:
+def count_samples(job: CountJob) -> dict[Condition, Evaluators]:
+    """The evaluators of each condition with the samples of a job."""
     result: dict[Condition, Evaluators] = {}
     for token, conditions in job.samples:
         for horizon in sorted({condition.horizon for condition in conditions}):

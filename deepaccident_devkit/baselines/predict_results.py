@@ -1,29 +1,49 @@
-"""Results files of the baselines: predictions of many samples, written like those of a model."""
+"""Results files of the baselines: predictions of many samples, written like those of a model.
+
+Each scenario's samples are results of their own at first, beside the whole: a killed run loses the scenarios at hand
+alone, and shards may be made anywhere.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import chain, groupby
 from pathlib import Path
-from typing import Any, Final, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
+from deepaccident_devkit._version import __version__
 from deepaccident_devkit.baselines.motion_models import MotionModel
 from deepaccident_devkit.baselines.predict import predict_accidents, predict_detections, predict_motion
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.errors import ConfigError, DeepAccidentError, ResultsError
 from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput
-from deepaccident_devkit.evaluation.results import ResultsTask, ResultsWriter
+from deepaccident_devkit.evaluation.results import ResultsTask, ResultsWriter, read_results
 from deepaccident_devkit.motion import MotionLabelConfig
-from deepaccident_devkit.parallel import run_unordered
+from deepaccident_devkit.parallel import (
+    MERGE,
+    Failure,
+    Part,
+    Places,
+    Shard,
+    ShardFiles,
+    check_failures,
+    check_whole,
+    mine,
+    part_of,
+    run_batch,
+)
+from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.text import choice, settle_choices
-from deepaccident_devkit.v2x import AgentConfig, Agents, Link
+from deepaccident_devkit.v2x import AgentConfig, Agents, Link, cooperating_agents
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
 
 Prediction = MotionOutput | list[Accident] | DetectedBoxes
-_BATCH: Final = 8
-"""Samples that a worker predicts before it reports."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,7 +96,7 @@ class Baseline:
         }
 
 
-def predict_results(
+def predict_results(  # noqa: PLR0913 - what, where, and on what
     dataset: Dataset,
     task: ResultsTask,
     tokens: Sequence[str],
@@ -84,11 +104,14 @@ def predict_results(
     baseline: Baseline | None = None,
     *,
     workers: int | None = None,
+    executor: Executor | None = None,
+    part: Part | str = None,
     progress: bool = False,
 ) -> Path:
     """Write a baseline's predictions of samples to a results file (of motion, a folder); returns its path.
 
-    The bytes do not depend on the number of workers.
+    The bytes do not depend on workers or parts. If a call is interrupted, the same call continues it: only the
+    scenarios at hand are lost. Complete results of the same samples and settings are left as they are.
 
     Args:
         dataset: the release.
@@ -97,48 +120,133 @@ def predict_results(
         out: the file or folder to write.
         baseline: None for a single vehicle and constant velocity.
         workers: processes; None takes what the work is worth.
+        executor: any executor of `concurrent.futures` to run on, in place of own workers.
+        part: `3/8` for the third of eight parts of the scenarios; `merge` to write the whole once all are there.
         progress: whether to show a bar.
 
     Raises:
-        ChoiceError: no such task.
-        ResultsError: a token comes twice, or the file cannot be written.
-        DeepAccidentError: a sample cannot be predicted.
-        WorkerError: a worker was killed.
+        ChoiceError: no such task or part.
+        NotAvailableError: an agent that cooperates is not in this (partial) release.
+        ResultsError: a token comes twice, something else stands at `out`, or nothing can be written.
+        SomeFailedError: samples of some scenarios cannot be predicted; the others are done.
+        UnfinishedError: `part` is `merge`, and some samples are not predicted.
+        WorkerError: a worker was killed, or cannot do the work.
     """
-    task = choice("task", task, get_args(ResultsTask))
-    chosen = baseline or Baseline()
-    config = chosen.config
-    settings: Mapping[str, Any] = (
-        {"grid": config.grid, "step": config.step * FRAME_PERIOD, "labels": "released"} if task == "motion" else {}
-    )
-    with ResultsWriter(out, task, meta=chosen.meta(), **settings) as writer:
-        jobs = [_Job(dataset, task, tuple(tokens[at : at + _BATCH]), chosen) for at in range(0, len(tokens), _BATCH)]
-        for token, prediction in _predicted(jobs, workers, progress=progress):
-            writer.add(token, prediction)
-    return Path(out)
+    part = part_of(part)
+    work = _Work(dataset, choice("task", task, get_args(ResultsTask)), baseline or Baseline())
+    path = Path(out).expanduser().absolute()
+    files, jobs = work.jobs(path, tokens)
+    if not work.is_done(path, tokens):
+        whole = work.writer(path)  # refuses what stands there
+        if part != MERGE:
+            own = mine(part, jobs)
+            for job in own:
+                cooperating_agents(dataset, job.tokens[0], work.baseline.agents)  # fails now, and not in every worker
+            places = Places(reads=dataset.places, writes=(files.folder,))
+            how: dict[str, Any] = {"workers": workers, "executor": executor, "progress": progress}
+            results = run_batch(_predict, own, label=work.task, places=places, **how)
+            check_failures([(job.scenario, result) for job, result in zip(own, results, strict=True)], str(path))
+        if isinstance(part, Shard):
+            return files.folder
+        _join(whole, jobs)
+    files.remove()
+    return path
+
+
+def is_predicted(
+    dataset: Dataset,
+    task: ResultsTask,
+    tokens: Sequence[str],
+    out: str | os.PathLike[str],
+    baseline: Baseline | None = None,
+) -> bool:
+    """Whether `predict_results` has written its results with these arguments before."""
+    return _Work(dataset, task, baseline or Baseline()).is_done(Path(out).expanduser().absolute(), tokens)
+
+
+def samples_by_scenario(tokens: Sequence[str]) -> list[tuple[str, ...]]:
+    """The samples of each scenario, in the given order; of lists in another order than a release's, runs of them."""
+    return [tuple(run) for _, run in groupby(tokens, lambda token: token.rsplit("/", 2)[0])]
+
+
+@dataclass(frozen=True, slots=True)
+class _Work:
+    """What is predicted; cheap to pickle."""
+
+    dataset: Dataset
+    task: ResultsTask
+    baseline: Baseline
+
+    @property
+    def meta(self) -> dict[str, Any]:
+        """The notes in its results."""
+        release = {"version": self.dataset.version, "index": self.dataset.tables_folder.name}
+        return {**self.baseline.meta(), "release": release, "devkit": __version__}
+
+    def jobs(self, path: Path, tokens: Sequence[str]) -> tuple[ShardFiles, list[_Job]]:
+        """One for each scenario, and the files that they write; raises ResultsError if a token comes twice."""
+        if len(set(tokens)) < len(tokens):
+            twice = next(token for token, often in Counter(tokens).items() if often > 1)
+            raise ResultsError(f"{path}: {twice}: comes twice; give each sample once")
+        scenarios = samples_by_scenario(tokens)
+        decisive = {"baseline": repr(self.baseline), "task": self.task, "tokens": list(tokens), "meta": self.meta}
+        files = ShardFiles(path, digest_of(decisive), "" if self.task == "motion" else ".json")
+        places = [files.path(Shard(number, len(scenarios))) for number in range(1, len(scenarios) + 1)]
+        return files, [_Job(self, each, place) for each, place in zip(scenarios, places, strict=True)]
+
+    def is_done(self, path: Path, tokens: Sequence[str]) -> bool:
+        """Whether its results of these samples are there."""
+        try:
+            results = read_results(path)
+        except ResultsError:  # nothing, or something else
+            return False
+        return (results.task, results.meta, results.tokens) == (self.task, self.meta, tuple(tokens))
+
+    def writer(self, path: Path) -> ResultsWriter:
+        """A writer of its results; raises ResultsError if something stands there."""
+        if self.task != "motion":
+            return ResultsWriter(path, self.task, meta=self.meta)
+        config = self.baseline.config
+        step = config.step * FRAME_PERIOD
+        return ResultsWriter(path, self.task, meta=self.meta, grid=config.grid, step=step, labels="released")
 
 
 @dataclass(frozen=True, slots=True)
 class _Job:
-    dataset: Dataset
-    task: ResultsTask
+    """The samples of a scenario, and where their results are kept until all are there."""
+
+    work: _Work
     tokens: tuple[str, ...]
-    baseline: Baseline
+    path: Path
+
+    @property
+    def scenario(self) -> str:
+        return self.tokens[0].rsplit("/", 2)[0]
 
 
-def _predict(job: _Job) -> list[Prediction]:
-    return [job.baseline.predict(job.dataset, job.task, token) for token in job.tokens]
+def _predict(job: _Job) -> Failure | None:
+    """Write the results of a scenario, unless they are there; what cannot be written ends it all."""
+    work = job.work
+    if job.path.exists():
+        return None
+    try:
+        with work.writer(job.path) as writer:
+            for token in job.tokens:
+                writer.add(token, work.baseline.predict(work.dataset, work.task, token))
+    except ResultsError:
+        if not job.path.exists():  # else another process has just written the same
+            raise
+    except DeepAccidentError as error:
+        return Failure(str(error))
+    return None
 
 
-def _predicted(jobs: Sequence[_Job], workers: int | None, *, progress: bool) -> Iterator[tuple[str, Prediction]]:
-    """Tokens and predictions in the order of the jobs."""
-    waiting: dict[int, list[Prediction]] = {}
-    following = 0
-    sizes = [len(job.tokens) for job in jobs]
-    done = run_unordered(_predict, jobs, workers=workers, label="samples", progress=progress, sizes=sizes)
-    with closing(done):
-        for position, predictions in done:
-            waiting[position] = predictions
-            while following in waiting:
-                yield from zip(jobs[following].tokens, waiting.pop(following), strict=True)
-                following += 1
+def _join(whole: ResultsWriter, jobs: Sequence[_Job]) -> None:
+    """Write the results of all scenarios as one; raises UnfinishedError if some are missing."""
+    there = chain.from_iterable(job.tokens for job in jobs if job.path.exists())
+    check_whole(list(chain.from_iterable(job.tokens for job in jobs)), set(there), whole.path)
+    with whole:
+        for job in jobs:
+            results = read_results(job.path)
+            for token in job.tokens:
+                whole.add(token, results.prediction(token))

@@ -15,9 +15,12 @@ import click
 from deepaccident_devkit.cli.groups import ModuleVerbs
 from deepaccident_devkit.cli.interruption import run_interruptibly
 from deepaccident_devkit.deprecations import DEPRECATED
-from deepaccident_devkit.errors import DeepAccidentError
+from deepaccident_devkit.errors import DeepAccidentError, SomeFailedError
 
 _ERROR_STATUS = 2
+_FINDINGS_STATUS = 1
+_OF_DASK = ("distributed", "tornado", "asyncio")
+"""Loggers of its parts."""
 
 
 _VERBS = (
@@ -63,13 +66,15 @@ def deepaccident(context: click.Context, version: bool, every: bool) -> None:
 
 def main() -> None:
     """Run the command line; errors that the user can mend become one message and exit status 2."""
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    shown = logging.StreamHandler()
+    shown.addFilter(lambda record: record.name.partition(".")[0] not in _OF_DASK)  # its errors come as exceptions too
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s", handlers=[shown])
     _show_deprecations()
     try:
         run_interruptibly(deepaccident)
     except (DeepAccidentError, OSError) as error:  # an OSError: a full disk, a folder without permission
         click.echo(f"error: {error}", err=True)
-        sys.exit(_ERROR_STATUS)
+        sys.exit(_FINDINGS_STATUS if isinstance(error, SomeFailedError) else _ERROR_STATUS)
 
 
 def _show_deprecations() -> None:

@@ -4,24 +4,29 @@ from typing import Any, get_args
 
 import click
 
-from deepaccident_devkit.baselines import MOTION_MODELS, Baseline, StudyConfig, predict_results, v2x_study
+from deepaccident_devkit.baselines import MOTION_MODELS, Baseline, StudyConfig, predict_results
 from deepaccident_devkit.baselines.figures import save_study
+from deepaccident_devkit.baselines.predict_results import is_predicted, samples_by_scenario
+from deepaccident_devkit.baselines.study_parts import StudyInParts
 from deepaccident_devkit.cli.evaluate_options import resamples_parameter
 from deepaccident_devkit.cli.options import (
     WordChoice,
     cooperating_parameter,
+    engine_of,
     names_or_configuration,
+    part_parameters,
     refuse_unused,
     release_parameters,
+    say_part_done,
 )
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS
 from deepaccident_devkit.evaluation.results import ResultsTask
-from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.files import writable_folder, write_bytes
 from deepaccident_devkit.motion.sample_lists import Scope, no_samples_text
-from deepaccident_devkit.statistics import writable_folder
+from deepaccident_devkit.parallel import Part, Shard, mine
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x import Link
 
@@ -54,6 +59,7 @@ def baseline() -> None:
 
 @baseline.command()
 @release_parameters
+@part_parameters
 @_SPLIT
 @click.option(
     "--task",
@@ -92,7 +98,7 @@ def baseline() -> None:
 def predict(split: str, tasks: tuple[str, ...], purpose: Any, scope: Scope, out: str, **options: Any) -> None:
     """Write results files of a baseline for one split of the release in DATAROOT.
 
-    The files are motion/, accident.json and detection.json.
+    The files are motion/, accident.json and detection.json. If the command is interrupted, the same command continues.
     """
     noise, latency, seed = options.pop("pose_noise"), options.pop("latency"), options.pop("seed")
     link = Link(latency=latency, pose_noise=noise or None, seed=seed) if noise or latency else None
@@ -103,6 +109,7 @@ def predict(split: str, tasks: tuple[str, ...], purpose: Any, scope: Scope, out:
         refuse_unused("without --pose-noise", "seed")
     if purpose == "all":
         refuse_unused("with --samples all, which are those of all scenarios", "scope")
+    part: Part = options.pop("part")
     chosen = Baseline(link=link, **{name: options.pop(name) for name in ("agents", "model", "horizon")})
     folder = writable_folder(out)
     dataset = DeepAccident(**options)
@@ -110,15 +117,22 @@ def predict(split: str, tasks: tuple[str, ...], purpose: Any, scope: Scope, out:
     tokens = dataset.samples(split, purpose, "released" if released else "paper", horizon=chosen.horizon, scope=scope)
     if not tokens:
         raise NotAvailableError(f"{split}: has no samples to predict; {no_samples_text(dataset, split, scope)}")
-    for task in get_args(ResultsTask):
-        if task in tasks or "all" in tasks:
-            path = folder / _FILES[task]
-            predict_results(dataset, task, tokens, path, chosen, workers=options["workers"], progress=True)
-            click.echo(f"{task}: {len(tokens):,} samples in {path}")
+    run = {**engine_of(options), "part": part, "progress": True}
+    wanted = [task for task in get_args(ResultsTask) if task in tasks or "all" in tasks]
+    for task in wanted:
+        path = folder / _FILES[task]
+        kept = is_predicted(dataset, task, tokens, path, chosen)
+        predict_results(dataset, task, tokens, path, chosen, **run)
+        if kept or not isinstance(part, Shard):
+            click.echo(f"{task}: {len(tokens):,} samples in {path}{', which were there already' if kept else ''}")
+    if isinstance(part, Shard):
+        own = mine(part, samples_by_scenario(tokens))
+        say_part_done(part, f"{sum(map(len, own)):,} samples of {len(own):,} scenarios, {', '.join(wanted)}")
 
 
 @baseline.command()
 @release_parameters
+@part_parameters
 @_SPLIT
 @_MODEL
 @click.option(
@@ -149,15 +163,23 @@ def predict(split: str, tasks: tuple[str, ...], purpose: Any, scope: Scope, out:
 def v2x(split: str, egos: tuple[str, ...], seeds: tuple[int, ...], resamples: int, out: str, **options: Any) -> None:
     """Compare how well seven sets of agents predict the accidents of the release in DATAROOT.
 
-    Print the tables, and write one CSV file and one picture per table.
+    Print the tables, and write one CSV file and one picture per table. If the command is interrupted, the same command
+    continues.
     """
+    part: Part = options.pop("part")
     how = {name: options.pop(name) for name in ("model", "scope", "protocol", "quick")}
     usual = StudyConfig()
     how |= {"egos": egos or usual.egos, "seeds": seeds or usual.seeds, "resampling": Resampling(resamples=resamples)}
     config = StudyConfig(**how)
     folder = writable_folder(out)
-    study = v2x_study(DeepAccident(**options), split, config, workers=options["workers"], progress=True)
+    work = StudyInParts(DeepAccident(**options), folder, split, config)
+    samples = work.count(part, **engine_of(options), progress=True)
+    if isinstance(part, Shard):
+        say_part_done(part, f"{samples:,} samples")
+        return
+    study = work.result()
     click.echo(study.to_text())
     written = [*study.to_csv(folder), *save_study(study, folder), folder / "v2x_study.json"]
     write_bytes(written[-1], study.to_json().encode())
+    work.remove()
     click.echo(f"written: {len(written)} files in {folder}")

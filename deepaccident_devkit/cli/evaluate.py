@@ -16,7 +16,14 @@ from deepaccident_devkit.cli.evaluate_options import (
     selection_parameters,
     switches_of,
 )
-from deepaccident_devkit.cli.options import WordChoice, refuse_unused, release_parameters
+from deepaccident_devkit.cli.options import (
+    WordChoice,
+    engine_of,
+    part_parameters,
+    refuse_unused,
+    release_parameters,
+    say_part_done,
+)
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation import Resampling
@@ -28,6 +35,7 @@ from deepaccident_devkit.evaluation.runs import (
     breakdowns_of,
     checked_target,
     evaluate_results,
+    evaluate_shard,
     explanation_checkpoint,
     save_run,
     summary_text,
@@ -37,6 +45,7 @@ from deepaccident_devkit.evaluation.runs.predictors import Chooser, chosen_thres
 from deepaccident_devkit.evaluation.runs.sanity import check_sanity
 from deepaccident_devkit.evaluation.runs.setups import TASK_PROTOCOLS, EvaluationSetup, TaskName
 from deepaccident_devkit.evaluation.runs.text import SHOWN_BREAKDOWNS
+from deepaccident_devkit.parallel import MERGE, Part, Shard
 from deepaccident_devkit.render.evaluation import save_report
 
 _HELP = {
@@ -45,7 +54,7 @@ _HELP = {
     "detection": "Evaluate detected boxes: AP and errors.",
     "warning": "Evaluate warnings: how early they come before accidents, and how often an alarm is false.",
 }
-_RELEASE = ("dataroot", "version", "index_dir", "workers", "on_error")
+_RELEASE = ("dataroot", "version", "index_dir", "on_error")
 
 
 @click.group()
@@ -90,6 +99,7 @@ def _task_verb(task: TaskName) -> click.Command:
         task, help=f"{_HELP[task]}\n\nThe predictions are compared with the labels of the release in DATAROOT."
     )
     @release_parameters
+    @part_parameters
     @click.option(
         "--results", required=True, type=click.Path(path_type=Path), help="Results file or folder with the predictions."
     )
@@ -147,29 +157,28 @@ def _task_verb(task: TaskName) -> click.Command:
     return verb
 
 
-def _evaluate(setup: EvaluationSetup, results: Path, *, by: tuple[str, ...], as_json: bool, **options: Any) -> None:
+def _evaluate(
+    setup: EvaluationSetup, results: Path, *, by: tuple[str, ...], as_json: bool, part: Part, **options: Any
+) -> None:
     out: Path | None = options["out"]
-    _refuse_unused(setup, options)
+    _refuse_unused(setup, options, part)
     if out is not None:
         checked_target(out, overwrite=options["overwrite"])  # before the release is indexed
     opened = read_results(results)
-    dataset = DeepAccident(**{name: options[name] for name in _RELEASE})
+    dataset = DeepAccident(**{name: options[name] for name in _RELEASE}, **engine_of(options))
     selection = selection_of(setup, options)
     if options.get("threshold_from") is not None:
         threshold = chosen_threshold(options["threshold_from"], options["threshold_by"], selection.tokens(dataset))
         setup = replace(setup, switches={**setup.switches, "threshold": threshold})
-    run = evaluate_results(
-        dataset,
-        opened,
-        setup,
-        selection,
-        allow_partial=options["allow_partial"],
-        workers=options["workers"],
-        out=out,
-        progress=True,
-    )
+    engine = engine_of(options)
+    how = {**engine, "allow_partial": options["allow_partial"], "out": out, "progress": True}
+    if isinstance(part, Shard):
+        counted = evaluate_shard(dataset, opened, setup, selection, part, **how)
+        say_part_done(part, f"{len(counted)} samples", err=as_json)
+        return
+    run = evaluate_results(dataset, opened, setup, selection, merge=part == MERGE, **how)
     resampling = Resampling(resamples=options["resamples"])
-    run = run.broken_down((EVERYTHING, *(by or breakdowns_of(setup.task))), resampling, workers=options["workers"])
+    run = run.broken_down((EVERYTHING, *(by or breakdowns_of(setup.task))), resampling, **engine)
     run, texts = _examined(run, dataset, opened, options)
     summary = run.summary()
     shown = summary_text(summary, by or SHOWN_BREAKDOWNS)
@@ -180,9 +189,11 @@ def _evaluate(setup: EvaluationSetup, results: Path, *, by: tuple[str, ...], as_
         click.echo(f"written: {save_run(run, out, **kept, extras=[report])}", err=as_json)
 
 
-def _refuse_unused(setup: EvaluationSetup, options: dict[str, Any]) -> None:
-    """End with a usage error if an option was given that changes nothing in this evaluation."""
+def _refuse_unused(setup: EvaluationSetup, options: dict[str, Any], part: Part) -> None:
+    """End with a usage error if an option was given that changes nothing in this evaluation, or lacks another."""
     if options["out"] is None:
+        if part is not None:
+            raise click.UsageError("--shard and --merge keep their counts beside the folder --out; give it")
         refuse_unused("without --out", "overwrite", "include_results")
     if options.get("threshold_from") is None:
         refuse_unused("without --threshold-from", "threshold_by")
@@ -198,16 +209,15 @@ def _examined(
     run: EvaluationRun, dataset: DeepAccident, results: Results, options: dict[str, Any]
 ) -> tuple[EvaluationRun, list[str]]:
     """The run with the requested checks (sanity, explanation), and their texts."""
-    texts, tokens, workers = [], sorted(run.evaluator.tokens), options["workers"]
+    texts, tokens = [], sorted(run.evaluator.tokens)
+    engine = engine_of(options)
     if options["sanity"]:
-        report = check_sanity(dataset, results, run.setup, tokens, workers=workers)
+        report = check_sanity(dataset, results, run.setup, tokens, **engine)
         run = replace(run, sanity=report.as_dict())
         texts.append(report.to_text())
     if options["explained"]:
         checkpoint = None if options["out"] is None else explanation_checkpoint(run, options["out"])
-        explanation = explain(
-            dataset, results, run.setup, tokens, workers=workers, progress=True, checkpoint=checkpoint
-        )
+        explanation = explain(dataset, results, run.setup, tokens, progress=True, checkpoint=checkpoint, **engine)
         run = replace(run, explanation=explanation.as_dict())
         texts.append(explanation.to_text())
     mark = "" if run.partial is None else f"{run.partial.text()}\n"

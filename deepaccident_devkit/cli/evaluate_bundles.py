@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from deepaccident_devkit.cli.evaluate_options import resamples_parameter, selection_of, selection_parameters
-from deepaccident_devkit.cli.options import WordChoice, on_error_parameter, refuse_unused
+from deepaccident_devkit.cli.options import WordChoice, engine_of, engine_parameters, on_error_parameter, refuse_unused
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.results import read_results
@@ -27,7 +27,6 @@ _FINDINGS_STATUS = 1
 _OF_RELEASE = ("version", "split", "samples", "scope", "agents", "horizon", "on_error")
 _KINDS = (".csv", ".json", *PICTURE_SUFFIXES)
 _DPI = 130
-_workers = click.option("--workers", type=click.IntRange(min=1), help="Number of processes to use.")
 
 
 @click.command()
@@ -37,9 +36,9 @@ _workers = click.option("--workers", type=click.IntRange(min=1), help="Number of
 )
 @click.option("--version", type=WordChoice(VERSIONS), default="v1", show_default=True, help="Version of the release.")
 @selection_parameters
-@_workers
+@engine_parameters
 @on_error_parameter
-def validate(results: Path, dataroot: Path | None, version: str, workers: int | None, **options: Any) -> None:
+def validate(results: Path, dataroot: Path | None, version: str, **options: Any) -> None:
     """Check every entry of the results file or folder RESULTS, and print a summary.
 
     With --dataroot, also repeat the warnings of `evaluate … --sanity`.
@@ -47,19 +46,19 @@ def validate(results: Path, dataroot: Path | None, version: str, workers: int | 
     """
     if dataroot is None:
         refuse_unused("without --dataroot", *_OF_RELEASE)
-    opened = read_results(results)
-    opened.check(workers=workers, progress=True)
+    opened, engine = read_results(results), engine_of(options)
+    opened.check(**engine, progress=True)
     click.echo(results_text(opened))
     if dataroot is None:
         return
-    dataset = DeepAccident(version, dataroot, workers=workers, on_error=options["on_error"])
+    dataset = DeepAccident(version, dataroot, on_error=options["on_error"], **engine)
     protocol = "boxes" if opened.task == "accident" else "released"  # the one that takes explicit accidents
     setup = EvaluationSetup(task=opened.task, protocol=protocol, horizon=options["horizon"])
     selection = selection_of(setup, options)
     covered = coverage(dataset, opened.tokens, selection)
     click.echo(f"{selection.text()}: {covered.to_text()}")
     shared = sorted(set(opened.tokens).intersection(selection.tokens(dataset)))
-    warnings = check_sanity(dataset, opened, setup, shared, workers=workers).warnings_text() if shared else ""
+    warnings = check_sanity(dataset, opened, setup, shared, **engine).warnings_text() if shared else ""
     if warnings:
         click.echo(warnings)
     if not covered.is_complete:
@@ -78,7 +77,7 @@ def validate(results: Path, dataroot: Path | None, version: str, workers: int | 
     type=click.Path(path_type=Path),
     help="Folder of the index.  [default: as it is, or else in the user's cache]",
 )
-@_workers
+@engine_parameters
 @on_error_parameter
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
 def verify(
@@ -87,9 +86,9 @@ def verify(
     results: Path | None,
     split: str | None,
     index_dir: Path | None,
-    workers: int | None,
     on_error: OnError,
     as_json: bool,
+    **engine: Any,
 ) -> None:
     """Repeat the evaluation in the folder DIR and list all differences.
 
@@ -102,8 +101,8 @@ def verify(
     check_repeated(bundle, {"dataroot": dataroot, "results": results, "split": split})
     layout = find_release((dataroot or bundle.dataroot).absolute(), bundle.release_version)
     place = index_dir or place_outside(layout)
-    dataset = DeepAccident(layout.version, layout.root, place, workers=workers, on_error=on_error)
-    verification = verify_bundle(folder, dataset, results=results, split=split, workers=workers, progress=True)
+    dataset = DeepAccident(layout.version, layout.root, place, on_error=on_error, **engine)
+    verification = verify_bundle(folder, dataset, results=results, split=split, progress=True, **engine)
     click.echo(json.dumps(verification.as_dict(), indent=1) if as_json else verification.to_text())
     if not verification.is_same:
         sys.exit(_FINDINGS_STATUS)

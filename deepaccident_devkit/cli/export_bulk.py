@@ -10,11 +10,14 @@ from deepaccident_devkit.cli.options import (
     WordChoice,
     agent_names,
     agents_parameter,
+    engine_of,
+    part_parameters,
     release_parameters,
     where_parameter,
 )
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.export.bulk import Exported, Format, Link, Plan, export_release
+from deepaccident_devkit.parallel import Part, Shard
 
 Verb = TypeVar("Verb", bound=Callable[..., Any])
 _OPTIONS = (
@@ -36,10 +39,10 @@ _OPTIONS = (
 
 
 def export_parameters(verb: Verb) -> Verb:
-    """Give a verb the arguments of a release, and --out, --split, --where, --agents, --link and --dry-run."""
+    """Give a verb the arguments of a release and of parts, --out, --split, --where, --agents, --link and --dry-run."""
     for option in reversed(_OPTIONS):
         verb = option(verb)
-    return release_parameters(verb)
+    return release_parameters(part_parameters(verb))
 
 
 def run_export(
@@ -52,15 +55,17 @@ def run_export(
     agents: tuple[str, ...],
     link: Link,
     dry_run: bool,
-    **release: Any,
+    **options: Any,
 ) -> Exported:
     """Export in a format with its `own` settings; says how much it will be, then what was written and left out."""
+    part: Part = options.pop("part")
     form = kind(split=split, where=where, agents=agent_names(agents), link=link, **own)  # before the release is indexed
     done = export_release(
-        DeepAccident(**release),
+        DeepAccident(**options),
         out,
         form,
-        workers=release["workers"],
+        **engine_of(options),
+        part=part,
         progress=True,
         dry_run=dry_run,
         on_plan=_say_plan,
@@ -69,8 +74,9 @@ def run_export(
         return done
     tally = done.tally
     linked = ", ".join(f"{count:,} files as {_WAYS[way]}" for way, count in sorted(tally.linked.items()))
+    whose = f"part {part} of " if isinstance(part, Shard) else ""
     click.echo(
-        f"{done.folder}: {tally.files:,} files written ({size_text(tally.bytes)})"
+        f"{whose}{done.folder}: {tally.files:,} files written ({size_text(tally.bytes)})"
         f"{f', {linked}' if linked else ''}; {done.written} written now, {done.kept} were there already"
     )
     for what, count in sorted(tally.left_out.items()):

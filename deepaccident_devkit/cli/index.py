@@ -1,13 +1,15 @@
 """`deepaccident index`: make or refresh the index ahead of time, look at it, remove it."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 
 from deepaccident_devkit.cli.groups import VerbGroup
-from deepaccident_devkit.cli.options import WordChoice, release_parameters
+from deepaccident_devkit.cli.options import WordChoice, part_parameters, release_parameters, say_part_done
+from deepaccident_devkit.parallel import Part, Shard
 from deepaccident_devkit.release import find_release
-from deepaccident_devkit.tables import Tables, clear_index, index_report, open_index
+from deepaccident_devkit.tables import Tables, clear_index, index_report, index_shard, open_index, open_merged_index
 from deepaccident_devkit.taxonomy import VERSIONS, OnError
 
 _check = click.option(
@@ -17,19 +19,17 @@ _check = click.option(
 
 @click.group(cls=VerbGroup)
 @release_parameters
+@part_parameters
 @_check
-def index(
-    dataroot: Path, version: str, index_dir: Path | None, workers: int | None, on_error: OnError, check: bool
-) -> None:
+def index(dataroot: Path, version: str, on_error: OnError, check: bool, part: Part, **options: Any) -> None:
     """Make or update the index of the release in DATAROOT, and print where it is."""
-    made = open_index(
-        find_release(dataroot, version),
-        index_dir=index_dir,
-        workers=workers,
-        on_error=on_error,
-        progress=True,
-        check_files=check,
-    )
+    layout, how = find_release(dataroot, version), {**options, "check_files": check, "progress": True}
+    if isinstance(part, Shard):
+        done = index_shard(layout, part, **how)
+        broken = sum(bool(each.messages) for each in done)
+        say_part_done(part, f"{len(done)} scenarios, {broken} of them broken")
+        return
+    made = (open_index if part is None else open_merged_index)(layout, on_error=on_error, **how)
     tables = Tables(made.tables_folder)
     counts = ", ".join(f"{len(tables.table(name)):,} {name}s" for name in ("scenario", "sample", "annotation"))
     click.echo(f"{made.tables_folder}: {counts}")

@@ -1,14 +1,17 @@
 """The arguments that every verb on a release takes, the same for all verbs."""
 
+import functools
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import click
 from click.core import ParameterSource
 
 from deepaccident_devkit.deprecations import warn_deprecated
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.parallel import MERGE, Part, Shard, cluster_executor
 from deepaccident_devkit.taxonomy import AGENTS, VERSIONS
 from deepaccident_devkit.text import choice, meant_text
 from deepaccident_devkit.v2x import AGENT_SETS, AVAILABLE
@@ -55,6 +58,19 @@ _VERSION = click.option(
     "--version", type=WordChoice(VERSIONS), default="v1", show_default=True, help="Version of the release."
 )
 _WORKERS = click.option("--workers", type=click.IntRange(min=1), help="Number of processes to use.")
+_ENGINE = (
+    _WORKERS,
+    click.option(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Run on this dask scheduler; or mpi: on all ranks (docs/clusters.md).",
+    ),
+    click.option(
+        "--scheduler-file",
+        type=click.Path(path_type=Path),
+        help="File that a dask scheduler wrote its address into, in place of --scheduler.",
+    ),
+)
 _INDEX_DIR = click.option("--index-dir", type=click.Path(path_type=Path), help="Folder of the index.")
 _UNUSED = tuple(
     click.option(name, hidden=True, expose_value=False, callback=_tell_unused) for name in ("--index-dir", "--on-error")
@@ -62,18 +78,77 @@ _UNUSED = tuple(
 
 
 def release_parameters(verb: Verb) -> Verb:
-    """Give a verb DATAROOT, --version, --index-dir, --workers and --on-error."""
-    return _DATAROOT(_VERSION(_INDEX_DIR(_WORKERS(on_error_parameter(verb)))))
+    """Give a verb DATAROOT, --version, --index-dir, --on-error and what `engine_parameters` gives."""
+    return _DATAROOT(_VERSION(_INDEX_DIR(engine_parameters(on_error_parameter(verb)))))
+
+
+def engine_parameters(verb: Verb) -> Verb:
+    """Give a verb `workers`, and as `executor` that of --scheduler or --scheduler-file, which is open while it runs."""
+
+    @functools.wraps(verb)
+    def run(*arguments: Any, scheduler: str | None, scheduler_file: Path | None, **options: Any) -> Any:
+        if scheduler is not None and scheduler_file is not None:
+            raise click.UsageError("--scheduler and --scheduler-file name the same; give one of them")
+        if scheduler or scheduler_file:
+            refuse_unused("with a scheduler, which has workers of its own", "workers")
+        with cluster_executor(scheduler, scheduler_file) as executor:
+            if executor is not None:  # workers have working folders of their own
+                options = {name: each.absolute() if isinstance(each, Path) else each for name, each in options.items()}
+            return verb(*arguments, executor=executor, **options)
+
+    for option in reversed(_ENGINE):
+        run = option(run)
+    return cast("Verb", run)
+
+
+def part_parameters(verb: Verb) -> Verb:
+    """Give a verb `part`: what --shard and --merge ask for (`parallel.Part`)."""
+
+    @functools.wraps(verb)
+    def run(*arguments: Any, shard: Part, merge: bool, **options: Any) -> Any:
+        if merge and shard is not None:
+            raise click.UsageError("--merge puts all shards together; leave --shard out")
+        return verb(*arguments, part=MERGE if merge else shard, **options)
+
+    options = (
+        click.option(
+            "--shard",
+            callback=_shard,
+            metavar="K/N",
+            help="Do part K of N, for job arrays: run all N, then the same command with --merge.",
+        ),
+        click.option("--merge", is_flag=True, help="Put together what all shards made."),
+    )
+    for option in reversed(options):
+        run = option(run)
+    return cast("Verb", run)
+
+
+def engine_of(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Of a verb's options, those that say what it runs on."""
+    return {name: options[name] for name in ("workers", "executor")}
+
+
+def say_part_done(part: Shard, what: str, *, err: bool = False) -> None:
+    """Say what a shard has done, and what comes after all of them."""
+    click.echo(f"part {part}: {what}; next: the same with --merge", err=err)
+
+
+def _shard(context: click.Context, parameter: click.Parameter, value: str | None) -> Shard | None:
+    try:
+        return None if value is None else Shard.parse(value)
+    except ChoiceError as error:
+        raise click.BadParameter(str(error), context, parameter) from error
 
 
 def files_parameters(verb: Verb) -> Verb:
-    """Give a verb that reads files and not the index DATAROOT, --version and --workers.
+    """Give a verb that reads files and not the index DATAROOT, --version and what `engine_parameters` gives.
 
     It takes the other options of a release too, as all verbs do, but does not offer them.
     """
     for parameter in _UNUSED:
         verb = parameter(verb)
-    return _DATAROOT(_VERSION(_WORKERS(verb)))
+    return _DATAROOT(_VERSION(engine_parameters(verb)))
 
 
 def where_parameter(verb: Verb) -> Verb:

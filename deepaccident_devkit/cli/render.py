@@ -44,7 +44,7 @@ from deepaccident_devkit.taxonomy import Frame
 from deepaccident_devkit.v2x import Link
 from deepaccident_devkit.v2x.collisions import default_scenario
 
-_RELEASE = ("dataroot", "version", "index_dir", "workers", "on_error")
+_RELEASE = ("dataroot", "version", "index_dir", "workers", "executor", "on_error")
 _logger = logging.getLogger(__name__)
 _OUT = f"File to write ({', '.join(PICTURE_SUFFIXES)}), or a folder for several pictures."
 
@@ -382,6 +382,7 @@ def video(
         agents=names_or_configuration(agents),
         layers=cast(list[Layer] | None, _words(layers)),
         workers=release["workers"],
+        executor=release["executor"],
         **options,
     )
     click.echo(f"written: {path}, {path.stat().st_size / 1e6:.1f} MB")

@@ -4,15 +4,29 @@ from typing import Any, get_args
 
 import click
 
-from deepaccident_devkit.cli.options import WordChoice, release_parameters, where_parameter
+from deepaccident_devkit.cli.options import (
+    WordChoice,
+    engine_of,
+    part_parameters,
+    release_parameters,
+    say_part_done,
+    where_parameter,
+)
 from deepaccident_devkit.deepaccident import DeepAccident
-from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.files import writable_folder, write_bytes
+from deepaccident_devkit.parallel import Part, Shard
 from deepaccident_devkit.render.statistics import PictureFormat, save_statistics
-from deepaccident_devkit.statistics import dataset_statistics, writable_folder
+from deepaccident_devkit.statistics import (
+    dataset_statistics,
+    merged_statistics,
+    remove_shards,
+    statistics_shard,
+)
 
 
 @click.command()
 @release_parameters
+@part_parameters
 @where_parameter
 @click.option(
     "--out", type=click.Path(), help="Folder to write statistics.json, one CSV file per table, and figures into."
@@ -26,7 +40,12 @@ from deepaccident_devkit.statistics import dataset_statistics, writable_folder
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
 def stats(
-    where: tuple[str, ...], out: str | None, formats: tuple[PictureFormat, ...], as_json: bool, **release: Any
+    where: tuple[str, ...],
+    out: str | None,
+    formats: tuple[PictureFormat, ...],
+    as_json: bool,
+    part: Part,
+    **release: Any,
 ) -> None:
     """Print the paper's statistics of the release in DATAROOT by split: scenarios and their ends, actors, boxes.
 
@@ -34,16 +53,27 @@ def stats(
     """
     if formats and out is None:
         raise click.UsageError("--format is for figures; give --out FOLDER too")
+    if part is not None and out is None:
+        raise click.UsageError("--shard and --merge need a folder, beside which the parts lie; give --out FOLDER too")
     dataset = DeepAccident(**release)
+    how = engine_of(release)
     chosen = dataset.find(*where) if where else None
     if out is not None and chosen == []:
         raise click.UsageError("no scenario matches --where, so there is nothing to write; change it or omit --out")
-    statistics = dataset_statistics(dataset, chosen)
     folder = None if out is None else writable_folder(out)
+    if folder and isinstance(part, Shard):
+        count = statistics_shard(dataset, part, folder, chosen, **how)
+        say_part_done(part, f"{count} scenarios")
+        return
+    if folder and part is not None:
+        statistics = merged_statistics(dataset, folder, chosen)
+    else:
+        statistics = dataset_statistics(dataset, chosen, **how)
     click.echo(statistics.to_json() if as_json else statistics.to_text())
     if folder:
         written = statistics.to_csv(folder)
         written.append(folder / "statistics.json")
         write_bytes(written[-1], statistics.to_json().encode())
         written += save_statistics(statistics, folder, formats or get_args(PictureFormat))
+        remove_shards(dataset, folder, chosen)
         click.echo(f"written: {len(written)} files in {folder}", err=as_json)

@@ -6,8 +6,16 @@ from typing import Any, get_args
 
 import click
 
-from deepaccident_devkit.cli.options import WordChoice, pixel_size, refuse_unused
+from deepaccident_devkit.cli.options import (
+    WordChoice,
+    engine_parameters,
+    part_parameters,
+    pixel_size,
+    refuse_unused,
+    say_part_done,
+)
 from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.parallel import Shard
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.synth.checking import checked_text
 from deepaccident_devkit.synth.config import IMAGE_SIZE, RELEASED_IMAGE_SIZE
@@ -18,7 +26,7 @@ from deepaccident_devkit.taxonomy import Layout
 _DEFAULTS = SynthConfig()
 _OF_FILES = (
     *("scenarios", "image_size", "layout", "no_sensors", "unlabelled_test", "exact", "for_released_code"),
-    *("unplanned", "workers"),
+    *("unplanned", "workers", "scheduler", "scheduler_file", "shard", "merge"),
 )
 """Options of what is written."""
 _FAULTY = 1
@@ -113,12 +121,8 @@ def _show_design(context: click.Context, _parameter: click.Parameter, number: in
     type=WordChoice(get_args(View)),
     help="hidden: a house at the corner hides the two vehicles that will collide from each other.",
 )
-@click.option(
-    "--workers",
-    type=click.IntRange(min=1),
-    default=None,
-    help="Number of processes to use.  [default: chosen by the amount of work]",
-)
+@engine_parameters
+@part_parameters
 @click.option(
     "--list-designs",
     is_flag=True,
@@ -136,13 +140,12 @@ def _show_design(context: click.Context, _parameter: click.Parameter, number: in
     help="Print the scenario file of a design, as a start for your own, and stop.",
 )
 @click.pass_context
-def synth(
-    context: click.Context, /, out: Path | None, *, no_sensors: bool, check: bool, workers: int | None, **options: Any
-) -> None:
+def synth(context: click.Context, /, out: Path | None, *, no_sensors: bool, check: bool, **options: Any) -> None:
     """Make a complete synthetic release in the new folder OUT.
 
     If a run is interrupted, the same command continues it.
     """
+    how = {name: options.pop(name) for name in ("workers", "executor", "part")}
     if check:
         _check(context, out, options)
         return
@@ -153,7 +156,11 @@ def synth(
     config = SynthConfig(sensors=not no_sensors, **options)
     if no_sensors and not has_embree():
         click.echo("slow without the package embreex; in a checkout: pip install '.[synth]'", err=True)
-    made = make_release(out, config, workers=workers, progress=True)
+    made = make_release(out, config, progress=True, **how)
+    if isinstance(how["part"], Shard):
+        own = len(how["part"].of(range(config.scenarios)))
+        say_part_done(how["part"], f"{own} of {config.scenarios} scenarios")
+        return
     scenarios = f"{config.scenarios} scenario{'s' if config.scenarios > 1 else ''}"
     frames = "" if config.frames is None else f" of {config.frames} frame{'s' if config.frames > 1 else ''}"
     click.echo(f"{made}: {scenarios}{frames} with five agents, layout {config.layout}")

@@ -11,12 +11,11 @@ import hashlib
 import os
 import zipfile
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, get_args
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, get_args
 
 import numpy as np
 
@@ -37,7 +36,19 @@ from deepaccident_devkit.motion.label_folder import (
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.sample_labels import motion_labels
 from deepaccident_devkit.motion.stored_labels import StoredLabels, write_array
-from deepaccident_devkit.parallel import run_batch
+from deepaccident_devkit.parallel import (
+    MERGE,
+    Failure,
+    Part,
+    Places,
+    Shard,
+    Tried,
+    check_failures,
+    check_whole,
+    mine,
+    part_of,
+    run_batch,
+)
 from deepaccident_devkit.tables.tokens import parse_number
 from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, LIDAR
 from deepaccident_devkit.text import choice
@@ -56,7 +67,7 @@ class LabelsWritten:
     """What `write_label_files` did.
 
     Attributes:
-        samples: how many of the requested samples the folder now holds.
+        samples: how many of the requested samples, or of those of the part, the folder now holds.
         written: files made.
         kept: files that were there already and hold the same.
     """
@@ -66,7 +77,7 @@ class LabelsWritten:
     kept: int
 
 
-def write_label_files(
+def write_label_files(  # noqa: PLR0913 - what, where, on what, and which part
     dataset: Dataset,
     folder: str | os.PathLike[str],
     tokens: Iterable[RowArgument],
@@ -75,6 +86,7 @@ def write_label_files(
     names: BatchNames | None = None,
     workers: int | None = None,
     executor: Executor | None = None,
+    part: Part | str = None,
     progress: bool = False,
 ) -> LabelsWritten:
     """Write the motion labels of samples into a folder, one file for each scenario and agent.
@@ -91,37 +103,57 @@ def write_label_files(
             its own, some 0.1 MB, for loops with numpy alone; None writes files for `LabelFiles`, 25 times smaller.
         workers: processes; None chooses by the amount of work.
         executor: any executor of `concurrent.futures` to run on, in place of own workers.
+        part: `3/8` for the scenarios of the third of eight parts (docs/clusters.md), whose samples the folder does not
+            list yet; `merge` to list all once they are there.
         progress: whether to show a bar.
 
     Raises:
         ConfigError: the folder holds labels of another configuration, or with other names; it is left as it is.
         LabelFilesError: the folder holds something else, its manifest cannot be read, or it cannot be written to.
         TokenError: no such sample.
-        ChoiceError: no sample at all, or no such agent, configuration of agents, or code.
+        ChoiceError: no sample at all, or no such agent, configuration of agents, code, or part.
         NotAvailableError: a sample has no label, or an agent whose sight counts is not in this (partial) release.
-        WorkerError: a worker was killed.
+        SomeFailedError: labels of some samples cannot be made; the others are written, and the same call continues.
+        UnfinishedError: `part` is `merge`, and some files are missing, or were made from something else.
+        WorkerError: a worker was killed, or cannot do the work.
     """
-    root, chosen = folder_path(folder), label_config(config)
+    root, chosen, part = folder_path(folder), label_config(config), part_of(part)
     names = choice("names", names, (*get_args(BatchNames), None))
     wanted = _by_recording(dataset, tokens)
     _check_agents(dataset, wanted, chosen)
     Manifest.of(root, chosen, names)
-    with writing_to(root):
+    own = set(mine(part, list(dict.fromkeys(map(_scenario, wanted)))))
+    wanted = {recording: frames for recording, frames in wanted.items() if _scenario(recording) in own}
+    with writing_to(root, shared=isinstance(part, Shard)):
         manifest = Manifest.of(root, chosen, names)
         manifest.write(root)
-        tasks = [
-            _Task(
-                dataset, root, recording, _with_kept(dataset, root, recording, frames, manifest), manifest.config, names
-            )
-            for recording, frames in wanted.items()
-        ]
-        made_by_task = run_batch(
-            _write_recording, tasks, workers=workers, executor=executor, label="motion labels", progress=progress
+        work = _Work(dataset, root, manifest.config, names, merge=part == MERGE)
+        files = {
+            recording: _with_kept(dataset, root, recording, frames, manifest) for recording, frames in wanted.items()
+        }
+        results = run_batch(
+            Tried(work.write),
+            list(files.items()),
+            workers=workers,
+            executor=executor,
+            label="motion labels",
+            progress=progress,
+            places=Places(reads=dataset.places, writes=(root,)),
         )
-        made = list(chain.from_iterable(made_by_task))
-        manifest.samples.update({task.recording: list(task.frames) for task in tasks})
-        manifest.write(root)
+        made = _checked(list(files), results, root)
+        if not isinstance(part, Shard):
+            manifest.samples.update({recording: list(frames) for recording, frames in files.items()})
+            manifest.write(root)
     return LabelsWritten(samples=sum(map(len, wanted.values())), written=sum(made), kept=len(made) - sum(made))
+
+
+def _checked(recordings: Sequence[str], results: Sequence[_Files | Failure], root: Path) -> list[bool]:
+    """Whether each file was written now; raises SomeFailedError or UnfinishedError if not all are there."""
+    check_failures(zip(recordings, results, strict=True), str(root))
+    files = {name: new for result in results if not isinstance(result, Failure) for name, new in result.items()}
+    made = {name: new for name, new in files.items() if new is not None}
+    check_whole(list(files), made, root)
+    return list(made.values())
 
 
 class LabelFiles(Mapping[str, MotionLabels]):
@@ -220,54 +252,63 @@ class LabelFiles(Mapping[str, MotionLabels]):
         return archive
 
 
+_Files: TypeAlias = dict[str, bool | None]
+"""Name in the folder → whether the file was written now, or was there already; None if it is to be there and is not."""
+
+
 @dataclass(frozen=True, slots=True)
-class _Task:
-    """The files of one scenario and agent."""
+class _Work:
+    """What workers do; cheap to pickle."""
 
     dataset: Dataset
     root: Path
-    recording: str
-    frames: tuple[int, ...]
     config: MotionLabelConfig
     names: BatchNames | None
+    merge: bool
 
+    def write(self, task: tuple[str, tuple[int, ...]]) -> _Files:
+        """Write the files of one scenario and agent, with labels of these frames; none if they are to be there."""
+        recording, frames = task
+        source = self._source(recording, frames)
+        paths = (
+            {label_path(self.root, recording): frames}
+            if self.names is None
+            else {batch_path(self.root, recording, frame): (frame,) for frame in frames}
+        )
+        return {
+            path.relative_to(self.root).as_posix(): self._write_file(path, recording, each, source)
+            for path, each in paths.items()
+        }
 
-def _write_recording(task: _Task) -> list[bool]:
-    """Write the labels of one scenario and agent; for each file, False if it is there already."""
-    source = _source(task)
-    if task.names is None:
-        return [_write_file(task, label_path(task.root, task.recording), task.frames, source)]
-    return [_write_file(task, batch_path(task.root, task.recording, frame), (frame,), source) for frame in task.frames]
-
-
-def _write_file(task: _Task, path: Path, frames: tuple[int, ...], source: str) -> bool:
-    """Write one file, unless it is there; a batch has its code's arrays alone, and its source as the zip's comment."""
-    if _source_of(path, task.names) == source:
-        return False
-    with replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-        if task.names is None:
-            write_array(archive, "config", np.array(task.config.digest))
-            write_array(archive, "source", np.array(source))
-        else:
-            archive.comment = source.encode()
-        for frame in frames:
-            labels = motion_labels(task.dataset, f"{task.recording}/{frame:03d}", task.config)
-            if task.names is None:
-                StoredLabels.of(labels).write(archive, f"{frame:03d}")
+    def _write_file(self, path: Path, recording: str, frames: tuple[int, ...], source: str) -> bool | None:
+        """Write one file, unless it is there; a batch has its code's arrays alone, its source is the zip's comment."""
+        if _source_of(path, self.names) == source:
+            return False
+        if self.merge:
+            return None
+        with replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+            if self.names is None:
+                write_array(archive, "config", np.array(self.config.digest))
+                write_array(archive, "source", np.array(source))
             else:
-                for name, array in labels.as_batch(task.names).items():
-                    write_array(archive, name, array)
-    return True
+                archive.comment = source.encode()
+            for frame in frames:
+                labels = motion_labels(self.dataset, f"{recording}/{frame:03d}", self.config)
+                if self.names is None:
+                    StoredLabels.of(labels).write(archive, f"{frame:03d}")
+                else:
+                    for name, array in labels.as_batch(self.names).items():
+                        write_array(archive, name, array)
+        return True
 
-
-def _source(task: _Task) -> str:
-    """A digest of all that files are made from: configuration, samples or names, and the scenario's rows."""
-    digest = hashlib.blake2b(digest_size=16)
-    what = task.frames if task.names is None else task.names  # a batch does not depend on the samples beside it
-    digest.update(f"{FORMAT_VERSION} {task.config.digest} {task.recording} {what}".encode())
-    for array in _scenario_arrays(task.dataset, task.recording.rsplit("/", 1)[0]):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
+    def _source(self, recording: str, frames: tuple[int, ...]) -> str:
+        """A digest of all that files are made from: configuration, samples or names, and the scenario's rows."""
+        digest = hashlib.blake2b(digest_size=16)
+        what = frames if self.names is None else self.names  # a batch does not depend on the samples beside it
+        digest.update(f"{FORMAT_VERSION} {self.config.digest} {recording} {what}".encode())
+        for array in _scenario_arrays(self.dataset, _scenario(recording)):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
 
 
 def _scenario_arrays(dataset: Dataset, scenario: str) -> Iterator[AnyArray]:
@@ -334,6 +375,11 @@ def _with_kept(dataset: Dataset, root: Path, recording: str, frames: list[int], 
             "folder"
         ) from error
     return tuple(sorted({*frames, *kept}))
+
+
+def _scenario(recording: str) -> str:
+    """The token of a recording's scenario."""
+    return recording.rsplit("/", 1)[0]
 
 
 def _order(recording: str) -> tuple[str, int]:

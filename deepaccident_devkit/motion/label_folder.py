@@ -119,20 +119,22 @@ class Manifest:
 
 
 @contextmanager
-def writing_to(root: Path) -> Iterator[None]:
+def writing_to(root: Path, *, shared: bool = False) -> Iterator[None]:
     """Hold the lock of a folder while labels are written into it; make it, and remove what killed processes left.
 
-    The system releases the lock when the process ends, even if it is killed.
+    The system releases the lock when the process ends, even if it is killed. Those who share it write different files,
+    and leave the removing to one who has it alone.
 
     Raises:
         LabelFilesError: the folder cannot be made, locked or written to.
     """
     try:
-        lock = held_lock(root / _LOCK, "writes labels")
+        lock = held_lock(root / _LOCK, "writes labels", shared=shared)
     except (OSError, NotImplementedError) as error:  # the latter: a file system without locks
         raise LabelFilesError(f"{root}: no labels can be written there ({error}); choose another folder") from error
+    tidy = (lambda _: None) if shared else _remove_half_written
     try:
-        _remove_half_written(root)
+        tidy(root)
         yield
     except DeepAccidentError:
         raise
@@ -140,7 +142,7 @@ def writing_to(root: Path) -> Iterator[None]:
         remedy = "make room there, or choose another folder, and run it again"
         raise LabelFilesError(f"{root}: labels cannot be written ({error}); {remedy}") from error
     finally:
-        _remove_half_written(root)
+        tidy(root)
         lock.release()
 
 

@@ -7,14 +7,17 @@ import json
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from deepaccident_devkit.errors import ReleaseError
-from deepaccident_devkit.parallel import run_batch
+from deepaccident_devkit.parallel import Places, run_batch
 from deepaccident_devkit.reading import FileKind
 from deepaccident_devkit.release._content import read_content
 from deepaccident_devkit.release.layout import ScenarioFolder, find_release, frame_numbers
 from deepaccident_devkit.taxonomy import AGENTS
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
 
 _DIGEST_BYTES: Final = 16
 _ENDINGS: Final[Mapping[FileKind, str]] = {"label": "txt", "calib": "pkl"}
@@ -54,7 +57,7 @@ class Located(Protocol):
 
 
 def scenario_hashes(
-    dataset: Located, scenarios: Collection[str], *, workers: int | None = None
+    dataset: Located, scenarios: Collection[str], *, workers: int | None = None, executor: Executor | None = None
 ) -> dict[str, ScenarioHashes]:
     """The hashes of some scenarios' files, by token in order; those that are not in the release are left out.
 
@@ -64,13 +67,16 @@ def scenario_hashes(
         dataset: the release.
         scenarios: their tokens.
         workers: processes to read with; None takes what the work is worth.
+        executor: any executor of `concurrent.futures` to run on, in place of own workers.
 
     Raises:
         DatarootError: the release's folder is gone, or one of its folders cannot be listed.
         ReleaseError: a file cannot be read.
+        WorkerError: a worker was killed, or does not see the release.
     """
     folders = scenario_folders(dataset, scenarios)
-    found = run_batch(folder_hashes, list(folders.values()), workers=workers)
+    places = Places(reads=(dataset.dataroot,))
+    found = run_batch(folder_hashes, list(folders.values()), workers=workers, executor=executor, places=places)
     return dict(zip(folders, found, strict=True))
 
 

@@ -1,7 +1,8 @@
 """The paper's statistics of a release, computed on the tables' columns."""
 
+from deepaccident_devkit.files import writable_folder
 from deepaccident_devkit.statistics.compute import dataset_statistics
-from deepaccident_devkit.statistics.report import DatasetStatistics, writable_folder
+from deepaccident_devkit.statistics.report import DatasetStatistics
 from deepaccident_devkit.statistics.results import (
     ENDS,
     GROUPS,
@@ -13,6 +14,7 @@ from deepaccident_devkit.statistics.results import (
     QuantileRow,
     QuantileTable,
 )
+from deepaccident_devkit.statistics.shards import merged_statistics, remove_shards, statistics_shard
 
 __all__ = [
     "ENDS",
@@ -26,5 +28,8 @@ __all__ = [
     "QuantileRow",
     "QuantileTable",
     "dataset_statistics",
+    "merged_statistics",
+    "remove_shards",
+    "statistics_shard",
     "writable_folder",
 ]

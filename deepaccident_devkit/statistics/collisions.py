@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -10,9 +9,10 @@ import numpy as np
 
 from deepaccident_devkit.arrays import IntArray
 from deepaccident_devkit.geometry import quaternions
-from deepaccident_devkit.statistics.results import GROUPS, TOTAL, UNKNOWN, CollisionPair, Histogram, LeftOut
+from deepaccident_devkit.statistics.results import UNKNOWN, CollisionPair, Histogram, LeftOut
 from deepaccident_devkit.statistics.scenarios import scenario_ends
-from deepaccident_devkit.statistics.selected import Selected, binned, group_of
+from deepaccident_devkit.statistics.selected import Selected, group_of
+from deepaccident_devkit.statistics.tally import LEFT_OUT, PARTS, Tally
 from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES
 
 if TYPE_CHECKING:
@@ -23,40 +23,46 @@ _ANGLE_EDGES = tuple(range(-_BIN // 2, 360, _BIN))
 """Twelve bins around 0°, 30°, …, 330°."""
 
 
-def collision_pairs(selected: Selected) -> tuple[tuple[CollisionPair, ...], LeftOut]:
-    """The pairs of the selected scenarios with a collision, and how many of these lack one of the pair's tracks.
+def count_collisions(selected: Selected, tally: Tally) -> None:
+    """Add the pairs of the scenarios with a collision to a new tally; those that lack one of their tracks are left out.
 
     Meta may name one actor twice: that is no pair.
     """
     ends, agents, tracks = scenario_ends(selected), _agents_of_actors(selected), _tracks_at_the_end(selected)
-    pairs, left_out = [], Counter[str]()
-    for row, scenario in zip(selected.rows, selected.scenarios, strict=True):
+    for row, scenario in selected.scenarios.items():
         if scenario["collision"] is None:
             continue
-        names = agents.get(row, {})
+        names = agents.get(scenario["token"], {})
         ids = _in_agents_order(scenario["collision"]["ids"], names)
-        here = tracks.get(row, {})
+        here = tracks.get(row - selected.first, {})
         if len(set(ids)) == len(ids) and set(ids) <= set(here):
             end = ends[scenario["token"]] or UNKNOWN
-            pairs.append(_pair(selected, scenario, end, [here[actor] for actor in ids], list(map(names.get, ids))))
+            tally.pairs[row] = _pair(selected, scenario, end, [here[actor] for actor in ids], list(map(names.get, ids)))
         else:
-            left_out.update((TOTAL, group_of(scenario)))
-    counts = {group: left_out[group] for group in GROUPS}
-    return tuple(pairs), LeftOut(what="collisions without a pair labelled at the last frame", counts=counts)
+            tally.counts["collision_pairs", LEFT_OUT, group_of(scenario)] += 1
+    pairs = tally.pairs.values()
+    groups = np.array([PARTS.index(pair.split) for pair in pairs], dtype=np.int8)
+    bearings = [_wrapped(np.degrees(np.arctan2(pair.y, pair.x))) for pair in pairs]
+    tally.count_bins("collision_angles", np.array([pair.angle for pair in pairs]), groups, _ANGLE_EDGES)
+    tally.count_bins("collision_bearings", np.array(bearings), groups, _ANGLE_EDGES)
 
 
-def collision_histograms(pairs: Sequence[CollisionPair], left_out: LeftOut) -> tuple[Histogram, Histogram]:
+def collision_pairs(tally: Tally) -> tuple[CollisionPair, ...]:
+    """The pairs, in the order of the scenario table."""
+    return tuple(tally.pairs[row] for row in sorted(tally.pairs))
+
+
+def collision_histograms(tally: Tally) -> list[Histogram]:
     """The pairs' angles between headings, and the bearings of the other as the first of the pair sees it."""
-    groups = np.array([GROUPS.index(pair.split) - 1 for pair in pairs], dtype=np.int8)
-    values = {
-        ("collision_angles", "Collision angle", "angle"): [pair.angle for pair in pairs],
-        ("collision_bearings", "Bearing of the other", "bearing"): [
-            _wrapped(np.degrees(np.arctan2(pair.y, pair.x))) for pair in pairs
-        ],
-    }
+    what = "collisions without a pair labelled at the last frame"
+    left_out = LeftOut(what=what, counts=tally.by_group("collision_pairs", LEFT_OUT))
+    names = (
+        ("collision_angles", "Collision angle", "angle"),
+        ("collision_bearings", "Bearing of the other", "bearing"),
+    )
     made = []
-    for (name, title, field), angles in values.items():
-        counts, outside = binned(np.array(angles, dtype=np.float64), groups, _ANGLE_EDGES)
+    for name, title, field in names:
+        counts, outside = tally.by_bin(name, _ANGLE_EDGES)
         made.append(
             Histogram(
                 name=name,
@@ -70,17 +76,14 @@ def collision_histograms(pairs: Sequence[CollisionPair], left_out: LeftOut) -> t
                 left_out=left_out,
             )
         )
-    return made[0], made[1]
+    return made
 
 
-def _agents_of_actors(selected: Selected) -> dict[int, dict[int, str]]:
-    """Scenario row → actor id → name of its agent."""
-    scenario_rows = selected.column("agent", "scenario_row").tolist()
-    actors = selected.column("agent", "actor_id").tolist()
-    names = selected.column("agent", "name").tolist()
-    agents: dict[int, dict[int, str]] = {}
-    for row, actor, name in zip(scenario_rows, actors, names, strict=True):
-        agents.setdefault(row, {})[actor] = AGENTS[name]
+def _agents_of_actors(selected: Selected) -> dict[str, dict[int | None, str]]:
+    """Scenario token → actor id → name of its agent."""
+    agents: dict[str, dict[int | None, str]] = {}
+    for agent in selected.agents:
+        agents.setdefault(agent["scenario_token"], {})[agent["actor_id"]] = agent["name"]
     return agents
 
 
@@ -126,7 +129,7 @@ def _wrapped(degrees: float) -> float:
     return float((degrees + _BIN / 2) % 360 - _BIN / 2)
 
 
-def _in_agents_order(ids: Sequence[int], names: Mapping[int, str]) -> list[int]:
+def _in_agents_order(ids: Sequence[int], names: Mapping[int | None, str]) -> list[int]:
     """A pair's actor ids, agents first and in the order of `AGENTS`, else as they are."""
     ranks: dict[str | None, int] = {name: rank for rank, name in enumerate(AGENTS)}
     return sorted(ids, key=lambda actor: ranks.get(names.get(actor), len(AGENTS)))

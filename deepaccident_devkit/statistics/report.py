@@ -11,8 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from deepaccident_devkit.arrays import ShortRepr
-from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.files import is_writable_folder, write_bytes
+from deepaccident_devkit.files import writable_folder, write_bytes
 from deepaccident_devkit.statistics.results import (
     GROUPS,
     PROBABILITIES,
@@ -165,23 +164,6 @@ class DatasetStatistics(ShortRepr):
             )
         heading = ("category, medians", "instances", "annotations", "l × w × h (m)", "distance (m)", "speed (m/s)")
         return columns_text([heading, *rows])
-
-
-def writable_folder(folder: str | os.PathLike[str]) -> Path:
-    """A folder that files can be written to, made if it is not there.
-
-    Raises:
-        ConfigError: the path is empty, it or a folder above it is a file, or it may not be written to.
-    """
-    if not os.fspath(folder):
-        raise ConfigError("expected a folder to write to, found an empty path; give '.' for the current one")
-    path = Path(folder)
-    if is_writable_folder(path):
-        return path
-    for part in (path, *path.parents):
-        if os.path.isfile(part):  # noqa: PTH113 - Path.is_file raises where it may not look
-            raise ConfigError(f"{path}: no file can be written there, {part} is a file; give a folder")
-    raise ConfigError(f"{path}: no file can be written there; give a folder that you may write to")
 
 
 def _number(value: float | None, digits: int) -> str:

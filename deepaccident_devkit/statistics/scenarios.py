@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from deepaccident_devkit.statistics.results import (
     ENDS,
     NO_ACCIDENT,
     NO_DESIGN,
+    UNKNOWN,
     WITH_OTHER,
     WITH_PEDESTRIAN,
     CountTable,
@@ -19,7 +20,8 @@ from deepaccident_devkit.statistics.results import (
     LeftOut,
     QuantileTable,
 )
-from deepaccident_devkit.statistics.selected import Selected, binned, group_counts, quantile_rows, word_counts
+from deepaccident_devkit.statistics.selected import Selected, group_of
+from deepaccident_devkit.statistics.tally import LEFT_OUT, Tally
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import AgentRecord, CollisionRecord, ScenarioRecord
@@ -27,22 +29,57 @@ if TYPE_CHECKING:
 _EGO = taxonomy.AGENTS[0]
 _LENGTH_EDGES = tuple(range(30, 101, 10))
 _SPEED_EDGES = tuple(range(21))
+_SIZES: Final = ("length", "width", "height")
+_TABLES: Final[Mapping[str, tuple[str, str, tuple[str, ...], str]]] = {
+    "scenario_types": ("Scenario types", "scenario_type", (), "scenarios"),
+    "towns": ("Towns", "town", taxonomy.TOWNS, "scenarios"),
+    "weathers": ("Weather", "weather", taxonomy.WEATHERS, "scenarios"),
+    "weather_frames": ("Weather, by frame", "weather", taxonomy.WEATHERS, "frames"),
+    "times_of_day": ("Time of day", "time_of_day", taxonomy.TIMES_OF_DAY, "scenarios"),
+    "time_of_day_frames": ("Time of day, by frame", "time_of_day", taxonomy.TIMES_OF_DAY, "frames"),
+    "road_types": ("Road types", "road_type", taxonomy.ROAD_TYPES, "scenarios"),
+    "collisions": ("Ended in a collision", "collision", ("yes", "no"), "scenarios"),
+    "ends": ("How scenarios ended", "end", ENDS, "scenarios"),
+}
+"""Table of counts → title, field, words that are there in any case, what is counted."""
 
 
-def scenario_counts(selected: Selected) -> list[CountTable]:
+def count_scenarios(selected: Selected, tally: Tally) -> None:
+    """Count scenarios, their frames and samples, by the words of their records and by length."""
+    ends = scenario_ends(selected)
+    for scenario in selected.scenarios.values():
+        group = group_of(scenario)
+        for table, (_, field, _, counted) in _TABLES.items():
+            word = ends[scenario["token"]] if field == "end" else _word(scenario, field)
+            number = scenario["num_frames"] if counted == "frames" else 1
+            tally.counts[table, word or UNKNOWN, group] += number
+    lengths = np.array([scenario["num_frames"] for scenario in selected.scenarios.values()], dtype=np.float64)
+    tally.count_bins("lengths", lengths, selected.scenario_group[selected.scenario_group >= 0], _LENGTH_EDGES)
+    tally.count("scenarios", selected.scenario_group)
+    for table in ("frame", "sample"):
+        tally.count(f"{table}s", selected.group(table))
+
+
+def count_egos(selected: Selected, tally: Tally) -> None:
+    """Count the speeds of `ego_vehicle` at its samples, and its size once a scenario, by its own label rows."""
+    ego = selected.column("sample", "agent") == taxonomy.AGENTS.index(_EGO)
+    speeds = np.linalg.norm(selected.column("sample", "velocity")[ego], axis=1)
+    groups, known = selected.group("sample")[ego], np.isfinite(speeds)
+    tally.count_bins("ego_speeds", speeds[known], groups[known], _SPEED_EDGES)
+    tally.count("ego_speeds", groups[~known], LEFT_OUT)
+    ego = selected.column("agent", "name") == taxonomy.AGENTS.index(_EGO)
+    sizes, groups = selected.column("agent", "size")[ego], selected.group("agent")[ego]
+    known = ~np.isnan(sizes).any(axis=1)
+    for axis, field in enumerate(_SIZES):
+        tally.add_values("ego_sizes", field, _EGO, sizes[known, axis], groups[known])
+    tally.count("ego_sizes", groups[~known], LEFT_OUT)
+
+
+def scenario_counts(tally: Tally) -> list[CountTable]:
     """Scenarios by type, town, weather, time of day, road type, collision and end; frames by weather and time."""
     return [
-        _by_field(selected, "scenario_types", "Scenario types", "scenario_type"),
-        _by_field(selected, "towns", "Towns", "town", taxonomy.TOWNS),
-        _by_field(selected, "weathers", "Weather", "weather", taxonomy.WEATHERS),
-        _by_field(selected, "weather_frames", "Weather, by frame", "weather", taxonomy.WEATHERS, frames=True),
-        _by_field(selected, "times_of_day", "Time of day", "time_of_day", taxonomy.TIMES_OF_DAY),
-        _by_field(
-            selected, "time_of_day_frames", "Time of day, by frame", "time_of_day", taxonomy.TIMES_OF_DAY, frames=True
-        ),
-        _by_field(selected, "road_types", "Road types", "road_type", taxonomy.ROAD_TYPES),
-        _collisions(selected),
-        _ends(selected),
+        CountTable(name=name, title=title, field=field, counted=counted, counts=tally.by_word(name, known))
+        for name, (title, field, known, counted) in _TABLES.items()
     ]
 
 
@@ -68,15 +105,15 @@ def scenario_end(scenario: ScenarioRecord, agents: Sequence[AgentRecord]) -> str
 def scenario_ends(selected: Selected) -> dict[str, str | None]:
     """Scenario token → how it ended."""
     agents: dict[str, list[AgentRecord]] = {}
-    for agent in selected.dataset.agent:
+    for agent in selected.agents:
         agents.setdefault(agent["scenario_token"], []).append(agent)
-    return {record["token"]: scenario_end(record, agents.get(record["token"], [])) for record in selected.scenarios}
+    records = selected.scenarios.values()
+    return {record["token"]: scenario_end(record, agents.get(record["token"], [])) for record in records}
 
 
-def lengths(selected: Selected) -> Histogram:
+def lengths(tally: Tally) -> Histogram:
     """Recorded frames of scenarios; meta's simulated ones are ten more."""
-    values = np.array([record["num_frames"] for record in selected.scenarios], dtype=np.float64)
-    counts, outside = binned(values, selected.scenario_group[list(selected.rows)], _LENGTH_EDGES)
+    counts, outside = tally.by_bin("lengths", _LENGTH_EDGES)
     return Histogram(
         name="lengths",
         title="Lengths of scenarios",
@@ -89,12 +126,9 @@ def lengths(selected: Selected) -> Histogram:
     )
 
 
-def ego_speeds(selected: Selected) -> Histogram:
+def ego_speeds(tally: Tally) -> Histogram:
     """Speeds of `ego_vehicle` at its samples, by the first line of their labels."""
-    ego = selected.column("sample", "agent") == taxonomy.AGENTS.index(_EGO)
-    speeds = np.linalg.norm(selected.column("sample", "velocity")[ego], axis=1)
-    groups, known = selected.group("sample")[ego], np.isfinite(speeds)
-    counts, outside = binned(speeds[known], groups[known], _SPEED_EDGES)
+    counts, outside = tally.by_bin("ego_speeds", _SPEED_EDGES)
     return Histogram(
         name="ego_speeds",
         title="Speed of the ego vehicle",
@@ -104,28 +138,20 @@ def ego_speeds(selected: Selected) -> Histogram:
         edges=_SPEED_EDGES,
         counts=counts,
         outside=outside,
-        left_out=LeftOut(what="ego samples without a label", counts=group_counts(groups[~known])),
+        left_out=LeftOut(what="ego samples without a label", counts=tally.by_group("ego_speeds", LEFT_OUT)),
     )
 
 
-def ego_sizes(selected: Selected) -> QuantileTable:
+def ego_sizes(tally: Tally) -> QuantileTable:
     """Size of `ego_vehicle`, once a scenario, by its own label row."""
-    ego = selected.column("agent", "name") == taxonomy.AGENTS.index(_EGO)
-    sizes, groups = selected.column("agent", "size")[ego], selected.group("agent")[ego]
-    known = ~np.isnan(sizes).any(axis=1)
-    counted = known & (groups >= 0)
-    rows = [
-        row
-        for axis, field in enumerate(("length", "width", "height"))
-        for row in quantile_rows(field, _EGO, sizes[counted, axis], groups[counted])
-    ]
+    what = "scenarios whose ego has no label row of its own"
     return QuantileTable(
         name="ego_sizes",
         title="Size of the ego vehicle",
         unit="m",
         counted="scenarios",
-        quantiles=tuple(rows),
-        left_out=LeftOut(what="scenarios whose ego has no label row of its own", counts=group_counts(groups[~known])),
+        quantiles=tuple(row for field in _SIZES for row in tally.quantiles("ego_sizes", field, _EGO)),
+        left_out=LeftOut(what=what, counts=tally.by_group("ego_sizes", LEFT_OUT)),
     )
 
 
@@ -143,33 +169,10 @@ def _undesigned_end(scenario: ScenarioRecord, collision: CollisionRecord, agents
     return None if None in [scenario[word] for word in story] else NO_DESIGN  # type: ignore[literal-required]
 
 
-def _by_field(
-    selected: Selected, name: str, title: str, field: str, known: Sequence[str] = (), *, frames: bool = False
-) -> CountTable:
-    """Scenarios by a field of their records; with `frames`, their frames."""
-    counts = word_counts(
-        selected.scenarios,
-        lambda record: record[field],  # type: ignore[literal-required]
-        known,
-        (lambda record: record["num_frames"]) if frames else (lambda _: 1),
-    )
-    counted = "frames" if frames else "scenarios"
-    return CountTable(name=name, title=title, field=field, counted=counted, counts=counts)
-
-
-def _collisions(selected: Selected) -> CountTable:
-    def word(scenario: ScenarioRecord) -> str | None:
-        if scenario["weather"] is None:  # there is no meta
-            return None
-        return "yes" if scenario["collision"] else "no"
-
-    counts = word_counts(selected.scenarios, word, ("yes", "no"))
-    return CountTable(
-        name="collisions", title="Ended in a collision", field="collision", counted="scenarios", counts=counts
-    )
-
-
-def _ends(selected: Selected) -> CountTable:
-    ends = scenario_ends(selected)
-    counts = word_counts(selected.scenarios, lambda record: ends[record["token"]], ENDS)
-    return CountTable(name="ends", title="How scenarios ended", field="end", counted="scenarios", counts=counts)
+def _word(scenario: ScenarioRecord, field: str) -> str | None:
+    """What a scenario counts as in tables of a field of its record."""
+    if field != "collision":
+        return scenario[field]  # type: ignore[literal-required,no-any-return]
+    if scenario["weather"] is None:  # there is no meta
+        return None
+    return "yes" if scenario["collision"] else "no"

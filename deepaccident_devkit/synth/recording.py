@@ -4,6 +4,7 @@ A scenario is recorded in parts; each part takes every nth frame, so that severa
 """
 
 import multiprocessing
+import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -67,7 +68,7 @@ def parts_of(config: SynthConfig) -> int:
 def record_scenario(job: RecordingJob) -> None:
     """Make a scenario and write all its files, or those of a part of it."""
     _share_cores()
-    scenario, rig = _made_ready(_Task(job.config, job.plan, job.progress))
+    scenario, rig = _KEPT.made_ready(_Task(job.config, job.plan, job.progress))
     labelled = job.plan.split != "test" or not job.config.unlabelled_test
     recorder = _Recorder(folder=job.folder, scenario=scenario, rig=rig, labelled=labelled)
     if labelled and job.first == 1:
@@ -77,8 +78,8 @@ def record_scenario(job: RecordingJob) -> None:
 
 
 def forget_scenario() -> None:
-    """Free the memory of the scenario that is kept for its next part."""
-    _made_ready.cache_clear()
+    """Free the memory of the scenario that this thread keeps for its next part."""
+    _KEPT.made_ready.cache_clear()
 
 
 def _share_cores() -> None:
@@ -98,9 +99,8 @@ class _Task:
     progress: bool = field(compare=False)
 
 
-@lru_cache(maxsize=1)
 def _made_ready(task: _Task) -> tuple[Scenario, Rig]:
-    """A scenario and its sensors; the last one is kept for the next part of it."""
+    """A scenario and its sensors."""
     config, plan = task.config, task.plan
     scenario = build_scenario(config, plan, progress=task.progress)
     rig = make_rig(
@@ -114,6 +114,16 @@ def _made_ready(task: _Task) -> tuple[Scenario, Rig]:
         exact=config.exact,
     )
     return scenario, rig
+
+
+class _Kept(threading.local):
+    """Keeps a thread's last scenario for the next part of it. Threads share none: a rig remembers what it casts."""
+
+    def __init__(self) -> None:
+        self.made_ready = lru_cache(maxsize=1)(_made_ready)
+
+
+_KEPT = _Kept()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -1,26 +1,30 @@
-"""A release that is being made: a folder beside its place, so that a later call can continue after an interruption."""
+"""A release that is being made: a folder beside its place, so that a later call can continue after an interruption.
+
+Several processes and hosts may record parts of its scenarios at once. One that has the folder alone puts them together.
+"""
 
 import json
+import os
 import shutil
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.files import held_lock, temporary_of, write_bytes
 from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.reading import fault_text, read_bytes, shortened
 from deepaccident_devkit.synth.config import SynthConfig
 
-_CONFIG_FILE, _MADE_FILE, _LOCK_FILE = "config.json", "made.txt", ".lock"
+_CONFIG_FILE, _CONFIG_LOCK, _LOCK = "config.json", ".config.lock", ".lock"
 
 
 @dataclass(frozen=True, slots=True)
 class Unfinished:
-    """The folder of a release that is being made.
+    """The folder of a release that is being made; cheap to pickle.
 
     Attributes:
         folder: hidden, beside the place that the release will have.
@@ -37,58 +41,127 @@ class Unfinished:
         """Where a part of a scenario is recorded, as in a release of its own."""
         return self.folder / "parts" / name
 
+    @contextmanager
+    def alone(self, name: str) -> Iterator[None]:
+        """Keep other processes and hosts from recording the same part in the block.
+
+        Raises:
+            ConfigError: nobody makes the release any more.
+        """
+        self._check_there()
+        lock = held_lock(self._locks / name, f"records {name}")
+        try:
+            yield
+        finally:
+            lock.release()
+
     def clear(self, name: str) -> None:
         """Remove the incomplete files of a part that was interrupted."""
         shutil.rmtree(self.part(name), ignore_errors=True)
 
+    def is_made(self, name: str) -> bool:
+        """Whether a part is complete."""
+        return self._note(name).exists()
+
     def made(self) -> frozenset[str]:
-        """Names of the complete parts; a last line without its end does not count."""
-        path = self.folder / _MADE_FILE
-        return frozenset(_text(path).split("\n")[:-1] if path.exists() else ())
+        """Names of the complete parts."""
+        return frozenset(path.name for path in self._note("").glob("*"))
+
+    def is_at_hand(self) -> bool:
+        """Whether a part is being recorded, perhaps by a worker whose caller was stopped."""
+        return any(map(_is_held, self._locks.glob("*")))
 
     def note(self, name: str) -> None:
-        """Remember that a part is complete."""
-        with (self.folder / _MADE_FILE).open("a", encoding="utf-8") as file:
-            file.write(f"{name}\n")
+        """Remember that a part is complete; raises ConfigError if it was removed meanwhile."""
+        self._check_there()
+        self._note(name).parent.mkdir(exist_ok=True)
+        self._note(name).touch()
 
     def gather(self, names: Iterable[str]) -> None:
         """Move the files of a scenario's parts into the release, if they are not there yet."""
         for name in names:
             if self.part(name).is_dir():
+                _remove_half_written(self.part(name))
                 _merge(self.part(name), self.release)
+
+    @property
+    def _locks(self) -> Path:
+        return self.folder / "locks"
+
+    def _note(self, name: str) -> Path:
+        return self.folder / "made" / name
+
+    def _check_there(self) -> None:
+        if not (self.folder / _CONFIG_FILE).exists():
+            raise ConfigError(f"{self.folder}: was removed while parts of the release were recorded; make it again")
 
 
 @contextmanager
-def unfinished_release(out: Path, config: SynthConfig) -> Iterator[Unfinished]:
+def unfinished_release(out: Path, config: SynthConfig, *, shared: bool = False) -> Iterator[Unfinished]:
     """The release that becomes `out` when the block succeeds; if the block fails, a later call can continue it.
 
-    Raises:
-        ConfigError: the unfinished release is of another configuration or version, or another process is making it.
-    """
-    from filelock import FileLock, Timeout
+    Args:
+        out: its place.
+        config: its settings.
+        shared: whether others may work on it too who share it, each on parts of its own; it does not become `out` then.
 
+    Raises:
+        ConfigError: `out` is taken, the unfinished release is of another configuration or version, or another process
+            is making it.
+    """
     place = out.absolute()
-    folder = place.with_name(f".{place.name}.unfinished")
-    folder.mkdir(exist_ok=True)
+    unfinished = Unfinished(place.with_name(f".{place.name}.unfinished"))
     try:
-        with FileLock(folder / _LOCK_FILE, timeout=0):
-            unfinished = Unfinished(folder)
-            _agree(folder / _CONFIG_FILE, config)
-            unfinished.release.mkdir(exist_ok=True)
-            try:
-                yield unfinished
-                _move_into_place(unfinished.release, out)
-            finally:
-                if out.is_dir() or not unfinished.made():
-                    shutil.rmtree(folder, ignore_errors=True)
-    except Timeout as error:
+        lock = held_lock(unfinished.folder / _LOCK, "makes the release", shared=shared, wait=False)
+    except BlockingIOError as error:
         raise ConfigError(
             f"{out}: another process is making it; wait for that one, or choose another folder"
         ) from error
+    try:
+        check_free(out)  # who held the lock may have completed it
+        _agree(unfinished.folder, config)
+        with nullcontext() if shared else _becoming(out, unfinished):
+            yield unfinished
+    finally:
+        lock.release()
 
 
-def _agree(path: Path, config: SynthConfig) -> None:
+@contextmanager
+def _becoming(out: Path, unfinished: Unfinished) -> Iterator[None]:
+    """Make the release's folder, and move it to its place if the block succeeds; else keep it if anything is made."""
+    unfinished.release.mkdir(exist_ok=True)
+    try:
+        yield
+        _move_into_place(unfinished.release, out)
+    finally:
+        if not (unfinished.release.is_dir() and (unfinished.made() or unfinished.is_at_hand())):
+            shutil.rmtree(unfinished.folder, ignore_errors=True)
+
+
+def check_free(out: Path) -> None:
+    """Raise ConfigError unless a release can be made there: nothing is, or an empty folder."""
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ConfigError(f"{out}: exists and is not an empty folder; choose another folder, or remove this one")
+
+
+def _is_held(lock: Path) -> bool:
+    try:
+        held_lock(lock, "records", wait=False).release()
+    except BlockingIOError:
+        return True
+    return False
+
+
+def _agree(folder: Path, config: SynthConfig) -> None:
     """Write the configuration beside the release, or compare it with the one that is there."""
+    lock = held_lock(folder / _CONFIG_LOCK, "begins the release")  # those who share the folder may begin at once
+    try:
+        _write_or_compare(folder / _CONFIG_FILE, config)
+    finally:
+        lock.release()
+
+
+def _write_or_compare(path: Path, config: SynthConfig) -> None:
     wanted = _as_json(config)
     if not path.exists():
         write_bytes(path, json.dumps(wanted, indent=1).encode())
@@ -133,6 +206,14 @@ def _move_into_place(release: Path, out: Path) -> None:
     if out.is_dir():
         out.rmdir()
     release.replace(out)
+
+
+def _remove_half_written(part: Path) -> None:
+    """Remove temporary files, which only those leave whose locks do not keep others out: the part is complete."""
+    for folder, _, files in os.walk(part):
+        for name in files:
+            if temporary_of(name) is not None:
+                Path(folder, name).unlink()
 
 
 def _merge(source: Path, target: Path) -> None:

@@ -13,6 +13,8 @@ changed, and compares the checksums of shards and tables. Everything is written 
 manifest last, so that a reader sees the old index or the new one.
 """
 
+from __future__ import annotations
+
 import hashlib
 import logging
 import os
@@ -20,14 +22,15 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import BrokenReleaseError, DatarootError, IndexStoreError
 from deepaccident_devkit.files import is_writable_folder
+from deepaccident_devkit.parallel import Shard
 from deepaccident_devkit.reading import RefusedFileError, fault_text, limit_of
 from deepaccident_devkit.release import ReleaseLayout
-from deepaccident_devkit.tables.indexing import is_unfinished, make_index
+from deepaccident_devkit.tables.indexing import Outcome, check_indexed, index_scenarios, is_unfinished, make_index
 from deepaccident_devkit.tables.locking import index_lock
 from deepaccident_devkit.tables.manifest import (
     MANIFEST_FILE,
@@ -40,6 +43,9 @@ from deepaccident_devkit.tables.manifest import (
 from deepaccident_devkit.tables.scan import contents_digest, folder_digest
 from deepaccident_devkit.taxonomy import OnError
 from deepaccident_devkit.text import choice
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
 
 logger = logging.getLogger(__name__)
 
@@ -70,6 +76,7 @@ def open_index(
     *,
     index_dir: Path | None = None,
     workers: int | None = None,
+    executor: Executor | None = None,
     on_error: OnError = "raise",
     progress: bool = False,
     check_files: bool = False,
@@ -80,6 +87,7 @@ def open_index(
         layout: the release.
         index_dir: where indexes are kept; by default in the dataroot, or in the user's cache if that is read-only.
         workers: processes to read with; see `parallel.run_batch`.
+        executor: any executor of `concurrent.futures` to run on, in place of own workers.
         on_error: `raise` lists every broken scenario and raises; `skip` leaves them out and logs them.
         progress: whether to show a progress bar.
         check_files: compare the content of every label, calib and meta file, and of every file of the index, with
@@ -94,7 +102,15 @@ def open_index(
     on_error = choice("on_error", on_error, get_args(OnError))
     _refuse_wrong_limits()
     index = None if check_files else _current_index(layout, index_dir)
-    make = partial(_found_or_made, layout, index_dir, check_files=check_files, workers=workers, progress=progress)
+    make = partial(
+        _found_or_made,
+        layout,
+        index_dir,
+        check_files=check_files,
+        workers=workers,
+        executor=executor,
+        progress=progress,
+    )
     if index is None:
         folder = _writable_folder(layout, index_dir)
         with index_lock(folder):
@@ -103,6 +119,40 @@ def open_index(
         index = _finished(index, make)
     _accept(layout, index, on_error)
     return index
+
+
+def open_merged_index(layout: ReleaseLayout, **how: Any) -> Index:
+    """The index that the shards of `index_shard` make together; arguments and errors are those of `open_index`.
+
+    Raises:
+        UnfinishedError: a scenario has no shard.
+    """
+    index_dir = how.get("index_dir")
+    if _current_index(layout, index_dir) is None:
+        check_indexed(layout, _writable_folder(layout, index_dir))
+    return open_index(layout, **how)
+
+
+def index_shard(layout: ReleaseLayout, shard: Shard, *, index_dir: Path | None = None, **how: Any) -> list[Outcome]:
+    """Index a part of a release; `open_index` makes the whole index with what is there then.
+
+    Args:
+        layout: the release.
+        shard: which part.
+        index_dir: where indexes are kept, as of `open_index`.
+        **how: of `open_index`: `check_files`, `workers`, `executor`, `progress`.
+
+    Returns:
+        The outcome of each scenario; broken ones are among them.
+
+    Raises:
+        IndexStoreError: something cannot be written, or a newer devkit's index is there.
+    """
+    _refuse_wrong_limits()
+    folder = _writable_folder(layout, index_dir)
+    with index_lock(folder, shared=True):
+        _refuse_newer(folder)
+        return index_scenarios(layout, folder, shard, **how)
 
 
 def _refuse_wrong_limits() -> None:
@@ -152,18 +202,15 @@ def _found_or_made(
     layout: ReleaseLayout,
     index_dir: Path | None,
     folder: Path,
-    *,
-    check_files: bool,
-    workers: int | None,
-    progress: bool,
+    **how: Any,
 ) -> Index:
     """The index, made in `folder`, whose lock is held, unless another process has made it meanwhile."""
-    index = None if check_files else _current_index(layout, index_dir)
+    index = None if how["check_files"] else _current_index(layout, index_dir)
     if index is not None and not (index.folder == folder and is_unfinished(folder)):
         return index
     _refuse_newer(folder)
     fingerprint = folder_digest(layout.scenarios, layout.split_files.values())
-    manifest = make_index(layout, folder, fingerprint, check_files=check_files, workers=workers, progress=progress)
+    manifest = make_index(layout, folder, fingerprint, **how)
     return Index(folder=folder, manifest=manifest)
 
 

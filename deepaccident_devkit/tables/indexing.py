@@ -1,5 +1,7 @@
 """Making an index: read the scenarios that changed, join all of them, put the result in place."""
 
+from __future__ import annotations
+
 import hashlib
 import os
 import shutil
@@ -8,10 +10,11 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from deepaccident_devkit.errors import DeepAccidentError, IndexStoreError
 from deepaccident_devkit.files import replacing_folder
-from deepaccident_devkit.parallel import run_batch
+from deepaccident_devkit.parallel import Places, Shard, check_whole, run_batch
 from deepaccident_devkit.reading import file_checksum, observed
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, read_meta
 from deepaccident_devkit.tables.build import ScenarioFiles, read_scenario, scenario_rows
@@ -34,6 +37,9 @@ from deepaccident_devkit.tables.scan import (
 )
 from deepaccident_devkit.tables.shards import ShardState, join_tables, shard_path, shard_state, write_shard
 from deepaccident_devkit.tables.split_assignment import SplitAssignment, assign_splits
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
 
 SHARDS_FOLDER = "shards"
 MARK_FILE = ".unfinished"
@@ -66,13 +72,14 @@ def make_index(
     *,
     check_files: bool = False,
     workers: int | None = None,
+    executor: Executor | None = None,
     progress: bool = False,
 ) -> Manifest:
     """Bring the index in `folder` up to date with the release and return its manifest.
 
     Files of the size and time that they had are taken for the same, unless `check_files` has their contents compared.
     Broken scenarios do not stop it: they are listed in the manifest. Damaged shards and tables are made again. The
-    caller holds the folder's lock.
+    caller holds the folder's lock. Arguments that are not described here are those of `open_index`.
 
     Raises:
         IndexStoreError: something cannot be written; the index that was there stays as it was. Or shards lie behind
@@ -81,13 +88,15 @@ def make_index(
         WorkerError: a worker was killed.
     """
     splits = assign_splits(layout)
-    candidates = [scenario for scenario in layout.scenarios if scenario.token not in splits.problems]
     _refuse_links(folder / SHARDS_FOLDER)
     with _store_errors(folder), _marked_unfinished(folder):
-        outcomes = run_batch(
-            partial(index_scenario, folder / SHARDS_FOLDER, check_files=check_files),
-            candidates,
+        outcomes = _indexed(
+            layout,
+            folder,
+            _candidates(layout, splits),
+            check_files=check_files,
             workers=workers,
+            executor=executor,
             label="indexing scenarios",
             progress=progress,
         )
@@ -105,6 +114,63 @@ def make_index(
     return manifest
 
 
+def index_scenarios(
+    layout: ReleaseLayout,
+    folder: Path,
+    part: Shard,
+    **how: Any,
+) -> list[Outcome]:
+    """Write the shards of a part of the scenarios, and no tables; the caller shares the folder's lock.
+
+    `how` is as of `make_index`.
+
+    Raises:
+        IndexStoreError: something cannot be written; or shards lie behind a link.
+        SplitFileError: a split file cannot be read.
+        WorkerError: a worker was killed.
+    """
+    _refuse_links(folder / SHARDS_FOLDER)
+    candidates = part.of(_candidates(layout, assign_splits(layout)))
+    with _store_errors(folder):
+        return _indexed(layout, folder, candidates, label=f"indexing part {part}", **how)
+
+
+def _indexed(
+    layout: ReleaseLayout, folder: Path, scenarios: list[ScenarioFolder], *, check_files: bool = False, **how: Any
+) -> list[Outcome]:
+    work = partial(index_scenario, folder / SHARDS_FOLDER, check_files=check_files)
+    return run_batch(work, scenarios, places=Places(reads=(layout.root,), writes=(folder,)), **how)
+
+
+def check_indexed(layout: ReleaseLayout, folder: Path) -> None:
+    """Raise UnfinishedError if a scenario that can be indexed has no shard of its present files."""
+    candidates = _candidates(layout, assign_splits(layout))
+    done = {each.token for each in candidates if _has_shard(folder / SHARDS_FOLDER, each)}
+    for scenario in candidates:
+        if scenario.token in done:
+            continue
+        scan = scan_scenario(scenario)
+        if scan.agents and not scan.problems and _read(scenario, scan)[0] is not None:
+            break
+        done.add(scenario.token)  # a broken one, which has no shard, or one without files
+    check_whole([each.token for each in candidates], done, folder)
+
+
+def _has_shard(shards: Path, scenario: ScenarioFolder) -> bool:
+    state = shard_state(shard_path(shards, scenario.token))
+    return state is not None and state.times == _times_of(scenario)
+
+
+def _times_of(scenario: ScenarioFolder) -> str:
+    """What a shard of the files as they are now remembers of their times."""
+    return f"{SCHEMA_VERSION}:{times_digest(scenario)}"
+
+
+def _candidates(layout: ReleaseLayout, splits: SplitAssignment) -> list[ScenarioFolder]:
+    """The scenarios that the split files agree on."""
+    return [scenario for scenario in layout.scenarios if scenario.token not in splits.problems]
+
+
 def is_unfinished(folder: Path) -> bool:
     """Whether an index is being made in this folder, or the process that made one was stopped."""
     return (folder / MARK_FILE).exists()
@@ -112,7 +178,7 @@ def is_unfinished(folder: Path) -> bool:
 
 def index_scenario(shards: Path, scenario: ScenarioFolder, *, check_files: bool = False) -> Outcome:
     """Write the shard of one scenario, unless it is there and its files are as they were."""
-    times = f"{SCHEMA_VERSION}:{times_digest(scenario)}"  # before anything is read: a later edit is noticed
+    times = _times_of(scenario)  # before anything is read: a later edit is noticed
     path = shard_path(shards, scenario.token)
     scan = scan_scenario(scenario)
     if scan.problems:
@@ -170,7 +236,7 @@ def edited_scenarios(layout: ReleaseLayout, folder: Path, manifest: Manifest) ->
     """
     splits = assign_splits(layout)
     broken = {problem.scenario: problem.contents for problem in manifest.problems}
-    candidates = [scenario for scenario in layout.scenarios if scenario.token not in splits.problems]
+    candidates = _candidates(layout, splits)
     same, edited = [], []
     for scenario, contents in zip(candidates, run_batch(contents_digest, candidates), strict=True):
         token = scenario.token

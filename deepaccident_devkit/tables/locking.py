@@ -1,28 +1,30 @@
 """The lock of an index folder: one process at a time writes there."""
 
-import logging
+from __future__ import annotations
+
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deepaccident_devkit.errors import IndexStoreError
+from deepaccident_devkit.files import SharedLock, held_lock, say_waiting
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
 
-logger = logging.getLogger(__name__)
-
 LOCK_FILE = ".lock"
+_TASK = "makes an index"
 
 
 @contextmanager
-def index_lock(folder: Path, *, wait: bool = True) -> Iterator[bool]:
+def index_lock(folder: Path, *, wait: bool = True, shared: bool = False) -> Iterator[bool]:
     """Hold the folder's lock, which the system takes back when a process ends, however it ends.
 
     Args:
         folder: an index folder; made where it is missing.
         wait: whether to wait, saying so, while another process holds it.
+        shared: whether others may hold it too who share it; this waits.
 
     Yields:
         Whether it is held; always so after waiting.
@@ -34,20 +36,24 @@ def index_lock(folder: Path, *, wait: bool = True) -> Iterator[bool]:
 
     if (folder / LOCK_FILE).is_symlink():  # it would be emptied
         raise IndexStoreError(f"{folder / LOCK_FILE}: a symbolic link, which no devkit makes; remove it")
-    lock = FileLock(folder / LOCK_FILE)
+    lock: BaseFileLock | SharedLock
     try:
-        _acquire(lock, folder, wait=wait)
+        if shared:
+            lock = held_lock(folder / LOCK_FILE, _TASK, shared=True)
+        else:
+            lock = FileLock(folder / LOCK_FILE)
+            _acquire(lock, folder, wait=wait)
     except Timeout:
         pass
     except (OSError, NotImplementedError) as error:  # the latter: a file system without locks
         raise IndexStoreError(f"{folder}: cannot be locked ({error}); give another index_dir=") from error
     try:
-        yield lock.is_locked
+        yield isinstance(lock, SharedLock) or lock.is_locked
     finally:
         lock.release()
 
 
-def _acquire(lock: "BaseFileLock", folder: Path, *, wait: bool) -> None:
+def _acquire(lock: BaseFileLock, folder: Path, *, wait: bool) -> None:
     from filelock import Timeout
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -56,11 +62,11 @@ def _acquire(lock: "BaseFileLock", folder: Path, *, wait: bool) -> None:
     except Timeout:
         if not wait:
             raise
-        logger.warning("%s: another process makes this index; waiting for it", folder)
+        say_waiting(folder, _TASK)
         _wait(lock, folder)
 
 
-def _wait(lock: "BaseFileLock", folder: Path) -> None:
+def _wait(lock: BaseFileLock, folder: Path) -> None:
     while not lock.is_locked:
         folder.mkdir(parents=True, exist_ok=True)  # gone if the other process cleared the index
         with suppress(FileNotFoundError):

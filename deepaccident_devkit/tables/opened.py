@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -48,14 +49,15 @@ class OpenTables:
         split_files: Mapping[str, Path],
         tables_folder: Path,
         problems: tuple[Problem, ...] = (),
+        tables: Tables | None = None,
     ) -> None:
-        """Open the tables of an index; raises IndexStoreError if they cannot be read."""
+        """Open the tables of an index, unless they are given; raises IndexStoreError if they cannot be read."""
         self.dataroot = dataroot
         self.version = version
         self.layout = layout
         self.problems = problems
         self._split_files = dict(split_files)
-        self._tables = Tables(tables_folder)
+        self._tables = tables or Tables(tables_folder)
 
     def __repr__(self) -> str:
         """Kind, version and place."""
@@ -74,6 +76,11 @@ class OpenTables:
                 "problems": self.problems,
             },
         )
+
+    @property
+    def places(self) -> tuple[Path, ...]:
+        """What a worker on another host must see to open it: the release's folder, and that of its tables."""
+        return self.dataroot, self.tables_folder
 
     @property
     def tables_folder(self) -> Path:
@@ -237,10 +244,20 @@ class OpenTables:
 
 
 def _reopened(kind: type[OpenTables], arguments: dict[str, Any]) -> OpenTables:
-    """Undo `OpenTables.__reduce__`, without looking for changes on disk."""
-    dataset = kind.__new__(kind)
-    OpenTables.__init__(dataset, **arguments)
+    """Undo `OpenTables.__reduce__`, without looking for changes on disk.
+
+    A worker gets a dataset with each item: it opens the files once, which takes as long as a sample's labels.
+    """
+    dataset, folder = kind.__new__(kind), arguments["tables_folder"]
+    tables = _tables_of(folder, folder.stat().st_ino) if folder.is_dir() else None
+    OpenTables.__init__(dataset, **arguments, tables=tables)
     return dataset
+
+
+@lru_cache(maxsize=2)
+def _tables_of(folder: Path, _number: int) -> Tables:
+    """The tables in a folder; the system's number of the folder tells one from another that takes its place."""
+    return Tables(folder)
 
 
 def token_of(row: RowArgument) -> str:

@@ -1,25 +1,29 @@
 """Looking at a whole release, or at one scenario: the checks in their order."""
 
+from __future__ import annotations
+
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import TokenError
-from deepaccident_devkit.parallel import run_batch
+from deepaccident_devkit.files import writable_folder, write_bytes
+from deepaccident_devkit.parallel import Places, Shard, check_whole, run_batch
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, find_release
 from deepaccident_devkit.release.layout import names_without_calib
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.build import read_scenario
 from deepaccident_devkit.tables.scan import scan_scenario
 from deepaccident_devkit.tables.split_assignment import SplitAssignment
-from deepaccident_devkit.tables.velocities import VelocityFit, fit_velocities, total_fit
+from deepaccident_devkit.tables.velocities import fit_velocities, total_fit
 from deepaccident_devkit.taxonomy import EXPECTED_MINI_SCENARIOS, EXPECTED_SCENARIOS
 from deepaccident_devkit.validation.agreement import check_agreement
-from deepaccident_devkit.validation.inventory import Recording, absences, take_inventory
+from deepaccident_devkit.validation.checks import NO_FIT, ScenarioCheck, kept_check, kept_path
+from deepaccident_devkit.validation.inventory import absences, take_inventory
 from deepaccident_devkit.validation.labels import check_labels
 from deepaccident_devkit.validation.poses import check_poses
 from deepaccident_devkit.validation.report import (
@@ -36,26 +40,8 @@ from deepaccident_devkit.validation.subject import make_finding, subject_of
 from deepaccident_devkit.validation.untracked import check_untracked
 from deepaccident_devkit.validation.velocities import check_velocities
 
-_NO_FIT = total_fit([])
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ScenarioCheck:
-    """What was found in one scenario.
-
-    Attributes:
-        token: the scenario's.
-        findings: in the order of the checks.
-        samples: agents times frames.
-        recordings: which agents have which kinds of file.
-        velocity: what the labels' velocities fit.
-    """
-
-    token: str
-    findings: tuple[Finding, ...]
-    samples: int
-    recordings: frozenset[Recording]
-    velocity: VelocityFit = _NO_FIT
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
 
 
 def validate_release(
@@ -64,45 +50,131 @@ def validate_release(
     *,
     deep: bool = False,
     workers: int | None = None,
+    executor: Executor | None = None,
     scenarios: Collection[str] | None = None,
+    parts: Path | None = None,
     progress: bool = False,
 ) -> ValidationReport:
-    """Look for everything that is wrong, odd or missing in a release; needs no index and writes nothing.
+    """Look for everything that is wrong, odd or missing in a release; needs no index.
 
     Args:
         root: the release's folder.
         version: `v1` or `v1-mini`.
         deep: also decode every image, point cloud and BEV array and hold them against the labels.
         workers: processes to use; see `parallel.run_batch`.
+        executor: any executor of `concurrent.futures` to run on, in place of own workers.
         scenarios: tokens of the scenarios to look at; None for all.
+        parts: folder to keep what was found in each scenario, so that the same call, or one of shards, does only what
+            is left; of a scenario whose files have changed since, nothing is left. None writes nothing.
         progress: whether to show a progress bar.
 
     Raises:
         DatarootError: the folder is missing, holds no release, or a part of it cannot be listed.
         VersionError: the version is unknown or not under this folder.
         TokenError: one of `scenarios` is not there.
-        WorkerError: a worker was killed.
+        ConfigError: `parts` cannot be written to.
+        WorkerError: a worker was killed, or cannot do the work.
     """
     layout = find_release(root, version)
+    work = _Work(deep=deep, parts=None if parts is None else writable_folder(parts))
+    checks = work.run(_chosen(layout, scenarios), workers=workers, executor=executor, progress=progress)
+    return _report(layout, checks, root=root, deep=deep, whole=scenarios is None)
+
+
+def validation_shard(root: Path, shard: Shard, parts: Path, version: str = "v1", **how: Any) -> list[ScenarioCheck]:
+    """Look at a part of a release, and keep what was found for `merged_validation`.
+
+    Args:
+        root: the release's folder.
+        shard: which part of its scenarios, or of `scenarios`.
+        parts: folder that all shards write into; what is there already is not done again.
+        version: `v1` or `v1-mini`.
+        **how: of `validate_release`: `deep`, `workers`, `executor`, `scenarios`, `progress`.
+
+    Raises:
+        ConfigError, DatarootError, VersionError, TokenError, WorkerError: as of `validate_release`.
+    """
+    chosen = shard.of(_chosen(find_release(root, version), how.pop("scenarios", None)))
+    return _Work(deep=how.pop("deep", False), parts=writable_folder(parts)).run(chosen, **how)
+
+
+def merged_validation(root: Path, parts: Path, version: str = "v1", **how: Any) -> ValidationReport:
+    """What `validate_release` gives, from what the shards kept; arguments are those of `validation_shard`.
+
+    Raises:
+        UnfinishedError: a scenario is not done, or only with other settings, by another devkit, or with other files.
+        DatarootError, VersionError, TokenError, WorkerError: as of `validate_release`.
+    """
+    layout, scenarios, deep = find_release(root, version), how.pop("scenarios", None), how.pop("deep", False)
+    checks = _Work(deep=deep, parts=parts, merge=True).run(_chosen(layout, scenarios), **how)
+    return _report(layout, checks, root=root, deep=deep, whole=scenarios is None)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Work:
+    """What workers do; cheap to pickle.
+
+    Attributes:
+        deep: whether sensor files are decoded.
+        parts: folder of what was found before, and is found now.
+        merge: whether nothing is looked at that is not there.
+    """
+
+    deep: bool
+    parts: Path | None
+    merge: bool = False
+
+    def __call__(self, scenario: ScenarioFolder) -> ScenarioCheck | None:
+        """Look at one scenario; None if it should be there and is not."""
+        if self.parts is None:
+            return check_scenario(scenario, deep=self.deep)
+        path = kept_path(self.parts, scenario, deep=self.deep)  # before anything is read: a later edit is noticed
+        check = kept_check(path)
+        if check is None and not self.merge:
+            check = check_scenario(scenario, deep=self.deep)
+            write_bytes(path, check.to_json().encode())
+        return check
+
+    def run(self, scenarios: Sequence[ScenarioFolder], **how: Any) -> list[ScenarioCheck]:
+        """Look at all of them; raises UnfinishedError if one is not there."""
+        places = Places(
+            reads=tuple({scenario.root for scenario in scenarios}),
+            writes=() if self.parts is None else (self.parts,),
+        )
+        found = run_batch(self, scenarios, label="validating scenarios", places=places, **how)
+        names = [str(Path(scenario.folder, scenario.token)) for scenario in scenarios]
+        done = {name: check for name, check in zip(names, found, strict=True) if check is not None}
+        check_whole(names, done, self.parts)
+        return list(done.values())
+
+
+def _chosen(layout: ReleaseLayout, scenarios: Collection[str] | None) -> list[ScenarioFolder]:
+    """The scenarios of some tokens, None for all; raises TokenError."""
     chosen = [folder for folder in layout.scenarios if scenarios is None or folder.token in scenarios]
     unknown = sorted(set(scenarios or ()) - {folder.token for folder in chosen})
     if unknown:
-        raise TokenError(f"{root}: has no scenario {unknown[0]!r}; its folders name {len(layout.scenarios)} others")
-    checks = run_batch(
-        partial(check_scenario, deep=deep), chosen, workers=workers, label="validating scenarios", progress=progress
-    )
+        raise TokenError(
+            f"{layout.root}: has no scenario {unknown[0]!r}; its folders name {len(layout.scenarios)} others"
+        )
+    return chosen
+
+
+def _report(
+    layout: ReleaseLayout, checks: Sequence[ScenarioCheck], *, root: Path, deep: bool, whole: bool
+) -> ValidationReport:
+    """What was found in scenarios, and in the release as a whole."""
     splits, of_release = check_splits(layout)
     tokens = {check.token for check in checks}
     of_release = [finding for finding in of_release if finding.scenario is None or finding.scenario in tokens]
-    of_release += _strays(layout) if scenarios is None else ()
+    of_release += _strays(layout) if whole else ()
     return ValidationReport(
         dataroot=str(root),
-        version=version,
+        version=layout.version,
         deep=deep,
         scenarios=len(checks),
         samples=sum(check.samples for check in checks),
         findings=worst_first([*of_release, *(finding for check in checks for finding in check.findings)]),
-        coverage=_coverage(version, checks if scenarios is None else [], splits),
+        coverage=_coverage(layout.version, checks if whole else [], splits),
         velocity=total_fit([check.velocity for check in checks]),
         velocity_frames={check.token: check.velocity.best for check in checks},
     )
@@ -139,7 +211,7 @@ def check_scenario(scenario: ScenarioFolder, *, deep: bool = False) -> ScenarioC
     recordings |= {(agent, "label") for agent in scan.labelled}
     files, faults = (None, []) if scan.problems or not scan.agents else read_scenario(scenario, scan)
     found += faults
-    velocity = _NO_FIT
+    velocity = NO_FIT
     if files is not None:
         with np.errstate(all="ignore"):  # absurd numbers are what is looked for
             subject = subject_of(files)

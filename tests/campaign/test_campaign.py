@@ -28,6 +28,7 @@ def healthy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_healthy(tmp_path_factory.mktemp("campaign") / "healthy")
 
 
+@pytest.mark.slow
 def test_300_changed_files_are_read_or_refused(healthy: Path) -> None:
     """And healthy ones are read."""
     unchanged = [Case(kind, None, 0) for kind in KINDS]

@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.arrays import FloatArray
 from deepaccident_devkit.errors import NotAvailableError, ResultsError, TokenError
@@ -22,8 +22,11 @@ from deepaccident_devkit.evaluation.results.faults import at, parsed_json, told_
 from deepaccident_devkit.evaluation.results.header import RESULTS_FILE, Header, MotionForm, ResultsTask, read_header
 from deepaccident_devkit.evaluation.results.motion_arrays import paths_of, stored_output, stored_paths
 from deepaccident_devkit.evaluation.results.shards import OpenShards, ShardCheck, check_shard, read_manifest
-from deepaccident_devkit.parallel import run_batch
+from deepaccident_devkit.parallel import Places, run_batch
 from deepaccident_devkit.reading import irregular_text, read_bytes
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
 
 Prediction = MotionOutput | list[Accident] | DetectedBoxes
 
@@ -48,7 +51,7 @@ class EntryContents:
         """The entries of a sample."""
         return self._at(self._entries, token)
 
-    def check(self, *, workers: int | None, progress: bool) -> None:
+    def check(self, _samples: Collection[str] | None, **_how: Any) -> None:
         """Nothing to do: all was checked when it was read."""
 
 
@@ -85,10 +88,15 @@ class MotionContents:
                 stored = stored_paths(archive, token, self.form)
         return paths_of(self.prediction(token), self.form.labels) if stored is None else stored
 
-    def check(self, *, workers: int | None, progress: bool) -> None:
-        """Read every array; raises ResultsError that names shard, token and array."""
-        tasks = [ShardCheck(self._root, shard, self.form) for shard in self._manifest.shards]
-        run_batch(check_shard, tasks, workers=workers, label="shards", progress=progress)
+    def check(self, samples: Collection[str] | None, **how: Any) -> None:
+        """Read every array, or those of the shards that begin with one of these samples, as `run_batch` is told.
+
+        Raises:
+            ResultsError: names shard, token and array.
+        """
+        chosen = [each for each in self._manifest.shards if samples is None or each.tokens[0] in samples]
+        tasks = [ShardCheck(self._root, shard, self.form) for shard in chosen]
+        run_batch(check_shard, tasks, label="shards", places=Places(reads=(self._root,)), **how)
 
 
 Contents = EntryContents | MotionContents
@@ -213,21 +221,31 @@ class Results:
             raise NotAvailableError(f"{self.path}: {self.task} results have no trajectories; motion results have")
         return contents.trajectories(token)
 
-    def check(self, *, workers: int | None = 1, progress: bool = False) -> None:
+    def check(
+        self,
+        *,
+        samples: Collection[str] | None = None,
+        workers: int | None = 1,
+        executor: Executor | None = None,
+        progress: bool = False,
+    ) -> None:
         """Read and check everything: do so before long work and before publishing.
 
         Args:
+            samples: of motion, only the shards that begin with one of these; None for all.
             workers: processes for the shards of motion; None takes what the work is worth.
+            executor: any executor of `concurrent.futures` to run on, in place of own workers.
             progress: whether to show a bar.
 
         Raises:
             ResultsError: names the shard, the token and the array of the first fault, or the file was changed.
+            WorkerError: a worker was killed, or does not see the results.
         """
         with told_of(self._file):
             now = content_fingerprint(read_bytes(self._file, "results"))
         if now != self.fingerprint:
             raise ResultsError(f"{self._file}: was changed after it was opened; open it again")
-        self._contents.check(workers=workers, progress=progress)
+        self._contents.check(samples, workers=workers, executor=executor, progress=progress)
 
     @property
     def _file(self) -> Path:

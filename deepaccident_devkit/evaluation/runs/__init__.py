@@ -5,11 +5,12 @@ says which differences of two are real.
 """
 
 from deepaccident_devkit.evaluation.runs.bundles import Bundle, checked_target, read_bundle, save_run
+from deepaccident_devkit.evaluation.runs.checkpoints import explanation_checkpoint
 from deepaccident_devkit.evaluation.runs.compare import compare_bundles
 from deepaccident_devkit.evaluation.runs.comparison import ComparedNumber, Comparison
 from deepaccident_devkit.evaluation.runs.coverage import Coverage, coverage
 from deepaccident_devkit.evaluation.runs.differences import Difference
-from deepaccident_devkit.evaluation.runs.evaluate import default_selection, evaluate_results
+from deepaccident_devkit.evaluation.runs.evaluate import default_selection, evaluate_results, evaluate_shard
 from deepaccident_devkit.evaluation.runs.evaluation_run import (
     BREAKDOWNS,
     EvaluationRun,
@@ -17,7 +18,6 @@ from deepaccident_devkit.evaluation.runs.evaluation_run import (
     ReleaseInfo,
     ResultsInfo,
     breakdowns_of,
-    explanation_checkpoint,
 )
 from deepaccident_devkit.evaluation.runs.rows import read_rows, sample_rows
 from deepaccident_devkit.evaluation.runs.selection import SampleSelection
@@ -45,6 +45,7 @@ __all__ = [
     "coverage",
     "default_selection",
     "evaluate_results",
+    "evaluate_shard",
     "explanation_checkpoint",
     "read_bundle",
     "read_rows",

@@ -13,12 +13,8 @@ from typing import Any, Final
 
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import ResultsError
-from deepaccident_devkit.evaluation.runs.evaluation_run import (
-    SUMMARY_FORMAT,
-    SUMMARY_VERSION,
-    EvaluationRun,
-    remove_checkpoints,
-)
+from deepaccident_devkit.evaluation.runs.checkpoints import remove_checkpoints
+from deepaccident_devkit.evaluation.runs.evaluation_run import SUMMARY_FORMAT, SUMMARY_VERSION, EvaluationRun
 from deepaccident_devkit.evaluation.runs.rows import sample_rows, write_rows
 from deepaccident_devkit.evaluation.runs.selection import SampleSelection
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
 import platform
-from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.arrays import ShortRepr
-from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.attributes import WITHIN_RECORDINGS, SampleAttributes, attribute_name
 from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown, Group, breakdown
 from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
@@ -24,8 +20,11 @@ from deepaccident_devkit.evaluation.metrics.intervals import Resampling
 from deepaccident_devkit.evaluation.runs.selection import SampleSelection
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.parallel import run_batch
-from deepaccident_devkit.release.fingerprints import ScenarioHashes, digest_of, fingerprint
+from deepaccident_devkit.release.fingerprints import ScenarioHashes, fingerprint
 from deepaccident_devkit.text import rows_html
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
 
 SUMMARY_FORMAT: Final = "DeepAccident metrics summary"
 SUMMARY_VERSION: Final = 1
@@ -189,7 +188,12 @@ class EvaluationRun:
         }
 
     def broken_down(
-        self, by: Sequence[str] | None = None, resampling: Resampling | None = None, *, workers: int | None = 1
+        self,
+        by: Sequence[str] | None = None,
+        resampling: Resampling | None = None,
+        *,
+        workers: int | None = 1,
+        executor: Executor | None = None,
     ) -> EvaluationRun:
         """The same run with results by these attributes, in place of those it has.
 
@@ -197,13 +201,15 @@ class EvaluationRun:
             by: of `attributes.ATTRIBUTES`; one that is given twice counts once. None for `breakdowns_of` the task.
             resampling: how intervals are made; None for the defaults.
             workers: processes, which share the attributes among them; None takes what the work is worth.
+            executor: any executor of `concurrent.futures` to run on, in place of own workers.
 
         Raises:
             ChoiceError: no such attribute.
         """
         chosen = breakdowns_of(self.setup.task) if by is None else map(attribute_name, by)
         work = partial(breakdown, self.evaluator, self.attributes, resampling=resampling)
-        return replace(self, breakdowns=tuple(run_batch(work, list(dict.fromkeys(chosen)), workers=workers)))
+        found = run_batch(work, list(dict.fromkeys(chosen)), workers=workers, executor=executor)
+        return replace(self, breakdowns=tuple(found))
 
     def summary(self) -> dict[str, Any]:
         """All numbers except those of single samples, and what they depend on, as JSON holds it."""
@@ -266,66 +272,3 @@ class EvaluationRun:
             }
             for group in groups
         ]
-
-
-_ENDING: Final = ".counts.json"
-
-
-def checkpoint_path(
-    out: str | os.PathLike[str],
-    setup: EvaluationSetup,
-    tokens: Collection[str],
-    fingerprints: Mapping[str, str],
-    purpose: str = "evaluation",
-) -> Path:
-    """The file beside `out` that such a run saves its counts to.
-
-    Its name is a digest of all that affects the counts: another setup, other samples, other predictions, other labels
-    and another devkit have another file, and so never go on with these counts.
-
-    Args:
-        out: the folder that the finished evaluation goes to.
-        setup: task and rules.
-        tokens: the samples.
-        fingerprints: of the predictions and of the labels.
-        purpose: what is counted, where that is something else than the evaluation itself.
-    """
-    name = digest_of(
-        {
-            "devkit": __version__,
-            "setup": setup.as_dict(),
-            "tokens": sorted(tokens),
-            "fingerprints": dict(fingerprints),
-            "purpose": purpose,
-        }
-    )
-    return _folder(out) / f"{name}{_ENDING}"
-
-
-def explanation_checkpoint(run: EvaluationRun, out: str | os.PathLike[str]) -> Path:
-    """The same file for the explanation of a run (`explain`), which takes longer than the run itself."""
-    fingerprints = {"results": run.results.fingerprint, "release": run.release.fingerprint}
-    return checkpoint_path(out, run.setup, run.evaluator.tokens, fingerprints, "explanation")
-
-
-def drop_if_damaged(path: Path, evaluator: Evaluator[Any]) -> None:
-    """Remove a file from which no counts can be taken: only time is lost."""
-    if path.exists():
-        try:
-            evaluator.fresh().resume(path)
-        except EvaluationError:
-            path.unlink()
-
-
-def remove_checkpoints(out: str | os.PathLike[str]) -> None:
-    """Remove all such files beside `out`, once what they were for is written."""
-    folder = _folder(out)
-    for path in folder.glob(f"*{_ENDING}"):
-        path.unlink(missing_ok=True)
-    with suppress(OSError):  # something else lies there
-        folder.rmdir()
-
-
-def _folder(out: str | os.PathLike[str]) -> Path:
-    target = Path(out).expanduser()
-    return target.with_name(f"{target.absolute().name}.unfinished")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
-from deepaccident_devkit.parallel import run_unordered
+from deepaccident_devkit.parallel import Places, run_unordered
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -34,8 +34,11 @@ def evaluate_samples(
     executor: Executor | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
     progress: bool = False,
+    places: Places | None = None,
 ) -> EvaluatorT:
     """Update an evaluator with many samples; the result is the same, to the bit, for any number of workers.
+
+    If a sample cannot be evaluated, the others are counted and saved before the error is raised.
 
     Args:
         evaluator: what counts; samples that it has already are passed over.
@@ -43,17 +46,19 @@ def evaluate_samples(
         load: gives what `evaluator.update` takes after the token: prediction, label and so on. With several workers a
             function of a module that they can import, or `functools.partial` of one (a dataset may be bound to it).
         workers: processes; None takes what the work is worth, and this one alone if others cannot import `load`.
-        executor: to run on instead, any of `concurrent.futures`.
+        executor: any executor of `concurrent.futures` to run on, in place of own workers.
         checkpoint: a file that the counts are saved to every half minute and at the end, also of a run that breaks
             off; if it is there, its samples are not evaluated again. None for none.
         progress: whether to show a bar.
+        places: what workers on other hosts must see.
 
     Returns:
         The evaluator itself.
 
     Raises:
-        EvaluationError: a sample cannot be evaluated (the message begins with its token), the checkpoint is of other
-            settings or samples or cannot be read or written, or workers cannot import `load`.
+        EvaluationError: samples cannot be evaluated (the message begins with the token of the only one, or lists all),
+            the checkpoint is of other settings or samples or cannot be read or written, or workers cannot import
+            `load`.
         WorkerError: a worker was killed.
         ChoiceError: `workers` is less than 1.
     """
@@ -77,11 +82,17 @@ def evaluate_samples(
         label="samples",
         progress=progress,
         sizes=[len(batch.samples) for batch in batches],
+        places=places,
     )
+    failed: dict[str, EvaluationError] = {}
     with _saved_now_and_then(evaluator, saved) as save, closing(done):
-        for _, part in done:
+        for _, (part, faults) in done:
             evaluator.merge(part)
+            for token, fault in faults.items():
+                fault.__cause__ = None if failed else fault.__cause__  # it holds what was being loaded
+                failed[token] = fault
             save()
+    _check_failed([failed[token] for token in samples if token in failed], len(left))
     return evaluator
 
 
@@ -92,19 +103,46 @@ class _Batch(Generic[Task]):
     load: Callable[[Task], Sequence[Any]]
 
 
-def _evaluated(batch: _Batch[Any]) -> Any:
+def _evaluated(batch: _Batch[Any]) -> tuple[Any, dict[str, EvaluationError]]:
+    """The counts of a batch, and why some of its samples have none."""
     evaluator = batch.evaluator.fresh()
-    for token, task in batch.samples:
-        _evaluate(evaluator, token, batch.load, task)
-    return evaluator
+    faults = {token: _fault(evaluator, token, batch.load, task) for token, task in batch.samples}
+    return evaluator, {token: fault for token, fault in faults.items() if fault is not None}
 
 
-def _evaluate(evaluator: Evaluator[Any], token: str, load: Callable[[Any], Sequence[Any]], task: Any) -> None:
+def _fault(
+    evaluator: Evaluator[Any], token: str, load: Callable[[Any], Sequence[Any]], task: Any
+) -> EvaluationError | None:
+    """Count a sample; the error if it cannot be, with its cause."""
     try:
         evaluator.update(token, *load(task))
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001 - whatever a caller's own function raises
         text = str(error).removeprefix(f"{token}: ")
-        raise EvaluationError(f"{token}: cannot be evaluated: {type(error).__name__}: {text}") from error
+        fault = EvaluationError(f"{token}: cannot be evaluated: {type(error).__name__}: {text}")
+        fault.__cause__ = error
+        return fault
+    return None
+
+
+def _check_failed(failed: Sequence[EvaluationError], samples: int) -> None:
+    """Raise EvaluationError if samples have failed: that of the only one, or a list of all."""
+    if len(failed) == 1:
+        raise failed[0]
+    if failed:
+        cause = next((each.__cause__ for each in failed if each.__cause__ is not None), None)
+        lines = [f"{len(failed)} of {samples} samples cannot be evaluated:", *(f"  {each}" for each in failed)]
+        raise EvaluationError("\n".join(lines)) from cause
+
+
+def take_stored(evaluator: Evaluator[Any], stored: Evaluator[Any]) -> None:
+    """Take stored counts, some of which it may have already; that alone does not make a sample a repeated one.
+
+    Raises:
+        EvaluationError: it has other counts of a sample.
+    """
+    repeated = evaluator.repeated | stored.repeated
+    evaluator.merge(stored)
+    evaluator.repeated = repeated
 
 
 def _resume(evaluator: Evaluator[Any], path: Path, samples: Mapping[str, Any]) -> None:
@@ -116,7 +154,7 @@ def _resume(evaluator: Evaluator[Any], path: Path, samples: Mapping[str, Any]) -
             f"{path}: has {len(others)} samples that are not among these, such as {others[0]}; give each evaluation a "
             "checkpoint of its own"
         )
-    evaluator.merge(stored)
+    take_stored(evaluator, stored)
 
 
 def _workers_that_can(batch: _Batch[Any], workers: int | None) -> int | None:

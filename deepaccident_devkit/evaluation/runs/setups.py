@@ -23,6 +23,7 @@ from deepaccident_devkit.evaluation.metrics.motion import MOTION_PROTOCOLS, Moti
 from deepaccident_devkit.evaluation.metrics.warning import WARNING_PROTOCOLS, WarningEvaluator
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels, motion_labels
+from deepaccident_devkit.parallel import Places
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.text import choice, settle_choices
 
@@ -147,6 +148,11 @@ class SampleLoader:
                 f"({form.frames} frames, {form.step:g} s apart, from the present on), less than the horizon of "
                 f"{self.setup.horizon:g} s; add the present frame if it is missing, or evaluate with a shorter horizon"
             )
+
+    @property
+    def places(self) -> Places:
+        """What workers must see."""
+        return Places(reads=(*self.dataset.places, self.results.path))
 
     def __call__(self, token: str) -> tuple[Any, ...]:
         """Prediction, truth and other arguments of the evaluator."""

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.arrays import ShortRepr
@@ -34,6 +34,9 @@ from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
 from deepaccident_devkit.evaluation.runs.rows import read_rows, sample_rows
 from deepaccident_devkit.evaluation.runs.selection import SampleSelection
 from deepaccident_devkit.release.fingerprints import scenario_hashes
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
 
 _SHOWN: Final = 10
 """Differences of a kind that the text lists."""
@@ -104,6 +107,7 @@ def verify_bundle(
     results: Results | str | os.PathLike[str] | None = None,
     split: str | os.PathLike[str] | None = None,
     workers: int | None = None,
+    executor: Executor | None = None,
     progress: bool = False,
 ) -> Verification:
     """Evaluate again what a bundle is of, and compare everything with it; numbers must be equal to the bit.
@@ -117,6 +121,7 @@ def verify_bundle(
         results: the predictions; None for the bundle's own copy.
         split: the split file, if the bundle is of one; else None.
         workers: processes; None takes what the work is worth.
+        executor: any executor of `concurrent.futures` to run on, in place of own workers.
         progress: whether to show bars.
 
     Raises:
@@ -126,11 +131,12 @@ def verify_bundle(
     check_repeated(bundle, {"dataroot": dataset.dataroot, "results": results, "split": split})
     given = bundle.results_path if results is None else results
     opened = given if isinstance(given, Results) else read_results(given)
-    found = [*_version(bundle), *_files(bundle), *_scenarios(bundle, dataset, workers), *_results(bundle, opened)]
+    engine = {"workers": workers, "executor": executor}
+    found = [*_version(bundle), *_files(bundle), *_scenarios(bundle, dataset, engine), *_results(bundle, opened)]
     run: EvaluationRun | None = None
     try:
         selection = bundle.selection if split is None else replace(bundle.selection, split=os.fspath(split))
-        run = _again(bundle, dataset, opened, selection, workers=workers, progress=progress)
+        run = _again(bundle, dataset, opened, selection, engine, progress=progress)
     except DeepAccidentError as error:
         found.append(Difference(kind="evaluation", where="all numbers", stored="evaluated", found=str(error)))
     if run is not None:
@@ -160,8 +166,8 @@ def _again(
     dataset: Dataset,
     results: Results,
     selection: SampleSelection,
+    engine: Mapping[str, Any],
     *,
-    workers: int | None,
     progress: bool,
 ) -> EvaluationRun:
     run = evaluate_results(
@@ -170,8 +176,8 @@ def _again(
         bundle.setup,
         selection,
         allow_partial=bundle.summary["partial"] is not None or bool(bundle.summary["counts"]["left_out"]),
-        workers=workers,
         progress=progress,
+        **engine,
     )
     breakdowns = bundle.summary["breakdowns"]
     if not breakdowns:
@@ -180,7 +186,7 @@ def _again(
         resampling = Resampling(**next(iter(breakdowns.values()))["resampling"])
     except TypeError as error:
         raise ResultsError(f"{SUMMARY_FILE}: does not say how intervals were made ({error})") from error
-    return run.broken_down(list(breakdowns), resampling, workers=workers)
+    return run.broken_down(list(breakdowns), resampling, **engine)
 
 
 def _version(bundle: Bundle) -> Iterator[Difference]:
@@ -199,13 +205,13 @@ def _files(bundle: Bundle) -> Iterator[Difference]:
         yield Difference(kind="file", where=name, stored=one, found=other)
 
 
-def _scenarios(bundle: Bundle, dataset: Dataset, workers: int | None) -> Iterator[Difference]:
+def _scenarios(bundle: Bundle, dataset: Dataset, engine: Mapping[str, Any]) -> Iterator[Difference]:
     try:
         stored = bundle.scenarios()
     except ResultsError as error:
         yield Difference(kind="file", where=SCENARIOS_FILE, stored="hashes", found=str(error))
         return
-    found = {token: each.as_dict() for token, each in scenario_hashes(dataset, stored, workers=workers).items()}
+    found = {token: each.as_dict() for token, each in scenario_hashes(dataset, stored, **engine).items()}
     for token, hashes in stored.items():
         if token not in found:
             yield Difference(kind="scenario", where=token, stored="in the release", found=ABSENT)

@@ -20,6 +20,7 @@ from deepaccident_devkit.reading import fault_text, read_bytes, shortened
 
 _FORMAT: Final = "DeepAccident export"
 _LOCK: Final = ".deepaccident.lock"
+_ENDING: Final = ".manifest.json"
 _AGAIN: Final = "export again into an empty folder"
 
 
@@ -139,28 +140,30 @@ class Manifest:
 
 def manifest_path(folder: Path, name: str) -> Path:
     """The manifest of a format's export."""
-    return folder / f"{name}.manifest.json"
+    return folder / f"{name}{_ENDING}"
 
 
 @contextmanager
-def writing_to(folder: Path) -> Iterator[None]:
+def writing_to(folder: Path, *, shared: bool = False) -> Iterator[None]:
     """Hold the lock of a folder while an export is written into it; make it, and remove what killed processes left.
 
-    The file of the lock stays, as one who waits for it may have it open already.
+    The file of the lock stays, as one who waits for it may have it open already. Those who share it write different
+    units, and leave the removing to one who has it alone.
 
     Raises:
         ExportError: the folder cannot be made, locked or written to.
     """
     try:
-        lock = held_lock(folder / _LOCK, "writes an export")
+        lock = held_lock(folder / _LOCK, "writes an export", shared=shared)
     except (OSError, NotImplementedError) as error:  # the latter: a file system without locks
         raise ExportError(f"{folder}: no export can be written there ({error}); choose another folder") from error
+    tidy = (lambda _: None) if shared else _remove_half_written
     try:
-        _remove_half_written(folder)
+        tidy(folder)
         try:
             yield
         except BaseException:
-            _remove_half_written(folder)
+            tidy(folder)
             raise
     except DeepAccidentError:
         raise
@@ -172,9 +175,11 @@ def writing_to(folder: Path) -> Iterator[None]:
 
 
 def _remove_half_written(folder: Path) -> None:
-    """Remove all temporary files; the lock is held, so that no process that lives has one."""
+    """Remove the temporary files of dead processes; a worker that a scheduler took for lost may live, and goes on."""
+    begun = {temporary_of(each.name) or "" for each in folder.iterdir()}
+    remove_leftovers(folder, [name for name in begun if name.endswith(_ENDING)])  # those are written by this one alone
     for each, _, _ in os.walk(folder):
-        remove_leftovers(Path(each), locked=True)
+        remove_leftovers(Path(each))
 
 
 def _is_own(name: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import errno
 import os
 import shutil
@@ -45,6 +46,12 @@ class Tally:
         self.bytes += other.bytes
         self.linked += other.linked
         self.left_out += other.left_out
+
+    def __add__(self, other: Tally) -> Tally:
+        """Both together."""
+        both = copy.deepcopy(self)
+        both.add(other)
+        return both
 
     def as_dict(self) -> dict[str, Any]:
         """For a manifest; names in order."""

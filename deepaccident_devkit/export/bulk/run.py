@@ -15,7 +15,19 @@ from deepaccident_devkit.export.bulk.format import Format, Plan, Unit
 from deepaccident_devkit.export.bulk.manifest import Manifest, writing_to
 from deepaccident_devkit.export.bulk.output import Tally
 from deepaccident_devkit.export.bulk.unfinished import Unfinished
-from deepaccident_devkit.parallel import run_batch
+from deepaccident_devkit.parallel import (
+    MERGE,
+    Failure,
+    Part,
+    Places,
+    Shard,
+    Tried,
+    check_failures,
+    check_whole,
+    mine,
+    part_of,
+    run_batch,
+)
 from deepaccident_devkit.release.fingerprints import digest_of, folder_hashes, scenario_folders
 from deepaccident_devkit.release.layout import ScenarioFolder
 from deepaccident_devkit.selection import find
@@ -48,13 +60,14 @@ class Exported:
     tally: Tally
 
 
-def export_release(
+def export_release(  # noqa: PLR0913 - what, where, on what, and what to say
     dataset: Dataset,
     folder: str | os.PathLike[str],
     form: Format,
     *,
     workers: int | None = None,
     executor: Executor | None = None,
+    part: Part | str = None,
     progress: bool = False,
     dry_run: bool = False,
     on_plan: Callable[[Plan, int], object] | None = None,
@@ -70,6 +83,7 @@ def export_release(
         form: the format, with which scenarios and agents, and its own settings.
         workers: processes; None chooses by the amount of work.
         executor: any executor of `concurrent.futures` to run on, in place of own workers.
+        part: `3/8` for the third of eight parts (docs/clusters.md); `merge` to complete the export once all are there.
         progress: whether to show bars.
         dry_run: only plan; nothing is written, and the folder is not made.
         on_plan: called with the plan and the bytes that are free, before anything is written.
@@ -80,46 +94,62 @@ def export_release(
             from other scenarios or another state of them.
         NotAvailableError: no scenario is left to export, or the release has no such split.
         ChoiceError, FieldError: no such filter, or `workers` is less than 1.
-        ReleaseError: a file of the release cannot be read.
-        WorkerError: a worker was killed.
+        SomeFailedError: files of some scenarios cannot be read; the others are written, and the same call continues.
+        UnfinishedError: `part` is `merge`, and some scenarios are not written.
+        WorkerError: a worker was killed, or cannot do the work.
     """
     if not os.fspath(folder):
         raise ExportError("expected a folder for the export, found an empty path; give '.' for the current one")
     root = Path(folder).expanduser().absolute()
+    part = part_of(part)
     scenarios = _chosen(dataset, form)
     settings = {**form.settings(), "version": dataset.version}
     manifest = Manifest.of(root, form.name, settings, form.beside)
-    task, units = _Work(dataset, form, Unfinished(root, form.name)), form.units(dataset, scenarios)
+    task, units = _Work(dataset, form, Unfinished(root, form.name), merge=part == MERGE), form.units(dataset, scenarios)
     run = partial(run_batch, workers=workers, executor=executor, progress=progress)
-    plans = run(task.plan, units, label="planning")
+    own = mine(part, units)
+    plans = run(task.plan, own, label="planning", places=Places(reads=dataset.places))
     plan = sum(plans, Plan())
     free = shutil.disk_usage(next(each for each in (root, *root.parents) if each.exists())).free
     exported = partial(Exported, folder=root, plan=plan)
     if on_plan is not None:
         on_plan(plan, free)
     if not manifest.complete:
-        _check_room(task, dict(zip(units, plans, strict=True)), free)
+        _check_room(task, dict(zip(own, plans, strict=True)), free)
     if dry_run:
         return exported(written=0, kept=0, tally=Tally())
     form.check(dataset, root)
     folders = _folders(dataset, scenarios)
+    places = Places(reads=dataset.places, writes=(root,))
     if not manifest.complete:
-        with writing_to(root):
+        with writing_to(root, shared=isinstance(part, Shard)):
             manifest = Manifest.of(root, form.name, settings, form.beside)  # who held the lock may have completed it
             if not manifest.complete:
                 manifest.write(root)
-                task.unfinished.remove_others(units)
-                jobs = [(unit, tuple(folders[token] for token in unit.scenarios)) for unit in units]
-                done = run(task.write, jobs, label=form.name)
+                if not isinstance(part, Shard):
+                    task.unfinished.remove_others(units)
+                jobs = [(unit, tuple(folders[token] for token in unit.scenarios)) for unit in own]
+                done = _checked(run(Tried(task.write), jobs, label=form.name, places=places), own, root)
+                written = sum(each.new for each in done)
+                if isinstance(part, Shard):
+                    tally = sum((each.tally for each in done), Tally())
+                    return exported(written=written, kept=len(own) - written, tally=tally)
                 manifest = task.finished(units, done, settings)
                 manifest.write(root)
                 task.unfinished.remove()
-                written = sum(each.new for each in done)
                 return exported(written=written, kept=len(units) - written, tally=manifest.tally)
-    hashes = run(folder_hashes, list(folders.values()), label="comparing")
+    hashes = run(folder_hashes, list(folders.values()), label="comparing", places=Places(reads=dataset.places))
     _check_release(manifest, root, {token: each.as_dict() for token, each in zip(folders, hashes, strict=True)})
     task.unfinished.remove()  # left by a call that was killed after the manifest was complete
     return exported(written=0, kept=len(units), tally=manifest.tally)
+
+
+def _checked(results: Sequence[_Done | Failure | None], units: Sequence[Unit], root: Path) -> list[_Done]:
+    """What was done; raises SomeFailedError or UnfinishedError if that is not all."""
+    named = list(zip((unit.name for unit in units), results, strict=True))
+    check_failures(named, str(root))
+    check_whole([name for name, _ in named], {name for name, done in named if done is not None}, root)
+    return [done for done in results if isinstance(done, _Done)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,21 +168,25 @@ class _Work:
     dataset: Dataset
     form: Format
     unfinished: Unfinished
+    merge: bool = False
 
     def plan(self, unit: Unit) -> Plan:
         """About how much a unit is."""
         return self.form.plan(self.dataset, unit)
 
-    def write(self, job: Job) -> _Done:
-        """Write a unit, unless it was written from the same files before."""
+    def write(self, job: Job) -> _Done | None:
+        """Write a unit, unless it was written from the same files before; None if it is to be there and is not."""
         unit, folders = job
         hashes = {each.token: folder_hashes(each).as_dict() for each in folders}
-        found = self.unfinished.done(unit)
-        if found is not None and found[0] == hashes:
-            return _Done(hashes, found[1], new=False)
-        with self.unfinished.output(self.form.link, unit) as output:
-            self.form.write(self.dataset, unit, output)
-        self.unfinished.set_done(unit, hashes, output.tally)
+        with self.unfinished.alone(unit):  # a worker that a scheduler took for lost may be at it still
+            found = self.unfinished.done(unit)
+            if found is not None and found[0] == hashes:
+                return _Done(hashes, found[1], new=False)
+            if self.merge:
+                return None
+            with self.unfinished.output(self.form.link, unit) as output:
+                self.form.write(self.dataset, unit, output)
+            self.unfinished.set_done(unit, hashes, output.tally)
         return _Done(hashes, output.tally, new=True)
 
     def finished(self, units: Sequence[Unit], done: Sequence[_Done], settings: Mapping[str, Any]) -> Manifest:

@@ -18,13 +18,14 @@ from typing import Any, Final
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.export.bulk.format import Unit
 from deepaccident_devkit.export.bulk.output import MALFORMED, Link, Output, Tally
-from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.files import held_lock, remove_leftovers, write_bytes
 from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.reading import read_bytes
 
 FOLDER: Final = ".deepaccident-parts"
 _DONE: Final = "done.json"
 _PATHS: Final = ".paths"
+_LOCK: Final = ".lock"
 _ODD: Final = ("", ".", "..")
 """Names that would lead out of the export, if somebody else wrote the paths."""
 
@@ -66,10 +67,20 @@ class Unfinished:
         write_bytes(self.parts(unit) / _DONE, json.dumps(record).encode())
 
     @contextmanager
-    def output(self, link: Link, unit: Unit | None = None) -> Iterator[Output]:
-        """Yield where to write a unit, or without one what spans units.
+    def alone(self, unit: Unit) -> Iterator[None]:
+        """Keep other processes and hosts from writing the same unit in the block."""
+        lock = held_lock(self.folder / f"{unit.name}{_LOCK}", f"writes {unit.name}")
+        try:
+            yield
+        finally:
+            lock.release()
 
-        Each path is noted before something is written there; at the end, what only earlier calls wrote is removed.
+    @contextmanager
+    def output(self, link: Link, unit: Unit | None = None) -> Iterator[Output]:
+        """Yield where to write a unit that the caller has alone, or without one what spans units.
+
+        Each path is noted before something is written there. What earlier calls left half-written is removed at the
+        beginning, also of another host's; what only they wrote, at the end.
         """
         name = "" if unit is None else unit.name
         if unit is not None:
@@ -77,6 +88,7 @@ class Unfinished:
         self.folder.mkdir(parents=True, exist_ok=True)
         journal = self.folder / f"{name}{_PATHS}"
         earlier, now = _noted(journal), set[str]()
+        self._remove_half_written(earlier)
         with journal.open("ab", buffering=0) as file:
 
             def note(path: str) -> None:
@@ -101,6 +113,14 @@ class Unfinished:
         shutil.rmtree(self.folder, ignore_errors=True)
         with suppress(OSError):  # another format's is there
             self.folder.parent.rmdir()
+
+    def _remove_half_written(self, paths: Collection[str]) -> None:
+        """Remove the temporary files and folders of these paths."""
+        names: dict[Path, set[str]] = {}
+        for place in map(self.root.joinpath, paths):
+            names.setdefault(place.parent, set()).add(place.name)
+        for folder, each in names.items():
+            remove_leftovers(folder, each)
 
     def _remove_paths(self, paths: Collection[str]) -> None:
         """Remove files or whole folders, and the folders that are empty then."""

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
-import os
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,7 +14,7 @@ import numpy as np
 
 from deepaccident_devkit.arrays import ByteArray
 from deepaccident_devkit.errors import ConfigError, MissingFileError
-from deepaccident_devkit.parallel import run_batch
+from deepaccident_devkit.parallel import own_threads, run_batch
 from deepaccident_devkit.release import read_image
 from deepaccident_devkit.render.replay.follow import Followed
 from deepaccident_devkit.render.replay.recording import Recording
@@ -211,7 +209,7 @@ def _kept(images: _Images, settings: PictureSettings) -> _Images:
 def _encoded(images: Sequence[_Image], settings: PictureSettings, *, progress: bool) -> list[bytes]:
     """The pictures as JPEG; made in threads, because the libraries that do most of the work let other threads run."""
     work = partial(_jpeg_of, settings=settings)
-    with ThreadPoolExecutor(os.cpu_count()) as threads:
+    with own_threads() as threads:
         return run_batch(work, images, executor=threads, label="pictures", progress=progress)
 
 

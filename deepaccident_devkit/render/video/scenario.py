@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Generator, Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import closing
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from deepaccident_devkit.arrays import ByteArray
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.parallel import run_unordered
+from deepaccident_devkit.parallel import Places, in_order, run_unordered
 from deepaccident_devkit.render.layers import Layer
 from deepaccident_devkit.render.video.views import OwnView, Scene, names_at, views_of
 from deepaccident_devkit.render.video.writers import check_target, write_video
 from deepaccident_devkit.tables.tokens import frame_token
 from deepaccident_devkit.v2x import Agents
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
 
 
 def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on its own in a notebook
@@ -30,6 +33,7 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
     size: tuple[int, int] = (1280, 720),
     fps: float = 10.0,
     workers: int | None = None,
+    executor: Executor | None = None,
     progress: bool = True,
 ) -> Path:
     """Write a scenario as a video.
@@ -53,6 +57,8 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
         fps: frames a second; the recordings have 10.
         workers: processes that render. None chooses by the amount of work, and only this process for functions of your
             own; with several processes these functions must be importable from a module.
+        executor: any executor of `concurrent.futures` to render on, in place of own workers; it must be able to send
+            functions of your own.
         progress: whether to show a bar.
 
     Returns:
@@ -64,7 +70,7 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
         NotAvailableError: an agent is not in this release, the sample has no label, or nobody collides and the view
             is `accident`.
         MissingExtraError: nothing here can write MP4.
-        WorkerError: a worker was killed.
+        WorkerError: a worker was killed, or cannot do the work.
     """
     target, (width, height) = Path(path).expanduser(), size
     check_target(target, size=(width, height), fps=fps)
@@ -74,10 +80,17 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
     names_at(dataset, tokens[0], agents)  # before any worker starts
     own = [view.own for view, _ in views if view.own is not None]
     scene = Scene(dataset=dataset, views=views, agents=agents, width=width, height=height)
-    count = _workers(own, workers)
-    drawn = run_unordered(scene.picture, tokens, workers=count, label="frames", progress=progress)
-    with closing(drawn):
-        write_video(target, _in_order(drawn), fps=fps)
+    drawn = run_unordered(
+        scene.picture,
+        tokens,
+        workers=_workers(own, workers),
+        executor=executor,
+        label="frames",
+        progress=progress,
+        places=Places(reads=dataset.places),
+    )
+    with closing(in_order(drawn)) as pictures:
+        write_video(target, pictures, fps=fps)
     return target
 
 
@@ -107,14 +120,3 @@ def _workers(own: Sequence[OwnView], workers: int | None) -> int | None:
                 f"workers: {name} cannot be sent to other processes; put it into a module of its own, or pass workers=1"
             )
     return workers
-
-
-def _in_order(results: Generator[tuple[int, ByteArray], None, None]) -> Generator[ByteArray, None, None]:
-    """The results in the order of their positions, each as soon as all before it are ready."""
-    waiting: dict[int, ByteArray] = {}
-    upcoming = 0
-    for position, result in results:
-        waiting[position] = result
-        while upcoming in waiting:
-            yield waiting.pop(upcoming)
-            upcoming += 1

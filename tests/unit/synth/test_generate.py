@@ -160,7 +160,7 @@ def unwritable(tmp_path):
     """A folder where a scenario's frames from the third on cannot be written: a file lies where a folder must be."""
     config = SynthConfig(scenarios=1, frames=4, image_size=(32, 18), seed=7)
     unfinished = Unfinished(tmp_path / ".out.unfinished")
-    name = next(iter(generate._jobs(unfinished, config, plan_scenarios(config)[0])))
+    name = next(iter(generate._parts(unfinished, config, plan_scenarios(config)[0])))
     return tmp_path / "out", config, unfinished.part(name.replace("1of", "3of"))
 
 
@@ -188,7 +188,7 @@ def test_a_scenario_that_could_not_be_moved_in_is_not_made_again(tmp_path, diges
         patch.setattr(Unfinished, "gather", lambda *_: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             make_release(tmp_path / "out", config, workers=1)
-    assert recording._made_ready.cache_info().currsize == 0
+    assert recording._KEPT.made_ready.cache_info().currsize == 0
     with monkeypatch.context() as patch:
         patch.setattr(generate, "record_scenario", lambda _: pytest.fail("made again"))
         make_release(tmp_path / "out", config, workers=1)
@@ -241,15 +241,6 @@ def test_two_processes_do_not_make_the_same_release(tmp_path):
     ):
         make_release(out, config, workers=1)
     assert not out.exists()
-
-
-def test_a_line_that_a_break_cut_off_is_no_scenario(tmp_path):
-    unfinished = Unfinished(tmp_path)
-    assert unfinished.made() == frozenset()
-    unfinished.note("a/b")
-    with (tmp_path / "made.txt").open("a") as file:
-        file.write("a/c")
-    assert unfinished.made() == {"a/b"}
 
 
 def test_an_unlabelled_test_split_has_calib_images_and_points_alone(tmp_path):

@@ -173,7 +173,7 @@ def test_a_process_waits_for_another_that_indexes(root: Path, caplog: pytest.Log
     thread = threading.Thread(target=lambda: result.append(opened(root)))
     with caplog.at_level(logging.WARNING):
         thread.start()
-        while "another process makes this index" not in caplog.text and thread.is_alive():
+        while "another process makes an index there" not in caplog.text and thread.is_alive():
             time.sleep(0.01)
         assert not result
         lock.release()

@@ -238,7 +238,7 @@ def test_clear_waits_for_a_process_that_indexes(root: Path, caplog: pytest.LogCa
     lock.acquire()
     thread = threading.Thread(target=clear_index, args=(root,))
     thread.start()
-    while "another process makes this index; waiting" not in caplog.text and thread.is_alive():
+    while "another process makes an index there; waiting" not in caplog.text and thread.is_alive():
         time.sleep(0.01)
     assert (root / ".deepaccident" / "v1" / "manifest.json").exists()
     lock.release()

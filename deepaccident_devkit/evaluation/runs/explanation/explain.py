@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import EvaluationError
@@ -24,6 +24,9 @@ from deepaccident_devkit.evaluation.runs.explanation.variants import (
 from deepaccident_devkit.evaluation.runs.many_samples import evaluate_samples
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
 from deepaccident_devkit.text import columns_text
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
 
 _SHOWN: Final = 8
 """Headlines that a table of the terminal has room for."""
@@ -156,6 +159,7 @@ def explain(
     tokens: Collection[str],
     *,
     workers: int | None = 1,
+    executor: Executor | None = None,
     progress: bool = False,
     checkpoint: str | os.PathLike[str] | None = None,
 ) -> Explanation:
@@ -170,6 +174,7 @@ def explain(
         setup: the rules that are explained.
         tokens: the samples that are evaluated, each with a prediction.
         workers: processes; None for as many as the work is worth.
+        executor: any executor of `concurrent.futures` to run on, in place of own workers.
         progress: whether to show a bar.
         checkpoint: as of `evaluate_samples`.
 
@@ -186,7 +191,16 @@ def explain(
     evaluator = SideBySide({name: kind(each.rules) for name, each in by_name.items()})
     samples = {token: token for token in sorted(tokens)}
     load = VariantsLoader(loader, by_name)
-    evaluate_samples(evaluator, samples, load, workers=workers, checkpoint=checkpoint, progress=progress)
+    evaluate_samples(
+        evaluator,
+        samples,
+        load,
+        workers=workers,
+        executor=executor,
+        checkpoint=checkpoint,
+        progress=progress,
+        places=loader.places,
+    )
     return _explanation(setup, variants, evaluator.compute(), len(samples))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -46,6 +46,9 @@ from deepaccident_devkit.evaluation.runs.sanity.report import SanityReport, verd
 from deepaccident_devkit.evaluation.runs.sanity.samples import telling_samples
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
 
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
 _SAMPLES: Final = 20
 _LISTS: Final = 60
 """Samples that are looked at, of maps and boxes, and of accident lists."""
@@ -63,6 +66,7 @@ def check_sanity(
     *,
     samples: int | None = None,
     workers: int | None = 1,
+    executor: Executor | None = None,
 ) -> SanityReport:
     """The scores of perfect and empty predictions, and whether the given ones look mirrored, turned, shifted and so on.
 
@@ -76,6 +80,7 @@ def check_sanity(
         tokens: the samples that are evaluated, each with a prediction.
         samples: how many of them are looked at; None for 20, or 60 of accident lists, which are short.
         workers: processes.
+        executor: any executor of `concurrent.futures` to run on, in place of own workers.
 
     Raises:
         ConfigError: `samples` is less than 1.
@@ -91,7 +96,8 @@ def check_sanity(
     chosen = telling_samples(dataset, tokens, count, setup.horizon, _says_something(results), varied=lists)
     evaluator = _SanityEvaluator(setup, _suspicions(results), _unchecked(results))
     load = _Loader(SampleLoader(dataset, results, setup))
-    evaluate_samples(evaluator, {token: token for token in chosen}, load, workers=workers)
+    wanted = {token: token for token in chosen}
+    evaluate_samples(evaluator, wanted, load, workers=workers, executor=executor, places=load.loader.places)
     return evaluator.compute()
 
 

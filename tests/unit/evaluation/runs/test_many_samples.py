@@ -7,6 +7,7 @@ import textwrap
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -102,8 +103,21 @@ class TestFaults:
             evaluate_samples(Sums(), {**VALUES, "x": BROKEN}, number, workers=workers)
 
     def test_arguments_that_do_not_fit(self) -> None:
-        with pytest.raises(EvaluationError, match=r"^00: cannot be evaluated: TypeError: "):
-            evaluate_samples(Sums(), VALUES, lambda task: (task, task, task), workers=1)
+        with pytest.raises(EvaluationError, match=r"^00: cannot be evaluated: TypeError: ") as caught:
+            evaluate_samples(Sums(), {"00": 1.0}, lambda task: (task, task, task), workers=1)
+        assert isinstance(caught.value.__cause__, TypeError)
+
+    @pytest.mark.parametrize("threads", [0, 3])
+    def test_several_are_all_listed_in_order_and_the_others_are_counted(self, threads: int) -> None:
+        evaluator, broken = Sums(), {"30": BROKEN, "02": BROKEN, "x": BROKEN}
+        executor = ThreadPoolExecutor(threads) if threads else None
+        with executor or nullcontext(), pytest.raises(EvaluationError, match=r"^3 of 41 samples cannot") as caught:
+            evaluate_samples(evaluator, VALUES | broken, number, workers=1, executor=executor)
+        lines = str(caught.value).splitlines()[1:]
+        fault = "cannot be evaluated: FileNotFoundError: predictions/7.npz"
+        assert lines == [f"  {token}: {fault}" for token in ("02", "30", "x")]
+        assert isinstance(caught.value.__cause__, FileNotFoundError)
+        assert evaluator.tokens == VALUES.keys() - broken.keys()
 
 
 class TestCheckpoints:
@@ -116,9 +130,9 @@ class TestCheckpoints:
         before = done(folder)
         evaluator = evaluate_samples(Sums(), VALUES, load, workers=1, checkpoint=path)
         assert evaluator.compute() == sum_of_all()
-        assert (before, done(folder)) == (31, 31 + 40 - 24)  # the whole batches before it are kept
+        assert (before, done(folder)) == (40, 40 + 1)  # all others are kept
         again = evaluate_samples(Sums(), VALUES, load, workers=2, checkpoint=path)
-        assert done(folder) == 31 + 40 - 24
+        assert done(folder) == 40 + 1
         assert dict(again.counts) == dict(evaluator.counts)
         assert not again.repeated
         assert [each.name for each in path.parent.iterdir()] == ["state.json"]
@@ -165,6 +179,15 @@ class TestCheckpoints:
         monkeypatch.setattr(Sums, "save", lambda self, _: sizes.append(len(self)))
         evaluate_samples(Sums(), VALUES, number, workers=1, checkpoint=tmp_path / "state.json")
         assert sizes == [0, 8, 16, 24, 32, 40, 40]
+
+    def test_counts_that_are_there_twice_are_no_repeated_samples(self, tmp_path: Path) -> None:
+        path = tmp_path / "state.json"
+        evaluator = evaluate_samples(Sums(), VALUES, number, workers=1, checkpoint=path)
+        assert not evaluate_samples(evaluator, VALUES, number, workers=1, checkpoint=path).repeated
+        other = Sums()
+        other.update("00", 5.0)
+        with pytest.raises(EvaluationError, match="00: evaluated twice, with different results"):
+            evaluate_samples(other, VALUES, number, workers=1, checkpoint=path)
 
     def test_of_other_settings_or_samples(self, tmp_path: Path) -> None:
         path = Sums(scale=2.0).save(tmp_path / "state.json")

@@ -1,6 +1,7 @@
 """Videos: what is in the file is what the views draw, in order; and nothing half-written."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,12 @@ def test_a_video_has_all_frames_in_order_at_its_size(video: Callable[..., Path],
 def test_two_workers_write_the_same_bytes_as_one(video: Callable[..., Path]) -> None:
     one, two = (video(f"{count}.mp4", what=[grey, "bev"], frames=slice(0, 3), workers=count) for count in (1, 2))
     assert one.read_bytes() == two.read_bytes()
+
+
+def test_an_executor_writes_the_same_bytes(video: Callable[..., Path]) -> None:
+    with ThreadPoolExecutor(3) as executor:
+        sent = video("sent.mp4", what="bev", executor=executor)
+    assert sent.read_bytes() == video("own.mp4", what="bev", workers=1).read_bytes()
 
 
 def test_the_same_pictures_are_the_same_bytes(da: DeepAccident, accident: str, tmp_path: Path) -> None:

@@ -10,7 +10,8 @@ import workers
 from processes import is_running, wait_for
 
 from deepaccident_devkit.errors import WorkerError
-from deepaccident_devkit.parallel import _signals_put_off, run_batch, run_unordered
+from deepaccident_devkit.parallel import run_batch, run_unordered
+from deepaccident_devkit.parallel.pool import signals_put_off
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -63,7 +64,7 @@ def test_signals_wait_for_the_start_of_processes(number: signal.Signals) -> None
     came: list[int] = []
     before = signal.signal(number, lambda each, _: came.append(each))
     try:
-        with _signals_put_off():
+        with signals_put_off():
             os.kill(os.getpid(), number)
             assert not came
         assert came == [number]
@@ -75,7 +76,7 @@ def test_other_threads_get_no_signals_to_put_off() -> None:
     entered: list[bool] = []
 
     def enter() -> None:
-        with _signals_put_off():
+        with signals_put_off():
             entered.append(True)
 
     thread = threading.Thread(target=enter)

@@ -1,0 +1,94 @@
+"""`ScenarioCheck`: what was found in one scenario; and the file in which one is kept."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from deepaccident_devkit._version import __version__
+from deepaccident_devkit.reading import LIMITS_VARIABLE, read_bytes
+from deepaccident_devkit.release import ScenarioFolder
+from deepaccident_devkit.tables import Finding
+from deepaccident_devkit.tables.scan import times_digest
+from deepaccident_devkit.tables.velocities import VelocityFit, total_fit
+from deepaccident_devkit.taxonomy import AGENTS, CHANNELS
+from deepaccident_devkit.validation.inventory import Recording
+
+NO_FIT = total_fit([])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScenarioCheck:
+    """What was found in one scenario.
+
+    Attributes:
+        token: the scenario's.
+        findings: in the order of the checks.
+        samples: agents times frames.
+        recordings: which agents have which kinds of file.
+        velocity: what the labels' velocities fit.
+    """
+
+    token: str
+    findings: tuple[Finding, ...]
+    samples: int
+    recordings: frozenset[Recording]
+    velocity: VelocityFit = NO_FIT
+
+    def to_json(self) -> str:
+        """One JSON object, from which `of_json` makes an equal one."""
+        return json.dumps({**asdict(self), "recordings": sorted(self.recordings)})
+
+    @classmethod
+    def of_json(cls, text: bytes) -> ScenarioCheck:
+        """The check that `to_json` wrote; raises ValueError, KeyError or TypeError."""
+        stored = json.loads(text)  # names of files may have half characters
+        return cls(
+            token=stored["token"],
+            findings=tuple(Finding(**each) for each in stored["findings"]),
+            samples=stored["samples"],
+            recordings=frozenset((agent, kind) for agent, kind in stored["recordings"]),
+            velocity=VelocityFit(**stored["velocity"]),
+        )
+
+
+def kept_path(folder: Path, scenario: ScenarioFolder, *, deep: bool) -> Path:
+    """The file in which a scenario's check is kept: its name changes with all that decides the check.
+
+    That is the devkit, the settings, and names, sizes and times of the scenario's files.
+    """
+    settings = (__version__, deep, str(scenario.root), scenario.folder, os.environ.get(LIMITS_VARIABLE))
+    digest = hashlib.blake2b(f"{settings} {times_digest(scenario)}".encode(), digest_size=8)
+    for agent in AGENTS:
+        for channel in CHANNELS:
+            for words in (f"{agent}/{channel}", *_entries(scenario.kind_folder(agent, channel))):
+                digest.update(os.fsencode(f"{words}\n"))
+    return folder / f"{scenario.scenario_type}.{scenario.name}.{digest.hexdigest()}.json"
+
+
+def kept_check(path: Path) -> ScenarioCheck | None:
+    """The check in a file; None if it is not there or damaged."""
+    try:
+        return ScenarioCheck.of_json(read_bytes(path, "bundle"))
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _entries(folder: Path) -> list[str]:
+    """Name, size and time of everything in a folder; nothing if it cannot be listed."""
+    try:
+        with os.scandir(folder) as entries:
+            return sorted(f"{entry.name} {_times(entry)}" for entry in entries)
+    except OSError:
+        return []
+
+
+def _times(entry: os.DirEntry[str]) -> str:
+    try:
+        status = entry.stat()
+    except OSError:  # a link that leads nowhere
+        return "none"
+    return f"{status.st_size} {status.st_mtime_ns}"

@@ -1,0 +1,60 @@
+"""`python -m benchmarks engine`, with settings that are small enough for a test."""
+
+import importlib
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+TOP = Path(__file__).parents[3]
+
+
+@pytest.fixture
+def benchmark(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The checkout's `benchmarks.engine`."""
+    monkeypatch.syspath_prepend(TOP)
+    return importlib.import_module("benchmarks.engine")
+
+
+@pytest.mark.slow
+def test_every_engine_is_measured(benchmark: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    small = {"SCENARIOS": 2, "FRAMES": 4, "ITEMS": 20, "BATCHES": 40, "REPEATS": 1}
+    engines = {"here": (1,), "own": (2,), "dask": (2,), "mpi": (2,)}
+    for name, value in {**small, "ENGINES": engines}.items():
+        monkeypatch.setattr(benchmark, name, value)
+    found = {figure.name: figure.value for figure in benchmark.measure()}
+    assert found["engine_samples"] == 2 * 4 * 5
+    assert found["engine_here_samples_per_s_1_worker"] > 0
+    for kind in filter(benchmark.installed, ("own", "dask", "mpi")):
+        name = f"engine_{kind}"
+        assert found[f"{name}_samples_per_s_2_workers"] > 0
+        assert found[f"{name}_batch_ms_2_workers"] > 0
+        assert found[f"{name}_efficiency_2_workers"] > 0
+        assert 0 <= found[f"{name}_caller_mb"] < 100
+        assert found[f"{name}_serial_share"] > 0
+        minutes = [found[f"{name}_whole_release_by_amdahl_{cores}"] for cores in benchmark.CORES]
+        times = [found[f"{name}_speed_up_by_amdahl_{cores}"] for cores in benchmark.CORES]
+        assert minutes[0] * times[0] == pytest.approx(minutes[1] * times[1])
+
+
+def test_a_missing_engine_is_told_of(
+    benchmark: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(benchmark.shutil, "which", lambda _: None)
+    assert [kind for kind in ("here", "own", "mpi") if benchmark.installed(kind)] == ["here", "own"]
+    assert capsys.readouterr().err == "engine: mpi is not installed; its figures are left out\n"
+
+
+def test_the_serial_share_is_of_one_core_and_bounds_all_cores(benchmark: ModuleType) -> None:
+    seen = {"samples": 100, "handed": 20, "item_s": 0.5, "batch_s": 0.5, "growth_mb": 1.0}
+    here = benchmark.Seen(**seen, export_s=10.0, outside_s=0.9, batch_busy_s=0.0)
+    engine = benchmark.Seen(**seen, export_s=6.0, outside_s=0.3, batch_busy_s=0.01)
+    assert benchmark.serial_share(here, engine) == pytest.approx((0.3 + 20 * 0.01) / 10)
+    assert benchmark.amdahl(0.0, 64) == 64
+    assert benchmark.amdahl(1.0, 64) == 1
+    assert benchmark.amdahl(0.05, 512) == pytest.approx(512 / (1 + 511 * 0.05))
+    found = {figure.name: figure for figure in benchmark.of_engine("engine_dask", here, here, engine)}
+    assert found["engine_dask_efficiency_2_workers"].value == pytest.approx(10 / 6 / 2)
+    whole = found["engine_dask_whole_release_by_amdahl_64"]
+    assert whole.value == pytest.approx(benchmark.WHOLE_SAMPLES / 100 * 10 / 60 / benchmark.amdahl(0.05, 64))
+    assert "computed" in whole.unit

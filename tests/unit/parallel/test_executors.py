@@ -1,0 +1,73 @@
+"""Schedulers that cannot be used; working ones are in tests/engines."""
+
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.errors import MissingExtraError, WorkerError
+from deepaccident_devkit.parallel import cluster_executor
+from deepaccident_devkit.parallel.executors import fault_of_workers, width_of
+
+
+def test_none_without_a_scheduler() -> None:
+    with cluster_executor() as executor:
+        assert executor is None
+
+
+def test_a_dead_scheduler() -> None:
+    from dask import config
+
+    message = r"^tcp://127\.0\.0\.1:1: no dask scheduler answers \(.*\); start one with `dask scheduler`, and give its"
+    with (
+        config.set({"distributed.comm.timeouts.connect": "300ms"}),
+        pytest.raises(WorkerError, match=message),
+        cluster_executor("tcp://127.0.0.1:1"),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("content", [None, "", "[1]", "{}"])
+def test_a_wrong_scheduler_file(tmp_path: Path, content: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("deepaccident_devkit.parallel.executors._FILE_SECONDS", 0.2)
+    path = tmp_path / "scheduler.json"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(WorkerError, match=rf"^{path}: no dask scheduler answers"), cluster_executor(None, path):
+        pass
+
+
+@pytest.mark.parametrize(("package", "address"), [("distributed", "tcp://127.0.0.1:1"), ("mpi4py", "mpi")])
+def test_without_the_package(monkeypatch: pytest.MonkeyPatch, package: str, address: str) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(MissingExtraError, match="pip install"), cluster_executor(address):
+        pass
+
+
+def test_the_width_of_executors() -> None:
+    with ThreadPoolExecutor(5) as threads:
+        assert width_of(threads) == 5
+
+
+def test_errors_of_the_work_are_not_those_of_workers() -> None:
+    assert fault_of_workers(MissingExtraError("install deepaccident_devkit[synth]")) is None
+    assert fault_of_workers(AttributeError("'Box' of deepaccident_devkit has no attribute 'x'")) is None
+    assert fault_of_workers(ValueError("deepaccident_devkit")) is None
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--scheduler", "tcp://x", "--scheduler-file", "f"], "name the same; give one of them"),
+        (["--scheduler", "tcp://x", "--workers", "2"], "--workers changes nothing with a scheduler"),
+        (["--shard", "9/8"], "expected K/N with K from 1 to N"),
+        (["--shard", "1/8", "--merge"], "--merge puts all shards together; leave --shard out"),
+    ],
+)
+def test_usage_errors(options: list[str], told: str) -> None:
+    result = CliRunner().invoke(deepaccident, ["index", "release", *options])
+    assert result.exit_code == 2
+    assert told in result.output
