@@ -43,7 +43,7 @@ def test_300_changed_files_are_read_or_refused(healthy: Path) -> None:
 def test_every_way_to_fail_is_noticed(healthy: Path) -> None:
     """Bad readers, by turns with good ones: what fails does not touch the next case."""
     cases = [case for kind in planted.KINDS for case in (Case(kind, "emptied", 0), Case("read", "emptied", 0))]
-    outcomes = run(cases, healthy, seconds=2.0, kinds="campaign.planted")
+    outcomes = run(cases, healthy, seconds=6.0, kinds="campaign.planted")
     assert [outcome.verdict for outcome in outcomes[::2]] == [kind.split(",")[0] for kind in planted.KINDS]
     assert {outcome.verdict for outcome in outcomes[1::2]} == {"read"}
 

@@ -109,6 +109,7 @@ class _Worker:
             _serve(Bench(healthy, home, kinds), os.fdopen(reading), writing)
         for end in (reading, writing):
             os.close(end)
+        os.read(self._from_fork, 1)  # it is ready: copying the healthy files is none of a case's time
 
     def answer(self, line: str, seconds: float) -> str | None:
         """The outcome's JSON; None if there is none in time, or the process ended."""
@@ -150,6 +151,7 @@ def _serve(bench: "Bench", cases: Iterable[str], writing: int) -> None:
         room = (_status("VmSize") << 10) + (_ROOM_MEGABYTES << 20)
         resource.setrlimit(resource.RLIMIT_AS, (room, room))
         bench.prepare()
+        os.write(writing, b"\n")
         for line in cases:
             case, _ = json.loads(line)
             outcome = bench.outcome(Case(**case))
