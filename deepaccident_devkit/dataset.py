@@ -10,11 +10,12 @@ import numpy as np
 
 from deepaccident_devkit import nuscenes_names
 from deepaccident_devkit.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
-from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.errors import ChoiceError, MissingFileError, NotAvailableError
 from deepaccident_devkit.geometry import SE3, Box, Boxes, LidarPointCloud, PinholeCamera
 from deepaccident_devkit.geometry.boxes import trusted_boxes
 from deepaccident_devkit.geometry.se3 import stored_transforms, trusted_se3
 from deepaccident_devkit.release import BevImage, read_bev, read_image, read_lidar
+from deepaccident_devkit.release.store import ReleasePath, StorePath
 from deepaccident_devkit.tables import OpenTables, RowArgument, displacement_velocities, visible_ids, visible_mask
 from deepaccident_devkit.tables.opened import token_of
 from deepaccident_devkit.tables.store import damaged_value
@@ -164,7 +165,42 @@ class Dataset(OpenTables):
     # sensor data
 
     def get_sample_data_path(self, sample_data: RowArgument, channel: str | None = None) -> Path:
-        """The path of a sensor file, which need not exist; arguments as of `get_sample_data`. Raises TokenError."""
+        """The path of a sensor file, which need not exist; arguments as of `get_sample_data`.
+
+        Raises:
+            TokenError: no such sensor file.
+            NotAvailableError: the release lies in archives or at a URL, so that there is no path; `local_path` gives
+                one.
+        """
+        path = self.sensor_path(sample_data, channel)
+        if isinstance(path, Path):
+            return path
+        raise NotAvailableError(f"{path}: lies in an archive or at a URL; da.local_path(token) gives a real path")
+
+    def local_path(self, sample_data: RowArgument, channel: str | None = None) -> Path:
+        """A real path with the content of a sensor file, for other programs; arguments as of `get_sample_data`.
+
+        What lies in an archive or at a URL is copied into the user's cache, whose size is bounded, so that a copy may
+        be gone later (docs/dataroots.md).
+
+        Raises:
+            TokenError: no such sensor file.
+            MissingFileError: it was not downloaded.
+            SensorFileError: it cannot be read, or there is no room in the cache.
+        """
+        path = self.sensor_path(sample_data, channel)
+        if isinstance(path, StorePath):
+            return path.local_path()
+        if not path.exists():
+            raise MissingFileError(f"{path}: no such file; unpack the archive that holds it")
+        return path
+
+    def sensor_path(self, sample_data: RowArgument, channel: str | None = None) -> ReleasePath:
+        """Where the devkit's readers find a sensor file, which need not be there; arguments as of `get_sample_data`.
+
+        Raises:
+            TokenError: no such sensor file.
+        """
         return self._path(self._sensor(sample_data, channel)[0])
 
     @nuscenes_names.with_keywords_named
@@ -173,7 +209,8 @@ class Dataset(OpenTables):
     ) -> tuple[Path, list[Box], FloatArray | None]:
         """A sensor file's path, all boxes of its sample in the sensor's frame, and K (3, 3) of a camera.
 
-        Boxes are not tested against the image: those behind a camera are among them (`camera` finds those in it).
+        The path is that of `get_sample_data_path` or, where there is none, that of `local_path`. Boxes are not tested
+        against the image: those behind a camera are among them (`camera` finds those in it).
 
         Args:
             sample_data: token or record of a sensor file; with `channel`, of a sample.
@@ -181,11 +218,13 @@ class Dataset(OpenTables):
 
         Raises:
             TokenError: no such sensor file.
+            MissingFileError, SensorFileError: as of `local_path`, if the release lies in archives or at a URL.
         """
         row, name = self._sensor(sample_data, channel)
         intrinsic = self._intrinsic(row) if name in CAMERAS else None
         boxes = self.get_boxes(self._tables.resolver.token("sample", row // len(CHANNELS)), name)
-        return self._path(row), boxes, intrinsic
+        path = self._path(row)
+        return path if isinstance(path, Path) else path.local_path(), boxes, intrinsic
 
     def camera(self, sample_data: RowArgument, channel: str | None = None) -> PinholeCamera:
         """A camera's K and image size as its calib file gives them, which projects points and finds visible boxes.
@@ -220,7 +259,7 @@ class Dataset(OpenTables):
         _, name = self._sensor(sample_data, channel)
         if name not in CAMERAS:
             raise ChoiceError(f"{name} holds no images; the cameras are {', '.join(CAMERAS)}")
-        return read_image(self.get_sample_data_path(sample_data, channel))
+        return read_image(self.sensor_path(sample_data, channel))
 
     def load_point_cloud(self, sample: RowArgument, frame: Frame = "world") -> LidarPointCloud:
         """A sample's LiDAR points in `world`, `ego` or `lidar`.
@@ -258,7 +297,7 @@ class Dataset(OpenTables):
         row = self.sample_data.row(token if channel is None else f"{token}/{spelled(channel, CHANNELS)}")
         return row, CHANNELS[row % len(CHANNELS)]
 
-    def _path(self, sample_data_row: int) -> Path:
+    def _path(self, sample_data_row: int) -> ReleasePath:
         return self.dataroot / self._tables.resolver.filename(sample_data_row)
 
     def _intrinsic(self, sample_data_row: int) -> FloatArray:
@@ -267,7 +306,7 @@ class Dataset(OpenTables):
         intrinsic: FloatArray = self._tables.views["calibrated_sensor"]["camera_intrinsic"][calibrated]
         return intrinsic.reshape(3, 3).copy()
 
-    def _channel_path(self, sample_row: int, channel: str) -> Path:
+    def _channel_path(self, sample_row: int, channel: str) -> ReleasePath:
         return self._path(sample_row * len(CHANNELS) + CHANNELS.index(channel))
 
     def _annotation_slice(self, sample_row: int) -> slice:

@@ -12,6 +12,7 @@ from deepaccident_devkit import overview, selection, v2x
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import IndexStoreError
 from deepaccident_devkit.release import find_release
+from deepaccident_devkit.release.store import Dataroot, open_dataroot
 from deepaccident_devkit.tables import open_index
 from deepaccident_devkit.taxonomy import OnError
 
@@ -75,7 +76,7 @@ class DeepAccident(Dataset):
     def __init__(
         self,
         version: str = "v1",
-        dataroot: str | os.PathLike[str] = "data/DeepAccident",
+        dataroot: Dataroot = "data/DeepAccident",
         index_dir: str | os.PathLike[str] | None = None,
         workers: int | None = None,
         on_error: OnError = "raise",
@@ -87,7 +88,8 @@ class DeepAccident(Dataset):
 
         Args:
             version: `v1` (train, val and test, or the flat layout) or `v1-mini`.
-            dataroot: the folder that the release was unpacked into.
+            dataroot: the folder that the release was unpacked into; or a zip, a folder of zips, or a URL that fsspec
+                can list, such as `s3://bucket/DeepAccident` (docs/dataroots.md).
             index_dir: where to keep the index, of this release alone; by default `<dataroot>/.deepaccident`, or the
                 user's cache folder where that cannot be written.
             workers: processes to index with; None chooses by the amount of work.
@@ -96,21 +98,17 @@ class DeepAccident(Dataset):
             executor: any executor of `concurrent.futures` to index on, in place of own processes.
 
         Raises:
-            DatarootError: the folder is missing or holds no release.
+            DatarootError: the folder is missing or holds no release; or an archive or a URL cannot be read.
             VersionError: the version is unknown or not under this folder.
             BrokenReleaseError: some scenarios are broken; the message lists them all.
             IndexStoreError: the index cannot be written.
+            MissingExtraError: the dataroot is a URL, and the extra `cloud` is not installed.
         """
-        layout = find_release(_absolute(dataroot), version)
+        how: dict[str, Any] = {"workers": workers, "executor": executor, "progress": verbose}
+        place = None if index_dir is None else Path(os.path.abspath(Path(index_dir).expanduser()))  # noqa: PTH100
+        layout = find_release(open_dataroot(dataroot, place, **how), version)
         for last_attempt in (False, True):
-            index = open_index(
-                layout,
-                index_dir=None if index_dir is None else _absolute(index_dir),
-                workers=workers,
-                executor=executor,
-                on_error=on_error,
-                progress=verbose,
-            )
+            index = open_index(layout, index_dir=place, on_error=on_error, **how)
             try:
                 super().__init__(
                     dataroot=layout.root,
@@ -181,11 +179,6 @@ class DeepAccident(Dataset):
             f"DeepAccident(version={self.version!r}, dataroot={str(self.dataroot)!r}): {len(self.scenario):,} "
             f"scenarios, {len(self.sample):,} samples, {len(self.annotation):,} annotations"
         )
-
-
-def _absolute(path: str | os.PathLike[str]) -> Path:
-    """The path from the root, so that a later `chdir` does not matter; symbolic links stay."""
-    return Path(os.path.abspath(Path(path).expanduser()))  # noqa: PTH100
 
 
 def _print(lines: Sequence[str]) -> None:

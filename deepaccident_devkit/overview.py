@@ -6,7 +6,6 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,6 +13,7 @@ import numpy as np
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.release.layout import ScenarioFolder, frame_numbers
+from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     CHANNEL_FORMAT,
@@ -191,7 +191,7 @@ def sample_lines(dataset: Dataset, sample: RowArgument) -> list[str]:
     """A sample's files and boxes, a line each."""
     record = dataset.get("sample", sample)
     files = [f"{record['token']}/{channel}" for channel in CHANNELS]
-    paths = [dataset.get_sample_data_path(token) for token in files]
+    paths = [dataset.sensor_path(token) for token in files]
     boxes = dataset.get_boxes(record, "lidar")
     return [
         f"sample {record['token']}, t = {record['timestamp']:.1f} s",
@@ -251,7 +251,7 @@ def _channel_files(
     return counts
 
 
-def _file_count(folder: Path, suffix: str) -> int:
+def _file_count(folder: ReleasePath, suffix: str) -> int:
     """How many frames a sensor's folder has; 0 if it is not there or cannot be listed."""
     try:
         return len(frame_numbers(folder, suffix)[0])

@@ -15,7 +15,7 @@ from contextvars import ContextVar
 from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import BinaryIO, Final, Literal, TypeAlias
+from typing import BinaryIO, Final, Literal, Protocol, TypeAlias
 
 FileKind: TypeAlias = Literal[
     "label",
@@ -63,7 +63,16 @@ MOST_TOLD: Final = 300
 _LIMIT: Final = re.compile(r"([a-z_]+)=([1-9][0-9]{0,11})([KMGT]?)")
 _FACTORS: Final = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 _FLAGS: Final = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)  # no waiting for a pipe
-_observer: ContextVar[Callable[[Path, bytes], None] | None] = ContextVar("observer", default=None)
+
+
+class StoredFile(Protocol):
+    """A file that is no file of the system (`release.store`)."""
+
+    def content(self, kind: FileKind) -> bytes:
+        """Its bytes; raises OSError as `read_bytes` does."""
+
+
+_observer: ContextVar[Callable[[Path | StoredFile, bytes], None] | None] = ContextVar("observer", default=None)
 
 
 class RefusedFileError(OSError):
@@ -80,14 +89,25 @@ def limit_of(kind: FileKind) -> int:
     return LIMITS[kind] if not changed else _changed_limits(changed).get(kind, LIMITS[kind])
 
 
-def read_bytes(path: Path, kind: FileKind) -> bytes:
+def read_bytes(path: Path | StoredFile, kind: FileKind) -> bytes:
     """A file's bytes. Plain system calls: `open` would double the time of a small file.
+
+    Args:
+        path: a real path, or a file in a store, which reads itself.
+        kind: of the file.
 
     Raises:
         FileNotFoundError: there is no such file.
         RefusedFileError: it is no regular file, or too large for its kind.
         OSError: it cannot be read.
     """
+    content = _read(path, kind) if isinstance(path, Path) else path.content(kind)
+    if (observer := _observer.get()) is not None:
+        observer(path, content)
+    return content
+
+
+def _read(path: Path, kind: FileKind) -> bytes:
     descriptor, size = _opened(path)
     try:
         check_size(size, kind)
@@ -99,13 +119,11 @@ def read_bytes(path: Path, kind: FileKind) -> bytes:
             check_size(len(content), kind)
     finally:
         os.close(descriptor)
-    if (observer := _observer.get()) is not None:
-        observer(path, content)
     return content
 
 
 @contextmanager
-def observed(observer: Callable[[Path, bytes], None]) -> Iterator[None]:
+def observed(observer: Callable[[Path | StoredFile, bytes], None]) -> Iterator[None]:
     """Show `observer` the path and the bytes of every file that `read_bytes` reads in the block, in this thread.
 
     So checksums are taken of just the bytes that something was made from, without a second reading.

@@ -8,7 +8,14 @@ from typing import Any
 import click
 
 from deepaccident_devkit.cli.evaluate_options import resamples_parameter, selection_of, selection_parameters
-from deepaccident_devkit.cli.options import WordChoice, engine_of, engine_parameters, on_error_parameter, refuse_unused
+from deepaccident_devkit.cli.options import (
+    DATAROOT,
+    WordChoice,
+    engine_of,
+    engine_parameters,
+    on_error_parameter,
+    refuse_unused,
+)
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.results import read_results
@@ -18,6 +25,7 @@ from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.evaluation.runs.verification import check_repeated
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.release import find_release
+from deepaccident_devkit.release.store import Dataroot, open_dataroot
 from deepaccident_devkit.render.evaluation import render_comparison
 from deepaccident_devkit.render.pictures import PICTURE_SUFFIXES, save_picture
 from deepaccident_devkit.tables import place_outside
@@ -31,14 +39,12 @@ _DPI = 130
 
 @click.command()
 @click.argument("results", type=click.Path(path_type=Path))
-@click.option(
-    "--dataroot", type=click.Path(path_type=Path), help="Also compare the samples with those of this release."
-)
+@click.option("--dataroot", type=DATAROOT, help="Also compare the samples with those of this release.")
 @click.option("--version", type=WordChoice(VERSIONS), default="v1", show_default=True, help="Version of the release.")
 @selection_parameters
 @engine_parameters
 @on_error_parameter
-def validate(results: Path, dataroot: Path | None, version: str, **options: Any) -> None:
+def validate(results: Path, dataroot: Dataroot | None, version: str, **options: Any) -> None:
     """Check every entry of the results file or folder RESULTS, and print a summary.
 
     With --dataroot, also repeat the warnings of `evaluate … --sanity`.
@@ -67,7 +73,7 @@ def validate(results: Path, dataroot: Path | None, version: str, **options: Any)
 
 @click.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
-@click.option("--dataroot", type=click.Path(path_type=Path), help="Folder of the release; without it, nothing is done.")
+@click.option("--dataroot", type=DATAROOT, help="Folder of the release; without it, nothing is done.")
 @click.option(
     "--results", type=click.Path(path_type=Path), help="Results file or folder.  [default: the copy in DIR, if any]"
 )
@@ -82,7 +88,7 @@ def validate(results: Path, dataroot: Path | None, version: str, **options: Any)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
 def verify(
     folder: Path,
-    dataroot: Path | None,
+    dataroot: Dataroot | None,
     results: Path | None,
     split: str | None,
     index_dir: Path | None,
@@ -99,7 +105,7 @@ def verify(
     """
     bundle = read_bundle(folder)
     check_repeated(bundle, {"dataroot": dataroot, "results": results, "split": split})
-    layout = find_release((dataroot or bundle.dataroot).absolute(), bundle.release_version)
+    layout = find_release(open_dataroot(dataroot or bundle.dataroot, index_dir, outside=True), bundle.release_version)
     place = index_dir or place_outside(layout)
     dataset = DeepAccident(layout.version, layout.root, place, on_error=on_error, **engine)
     verification = verify_bundle(folder, dataset, results=results, split=split, progress=True, **engine)

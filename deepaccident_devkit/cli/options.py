@@ -1,6 +1,7 @@
 """The arguments that every verb on a release takes, the same for all verbs."""
 
 import functools
+import os
 import re
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -39,6 +40,18 @@ class WordChoice(_Choice):
             self.fail(f"{error.message.removesuffix('.')}{meant_text(value, self.choices)}", param, ctx)
 
 
+class DatarootParameter(click.Path):
+    """A release on the command line: a path, or a URL, which stays a text."""
+
+    def convert(
+        self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None
+    ) -> str | bytes | os.PathLike[str]:
+        """The path, or the URL as it is."""
+        return value if isinstance(value, str) and "://" in value else super().convert(value, param, ctx)
+
+
+DATAROOT = DatarootParameter(path_type=Path)
+"""The type of what names a release."""
 on_error_parameter = click.option(
     "--on-error",
     type=WordChoice(["raise", "skip"]),
@@ -53,7 +66,7 @@ def _tell_unused(_context: click.Context, parameter: click.Parameter, value: str
         click.echo(f"{parameter.opts[0]} changes nothing here: the command reads the files, not the index", err=True)
 
 
-_DATAROOT = click.argument("dataroot", type=click.Path(path_type=Path))
+_DATAROOT = click.argument("dataroot", type=DATAROOT)
 _VERSION = click.option(
     "--version", type=WordChoice(VERSIONS), default="v1", show_default=True, help="Version of the release."
 )

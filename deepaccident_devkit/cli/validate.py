@@ -8,6 +8,7 @@ import click
 
 from deepaccident_devkit.cli.options import files_parameters, part_parameters, refuse_unused, say_part_done
 from deepaccident_devkit.parallel import Part, Shard
+from deepaccident_devkit.release.store import Dataroot
 from deepaccident_devkit.validation import merged_validation, validate_release, validation_shard
 
 _FINDINGS_STATUS = 1
@@ -30,7 +31,7 @@ _FINDINGS_STATUS = 1
 @click.option("--all", "whole", is_flag=True, help="List all findings of each scenario, not only the first eight.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document, for programs.")
 def validate(
-    dataroot: Path,
+    dataroot: Dataroot,
     version: str,
     scenarios: tuple[str, ...],
     notes: bool,

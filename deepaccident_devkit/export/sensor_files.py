@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from contextlib import suppress
-from pathlib import Path
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import DatarootError
 from deepaccident_devkit.reading import fault_text
 from deepaccident_devkit.release import read_lidar
+from deepaccident_devkit.release.store import ReleasePath, listed
 from deepaccident_devkit.tables.tokens import sample_token
 
 
-def sensor_files(dataset: Dataset, scenario: str, agent: str, channel: str) -> dict[int, tuple[Path, int]]:
+def sensor_files(dataset: Dataset, scenario: str, agent: str, channel: str) -> dict[int, tuple[ReleasePath, int]]:
     """Frame number → path and bytes of the files of a channel that are in this (partial) release.
 
     Raises:
@@ -22,12 +21,12 @@ def sensor_files(dataset: Dataset, scenario: str, agent: str, channel: str) -> d
         DatarootError: their folder cannot be listed.
     """
     count = dataset.scenario[dataset.getind("scenario", scenario)]["num_frames"]
-    first = dataset.get_sample_data_path(f"{sample_token(scenario, agent, 1)}/{channel}")
+    first = dataset.sensor_path(f"{sample_token(scenario, agent, 1)}/{channel}")
     folder, (stem, ending) = first.parent, first.name.rsplit("_001.", 1)
     sizes: dict[str, int] = {}
     try:
-        with suppress(FileNotFoundError, NotADirectoryError), os.scandir(folder) as entries:
-            for entry in entries:
+        with suppress(FileNotFoundError, NotADirectoryError):
+            for entry in listed(folder):
                 with suppress(OSError):  # a link to nothing is a file that is not there
                     sizes[entry.name] = entry.stat().st_size
     except OSError as error:
@@ -36,7 +35,7 @@ def sensor_files(dataset: Dataset, scenario: str, agent: str, channel: str) -> d
     return {number: (folder / name, sizes[name]) for number, name in names if name in sizes}
 
 
-def points_in(files: Mapping[int, tuple[Path, int]]) -> int:
+def points_in(files: Mapping[int, tuple[ReleasePath, int]]) -> int:
     """About how many points LiDAR files have together: as many in each as in the first.
 
     Raises:

@@ -21,6 +21,7 @@ from deepaccident_devkit.export.sensor_files import points_in, sensor_files
 from deepaccident_devkit.export.shards import README, readme, shards
 from deepaccident_devkit.release import read_lidar
 from deepaccident_devkit.release.images import read_image_bytes
+from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, CHANNELS, LIDAR
 from deepaccident_devkit.text import choice
@@ -146,7 +147,7 @@ class _Recording:
         self.samples = len(self._agents) * len(self._numbers)
 
     @cached_property
-    def _files(self) -> dict[tuple[str, str], dict[int, tuple[Path, int]]]:
+    def _files(self) -> dict[tuple[str, str], dict[int, tuple[ReleasePath, int]]]:
         """Agent and channel → frame → path and bytes of what is there."""
         found = {}
         for agent, channel in product(self._agents, CHANNELS):
@@ -158,7 +159,7 @@ class _Recording:
         """Bytes, as if all files were as large as the first ones."""
         size = self.samples * _FACTS_BYTES
         for agent, channel in product(self._agents, _IN_SHARDS):
-            path = self._dataset.get_sample_data_path(sample_token(self._scenario, agent, self._numbers[0]), channel)
+            path = self._dataset.sensor_path(sample_token(self._scenario, agent, self._numbers[0]), channel)
             size += path.stat().st_size * len(self._numbers) if path.is_file() else 0
         return size
 
@@ -204,7 +205,7 @@ def _add(archive: tarfile.TarFile, name: str, content: bytes) -> None:
     archive.addfile(entry, io.BytesIO(content))
 
 
-def _npy(path: Path) -> bytes:
+def _npy(path: ReleasePath) -> bytes:
     """A LiDAR file as the bytes of a `.npy` file."""
     cloud, content = read_lidar(path), io.BytesIO()
     np.save(content, cloud.points.astype(np.float32), allow_pickle=False)

@@ -1,12 +1,11 @@
 """The bytes and lines of the release's files, with the devkit's errors if they cannot be read."""
 
-from pathlib import Path
-
 from deepaccident_devkit.errors import MissingFileError, ReleaseError
 from deepaccident_devkit.reading import FileKind, fault_text, read_bytes
+from deepaccident_devkit.release.store import ReleasePath
 
 
-def read_content(path: Path, kind: FileKind, fault: type[ReleaseError], remedy: str) -> bytes:
+def read_content(path: ReleasePath, kind: FileKind, fault: type[ReleaseError], remedy: str) -> bytes:
     """A file's bytes.
 
     Raises:
@@ -22,7 +21,7 @@ def read_content(path: Path, kind: FileKind, fault: type[ReleaseError], remedy: 
         raise fault(f"{path}: {fault_text(error)}; {remedy}") from error
 
 
-def read_lines(path: Path, kind: FileKind, fault: type[ReleaseError], remedy: str) -> list[str]:
+def read_lines(path: ReleasePath, kind: FileKind, fault: type[ReleaseError], remedy: str) -> list[str]:
     """The lines of a UTF-8 file, without line ends.
 
     Raises as `read_content` does, and `fault` if the file is no text.

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from deepaccident_devkit.arrays import ByteArray, ShortRepr, readonly
 from deepaccident_devkit.errors import SensorFileError
 from deepaccident_devkit.release.npz import FAST, read_npz, write_npz
+from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.taxonomy import BEV_RESOLUTION, BEV_SHAPE
 
 TAGS: dict[str, int] = {"pedestrian": 4, "road_line": 6, "road": 7, "sidewalk": 8, "vehicle": 10}
@@ -39,10 +40,10 @@ class BevImage(ShortRepr):
 
 
 @overload
-def read_bev(path: Path, *, raw: Literal[False] = False) -> BevImage: ...
+def read_bev(path: ReleasePath, *, raw: Literal[False] = False) -> BevImage: ...
 @overload
-def read_bev(path: Path, *, raw: Literal[True]) -> ByteArray: ...
-def read_bev(path: Path, *, raw: bool = False) -> BevImage | ByteArray:
+def read_bev(path: ReleasePath, *, raw: Literal[True]) -> ByteArray: ...
+def read_bev(path: ReleasePath, *, raw: bool = False) -> BevImage | ByteArray:
     """The BEV camera's array.
 
     Args:

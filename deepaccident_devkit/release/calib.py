@@ -16,6 +16,7 @@ from deepaccident_devkit.geometry.se3 import RIGID_TOLERANCE, rigid_fault
 from deepaccident_devkit.release._content import read_content
 from deepaccident_devkit.release._unpickle import load_arrays
 from deepaccident_devkit.release.pickles import pickled
+from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.taxonomy import CAMERAS
 
 _EGO_KEYS = ("lidar_to_ego", "ego_to_world")
@@ -75,10 +76,10 @@ class Calib(ShortRepr):
 
 
 @overload
-def read_calib(path: Path, *, raw: Literal[False] = False) -> Calib: ...
+def read_calib(path: ReleasePath, *, raw: Literal[False] = False) -> Calib: ...
 @overload
-def read_calib(path: Path, *, raw: Literal[True]) -> dict[str, AnyArray]: ...
-def read_calib(path: Path, *, raw: bool = False) -> Calib | dict[str, AnyArray]:
+def read_calib(path: ReleasePath, *, raw: Literal[True]) -> dict[str, AnyArray]: ...
+def read_calib(path: ReleasePath, *, raw: bool = False) -> Calib | dict[str, AnyArray]:
     """The calibration in one file.
 
     Args:
@@ -102,10 +103,10 @@ def read_calib(path: Path, *, raw: bool = False) -> Calib | dict[str, AnyArray]:
 
 
 @overload
-def read_calibs(paths: Sequence[Path], *, raw: Literal[False] = False) -> Calibs: ...
+def read_calibs(paths: Sequence[ReleasePath], *, raw: Literal[False] = False) -> Calibs: ...
 @overload
-def read_calibs(paths: Sequence[Path], *, raw: Literal[True]) -> list[dict[str, AnyArray]]: ...
-def read_calibs(paths: Sequence[Path], *, raw: bool = False) -> Calibs | list[dict[str, AnyArray]]:
+def read_calibs(paths: Sequence[ReleasePath], *, raw: Literal[True]) -> list[dict[str, AnyArray]]: ...
+def read_calibs(paths: Sequence[ReleasePath], *, raw: bool = False) -> Calibs | list[dict[str, AnyArray]]:
     """The calibrations of several files as stacked arrays, or with `raw` as the files' own dicts.
 
     Raises as `read_calib` does.
@@ -136,7 +137,7 @@ def write_raw_calib(path: Path, raw: Mapping[str, AnyArray]) -> None:
     write_bytes(path, pickled(arrays))
 
 
-def read_unchecked_calib(path: Path) -> dict[str, AnyArray]:
+def read_unchecked_calib(path: ReleasePath) -> dict[str, AnyArray]:
     """A file's own dict, as `read_calib(raw=True)` returns it, but whatever its numbers are: only keys and shapes hold.
 
     Raises as `read_calib` does, but not for NaN and transforms that are not rigid.
@@ -150,7 +151,7 @@ def read_unchecked_calib(path: Path) -> dict[str, AnyArray]:
     return _checked_raw(path, loaded)
 
 
-def _checked_raw(path: Path, loaded: Any) -> dict[str, AnyArray]:
+def _checked_raw(path: ReleasePath, loaded: Any) -> dict[str, AnyArray]:
     if not isinstance(loaded, dict):
         raise CalibError(f"{path}: expected a dict of arrays, found {type(loaded).__name__}; {_REMEDY}")
     missing = [key for key in KEYS if key not in loaded]
@@ -164,7 +165,7 @@ def _checked_raw(path: Path, loaded: Any) -> dict[str, AnyArray]:
     return loaded
 
 
-def _converted(paths: Sequence[Path], files: Sequence[Mapping[str, AnyArray]]) -> Calibs:
+def _converted(paths: Sequence[ReleasePath], files: Sequence[Mapping[str, AnyArray]]) -> Calibs:
     """Check the numbers of all files at once and turn them right-handed."""
 
     def stacked(keys: Sequence[str], shape: tuple[int, int]) -> FloatArray:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from deepaccident_devkit.errors import ReleaseError
@@ -14,6 +14,7 @@ from deepaccident_devkit.parallel import Places, run_batch
 from deepaccident_devkit.reading import FileKind
 from deepaccident_devkit.release._content import read_content
 from deepaccident_devkit.release.layout import ScenarioFolder, find_release, frame_numbers
+from deepaccident_devkit.release.store import ReleasePath, places_of
 from deepaccident_devkit.taxonomy import AGENTS
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ class Located(Protocol):
     """An object that knows where a release is, such as a `Dataset`."""
 
     @property
-    def dataroot(self) -> Path:
+    def dataroot(self) -> ReleasePath:
         """The release's folder."""
 
     @property
@@ -75,7 +76,7 @@ def scenario_hashes(
         WorkerError: a worker was killed, or does not see the release.
     """
     folders = scenario_folders(dataset, scenarios)
-    places = Places(reads=(dataset.dataroot,))
+    places = Places(reads=places_of(dataset.dataroot))
     found = run_batch(folder_hashes, list(folders.values()), workers=workers, executor=executor, places=places)
     return dict(zip(folders, found, strict=True))
 
@@ -115,7 +116,7 @@ def digest_of(value: Any) -> str:
     return hashlib.blake2b(text.encode(), digest_size=_DIGEST_BYTES).hexdigest()
 
 
-def _files(scenario: ScenarioFolder, kind: FileKind) -> list[Path]:
+def _files(scenario: ScenarioFolder, kind: FileKind) -> list[ReleasePath]:
     ending = _ENDINGS[kind]
     return [
         scenario.file(agent, kind, frame, ending)
@@ -124,16 +125,20 @@ def _files(scenario: ScenarioFolder, kind: FileKind) -> list[Path]:
     ]
 
 
-def _base(scenario: ScenarioFolder) -> Path:
+def _base(scenario: ScenarioFolder) -> ReleasePath:
     return scenario.root / scenario.folder / scenario.scenario_type
 
 
-def _digest(paths: Collection[Path], kind: FileKind, base: Path) -> str | None:
+def _digest(paths: Collection[ReleasePath], kind: FileKind, base: ReleasePath) -> str | None:
     if not paths:
         return None
     digest = hashlib.blake2b(digest_size=_DIGEST_BYTES)
     for path in paths:
         content = read_content(path, kind, ReleaseError, "restore the file from its archive")
-        digest.update(f"{path.relative_to(base).as_posix()} {len(content)}\n".encode())
+        digest.update(f"{_below(path, base)} {len(content)}\n".encode())
         digest.update(content)
     return digest.hexdigest()
+
+
+def _below(path: ReleasePath, base: ReleasePath) -> str:
+    return str(path).removeprefix(str(base)).replace(os.sep, "/").lstrip("/")

@@ -15,6 +15,7 @@ from deepaccident_devkit.errors import SensorFileError
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.reading import MOST_TOLD, check_size, fault_text, shortened
 from deepaccident_devkit.release._content import read_content
+from deepaccident_devkit.release.store import ReleasePath
 
 JPEG_QUALITY = 90
 _DAMAGED = (OSError, SyntaxError, ValueError, struct.error, EOFError, MemoryError, OverflowError, zlib.error)
@@ -25,7 +26,7 @@ _BYTES_A_PIXEL = 3
 _REMEDY = "restore the file from its archive"
 
 
-def read_image(path: Path, *, raw: bool = False) -> ByteArray:
+def read_image(path: ReleasePath, *, raw: bool = False) -> ByteArray:
     """An image as (H, W, 3) uint8, RGB.
 
     Args:
@@ -40,18 +41,18 @@ def read_image(path: Path, *, raw: bool = False) -> ByteArray:
     return decode_image(path, read_image_bytes(path), raw=raw)
 
 
-def read_image_bytes(path: Path) -> bytes:
+def read_image_bytes(path: ReleasePath) -> bytes:
     """An image file's bytes; raises MissingFileError, and SensorFileError if it is no file or too large."""
     return read_content(path, "image", SensorFileError, _REMEDY)
 
 
-def decode_image(path: Path, content: bytes, *, raw: bool = False) -> ByteArray:
+def decode_image(path: ReleasePath, content: bytes, *, raw: bool = False) -> ByteArray:
     """The image in the bytes of a file, which errors name; as `read_image` returns it."""
     with _opened(path, content, _FORMATS) as image:
         return np.array(image if raw else image.convert("RGB"))
 
 
-def read_jpeg(path: Path) -> tuple[bytes, tuple[int, int]]:
+def read_jpeg(path: ReleasePath) -> tuple[bytes, tuple[int, int]]:
     """A JPEG file's bytes, and the width and height that its head says; the picture itself is not decoded.
 
     Raises as `read_image` does.
@@ -74,7 +75,7 @@ def write_image(path: Path, image: ByteArray) -> None:
 
 
 @contextmanager
-def _opened(path: Path, content: bytes, formats: tuple[str, ...]) -> Iterator[Any]:
+def _opened(path: ReleasePath, content: bytes, formats: tuple[str, ...]) -> Iterator[Any]:
     """Pillow's image of a file's bytes, which is not too large; what it raises becomes SensorFileError."""
     from PIL import Image, UnidentifiedImageError
 

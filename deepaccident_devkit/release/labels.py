@@ -21,6 +21,7 @@ from deepaccident_devkit.geometry import Boxes, handedness, quaternions
 from deepaccident_devkit.reading import LIMITS_VARIABLE, limit_of, shortened
 from deepaccident_devkit.release._content import read_content
 from deepaccident_devkit.release._words import integer_of, number_of
+from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 FIELDS = ("class", "x", "y", "z", "l", "w", "h", "yaw", "vx", "vy", "id", "num_lidar_pts", "camera_visible")
@@ -103,12 +104,12 @@ class Labels(ShortRepr):
         )
 
 
-def read_label(path: Path, *, raw: bool = False) -> Labels:
+def read_label(path: ReleasePath, *, raw: bool = False) -> Labels:
     """One label file; see `read_labels`."""
     return read_labels([path], raw=raw)
 
 
-def read_labels(paths: Sequence[Path], *, raw: bool = False) -> Labels:
+def read_labels(paths: Sequence[ReleasePath], *, raw: bool = False) -> Labels:
     """The boxes of several label files.
 
     Lines with one token or none are skipped (`read_lone_words` tells them), blanks at line ends and CRLF are read, a
@@ -128,7 +129,7 @@ def read_labels(paths: Sequence[Path], *, raw: bool = False) -> Labels:
     return _labels({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, raw=raw)
 
 
-def read_label_to_fault(path: Path, *, raw: bool = False) -> tuple[Labels, LabelError | None]:
+def read_label_to_fault(path: ReleasePath, *, raw: bool = False) -> tuple[Labels, LabelError | None]:
     """One label file as far as its first wrong line, and the error that `read_label` raises for that; None if good.
 
     Raises as `read_label` does, if not even the first line can be read.
@@ -147,7 +148,7 @@ def read_label_to_fault(path: Path, *, raw: bool = False) -> tuple[Labels, Label
         return _labels(columns, raw=raw), error
 
 
-def read_lone_words(path: Path) -> list[tuple[int, str, bool]]:
+def read_lone_words(path: ReleasePath) -> list[tuple[int, str, bool]]:
     """The lines of one label file that are skipped since they have one word, as its reference reader skips them.
 
     Returns:
@@ -203,7 +204,7 @@ def _words(numbers: Iterable[float]) -> str:
     return " ".join(map(repr, numbers))
 
 
-def _parse_batches(batches: Sequence[Sequence[Path]]) -> list[dict[str, AnyArray]]:
+def _parse_batches(batches: Sequence[Sequence[ReleasePath]]) -> list[dict[str, AnyArray]]:
     """Parse every batch: of several, this thread reads files while other threads parse."""
     if len(batches) < 2:
         return [_parse_files(batch, [_content(path) for path in batch]) for batch in batches]
@@ -214,7 +215,7 @@ def _parse_batches(batches: Sequence[Sequence[Path]]) -> list[dict[str, AnyArray
         return [part.result() for part in parts]
 
 
-def _parse_files(paths: Sequence[Path], contents: Sequence[bytes]) -> dict[str, AnyArray]:
+def _parse_files(paths: Sequence[ReleasePath], contents: Sequence[bytes]) -> dict[str, AnyArray]:
     parsed = _parse_joined(contents)
     if parsed is None and not any(b"\0" in content for content in contents):
         parsed = _parse_joined([_tidied(content) for content in contents])
@@ -223,7 +224,7 @@ def _parse_files(paths: Sequence[Path], contents: Sequence[bytes]) -> dict[str, 
     return parsed
 
 
-def _content(path: Path, *, ended: bool = True) -> bytes:
+def _content(path: ReleasePath, *, ended: bool = True) -> bytes:
     """A file's bytes, of not too many lines, ending in a line end if `ended`."""
     content = read_content(path, "label", LabelError, _REMEDY).removeprefix(codecs.BOM_UTF8)
     lines = max(content.count(b"\n"), content.count(b"\r"))
@@ -337,7 +338,7 @@ def _split(line: bytes) -> list[bytes]:
     return line.split(maxsplit=len(FIELDS))
 
 
-def _first_fault(paths: Sequence[Path], contents: Sequence[bytes]) -> LabelError:
+def _first_fault(paths: Sequence[ReleasePath], contents: Sequence[bytes]) -> LabelError:
     """Name the first line that is wrong."""
     for path, content in zip(paths, contents, strict=True):
         if (fault := _faulty_line(content)) is not None:

@@ -9,20 +9,22 @@ from pathlib import Path
 
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import DatarootError, VersionError
+from deepaccident_devkit.release.store import Entry, ReleasePath, listed
+from deepaccident_devkit.release.store.names import (
+    MINI_FOLDER,
+    SCENARIO_TYPE,
+    SPLIT_FILE_FOLDER,
+    SPLIT_FILES,
+    SPLIT_FOLDERS,
+)
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     CHANNEL_FORMAT,
-    MINI_SPLITS,
-    SPLITS,
     VERSIONS,
     AgentName,
 )
 from deepaccident_devkit.text import spelled
 
-MINI_FOLDER = "DeepAccident_mini"
-SPLIT_FOLDERS = SPLITS
-SPLIT_FILE_FOLDER = "split_txt_files"
-_SCENARIO_TYPE = re.compile(r"type\d+_subtype\d+_(accident|normal)")
 _UNLISTABLE_REMEDY = "unpack its archive again, or make it readable"
 _FRAME_FILE = re.compile(r"_(\d{3,})\.\w+")
 
@@ -39,7 +41,7 @@ class ScenarioFolder:
         agents: the agents that have a calib folder, in the order of `taxonomy.AGENTS`.
     """
 
-    root: Path
+    root: ReleasePath
     folder: str
     scenario_type: str
     name: str
@@ -51,27 +53,27 @@ class ScenarioFolder:
         return f"{self.scenario_type}/{self.name}"
 
     @property
-    def meta_path(self) -> Path:
+    def meta_path(self) -> ReleasePath:
         """The scenario's meta file."""
         return self.root / self.folder / self.scenario_type / "meta" / f"{self.name}.txt"
 
-    def kind_folder(self, agent: str, kind: str) -> Path:
+    def kind_folder(self, agent: str, kind: str) -> ReleasePath:
         """The folder of one kind of file (`label`, `calib` or a channel) of one agent."""
         return self.root / self.folder / self.scenario_type / agent / kind / self.name
 
-    def file(self, agent: str, kind: str, frame: int, ending: str) -> Path:
+    def file(self, agent: str, kind: str, frame: int, ending: str) -> ReleasePath:
         """One frame's file of a kind."""
         return self.kind_folder(agent, kind) / f"{self.name}_{frame:03d}.{ending}"
 
-    def label_path(self, agent: str, frame: int) -> Path:
+    def label_path(self, agent: str, frame: int) -> ReleasePath:
         """One frame's label file."""
         return self.file(agent, "label", frame, "txt")
 
-    def calib_path(self, agent: str, frame: int) -> Path:
+    def calib_path(self, agent: str, frame: int) -> ReleasePath:
         """One frame's calib file."""
         return self.file(agent, "calib", frame, "pkl")
 
-    def channel_path(self, agent: str, channel: str, frame: int) -> Path:
+    def channel_path(self, agent: str, channel: str, frame: int) -> ReleasePath:
         """One frame's image or array of a sensor channel."""
         return self.file(agent, channel, frame, CHANNEL_FORMAT[channel])
 
@@ -88,15 +90,15 @@ class ReleaseLayout(ShortRepr):
         split_files: split name → its file, where there is one.
     """
 
-    root: Path
+    root: ReleasePath
     version: str
     layout: str
     scenarios: tuple[ScenarioFolder, ...]
-    split_files: Mapping[str, Path] = field(default_factory=dict)
+    split_files: Mapping[str, ReleasePath] = field(default_factory=dict)
 
 
-def find_release(root: Path, version: str = "v1") -> ReleaseLayout:
-    """Find the scenarios under `root` by listing folders; opens no file.
+def find_release(root: ReleasePath, version: str = "v1") -> ReleaseLayout:
+    """Find the scenarios under `root`, which `open_dataroot` gives, by listing folders; opens no file.
 
     Raises:
         DatarootError: the folder is missing or holds no release.
@@ -105,7 +107,7 @@ def find_release(root: Path, version: str = "v1") -> ReleaseLayout:
     version = spelled(version, VERSIONS)
     if version not in VERSIONS:
         raise VersionError(f"unknown version {version!r}; known are {', '.join(VERSIONS)}{_version_remedy(version)}")
-    if not _is_unicode(root):
+    if not _is_unicode(str(root)):
         raise DatarootError(f"{str(root)!r}: is not UTF-8, which Arrow needs a path to be; rename the folder")
     if not root.is_dir():
         state = "is a file" if root.is_file() else "does not exist"
@@ -116,7 +118,8 @@ def find_release(root: Path, version: str = "v1") -> ReleaseLayout:
         raise DatarootError(
             f"{root}: no scenario found; expected <scenario_type>/<agent>/calib/<scenario>/*.pkl below it, or below "
             f"its folders {', '.join((*SPLIT_FOLDERS, MINI_FOLDER))} "
-            "(unpack the calib archives, or make a small release with: deepaccident synth OUT)"
+            "(unpack the calib archives, give a folder of zips alone, or make a small release with: deepaccident synth "
+            "OUT)"
         )
     return ReleaseLayout(
         root=root,
@@ -137,15 +140,15 @@ def _version_remedy(version: object) -> str:
     return ""
 
 
-def _is_unicode(path: Path) -> bool:
+def _is_unicode(path: str) -> bool:
     try:
-        str(path).encode()
+        path.encode()
     except UnicodeEncodeError:
         return False
     return True
 
 
-def frame_numbers(folder: Path, ending: str) -> tuple[list[int], list[str]]:
+def frame_numbers(folder: ReleasePath, ending: str) -> tuple[list[int], list[str]]:
     """The frame numbers of a folder's files, ascending, and the names with that ending but without a frame number.
 
     A folder that is not there has none.
@@ -166,12 +169,12 @@ def frame_numbers(folder: Path, ending: str) -> tuple[list[int], list[str]]:
     return sorted(frames), sorted(odd)
 
 
-def names_without_calib(layout: ReleaseLayout) -> Iterator[tuple[Path, str]]:
+def names_without_calib(layout: ReleaseLayout) -> Iterator[tuple[ReleasePath, str]]:
     """Scenario type folders and the names in them that have labels, meta or sensor files, but no calib of any agent.
 
     Folders that cannot be listed have none; each scenario of theirs tells that itself.
     """
-    known: dict[Path, set[str]] = {}
+    known: dict[ReleasePath, set[str]] = {}
     for scenario in layout.scenarios:
         known.setdefault(scenario.root / scenario.folder / scenario.scenario_type, set()).add(scenario.name)
     for folder, names in known.items():
@@ -186,7 +189,7 @@ def names_without_calib(layout: ReleaseLayout) -> Iterator[tuple[Path, str]]:
             yield folder, name
 
 
-def _folders_of(root: Path, version: str) -> list[str]:
+def _folders_of(root: ReleasePath, version: str) -> list[str]:
     """The folders below the root, `""` for the root itself, that hold scenario types of this version."""
     flat = [""] if _scenario_types(root) else []
     split = [name for name in SPLIT_FOLDERS if _scenario_types(root / name)]
@@ -201,11 +204,11 @@ def _folders_of(root: Path, version: str) -> list[str]:
     return mini
 
 
-def _scenario_types(folder: Path) -> list[str]:
-    return sorted(name for name in _subfolders(folder) if _SCENARIO_TYPE.fullmatch(name))
+def _scenario_types(folder: ReleasePath) -> list[str]:
+    return sorted(name for name in _subfolders(folder) if SCENARIO_TYPE.fullmatch(name))
 
 
-def _scenarios_in(root: Path, folder: str) -> Iterator[ScenarioFolder]:
+def _scenarios_in(root: ReleasePath, folder: str) -> Iterator[ScenarioFolder]:
     for scenario_type in _scenario_types(root / folder):
         _entries(root / folder / scenario_type)  # one that cannot be listed would hide its scenarios
         agents_of: dict[str, list[AgentName]] = {}
@@ -223,7 +226,7 @@ def _scenarios_in(root: Path, folder: str) -> Iterator[ScenarioFolder]:
             yield ScenarioFolder(root, folder, scenario_type, name, tuple(agents))
 
 
-def _subfolders(folder: Path) -> list[str]:
+def _subfolders(folder: ReleasePath) -> list[str]:
     """The folders in a folder; none where a file is in the way, which `frame_numbers` reports for each scenario."""
     try:
         entries = _entries(folder)
@@ -234,7 +237,7 @@ def _subfolders(folder: Path) -> list[str]:
     return [entry.name for entry in entries if not entry.name.startswith(".") and _may_be_folder(entry)]
 
 
-def _may_be_folder(entry: os.DirEntry[str]) -> bool:
+def _may_be_folder(entry: Entry) -> bool:
     """Whether an entry is a folder, or a link whose end cannot be found; listing that one tells why."""
     try:
         return entry.is_dir()
@@ -242,22 +245,23 @@ def _may_be_folder(entry: os.DirEntry[str]) -> bool:
         return True
 
 
-def _entries(folder: Path) -> list[os.DirEntry[str]]:
+def _entries(folder: ReleasePath) -> list[Entry]:
     """What lies in a folder; nothing if there is no such folder."""
     try:
-        return list(os.scandir(folder))
+        return listed(folder)
     except FileNotFoundError:
         return []
     except OSError as error:
         raise DatarootError(f"{folder}: cannot be listed ({error.strerror}); {_UNLISTABLE_REMEDY}") from error
 
 
-def _split_files(root: Path) -> dict[str, Path]:
-    found = {}
-    for split in (*SPLITS, *MINI_SPLITS):
+def _split_files(root: ReleasePath) -> dict[str, ReleasePath]:
+    found: dict[str, ReleasePath] = {}
+    for name in SPLIT_FILES:
         for folder in (root, root / SPLIT_FILE_FOLDER):
-            path = folder / f"{split}.txt"
-            if os.path.lexists(path) and not path.is_dir():  # a pipe, or a link to itself, is the reader's error
-                found[split] = path
+            path = folder / name
+            there = os.path.lexists(path) if isinstance(path, Path) else path.is_file()
+            if there and not path.is_dir():  # a pipe, or a link to itself, is the reader's error
+                found[path.stem] = path
                 break
     return found

@@ -11,16 +11,17 @@ from deepaccident_devkit.errors import SensorFileError
 from deepaccident_devkit.geometry import LidarPointCloud
 from deepaccident_devkit.geometry.handedness import flip_points
 from deepaccident_devkit.release.npz import read_npz, write_npz
+from deepaccident_devkit.release.store import ReleasePath
 
 _LEVEL = 1
 """Of compression: the numbers have single precision, so half of each is zeros; a higher level saves little more."""
 
 
 @overload
-def read_lidar(path: Path, *, raw: Literal[False] = False) -> LidarPointCloud: ...
+def read_lidar(path: ReleasePath, *, raw: Literal[False] = False) -> LidarPointCloud: ...
 @overload
-def read_lidar(path: Path, *, raw: Literal[True]) -> AnyArray: ...
-def read_lidar(path: Path, *, raw: bool = False) -> LidarPointCloud | AnyArray:
+def read_lidar(path: ReleasePath, *, raw: Literal[True]) -> AnyArray: ...
+def read_lidar(path: ReleasePath, *, raw: bool = False) -> LidarPointCloud | AnyArray:
     """A point cloud in its LiDAR frame, right-handed, metres.
 
     Args:

@@ -12,6 +12,7 @@ from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.reading import shortened
 from deepaccident_devkit.release._content import read_lines
 from deepaccident_devkit.release._words import integer_of, number_of
+from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.taxonomy import META_AGENTS, TIMES_OF_DAY, UNTRACKED_ID, WARM_UP_FRAMES, AgentName
 
 _FIRST_LINE = "<weather+time> <id1> <class1> <id2> <class2> <impact> <spawn relation> <contact side> <frames>"
@@ -76,10 +77,10 @@ class Meta(ShortRepr):
 
 
 @overload
-def read_meta(path: Path, *, raw: Literal[False] = False) -> Meta: ...
+def read_meta(path: ReleasePath, *, raw: Literal[False] = False) -> Meta: ...
 @overload
-def read_meta(path: Path, *, raw: Literal[True]) -> tuple[str, ...]: ...
-def read_meta(path: Path, *, raw: bool = False) -> Meta | tuple[str, ...]:
+def read_meta(path: ReleasePath, *, raw: Literal[True]) -> tuple[str, ...]: ...
+def read_meta(path: ReleasePath, *, raw: bool = False) -> Meta | tuple[str, ...]:
     """What a meta file says.
 
     Args:
@@ -124,7 +125,7 @@ def write_meta(path: Path, meta: Meta) -> None:
     write_bytes(path, "\n".join(lines).encode())
 
 
-def _entries(path: Path, lines: Sequence[tuple[int, str]]) -> dict[str, tuple[int, str]]:
+def _entries(path: ReleasePath, lines: Sequence[tuple[int, str]]) -> dict[str, tuple[int, str]]:
     """Key → (line number, value) of the lines after the first."""
     entries = {}
     for number, line in lines:
@@ -135,7 +136,7 @@ def _entries(path: Path, lines: Sequence[tuple[int, str]]) -> dict[str, tuple[in
     return entries
 
 
-def _parse(path: Path, first: tuple[int, str], entries: dict[str, tuple[int, str]]) -> Meta:
+def _parse(path: ReleasePath, first: tuple[int, str], entries: dict[str, tuple[int, str]]) -> Meta:
     number, line = first
     words = line.split()
     if len(words) != 9:
@@ -184,7 +185,7 @@ def _collision(
 
 
 def _colliding_agents(
-    path: Path, entries: dict[str, tuple[int, str]]
+    path: ReleasePath, entries: dict[str, tuple[int, str]]
 ) -> tuple[AgentName | None, AgentName | None] | None:
     if "colliding agents" not in entries:
         return None
@@ -196,7 +197,7 @@ def _colliding_agents(
     return META_AGENTS[names[0]], META_AGENTS[names[1]]
 
 
-def _agent_ids(path: Path, entries: dict[str, tuple[int, str]]) -> tuple[int, int, int, int] | None:
+def _agent_ids(path: ReleasePath, entries: dict[str, tuple[int, str]]) -> tuple[int, int, int, int] | None:
     if "agents id" not in entries:
         return None
     number, value = entries["agents id"]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from pathlib import Path
 from typing import get_args
 
 from deepaccident_devkit.errors import MissingFileError
+from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.taxonomy import OnError
 from deepaccident_devkit.text import choice
 
@@ -17,14 +17,14 @@ _logger = logging.getLogger(__name__)
 class MissingFiles:
     """Asks for sensor files, and counts by channel those that are not there (`on_missing='skip'`)."""
 
-    def __init__(self, root: Path, on_missing: OnError = "raise") -> None:
+    def __init__(self, root: ReleasePath, on_missing: OnError = "raise") -> None:
         """Files below a release's folder; raises ChoiceError."""
         self._root = root
         self._skips = choice("on_missing", on_missing, get_args(OnError)) == "skip"
         self._asked: Counter[str] = Counter()
         self._missing: Counter[str] = Counter()
 
-    def has(self, path: Path, channel: str) -> bool:
+    def has(self, path: ReleasePath, channel: str) -> bool:
         """Whether a file is there, to be read; raises MissingFileError if it is not and nothing may be left out."""
         self._asked[channel] += 1
         if path.exists():

@@ -12,6 +12,7 @@ from deepaccident_devkit.errors import SensorFileError
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.reading import MOST_TOLD, FileKind, fault_text, shortened
 from deepaccident_devkit.release._content import read_content
+from deepaccident_devkit.release.store import ReleasePath
 
 KEY = "data"
 _ENDING = ".npy"
@@ -22,7 +23,7 @@ FAST = 1
 _REMEDY = "restore the file from its archive"
 
 
-def read_npz(path: Path, kind: FileKind) -> AnyArray:
+def read_npz(path: ReleasePath, kind: FileKind) -> AnyArray:
     """The array under `data`, or the only one in the file, of numbers.
 
     Raises:
@@ -52,7 +53,7 @@ def write_npz(path: Path, array: AnyArray, *, level: int = FAST) -> None:
     write_bytes(path, archive.getvalue())
 
 
-def _array_member(path: Path, archive: zipfile.ZipFile) -> zipfile.ZipInfo:
+def _array_member(path: ReleasePath, archive: zipfile.ZipFile) -> zipfile.ZipInfo:
     entries = [entry for entry in archive.infolist() if entry.filename.endswith(_ENDING)]
     named = [entry for entry in entries if entry.filename == f"{KEY}{_ENDING}"] or entries
     if len(named) != 1:

@@ -8,13 +8,14 @@ from deepaccident_devkit.errors import SplitFileError
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.reading import shortened
 from deepaccident_devkit.release._content import read_lines
+from deepaccident_devkit.release.store import ReleasePath
 
 
 @overload
-def read_split_file(path: Path, *, raw: Literal[False] = False, unique: bool = False) -> list[str]: ...
+def read_split_file(path: ReleasePath, *, raw: Literal[False] = False, unique: bool = False) -> list[str]: ...
 @overload
-def read_split_file(path: Path, *, raw: Literal[True], unique: bool = False) -> list[tuple[str, ...]]: ...
-def read_split_file(path: Path, *, raw: bool = False, unique: bool = False) -> list[str] | list[tuple[str, ...]]:
+def read_split_file(path: ReleasePath, *, raw: Literal[True], unique: bool = False) -> list[tuple[str, ...]]: ...
+def read_split_file(path: ReleasePath, *, raw: bool = False, unique: bool = False) -> list[str] | list[tuple[str, ...]]:
     """The scenarios of a split file, in its order, each once, as tokens `<scenario_type>/<scenario>`.
 
     Blank lines, blanks at line ends and CRLF are read.
@@ -49,7 +50,7 @@ def write_split_file(path: Path, scenario_tokens: Sequence[str]) -> None:
     write_bytes(path, "".join(lines).encode())
 
 
-def _check_unique(path: Path, words: Sequence[tuple[int, tuple[str, ...]]]) -> None:
+def _check_unique(path: ReleasePath, words: Sequence[tuple[int, tuple[str, ...]]]) -> None:
     first_line: dict[tuple[str, ...], int] = {}
     for number, line_words in words:
         if line_words in first_line:

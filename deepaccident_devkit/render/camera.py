@@ -81,7 +81,7 @@ def render_sample_data(
         there = {"image": is_there(dataset, record["token"]), "points": has_cloud(dataset, record["sample_token"])}
         if chosen and not any(there.get(layer, True) for layer in chosen):
             raise MissingFileError(
-                f"{dataset.get_sample_data_path(record)}: no such file, and nothing else to render; unpack the archive "
+                f"{dataset.sensor_path(record)}: no such file, and nothing else to render; unpack the archive "
                 "that holds it, or choose other layers, such as boxes"
             )
         ax = axes_or_new(ax, (8, 5.4))
@@ -215,7 +215,7 @@ def render_pointcloud_in_image(
     sources = [source for source in sources if source["agent"] not in absent]
     if not (sources or is_there(dataset, record["token"])):
         raise MissingFileError(
-            f"{dataset.get_sample_data_path(record)}: no such file, and {missing_clouds_text(absent)}; unpack the "
+            f"{dataset.sensor_path(record)}: no such file, and {missing_clouds_text(absent)}; unpack the "
             "archives of the camera or of the LiDAR"
         )
     ax = axes_or_new(ax, (8, 5))

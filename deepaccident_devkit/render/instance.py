@@ -144,7 +144,7 @@ def _draw_path(dataset: Dataset, actor: _Actor, layers: frozenset[Layer], ax: Ax
     reach = float(np.ptp(path, axis=0).max()) / 2 + _AROUND
     ax.set(xlim=(center[0] - reach, center[0] + reach), ylim=(center[1] - reach, center[1] + reach), aspect="equal")
     middle = sample_token(actor.scenario, actor.recorder, int(actor.index[len(actor.index) // 2]))
-    if "bev" in layers and dataset.get_sample_data_path(f"{middle}/{BEV_CAMERA}").is_file():
+    if "bev" in layers and dataset.sensor_path(f"{middle}/{BEV_CAMERA}").is_file():
         world_from_ego = dataset.world_from(middle, "ego")
         away = float(np.abs(center - world_from_ego.translation[:2]).max())
         draw_underlay(dataset.load_bev(middle), ax, target_from_ego=world_from_ego, view_range=reach + away)

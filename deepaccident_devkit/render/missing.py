@@ -7,6 +7,7 @@ from collections.abc import Collection
 from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.release.store import listed
 from deepaccident_devkit.render.chips import SMALLEST_TEXT
 from deepaccident_devkit.render.colors import MISSING_COLOR
 from deepaccident_devkit.render.roles import in_drawing_order
@@ -24,7 +25,7 @@ _LETTERS: Final = 50
 
 def is_there(dataset: Dataset, sample_data: str) -> bool:
     """Whether a sensor's file, by its token, is there."""
-    return dataset.get_sample_data_path(sample_data).exists()
+    return dataset.sensor_path(sample_data).exists()
 
 
 def has_cloud(dataset: Dataset, sample: str) -> bool:
@@ -42,8 +43,8 @@ def draw_missing_image(dataset: Dataset, sample_data: str, ax: Axes) -> None:
 
 def absence_text(dataset: Dataset, sample_data: str) -> str:
     """Why a sensor's file, by its token, is not there: the folder has files of other frames, or none at all."""
-    folder = dataset.get_sample_data_path(sample_data).parent
-    return "no file of this frame" if folder.is_dir() and any(folder.iterdir()) else "not downloaded"
+    folder = dataset.sensor_path(sample_data).parent
+    return "no file of this frame" if folder.is_dir() and listed(folder) else "not downloaded"
 
 
 def write_missing(ax: Axes, words: str) -> None:

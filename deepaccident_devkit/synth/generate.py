@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.files import is_writable_folder
 from deepaccident_devkit.parallel import MERGE, Part, Places, Progress, Shard, check_whole, mine, part_of, run_unordered
-from deepaccident_devkit.release.layout import SPLIT_FILE_FOLDER
+from deepaccident_devkit.release.store.names import SPLIT_FILE_FOLDER
 from deepaccident_devkit.synth.config import SynthConfig
 from deepaccident_devkit.synth.plan import ScenarioPlan, plan_scenarios, plan_splits
 from deepaccident_devkit.synth.recording import RecordingJob, forget_scenario, parts_of, record_scenario

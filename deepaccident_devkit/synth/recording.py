@@ -19,6 +19,7 @@ from deepaccident_devkit.release import (
     write_lidar,
     write_meta,
 )
+from deepaccident_devkit.release.store import real_path
 from deepaccident_devkit.synth.config import SynthConfig
 from deepaccident_devkit.synth.plan import ScenarioPlan
 from deepaccident_devkit.synth.roads import Arm
@@ -72,7 +73,7 @@ def record_scenario(job: RecordingJob) -> None:
     labelled = job.plan.split != "test" or not job.config.unlabelled_test
     recorder = _Recorder(folder=job.folder, scenario=scenario, rig=rig, labelled=labelled)
     if labelled and job.first == 1:
-        write_meta(job.folder.meta_path, scenario.meta)
+        write_meta(real_path(job.folder.meta_path), scenario.meta)
     for frame in range(job.first, scenario.frames + 1, job.step):
         recorder.record(frame)
 
@@ -142,21 +143,23 @@ class _Recorder:
         around = rig.surroundings(scene, self._signals(time))
         for agent in rig.agents:
             sighting = rig.sighting(scene, agent, frame)
-            write_calib(self.folder.calib_path(agent.name, frame), sighting.calib)
+            write_calib(real_path(self.folder.calib_path(agent.name, frame)), sighting.calib)
             if self.labelled:
-                write_label(self.folder.label_path(agent.name, frame), sighting.labels)
+                write_label(real_path(self.folder.label_path(agent.name, frame)), sighting.labels)
             if around:
                 intensity = rig.intensity(sighting.points)
-                write_lidar(self.folder.channel_path(agent.name, LIDAR, frame), sighting.points.xyz, intensity)
+                write_lidar(
+                    real_path(self.folder.channel_path(agent.name, LIDAR, frame)), sighting.points.xyz, intensity
+                )
                 self._record_pictures(scene, around, agent, frame)
 
     def _record_pictures(self, scene: Scene, around: Surroundings, agent: Agent, frame: int) -> None:
         """Write the images, and if there are labels also the BEV arrays, whose instances are labels too."""
         if self.labelled:
             bev = self.rig.bev(scene, agent)
-            write_bev(self.folder.channel_path(agent.name, BEV_CAMERA, frame), bev.semantic, bev.instance)
+            write_bev(real_path(self.folder.channel_path(agent.name, BEV_CAMERA, frame)), bev.semantic, bev.instance)
         for channel, image in self.rig.images(scene, around, agent, frame):
-            write_image(self.folder.channel_path(agent.name, channel, frame), image)
+            write_image(real_path(self.folder.channel_path(agent.name, channel, frame)), image)
 
     def _signals(self, time: float) -> Mapping[Arm, int]:
         """Arm → the state of its traffic light."""

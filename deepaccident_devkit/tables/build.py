@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +9,7 @@ import numpy as np
 from deepaccident_devkit.arrays import AnyArray, FloatArray, IntArray
 from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.release import Calibs, Labels, Meta, ScenarioFolder, read_calibs, read_labels, read_meta
+from deepaccident_devkit.release.store import ReleasePath, fetched
 from deepaccident_devkit.tables import boxes as box_rules
 from deepaccident_devkit.tables.accidents import accident_type
 from deepaccident_devkit.tables.boxes import ScenarioBoxes
@@ -61,7 +61,7 @@ def read_scenario(scenario: ScenarioFolder, scan: ScenarioScan) -> tuple[Scenari
     """
     faults: list[Finding] = []
 
-    def attempt(read: Any, code: str, paths: list[Path]) -> Any:
+    def attempt(read: Any, code: str, paths: list[ReleasePath]) -> Any:
         try:
             return read(paths)
         except ReleaseError as error:
@@ -76,20 +76,20 @@ def read_scenario(scenario: ScenarioFolder, scan: ScenarioScan) -> tuple[Scenari
             return None
 
     frames = range(1, scan.num_frames + 1)
-    metas = attempt(_read_metas, "meta-unreadable", [scenario.meta_path] if scan.has_meta else [])
-    calibs = attempt(
-        read_calibs, "calib-unreadable", [scenario.calib_path(agent, n) for agent in scan.agents for n in frames]
-    )
-    labels = attempt(
-        read_labels, "label-unreadable", [scenario.label_path(agent, n) for agent in scan.labelled for n in frames]
-    )
+    meta_paths = [scenario.meta_path] if scan.has_meta else []
+    calib_paths = [scenario.calib_path(agent, n) for agent in scan.agents for n in frames]
+    label_paths = [scenario.label_path(agent, n) for agent in scan.labelled for n in frames]
+    with fetched([*meta_paths, *calib_paths, *label_paths]):
+        metas = attempt(_read_metas, "meta-unreadable", meta_paths)
+        calibs = attempt(read_calibs, "calib-unreadable", calib_paths)
+        labels = attempt(read_labels, "label-unreadable", label_paths)
     if faults:
         return None, faults
     meta = metas[0] if metas else None
     return ScenarioFiles(scenario=scenario, scan=scan, meta=meta, calibs=calibs, labels=labels), []
 
 
-def _read_metas(paths: Sequence[Path]) -> list[Meta]:
+def _read_metas(paths: Sequence[ReleasePath]) -> list[Meta]:
     return [read_meta(path) for path in paths]
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from deepaccident_devkit.errors import IndexStoreError, VersionError
 from deepaccident_devkit.files import temporary_of
+from deepaccident_devkit.release.store import Dataroot, list_files_in
 from deepaccident_devkit.tables.index import index_folders
 from deepaccident_devkit.tables.indexing import MARK_FILE, SHARDS_FOLDER
 from deepaccident_devkit.tables.locking import LOCK_FILE, index_lock
@@ -38,13 +39,13 @@ class Cleared:
         return f"removed {self.folder}: {self.num_files} files, {megabytes(self.num_bytes)}"
 
 
-def clear_index(dataroot: Path, *, version: str = "v1", index_dir: Path | None = None) -> list[Cleared]:
+def clear_index(dataroot: Dataroot, *, version: str = "v1", index_dir: Path | None = None) -> list[Cleared]:
     """Remove the indexes of a release, in its own folder and in the user's cache, with what stopped processes left.
 
     Waits for a process that makes one. The release itself is not needed, nor touched.
 
     Args:
-        dataroot: the release's folder.
+        dataroot: the release, as of `DeepAccident`; it need not be there.
         version: whose indexes.
         index_dir: the only place to look in, where given.
 
@@ -67,6 +68,8 @@ def clear_index(dataroot: Path, *, version: str = "v1", index_dir: Path | None =
             removed = _remove(folder)
         if had_index:
             cleared.append(removed)
+        for listing in list_files_in(folder.parent):
+            listing.unlink(missing_ok=True)
         if index_dir is None:
             with suppress(OSError):  # not empty: another version's index
                 folder.parent.rmdir()

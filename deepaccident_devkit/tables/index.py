@@ -15,9 +15,7 @@ manifest last, so that a reader sees the old index or the new one.
 
 from __future__ import annotations
 
-import hashlib
 import logging
-import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -30,6 +28,7 @@ from deepaccident_devkit.files import is_writable_folder
 from deepaccident_devkit.parallel import Shard
 from deepaccident_devkit.reading import RefusedFileError, fault_text, limit_of
 from deepaccident_devkit.release import ReleaseLayout
+from deepaccident_devkit.release.store import Dataroot, index_places
 from deepaccident_devkit.tables.indexing import Outcome, check_indexed, index_scenarios, is_unfinished, make_index
 from deepaccident_devkit.tables.locking import index_lock
 from deepaccident_devkit.tables.manifest import (
@@ -49,7 +48,6 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-INDEX_FOLDER = ".deepaccident"
 _MESSAGES_A_SCENARIO = 5
 
 
@@ -171,16 +169,9 @@ def find_indexes(layout: ReleaseLayout, index_dir: Path | None = None) -> Iterat
             yield Index(folder=folder, manifest=manifest)
 
 
-def index_folders(root: Path, version: str, index_dir: Path | None = None) -> Iterator[Path]:
+def index_folders(root: Dataroot, version: str, index_dir: Path | None = None) -> Iterator[Path]:
     """Where a release's index may lie, the first choice first."""
-    if index_dir is not None:
-        yield index_dir / version
-        return
-    yield root / INDEX_FOLDER / version
-    from platformdirs import user_cache_path
-
-    key = hashlib.blake2b(os.fsencode(root.resolve()), digest_size=8).hexdigest()
-    yield user_cache_path("deepaccident_devkit") / key / version
+    return (place / version for place in index_places(root, index_dir))
 
 
 def place_outside(layout: ReleaseLayout) -> Path | None:

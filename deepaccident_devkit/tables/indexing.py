@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -17,6 +16,7 @@ from deepaccident_devkit.files import replacing_folder
 from deepaccident_devkit.parallel import Places, Shard, check_whole, run_batch
 from deepaccident_devkit.reading import file_checksum, observed
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, read_meta
+from deepaccident_devkit.release.store import places_of
 from deepaccident_devkit.tables.build import ScenarioFiles, read_scenario, scenario_rows
 from deepaccident_devkit.tables.findings import Finding
 from deepaccident_devkit.tables.manifest import (
@@ -139,7 +139,7 @@ def _indexed(
     layout: ReleaseLayout, folder: Path, scenarios: list[ScenarioFolder], *, check_files: bool = False, **how: Any
 ) -> list[Outcome]:
     work = partial(index_scenario, folder / SHARDS_FOLDER, check_files=check_files)
-    return run_batch(work, scenarios, places=Places(reads=(layout.root,), writes=(folder,)), **how)
+    return run_batch(work, scenarios, places=Places(reads=places_of(layout.root), writes=(folder,)), **how)
 
 
 def check_indexed(layout: ReleaseLayout, folder: Path) -> None:
@@ -201,8 +201,8 @@ def _read(scenario: ScenarioFolder, scan: ScenarioScan) -> tuple[ScenarioFiles |
     """What `read_scenario` returns, and the digest of the contents that it was made from."""
     words: dict[str, bytes] = {}
 
-    def note(path: Path, content: bytes) -> None:
-        words[os.fspath(path)] = content_words(content)
+    def note(path: object, content: bytes) -> None:
+        words[str(path)] = content_words(content)
 
     with observed(note):
         files, faults = read_scenario(scenario, scan)

@@ -13,6 +13,7 @@ import numpy as np
 
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
 from deepaccident_devkit.release import read_split_file
+from deepaccident_devkit.release.store import ReleasePath, places_of
 from deepaccident_devkit.tables.manifest import Problem
 from deepaccident_devkit.tables.tables import Table, Tables, table_names
 from deepaccident_devkit.taxonomy import AGENTS, MINI_SPLITS, SPLITS, OnError
@@ -35,7 +36,7 @@ class OpenTables:
         problems: the broken scenarios that were left out (`on_error='skip'`).
     """
 
-    dataroot: Path
+    dataroot: ReleasePath
     version: str
     layout: str
     problems: tuple[Problem, ...]
@@ -43,10 +44,10 @@ class OpenTables:
     def __init__(
         self,
         *,
-        dataroot: Path,
+        dataroot: ReleasePath,
         version: str,
         layout: str,
-        split_files: Mapping[str, Path],
+        split_files: Mapping[str, ReleasePath],
         tables_folder: Path,
         problems: tuple[Problem, ...] = (),
         tables: Tables | None = None,
@@ -80,7 +81,7 @@ class OpenTables:
     @property
     def places(self) -> tuple[Path, ...]:
         """What a worker on another host must see to open it: the release's folder, and that of its tables."""
-        return self.dataroot, self.tables_folder
+        return *places_of(self.dataroot), self.tables_folder
 
     @property
     def tables_folder(self) -> Path:
@@ -228,7 +229,7 @@ class OpenTables:
         return set(self.scenario.tokens_where("split", split))
 
     def _own_split_text(self) -> str:
-        place = shlex.quote(os.fspath(self.dataroot))
+        place = shlex.quote(str(self.dataroot))
         return f"or make a split file of your own: deepaccident split {place} --save mine.txt, then --split mine.txt"
 
     def _listed_scenarios(self, path: Path, missing: OnError) -> set[str]:

@@ -9,6 +9,7 @@ from typing import Literal
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import DatarootError, IndexStoreError, VersionError
 from deepaccident_devkit.release import ReleaseLayout, find_release
+from deepaccident_devkit.release.store import Dataroot, open_dataroot
 from deepaccident_devkit.tables.clearing import holds_index, megabytes, sizes_in
 from deepaccident_devkit.tables.index import Index, index_folders, is_current
 from deepaccident_devkit.tables.indexing import SHARDS_FOLDER, edited_scenarios, is_unfinished
@@ -119,12 +120,12 @@ class IndexReport(ShortRepr):
 
 
 def index_report(
-    dataroot: Path, *, version: str | None = None, index_dir: Path | None = None, check_files: bool = False
+    dataroot: Dataroot, *, version: str | None = None, index_dir: Path | None = None, check_files: bool = False
 ) -> IndexReport:
     """Look at the indexes of a dataroot, in its own folder and in the user's cache; changes nothing.
 
     Args:
-        dataroot: the release's folder.
+        dataroot: the release, as of `DeepAccident`.
         version: whose indexes; None looks for every version's.
         index_dir: the only place to look in, where given.
         check_files: compare the content of every label, calib and meta file, and of the tables, with the index.
@@ -138,7 +139,7 @@ def index_report(
     versions = VERSIONS if version is None else (version,)
     for each in versions:
         try:
-            layout: ReleaseLayout | None = find_release(dataroot, each)
+            layout: ReleaseLayout | None = find_release(open_dataroot(dataroot, index_dir), each)
         except (DatarootError, VersionError) as error:
             layout = None
             missing.append(error)

@@ -6,16 +6,19 @@ import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.reading import FileKind, fault_text, read_bytes
 from deepaccident_devkit.release import ScenarioFolder
 from deepaccident_devkit.release.layout import frame_numbers
+from deepaccident_devkit.release.store import ReleasePath, StorePath, listed
 from deepaccident_devkit.tables.findings import Finding, finding_of
 from deepaccident_devkit.taxonomy import AGENTS, AgentName
 
 _ENDINGS = {"calib": "pkl", "label": "txt"}
 _FRAMES_NAMED = 6
+_AnyPath: TypeAlias = ReleasePath | str
 _REMEDY = "unpack its archive again, or leave the scenario out with on_error='skip'"
 
 
@@ -55,7 +58,7 @@ def scan_scenario(scenario: ScenarioFolder) -> ScenarioScan:
         if frames[agent, "label"] and agent not in agents
     ]
     labelled = tuple(agent for agent in agents if frames[agent, "label"])
-    has_meta = os.path.exists(scenario.meta_path)  # noqa: PTH110 - Path.exists raises where the folder is closed
+    has_meta = _is_there(scenario.meta_path)
     if labelled and not has_meta:
         notices.append(
             f"{scenario.meta_path}: missing or not readable: weather and collision of this scenario are unknown"
@@ -90,17 +93,21 @@ def _frames(scenario: ScenarioFolder, agent: AgentName, kind: str, ending: str, 
     return frames
 
 
-def _broken(scenario: ScenarioFolder, code: str, where: Path, what: str, remedy: str) -> Finding:
+def _broken(scenario: ScenarioFolder, code: str, where: ReleasePath, what: str, remedy: str) -> Finding:
     return Finding(code=code, severity="error", scenario=scenario.token, where=str(where), what=what, remedy=remedy)
 
 
-def folder_digest(scenarios: Iterable[ScenarioFolder], files: Iterable[Path]) -> str:
+def folder_digest(scenarios: Iterable[ScenarioFolder], files: Iterable[ReleasePath]) -> str:
     """A digest of the times of the scenarios' calib and label folders and of some files; opens none of them.
 
-    It changes when a file is added, removed or renamed, not when one is edited in place.
+    It changes when a file is added, removed or renamed, not when one is edited in place; in a store, when an archive
+    changes.
     """
     digest = hashlib.blake2b(digest_size=16)
     for scenario in scenarios:
+        if isinstance(scenario.root, StorePath):
+            digest.update(os.fsencode(f"{scenario.root.store.state} {scenario.folder}/{scenario.token}\n"))
+            continue
         root = os.fspath(scenario.root)
         base = os.path.join(root, scenario.folder, scenario.scenario_type)  # noqa: PTH118 - 7,000 of them at start
         digest.update(os.fsencode(f"{scenario.folder}/{scenario.token}\n"))
@@ -108,7 +115,7 @@ def folder_digest(scenarios: Iterable[ScenarioFolder], files: Iterable[Path]) ->
         for path in [*paths, f"{base}/meta/{scenario.name}.txt"]:
             digest.update(_stat_words(path))
     for file in files:
-        digest.update(os.fsencode(file.name) + _stat_words(os.fspath(file)))
+        digest.update(os.fsencode(file.name) + _stat_words(file))
     return digest.hexdigest()
 
 
@@ -125,7 +132,7 @@ def contents_digest(scenario: ScenarioFolder, known: Mapping[str, bytes] | None 
         known: path → `content_words` of files that were read already; the others are read now.
     """
     found = known or {}
-    return _digest(scenario, lambda path, kind: found.get(path) or _words_of_file(path, kind))
+    return _digest(scenario, lambda path, kind: found.get(str(path)) or _words_of_file(path, kind))
 
 
 def content_words(content: bytes) -> bytes:
@@ -133,39 +140,51 @@ def content_words(content: bytes) -> bytes:
     return f" {len(content)} {zlib.crc32(content):08x}\n".encode()
 
 
-def _digest(scenario: ScenarioFolder, words_of: Callable[[str, FileKind], bytes]) -> str:
+def _digest(scenario: ScenarioFolder, words_of: Callable[[_AnyPath, FileKind], bytes]) -> str:
     """A digest of where a scenario lies, and of each small file's name and what `words_of` its path and kind gives."""
     digest = hashlib.blake2b(os.fsencode(f"{scenario.folder}/{scenario.token}"), digest_size=16)
     kinds: tuple[FileKind, ...] = ("calib", "label")
     for agent in AGENTS:
         for kind in kinds:
-            folder = os.fspath(scenario.kind_folder(agent, kind))
+            folder = scenario.kind_folder(agent, kind)
             for name in _names(folder):
-                digest.update(os.fsencode(f"{agent}/{kind}/{name}") + words_of(f"{folder}{os.sep}{name}", kind))
-    digest.update(words_of(os.fspath(scenario.meta_path), "meta"))
+                digest.update(os.fsencode(f"{agent}/{kind}/{name}") + words_of(_below(folder, name), kind))
+    digest.update(words_of(scenario.meta_path, "meta"))
     return digest.hexdigest()
 
 
-def _words_of_file(path: str, kind: FileKind) -> bytes:
+def _words_of_file(path: _AnyPath, kind: FileKind) -> bytes:
     try:
-        return content_words(read_bytes(Path(path), kind))
+        return content_words(read_bytes(Path(path) if isinstance(path, str) else path, kind))
     except OSError as error:
         return f" {fault_text(error)}\n".encode()
 
 
-def _names(folder: str) -> list[str]:
+def _names(folder: ReleasePath) -> list[str]:
     try:
-        return sorted(os.listdir(folder))  # noqa: PTH208 - names alone
+        return sorted(entry.name for entry in listed(folder))
     except OSError:
         return []
 
 
-def _stat_words(path: str) -> bytes:
+def _below(folder: ReleasePath, name: str) -> _AnyPath:
+    """A file in a folder; a text, as there are a million of them."""
+    return f"{folder}{os.sep}{name}" if isinstance(folder, Path) else folder / name
+
+
+def _stat_words(path: _AnyPath) -> bytes:
     try:
-        found = os.stat(path)  # noqa: PTH116 - 7,000 of them at start
+        found = path.stat() if isinstance(path, StorePath) else os.stat(path)  # noqa: PTH116 - texts, as above
     except OSError:
         return b" none\n"
     return f" {found.st_size} {found.st_mtime_ns}\n".encode()
+
+
+def _is_there(path: ReleasePath) -> bool:
+    try:
+        return path.exists()
+    except OSError:  # its folder is closed
+        return False
 
 
 def frame_ranges(numbers: Sequence[int]) -> str:

@@ -14,6 +14,7 @@ from deepaccident_devkit.release import ScenarioFolder, read_calib, write_raw_ca
 from deepaccident_devkit.release.labels import FIELDS
 from deepaccident_devkit.release.layout import frame_numbers
 from deepaccident_devkit.release.npz import KEY, read_npz
+from deepaccident_devkit.release.store import real_path
 from deepaccident_devkit.taxonomy import CHANNEL_FORMAT
 
 Rows = list[list[str]]
@@ -47,11 +48,11 @@ class ScenarioEditor:
 
     def file(self, agent: str, kind: str, frame: int) -> Path:
         """A file of a kind: `label`, `calib` or a channel."""
-        return self.scenario.file(agent, kind, frame, ENDINGS[kind])
+        return real_path(self.scenario.file(agent, kind, frame, ENDINGS[kind]))
 
     def folder(self, agent: str, kind: str) -> Path:
         """The folder of the files of a kind."""
-        return self.scenario.kind_folder(agent, kind)
+        return real_path(self.scenario.kind_folder(agent, kind))
 
     def write(self, path: Path, content: bytes) -> None:
         """Make or replace a file."""
@@ -128,8 +129,8 @@ class ScenarioEditor:
 
     def meta_lines(self) -> list[str]:
         """The lines of the meta file."""
-        return self.scenario.meta_path.read_text("ascii").splitlines()
+        return real_path(self.scenario.meta_path).read_text("ascii").splitlines()
 
     def write_meta_lines(self, lines: Sequence[str]) -> None:
         """Replace the meta file."""
-        self.write(self.scenario.meta_path, "\n".join(lines).encode("ascii"))
+        self.write(real_path(self.scenario.meta_path), "\n".join(lines).encode("ascii"))

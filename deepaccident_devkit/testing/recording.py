@@ -16,6 +16,7 @@ from deepaccident_devkit.release import (
     write_label,
     write_lidar,
 )
+from deepaccident_devkit.release.store import real_path
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     BEV_CAMERA,
@@ -64,17 +65,17 @@ class Recorder:
 
     def write_calib(self) -> None:
         """The poses and cameras."""
-        write_calib(self._folder.calib_path(self._agent, self._frame), self._calib)
+        write_calib(real_path(self._folder.calib_path(self._agent, self._frame)), self._calib)
 
     def write_label(self) -> None:
         """The boxes: the own row is first; the pedestrian who is far away is not tracked."""
         labels = self._labels()
         points = labels.boxes().count_points(self._cloud)
-        write_label(self._folder.label_path(self._agent, self._frame), replace(labels, num_lidar_pts=points))
+        write_label(real_path(self._folder.label_path(self._agent, self._frame)), replace(labels, num_lidar_pts=points))
 
     def write_channel(self, channel: str) -> None:
         """The file of one sensor."""
-        path = self._folder.channel_path(self._agent, channel, self._frame)
+        path = real_path(self._folder.channel_path(self._agent, channel, self._frame))
         if channel == LIDAR:
             write_lidar(path, self._cloud, np.linspace(0.0, 1.0, len(self._cloud)))
         elif channel == BEV_CAMERA:

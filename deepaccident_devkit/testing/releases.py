@@ -11,6 +11,7 @@ import numpy as np
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.files import replacing_folder
 from deepaccident_devkit.release import Collision, Meta, ScenarioFolder, write_meta, write_split_file
+from deepaccident_devkit.release.store import real_path
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     BEV_CAMERA,
@@ -148,7 +149,7 @@ def _write_scenario(root: Path, story: _Story, config: SmallRelease) -> None:
     scene = small_scene(rng, frames=config.frames, accident=story.accident)
     meta = _meta(rng, scene, accident=story.accident)
     if story.published:
-        write_meta(folder.meta_path, meta)
+        write_meta(real_path(folder.meta_path), meta)
     channels = [channel for channel in config.channels if story.published or channel != BEV_CAMERA]
     for agent in config.agents:
         for frame in range(1, config.frames + 1):

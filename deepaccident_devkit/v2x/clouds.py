@@ -68,7 +68,7 @@ def aggregate_point_cloud(
     files = MissingFiles(dataset.dataroot, on_missing)
     parts = []
     for message in messages(dataset, sample, agents, link, sweeps=sweeps):
-        if not files.has(dataset.get_sample_data_path(f"{message.sample}/{LIDAR}"), LIDAR):
+        if not files.has(dataset.sensor_path(f"{message.sample}/{LIDAR}"), LIDAR):
             continue
         cloud = dataset.load_point_cloud(message.sample, "lidar")
         if tracks is not None:

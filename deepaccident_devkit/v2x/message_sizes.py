@@ -86,7 +86,7 @@ def message_sizes(
     sizes: dict[str, MessageSize] = {}
     for message in messages(dataset, sample, agents, link):
         images = [dataset.get("sample_data", f"{message.sample}/{camera}") for camera in CAMERAS]
-        path = dataset.get_sample_data_path(f"{message.sample}/{LIDAR}")
+        path = dataset.sensor_path(f"{message.sample}/{LIDAR}")
         counted = clouds and files.has(path, LIDAR)
         points = len(dataset.load_point_cloud(message.sample, "lidar")) if counted else None
         sizes[message.agent] = MessageSize(

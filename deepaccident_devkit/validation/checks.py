@@ -11,6 +11,7 @@ from pathlib import Path
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.reading import LIMITS_VARIABLE, read_bytes
 from deepaccident_devkit.release import ScenarioFolder
+from deepaccident_devkit.release.store import Entry, ReleasePath, listed
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.scan import times_digest
 from deepaccident_devkit.tables.velocities import VelocityFit, total_fit
@@ -77,16 +78,15 @@ def kept_check(path: Path) -> ScenarioCheck | None:
         return None
 
 
-def _entries(folder: Path) -> list[str]:
+def _entries(folder: ReleasePath) -> list[str]:
     """Name, size and time of everything in a folder; nothing if it cannot be listed."""
     try:
-        with os.scandir(folder) as entries:
-            return sorted(f"{entry.name} {_times(entry)}" for entry in entries)
+        return sorted(f"{entry.name} {_times(entry)}" for entry in listed(folder))
     except OSError:
         return []
 
 
-def _times(entry: os.DirEntry[str]) -> str:
+def _times(entry: Entry) -> str:
     try:
         status = entry.stat()
     except OSError:  # a link that leads nowhere

@@ -1,12 +1,11 @@
 """Which sensor files there are, by their names and sizes: nothing is opened."""
 
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.reading import fault_text, irregular_text
-from deepaccident_devkit.release import ScenarioFolder
+from deepaccident_devkit.release import ScenarioFolder, store
 from deepaccident_devkit.release.layout import frame_numbers
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.findings import finding_of
@@ -89,7 +88,7 @@ def _frame_findings(
     if extra:
         what = f"has frames {frame_ranges(extra)} beyond {scan.num_frames}"
         yield make_finding("sensor-frames-extra", scenario.token, str(folder), what)
-    for entry in sorted(os.scandir(folder), key=lambda entry: entry.name):
+    for entry in sorted(store.listed(folder), key=lambda entry: entry.name):
         path = folder / entry.name
         try:
             status = entry.stat()

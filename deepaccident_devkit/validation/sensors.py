@@ -1,19 +1,20 @@
 """Findings that only the sensor files show (`--deep`): every image and array is decoded."""
 
+import hashlib
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
 from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.reading import file_checksum
+from deepaccident_devkit.reading import FileKind, read_bytes
 from deepaccident_devkit.release import read_bev, read_lidar
 from deepaccident_devkit.release.bev_camera import TAGS
 from deepaccident_devkit.release.images import decode_image, read_image_bytes
+from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.findings import finding_of
 from deepaccident_devkit.taxonomy import (
@@ -29,6 +30,7 @@ from deepaccident_devkit.validation.inventory import Inventory
 from deepaccident_devkit.validation.jpeg import ends_early, zero_stretch
 from deepaccident_devkit.validation.subject import MOST_BOXES, Subject, frames_text
 
+_KINDS: dict[str, FileKind] = {LIDAR: "lidar", BEV_CAMERA: "bev"}
 LIDAR_RANGE = 75.0
 """Metres; the real LiDAR ends at 70."""
 POINT_COUNT = (5, 0.25)
@@ -86,12 +88,13 @@ def check_sensors(subject: Subject, inventory: Inventory) -> Iterator[Finding]:
         else:
             yield from _bevs(subject, row, paths, telling)
         for frame in telling:
-            checksums[file_checksum(paths[frame])].append((agent, channel, frame))
+            content = read_bytes(paths[frame], _KINDS.get(channel, "image"))
+            checksums[hashlib.blake2b(content, digest_size=16).hexdigest()].append((agent, channel, frame))
     yield from _repeated(subject, checksums)
 
 
 def _images(
-    subject: Subject, agent: int, channel: str, paths: Mapping[int, Path], telling: list[int]
+    subject: Subject, agent: int, channel: str, paths: Mapping[int, ReleasePath], telling: list[int]
 ) -> Iterator[Finding]:
     """Decode a camera's images; the frames that show something (more than a wall, fog) go to `telling`."""
     import cv2
@@ -173,7 +176,7 @@ def _distance(first: FloatArray, second: FloatArray) -> FloatArray:
     return distance
 
 
-def _clouds(subject: Subject, agent: int, paths: Mapping[int, Path], telling: list[int]) -> Iterator[Finding]:
+def _clouds(subject: Subject, agent: int, paths: Mapping[int, ReleasePath], telling: list[int]) -> Iterator[Finding]:
     """Decode an agent's point clouds; the frames that could be read go to `telling`."""
     odd, differing = [], {}
     for frame, path in paths.items():
@@ -212,7 +215,7 @@ def _sample_boxes(subject: Subject, agent: int, frame: int) -> Boxes:
     return subject.lidar_boxes.select(rows)
 
 
-def _bevs(subject: Subject, agent: int, paths: Mapping[int, Path], telling: list[int]) -> Iterator[Finding]:
+def _bevs(subject: Subject, agent: int, paths: Mapping[int, ReleasePath], telling: list[int]) -> Iterator[Finding]:
     """Decode an agent's BEV arrays; the frames that could be read go to `telling`."""
     total = _BevHits()
     for frame, path in paths.items():

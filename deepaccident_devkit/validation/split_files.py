@@ -3,11 +3,11 @@
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.reading import shortened
 from deepaccident_devkit.release import ReleaseLayout, read_split_file
+from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.findings import finding_of
 from deepaccident_devkit.tables.split_assignment import SplitAssignment, assign_splits
@@ -20,7 +20,7 @@ _NAMED = 3
 def check_splits(layout: ReleaseLayout) -> tuple[SplitAssignment, list[Finding]]:
     """Which split each scenario belongs to, by the split files that can be read, and what is wrong with all of them."""
     found: list[Finding] = []
-    readable: dict[str, Path] = {}
+    readable: dict[str, ReleasePath] = {}
     for split, path in layout.split_files.items():
         try:
             lines = read_split_file(path, raw=True)
@@ -33,7 +33,7 @@ def check_splits(layout: ReleaseLayout) -> tuple[SplitAssignment, list[Finding]]
     return splits, [*found, *_assignment_findings(splits), *_twins(splits)]
 
 
-def _repeated(path: Path, lines: list[tuple[str, ...]]) -> Iterator[Finding]:
+def _repeated(path: ReleasePath, lines: list[tuple[str, ...]]) -> Iterator[Finding]:
     """Scenarios that a file lists more than once; reading takes them once."""
     repeated = [shortened(" ".join(words)) for words, count in Counter(lines).items() if count > 1]
     if repeated:

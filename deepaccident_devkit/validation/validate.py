@@ -15,6 +15,7 @@ from deepaccident_devkit.files import writable_folder, write_bytes
 from deepaccident_devkit.parallel import Places, Shard, check_whole, run_batch
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, find_release
 from deepaccident_devkit.release.layout import names_without_calib
+from deepaccident_devkit.release.store import Dataroot, checksums_compared, open_dataroot, places_of
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.build import read_scenario
 from deepaccident_devkit.tables.scan import scan_scenario
@@ -45,7 +46,7 @@ if TYPE_CHECKING:
 
 
 def validate_release(
-    root: Path,
+    root: Dataroot,
     version: str = "v1",
     *,
     deep: bool = False,
@@ -58,7 +59,7 @@ def validate_release(
     """Look for everything that is wrong, odd or missing in a release; needs no index.
 
     Args:
-        root: the release's folder.
+        root: the release, as of `DeepAccident`: a folder, archives, or a URL.
         version: `v1` or `v1-mini`.
         deep: also decode every image, point cloud and BEV array and hold them against the labels.
         workers: processes to use; see `parallel.run_batch`.
@@ -75,17 +76,17 @@ def validate_release(
         ConfigError: `parts` cannot be written to.
         WorkerError: a worker was killed, or cannot do the work.
     """
-    layout = find_release(root, version)
+    layout = find_release(open_dataroot(root), version)
     work = _Work(deep=deep, parts=None if parts is None else writable_folder(parts))
     checks = work.run(_chosen(layout, scenarios), workers=workers, executor=executor, progress=progress)
     return _report(layout, checks, root=root, deep=deep, whole=scenarios is None)
 
 
-def validation_shard(root: Path, shard: Shard, parts: Path, version: str = "v1", **how: Any) -> list[ScenarioCheck]:
+def validation_shard(root: Dataroot, shard: Shard, parts: Path, version: str = "v1", **how: Any) -> list[ScenarioCheck]:
     """Look at a part of a release, and keep what was found for `merged_validation`.
 
     Args:
-        root: the release's folder.
+        root: the release, as of `DeepAccident`: a folder, archives, or a URL.
         shard: which part of its scenarios, or of `scenarios`.
         parts: folder that all shards write into; what is there already is not done again.
         version: `v1` or `v1-mini`.
@@ -94,18 +95,19 @@ def validation_shard(root: Path, shard: Shard, parts: Path, version: str = "v1",
     Raises:
         ConfigError, DatarootError, VersionError, TokenError, WorkerError: as of `validate_release`.
     """
-    chosen = shard.of(_chosen(find_release(root, version), how.pop("scenarios", None)))
+    chosen = shard.of(_chosen(find_release(open_dataroot(root), version), how.pop("scenarios", None)))
     return _Work(deep=how.pop("deep", False), parts=writable_folder(parts)).run(chosen, **how)
 
 
-def merged_validation(root: Path, parts: Path, version: str = "v1", **how: Any) -> ValidationReport:
+def merged_validation(root: Dataroot, parts: Path, version: str = "v1", **how: Any) -> ValidationReport:
     """What `validate_release` gives, from what the shards kept; arguments are those of `validation_shard`.
 
     Raises:
         UnfinishedError: a scenario is not done, or only with other settings, by another devkit, or with other files.
         DatarootError, VersionError, TokenError, WorkerError: as of `validate_release`.
     """
-    layout, scenarios, deep = find_release(root, version), how.pop("scenarios", None), how.pop("deep", False)
+    layout = find_release(open_dataroot(root), version)
+    scenarios, deep = how.pop("scenarios", None), how.pop("deep", False)
     checks = _Work(deep=deep, parts=parts, merge=True).run(_chosen(layout, scenarios), **how)
     return _report(layout, checks, root=root, deep=deep, whole=scenarios is None)
 
@@ -138,7 +140,7 @@ class _Work:
     def run(self, scenarios: Sequence[ScenarioFolder], **how: Any) -> list[ScenarioCheck]:
         """Look at all of them; raises UnfinishedError if one is not there."""
         places = Places(
-            reads=tuple({scenario.root for scenario in scenarios}),
+            reads=tuple({place for scenario in scenarios for place in places_of(scenario.root)}),
             writes=() if self.parts is None else (self.parts,),
         )
         found = run_batch(self, scenarios, label="validating scenarios", places=places, **how)
@@ -160,7 +162,7 @@ def _chosen(layout: ReleaseLayout, scenarios: Collection[str] | None) -> list[Sc
 
 
 def _report(
-    layout: ReleaseLayout, checks: Sequence[ScenarioCheck], *, root: Path, deep: bool, whole: bool
+    layout: ReleaseLayout, checks: Sequence[ScenarioCheck], *, root: Dataroot, deep: bool, whole: bool
 ) -> ValidationReport:
     """What was found in scenarios, and in the release as a whole."""
     splits, of_release = check_splits(layout)
@@ -198,6 +200,7 @@ def findings(dataset: Dataset, scenario: RowArgument, *, deep: bool = False) -> 
     return [finding for finding in report.findings if finding.scenario == token]
 
 
+@checksums_compared()
 def check_scenario(scenario: ScenarioFolder, *, deep: bool = False) -> ScenarioCheck:
     """All findings in one scenario's files.
 

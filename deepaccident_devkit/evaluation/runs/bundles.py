@@ -70,9 +70,9 @@ class Bundle(ShortRepr):
             raise self._damaged(error) from error
 
     @property
-    def dataroot(self) -> Path:
+    def dataroot(self) -> str:
         """The release that it was evaluated with."""
-        return Path(self.summary["release"]["dataroot"])
+        return str(self.summary["release"]["dataroot"])
 
     @property
     def release_version(self) -> str:
@@ -98,7 +98,7 @@ class Bundle(ShortRepr):
         Raises:
             ResultsError: a copy of the results is not what it should be.
         """
-        named = {"dataroot": os.fspath(self.dataroot)}
+        named = {"dataroot": self.dataroot}
         if self._copy() is None:
             named["results"] = self.summary["results"]["path"]
         if self.summary["split"] not in (*SPLITS, *MINI_SPLITS):

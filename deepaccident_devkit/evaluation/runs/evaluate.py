@@ -111,7 +111,7 @@ def evaluate_results(  # noqa: PLR0913 - of what, by which rules, on what, and w
     if not merge:
         plan.loader.results.check(**engine, progress=progress)
     release = ReleaseInfo(
-        dataroot=os.fspath(dataset.dataroot),
+        dataroot=str(dataset.dataroot),
         version=dataset.version,
         scenarios=scenario_hashes(dataset, _scenarios(plan.tokens), **engine),
     )
@@ -267,7 +267,7 @@ def check_metas(dataset: Dataset, tokens: Sequence[str], split: str) -> None:
             f"{len(silent)} of {len(scenarios)} scenarios have no meta file, which names the colliding pair, so that "
             f"accidents cannot be evaluated there: {', '.join(silent[:3])}{', …' if len(silent) > 3 else ''}; unpack "
             f"their meta folders, or leave them out with a split file of your own: deepaccident split "
-            f"{shlex.quote(os.fspath(dataset.dataroot))}{of_split} --where 'weather!=unknown' --save mine.txt, then "
+            f"{shlex.quote(str(dataset.dataroot))}{of_split} --where 'weather!=unknown' --save mine.txt, then "
             "--split mine.txt"
         )
 

@@ -15,7 +15,8 @@ from typing import Any, Final, Literal
 
 from deepaccident_devkit.errors import SensorFileError
 from deepaccident_devkit.files import replacing, replacing_folder, write_bytes
-from deepaccident_devkit.reading import fault_text, open_file
+from deepaccident_devkit.reading import fault_text, open_file, read_bytes
+from deepaccident_devkit.release.store import ReleasePath, StorePath
 
 Link = Literal["hard", "symbolic", "copy"]
 _NO_LINKS: Final = (errno.EXDEV, errno.EPERM, errno.EACCES, errno.EMLINK, errno.ENOTSUP, errno.ENOSYS)
@@ -121,9 +122,16 @@ class Output:
         with replacing_folder(target) as temporary:
             yield Output(temporary, self.parts, self._link, self.tally)
 
-    def link(self, source: Path, path: str) -> None:
-        """Link a file of the release: hard, else symbolic, else copied; raises SensorFileError if it cannot be read."""
+    def link(self, source: ReleasePath, path: str) -> None:
+        """Link a file of the release: hard, else symbolic, else copied, as one out of an archive is.
+
+        Raises SensorFileError if it cannot be read.
+        """
         try:
+            if isinstance(source, StorePath):
+                write_bytes(self._place(path), read_bytes(source, "image"))
+                self.tally.linked["copy"] += 1
+                return
             real = Path(os.path.realpath(source))
             open_file(real).close()
         except OSError as error:

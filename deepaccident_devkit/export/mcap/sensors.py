@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -16,6 +15,7 @@ from deepaccident_devkit.export.mcap.moment import Moment
 from deepaccident_devkit.export.mcap.recording import Recording, frame_timestamp
 from deepaccident_devkit.release.images import read_jpeg
 from deepaccident_devkit.release.missing_files import MissingFiles
+from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.taxonomy import LIDAR
 from deepaccident_devkit.v2x.projection import camera_of
 
@@ -36,7 +36,7 @@ class Sensors:
         """Write the files of a moment, agent by agent; raises MissingFileError or SensorFileError."""
         for agent, sample in moment.samples.items():
             for channel in self._channels:
-                path = self._dataset.get_sample_data_path(f"{sample}/{channel}")
+                path = self._dataset.sensor_path(f"{sample}/{channel}")
                 if not self._files.has(path, channel):
                     continue
                 if channel == LIDAR:
@@ -48,7 +48,7 @@ class Sensors:
         """Log how many files were left out, if any."""
         self._files.tell()
 
-    def _write_image(self, agent: str, token: str, path: Path, index: int, recording: Recording) -> None:
+    def _write_image(self, agent: str, token: str, path: ReleasePath, index: int, recording: Recording) -> None:
         (content, size), channel = read_jpeg(path), token.rsplit("/", 1)[1]
         frame = frame_id(agent, channel)
         image = CompressedImage(timestamp=frame_timestamp(index), frame_id=frame, data=content, format="jpeg")

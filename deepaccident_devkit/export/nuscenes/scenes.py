@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deepaccident_devkit.export.keyframes import keyframe_after, keyframes
 from deepaccident_devkit.export.nuscenes.names import CHANNEL_NAMES, scene_name, timestamp, token
 from deepaccident_devkit.export.sensor_files import sensor_files
+from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.tables.tokens import agent_token, sample_token
 from deepaccident_devkit.v2x.configurations import agents_of
 
@@ -55,7 +55,7 @@ class Scene:
         return range(1, self.last + 1) if self.sweeps else keyframes(self.last)
 
     @cached_property
-    def files(self) -> Mapping[str, Mapping[int, tuple[Path, int]]]:
+    def files(self) -> Mapping[str, Mapping[int, tuple[ReleasePath, int]]]:
         """Channel → number of an exported frame → path and bytes of the file, where it is there."""
         files = {}
         for channel in CHANNEL_NAMES:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
@@ -13,6 +12,7 @@ from deepaccident_devkit.export.sensor_files import sensor_files
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.release import read_lidar
 from deepaccident_devkit.release.images import read_jpeg
+from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.tables.tokens import sample_data_token
 from deepaccident_devkit.taxonomy import BEV_CAMERA, LIDAR
 
@@ -114,7 +114,7 @@ def _calibrated_row(scene: Scene, sensor: str, source: str, size: tuple[int, int
     }
 
 
-def _cloud(path: Path, axes: LidarAxes) -> bytes:
+def _cloud(path: ReleasePath, axes: LidarAxes) -> bytes:
     """The content of a `.pcd.bin`: x, y, z, intensity, ring (0), in the LiDAR's frame with these axes."""
     cloud = read_lidar(path)
     points = np.zeros((len(cloud), 5), dtype="<f4")

@@ -71,8 +71,7 @@ def with_files(
     for p, moment in enumerate(arrived):
         for name, message in moment.items():
             lacking[names.index(name), p] = sum(
-                not files.has(dataset.get_sample_data_path(f"{message.sample}/{channel}"), channel)
-                for channel in channels
+                not files.has(dataset.sensor_path(f"{message.sample}/{channel}"), channel) for channel in channels
             )
     if lacking[0, -1]:
         raise MissingFileError(

@@ -7,7 +7,6 @@ import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -16,6 +15,7 @@ from deepaccident_devkit.arrays import ByteArray
 from deepaccident_devkit.errors import ConfigError, MissingFileError
 from deepaccident_devkit.parallel import own_threads, run_batch
 from deepaccident_devkit.release import read_image
+from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.render.replay.follow import Followed
 from deepaccident_devkit.render.replay.recording import Recording
 from deepaccident_devkit.taxonomy import CAMERAS
@@ -99,11 +99,11 @@ def check_picture_settings(width: int | None, quality: int | None) -> None:
 class _Image:
     """An image file, and whether its picture is one of the larger ones."""
 
-    path: Path
+    path: ReleasePath
     large: bool
 
 
-CameraFiles = Mapping[tuple[str, str], Sequence[Path | None]]
+CameraFiles = Mapping[tuple[str, str], Sequence[ReleasePath | None]]
 """Agent and camera → one file for each frame; None where there is none."""
 _Images = dict[tuple[str, str], list[_Image | None]]
 _Jpegs = dict[str, dict[str, tuple[bytes | None, ...]]]
@@ -155,8 +155,8 @@ def camera_pictures(
     return CameraPictures(jpegs=jpegs, settings=settings, found=found, wanted=wanted)
 
 
-def _file(recording: Recording, agent: str, frame: int, channel: str) -> Path | None:
-    path = recording.dataset.get_sample_data_path(f"{recording.sample(agent, frame)}/{channel}")
+def _file(recording: Recording, agent: str, frame: int, channel: str) -> ReleasePath | None:
+    path = recording.dataset.sensor_path(f"{recording.sample(agent, frame)}/{channel}")
     return path if path.exists() else None
 
 

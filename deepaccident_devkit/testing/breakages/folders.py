@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from deepaccident_devkit.errors import BrokenReleaseError, SplitFileError
+from deepaccident_devkit.release.store import real_path
 from deepaccident_devkit.taxonomy import SPLITS
 from deepaccident_devkit.testing.breakages.kinds import Group, Victim
 from deepaccident_devkit.testing.editing import ENDINGS
@@ -56,8 +57,9 @@ def folder_is_a_file(victim: Victim) -> Path:
 def scenario_twice(victim: Victim) -> Path:
     """A scenario is also in the folder of a second split."""
     scenario = victim.editor.scenario
-    start = scenario.root / scenario.folder
-    copy = scenario.root / ("val" if scenario.folder != "val" else "train")
+    root = real_path(scenario.root)
+    start = root / scenario.folder
+    copy = root / ("val" if scenario.folder != "val" else "train")
     for path in sorted((start / scenario.scenario_type).rglob(f"{scenario.name}*")):
         if path.is_file():
             victim.editor.write(copy / path.relative_to(start), path.read_bytes())

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from deepaccident_devkit.release.store import real_path
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CHANNELS, INFRASTRUCTURE, LIDAR, OWN_ACTOR_ID, UNTRACKED_ID
 from deepaccident_devkit.testing.breakages.kinds import Group, Victim
 from deepaccident_devkit.testing.editing import ENDINGS, FIELD
@@ -45,7 +46,7 @@ def label_velocity_nan(victim: Victim) -> Path:
 def meta_short(victim: Victim) -> Path:
     """A meta file ends after its third line."""
     victim.editor.write_meta_lines(victim.editor.meta_lines()[:3])
-    return victim.editor.scenario.meta_path
+    return real_path(victim.editor.scenario.meta_path)
 
 
 @GROUP.enter("no-collision-in-accident")
@@ -54,7 +55,7 @@ def meta_no_collision(victim: Victim) -> Path:
     first, _, *rest = victim.editor.meta_lines()
     words = first.split()
     victim.editor.write_meta_lines([" ".join([words[0], *["-1"] * 7, words[8]]), " colliding agents: none none", *rest])
-    return victim.editor.scenario.meta_path
+    return real_path(victim.editor.scenario.meta_path)
 
 
 @GROUP.enter("agent-missing")
@@ -71,7 +72,7 @@ def labels_absent(victim: Victim) -> Path:
     for agent in AGENTS:
         for kind in ("label", BEV_CAMERA):
             victim.editor.remove_folder(victim.editor.folder(agent, kind))
-    victim.editor.remove(victim.editor.scenario.meta_path)
+    victim.editor.remove(real_path(victim.editor.scenario.meta_path))
     return victim.editor.folder(victim.agent, "label")
 
 

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from deepaccident_devkit.errors import BrokenReleaseError, MetaError
+from deepaccident_devkit.release.store import real_path
 from deepaccident_devkit.testing.breakages.kinds import Group, Victim
 
 FORM = Group("meta", opening=BrokenReleaseError, reading=MetaError)
@@ -14,21 +15,21 @@ def _edit_first_line(victim: Victim, word: int, new: str) -> Path:
     words = first.split()
     words[word] = new
     victim.editor.write_meta_lines([" ".join(words), *rest])
-    return victim.editor.scenario.meta_path
+    return real_path(victim.editor.scenario.meta_path)
 
 
 @FORM.enter("meta-unreadable")
 def meta_empty(victim: Victim) -> Path:
     """A meta file has no bytes."""
     victim.editor.write_meta_lines([])
-    return victim.editor.scenario.meta_path
+    return real_path(victim.editor.scenario.meta_path)
 
 
 @FORM.enter("meta-unreadable")
 def meta_cut(victim: Victim) -> Path:
     """A meta file ends within its first line."""
     victim.editor.write_meta_lines([victim.editor.meta_lines()[0][:20]])
-    return victim.editor.scenario.meta_path
+    return real_path(victim.editor.scenario.meta_path)
 
 
 @FORM.enter("meta-unreadable")
@@ -40,8 +41,8 @@ def meta_id_no_number(victim: Victim) -> Path:
 @MEANING.enter("meta-missing")
 def meta_missing(victim: Victim) -> Path:
     """A labelled scenario has no meta file."""
-    victim.editor.remove(victim.editor.scenario.meta_path)
-    return victim.editor.scenario.meta_path
+    victim.editor.remove(real_path(victim.editor.scenario.meta_path))
+    return real_path(victim.editor.scenario.meta_path)
 
 
 @MEANING.enter("meta-frames")

@@ -1,0 +1,35 @@
+"""Where a release's files are read: real folders, zip archives, or URLs. Nothing above `release` knows which."""
+
+from deepaccident_devkit.release.store.opening import (
+    INDEX_FOLDER,
+    index_places,
+    list_files_in,
+    open_dataroot,
+    places_of,
+)
+from deepaccident_devkit.release.store.paths import (
+    Dataroot,
+    Entry,
+    ReleasePath,
+    StorePath,
+    checksums_compared,
+    fetched,
+    listed,
+    real_path,
+)
+
+__all__ = [
+    "INDEX_FOLDER",
+    "Dataroot",
+    "Entry",
+    "ReleasePath",
+    "StorePath",
+    "checksums_compared",
+    "fetched",
+    "index_places",
+    "list_files_in",
+    "listed",
+    "open_dataroot",
+    "places_of",
+    "real_path",
+]

@@ -1,0 +1,213 @@
+"""The list of a store's files: where each lies in which archive; a memory-mapped Arrow file beside the index.
+
+Opening it takes milliseconds for millions of files: only folders are looked at, and a file is found among those of its
+folder, which are sorted, when it is asked for.
+"""
+
+from __future__ import annotations
+
+import json
+from bisect import bisect_left
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray
+from deepaccident_devkit.errors import DatarootError, IndexStoreError
+from deepaccident_devkit.files import replacing
+from deepaccident_devkit.reading import irregular_text, shortened
+
+FORM: Final = 1
+"""Counts up whenever the file's form or its meaning changes."""
+_HEAD: Final = b"deepaccident_members"
+_NUMBERS: Final[Mapping[str, str]] = {
+    "archive": "int32",
+    "offset": "int64",
+    "stored": "int64",
+    "size": "int64",
+    "version": "uint32",
+    "deflated": "uint8",
+}
+"""Column of a member's numbers → its type; `Member` says what they are."""
+_REMEDY: Final = "remove it with: deepaccident index clear DATAROOT"
+
+
+class Member(NamedTuple):
+    """One file of a store.
+
+    Attributes:
+        archive: position in `Members.archives`.
+        offset: where its head begins in the archive; −1 where the archive is the folder that it lies in.
+        stored: bytes in the archive.
+        size: bytes of the file.
+        version: its CRC-32 in a zip; another number that changes with the file elsewhere.
+        deflated: whether it is compressed.
+    """
+
+    archive: int
+    offset: int
+    stored: int
+    size: int
+    version: int
+    deflated: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Listing:
+    """The files of one archive that are of a release; N of them.
+
+    Attributes:
+        archive: its path from the store's place.
+        folders: of the release, each once.
+        folder: (N,) positions in `folders`.
+        names: N names of files.
+        numbers: the columns of `Member` but `archive`, (N,) each.
+    """
+
+    archive: str
+    folders: Sequence[str]
+    folder: AnyArray
+    names: Sequence[str]
+    numbers: Mapping[str, AnyArray]
+
+
+class Members:
+    """The files of a store, by folder and name.
+
+    Attributes:
+        archives: their paths from the store's base.
+        states: of those of them at a URL whose changes must be noticed, bytes and a text that changes with them.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Map the file that `write_members` wrote; raises IndexStoreError if it cannot be read."""
+        import pyarrow as pa
+
+        try:
+            if fault := irregular_text(path.stat().st_mode):
+                raise OSError(fault)
+            batch = pa.ipc.open_file(pa.memory_map(str(path))).get_batch(0)
+            head = json.loads(batch.schema.metadata[_HEAD])
+            names = batch.column("name")
+            _, offsets, content = names.buffers()
+            self.archives: tuple[str, ...] = tuple(map(str, head["archives"]))
+            self.states = {str(name): (int(size), str(text)) for name, (size, text) in head["states"].items()}
+            self._rows = {str(folder): (int(first), int(last)) for folder, first, last in head["folders"]}
+            self._starts = np.frombuffer(offsets, np.int64) if offsets else np.zeros(1, np.int64)
+            self._content = memoryview(content) if content else memoryview(b"")
+            self._numbers = [batch.column(name).to_numpy() for name in _NUMBERS]
+            if any(len(column) != len(names) for column in self._numbers) or self._starts[-1] > len(self._content):
+                raise ValueError("its columns do not fit together")
+        except (OSError, pa.ArrowException, KeyError, TypeError, ValueError, AttributeError) as error:
+            raise IndexStoreError(f"{path}: cannot be read ({shortened(str(error))}); {_REMEDY}") from error
+        self._children: dict[str, dict[str, None]] = {"": {}}
+        for folder in self._rows:
+            self._add_folder(folder)
+
+    def __len__(self) -> int:
+        """How many files there are."""
+        return len(self._starts) - 1
+
+    def find(self, name: str) -> Member | None:
+        """A file by its path in the release; None if it is not there."""
+        folder, _, base = name.rpartition("/")
+        low, high = self._rows.get(folder, (0, 0))
+        row = bisect_left(range(high), base.encode(errors="surrogateescape"), low, high, key=self._name)
+        if row == high or self._name(row) != base.encode(errors="surrogateescape"):
+            return None
+        return self._member(row)
+
+    def has_folder(self, folder: str) -> bool:
+        """Whether a folder of the release has anything in it."""
+        return folder in self._children
+
+    def folders_in(self, folder: str) -> list[str]:
+        """The names of a folder's folders."""
+        return [*self._children.get(folder, ())]
+
+    def files_in(self, folder: str) -> list[tuple[str, Member]]:
+        """The names of a folder's files in order, and where they are."""
+        low, high = self._rows.get(folder, (0, 0))
+        return [(self._name(row).decode(errors="surrogateescape"), self._member(row)) for row in range(low, high)]
+
+    def _name(self, row: int) -> bytes:
+        start, stop = self._starts[row : row + 2].tolist()
+        return bytes(self._content[start:stop])
+
+    def _member(self, row: int) -> Member:
+        return Member(*(column.item(row) for column in self._numbers))
+
+    def _add_folder(self, folder: str) -> None:
+        self._children.setdefault(folder, {})
+        while folder:
+            folder, _, name = folder.rpartition("/")
+            siblings = self._children.setdefault(folder, {})
+            if name in siblings:
+                break
+            siblings[name] = None
+
+
+def write_members(path: Path, listings: Sequence[Listing], states: Mapping[str, tuple[int, str]]) -> None:
+    """Write the list of the files of some archives, whose `Members.states` are these.
+
+    Raises:
+        DatarootError: a file is in two archives, or twice in one.
+        OSError: it cannot be written.
+    """
+    import pyarrow as pa
+
+    folders = sorted({folder for listing in listings for folder in listing.folders})
+    number_of = {folder: number for number, folder in enumerate(folders)}
+    parts = [
+        pa.table(
+            {
+                "folder": np.array([number_of[name] for name in listing.folders], np.int32)[listing.folder],
+                "name": pa.array([name.encode(errors="surrogateescape") for name in listing.names], pa.large_binary()),
+                "archive": np.full(len(listing.names), number, np.int32),
+                **{name: np.asarray(values, _NUMBERS[name]) for name, values in listing.numbers.items()},
+            }
+        )
+        for number, listing in enumerate(listings)
+    ]
+    table = pa.concat_tables(parts).sort_by([("folder", "ascending"), ("name", "ascending")]).combine_chunks()
+    archives = [listing.archive for listing in listings]
+    folder = table["folder"].to_numpy()
+    _check_once(table, folder, folders, archives)
+    last = np.cumsum(np.bincount(folder, minlength=len(folders)))
+    rows = zip(folders, [0, *last[:-1].tolist()], last.tolist(), strict=True)
+    head = json.dumps({"archives": archives, "folders": list(rows), "states": states})
+    table = table.select(["name", *_NUMBERS]).replace_schema_metadata({_HEAD: head.encode()})
+    with replacing(path) as temporary, pa.ipc.new_file(str(temporary), table.schema) as writer:
+        writer.write_batch(pa.RecordBatch.from_arrays([_one(column) for column in table.columns], schema=table.schema))
+
+
+def _one(column: Any) -> Any:
+    """A column's only piece; an empty one has none."""
+    import pyarrow as pa
+
+    return column.chunk(0) if column.num_chunks else pa.array([], column.type)
+
+
+def _check_once(table: Any, folder: AnyArray, folders: Sequence[str], archives: Sequence[str]) -> None:
+    """Raise DatarootError if two rows, which are neighbours as they are sorted, are of the same file."""
+    import pyarrow.compute as pc
+
+    if len(folder) < 2:
+        return
+    names = table["name"]
+    same = (folder[1:] == folder[:-1]) & pc.equal(names[1:], names[:-1]).to_numpy()
+    if same.any():
+        row = int(np.flatnonzero(same)[0])
+        name = names[row].as_py().decode(errors="backslashreplace")
+        first, second = (archives[table["archive"][each].as_py()] for each in (row, row + 1))
+        where = f"in {first} and in {second}" if first != second else f"twice in {first}"
+        raise DatarootError(
+            f"{folders[folder[row]]}/{name}: is {where}{_more(int(same.sum()) - 1)}; keep one of them in this folder"
+        )
+
+
+def _more(count: int) -> str:
+    return f", and so are {count:,} more" if count else ""

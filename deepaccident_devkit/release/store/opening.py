@@ -1,0 +1,310 @@
+"""A dataroot, as a caller names it → where its files are read: a real folder, archives, or a URL."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from urllib.parse import unquote, urlsplit
+
+import numpy as np
+
+from deepaccident_devkit.errors import DatarootError, DeepAccidentError, IndexStoreError
+from deepaccident_devkit.files import is_writable_folder
+from deepaccident_devkit.parallel import Places, run_batch
+from deepaccident_devkit.reading import fault_text, open_file
+from deepaccident_devkit.release.store.members import FORM, Listing, Members, write_members
+from deepaccident_devkit.release.store.names import (
+    MINI_FOLDER,
+    SCENARIO_TYPE,
+    SPLIT_FILE_FOLDER,
+    SPLIT_FILES,
+    SPLIT_FOLDERS,
+    is_release_file,
+    release_folder,
+)
+from deepaccident_devkit.release.store.paths import Dataroot, ReleasePath, StorePath, listed
+from deepaccident_devkit.release.store.sources import UrlSource
+from deepaccident_devkit.release.store.store import opened_store
+from deepaccident_devkit.release.store.zips import list_zip
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+_States: TypeAlias = Mapping[str, tuple[int, str]]
+"""File → its bytes, and a text that changes with it."""
+INDEX_FOLDER: Final = ".deepaccident"
+_ENDING: Final = ".zip"
+_DEEPEST: Final = 3
+"""Folders below a dataroot in which archives are looked for."""
+_LIST: Final = "files-"
+"""How the name of a list of a store's files begins."""
+
+
+def open_dataroot(
+    dataroot: Dataroot,
+    index_dir: Path | None = None,
+    *,
+    refresh: bool = False,
+    outside: bool = False,
+    workers: int | None = None,
+    executor: Executor | None = None,
+    progress: bool = False,
+) -> ReleasePath:
+    """Where the files of a release are read.
+
+    A folder that holds a release is read as it is. Of a zip, a folder of zips and a URL, the files are listed once,
+    beside the index; archives are listed again when their size or time changes, a URL's files when `refresh` is set.
+
+    Args:
+        dataroot: a folder, a zip, a folder with zips (of any part of a release each), or a URL that fsspec can list.
+        index_dir: where lists and indexes are kept; by default in the dataroot, or in the user's cache.
+        refresh: list the files of a URL again.
+        outside: keep a new list in the user's cache, not beside the archives.
+        workers: processes to list archives with; None chooses by their number.
+        executor: any executor of `concurrent.futures` to run on, in place of own workers.
+        progress: whether to show a progress bar.
+
+    Returns:
+        The folder's absolute path, which need not be there; or the release's folder in a store.
+
+    Raises:
+        DatarootError: an archive cannot be read, two hold the same file, or the URL cannot be listed.
+        IndexStoreError: the list cannot be kept or read.
+        MissingExtraError: the URL needs fsspec, or one of its file systems.
+    """
+    if isinstance(dataroot, StorePath):
+        if not (refresh and dataroot.store.is_remote):
+            return dataroot
+        dataroot = dataroot.store.place
+    text = os.fspath(dataroot)
+    if "://" in text and urlsplit(text).scheme != "file":
+        return _opened_url(UrlSource(text), _places(text, index_dir, outside=outside), refresh=refresh)
+    path = Path(unquote(urlsplit(text).path)) if "://" in text else Path(text)
+    path = Path(os.path.abspath(path.expanduser()))  # noqa: PTH100 - symbolic links stay
+    archives = _archives(path)
+    if not archives:
+        return path
+    how: dict[str, Any] = {"workers": workers, "executor": executor, "progress": progress}
+    return _opened_archives(path, archives, _places(path, index_dir, outside=outside), **how)
+
+
+def index_places(dataroot: Dataroot, index_dir: Path | None = None) -> Iterator[Path]:
+    """The folders in which a dataroot's index may be kept, the first choice first."""
+    if index_dir is not None:
+        yield index_dir
+        return
+    text = str(dataroot)
+    identity = os.fsencode(text)
+    if "://" not in text:
+        path = Path(text)
+        yield path.parent / INDEX_FOLDER / path.name if path.is_file() else path / INDEX_FOLDER
+        identity = os.fsencode(path.resolve())
+    from platformdirs import user_cache_path
+
+    yield user_cache_path("deepaccident_devkit") / hashlib.blake2b(identity, digest_size=8).hexdigest()
+
+
+def list_files_in(place: Path) -> list[Path]:
+    """The lists of stores' files in a folder of indexes, with what they were made from."""
+    return sorted(place.glob(f"{_LIST}*"))
+
+
+def places_of(root: ReleasePath) -> tuple[Path, ...]:
+    """What workers must see to read a release."""
+    return (root,) if isinstance(root, Path) else root.store.places
+
+
+def _places(dataroot: Dataroot, index_dir: Path | None, *, outside: bool) -> list[Path]:
+    """Where a list of files is looked for, and written where that can be done first."""
+    places = list(index_places(dataroot, index_dir))
+    return places[::-1] if outside else places
+
+
+def _archives(path: Path) -> list[Path]:
+    """The archives that a path stands for: itself, or those in a folder that holds no release; none for others."""
+    if path.suffix.lower() == _ENDING and path.is_file():
+        return [path]
+    if any(_has_scenarios(folder) for folder in (path, *(path / name for name in (*SPLIT_FOLDERS, MINI_FOLDER)))):
+        return []
+    found: list[Path] = []
+    folders = [(path, 0)]
+    while folders:
+        folder, depth = folders.pop()
+        with suppress(OSError):
+            for entry in listed(folder):
+                if entry.is_dir() and depth < _DEEPEST and not entry.name.startswith("."):
+                    folders.append((folder / entry.name, depth + 1))
+                elif entry.name.lower().endswith(_ENDING) and entry.is_file() and not entry.name.startswith("."):
+                    found.append(folder / entry.name)
+    return sorted(found)
+
+
+def _has_scenarios(folder: Path) -> bool:
+    with suppress(OSError):
+        return any(SCENARIO_TYPE.fullmatch(entry.name) and entry.is_dir() for entry in listed(folder))
+    return False
+
+
+def _opened_archives(path: Path, archives: Sequence[Path], places: Sequence[Path], **how: Any) -> StorePath:
+    base = path.parent if archives == [path] else path
+    files = [*archives, *(each for each in _split_paths(path) if each.is_file())]
+    states = {file.relative_to(base).as_posix(): _state(file) for file in files}
+    name = _list_name(sorted(states.items()))
+    known = next((place / name for place in places if (place / name).is_file()), None)
+    if known is None:
+        jobs = [(str(archive), archive.relative_to(base).as_posix()) for archive in archives]
+        how = {"label": "listing archives", **how}
+        listings = run_batch(_listed_archive, jobs, places=Places(reads=(base,)), **how)
+        known = _written(
+            places, name, _with_loose(listings, {each: states[each] for each in states if _is_split(each)})
+        )
+    return StorePath(opened_store(str(path), str(base), known))
+
+
+def _split_paths(folder: Path) -> list[Path]:
+    """Where split files may lie beside archives."""
+    return [folder / below / name for below in ("", SPLIT_FILE_FOLDER) for name in SPLIT_FILES]
+
+
+def _state(file: Path) -> tuple[int, str]:
+    status = file.stat()
+    return status.st_size, str(status.st_mtime_ns)
+
+
+def _listed_archive(job: tuple[str, str]) -> Listing:
+    path, name = job
+    try:
+        with open_file(Path(path)) as file:
+            return list_zip(file, name, path, os.fstat(file.fileno()).st_size)
+    except OSError as error:
+        if isinstance(error, DatarootError):
+            raise
+        raise DatarootError(f"{path}: {fault_text(error)}; make it readable, or fetch it again") from error
+
+
+def _opened_url(source: UrlSource, places: Sequence[Path], *, refresh: bool) -> StorePath:
+    url = source.url
+    base = UrlSource(url.rpartition("/")[0]) if url.lower().endswith(_ENDING) else source
+    with _told(url):
+        known = None if refresh else _known_list(base, places)
+        if known is None:
+            archives, others = _files_at(base, url)
+            listings = [_listed_at(base, archive, size) for archive, (size, _) in archives.items()]
+            listings = _with_loose(listings, others)
+            if not any(listing.names for listing in listings):
+                raise DatarootError(f"{url}: no file of a release found; give the URL that the release lies below")
+            known = _written(places, _list_name([*archives.items(), *others.items()]), listings, archives)
+    return StorePath(opened_store(url, base.url, known))
+
+
+def _known_list(base: UrlSource, places: Sequence[Path]) -> Path | None:
+    """The list of a URL's files that was made before, if its archives have not changed since; others are not asked."""
+    for path in (path for place in places for path in list_files_in(place)):
+        with suppress(IndexStoreError):
+            if all(base.state_of(archive) == state for archive, state in Members(path).states.items()):
+                return path
+    return None
+
+
+def _files_at(base: UrlSource, url: str) -> tuple[_States, _States]:
+    """The archives at a URL, and the other files that are read: split files beside archives, all where there are none.
+
+    Path from the base → bytes, and a text that changes with the file.
+    """
+    if base.url != url:
+        name = PurePosixPath(url).name
+        return {name: base.state_of(name)}, {}
+    files = dict(sorted(base.list_files().items()))
+    archives = {name: state for name, state in files.items() if name.lower().endswith(_ENDING)}
+    if not archives or any(release_folder(folder.split("/")) for folder in {each.rpartition("/")[0] for each in files}):
+        return {}, files
+    return archives, {name: state for name, state in files.items() if _is_split(name)}
+
+
+def _listed_at(base: UrlSource, archive: str, size: int) -> Listing:
+    with base.opened(archive) as file:
+        return list_zip(file, archive, f"{base.url}/{archive}", size)
+
+
+def _is_split(path: str) -> bool:
+    """Whether a file beside archives is a split file, by its path from the place."""
+    folder, _, name = path.rpartition("/")
+    return name in SPLIT_FILES and folder in ("", SPLIT_FILE_FOLDER)
+
+
+def _with_loose(listings: Sequence[Listing], files: _States) -> list[Listing]:
+    """The listings of archives, and of files beside them; a split file that an archive holds counts more than those."""
+    packed = {name for listing in listings for name in listing.names if name in SPLIT_FILES}
+    return [*listings, *_loose({path: files[path] for path in files if path.rpartition("/")[2] not in packed})]
+
+
+def _loose(files: _States) -> list[Listing]:
+    """The files at a URL, a listing for each folder."""
+    folders: dict[str, list[str]] = {}
+    for path in files:
+        folders.setdefault(path.rpartition("/")[0], []).append(path)
+    listings = []
+    for folder, paths in folders.items():
+        found = release_folder(folder.split("/"))
+        if found is None:
+            continue
+        paths = [path for path in paths if is_release_file(found, path.rpartition("/")[2])]  # noqa: PLW2901
+        sizes = np.array([files[path][0] for path in paths], np.int64)
+        numbers = {
+            "offset": np.full(len(paths), -1),
+            "stored": sizes,
+            "size": sizes,
+            "version": np.array([zlib.crc32(files[path][1].encode()) for path in paths], np.uint32),
+            "deflated": np.zeros(len(paths), np.uint8),
+        }
+        names = [path.rpartition("/")[2] for path in paths]
+        zeros = np.zeros(len(paths), int)
+        listings.append(Listing(archive=folder, folders=[found], folder=zeros, names=names, numbers=numbers))
+    return listings
+
+
+def _list_name(states: Sequence[Any]) -> str:
+    digest = hashlib.blake2b(json.dumps([FORM, states]).encode(), digest_size=8).hexdigest()
+    return f"{_LIST}{digest}.arrow"
+
+
+def _written(
+    places: Sequence[Path],
+    name: str,
+    listings: Sequence[Listing],
+    states: _States | None = None,
+) -> Path:
+    """Write the list of a store's files into the first place that can be written, and remove older ones there."""
+    place = next((place for place in places if is_writable_folder(place)), None)
+    if place is None:
+        told = " or ".join(map(str, places))
+        raise IndexStoreError(f"{told}: no place to write the index; give a writable folder with index_dir=")
+    try:
+        write_members(place / name, listings, states or {})
+        for path in list_files_in(place):
+            if path.name != name:
+                path.unlink(missing_ok=True)
+    except OSError as error:
+        if isinstance(error, DeepAccidentError):
+            raise
+        raise IndexStoreError(f"{place / name}: cannot be written ({fault_text(error)}); make room there") from error
+    return place / name
+
+
+@contextmanager
+def _told(url: str) -> Iterator[None]:
+    """Turn what a URL's files raise into DatarootError."""
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, DeepAccidentError):
+            raise
+        missing = isinstance(error, FileNotFoundError)
+        what = "does not exist, or may not be listed" if missing else fault_text(error)
+        raise DatarootError(f"{url}: {what}; check the URL, and the credentials in the environment") from None

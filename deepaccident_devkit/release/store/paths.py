@@ -1,0 +1,199 @@
+"""`StorePath`: a file or folder of a release that lies in archives or at a URL, with the part of Path that is used."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import total_ordering
+from pathlib import Path, PurePath, PurePosixPath
+from typing import TypeAlias
+
+from deepaccident_devkit.errors import NotAvailableError
+from deepaccident_devkit.reading import FileKind
+from deepaccident_devkit.release.store.store import COMPARES, READ_BEFORE, Store
+
+
+@dataclass(frozen=True, slots=True)
+class StoreStatus:
+    """What `stat` says of a file in a store, by the names of `os.stat_result`."""
+
+    st_mode: int
+    st_size: int
+    st_mtime_ns: int
+    """A number that changes with the file."""
+
+
+@total_ordering
+@dataclass(frozen=True, slots=True, repr=False, eq=False)
+class StorePath:
+    """A path in a store; equal to another one of the same text.
+
+    Attributes:
+        store: where it is read.
+        inside: the path in the release, with `/` between names; empty for the release's folder.
+    """
+
+    store: Store
+    inside: str = ""
+
+    def __truediv__(self, below: str | PurePath) -> StorePath:
+        """A path below this one."""
+        text = below if isinstance(below, str) else below.as_posix()
+        return StorePath(self.store, f"{self.inside}/{text}".strip("/") if text else self.inside)
+
+    def __str__(self) -> str:
+        """The store's place and the path in it."""
+        return f"{self.store.place}/{self.inside}" if self.inside else self.store.place
+
+    def __repr__(self) -> str:
+        return f"StorePath({str(self)!r})"
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, StorePath) and str(self) == str(other)
+
+    def __lt__(self, other: StorePath) -> bool:
+        return str(self) < str(other)
+
+    def __hash__(self) -> int:
+        return hash(str(self))
+
+    @property
+    def name(self) -> str:
+        """The last name; of the release's folder that of the archive or of the URL's end."""
+        return PurePosixPath(str(self)).name
+
+    @property
+    def stem(self) -> str:
+        """The last name without its ending."""
+        return PurePosixPath(self.name).stem
+
+    @property
+    def suffix(self) -> str:
+        """The ending of the last name, with its dot."""
+        return PurePosixPath(self.name).suffix
+
+    @property
+    def parent(self) -> StorePath:
+        """The folder above; the release's folder is its own."""
+        return StorePath(self.store, self.inside.rpartition("/")[0])
+
+    def relative_to(self, other: StorePath) -> PurePosixPath:
+        """The path from another one above it; raises ValueError if that is not above it."""
+        return PurePosixPath(self.inside).relative_to(other.inside)
+
+    def resolve(self) -> StorePath:
+        """Itself: there are no links."""
+        return self
+
+    def exists(self) -> bool:
+        """Whether there is such a file or folder."""
+        return self.is_file() or self.is_dir()
+
+    def is_file(self) -> bool:
+        """Whether there is such a file."""
+        return self.store.members.find(self.inside) is not None
+
+    def is_dir(self) -> bool:
+        """Whether there is such a folder."""
+        return self.store.members.has_folder(self.inside)
+
+    def stat(self) -> StoreStatus:
+        """Size and kind; raises FileNotFoundError."""
+        member = self.store.members.find(self.inside)
+        if member is not None:
+            return StoreStatus(stat.S_IFREG, member.size, member.version)
+        if self.is_dir():
+            return StoreStatus(stat.S_IFDIR, 0, 0)
+        raise FileNotFoundError(str(self))
+
+    def local_path(self) -> Path:
+        """A real path with its content; raises as `Store.local_path` does."""
+        return self.store.local_path(self.inside)
+
+    def content(self, kind: FileKind) -> bytes:
+        """The file's bytes, as `reading.read_bytes` gives them; raises OSError."""
+        return self.store.read(self.inside, kind)
+
+
+ReleasePath: TypeAlias = Path | StorePath
+"""Where something of a release lies: a real path, or one in a store."""
+
+
+def real_path(path: ReleasePath) -> Path:
+    """A path that can be written to, and that other programs understand; raises NotAvailableError if it is none."""
+    if isinstance(path, Path):
+        return path
+    raise NotAvailableError(f"{path}: lies in an archive or at a URL, and has no path of its own; unpack it first")
+
+
+@dataclass(frozen=True, slots=True)
+class StoreEntry:
+    """What lies in a folder of a store, as `os.DirEntry`."""
+
+    name: str
+    status: StoreStatus
+
+    def is_dir(self) -> bool:
+        """Whether it is a folder."""
+        return stat.S_ISDIR(self.status.st_mode)
+
+    def is_file(self) -> bool:
+        """Whether it is a file."""
+        return not self.is_dir()
+
+    def stat(self) -> StoreStatus:
+        """Its size and kind."""
+        return self.status
+
+
+Dataroot: TypeAlias = "str | os.PathLike[str] | ReleasePath"
+"""How a caller names a release: its folder, an archive, a folder of archives, a URL."""
+Entry: TypeAlias = "os.DirEntry[str] | StoreEntry"
+
+
+def listed(folder: ReleasePath) -> list[Entry]:
+    """What lies in a folder, in no order.
+
+    Raises:
+        FileNotFoundError: there is no such folder.
+        OSError: it cannot be listed.
+    """
+    if isinstance(folder, Path):
+        with os.scandir(folder) as entries:
+            return list(entries)
+    members = folder.store.members
+    if not members.has_folder(folder.inside):
+        if folder.is_file():
+            raise NotADirectoryError(str(folder))
+        raise FileNotFoundError(str(folder))
+    folders = [StoreEntry(name, StoreStatus(stat.S_IFDIR, 0, 0)) for name in members.folders_in(folder.inside)]
+    files = [
+        StoreEntry(name, StoreStatus(stat.S_IFREG, member.size, member.version))
+        for name, member in members.files_in(folder.inside)
+    ]
+    return [*folders, *files]
+
+
+@contextmanager
+def fetched(paths: Iterable[ReleasePath]) -> Iterator[None]:
+    """Have small files read together if they are at a URL; in the block, in this thread, they are read from memory."""
+    remote = [path for path in paths if isinstance(path, StorePath) and path.store.is_remote]
+    known = remote[0].store.fetch(path.inside for path in remote) if remote else None
+    token = READ_BEFORE.set(known)
+    try:
+        yield
+    finally:
+        READ_BEFORE.reset(token)
+
+
+@contextmanager
+def checksums_compared() -> Iterator[None]:
+    """Have what is read from archives in the block, in this thread, compared with the archives' checksums."""
+    token = COMPARES.set(True)
+    try:
+        yield
+    finally:
+        COMPARES.reset(token)

@@ -1,0 +1,182 @@
+"""Where archives lie, and how a part of one is read: a folder of this machine, or a URL."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+from typing import Any, BinaryIO, Final, TypeVar, cast
+from urllib.parse import urlsplit
+
+from deepaccident_devkit.errors import DatarootError, MissingExtraError
+from deepaccident_devkit.reading import MOST_TOLD, RefusedFileError, open_file, shortened
+
+Result = TypeVar("Result")
+_SECRETS: Final = re.compile(r"\?\S*|(?<=://)[^/@\s]+@")
+"""Parts of a URL in a library's message that may be secret: what is asked for, and who asks."""
+_LARGEST_GAP: Final = 1 << 16
+_LARGEST_RANGE: Final = 64 << 20
+"""Bytes between two members that are fetched with them, and that are fetched at once."""
+Range = tuple[str, int, int]
+"""An archive, and the first byte and the one after the last."""
+
+
+class Source(ABC):
+    """Reads parts of the archives below one place."""
+
+    @abstractmethod
+    def read(self, archive: str, start: int, stop: int) -> bytes:
+        """Bytes of an archive, as many as are there; raises OSError, of a file that is gone FileNotFoundError."""
+
+    def read_all(self, ranges: Sequence[Range]) -> list[bytes]:
+        """Several parts; raises OSError."""
+        return [self.read(*each) for each in ranges]
+
+
+class LocalSource(Source):
+    """A folder of this machine. An open archive is read by several threads and forked processes at once."""
+
+    def __init__(self, folder: Path) -> None:
+        """Read below this folder."""
+        self._folder = folder
+        self._opened: dict[str, BinaryIO] = {}
+
+    def read(self, archive: str, start: int, stop: int) -> bytes:
+        """Bytes of an archive."""
+        file = self._opened.get(archive)
+        if file is None:  # two threads may open it, and one of the two files is closed when nobody has it any more
+            file = self._opened.setdefault(archive, open_file(self._folder / archive))
+        descriptor = file.fileno()
+        content = os.pread(descriptor, stop - start, start)
+        return content if len(content) == stop - start else self._rest(descriptor, content, start, stop)
+
+    @staticmethod
+    def _rest(descriptor: int, content: bytes, start: int, stop: int) -> bytes:
+        """The bytes after `content`, which one call did not give: the system gives at most 2 GiB at once."""
+        while len(content) < stop - start and (
+            more := os.pread(descriptor, stop - start - len(content), start + len(content))
+        ):
+            content += more
+        return content
+
+
+class UrlSource(Source):
+    """A URL that fsspec can list and read. Its credentials are fsspec's business: its settings, the environment."""
+
+    def __init__(self, url: str) -> None:
+        """Read below this URL; raises DatarootError if it holds a password or another secret."""
+        self.url = checked_url(url)
+        self._opened: tuple[int, Any, str] | None = None
+
+    def read(self, archive: str, start: int, stop: int) -> bytes:
+        """Bytes of an archive, or of a file."""
+        files, root = self._files()
+        content = _asked(lambda: files.cat_file(f"{root}/{archive}", start=start, end=stop))
+        return cast("bytes", content)
+
+    def read_all(self, ranges: Sequence[Range]) -> list[bytes]:
+        """Several parts, together: what lies close together comes as one."""
+        from fsspec.utils import merge_offset_ranges
+
+        files, root = self._files()
+        names, starts, stops = (list(each) for each in zip(*ranges, strict=True))
+        merged = merge_offset_ranges(names, starts, stops, max_gap=_LARGEST_GAP, max_block=_LARGEST_RANGE, sort=True)
+        names, starts, stops = merged
+        paths = [f"{root}/{name}" for name in names]
+        blocks = _asked(lambda: files.cat_ranges(paths, starts, stops, on_error="raise"))
+        found = {(name, start): block for name, start, block in zip(names, starts, blocks, strict=True)}
+        firsts: dict[str, list[int]] = {}
+        for name, start in sorted(found):
+            firsts.setdefault(name, []).append(start)
+        result = []
+        for name, start, stop in ranges:
+            first = max(each for each in firsts[name] if each <= start)
+            result.append(found[name, first][start - first : stop - first])
+        return result
+
+    def list_files(self) -> dict[str, tuple[int, str]]:
+        """The files below the URL: path from there → bytes, and a text that changes with the file; raises OSError."""
+        files, root = self._files()
+        found = _asked(lambda: files.find(root, detail=True))
+        return {
+            PurePosixPath(path).relative_to(PurePosixPath(root)).as_posix(): _state(detail)
+            for path, detail in found.items()
+            if path != root
+        }
+
+    def state_of(self, archive: str) -> tuple[int, str]:
+        """An archive's bytes, and a text that changes with it; raises OSError."""
+        files, root = self._files()
+        return _state(_asked(lambda: files.info(f"{root}/{archive}")))
+
+    @contextmanager
+    def opened(self, archive: str) -> Iterator[Any]:
+        """An archive as a file in which one can move; raises OSError."""
+        files, root = self._files()
+        with _asked(lambda: files.open(f"{root}/{archive}", "rb")) as file:
+            yield file
+
+    def is_file(self) -> bool:
+        """Whether the URL is that of one file; raises OSError."""
+        files, root = self._files()
+        return bool(_asked(lambda: files.isfile(root)))
+
+    def _files(self) -> tuple[Any, str]:
+        """Fsspec's file system, made anew in a forked process, and the path of the URL in it."""
+        if self._opened is None or self._opened[0] != os.getpid():
+            fsspec = _fsspec(self.url)
+            files, root = _asked(lambda: fsspec.core.url_to_fs(self.url))
+            self._opened = (os.getpid(), files, root.rstrip("/"))
+        return self._opened[1:]
+
+
+def checked_url(url: str) -> str:
+    """A URL without a slash at its end; raises DatarootError, which does not show the secret, if it holds one."""
+    parts = urlsplit(url)
+    if parts.query or parts.password is not None or "@" in parts.netloc:
+        raise DatarootError(
+            f"{parts.scheme}://{parts.hostname or ''}…: holds a name, a password or a signature, which the index and "
+            "messages would show; give it by fsspec's settings or the environment (docs/dataroots.md)"
+        )
+    return url.rstrip("/")
+
+
+def _fsspec(url: str) -> Any:
+    try:
+        import fsspec.core
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(f"{url}: needs fsspec: in a checkout, pip install '.[cloud]'") from error
+    logging.getLogger("fsspec").addHandler(logging.NullHandler())
+    return fsspec
+
+
+def _asked(call: Callable[[], Result]) -> Result:
+    """What a call of fsspec returns; whatever a library below raises becomes an OSError whose words hold no secret."""
+    try:
+        return call()
+    except FileNotFoundError:
+        raise
+    except ImportError as error:
+        raise MissingExtraError(f"{error}; in a checkout: pip install '.[cloud]'") from error
+    except Exception as error:  # noqa: BLE001 - each file system has errors of its own
+        said = str(error.strerror) if isinstance(error, OSError) and error.strerror else str(error)
+        said = shortened(_SECRETS.sub("", said) or type(error).__name__, MOST_TOLD)
+        number = error.errno if isinstance(error, OSError) and error.errno else errno.EIO
+        raise RefusedFileError(number, f"cannot be read ({said})") from None
+
+
+def _state(detail: Any) -> tuple[int, str]:
+    for name in ("ETag", "etag", "md5Hash", "mtime", "LastModified", "last_modified", "created"):
+        if detail.get(name) is not None:
+            return int(detail["size"] or 0), str(detail[name])
+    return int(detail["size"] or 0), ""
+
+
+def source_of(base: str) -> Source:
+    """The source of a URL or of a folder's absolute path."""
+    return UrlSource(base) if "://" in base else LocalSource(Path(base))

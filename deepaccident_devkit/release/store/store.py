@@ -1,0 +1,159 @@
+"""`Store`: the files of a release in archives or at a URL, read by their path in the release."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterable
+from contextvars import ContextVar
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any, Final
+
+from deepaccident_devkit.errors import MissingFileError, SensorFileError
+from deepaccident_devkit.reading import FileKind, check_size, fault_text
+from deepaccident_devkit.release.store.cache import FileCache
+from deepaccident_devkit.release.store.members import Member, Members
+from deepaccident_devkit.release.store.sources import Range, Source, source_of
+from deepaccident_devkit.release.store.zips import HEAD_LENGTH, LONGEST_HEAD, damaged, head_length, member_bytes
+
+_SENSOR_KINDS: Final[tuple[FileKind, ...]] = ("image", "lidar", "bev")
+COMPARES: ContextVar[bool] = ContextVar("compares", default=False)
+"""Whether the bytes of archives' members are compared with their checksums; `paths.checksums_compared` sets it."""
+READ_BEFORE: ContextVar[dict[str, bytes] | None] = ContextVar("fetched", default=None)
+"""Files by name that were read together; `paths.fetched` sets it."""
+
+
+class Store:
+    """The files of one release that have no paths of their own. Cheap to pickle; safe in forks and threads.
+
+    Attributes:
+        place: the archive, the folder of archives or the URL, as messages name it.
+        base: what the archives' names are relative to.
+        list_file: the list of the files.
+    """
+
+    def __init__(self, place: str, base: str, list_file: Path) -> None:
+        """Open the list of a store's files, which is there; raises IndexStoreError if it cannot be read."""
+        self.place, self.base, self.list_file = place, base, list_file
+        self.members = Members(list_file)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle places; a process opens each store once."""
+        return opened_store, (self.place, self.base, self.list_file)
+
+    def __repr__(self) -> str:
+        return f"Store({self.place!r})"
+
+    @property
+    def is_remote(self) -> bool:
+        """Whether it is at a URL."""
+        return "://" in self.base
+
+    @property
+    def state(self) -> str:
+        """A text that changes with the archives."""
+        return self.list_file.name
+
+    @property
+    def places(self) -> tuple[Path, ...]:
+        """What workers must see to read it."""
+        return (self.list_file,) if self.is_remote else (Path(self.place), self.list_file)
+
+    def read(self, name: str, kind: FileKind) -> bytes:
+        """A file's bytes; of a URL, sensor files are kept in the user's cache (`cache.FileCache`).
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            RefusedFileError: it is too large for its kind, or damaged.
+            OSError: it cannot be read, or there is no room in the cache.
+        """
+        if (known := READ_BEFORE.get()) is not None and name in known:
+            return known[name]
+        member = self._member(name)
+        check_size(member.size, kind)
+        if self.is_remote and kind in _SENSOR_KINDS:
+            return self._kept(name, member).read_bytes()
+        return self._bytes(name, member)
+
+    def local_path(self, name: str) -> Path:
+        """A real path of a file's bytes, in the user's cache; it may be gone when that is full of newer ones.
+
+        Raises:
+            MissingFileError: there is no such file.
+            SensorFileError: it cannot be read, or there is no room in the cache.
+            ConfigError: the environment names a wrong size of the cache.
+        """
+        try:
+            return self._kept(name, self._member(name))
+        except FileNotFoundError:
+            raise MissingFileError(f"{self.place}/{name}: no such file; add the archive that holds it") from None
+        except OSError as error:
+            raise SensorFileError(f"{self.place}/{name}: {fault_text(error)}") from error
+
+    def fetch(self, names: Iterable[str]) -> dict[str, bytes]:
+        """Small files by name, read together; those that are not there, or cannot be read so, are left out."""
+        wanted = [(name, member) for name in names if (member := self.members.find(name)) is not None]
+        if not wanted:
+            return {}
+        contents = self._source.read_all([self._range(name, member) for name, member in wanted])
+        found = {}
+        for (name, member), content in zip(wanted, contents, strict=True):
+            if member.offset >= 0:
+                start = head_length(content[:HEAD_LENGTH])
+                content = _decoded(content[start : start + member.stored], member)  # noqa: PLW2901
+            found[name] = content
+        return found
+
+    @cached_property
+    def _source(self) -> Source:
+        return source_of(self.base)
+
+    @cached_property
+    def _cache(self) -> FileCache:
+        return FileCache.of_user()
+
+    def _member(self, name: str) -> Member:
+        member = self.members.find(name)
+        if member is None:
+            raise FileNotFoundError(f"{self.place}/{name}")
+        return member
+
+    def _kept(self, name: str, member: Member) -> Path:
+        path = self._cache.path_of(f"{self.place}\n{name}\n{member.size} {member.version}", name.rpartition("/")[2])
+        if not self._cache.found(path, member.size):
+            self._cache.put(path, self._bytes(name, member))
+        return path
+
+    def _range(self, name: str, member: Member) -> Range:
+        archive = self.members.archives[member.archive]
+        if member.offset < 0:
+            return f"{archive}/{name.rpartition('/')[2]}".lstrip("/"), 0, member.size
+        return archive, member.offset, member.offset + LONGEST_HEAD + member.stored
+
+    def _bytes(self, name: str, member: Member) -> bytes:
+        archive, first, last = self._range(name, member)
+        if member.offset < 0:
+            return self._source.read(archive, first, last)
+        if self.is_remote:  # one question costs more than the bytes that are too many
+            content = self._source.read(archive, first, last)
+            start = head_length(content[:HEAD_LENGTH])
+            content = content[start : start + member.stored]
+        else:
+            start = member.offset + head_length(self._source.read(archive, first, first + HEAD_LENGTH))
+            content = self._source.read(archive, start, start + member.stored)
+        if len(content) < member.stored:
+            raise damaged(f"{archive} ends before it")
+        return _decoded(content, member)
+
+
+def _decoded(content: bytes, member: Member) -> bytes:
+    content = member_bytes(content, member)
+    if COMPARES.get() and zlib.crc32(content) != member.version:
+        raise damaged("its bytes do not agree with its checksum")
+    return content
+
+
+@lru_cache(maxsize=4)
+def opened_store(place: str, base: str, list_file: Path) -> Store:
+    """The store of a list of files, opened once a process."""
+    return Store(place, base, list_file)
