@@ -77,7 +77,7 @@ def validate_release(
     """
     layout = find_release(root, version)
     work = _Work(deep=deep, parts=None if parts is None else writable_folder(parts))
-    checks = work.run(_chosen(layout, scenarios), workers=workers, executor=executor, progress=progress)
+    checks = work.run(chosen_scenarios(layout, scenarios), workers=workers, executor=executor, progress=progress)
     return _report(layout, checks, root=root, deep=deep, whole=scenarios is None)
 
 
@@ -94,7 +94,7 @@ def validation_shard(root: Path, shard: Shard, parts: Path, version: str = "v1",
     Raises:
         ConfigError, DatarootError, VersionError, TokenError, WorkerError: as of `validate_release`.
     """
-    chosen = shard.of(_chosen(find_release(root, version), how.pop("scenarios", None)))
+    chosen = shard.of(chosen_scenarios(find_release(root, version), how.pop("scenarios", None)))
     return _Work(deep=how.pop("deep", False), parts=writable_folder(parts)).run(chosen, **how)
 
 
@@ -106,7 +106,7 @@ def merged_validation(root: Path, parts: Path, version: str = "v1", **how: Any) 
         DatarootError, VersionError, TokenError, WorkerError: as of `validate_release`.
     """
     layout, scenarios, deep = find_release(root, version), how.pop("scenarios", None), how.pop("deep", False)
-    checks = _Work(deep=deep, parts=parts, merge=True).run(_chosen(layout, scenarios), **how)
+    checks = _Work(deep=deep, parts=parts, merge=True).run(chosen_scenarios(layout, scenarios), **how)
     return _report(layout, checks, root=root, deep=deep, whole=scenarios is None)
 
 
@@ -148,7 +148,7 @@ class _Work:
         return list(done.values())
 
 
-def _chosen(layout: ReleaseLayout, scenarios: Collection[str] | None) -> list[ScenarioFolder]:
+def chosen_scenarios(layout: ReleaseLayout, scenarios: Collection[str] | None) -> list[ScenarioFolder]:
     """The scenarios of some tokens, None for all; raises TokenError."""
     chosen = [folder for folder in layout.scenarios if scenarios is None or folder.token in scenarios]
     unknown = sorted(set(scenarios or ()) - {folder.token for folder in chosen})
