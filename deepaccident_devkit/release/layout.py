@@ -182,11 +182,12 @@ def _frame_entries(
     folder: Path, entries: Iterable[os.DirEntry[str]], ending: str
 ) -> Iterator[tuple[int | None, os.DirEntry[str]]]:
     """A folder's entries with an ending, each with its frame number; None if the name has none."""
+    stem = folder.name
     for entry in entries:
         name = entry.name
         if not name.endswith(f".{ending}") or name.startswith("."):
             continue
-        match = _FRAME_FILE.fullmatch(name[len(folder.name) :]) if name.startswith(folder.name) else None
+        match = _FRAME_FILE.fullmatch(name, len(stem)) if name.startswith(stem) else None
         number = int(match[1]) if match and match[1] == f"{int(match[1]):03d}" else None
         yield number or None, entry
 
