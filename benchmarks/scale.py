@@ -17,8 +17,8 @@ from benchmarks.measure import Figure
 from benchmarks.releases import index_share_of_raw
 from deepaccident_devkit.geometry.se3 import SE3
 from deepaccident_devkit.release import Calibs, Collision, Labels, Meta, ScenarioFolder, find_release, write_meta
+from deepaccident_devkit.release.store import INDEX_FOLDER
 from deepaccident_devkit.tables.build import ScenarioFiles, scenario_rows
-from deepaccident_devkit.tables.index import INDEX_FOLDER
 from deepaccident_devkit.tables.indexing import table_file_states
 from deepaccident_devkit.tables.manifest import SCHEMA_VERSION, Manifest, write_manifest
 from deepaccident_devkit.tables.scan import ScenarioScan, folder_digest

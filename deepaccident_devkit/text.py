@@ -65,6 +65,18 @@ def fixed_text(value: float, digits: int) -> str:
     return f"{round(float(value), digits) + 0.0:.{digits}f}"
 
 
+def size_text(count: int) -> str:
+    """Bytes in GB, or in MB, kB or B if there are few.
+
+    >>> size_text(310_000_000_000), size_text(26_500), size_text(999)
+    ('310.0 GB', '26.5 kB', '999 B')
+    """
+    for unit, name in ((1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
+        if count >= unit:
+            return f"{count / unit:,.1f} {name}"
+    return f"{count} B"
+
+
 def possible_text(wrong: str, possible: Iterable[str]) -> str:
     """The possible words in a line, those most like `wrong` first; of many, the first twenty and how many more."""
     words = list(possible)

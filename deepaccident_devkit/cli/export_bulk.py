@@ -18,6 +18,7 @@ from deepaccident_devkit.cli.options import (
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.export.bulk import Exported, Format, Link, Plan, export_release
 from deepaccident_devkit.parallel import Part, Shard
+from deepaccident_devkit.text import size_text
 
 Verb = TypeVar("Verb", bound=Callable[..., Any])
 _OPTIONS = (
@@ -85,11 +86,6 @@ def run_export(
 
 
 _WAYS = {"hard": "hard links", "symbolic": "symbolic links", "copy": "copies"}
-
-
-def size_text(count: int) -> str:
-    """Bytes in GB, or in MB if there are few."""
-    return f"{count / 1e9:,.1f} GB" if count >= 1e9 else f"{count / 1e6:,.1f} MB"
 
 
 def _say_plan(plan: Plan, free: int) -> None:

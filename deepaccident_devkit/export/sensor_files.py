@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import suppress
 
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.errors import DatarootError
-from deepaccident_devkit.reading import fault_text
 from deepaccident_devkit.release import read_lidar
-from deepaccident_devkit.release.store import ReleasePath, listed
+from deepaccident_devkit.release.layout import frame_sizes
+from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.tables.tokens import sample_token
+from deepaccident_devkit.taxonomy import CHANNEL_FORMAT
 
 
 def sensor_files(dataset: Dataset, scenario: str, agent: str, channel: str) -> dict[int, tuple[ReleasePath, int]]:
@@ -21,18 +20,14 @@ def sensor_files(dataset: Dataset, scenario: str, agent: str, channel: str) -> d
         DatarootError: their folder cannot be listed.
     """
     count = dataset.scenario[dataset.getind("scenario", scenario)]["num_frames"]
-    first = dataset.sensor_path(f"{sample_token(scenario, agent, 1)}/{channel}")
-    folder, (stem, ending) = first.parent, first.name.rsplit("_001.", 1)
-    sizes: dict[str, int] = {}
-    try:
-        with suppress(FileNotFoundError, NotADirectoryError):
-            for entry in listed(folder):
-                with suppress(OSError):  # a link to nothing is a file that is not there
-                    sizes[entry.name] = entry.stat().st_size
-    except OSError as error:
-        raise DatarootError(f"{folder}: {fault_text(error)}; unpack its archive again, or make it readable") from error
-    names = ((number, f"{stem}_{number:03d}.{ending}") for number in range(1, count + 1))
-    return {number: (folder / name, sizes[name]) for number, name in names if name in sizes}
+    folder = dataset.sensor_path(f"{sample_token(scenario, agent, 1)}/{channel}").parent
+    ending = CHANNEL_FORMAT[channel]
+    sizes = frame_sizes(folder, ending)
+    return {
+        number: (folder / f"{folder.name}_{number:03d}.{ending}", size)
+        for number, size in sizes.items()
+        if number <= count
+    }
 
 
 def points_in(files: Mapping[int, tuple[ReleasePath, int]]) -> int:

@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -157,16 +157,40 @@ def frame_numbers(folder: ReleasePath, ending: str) -> tuple[list[int], list[str
         DatarootError: it cannot be listed: a file in its place, no permission.
     """
     frames, odd = [], []
-    for name in (entry.name for entry in _entries(folder)):
+    for number, entry in _frame_entries(folder, _entries(folder), ending):
+        if number is None:
+            odd.append(entry.name)
+        else:
+            frames.append(number)
+    return sorted(frames), sorted(odd)
+
+
+def frame_sizes(folder: ReleasePath, ending: str) -> dict[int, int]:
+    """Frame number → bytes of a folder's files of frames, ascending, by one look into it.
+
+    A folder that is not there, or with a file in its place, has none; a link to nothing is no file.
+
+    Raises:
+        DatarootError: it cannot be listed.
+    """
+    sizes = {}
+    for number, entry in _frame_entries(folder, _entries_of_folder(folder), ending):
+        with suppress(OSError):
+            if number is not None:
+                sizes[number] = entry.stat().st_size
+    return dict(sorted(sizes.items()))
+
+
+def _frame_entries(folder: ReleasePath, entries: Iterable[Entry], ending: str) -> Iterator[tuple[int | None, Entry]]:
+    """A folder's entries with an ending, each with its frame number; None if the name has none."""
+    stem = folder.name
+    for entry in entries:
+        name = entry.name
         if not name.endswith(f".{ending}") or name.startswith("."):
             continue
-        prefix_length = len(folder.name)
-        match = _FRAME_FILE.fullmatch(name[prefix_length:]) if name.startswith(folder.name) else None
-        if match and match[1] == f"{int(match[1]):03d}" and int(match[1]):
-            frames.append(int(match[1]))
-        else:
-            odd.append(name)
-    return sorted(frames), sorted(odd)
+        match = _FRAME_FILE.fullmatch(name, len(stem)) if name.startswith(stem) else None
+        number = int(match[1]) if match and match[1] == f"{int(match[1]):03d}" else None
+        yield number or None, entry
 
 
 def names_without_calib(layout: ReleaseLayout) -> Iterator[tuple[ReleasePath, str]]:
@@ -228,13 +252,18 @@ def _scenarios_in(root: ReleasePath, folder: str) -> Iterator[ScenarioFolder]:
 
 def _subfolders(folder: ReleasePath) -> list[str]:
     """The folders in a folder; none where a file is in the way, which `frame_numbers` reports for each scenario."""
+    entries = _entries_of_folder(folder)
+    return [entry.name for entry in entries if not entry.name.startswith(".") and _may_be_folder(entry)]
+
+
+def _entries_of_folder(folder: ReleasePath) -> list[Entry]:
+    """What lies in a folder; nothing if there is no such folder, or a file in its place."""
     try:
-        entries = _entries(folder)
+        return _entries(folder)
     except DatarootError as error:
         if isinstance(error.__cause__, NotADirectoryError):
             return []
         raise
-    return [entry.name for entry in entries if not entry.name.startswith(".") and _may_be_folder(entry)]
 
 
 def _may_be_folder(entry: Entry) -> bool:

@@ -16,7 +16,8 @@ from deepaccident_devkit.release.store import ReleasePath, StorePath, listed
 from deepaccident_devkit.tables.findings import Finding, finding_of
 from deepaccident_devkit.taxonomy import AGENTS, AgentName
 
-_ENDINGS = {"calib": "pkl", "label": "txt"}
+ENDINGS = {"calib": "pkl", "label": "txt"}
+"""Kind of small file → ending of its files."""
 _FRAMES_NAMED = 6
 _AnyPath: TypeAlias = ReleasePath | str
 _REMEDY = "unpack its archive again, or leave the scenario out with on_error='skip'"
@@ -49,7 +50,7 @@ def scan_scenario(scenario: ScenarioFolder) -> ScenarioScan:
     frames = {
         (agent, kind): _frames(scenario, agent, kind, ending, problems)
         for agent in AGENTS
-        for kind, ending in _ENDINGS.items()
+        for kind, ending in ENDINGS.items()
     }
     agents = tuple(agent for agent in AGENTS if frames[agent, "calib"])
     notices = [

@@ -78,7 +78,7 @@ def validate_release(
     """
     layout = find_release(open_dataroot(root), version)
     work = _Work(deep=deep, parts=None if parts is None else writable_folder(parts))
-    checks = work.run(_chosen(layout, scenarios), workers=workers, executor=executor, progress=progress)
+    checks = work.run(chosen_scenarios(layout, scenarios), workers=workers, executor=executor, progress=progress)
     return _report(layout, checks, root=root, deep=deep, whole=scenarios is None)
 
 
@@ -95,7 +95,8 @@ def validation_shard(root: Dataroot, shard: Shard, parts: Path, version: str = "
     Raises:
         ConfigError, DatarootError, VersionError, TokenError, WorkerError: as of `validate_release`.
     """
-    chosen = shard.of(_chosen(find_release(open_dataroot(root), version), how.pop("scenarios", None)))
+    layout = find_release(open_dataroot(root), version)
+    chosen = shard.of(chosen_scenarios(layout, how.pop("scenarios", None)))
     return _Work(deep=how.pop("deep", False), parts=writable_folder(parts)).run(chosen, **how)
 
 
@@ -108,7 +109,7 @@ def merged_validation(root: Dataroot, parts: Path, version: str = "v1", **how: A
     """
     layout = find_release(open_dataroot(root), version)
     scenarios, deep = how.pop("scenarios", None), how.pop("deep", False)
-    checks = _Work(deep=deep, parts=parts, merge=True).run(_chosen(layout, scenarios), **how)
+    checks = _Work(deep=deep, parts=parts, merge=True).run(chosen_scenarios(layout, scenarios), **how)
     return _report(layout, checks, root=root, deep=deep, whole=scenarios is None)
 
 
@@ -150,7 +151,7 @@ class _Work:
         return list(done.values())
 
 
-def _chosen(layout: ReleaseLayout, scenarios: Collection[str] | None) -> list[ScenarioFolder]:
+def chosen_scenarios(layout: ReleaseLayout, scenarios: Collection[str] | None) -> list[ScenarioFolder]:
     """The scenarios of some tokens, None for all; raises TokenError."""
     chosen = [folder for folder in layout.scenarios if scenarios is None or folder.token in scenarios]
     unknown = sorted(set(scenarios or ()) - {folder.token for folder in chosen})

@@ -104,6 +104,9 @@ NOT_OF_STRANGERS = {
     "files.py": "the system's processes",
     "cli/demo.py": "the mark of the demo's own folder",
     "evaluation/runs/bundles.py": "counts that were written a line before",
+    "release/store/sources.py": "fsspec, and the gate's files",
+    "release/store/store.py": "the cache's own copies",
+    "release/store/zips.py": "the directory of an archive that the gate or fsspec opened",
     "render/replay/replay.py": "the package's own page",
     "synth/spec/catalogue.py": "the package's own designs",
 }

@@ -4,7 +4,7 @@ import pytest
 
 from deepaccident_devkit.errors import DatarootError, VersionError
 from deepaccident_devkit.release import find_release
-from deepaccident_devkit.release.layout import frame_numbers
+from deepaccident_devkit.release.layout import frame_numbers, frame_sizes
 
 ACCIDENT, NORMAL = "type1_subtype1_accident", "type1_subtype2_normal"
 NAME, OTHER = "Town03_type001_subtype0001_scenario00024", "Town10HD_type001_subtype0001_scenario00014"
@@ -177,6 +177,18 @@ def test_a_frame_number_that_leads_to_no_path_is_odd(root: Path) -> None:
     assert all(each.calib_path("ego_vehicle", frame).exists() for frame in frames)
     assert frames == [7, 1000]
     assert odd == sorted([f"{NAME}_0007.pkl", f"{NAME}_٠٠٩.pkl"])
+
+
+def test_frame_sizes_are_those_of_files_with_a_number(tmp_path: Path) -> None:
+    folder = tmp_path / NAME
+    folder.mkdir()
+    for frame in (10, 2):
+        (folder / f"{NAME}_{frame:03d}.txt").write_text("x" * frame)
+    for name in (f"{NAME}_003.pkl", "notes.txt", f"{NAME}_000.txt"):
+        (folder / name).write_text("x")
+    (folder / f"{NAME}_004.txt").symlink_to("nowhere")
+    assert list(frame_sizes(folder, "txt").items()) == [(2, 2), (10, 10)]
+    assert frame_sizes(tmp_path / "gone", "txt") == frame_sizes(folder / "notes.txt", "txt") == {}
 
 
 def test_a_link_to_itself_is_an_error_that_names_it(root: Path) -> None:

@@ -15,6 +15,7 @@ from filelock import FileLock
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import DatarootError, IndexStoreError, VersionError
+from deepaccident_devkit.release.store import INDEX_FOLDER
 from deepaccident_devkit.tables import clear_index, index_report, indexing
 from deepaccident_devkit.tables import index as index_module
 from deepaccident_devkit.tables.manifest import SCHEMA_VERSION
@@ -159,7 +160,7 @@ def test_info_of_no_release(tmp_path: Path) -> None:
 
 def test_clear_removes_every_index_and_says_what(root: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     index_in_the_cache(root, monkeypatch)
-    own = index_module.INDEX_FOLDER
+    own = INDEX_FOLDER
     shutil.copytree(next(cache.rglob("v1")), root / own / "v1")
     (root / own / "v1" / ".tables-0123.abcd").mkdir()
     (root / own / "v1" / ".tables-0123.abcd" / ".track.size.part").write_bytes(b"half")
