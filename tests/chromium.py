@@ -34,10 +34,13 @@ class Browser:
         return [entry["message"] for entry in self.driver.get_log("browser")]
 
     def requests(self) -> list[str]:
-        """The addresses asked for since the page was opened, its own first; not data that stand in the page."""
+        """The addresses asked for since the page was opened, its own first.
+
+        Not data that stand in the page, nor the browser's own start page, which may still be on its way.
+        """
         events = [json.loads(entry["message"])["message"] for entry in self.driver.get_log("performance")]
         asked = [each["params"] for each in events if each["method"] == "Network.requestWillBeSent"]
-        return [each["request"]["url"] for each in asked if not each["request"]["url"].startswith("data:")]
+        return [each["request"]["url"] for each in asked if not each["request"]["url"].startswith(("data:", "chrome:"))]
 
     def script(self, code: str) -> Any:
         """What JavaScript returns."""

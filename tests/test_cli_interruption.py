@@ -255,3 +255,28 @@ def test_a_signal_amid_the_end_of_python_changes_nothing(number: signal.Signals)
     """
     done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("whole\nwent on\n", "")
+
+
+@pytest.mark.parametrize(("number", "status"), SIGNALS.items())
+def test_a_signal_amid_what_python_calls_in_between(number: signal.Signals, status: int) -> None:
+    """Python ignores what a `__del__` raises, and would say so."""
+    script = f"""
+        import os, time
+        from deepaccident_devkit.cli.interruption import run_interruptibly
+
+        class Last:
+            def __del__(self):
+                os.kill(os.getpid(), {int(number)})
+                time.sleep(0.01)
+
+        def verb():
+            Last()
+            try:
+                time.sleep(60)
+            finally:
+                print("tidied up", flush=True)
+
+        run_interruptibly(verb)
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr.splitlines(), done.returncode) == ("tidied up\n", [LINE], status)

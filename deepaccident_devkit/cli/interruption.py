@@ -15,6 +15,8 @@ _ENDING: Final = (signal.SIGINT, signal.SIGTERM)
 _LINE: Final = b"interrupted; no file is half-written, and the same command can be run again\n"
 _TIDYING_SECONDS: Final = 1.5
 """Time for the verb to remove its temporary files; then the process ends as it is."""
+_AGAIN_AFTER: Final = 0.02
+"""Seconds after which a signal is sent once more whose exception Python ignored."""
 _SAME_SIGNAL: Final = 0.2
 """Seconds: some programs send a signal to a process and then to its group."""
 
@@ -30,6 +32,7 @@ class _Signals:
         self.first: int | None = None
         self._since = 0.0
         self._verb_ended = False
+        self._told_before = sys.unraisablehook
 
     def install(self) -> None:
         """Take over both signals. A thread watches too: the handler waits while the main thread is in a library."""
@@ -39,6 +42,7 @@ class _Signals:
         threading.Thread(target=self._watch, args=(reading,), name="signals", daemon=True).start()
         for number in _ENDING:
             signal.signal(number, self._handle)
+        sys.unraisablehook = self._raise_again
         atexit.register(_ignore)  # amid its own ending Python would let a signal kill a verb that has done its work
 
     def verb_ended(self) -> None:
@@ -53,6 +57,14 @@ class _Signals:
             raise _Interrupted
         if time.monotonic() - self._since > _SAME_SIGNAL:
             _end_now(number)
+
+    def _raise_again(self, ignored: sys.UnraisableHookArgs) -> None:
+        """A signal came amid what Python calls in between, a `__del__` say, whose exceptions lead nowhere."""
+        if ignored.exc_type is not _Interrupted:
+            self._told_before(ignored)
+        elif self.first is not None and not self._verb_ended:
+            number, self.first = self.first, None
+            threading.Timer(_AGAIN_AFTER, os.kill, (os.getpid(), number)).start()
 
     def _watch(self, reading: int) -> None:
         number = 0

@@ -23,15 +23,19 @@ from deepaccident_devkit.reading import irregular_text, shortened
 FORM: Final = 1
 """Counts up whenever the file's form or its meaning changes."""
 _HEAD: Final = b"deepaccident_members"
-_NUMBERS: Final[Mapping[str, str]] = {
-    "archive": "int32",
-    "offset": "int64",
-    "stored": "int64",
-    "size": "int64",
-    "version": "uint32",
-    "deflated": "uint8",
-}
-"""Column of a member's numbers → its type; `Member` says what they are."""
+_NUMBERS: Final = np.dtype(
+    [
+        ("archive", "<i4"),
+        ("offset", "<i8"),
+        ("stored", "<i8"),
+        ("size", "<i8"),
+        ("version", "<u4"),
+        ("deflated", "u1"),
+    ]
+)
+"""How a `Member` is stored."""
+_FRAME: Final = slice(-7, -4)
+"""Where the name of a frame's file has its number."""
 _REMEDY: Final = "remove it with: deepaccident index clear DATAROOT"
 
 
@@ -98,8 +102,8 @@ class Members:
             self._rows = {str(folder): (int(first), int(last)) for folder, first, last in head["folders"]}
             self._starts = np.frombuffer(offsets, np.int64) if offsets else np.zeros(1, np.int64)
             self._content = memoryview(content) if content else memoryview(b"")
-            self._numbers = [batch.column(name).to_numpy() for name in _NUMBERS]
-            if any(len(column) != len(names) for column in self._numbers) or self._starts[-1] > len(self._content):
+            self._numbers = np.frombuffer(batch.column("member").buffers()[1] or b"", _NUMBERS)
+            if len(self._numbers) < len(names) or self._starts[-1] > len(self._content):
                 raise ValueError("its columns do not fit together")
         except (OSError, pa.ArrowException, KeyError, TypeError, ValueError, AttributeError) as error:
             raise IndexStoreError(f"{path}: cannot be read ({shortened(str(error))}); {_REMEDY}") from error
@@ -113,11 +117,15 @@ class Members:
 
     def find(self, name: str) -> Member | None:
         """A file by its path in the release; None if it is not there."""
-        folder, _, base = name.rpartition("/")
+        folder, _, last = name.rpartition("/")
         low, high = self._rows.get(folder, (0, 0))
-        row = bisect_left(range(high), base.encode(errors="surrogateescape"), low, high, key=self._name)
-        if row == high or self._name(row) != base.encode(errors="surrogateescape"):
-            return None
+        base = last.encode(errors="surrogateescape")
+        frame = base[_FRAME]
+        row = low + int(frame) - 1 if frame.isdigit() else high  # of a whole recording
+        if not (low <= row < high and self._name(row) == base):
+            row = bisect_left(range(high), base, low, high, key=self._name)
+            if row == high or self._name(row) != base:
+                return None
         return self._member(row)
 
     def has_folder(self, folder: str) -> bool:
@@ -134,11 +142,10 @@ class Members:
         return [(self._name(row).decode(errors="surrogateescape"), self._member(row)) for row in range(low, high)]
 
     def _name(self, row: int) -> bytes:
-        start, stop = self._starts[row : row + 2].tolist()
-        return bytes(self._content[start:stop])
+        return bytes(self._content[self._starts.item(row) : self._starts.item(row + 1)])
 
     def _member(self, row: int) -> Member:
-        return Member(*(column.item(row) for column in self._numbers))
+        return Member._make(self._numbers.item(row))
 
     def _add_folder(self, folder: str) -> None:
         self._children.setdefault(folder, {})
@@ -161,25 +168,32 @@ def write_members(path: Path, listings: Sequence[Listing], states: Mapping[str, 
 
     folders = sorted({folder for listing in listings for folder in listing.folders})
     number_of = {folder: number for number, folder in enumerate(folders)}
-    parts = [
-        pa.table(
-            {
-                "folder": np.array([number_of[name] for name in listing.folders], np.int32)[listing.folder],
-                "name": pa.array([name.encode(errors="surrogateescape") for name in listing.names], pa.large_binary()),
-                "archive": np.full(len(listing.names), number, np.int32),
-                **{name: np.asarray(values, _NUMBERS[name]) for name, values in listing.numbers.items()},
-            }
+    parts = []
+    for archive, listing in enumerate(listings):
+        numbers = np.zeros(len(listing.names), _NUMBERS)
+        for name, values in {**listing.numbers, "archive": archive}.items():
+            numbers[name] = values
+        parts.append(
+            pa.table(
+                {
+                    "folder": np.array([number_of[name] for name in listing.folders], np.int32)[listing.folder],
+                    "name": pa.array(
+                        [name.encode(errors="surrogateescape") for name in listing.names], pa.large_binary()
+                    ),
+                    "member": pa.FixedSizeBinaryArray.from_buffers(
+                        pa.binary(_NUMBERS.itemsize), len(numbers), [None, pa.py_buffer(numbers.tobytes())]
+                    ),
+                }
+            )
         )
-        for number, listing in enumerate(listings)
-    ]
     table = pa.concat_tables(parts).sort_by([("folder", "ascending"), ("name", "ascending")]).combine_chunks()
     archives = [listing.archive for listing in listings]
     folder = table["folder"].to_numpy()
     _check_once(table, folder, folders, archives)
     last = np.cumsum(np.bincount(folder, minlength=len(folders)))
-    rows = zip(folders, [0, *last[:-1].tolist()], last.tolist(), strict=True)
+    rows = zip(folders, [0, *last.tolist()], last.tolist(), strict=False)
     head = json.dumps({"archives": archives, "folders": list(rows), "states": states})
-    table = table.select(["name", *_NUMBERS]).replace_schema_metadata({_HEAD: head.encode()})
+    table = table.select(["name", "member"]).replace_schema_metadata({_HEAD: head.encode()})
     with replacing(path) as temporary, pa.ipc.new_file(str(temporary), table.schema) as writer:
         writer.write_batch(pa.RecordBatch.from_arrays([_one(column) for column in table.columns], schema=table.schema))
 
@@ -202,7 +216,8 @@ def _check_once(table: Any, folder: AnyArray, folders: Sequence[str], archives: 
     if same.any():
         row = int(np.flatnonzero(same)[0])
         name = names[row].as_py().decode(errors="backslashreplace")
-        first, second = (archives[table["archive"][each].as_py()] for each in (row, row + 1))
+        members = (np.frombuffer(table["member"][each].as_py(), _NUMBERS) for each in (row, row + 1))
+        first, second = (archives[int(member["archive"][0])] for member in members)
         where = f"in {first} and in {second}" if first != second else f"twice in {first}"
         raise DatarootError(
             f"{folders[folder[row]]}/{name}: is {where}{_more(int(same.sum()) - 1)}; keep one of them in this folder"

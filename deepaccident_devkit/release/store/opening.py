@@ -154,8 +154,8 @@ def _has_scenarios(folder: Path) -> bool:
 def _opened_archives(path: Path, archives: Sequence[Path], places: Sequence[Path], **how: Any) -> StorePath:
     base = path.parent if archives == [path] else path
     files = [*archives, *(each for each in _split_paths(path) if each.is_file())]
-    states = {file.relative_to(base).as_posix(): _state(file) for file in files}
-    name = _list_name(sorted(states.items()))
+    states = {file.relative_to(base).as_posix(): state_of(file) for file in files}
+    name = list_name(sorted(states.items()))
     known = next((place / name for place in places if (place / name).is_file()), None)
     if known is None:
         jobs = [(str(archive), archive.relative_to(base).as_posix()) for archive in archives]
@@ -172,7 +172,8 @@ def _split_paths(folder: Path) -> list[Path]:
     return [folder / below / name for below in ("", SPLIT_FILE_FOLDER) for name in SPLIT_FILES]
 
 
-def _state(file: Path) -> tuple[int, str]:
+def state_of(file: Path) -> tuple[int, str]:
+    """A file's bytes, and a text that changes with it."""
     status = file.stat()
     return status.st_size, str(status.st_mtime_ns)
 
@@ -199,7 +200,7 @@ def _opened_url(source: UrlSource, places: Sequence[Path], *, refresh: bool) -> 
             listings = _with_loose(listings, others)
             if not any(listing.names for listing in listings):
                 raise DatarootError(f"{url}: no file of a release found; give the URL that the release lies below")
-            known = _written(places, _list_name([*archives.items(), *others.items()]), listings, archives)
+            known = _written(places, list_name([*archives.items(), *others.items()]), listings, archives)
     return StorePath(opened_store(url, base.url, known))
 
 
@@ -269,7 +270,8 @@ def _loose(files: _States) -> list[Listing]:
     return listings
 
 
-def _list_name(states: Sequence[Any]) -> str:
+def list_name(states: Sequence[Any]) -> str:
+    """The name of the list of what is made from files of these states."""
     digest = hashlib.blake2b(json.dumps([FORM, states]).encode(), digest_size=8).hexdigest()
     return f"{_LIST}{digest}.arrow"
 

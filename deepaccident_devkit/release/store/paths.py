@@ -149,9 +149,9 @@ class StoreEntry:
         return self.status
 
 
-Dataroot: TypeAlias = "str | os.PathLike[str] | ReleasePath"
+Dataroot: TypeAlias = str | os.PathLike[str] | ReleasePath
 """How a caller names a release: its folder, an archive, a folder of archives, a URL."""
-Entry: TypeAlias = "os.DirEntry[str] | StoreEntry"
+Entry: TypeAlias = os.DirEntry[str] | StoreEntry
 
 
 def listed(folder: ReleasePath) -> list[Entry]:

@@ -46,6 +46,11 @@ class LocalSource(Source):
         self._folder = folder
         self._opened: dict[str, BinaryIO] = {}
 
+    def __del__(self) -> None:
+        """Close the archives."""
+        for file in self._opened.values():
+            file.close()
+
     def read(self, archive: str, start: int, stop: int) -> bytes:
         """Bytes of an archive."""
         file = self._opened.get(archive)

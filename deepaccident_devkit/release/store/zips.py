@@ -110,8 +110,8 @@ def _check_entry(entry: zipfile.ZipInfo, shown: str, size: int) -> None:
         fault = "encrypted; unpack the archive with its password"
     elif entry.compress_type not in _METHODS:
         fault = f"compressed by method {entry.compress_type}; unpack the archive, or pack it again as an ordinary zip"
-    elif entry.header_offset + HEAD_LENGTH + entry.compress_size > size:
-        fault = f"said to lie beyond the archive's end; {_REMEDY}"
+    elif not 0 <= entry.header_offset <= size - HEAD_LENGTH - entry.compress_size:
+        fault = f"said to lie beyond the archive; {_REMEDY}"
     elif entry.compress_type == zipfile.ZIP_STORED and entry.compress_size != entry.file_size:
         fault = f"stored with two sizes; {_REMEDY}"
     if fault:

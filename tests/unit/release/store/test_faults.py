@@ -1,0 +1,244 @@
+"""Archives and URLs that cannot be read: the devkit's own errors, which name the archive and the remedy."""
+
+import struct
+import zipfile
+from pathlib import Path
+
+import fsspec
+import pytest
+from packing import packed
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import (
+    ConfigError,
+    DatarootError,
+    DeepAccidentError,
+    IndexStoreError,
+    NotAvailableError,
+    SensorFileError,
+)
+from deepaccident_devkit.release.store import open_dataroot
+from deepaccident_devkit.release.store.store import opened_store
+from deepaccident_devkit.validation import validate_release
+
+_NAME = "type1_subtype1_accident/ego_vehicle/calib/a/a_001.pkl"
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Path:
+    """A zip of one small stored file."""
+    path = tmp_path / "small.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(_NAME, b"0123456789")
+    return path
+
+
+def _opened(path: Path | str, tmp_path: Path) -> object:
+    return open_dataroot(path, tmp_path / "index", workers=1)
+
+
+def _changed(path: Path, where: bytes, offset: int, form: str, value: int) -> None:
+    """Change a number of the archive's head or directory that begins with `where`."""
+    content = bytearray(path.read_bytes())
+    struct.pack_into(form, content, content.index(where) + offset, value)
+    path.write_bytes(content)
+
+
+def test_a_truncated_archive_is_refused(small: Path, tmp_path: Path) -> None:
+    small.write_bytes(small.read_bytes()[:-30])
+    with pytest.raises(DatarootError, match=r"small\.zip: not a readable zip archive \(.*\); fetch the archive again"):
+        _opened(small, tmp_path)
+    assert not [*tmp_path.glob("index/*")]
+
+
+def test_two_archives_with_the_same_member_are_refused(small: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "zips"
+    folder.mkdir()
+    for name in ("a.zip", "b.zip"):
+        (folder / name).write_bytes(small.read_bytes())
+    with pytest.raises(DatarootError, match=rf"{_NAME}: is in a\.zip and in b\.zip; keep one of them"):
+        _opened(folder, tmp_path)
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name:UserWarning")
+def test_a_member_that_is_twice_in_an_archive_is_refused(small: Path, tmp_path: Path) -> None:
+    with zipfile.ZipFile(small, "a") as archive:
+        archive.writestr(_NAME, b"other")
+    with pytest.raises(DatarootError, match=rf"{_NAME}: is twice in small\.zip"):
+        _opened(small, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("offset", "form", "value", "said"),
+    [
+        (8, "<H", 1, "is encrypted; unpack the archive with its password"),
+        (10, "<H", 14, "is compressed by method 14; unpack the archive, or pack it again"),
+        (20, "<I", 10_000, "is said to lie beyond the archive; fetch the archive again"),
+        (24, "<I", 11, "is stored with two sizes"),
+    ],
+)
+def test_members_that_cannot_be_read_in_place_are_refused(
+    small: Path, tmp_path: Path, offset: int, form: str, value: int, said: str
+) -> None:
+    _changed(small, b"PK\x01\x02", offset, form, value)
+    with pytest.raises(DatarootError, match=rf"small\.zip: its member {_NAME} {said}"):
+        _opened(small, tmp_path)
+
+
+def test_a_member_whose_head_is_gone_is_refused_when_it_is_read(small: Path, tmp_path: Path) -> None:
+    root = open_dataroot(small, tmp_path / "index", workers=1)
+    content = small.read_bytes().replace(b"PK\x03\x04", b"KP\x03\x04")
+    small.write_bytes(content)
+    with pytest.raises(OSError, match=r"damaged in its archive \(no head at its place\)"):
+        (root / _NAME).content("calib")  # type: ignore[union-attr]
+
+
+def test_validate_compares_checksums_and_reading_does_not(release_root: Path, tmp_path: Path) -> None:
+    path = packed(release_root, tmp_path / "all.zip")
+    dataset = DeepAccident(dataroot=path, workers=1, verbose=False)
+    token = f"{dataset.sample[0]['token']}/Camera_Front"
+    image = dataset.local_path(token).read_bytes()
+    position = path.read_bytes().index(image) + len(image) // 2
+    with path.open("r+b") as file:
+        file.seek(position)
+        file.write(bytes([image[len(image) // 2] ^ 1]))
+    scenario = dataset.scenario[0]["token"]
+    report = validate_release(path, deep=True, workers=1, scenarios=[scenario])
+    found = [finding for finding in report.findings if "checksum" in finding.what]
+    assert [finding.code for finding in found] == ["sensor-unreadable"]
+    assert "damaged in its archive (its bytes do not agree with its checksum)" in found[0].what
+    dataset.load_image(token)
+
+
+def test_a_label_of_another_checksum_is_a_finding(release_root: Path, tmp_path: Path) -> None:
+    path = packed(release_root, tmp_path / "all.zip")
+    label = next(release_root.rglob("label/*/*.txt")).read_bytes()
+    content = path.read_bytes()
+    assert content.count(label) == 1
+    path.write_bytes(content.replace(label, label.replace(b"car", b"van", 1)))
+    codes = {finding.code for finding in validate_release(path, workers=1).findings}
+    assert "label-unreadable" in codes
+
+
+def test_a_bomb_is_not_unpacked(tmp_path: Path) -> None:
+    path = tmp_path / "bomb.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(_NAME, bytes(5 << 20))
+    root = open_dataroot(path, tmp_path / "index", workers=1)
+    with pytest.raises(OSError, match=r"has 5,242,880 bytes, more than 1,048,576, the limit for calib"):
+        (root / _NAME).content("calib")  # type: ignore[union-attr]
+    _changed(path, b"PK\x01\x02", 24, "<I", 1000)
+    root = open_dataroot(path, tmp_path / "other index", workers=1)
+    with pytest.raises(OSError, match=r"1,001 bytes in place of 1,000"):
+        (root / _NAME).content("calib")  # type: ignore[union-attr]
+
+
+def test_names_that_lead_out_of_an_archive_are_of_no_release(tmp_path: Path) -> None:
+    path = tmp_path / "odd.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(f"../{_NAME}", b"x")
+        archive.writestr(f"__MACOSX/{_NAME}", b"x")
+        archive.writestr("README.txt", b"x")
+    assert len(open_dataroot(path, tmp_path / "index", workers=1).store.members) == 0  # type: ignore[union-attr]
+    with pytest.raises(DatarootError, match=r"odd\.zip: no scenario found"):
+        DeepAccident(dataroot=path, workers=1, verbose=False)
+
+
+@pytest.mark.parametrize(
+    ("url", "said"),
+    [
+        ("memory://nothing/here", r"memory://nothing/here: (does not exist|no file of a release found)"),
+        ("nosuch://bucket", r"nosuch://bucket: cannot be read \(Protocol not known: nosuch\); check the URL"),
+        ("s3://name:secret@bucket/x", r"s3://bucket…: holds a name, a password or a signature"),
+        ("https://host/x?signature=secret", r"https://host…: holds a name, a password or a signature"),
+        ("memory://nothing/all.zip", r"memory://nothing/all\.zip: does not exist, or may not be listed"),
+    ],
+)
+def test_wrong_urls_are_refused_without_their_secrets(url: str, said: str, tmp_path: Path) -> None:
+    with pytest.raises(DatarootError, match=said) as raised:
+        _opened(url, tmp_path)
+    assert "secret" not in str(raised.value)
+
+
+def test_a_url_of_a_truncated_archive_is_refused(small: Path, tmp_path: Path) -> None:
+    memory = fsspec.filesystem("memory")
+    memory.pipe_file("/broken/all.zip", small.read_bytes()[:-10])
+    with pytest.raises(DatarootError, match=r"memory://broken/all\.zip: not a readable zip archive"):
+        _opened("memory://broken/all.zip", tmp_path)
+    memory.rm("/broken", recursive=True)
+
+
+def test_a_changed_archive_at_a_url_is_noticed_and_loose_files_when_asked(small: Path, tmp_path: Path) -> None:
+    memory = fsspec.filesystem("memory")
+    memory.pipe_file("/changing/small.zip", small.read_bytes())
+    first = open_dataroot("memory://changing", tmp_path / "index")
+    with zipfile.ZipFile(small, "a") as archive:
+        archive.writestr(_NAME.replace("001", "002"), b"more")
+    memory.pipe_file("/changing/small.zip", small.read_bytes())
+    second = open_dataroot("memory://changing", tmp_path / "index")
+    assert [len(root.store.members) for root in (first, second)] == [1, 2]  # type: ignore[union-attr]
+    memory.pipe_file(f"/loose2/{_NAME}", b"x")
+    open_dataroot("memory://loose2", tmp_path / "index2")
+    memory.pipe_file(f"/loose2/{_NAME.replace('001', '002')}", b"x")
+    kept, asked = (open_dataroot("memory://loose2", tmp_path / "index2", refresh=each) for each in (False, True))
+    assert [len(root.store.members) for root in (kept, asked)] == [1, 2]  # type: ignore[union-attr]
+    assert kept.store.state != asked.store.state  # type: ignore[union-attr]
+
+
+def test_a_damaged_list_is_told(small: Path, tmp_path: Path) -> None:
+    _opened(small, tmp_path)
+    (file,) = (tmp_path / "index").glob("files-*")
+    file.write_bytes(file.read_bytes()[:200])
+    opened_store.cache_clear()
+    with pytest.raises(IndexStoreError, match=r"cannot be read .*; remove it with: deepaccident index clear DATAROOT"):
+        open_dataroot(small, tmp_path / "index", workers=1)
+
+
+def test_full_disks_are_told(release_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = packed(release_root, tmp_path / "all.zip")
+    dataset = DeepAccident(dataroot=path, workers=1, verbose=False)
+    monkeypatch.setattr(Path, "write_bytes", _no_room)
+    monkeypatch.setenv("DEEPACCIDENT_CACHE", str(tmp_path / "full"))
+    with pytest.raises(SensorFileError, match=r"cannot be kept in .*full: .*No space left.*DEEPACCIDENT_CACHE"):
+        dataset.local_path(dataset.sample[0], "lidar01")
+    assert [each for each in (tmp_path / "full").rglob("*") if each.is_file()] == []
+
+
+def _no_room(path: Path, _content: bytes) -> int:
+    path.touch()
+    raise OSError(28, "No space left on device")
+
+
+@pytest.mark.parametrize("size", ["0", "x", "-1", "3X"])
+def test_a_wrong_size_of_the_cache_is_told(
+    release_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: str
+) -> None:
+    monkeypatch.setenv("DEEPACCIDENT_CACHE_SIZE", size)
+    dataset = DeepAccident(dataroot=packed(release_root, tmp_path / "all.zip"), workers=1, verbose=False)
+    with pytest.raises(ConfigError, match="DEEPACCIDENT_CACHE_SIZE: expected bytes"):
+        dataset.local_path(dataset.sample[0], "lidar01")
+
+
+def test_releases_in_stores_cannot_be_written_to(small: Path, tmp_path: Path) -> None:
+    from deepaccident_devkit.release.store import real_path
+
+    with pytest.raises(NotAvailableError, match="lies in an archive or at a URL"):
+        real_path(open_dataroot(small, tmp_path / "index", workers=1))
+
+
+def test_every_error_is_the_devkits(small: Path, tmp_path: Path) -> None:
+    """Any byte of an archive may be wrong."""
+    content = small.read_bytes()
+    for place in range(len(content)):
+        changed = bytearray(content)
+        changed[place] ^= 0xFF
+        small.write_bytes(changed)
+        try:
+            root = open_dataroot(small, tmp_path / f"index{place}", workers=1)
+        except DeepAccidentError:
+            continue
+        try:
+            if (root / _NAME).exists():
+                (root / _NAME).content("calib")  # type: ignore[union-attr]
+        except OSError as error:
+            assert "archive" in str(error)  # noqa: PT017 - other changes do no harm

@@ -1,0 +1,56 @@
+"""Lists of stores' files: each is found where it was said to be."""
+
+from pathlib import Path
+
+import numpy as np
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from deepaccident_devkit.release.store.members import Listing, Member, Members, write_members
+from deepaccident_devkit.release.store.names import release_folder
+
+_PARTS = st.text(st.characters(exclude_characters="/", exclude_categories=["Cs"]), min_size=1, max_size=9)
+_FRAMES = st.integers(0, 1200).map(lambda number: f"name_{number:03d}.jpg")
+_PATHS = st.tuples(st.lists(_PARTS, max_size=3).map("/".join), st.one_of(_FRAMES, _PARTS))
+
+
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(files=st.dictionaries(_PATHS, st.integers(0, 1 << 40), max_size=40), archives=st.integers(1, 3))
+def test_every_file_is_found_and_no_other(tmp_path: Path, files: dict[tuple[str, str], int], archives: int) -> None:
+    listings, expected = [], {}
+    for number in range(archives):
+        chosen = [(*path, size) for path, size in files.items() if size % archives == number]
+        folders = sorted({folder for folder, *_ in chosen})
+        sizes = np.array([size for *_, size in chosen], np.int64)
+        numbers = {"offset": sizes * 2, "stored": sizes, "size": sizes, "version": sizes % 7, "deflated": sizes % 2}
+        positions = np.array([folders.index(folder) for folder, *_ in chosen], int)
+        names = [name for _, name, _ in chosen]
+        listings.append(
+            Listing(archive=f"{number}.zip", folders=folders, folder=positions, names=names, numbers=numbers)
+        )
+        for folder, name, size in chosen:
+            path = f"{folder}/{name}" if folder else name
+            expected[path] = Member(number, 2 * size, size, size, size % 7, size % 2)
+    write_members(tmp_path / "list.arrow", listings, {"0.zip": (3, "x")})
+    members = Members(tmp_path / "list.arrow")
+    assert {path: members.find(path) for path in expected} == expected
+    assert len(members) == len(files)
+    assert members.states == {"0.zip": (3, "x")}
+    for folder, name in files:
+        assert members.find(f"{folder}/{name}x") in (None, expected.get(f"{folder}/{name}x"))
+        assert members.has_folder(folder)
+        assert name in dict(members.files_in(folder))
+        above, _, last = folder.rpartition("/")
+        assert not folder or last in members.folders_in(above)
+
+
+def test_folders_of_a_release_by_what_leads_to_them() -> None:
+    kind = "type1_subtype2_normal"
+    assert release_folder(("a", kind, "meta")) == f"{kind}/meta"
+    assert release_folder(("train", kind, "meta")) == f"train/{kind}/meta"
+    assert release_folder(("x", "val", "train", "y", kind)) == f"train/{kind}"
+    assert release_folder((kind, kind, "meta")) == f"{kind}/meta"
+    assert release_folder(("DeepAccident_mini", kind)) == f"DeepAccident_mini/{kind}"
+    assert release_folder(("split_txt_files",)) == ""
+    assert release_folder((kind, "..", "meta")) is None
+    assert release_folder((".deepaccident", kind)) is None

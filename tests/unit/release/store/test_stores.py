@@ -1,0 +1,184 @@
+"""The same release in a folder, in zips and at URLs: every byte, every number and every verb."""
+
+import pickle
+import shutil
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from packing import files_of, image_sum, packed
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.errors import MissingFileError, NotAvailableError
+from deepaccident_devkit.evaluation import MotionEvaluator, instances_of
+from deepaccident_devkit.release.fingerprints import scenario_hashes
+from deepaccident_devkit.taxonomy import CHANNELS
+from deepaccident_devkit.validation import release_completeness, validate_release
+
+STORES = ("zip", "zips", "memory", "memory zips", "memory zip")
+LOCAL_STORES = ("zip", "zips")
+
+
+@pytest.mark.parametrize("kind", STORES)
+def test_the_index_has_the_same_bytes(opened: dict[str, DeepAccident], kind: str) -> None:
+    folder, other = opened["folder"].tables_folder, opened[kind].tables_folder
+    assert [path.name for path in sorted(other.iterdir())] == [path.name for path in sorted(folder.iterdir())]
+    for path in folder.iterdir():
+        assert (other / path.name).read_bytes() == path.read_bytes()
+    assert opened[kind].split_scenarios("train") == opened["folder"].split_scenarios("train")
+
+
+@pytest.mark.parametrize("kind", STORES)
+def test_every_sensor_file_has_the_same_bytes(opened: dict[str, DeepAccident], kind: str) -> None:
+    folder, other = opened["folder"], opened[kind]
+    tokens = [f"{record['token']}/{channel}" for record in folder.sample for channel in CHANNELS][::7]
+    for token in tokens:
+        assert other.local_path(token).read_bytes() == folder.get_sample_data_path(token).read_bytes()
+    sample = folder.sample[3]["token"]
+    assert np.array_equal(other.load_image(sample, "Camera_Back"), folder.load_image(sample, "Camera_Back"))
+    assert np.array_equal(other.load_point_cloud(sample).xyz, folder.load_point_cloud(sample).xyz)
+    assert np.array_equal(other.load_bev(sample).instance, folder.load_bev(sample).instance)
+
+
+@pytest.mark.parametrize("kind", STORES)
+def test_labels_metrics_and_hashes_are_the_same(opened: dict[str, DeepAccident], kind: str) -> None:
+    folder, other = opened["folder"], opened[kind]
+    sample = next(record["token"] for record in folder.sample if record["labelled"])
+    labels = [dataset.motion_labels(sample) for dataset in (folder, other)]
+    for name in ("segmentation", "instance", "centerness", "offset", "flow", "future_egomotion"):
+        assert getattr(labels[0], name).tobytes() == getattr(labels[1], name).tobytes()
+    results = []
+    for each in labels:
+        evaluator = MotionEvaluator(protocol="paper")
+        evaluator.update(sample, instances_of(each.to_present().instance, each.config.grid), each)
+        results.append(evaluator.compute())
+    assert results[0] == results[1]
+    token = folder.scenario[0]["token"]
+    assert scenario_hashes(other, [token], workers=1) == scenario_hashes(folder, [token], workers=1)
+
+
+@pytest.mark.parametrize("kind", STORES)
+def test_a_release_in_a_store_is_valid_and_whole(
+    places: dict[str, str], opened: dict[str, DeepAccident], kind: str
+) -> None:
+    root = opened[kind].dataroot
+    one = opened[kind].scenario[0]["token"]
+    found, plain = (validate_release(each, deep=True, workers=1, scenarios=[one]) for each in (root, places["folder"]))
+    assert [finding.code for finding in found.findings] == [finding.code for finding in plain.findings]
+    counts, of_folder = (release_completeness(each, workers=1) for each in (root, places["folder"]))
+    assert counts.total == of_folder.total
+    assert counts.splits == of_folder.splits
+
+
+@pytest.mark.parametrize("kind", STORES)
+def test_a_path_is_given_only_where_there_is_one(opened: dict[str, DeepAccident], kind: str) -> None:
+    dataset, token = opened[kind], opened[kind].sample[0]["token"]
+    with pytest.raises(NotAvailableError, match=r"lies in an archive or at a URL; da\.local_path\(token\)"):
+        dataset.get_sample_data_path(token, "lidar01")
+    path, boxes, _ = dataset.get_sample_data(token, "lidar01")
+    assert path == dataset.local_path(token, "lidar01")
+    assert path.name == opened["folder"].get_sample_data_path(token, "lidar01").name
+    assert len(boxes) == len(opened["folder"].get_boxes(token))
+
+
+def test_local_path_of_a_folder_is_the_file_itself(da_partial: DeepAccident, da: DeepAccident) -> None:
+    token = da.sample[0]["token"]
+    assert da.local_path(token, "lidar01") == da.get_sample_data_path(token, "lidar01")
+    absent = next(
+        f"{record['token']}/{channel}"
+        for record in da_partial.sample
+        for channel in CHANNELS
+        if not da_partial.get_sample_data_path(f"{record['token']}/{channel}").exists()
+    )
+    with pytest.raises(MissingFileError, match="no such file"):
+        da_partial.local_path(absent)
+
+
+def test_a_file_that_no_archive_holds_is_missing(release_root: Path, tmp_path: Path) -> None:
+    packed(release_root, tmp_path / "some.zip", chosen=lambda path: "lidar01" not in path.parts)
+    dataset = DeepAccident(dataroot=tmp_path / "some.zip", workers=1, verbose=False)
+    with pytest.raises(MissingFileError, match=r"some\.zip/.*lidar01.*no such file"):
+        dataset.load_point_cloud(dataset.sample[0])
+    with pytest.raises(MissingFileError, match="no such file; add the archive that holds it"):
+        dataset.local_path(dataset.sample[0], "lidar01")
+
+
+@pytest.mark.parametrize("kind", LOCAL_STORES)
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+def test_workers_read_what_was_pickled(opened: dict[str, DeepAccident], kind: str, method: str) -> None:
+    dataset, token = opened[kind], opened[kind].sample[2]["token"]
+    expected = image_sum(opened["folder"], token)
+    assert image_sum(dataset, token) == expected  # the archive is open before the fork
+    assert image_sum(pickle.loads(pickle.dumps(dataset)), token) == expected
+    with ProcessPoolExecutor(2, mp_context=get_context(method)) as pool:
+        assert list(pool.map(image_sum, [dataset] * 4, [token] * 4)) == [expected] * 4
+
+
+@pytest.mark.parametrize("kind", LOCAL_STORES)
+def test_verbs_take_archives(places: dict[str, str], kind: str, tmp_path: Path) -> None:
+    """Every verb opens a dataroot in one of three ways: by the facade, by files alone, by the index."""
+    for number, verb in enumerate(
+        (
+            ["index", "--workers", "1"],
+            ["info"],
+            ["info", "--missing", "--workers", "1"],
+            ["validate", "--workers", "1"],
+            ["export", "opencood", "--out", str(tmp_path / "opencood"), "--workers", "1"],
+            ["index", "info"],
+        )
+    ):
+        at = 2 if verb[0] == "export" or verb[:2] == ["index", "info"] else 1
+        command = [*verb[:at], places[kind], *verb[at:]]
+        if verb[:1] != ["validate"] and "--missing" not in verb:
+            command += ["--index-dir", str(tmp_path / "index")]
+        result = CliRunner().invoke(deepaccident, command)
+        assert result.exit_code == 0, (number, result.output)
+
+
+def test_exports_copy_what_they_would_link(opened: dict[str, DeepAccident], tmp_path: Path) -> None:
+    from deepaccident_devkit.export.bulk import export_release
+    from deepaccident_devkit.export.opencood import OpenCood
+
+    for kind in ("folder", "zips"):
+        export_release(opened[kind], tmp_path / kind, OpenCood(link="copy"), workers=1)
+    found, expected = ({p.relative_to(tmp_path / k): p for p in files_of(tmp_path / k)} for k in ("zips", "folder"))
+    assert [*found] == [*expected]
+    for name in found:
+        if name.suffix != ".json":
+            assert found[name].read_bytes() == expected[name].read_bytes()
+
+
+def test_an_unpacked_release_counts_and_not_the_archives_beside_it(own_release: Path) -> None:
+    packed(own_release, own_release / "left.zip")
+    assert DeepAccident(dataroot=own_release, workers=1, verbose=False).dataroot == own_release
+
+
+def test_a_new_archive_is_noticed(release_root: Path, tmp_path: Path) -> None:
+    agents = [path.name for path in (release_root / "type1_subtype1_accident").iterdir() if path.name != "meta"]
+    folder = tmp_path / "zips"
+    packed(release_root, folder / "one.zip", chosen=lambda path: agents[0] in path.parts or "meta" in path.parts)
+    before = len(DeepAccident(dataroot=folder, workers=1, verbose=False).sample)
+    packed(release_root, folder / "two.zip", chosen=lambda path: agents[1] in path.parts)
+    after = DeepAccident(dataroot=folder, workers=1, verbose=False)
+    assert len(after.sample) > before
+    assert len(list((folder / ".deepaccident").glob("files-*"))) == 1
+
+
+def test_where_nothing_can_be_written_lists_are_kept_in_the_cache(
+    places: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from deepaccident_devkit.release.store import opening
+
+    monkeypatch.setattr("platformdirs.user_cache_path", lambda _: tmp_path / "cache")
+    shutil.copy(places["zip"], tmp_path / "all.zip")
+    writable = opening.is_writable_folder
+    for module in (opening, __import__("deepaccident_devkit.tables.index", fromlist=["index"])):
+        monkeypatch.setattr(module, "is_writable_folder", lambda path: "cache" in path.parts and writable(path))
+    dataset = DeepAccident(dataroot=tmp_path / "all.zip", workers=1, verbose=False)
+    assert tmp_path / "cache" in dataset.tables_folder.parents
+    assert not (tmp_path / ".deepaccident").exists()
