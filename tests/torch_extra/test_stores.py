@@ -1,0 +1,27 @@
+"""Loaders with workers over a release in a zip."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from packing import packed
+from torch.utils.data import DataLoader
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.export.torch import ImageConfig, V2XConfig, V2XDataset, collate
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+def test_two_workers_read_a_zip(method: str, da: DeepAccident, release_root: Path, tmp_path: Path) -> None:
+    zipped = DeepAccident(dataroot=packed(release_root, tmp_path / "all.zip"), workers=1, verbose=False)
+    tokens = [da.sample[number]["token"] for number in (1, 4, 8)]
+    config = V2XConfig(agents="+infrastructure", images=ImageConfig(resize=(18, 32)))
+    expected = list(DataLoader(V2XDataset(da, tokens, config), collate_fn=collate))
+    data = V2XDataset(zipped, tokens, config)
+    data[0]  # the archive is open before the fork
+    found = list(DataLoader(data, collate_fn=collate, num_workers=2, multiprocessing_context=method))
+    for own, other in zip(expected, found, strict=True):
+        assert torch.equal(own["images"], other["images"])
+        assert torch.equal(own["points"][0][1][0], other["points"][0][1][0])
