@@ -275,7 +275,7 @@ def _planes(matrices: AnyArray, grid: BevGrid) -> AnyArray:
 
 def _fiery_lines(matrices: AnyArray, grid: BevGrid) -> tuple[SamplingLine, SamplingLine]:
     tx, ty, _, _, _, yaw = six_vectors.from_matrices(np.linalg.inv(matrices)).astype(np.float32).T[..., None]
-    cosine, sine = single_precision.cosine(yaw), single_precision.sine(yaw)
+    sine, cosine = single_precision.sines_and_cosines(yaw)
     half = np.float32((grid.x[1] - grid.x[0]) / 2)
     x, y = (_fiery_coordinates(axis, float(half)) for axis in (grid.x, grid.y))
 
