@@ -151,7 +151,7 @@ def _draw_peaks(centerness: AnyArray, frame: IntArray, center: IntArray, sigma: 
 @functools.lru_cache(maxsize=8)
 def _peak(sigma: float, farthest: int) -> Float32Array:
     """(2 r + 1, 2 r + 1) exp(−d² / σ²) around a centre in float32, until it is 0 or the grid ends."""
-    radius = min(math.ceil(sigma * math.sqrt(_VANISHED)), farthest)
+    radius = min(math.floor(sigma * math.sqrt(_VANISHED)), farthest)
     steps = np.arange(-radius, radius + 1, dtype=np.float32)
     squares = np.add.outer(steps**2, steps**2) / np.float32(sigma**2)
     return np.exp(-squares.astype(np.float64)).astype(np.float32)

@@ -53,12 +53,14 @@ def sines_and_cosines(angle: ArrayLike) -> Float32Array:
 
 def sine(angle: ArrayLike) -> Float32Array:
     """Sines of float32 angles (…), radians."""
-    return sines_and_cosines(angle)[0]
+    sines: Float32Array = sines_and_cosines(angle)[0]
+    return sines
 
 
 def cosine(angle: ArrayLike) -> Float32Array:
     """Cosines of float32 angles (…), radians."""
-    return sines_and_cosines(angle)[1]
+    cosines: Float32Array = sines_and_cosines(angle)[1]
+    return cosines
 
 
 def product(first: Float32Array, second: Float32Array) -> Float32Array:
