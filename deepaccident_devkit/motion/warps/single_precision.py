@@ -51,18 +51,6 @@ def sines_and_cosines(angle: ArrayLike) -> Float32Array:
     return _sine_within(np.array([radians - half_turns[0] * np.pi, radians - cosines * np.pi]), half_turns)
 
 
-def sine(angle: ArrayLike) -> Float32Array:
-    """Sines of float32 angles (…), radians."""
-    sines: Float32Array = sines_and_cosines(angle)[0]
-    return sines
-
-
-def cosine(angle: ArrayLike) -> Float32Array:
-    """Cosines of float32 angles (…), radians."""
-    cosines: Float32Array = sines_and_cosines(angle)[1]
-    return cosines
-
-
 def product(first: Float32Array, second: Float32Array) -> Float32Array:
     """Matrix products (…, I, K) · (…, K, J), summed from the first inner index to the last."""
     total: Float32Array = first[..., :, 0, None] * second[..., None, 0, :]
