@@ -83,6 +83,13 @@ def checked(
         dtype: the element type wanted, None for that of `values`; an array that has it already is not copied. Of an
             integer type, numbers must be whole and in its range.
     """
+    if (
+        type(values) is np.ndarray
+        and values.dtype.kind in _NUMBERS
+        and values.dtype == dtype
+        and _fits(values.shape, shape)
+    ):
+        return values  # as nearly always; many small arrays of a sample's labels come here
     array = as_numbers(name, values, f"an array of shape {_shape_text(shape)}", dtype)
     if not _fits(array.shape, shape):
         remedy = "; transpose it (.T)" if array.ndim == 2 and _fits(array.shape[::-1], shape) else ""
@@ -117,6 +124,8 @@ def as_numbers(
         )
     if given.dtype == wanted:
         return given
+    if np.can_cast(given.dtype, wanted, "safe"):
+        return given.astype(wanted)
     with np.errstate(invalid="ignore", over="ignore"):
         array = given.astype(wanted)
     if wanted.kind in "iu":

@@ -48,17 +48,24 @@ class StoredLabels(ShortRepr):
     @classmethod
     def of(cls, labels: MotionLabels) -> StoredLabels:
         """The stored arrays of labels whose frames are in their own ego frames."""
-        instance = np.where(labels.label_valid[:, None, None], labels.instance, 0)
-        frame, row, column = np.nonzero(instance)
-        identity = instance[frame, row, column]
+        instance, cells = labels.instance, labels.config.grid.cells
+        if not labels.label_valid.all():
+            instance = np.where(labels.label_valid[:, None, None], instance, 0)
+        flat = np.flatnonzero(instance != 0)
+        identity = instance.reshape(-1)[flat]
         highest = max(int(identity.max(initial=0)), *labels.id_map.values(), 0)
+        # all cells of an instance have the same centre and flow: one cell is enough
+        one = np.full(len(instance) * (1 + highest), -1)
+        one[flat // cells * (1 + highest) + identity] = flat
+        shown = np.flatnonzero(one >= 0)
+        frame, cell = np.divmod(one[shown], cells)
+        row, column = np.divmod(cell, instance.shape[2])
         center = np.full((len(instance), 1 + highest, 2), NOWHERE, dtype=np.int16)
         flow = center.copy()
-        cells = np.stack([row, column], axis=1)
-        center[frame, identity] = cells + labels.offset[frame, :, row, column]
+        center.reshape(-1, 2)[shown] = np.stack([row, column], axis=1) + labels.offset[frame, :, row, column]
         vectors = labels.flow[frame, :, row, column]
         known = (vectors != labels.config.ignore_index).any(axis=1)
-        flow[frame[known], identity[known]] = vectors[known]
+        flow.reshape(-1, 2)[shown[known]] = vectors[known]
         actor = np.full(1 + highest, NOBODY, dtype=np.int64)
         actor[list(labels.id_map.values())] = list(labels.id_map)
         return cls(

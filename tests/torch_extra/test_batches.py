@@ -1,5 +1,6 @@
 """Batches, workers and a training loop."""
 
+import math
 import pickle
 import re
 import shutil
@@ -225,10 +226,15 @@ def test_a_dataset_pickles_cheaply(da: DeepAccident) -> None:
 def test_the_documented_training_loop_learns(da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The code of docs/training.md as it stands there; the session's release takes the place of its own."""
     page = Path(__file__).parents[2] / "docs" / "training.md"
-    [code] = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    code, several = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     (tmp_path / "training_release").symlink_to(da.dataroot)
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
     exec(compile(code, str(page), "exec"), names)  # noqa: S102
     assert len(names["losses"]) == 5
     assert names["losses"][-1] < 0.8 * names["losses"][0]
+    for name, value in {"RANK": 0, "WORLD_SIZE": 1, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": 0}.items():
+        monkeypatch.setenv(name, str(value))  # as torchrun does
+    exec(compile(several, str(page), "exec"), names)  # noqa: S102
+    assert names["evaluator"].tokens == set(da.evaluation_samples("val"))
+    assert math.isfinite(names["loss"].item())

@@ -10,7 +10,7 @@
     loader = DataLoader(data, batch_size=2, shuffle=True, num_workers=4, collate_fn=collate)
 
 `V2XDataset` describes an item, `collate` and `collate_fusion` describe a batch; without `collate_fn` a loader uses
-`collate`. docs/training.md has a training loop.
+`collate`. docs/training.md has a training loop. `EvaluationSampler` and `merged_evaluator` are for several GPUs.
 Only this package imports torch; importing it without torch raises MissingExtraError.
 """
 
@@ -28,6 +28,16 @@ from deepaccident_devkit.export.torch.augmentation import RandomAugmentation
 from deepaccident_devkit.export.torch.collate import collate, collate_fusion
 from deepaccident_devkit.export.torch.config import V2XConfig
 from deepaccident_devkit.export.torch.dataset import V2XDataset
+from deepaccident_devkit.export.torch.distributed import EvaluationSampler, merged_evaluator
 from deepaccident_devkit.export.torch.images import ImageConfig
 
-__all__ = ["ImageConfig", "RandomAugmentation", "V2XConfig", "V2XDataset", "collate", "collate_fusion"]
+__all__ = [
+    "EvaluationSampler",
+    "ImageConfig",
+    "RandomAugmentation",
+    "V2XConfig",
+    "V2XDataset",
+    "collate",
+    "collate_fusion",
+    "merged_evaluator",
+]

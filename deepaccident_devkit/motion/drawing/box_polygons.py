@@ -76,7 +76,7 @@ class FrameBoxes(ShortRepr):
         }
         for name, (shape, dtype) in shapes.items():
             array = checked(f"FrameBoxes.{name}", getattr(self, name), shape, dtype)
-            if not np.isfinite(array).all():
+            if dtype is np.float64 and not np.isfinite(array).all():
                 row = int(np.argwhere(~np.isfinite(array))[0, 0])
                 remedy = "give None for a frame without a pose" if name == "ego_from_lidar" else "leave out such rows"
                 raise GeometryError(f"FrameBoxes.{name}: row {row} is not finite; {remedy}")
@@ -261,7 +261,7 @@ def _augmented(boxes: Float32Array, augmentation: Augmentation) -> Float32Array:
 def _corners(boxes: Float32Array) -> Float32Array:
     """(N, 4, 2) float32 x forward, y left of mmdet3d's boxes' bottom corners 0, 3, 7, 4."""
     around, yaw = _CORNERS * boxes[:, None, 3:5], boxes[:, 6, None]
-    cosine, sine = single_precision.cosine(yaw), single_precision.sine(yaw)
+    sine, cosine = single_precision.sines_and_cosines(yaw)
     x = around[..., 0] * cosine + around[..., 1] * sine + boxes[:, 0, None]
     y = around[..., 0] * -sine + around[..., 1] * cosine + boxes[:, 1, None]
     return np.stack([x, -y], axis=-1)

@@ -12,20 +12,21 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, Float32Array, IntArray, checked, checked_whole
+from deepaccident_devkit.arrays import AnyArray, IntArray, checked, checked_whole
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import Axis
 from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
 from deepaccident_devkit.motion.drawing.box_polygons import FrameBoxes, FramePolygons, box_polygons
 from deepaccident_devkit.motion.drawing.label_maps import CoveredCells, label_maps
-from deepaccident_devkit.motion.drawing.polygon_fill import filled_cells
+from deepaccident_devkit.motion.drawing.next_centers import Footprints, following_centers
+from deepaccident_devkit.motion.drawing.polygon_fill import topmost
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.orientations import axes_of
 from deepaccident_devkit.motion.protocols import LabelProtocol
 from deepaccident_devkit.motion.settings import count
 from deepaccident_devkit.motion.warps.chains import frames_from_next
-from deepaccident_devkit.motion.warps.warping import nearest_indices, sampling_matrix
+from deepaccident_devkit.motion.warps.warping import sampling_matrix
 from deepaccident_devkit.taxonomy import UNTRACKED_ID
 
 __all__ = ["FrameBoxes", "FramePolygons", "labels_from_polygons", "motion_labels_from_boxes"]
@@ -89,10 +90,11 @@ def labels_from_polygons(
     there = np.array([True] * past + [frame is not None for frame in polygons])
     known = there if valid is None else there & checked("valid", valid, (config.frames,), np.bool_)
     ids, continued = _numbered(polygons, config, _checked_ids(id_map, config))
-    covered = _covered(polygons, ids, config)
+    footprints = _footprints(polygons, ids, config)
+    covered = _covered(footprints, config)
     centers = covered.centers()
     this_from_next = frames_from_next(motion[past:-1], config.rules, config.augmentation)
-    following = _following_centers(covered, sampling_matrix(this_from_next, config.rules), config)
+    following = following_centers(footprints, sampling_matrix(this_from_next, config.rules), config, covered.ids)
     following[np.isnan(centers)] = np.nan
     maps = label_maps(covered, centers, following, ~known[past:], config)
     return MotionLabels(
@@ -140,22 +142,30 @@ def _numbered(
     return np.array(ids, dtype=np.int64), id_map
 
 
-def _covered(polygons: Sequence[FramePolygons | None], ids: IntArray, config: MotionLabelConfig) -> CoveredCells:
-    """The cells of the polygons with these ids, in native orientation; later polygons lie on top."""
+def _footprints(polygons: Sequence[FramePolygons | None], ids: IntArray, config: MotionLabelConfig) -> Footprints:
+    """The polygons with these ids, rasterised in native orientation; later polygons lie on top."""
     native = config.grid.with_orientation(config.rules.native)
     there = [(number, frame) for number, frame in enumerate(polygons) if frame is not None]
     corners = np.concatenate([np.zeros((0, 4, 2), dtype=np.float32), *(frame.corners for _, frame in there)])
-    image = np.repeat([number for number, _ in there], [len(frame.key) for _, frame in there]).astype(np.int64)
-    cells, owner = filled_cells(_vertices(corners, native, config.rules), native.shape, image, len(polygons))
-    frame = image[owner]
-    row = cells // native.shape[1]  # rows of all frames, one frame after another
+    frame = np.repeat([number for number, _ in there], [len(frame.key) for _, frame in there]).astype(np.int64)
+    vertices = _vertices(corners, native, config.rules)
+    return Footprints(vertices, frame, ids, topmost(vertices, native.shape, frame, len(polygons)))
+
+
+def _covered(footprints: Footprints, config: MotionLabelConfig) -> CoveredCells:
+    """The cells of the footprints, in native orientation."""
+    rows, columns = config.grid.with_orientation(config.rules.native).shape
+    cells = np.flatnonzero(footprints.top != 0)  # of bools: twice as fast
+    owner = footprints.top[cells] - 1
+    frame = footprints.frame[owner]
+    row = cells // columns  # rows of all frames, one frame after another
     return CoveredCells(
         frame=frame,
-        row=row - frame * native.shape[0],
-        column=cells - row * native.shape[1],
-        identity=ids[owner],
-        frames=len(polygons),
-        ids=int(ids.max(initial=0)),
+        row=row - frame * rows,
+        column=cells - row * columns,
+        identity=footprints.identity[owner],
+        frames=len(footprints.top) // (rows * columns),
+        ids=int(footprints.identity.max(initial=0)),
     )
 
 
@@ -175,27 +185,3 @@ def _steps(values: AnyArray, axis: Axis, rules: LabelProtocol) -> IntArray:
         first_center, cell = np.float32(low + size / 2), np.float32(size)
         cells = np.rint((values - first_center + cell / np.float32(2)) / cell)
     return np.clip(cells, -_FAR, _FAR).astype(np.int64)
-
-
-def _following_centers(covered: CoveredCells, next_from_this: AnyArray, config: MotionLabelConfig) -> Float32Array:
-    """(T, 1 + ids, 2) centres of the instances at the next frame, warped to each frame; NaN where they are not seen."""
-    columns = config.grid.with_orientation(config.rules.native).shape[1]
-    cells = config.grid.cells + 1  # one more at the end, where the index OUTSIDE, −1, points
-    identity = np.zeros((covered.frames, cells), dtype=np.int32)
-    identity.reshape(-1)[covered.frame * cells + covered.row * columns + covered.column] = covered.identity
-    targets, sources = [], []
-    for matrix, following in zip(next_from_this, identity[1:], strict=True):
-        sampled = following.take(nearest_indices(matrix, config.grid, config.rules))
-        seen = np.flatnonzero(sampled != 0)
-        targets.append(seen)
-        sources.append(sampled[seen])
-    target = np.concatenate(targets)
-    warped = CoveredCells(
-        frame=np.repeat(np.arange(len(targets)), [len(seen) for seen in targets]),
-        row=target // columns,
-        column=target % columns,
-        identity=np.concatenate(sources),
-        frames=covered.frames,
-        ids=covered.ids,
-    )
-    return warped.centers()

@@ -41,9 +41,14 @@ class CoveredCells:
     frames: int
     ids: int
 
+    @property
+    def slot(self) -> IntArray:
+        """(P,) frame · (1 + ids) + identity."""
+        return self.frame * (1 + self.ids) + self.identity
+
     def centers(self) -> Float32Array:
         """(frames, 1 + ids, 2) the cell nearest to the mean of each instance's cells, half to even; NaN for none."""
-        slot, slots = self.frame * (1 + self.ids) + self.identity, self.frames * (1 + self.ids)
+        slot, slots = self.slot, self.frames * (1 + self.ids)
         count = np.bincount(slot, minlength=slots).astype(np.float32)
         # sums of whole numbers are exact in float32, except on huge grids: so the mean is torch's
         sums = [
@@ -107,20 +112,18 @@ def label_maps(
     cell += before
     maps.segmentation.reshape(-1)[cell] = 1
     maps.instance.reshape(-1)[cell] = covered.identity
+    slot = covered.slot
+    (down, along), (next_down, next_along) = np.array([centers, following]).reshape(2, -1, 2).swapaxes(1, 2).copy()
+    from_row = down.take(slot) - covered.row.astype(np.float32)
+    from_column = along.take(slot) - covered.column.astype(np.float32)
+    offset = vectors_in(from_row, from_column, source, target)
+    flow = vectors_in(next_down - down, next_along - along, source, target)
     cell += before  # offset and flow have two channels
-    slot = covered.frame * (1 + covered.ids) + covered.identity
-    place = np.stack([covered.row, covered.column], axis=1).astype(np.float32)
-    own = centers.reshape(-1, 2)
-    for raster, vector in (
-        (maps.offset, own.take(slot, axis=0) - place),
-        (maps.flow, (following.reshape(-1, 2) - own).take(slot, axis=0)),
-    ):
-        down, along = vectors_in(vector[:, 0], vector[:, 1], source, target)
-        known = np.flatnonzero(~np.isnan(down))
-        index = cell[known]
-        flat = raster.reshape(-1)
-        flat[index] = down[known]
-        flat[index + native.cells] = along[known]
+    for channel in range(2):
+        for raster, vector in ((maps.offset, offset[channel]), (maps.flow, flow[channel])):
+            values = np.where(np.isnan(vector), np.float32(config.ignore_index), vector)
+            raster.reshape(-1)[cell] = values if raster is maps.offset else values.take(slot)
+        cell += native.cells
     frame, identity = np.nonzero(~np.isnan(centers[..., 0]))
     peak_row, peak_column = centers[frame, identity].astype(np.int64).T
     peak_row, peak_column = cells_in(peak_row, peak_column, shape, source, target)
@@ -133,6 +136,8 @@ def label_maps(
 
 def _draw_peaks(centerness: AnyArray, frame: IntArray, center: IntArray, sigma: float) -> None:
     """Put peaks around centres (n, 2), row and column, of frames (n,) into (T, 1, H, W); the higher value counts."""
+    import cv2
+
     shape = centerness.shape[-2:]
     peak = _peak(sigma, max(shape))
     reach = len(peak) // 2
@@ -140,13 +145,13 @@ def _draw_peaks(centerness: AnyArray, frame: IntArray, center: IntArray, sigma: 
     bounds = np.hstack([first, last, first - center + reach, last - center + reach]).tolist()
     for number, (top, left, bottom, right, above, before, below, behind) in zip(frame.tolist(), bounds, strict=True):
         part = centerness[number, 0, top:bottom, left:right]
-        np.maximum(part, peak[above:below, before:behind], out=part)
+        cv2.max(part, peak[above:below, before:behind], part)  # half of numpy's time: it goes from row to row faster
 
 
 @functools.lru_cache(maxsize=8)
 def _peak(sigma: float, farthest: int) -> Float32Array:
     """(2 r + 1, 2 r + 1) exp(−d² / σ²) around a centre in float32, until it is 0 or the grid ends."""
-    radius = min(math.ceil(sigma * math.sqrt(_VANISHED)), farthest)
+    radius = min(math.floor(sigma * math.sqrt(_VANISHED)), farthest)
     steps = np.arange(-radius, radius + 1, dtype=np.float32)
     squares = np.add.outer(steps**2, steps**2) / np.float32(sigma**2)
     return np.exp(-squares.astype(np.float64)).astype(np.float32)

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray, checked
 from deepaccident_devkit.errors import GeometryError
@@ -45,6 +45,22 @@ def filled_cells(
     Raises:
         GeometryError: `polygons` or `image` has another shape, or an image does not exist.
     """
+    top = topmost(polygons, shape, image, images)
+    covered = np.flatnonzero(top != 0)  # of bools: twice as fast
+    return covered, top[covered] - np.int64(1)
+
+
+def topmost(
+    polygons: ArrayLike, shape: tuple[int, int], image: ArrayLike | None = None, images: int = 1
+) -> NDArray[np.int32]:
+    """`filled_cells` as one map.
+
+    Returns:
+        (images · rows · columns,) 1 + the number of the polygon on top of each cell, 0 where there is none.
+
+    Raises:
+        GeometryError: as `filled_cells`.
+    """
     corners = checked("polygons", polygons, (None, None, 2), np.int64)
     where = checked("image", np.zeros(len(corners)) if image is None else image, (len(corners),), np.int64)
     if corners.shape[1] < 3:
@@ -58,8 +74,7 @@ def filled_cells(
     cells += np.arange(len(cells))
     top = np.zeros(images * math.prod(shape), dtype=np.int32)
     np.maximum.at(top, cells, np.repeat((owner + 1).astype(np.int32), lengths))
-    covered = np.flatnonzero(top != 0)
-    return covered, top[covered] - np.int64(1)
+    return top
 
 
 def _runs(corners: IntArray, shape: tuple[int, int]) -> tuple[IntArray, IntArray, IntArray]:
@@ -112,7 +127,7 @@ def _outlines(
     corners: IntArray, beside: BoolArray, shape: tuple[int, int]
 ) -> tuple[IntArray, IntArray, IntArray, IntArray]:
     """The runs of the edges (N · V) in the image, one for each row that an edge touches: row, columns, which edge."""
-    start, end = np.roll(corners, 1, axis=1).reshape(-1, 2), corners.reshape(-1, 2)
+    start, end = _before(corners).reshape(-1, 2), corners.reshape(-1, 2)
     drawn = np.ones(len(start), dtype=bool)
     if beside.any():
         cut = np.repeat(beside, corners.shape[1])
@@ -128,6 +143,11 @@ def _outlines(
     return lines.y[line] + step * lines.direction[line], first, last, line
 
 
+def _before(corners: IntArray) -> IntArray:
+    """(N, V, 2) the corner before each, the last one before the first: np.roll, which takes five times as long."""
+    return corners.take(np.arange(-1, corners.shape[1] - 1), axis=1)
+
+
 class _Lines:
     """Bresenham's lines between cells (L, 2), column and row, as LineIterator walks them: from left to right.
 
@@ -138,8 +158,8 @@ class _Lines:
     """
 
     def __init__(self, start: IntArray, end: IntArray) -> None:
-        leftward = end[:, 0] < start[:, 0]
-        x1, y1, x2, y2 = np.where(leftward, np.hstack([end, start]).T, np.hstack([start, end]).T)
+        leftward = end[:, :1] < start[:, :1]
+        (x1, y1), (x2, y2) = np.where(leftward, end, start).T, np.where(leftward, start, end).T
         across, down = x2 - x1, y2 - y1
         self.y, self.rise, self.direction = y1, np.abs(down), np.where(down < 0, -1, 1)
         # After k of the D steps along its longer side a line has made (2 d k + D − 1) // 2 D steps along the other
@@ -152,7 +172,7 @@ class _Lines:
 
     def columns(self, line: IntArray, step: IntArray) -> tuple[IntArray, IntArray]:
         """First and last columns of lines in their rows number `step`, counted from the left end."""
-        x, across, enter, leave, divisor = self._numbers[:, line]
+        x, across, enter, leave, divisor = self._numbers.take(line, axis=1)
         travelled = 2 * across * step
         # quotients of small whole numbers: rounding moves none past a whole number
         first = np.maximum(np.floor((travelled + enter) / divisor), 0)
@@ -167,7 +187,7 @@ def _between(corners: IntArray, shape: tuple[int, int]) -> tuple[IntArray, IntAr
     rows = np.minimum(corners[..., 1].max(axis=1), height - 1) - low + 1
     owner = np.repeat(np.arange(len(corners)), rows)
     row = np.arange(len(owner)) + np.repeat(low - np.cumsum(rows) + rows, rows)
-    start = np.roll(corners, 1, axis=1)
+    start = _before(corners)
     downward = (start[..., 1] < corners[..., 1])[..., None]
     upper, lower = np.where(downward, start, corners), np.where(downward, corners, start)
     ahead = (lower[..., 0] - upper[..., 0]) << _FIXED

@@ -26,7 +26,7 @@ angles in [−π, π] very few differ.
 def pose_matrices(six: ArrayLike) -> Float32Array:
     """6-vectors (…, 6) → matrices (…, 4, 4): (Rx · Ry) · Rz, what `geometry.six_vectors` does in float64."""
     vector = np.asarray(six, dtype=np.float32)
-    cosines, sines = cosine(vector[..., 3:]), sine(vector[..., 3:])
+    sines, cosines = sines_and_cosines(vector[..., 3:])
     cx, cy, cz = (cosines[..., axis] for axis in range(3))
     sx, sy, sz = (sines[..., axis] for axis in range(3))
     xy, yx = sx * sy, cx * sy
@@ -42,18 +42,13 @@ def pose_matrices(six: ArrayLike) -> Float32Array:
     return result
 
 
-def sine(angle: ArrayLike) -> Float32Array:
-    """Sines of float32 angles (…), radians."""
+def sines_and_cosines(angle: ArrayLike) -> Float32Array:
+    """(2, …) sines and cosines of float32 angles (…), radians; cosines are sines of the angles plus a quarter turn."""
     radians = np.asarray(angle, dtype=np.float32).astype(np.float64)
-    half_turns = np.rint(radians / np.pi)
-    return _sine_within(radians - half_turns * np.pi, half_turns)
-
-
-def cosine(angle: ArrayLike) -> Float32Array:
-    """Cosines of float32 angles (…), radians: sines of the angles plus a quarter turn."""
-    radians = np.asarray(angle, dtype=np.float32).astype(np.float64)
-    half_turns = np.rint(radians / np.pi + 0.5)
-    return _sine_within(radians - (half_turns - 0.5) * np.pi, half_turns)
+    turns = radians / np.pi
+    half_turns = np.rint(np.array([turns, turns + 0.5]))
+    cosines = half_turns[1] - 0.5
+    return _sine_within(np.array([radians - half_turns[0] * np.pi, radians - cosines * np.pi]), half_turns)
 
 
 def product(first: Float32Array, second: Float32Array) -> Float32Array:
@@ -109,7 +104,8 @@ def _eliminated(matrix: Float32Array) -> tuple[Float32Array, IntArray]:
     """Lower and upper factor in one array, (N, 4, 4), and the order of the rows, (N, 4)."""
     mixed = matrix.copy()
     count = np.arange(len(mixed))
-    order: IntArray = np.tile(np.arange(4), (len(mixed), 1))
+    order: IntArray = np.empty((len(mixed), 4), dtype=np.int64)
+    order[:] = np.arange(4)
     for step in range(3):
         pivot = step + np.abs(mixed[:, step:, step]).argmax(axis=1)
         if (pivot != step).any():
@@ -127,8 +123,13 @@ def _eliminated(matrix: Float32Array) -> tuple[Float32Array, IntArray]:
 
 def _sine_within(radians: FloatArray, half_turns: FloatArray) -> Float32Array:
     """Sines of angles in [−π/2, π/2], after so many half turns."""
-    ratio = np.polyval(_SINE, radians * radians)
-    return (radians * ratio * np.where(half_turns % 2 == 0, 1.0, -1.0)).astype(np.float32)
+    square = radians * radians
+    ratio = square * _SINE[0] + _SINE[1]
+    for factor in _SINE[2:]:
+        ratio *= square
+        ratio += factor
+    ratio *= radians
+    return np.where(half_turns % 2 == 0, ratio, -ratio).astype(np.float32)
 
 
 def _rigid(rotation: NDArray[Any] | np.float32, translation: NDArray[Any]) -> Float32Array:

@@ -22,12 +22,13 @@ transformed points count. `source_from_target` maps points of the result's frame
 """
 
 import functools
-from typing import Final, Literal, get_args
+from collections.abc import Callable
+from typing import Final, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from deepaccident_devkit.arrays import AnyArray, Float32Array, FloatArray, checked
+from deepaccident_devkit.arrays import AnyArray, Float32Array, FloatArray, IntArray, checked
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import BevGrid, six_vectors
 from deepaccident_devkit.geometry.bev_grid import Axis, Orientation
@@ -190,64 +191,103 @@ def sample_points(source_from_target: ArrayLike, grid: BevGrid, rules: LabelProt
     matrix = checked("source_from_target", source_from_target, (4, 4))
     if not np.isfinite(matrix).all():
         raise GeometryError("source_from_target: not all numbers are finite; leave out frames without a pose")
+    rows, columns = sampling_lines(matrix[None], grid, rules)
+    return rows.points(), columns.points()
+
+
+class SamplingLine(NamedTuple):
+    """The rows, or the columns, at which target cells sample with N matrices: `finish(of_row + of_column + shift)`.
+
+    Attributes:
+        of_row: (N, H) what a target cell's row adds.
+        of_column: (N, W) what its column adds.
+        shift: (N,) what every cell adds.
+        finish: from sums to cells of the source, 0 the first cell's centre; may write into its argument.
+    """
+
+    of_row: AnyArray
+    of_column: AnyArray
+    shift: AnyArray
+    finish: Callable[[AnyArray], AnyArray]
+
+    def points(self) -> AnyArray:
+        """(H, W), of all target cells with the first matrix."""
+        point = np.add.outer(self.of_row[0], self.of_column[0])
+        point += self.shift[0]
+        return self.finish(point)
+
+    def points_of(self, matrix: IntArray, row: IntArray, column: IntArray, run: IntArray) -> AnyArray:
+        """(P,), bit by bit those of `points`, of the target cells in `column` (P,) of `run` (P,).
+
+        `matrix` and `row` (R,) are those of the runs; the columns of matrix m count from m · W.
+        """
+        point = self.of_row[matrix, row].take(run)
+        point += self.of_column.reshape(-1).take(column)
+        point += self.shift[matrix].take(run)
+        return self.finish(point)
+
+
+def sampling_lines(matrices: AnyArray, grid: BevGrid, rules: LabelProtocol) -> tuple[SamplingLine, SamplingLine]:
+    """What `sample_points` computes its rows and columns from, for matrices (N, 4, 4): to sample only some cells."""
     if rules.warp == "fiery":
-        return _fiery_points(matrix, grid)
+        return _fiery_lines(matrices, grid)
     native = grid.with_orientation(rules.native)
-    if rules.warp == "exact":
-        return _exact_points(matrix, native)
-    return _stretched_points(matrix.astype(np.float32), native)
+    planes = _planes(matrices if rules.warp == "exact" else matrices.astype(np.float32), native)
+    line = _exact_line if rules.warp == "exact" else _stretched_line
+    first, second = axes_of(native)
+    return line(native, first, planes[:, 0]), line(native, second, planes[:, 1])
 
 
-def _stretched_points(matrix: Float32Array, grid: BevGrid) -> tuple[AnyArray, AnyArray]:
-    axes = axes_of(grid)
-    values = [_released_coordinates(axis) for axis in axes]
-    points = []
-    for (low, high, _), (down, along, shift), steps in zip(axes, _plane(matrix, grid), values, strict=True):
-        point = np.add.outer(down * values[0], along * values[1])
-        point += shift
-        middle, half = (low + high) / 2, (high - low) / 2
+def _stretched_line(grid: BevGrid, axis: Axis, plane: AnyArray) -> SamplingLine:
+    low, high, size = axis
+    middle, half = (low + high) / 2, np.float32((high - low) / 2)
+    scale = np.float32((round((high - low) / size) - 1) / 2)
+
+    def finish(point: AnyArray) -> AnyArray:
         if middle:
             point -= np.float32(middle)
-        point /= np.float32(half)
+        point /= half
         point += np.float32(1)
-        point *= np.float32((len(steps) - 1) / 2)
-        points.append(point)
-    return points[0], points[1]
+        point *= scale
+        return point
+
+    rows, columns = (_released_coordinates(each) for each in axes_of(grid))
+    return SamplingLine(plane[:, :1] * rows, plane[:, 1:2] * columns, plane[:, 2], finish)
 
 
-def _exact_points(matrix: FloatArray, grid: BevGrid) -> tuple[AnyArray, AnyArray]:
-    axes = axes_of(grid)
-    values = [_centers(axis) for axis in axes]
-    points = []
-    for (low, _, size), (down, along, shift) in zip(axes, _plane(matrix, grid), strict=True):
-        point = np.add.outer(down / size * values[0], along / size * values[1])
-        point += (shift - low) / size - 0.5
-        points.append(point)
-    return points[0], points[1]
+def _exact_line(grid: BevGrid, axis: Axis, plane: AnyArray) -> SamplingLine:
+    low, _, size = axis
+    rows, columns = (_centers(each) for each in axes_of(grid))
+    shift = (plane[:, 2] - low) / size - 0.5
+    return SamplingLine(plane[:, :1] / size * rows, plane[:, 1:2] / size * columns, shift, _as_they_are)
 
 
-def _plane(matrix: AnyArray, grid: BevGrid) -> AnyArray:
-    """(2, 3) the part of a matrix that counts on the plane z = 0, metres along rows and columns: factors and shift."""
+def _as_they_are(point: AnyArray) -> AnyArray:
+    return point
+
+
+def _planes(matrices: AnyArray, grid: BevGrid) -> AnyArray:
+    """(N, 2, 3) the parts that count on the plane z = 0, metres along rows and columns: factors and shift."""
     order = [0, 1] if grid.orientation == "fiery" else [1, 0]
-    return matrix[order][:, [*order, 3]]
+    planes: AnyArray = matrices[:, order][:, :, [*order, 3]]
+    return planes
 
 
-def _fiery_points(matrix: FloatArray, grid: BevGrid) -> tuple[AnyArray, AnyArray]:
-    tx, ty, _, _, _, yaw = six_vectors.from_matrices(np.linalg.inv(matrix)).astype(np.float32)
-    cosine, sine = single_precision.cosine(yaw), single_precision.sine(yaw)
+def _fiery_lines(matrices: AnyArray, grid: BevGrid) -> tuple[SamplingLine, SamplingLine]:
+    tx, ty, _, _, _, yaw = six_vectors.from_matrices(np.linalg.inv(matrices)).astype(np.float32).T[..., None]
+    sine, cosine = single_precision.sines_and_cosines(yaw)
     half = np.float32((grid.x[1] - grid.x[0]) / 2)
     x, y = (_fiery_coordinates(axis, float(half)) for axis in (grid.x, grid.y))
-    points = []
-    for (low, _, size), along_x, along_y, shift in (
-        (grid.x, cosine, sine, -tx / half),
-        (grid.y, -sine, cosine, ty / half),
-    ):
-        point = np.add.outer(along_x * x, along_y * y)
-        point += shift
-        point -= np.float32(low / half)
+
+    def finish(axis: Axis, point: AnyArray) -> AnyArray:
+        point -= np.float32(axis[0] / half)
         # torch fuses these two steps: one rounding
-        points.append((point.astype(np.float64) * float(half / size) - 0.5).astype(np.float32))
-    return points[0], points[1]
+        return (point.astype(np.float64) * float(half / axis[2]) - 0.5).astype(np.float32)
+
+    return (
+        SamplingLine(cosine * x, sine * y, -tx[:, 0] / half, functools.partial(finish, grid.x)),
+        SamplingLine(-sine * x, cosine * y, ty[:, 0] / half, functools.partial(finish, grid.y)),
+    )
 
 
 def _parted(points: AnyArray, count: int) -> tuple[AnyArray, Float32Array]:

@@ -142,20 +142,20 @@ def test_sines_are_torchs_and_not_the_nearest_float32() -> None:
     """As torch 2.13 gave them on a processor; most of these are chosen to be the nearest's neighbours."""
     angles = np.array([-2.86, -2.84, -2.8, -2.9, -2.85, -2.74, 0.0, 3.1], dtype=np.float32)
     assert_array_equal(
-        single_precision.cosine(angles),
+        single_precision.sines_and_cosines(angles)[1],
         np.array(
             [-0.9606141, -0.9548646, -0.94222236, -0.9709582, -0.9577872, -0.9204396, 1.0, -0.99913514],
             dtype=np.float32,
         ),
     )
     assert_array_equal(
-        single_precision.sine(angles),
+        single_precision.sines_and_cosines(angles)[0],
         np.array(
             [-0.27788603, -0.29704145, -0.3349882, -0.23924924, -0.28747812, -0.3908848, 0.0, 0.04158076],
             dtype=np.float32,
         ),
     )
-    assert (single_precision.cosine(angles) != np.cos(angles.astype(np.float64)).astype(np.float32)).any()
+    assert (single_precision.sines_and_cosines(angles)[1] != np.cos(angles.astype(np.float64)).astype(np.float32)).any()
 
 
 def make_labels(config: MotionLabelConfig, step: list[float]) -> MotionLabels:

@@ -1,0 +1,124 @@
+"""Several processes: who evaluates which samples, their counts together, epochs, and one index for all."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from shutil import copytree, ignore_patterns
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from ranks import RANKS, counted, everything, run_ranks
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ConfigError, EvaluationError
+from deepaccident_devkit.evaluation import MotionEvaluator
+from deepaccident_devkit.export.torch import (
+    EvaluationSampler,
+    RandomAugmentation,
+    V2XConfig,
+    V2XDataset,
+    merged_evaluator,
+)
+
+Outcome = Callable[[str], list[Any]]
+
+
+@given(st.integers(0, 50), st.integers(1, 60))
+def test_ranks_have_each_sample_once(samples: int, ranks: int) -> None:
+    parts = [EvaluationSampler(range(samples), ranks, rank) for rank in range(ranks)]
+    assert sorted(position for part in parts for position in part) == list(range(samples))
+    sizes = [len(part) for part in parts]
+    assert [len(list(part)) for part in parts] == sizes
+    assert max(sizes) - min(sizes) <= 1
+
+
+def test_alone_one_process_has_all() -> None:
+    assert list(EvaluationSampler(range(3))) == [0, 1, 2]
+    assert repr(EvaluationSampler(range(3))) == "EvaluationSampler(3 of 3 samples, rank 0)"
+    evaluator = MotionEvaluator()
+    merged = merged_evaluator(evaluator)
+    assert merged is not evaluator
+    assert merged.settings == evaluator.settings
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((iter([]),), "expected a V2XDataset, or what has a length"),
+        (([], 2), "give both, or none"),
+        (([], None, 0), "give both, or none"),
+        (([], 2, 2), r"expected 0 to num_replicas - 1, found 2 of 2"),
+        (([], 2, -1), r"found -1 of 2"),
+        (([], 2.0, 0), "num_replicas: expected a whole number"),
+    ],
+)
+def test_samplers_of_no_rank_are_refused(arguments: tuple[Any, ...], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        EvaluationSampler(*arguments)
+
+
+def test_only_evaluators_are_merged() -> None:
+    with pytest.raises(EvaluationError, match=r"MotionEvaluator\(\), rank 0 has 0\.5"):
+        merged_evaluator(0.5)  # type: ignore[type-var]
+
+
+@pytest.fixture(scope="module")
+def tokens(da_motion: DeepAccident) -> list[str]:
+    """An odd number, so that ranks have different numbers."""
+    return [record["token"] for record in da_motion.sample if record["token"].endswith("ego_vehicle/015")] + [
+        record["token"] for record in da_motion.sample if record["token"].endswith("other_vehicle/020")
+    ][:1]
+
+
+@pytest.fixture(scope="module")
+def outcome(
+    da_motion: DeepAccident, tokens: list[str], release_root_b: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Outcome:
+    """What `ranks.everything` found, by rank."""
+    folder = tmp_path_factory.mktemp("ranks")
+    root = copytree(release_root_b, folder / "release", ignore=ignore_patterns(".deepaccident"))
+    run_ranks(everything, folder, da_motion, tokens, root)
+
+    def read(what: str) -> list[Any]:
+        return [json.loads((folder / f"{what}_{rank}.json").read_text()) for rank in range(RANKS)]
+
+    return read
+
+
+@pytest.mark.slow
+class TestTwoProcesses:
+    """One run for all, since each process takes seconds to start."""
+
+    def test_each_evaluates_its_own_samples(self, outcome: Outcome, tokens: list[str]) -> None:
+        assert outcome("evaluated") == [tokens[0::2], tokens[1::2]]
+
+    def test_all_have_the_counts_of_one_process(
+        self, outcome: Outcome, da_motion: DeepAccident, tokens: list[str], tmp_path: Path
+    ) -> None:
+        for alone in counted(da_motion, tokens):
+            saved = json.loads(alone.save(tmp_path / "alone.json").read_text())
+            assert outcome(type(alone).__name__) == [saved] * RANKS
+
+    def test_all_refuse_other_settings(self, outcome: Outcome) -> None:
+        assert all("evaluate both with the same settings" in error for error in outcome("refused"))
+
+    def test_they_draw_their_own_augmentations_each_epoch(
+        self, outcome: Outcome, da_motion: DeepAccident, tokens: list[str]
+    ) -> None:
+        data = V2XDataset(da_motion, tokens, V2XConfig(points=False, augmentation=RandomAugmentation()))
+        ranks = outcome("trained")
+        for epoch in range(2):
+            data.set_epoch(epoch)
+            drawn = [matrix for rank in ranks for matrix in rank[epoch].values()]
+            assert len({str(matrix) for matrix in drawn}) == len(tokens)
+            together = ranks[0][epoch] | ranks[1][epoch]
+            assert set(together) == set(tokens)
+            for position, token in enumerate(tokens):
+                assert torch.equal(data[position]["augmentation"], torch.tensor(together[token])), token
+        assert ranks[0][0] != ranks[0][1]
+
+    def test_they_make_one_index(self, outcome: Outcome) -> None:
+        assert sorted(outcome("opened")) == [0, 1]
