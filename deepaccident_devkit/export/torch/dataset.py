@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, DTypeLike
 from deepaccident_devkit.arrays import checked_whole
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, NotAvailableError
+from deepaccident_devkit.export.image_cache import ImageCache
 from deepaccident_devkit.export.torch import sensor_data
 from deepaccident_devkit.export.torch.augmentation import augmented_boxes, augmented_six_vectors
 from deepaccident_devkit.export.torch.collate import V2XItem
@@ -96,7 +97,7 @@ class V2XDataset(TorchDataset):
             NotAvailableError: labels are wanted for a sample without a label, or an agent is not in this (partial)
                 release.
             ConfigError: the link's latency is longer than the past of a sample; `tokens` is a single sample, or
-                `config` no V2XConfig.
+                `config` no V2XConfig; or the cache of images lacks something, or is of other images.
         """
         import torch
 
@@ -110,6 +111,7 @@ class V2XDataset(TorchDataset):
         self._check_agents()
         self._check_labelled()
         self._check_latency()
+        self._cache = self._opened_cache()
         # shared memory, so that workers that live longer than an epoch know the next one
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
 
@@ -160,10 +162,12 @@ class V2XDataset(TorchDataset):
 
     def _received_item(self, sample: str, augmentation: Augmentation) -> dict[str, Any]:
         """The sample's own tensors, and the sensor data that arrived."""
+        import torch
+
         dataset, config = self._dataset, self.config
         names = sensor_data.participants(dataset, sample, config.agents)
         received = sensor_data.received(dataset, sample, names, config)
-        arrived, lacking = sensor_data.with_files(dataset, sample, names, received, config)
+        arrived, lacking = sensor_data.with_files(dataset, sample, names, received, config, self._cache)
         world_from_ego = dataset.world_from(sample, "ego").matrix @ np.linalg.inv(augmentation.matrix)
         item: dict[str, Any] = {
             "token": sample,
@@ -179,8 +183,8 @@ class V2XDataset(TorchDataset):
             clouds = sensor_data.point_clouds(dataset, names, arrived, augmentation)
             item["points"] = [[_tensor(cloud) for cloud in of_agent] for of_agent in clouds]
         if config.images is not None:
-            arrays = sensor_data.camera_arrays(dataset, names, arrived, augmentation, config.images)
-            item |= {name: _tensor(array) for name, array in arrays.items()}
+            arrays = sensor_data.camera_arrays(dataset, names, arrived, augmentation, config.images, self._cache)
+            item |= {name: torch.from_numpy(array) for name, array in arrays.items()}  # new arrays: no copy
         return item
 
     def _box_item(self, sample: str, augmentation: Augmentation) -> dict[str, Tensor]:
@@ -212,6 +216,16 @@ class V2XDataset(TorchDataset):
             "future_egomotion": _tensor(augmented_six_vectors(labels.future_egomotion, augmentation), np.float32),
             "label_valid": _tensor(labels.label_valid),
         }
+
+    def _opened_cache(self) -> ImageCache | None:
+        """The cache of images, if one is wanted and has them."""
+        if self.config.images_cache is None or self.config.images is None:
+            return None
+        cache = ImageCache(self.config.images_cache)
+        cache.check(self.config.images)
+        rows = np.unique(self._dataset.columns("sample")["agent_row"][self._rows])
+        cache.check_release(self._dataset, [self._dataset.agent[row]["token"] for row in rows.tolist()])
+        return cache
 
     def _check_agents(self) -> None:
         """Check `agents` with the first sample: a mistake is the same for all samples."""
