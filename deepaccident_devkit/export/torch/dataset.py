@@ -20,6 +20,7 @@ from deepaccident_devkit.export.torch.collate import V2XItem
 from deepaccident_devkit.export.torch.config import V2XConfig
 from deepaccident_devkit.motion import Augmentation, MotionLabelConfig, bev_segmentation
 from deepaccident_devkit.motion.sample_labels import motion_labels
+from deepaccident_devkit.tables.tokens import agent_token
 from deepaccident_devkit.v2x import cooperative_boxes
 
 if TYPE_CHECKING:
@@ -223,8 +224,14 @@ class V2XDataset(TorchDataset):
             return None
         cache = ImageCache(self.config.images_cache)
         cache.check(self.config.images)
-        rows = np.unique(self._dataset.columns("sample")["agent_row"][self._rows])
-        cache.check_release(self._dataset, [self._dataset.agent[row]["token"] for row in rows.tolist()])
+        _, first = np.unique(self._dataset.columns("sample")["agent_row"][self._rows], return_index=True)
+        asked: dict[str, None] = {}
+        for row in self._rows[first].tolist():  # one sample of each agent: its partners are always the same
+            sample = self._dataset.sample[row]["token"]
+            scenario = sample.rsplit("/", 2)[0]
+            names = sensor_data.participants(self._dataset, sample, self.config.agents)
+            asked.update(dict.fromkeys(agent_token(scenario, name) for name in names))
+        cache.check_release(self._dataset, list(asked))
         return cache
 
     def _check_agents(self) -> None:
