@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 
 from benchmarks.measure import Figure, best_of, one_core
@@ -63,7 +64,7 @@ def measure() -> list[Figure]:
     try:
         import deepaccident_devkit.export.torch  # noqa: F401
     except MissingExtraError as error:
-        print(f"loader: not measured; {error}")
+        click.echo(f"loader: not measured; {error}", err=True)
         return []
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
