@@ -8,7 +8,6 @@ import pytest
 from deepaccident_devkit.synth import SynthConfig
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_every_way_to_load_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(Path(__file__).parents[2])

@@ -63,7 +63,7 @@ def test_a_cached_item_is_the_same(da: DeepAccident, folder: Path, tokens: list[
     assert all(same(plain[0][key], quick[0][key]) for key in plain[0])
 
 
-@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 @pytest.mark.parametrize("context", ["fork", "spawn"])
 def test_workers_read_the_cache(da: DeepAccident, folder: Path, tokens: list[str], context: str) -> None:
     data = V2XDataset(da, tokens, replace(CONFIG, images_cache=folder))
