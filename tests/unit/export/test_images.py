@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.errors import ConfigError, SensorFileError
 from deepaccident_devkit.export.images import ImageConfig, _resized_part
 from deepaccident_devkit.release import read_image, write_image
 
@@ -60,6 +60,15 @@ def test_a_jpeg_is_decoded_no_smaller(tmp_path: Path, least: tuple[int, int], sh
 def test_a_png_is_decoded_whole(tmp_path: Path) -> None:
     Image.fromarray(picture(64, 120)).save(tmp_path / "image.jpg", format="PNG")
     np.testing.assert_array_equal(read_image(tmp_path / "image.jpg", least=(8, 8)), picture(64, 120))
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
+def test_a_truncated_jpeg_is_no_half_grey_picture(tmp_path: Path, share: float) -> None:
+    path = tmp_path / "image.jpg"
+    write_image(path, picture(64, 120))
+    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
+    with pytest.raises(SensorFileError, match=r"image\.jpg: not a readable image"):
+        read_image(path, least=(16, 16))
 
 
 @given(st.data())
