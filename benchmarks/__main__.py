@@ -19,6 +19,7 @@ NAMES = (
     "render",
     "synth",
     "export",
+    "loader",
     "engine",
     "stores",
 )
@@ -29,7 +30,7 @@ NAMES = (
 @click.option("--json", "as_json", is_flag=True, help="One flat JSON object (name: number) and nothing else.")
 def main(names: tuple[str, ...], as_json: bool) -> None:  # noqa: FBT001 - click's flag
     """Measure the devkit; NAME is one of parsing, indexing, scale, validation, geometry, labels, evaluation,
-    coverage, render, synth, export, engine, stores.
+    coverage, render, synth, export, loader, engine, stores.
     """
     figures = []
     for name in names or NAMES:

@@ -14,6 +14,8 @@ from benchmarks.measure import Figure, best_of, one_core
 from benchmarks.releases import copied_release
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.export.bulk import Format, export_release
+from deepaccident_devkit.export.image_cache import CachedImages
+from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.export.mmdet3d import Mmdet3d
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.export.opencood import OpenCood
@@ -23,7 +25,8 @@ from deepaccident_devkit.export.webdataset import WebDataset
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.synth import SynthConfig, make_release
 
-FORMATS: tuple[Format, ...] = (OpenCood(), NuScenes(), Mmdet3d(), ReleasedInfos(), Parquet(), WebDataset())
+CACHE = CachedImages(images=ImageConfig(resize=(396, 704), crop=(140, 0, 256, 704)), where=("length>=1",))
+FORMATS: tuple[Format, ...] = (OpenCood(), NuScenes(), Mmdet3d(), ReleasedInfos(), Parquet(), WebDataset(), CACHE)
 """One of each; a format that lies in another's folder comes after it."""
 RELEASE = SynthConfig(scenarios=1, frames=8, image_size=(800, 450), seed=7)
 SCENARIOS = 3

@@ -30,6 +30,7 @@ _VERBS = (
     "info",
     "explain",
     "labels",
+    "cache",
     "split",
     "stats",
     "validate",

@@ -26,19 +26,21 @@ _BYTES_A_PIXEL = 3
 _REMEDY = "restore the file from its archive"
 
 
-def read_image(path: ReleasePath, *, raw: bool = False) -> ByteArray:
+def read_image(path: ReleasePath, *, raw: bool = False, least: tuple[int, int] | None = None) -> ByteArray:
     """An image as (H, W, 3) uint8, RGB.
 
     Args:
         path: the file.
         raw: return the pixels in the file's own mode, without conversion to RGB: (H, W) for a grey image.
+        least: a height and width that suffice: a JPEG is decoded at 1/2, 1/4 or 1/8 of its size (rounded up) if that
+            is no smaller, which takes less time. None decodes all of it.
 
     Raises:
         MissingFileError: there is no such file.
         SensorFileError: it is truncated, neither JPEG nor PNG, too large, or no file. (Of a truncated one, OpenCV
             returns a half-grey picture.)
     """
-    return decode_image(path, read_image_bytes(path), raw=raw)
+    return decode_image(path, read_image_bytes(path), raw=raw, least=least)
 
 
 def read_image_bytes(path: ReleasePath) -> bytes:
@@ -46,10 +48,15 @@ def read_image_bytes(path: ReleasePath) -> bytes:
     return read_content(path, "image", SensorFileError, _REMEDY)
 
 
-def decode_image(path: ReleasePath, content: bytes, *, raw: bool = False) -> ByteArray:
+def decode_image(
+    path: ReleasePath, content: bytes, *, raw: bool = False, least: tuple[int, int] | None = None
+) -> ByteArray:
     """The image in the bytes of a file, which errors name; as `read_image` returns it."""
     with _opened(path, content, _FORMATS) as image:
-        return np.array(image if raw else image.convert("RGB"))
+        if least is not None:
+            image.draft(None, least[::-1])
+        image.load()
+        return np.array(image if raw or image.mode == "RGB" else image.convert("RGB"))
 
 
 def read_jpeg(path: ReleasePath) -> tuple[bytes, tuple[int, int]]:
@@ -64,14 +71,19 @@ def read_jpeg(path: ReleasePath) -> tuple[bytes, tuple[int, int]]:
 
 def write_image(path: Path, image: ByteArray) -> None:
     """Write an RGB image (H, W, 3) uint8 as JPEG."""
+    write_bytes(path, encode_jpeg(path, image))
+
+
+def encode_jpeg(path: Path, image: ByteArray, quality: int = JPEG_QUALITY) -> bytes:
+    """An RGB image (H, W, 3) uint8 as the bytes of a JPEG file, which errors name; raises SensorFileError."""
     import cv2
 
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
         raise SensorFileError(f"{path}: expected shape (H, W, 3) of uint8, found {image.shape} of {image.dtype}")
-    done, encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    done, encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
         raise SensorFileError(f"{path}: an image of shape {image.shape} cannot be encoded as JPEG")
-    write_bytes(path, encoded.tobytes())
+    return bytes(encoded.tobytes())
 
 
 @contextmanager

@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from click.testing import CliRunner
 from numpy.testing import assert_allclose, assert_array_equal
 from torch.utils.data import DataLoader
 
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ConfigError, MissingFileError
 from deepaccident_devkit.export.torch import (
     ImageConfig,
@@ -226,15 +228,20 @@ def test_a_dataset_pickles_cheaply(da: DeepAccident) -> None:
 def test_the_documented_training_loop_learns(da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The code of docs/training.md as it stands there; the session's release takes the place of its own."""
     page = Path(__file__).parents[2] / "docs" / "training.md"
-    code, several = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    blocks = re.findall(r"```(python|bash)\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     (tmp_path / "training_release").symlink_to(da.dataroot)
     monkeypatch.chdir(tmp_path)
-    names: dict[str, Any] = {}
-    exec(compile(code, str(page), "exec"), names)  # noqa: S102
-    assert len(names["losses"]) == 5
-    assert names["losses"][-1] < 0.8 * names["losses"][0]
     for name, value in {"RANK": 0, "WORLD_SIZE": 1, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": 0}.items():
         monkeypatch.setenv(name, str(value))  # as torchrun does
-    exec(compile(several, str(page), "exec"), names)  # noqa: S102
+    names: dict[str, Any] = {}
+    for language, code in blocks:
+        if language == "bash":
+            words = code.replace("deepaccident ", "", 1).split()
+            CliRunner().invoke(deepaccident, words, catch_exceptions=False, standalone_mode=False)
+        else:
+            exec(compile(code, str(page), "exec"), names)  # noqa: S102
+    assert names["item"]["images"].shape == (5, 1, 6, 3, 12, 32)
+    assert len(names["losses"]) == 5
+    assert names["losses"][-1] < 0.8 * names["losses"][0]
     assert names["evaluator"].tokens == set(da.evaluation_samples("val"))
     assert math.isfinite(names["loss"].item())

@@ -299,10 +299,11 @@ def test_a_crop_beyond_the_stored_image(da: DeepAccident, sample: str) -> None:
         V2XDataset(da, [sample], V2XConfig(images=ImageConfig(crop=(30, 0, 10, 64))))[0]
 
 
-def test_images_of_different_sizes(da: DeepAccident) -> None:
-    images = [np.zeros((4, 5, 3), dtype=np.uint8), np.zeros((4, 6, 3), dtype=np.uint8)]
+def test_images_of_different_sizes(da: DeepAccident, sample: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = iter([(4, 5), (4, 6)])
+    monkeypatch.setattr(type(da), "load_image", lambda *_: np.zeros((*next(sizes), 3), dtype=np.uint8))
     with pytest.raises(ConfigError, match=r"different sizes, \(4, 5\) and \(4, 6\); choose resize="):
-        ImageConfig().stacked(images)
+        V2XDataset(da, [sample], V2XConfig(points=False, images=ImageConfig()))[0]
 
 
 def projected(image_from_ego: torch.Tensor, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

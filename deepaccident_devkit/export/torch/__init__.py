@@ -24,12 +24,12 @@ except ModuleNotFoundError as error:
         "(for its CPU build alone: pip install torch --index-url https://download.pytorch.org/whl/cpu)"
     ) from error
 
+from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.export.torch.augmentation import RandomAugmentation
 from deepaccident_devkit.export.torch.collate import collate, collate_fusion
 from deepaccident_devkit.export.torch.config import V2XConfig
 from deepaccident_devkit.export.torch.dataset import V2XDataset
 from deepaccident_devkit.export.torch.distributed import EvaluationSampler, merged_evaluator
-from deepaccident_devkit.export.torch.images import ImageConfig
 
 __all__ = [
     "EvaluationSampler",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Literal, get_args
@@ -11,7 +12,7 @@ import numpy as np
 from deepaccident_devkit.arrays import checked_whole
 from deepaccident_devkit.dataset import Visible
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.export.torch.images import ImageConfig
+from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import Augmentation, MotionLabelConfig
 from deepaccident_devkit.motion.warps.warping import WarpMode
@@ -37,6 +38,7 @@ class V2XConfig:
         past: frames of sensor data, the present included.
         step: recorded frames (0.1 s) between them; None for the labels' own step or, without labels, 5 (2 Hz).
         images: None for no images and cameras.
+        images_cache: folder that `deepaccident cache` wrote, from which images are taken; None for the release's own.
         points: whether to load point clouds.
         boxes: `sample` for those that the sample's agent annotated, `cooperative` for the union of what the
             cooperating agents annotated (`v2x.cooperative_boxes`: with the sample's own agent, if another one annotated
@@ -60,6 +62,7 @@ class V2XConfig:
     past: int = 1
     step: int | None = None
     images: ImageConfig | None = None
+    images_cache: str | os.PathLike[str] | None = None
     points: bool = True
     boxes: BoxSource | None = "sample"
     visible: Visible | None = "released"
@@ -83,6 +86,8 @@ class V2XConfig:
         words = {"boxes": get_args(BoxSource), "visible": get_args(Visible), "to_present": get_args(WarpMode)}
         settle_choices(self, {name: (None, *possible) for name, possible in words.items()})
         settle_choices(self, {"on_missing": get_args(OnError)})
+        if self.images_cache is not None and self.images is None:
+            raise ConfigError("images_cache: changes nothing without images=ImageConfig(…); give that too")
         if isinstance(self.labels, MotionLabelConfig) and self.labels.augmentation is not None:
             raise ConfigError(
                 "labels: their augmentation is that of boxes, points and poses; give V2XConfig(augmentation=…) alone"

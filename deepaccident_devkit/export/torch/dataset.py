@@ -13,12 +13,14 @@ from numpy.typing import ArrayLike, DTypeLike
 from deepaccident_devkit.arrays import checked_whole
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, NotAvailableError
+from deepaccident_devkit.export.image_cache import ImageCache
 from deepaccident_devkit.export.torch import sensor_data
 from deepaccident_devkit.export.torch.augmentation import augmented_boxes, augmented_six_vectors
 from deepaccident_devkit.export.torch.collate import V2XItem
 from deepaccident_devkit.export.torch.config import V2XConfig
 from deepaccident_devkit.motion import Augmentation, MotionLabelConfig, bev_segmentation
 from deepaccident_devkit.motion.sample_labels import motion_labels
+from deepaccident_devkit.tables.tokens import agent_token
 from deepaccident_devkit.v2x import cooperative_boxes
 
 if TYPE_CHECKING:
@@ -96,7 +98,7 @@ class V2XDataset(TorchDataset):
             NotAvailableError: labels are wanted for a sample without a label, or an agent is not in this (partial)
                 release.
             ConfigError: the link's latency is longer than the past of a sample; `tokens` is a single sample, or
-                `config` no V2XConfig.
+                `config` no V2XConfig; or the cache of images lacks something, or is of other images.
         """
         import torch
 
@@ -110,6 +112,7 @@ class V2XDataset(TorchDataset):
         self._check_agents()
         self._check_labelled()
         self._check_latency()
+        self._cache = self._opened_cache()
         # shared memory, so that workers that live longer than an epoch know the next one
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
 
@@ -160,10 +163,12 @@ class V2XDataset(TorchDataset):
 
     def _received_item(self, sample: str, augmentation: Augmentation) -> dict[str, Any]:
         """The sample's own tensors, and the sensor data that arrived."""
+        import torch
+
         dataset, config = self._dataset, self.config
         names = sensor_data.participants(dataset, sample, config.agents)
         received = sensor_data.received(dataset, sample, names, config)
-        arrived, lacking = sensor_data.with_files(dataset, sample, names, received, config)
+        arrived, lacking = sensor_data.with_files(dataset, sample, names, received, config, self._cache)
         world_from_ego = dataset.world_from(sample, "ego").matrix @ np.linalg.inv(augmentation.matrix)
         item: dict[str, Any] = {
             "token": sample,
@@ -179,8 +184,8 @@ class V2XDataset(TorchDataset):
             clouds = sensor_data.point_clouds(dataset, names, arrived, augmentation)
             item["points"] = [[_tensor(cloud) for cloud in of_agent] for of_agent in clouds]
         if config.images is not None:
-            arrays = sensor_data.camera_arrays(dataset, names, arrived, augmentation, config.images)
-            item |= {name: _tensor(array) for name, array in arrays.items()}
+            arrays = sensor_data.camera_arrays(dataset, names, arrived, augmentation, config.images, self._cache)
+            item |= {name: torch.from_numpy(array) for name, array in arrays.items()}  # new arrays: no copy
         return item
 
     def _box_item(self, sample: str, augmentation: Augmentation) -> dict[str, Tensor]:
@@ -212,6 +217,22 @@ class V2XDataset(TorchDataset):
             "future_egomotion": _tensor(augmented_six_vectors(labels.future_egomotion, augmentation), np.float32),
             "label_valid": _tensor(labels.label_valid),
         }
+
+    def _opened_cache(self) -> ImageCache | None:
+        """The cache of images, if one is wanted and has them."""
+        if self.config.images_cache is None or self.config.images is None:
+            return None
+        cache = ImageCache(self.config.images_cache)
+        cache.check(self.config.images)
+        _, first = np.unique(self._dataset.columns("sample")["agent_row"][self._rows], return_index=True)
+        asked: dict[str, None] = {}
+        for row in self._rows[first].tolist():  # one sample of each agent: its partners are always the same
+            sample = self._dataset.sample[row]["token"]
+            scenario = sample.rsplit("/", 2)[0]
+            names = sensor_data.participants(self._dataset, sample, self.config.agents)
+            asked.update(dict.fromkeys(agent_token(scenario, name) for name in names))
+        cache.check_release(self._dataset, list(asked))
+        return cache
 
     def _check_agents(self) -> None:
         """Check `agents` with the first sample: a mistake is the same for all samples."""

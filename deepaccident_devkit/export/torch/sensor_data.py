@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from deepaccident_devkit.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError, MissingFileError
+from deepaccident_devkit.export.image_cache import ImageCache
+from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.export.torch.augmentation import augmented_points, augmented_pose
 from deepaccident_devkit.export.torch.config import V2XConfig
-from deepaccident_devkit.export.torch.images import ImageConfig
 from deepaccident_devkit.motion import Augmentation
 from deepaccident_devkit.release.missing_files import MissingFiles
 from deepaccident_devkit.tables.tokens import sample_token
@@ -58,21 +60,32 @@ def _reaches(link: Link | None, index: int) -> bool:
 
 
 def with_files(
-    dataset: Dataset, sample: str, names: Sequence[AgentName], arrived: Received, config: V2XConfig
+    dataset: Dataset,
+    sample: str,
+    names: Sequence[AgentName],
+    arrived: Received,
+    config: V2XConfig,
+    cache: ImageCache | None,
 ) -> tuple[Received, IntArray]:
     """The messages whose sensor files are all there, and how many files each agent and frame (A, P) lacks.
+
+    With a cache, images are there if it has them.
 
     Raises:
         MissingFileError: a file is not there, and it is the sample's own of the present or `on_missing` is `raise`.
     """
     channels = (*[LIDAR] * config.points, *(() if config.images is None else config.images.cameras))
     files = MissingFiles(dataset.dataroot, config.on_missing)
+
+    def lacks(token: str, channel: str) -> bool:
+        if cache is not None and channel != LIDAR:
+            return config.on_missing == "skip" and not cache.has(token)  # else the error comes from loading it
+        return not files.has(dataset.sensor_path(token), channel)
+
     lacking = np.zeros((len(names), len(arrived)), dtype=np.int64)
     for p, moment in enumerate(arrived):
         for name, message in moment.items():
-            lacking[names.index(name), p] = sum(
-                not files.has(dataset.sensor_path(f"{message.sample}/{channel}"), channel) for channel in channels
-            )
+            lacking[names.index(name), p] = sum(lacks(f"{message.sample}/{channel}", channel) for channel in channels)
     if lacking[0, -1]:
         raise MissingFileError(
             f"{sample}: {lacking[0, -1]} of {len(channels)} sensor files of this sample's own agent are not there, and "
@@ -127,6 +140,7 @@ def camera_arrays(
     arrived: Received,
     augmentation: Augmentation,
     config: ImageConfig,
+    cache: ImageCache | None,
 ) -> dict[str, AnyArray]:
     """All agents' C cameras; without a message, images are 0 and matrices are the identity.
 
@@ -140,55 +154,44 @@ def camera_arrays(
         SensorFileError: one cannot be read.
         ConfigError: images have different sizes, or the crop reaches beyond them.
     """
-    seen = {
-        (a, p): _cameras_of(dataset, moment[name].sample, augmentation, config)
-        for a, name in enumerate(names)
-        for p, moment in enumerate(arrived)
-        if name in moment
-    }
-    result: dict[str, AnyArray] = {}
-    for key, blank_like in _BLANK.items():
-        parts = {place: arrays[key] for place, arrays in seen.items()}
-        example = next(iter(parts.values()))
-        for part in parts.values():
-            if part.shape != example.shape:
-                raise ConfigError(
-                    f"agents' images have different sizes, {example.shape[2:]} and {part.shape[2:]}; choose resize="
-                )
-        blank = blank_like(example)
-        result[key] = np.stack(
-            [np.stack([parts.get((a, p), blank) for p in range(len(arrived))]) for a in range(len(names))]
-        )
-    return result
+    load = config.load if cache is None else partial(cache.load, config)
+    shape = (len(names), len(arrived), len(config.cameras))
+    images: ByteArray = np.zeros((*shape, 3, 0, 0), dtype=np.uint8)  # until the first one tells the size
+    result = {key: np.tile(np.eye(size, dtype=np.float32), (*shape, 1, 1)) for key, size in _MATRICES.items()}
+    for p, moment in enumerate(arrived):
+        for name, message in moment.items():
+            a, intrinsics = names.index(name), []
+            for c, channel in enumerate(config.cameras):
+                pixels, intrinsic = load(dataset, f"{message.sample}/{channel}")
+                if not images.size:
+                    images = np.zeros((*shape, 3, *pixels.shape[:2]), dtype=np.uint8)
+                if images.shape[4:] != pixels.shape[:2]:
+                    raise ConfigError(
+                        f"images have different sizes, {images.shape[4:]} and {pixels.shape[:2]}; choose resize="
+                    )
+                images[a, p, c] = pixels.transpose(2, 0, 1)
+                intrinsics.append(intrinsic)
+            matrices = _matrices(dataset, message.sample, augmentation, config, np.stack(intrinsics))
+            for key, each in matrices.items():
+                result[key][a, p] = each
+    return {"images": config.values(images, valid_mask(names, arrived)), **result}
 
 
-def _cameras_of(dataset: Dataset, sample: str, augmentation: Augmentation, config: ImageConfig) -> dict[str, AnyArray]:
-    """One agent's cameras at one moment: `camera_arrays` without the first two axes."""
+def _matrices(
+    dataset: Dataset, sample: str, augmentation: Augmentation, config: ImageConfig, intrinsics: FloatArray
+) -> dict[str, AnyArray]:
+    """One agent's cameras at one moment: the matrices of `camera_arrays` without the first two axes."""
     ego_from_world = dataset.world_from(sample, "ego").inverse()
-    images, intrinsics, poses = [], [], []
-    for channel in config.cameras:
-        image, intrinsic = config.load(dataset, f"{sample}/{channel}")
-        images.append(image)
-        intrinsics.append(intrinsic)
-        poses.append((ego_from_world @ dataset.world_from(sample, channel)).matrix)
+    poses = [(ego_from_world @ dataset.world_from(sample, channel)).matrix for channel in config.cameras]
     ego_from_camera: FloatArray = augmentation.matrix @ np.stack(poses)
-    projection = np.tile(np.eye(4), (len(images), 1, 1))
+    projection = np.tile(np.eye(4), (len(poses), 1, 1))
     projection[:, :3, :3] = intrinsics
     return {
-        "images": config.stacked(images),
-        "intrinsics": np.stack(intrinsics).astype(np.float32),
-        "ego_from_camera": ego_from_camera.astype(np.float32),
-        "image_from_ego": (projection @ np.linalg.inv(ego_from_camera)).astype(np.float32),
+        "intrinsics": intrinsics,
+        "ego_from_camera": ego_from_camera,
+        "image_from_ego": projection @ np.linalg.inv(ego_from_camera),
     }
 
 
-def _identities(like: AnyArray) -> AnyArray:
-    return np.broadcast_to(np.eye(like.shape[-1], dtype=like.dtype), like.shape)
-
-
-_BLANK: Final[Mapping[str, Callable[[AnyArray], AnyArray]]] = {
-    "images": np.zeros_like,
-    "intrinsics": _identities,
-    "ego_from_camera": _identities,
-    "image_from_ego": _identities,
-}
+_MATRICES: Final = {"intrinsics": 3, "ego_from_camera": 4, "image_from_ego": 4}
+"""Name → rows and columns."""

@@ -1,0 +1,164 @@
+"""Items a second of `V2XDataset` with images of 704 × 256 alone, whole, scaled and cached, beside a plain loader.
+
+The plain loader decodes and resizes with Pillow and stacks with numpy, without poses. The milliseconds of an item are
+processor time on one core, the fastest of some items; images are in the page cache.
+"""
+
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from benchmarks.measure import Figure, best_of, one_core
+from benchmarks.releases import copied_release
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import MissingExtraError
+from deepaccident_devkit.export.bulk import export_release
+from deepaccident_devkit.export.image_cache import CachedImages
+from deepaccident_devkit.export.images import ImageConfig
+from deepaccident_devkit.synth import SynthConfig, make_release
+from deepaccident_devkit.taxonomy import AGENTS
+
+RELEASE = SynthConfig(scenarios=1, frames=2, image_size=(1600, 900), seed=7, unplanned=0)
+SCENARIOS = 4
+IMAGES = ImageConfig(resize=(396, 704), crop=(140, 0, 256, 704), dtype="uint8")
+SCALED = replace(IMAGES, decode="scaled")
+TEAMS: dict[str, tuple[str, ...]] = {
+    "one": AGENTS[:1],
+    "two": ("ego_vehicle", "infrastructure"),
+    "five": AGENTS,
+}
+BOUNDS = {("scaled", "one"): 40.0, ("scaled", "five"): 160.0, ("cached_raw", "five"): 25.0}
+"""Milliseconds of an item on one core."""
+REPEATS = 2
+
+
+class PlainItems:
+    """What one writes without the devkit: paths to an array (agents, cameras, 3, h, w)."""
+
+    def __init__(self, paths: list[list[list[Path]]]) -> None:
+        self._paths = paths
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    def __getitem__(self, index: int) -> Any:
+        return np.stack([np.stack([plain_image(path) for path in agent]) for agent in self._paths[index]])
+
+
+def plain_image(path: Path) -> Any:
+    from PIL import Image
+
+    top, left, height, width = IMAGES.crop or (0, 0, 0, 0)
+    with Image.open(path) as image:
+        whole = image.resize((IMAGES.resize or (0, 0))[::-1], Image.Resampling.BILINEAR)
+    return np.asarray(whole)[top : top + height, left : left + width].transpose(2, 0, 1)
+
+
+def measure() -> list[Figure]:
+    try:
+        import deepaccident_devkit.export.torch  # noqa: F401
+    except MissingExtraError as error:
+        click.echo(f"loader: not measured; {error}", err=True)
+        return []
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        made = make_release(root / "made", RELEASE, workers=2)
+        dataset = DeepAccident(dataroot=copied_release(made, root / "release", scenarios=SCENARIOS), verbose=False)
+        for codec in ("raw", "jpeg"):
+            form = CachedImages(images=SCALED, codec=codec, where=("length>=1",))  # type: ignore[arg-type]
+            export_release(dataset, root / codec, form, workers=2)
+        figures = [*differences(dataset), *sizes(dataset, root)]
+        for team, agents in TEAMS.items():
+            for way, items in ways(dataset, root, agents).items():
+                figures += speeds(way, team, items)
+        return figures
+
+
+def ways(dataset: DeepAccident, root: Path, agents: tuple[str, ...]) -> dict[str, Any]:
+    """Each way to make the items, of the first agent's samples."""
+    from deepaccident_devkit.export.torch import V2XConfig, V2XDataset
+
+    tokens = [record["token"] for record in dataset.sample if record["agent"] == agents[0]]
+    base = V2XConfig(agents=agents, points=False, boxes=None, images=SCALED)
+    configs = {
+        "full": replace(base, images=IMAGES),
+        "scaled": base,
+        "cached_raw": replace(base, images_cache=root / "raw"),
+        "cached_jpeg": replace(base, images_cache=root / "jpeg"),
+    }
+    found: dict[str, Any] = {way: V2XDataset(dataset, tokens, config) for way, config in configs.items()}
+    together = [[token.replace(f"/{agents[0]}/", f"/{agent}/") for agent in agents] for token in tokens]
+    paths = [
+        [[dataset.get_sample_data_path(each, camera) for camera in IMAGES.cameras] for each in moment]
+        for moment in together
+    ]
+    return {**found, "plain": PlainItems(paths)}
+
+
+def speeds(way: str, team: str, items: Any) -> list[Figure]:
+    """The processor time of an item, and items a second of a loader with no worker and with two."""
+    name, count = f"loader_{way}_{team}", len(items)
+    with one_core():
+        seconds = min(processor_seconds(items, index % count) for index in range(max(count, REPEATS)))
+    figures = [Figure(name=f"{name}_ms", value=seconds * 1e3, unit="ms", bound=BOUNDS.get((way, team)))]
+    for workers in (0, 2):
+        value = count / loading_seconds(items, workers)
+        figures.append(Figure(name=f"{name}_items_per_s_{workers}_workers", value=value, unit="items/s"))
+    return figures
+
+
+def processor_seconds(items: Any, index: int) -> float:
+    """Of an item: where other programs work too, the clock's would be theirs as well."""
+    start = time.process_time()
+    items[index]
+    return time.process_time() - start
+
+
+def loading_seconds(items: Any, workers: int) -> float:
+    """Of the fastest epoch; the workers are started before."""
+    from torch.utils.data import DataLoader
+
+    loader: Any = DataLoader(items, num_workers=workers, persistent_workers=workers > 0)
+    epoch: Callable[[], object] = lambda: [None for _ in loader]  # noqa: E731 - what is timed
+    epoch()
+    return best_of(REPEATS, epoch)
+
+
+def differences(dataset: DeepAccident) -> list[Figure]:
+    """How far `scaled` and JPEG of quality 95 are from `full`, in steps of 255."""
+    frames = [f"{record['token']}/{camera}" for record in dataset.sample[:10] for camera in IMAGES.cameras]
+    found = np.concatenate(
+        [
+            np.abs(SCALED.load(dataset, each)[0].astype(np.int16) - IMAGES.load(dataset, each)[0]).ravel()
+            for each in frames
+        ]
+    )
+    return [
+        Figure(name="loader_scaled_difference_mean", value=float(found.mean()), unit="of 255"),
+        Figure(name="loader_scaled_difference_99_percent", value=float(np.percentile(found, 99)), unit="of 255"),
+        Figure(name="loader_scaled_difference_max", value=float(found.max()), unit="of 255"),
+    ]
+
+
+def sizes(dataset: DeepAccident, root: Path) -> list[Figure]:
+    """Bytes of an image: stored, and in the caches."""
+    count = len(dataset.sample) * len(IMAGES.cameras)
+    folders = {
+        "stored": (dataset.dataroot, "*.jpg"),
+        "raw": (root / "raw", "*.images"),
+        "jpeg": (root / "jpeg", "*.images"),
+    }
+    return [
+        Figure(
+            name=f"loader_{name}_kb_per_image",
+            value=sum(path.stat().st_size for path in folder.rglob(pattern)) / count / 1e3,
+            unit="kB",
+        )
+        for name, (folder, pattern) in folders.items()
+    ]

@@ -1,0 +1,23 @@
+"""`python -m benchmarks loader`, on a release that is small enough for a test."""
+
+import importlib
+from pathlib import Path
+
+import pytest
+
+from deepaccident_devkit.synth import SynthConfig
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_every_way_to_load_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(Path(__file__).parents[2])
+    benchmark = importlib.import_module("benchmarks.loader")
+    monkeypatch.setattr(benchmark, "RELEASE", SynthConfig(scenarios=1, frames=2, image_size=(64, 36)))
+    monkeypatch.setattr(benchmark, "TEAMS", {"two": benchmark.TEAMS["two"]})
+    for name in ("SCENARIOS", "REPEATS"):
+        monkeypatch.setattr(benchmark, name, 1)
+    found = {figure.name: figure.value for figure in benchmark.measure()}
+    for way in ("full", "scaled", "cached_raw", "cached_jpeg", "plain"):
+        for ending in ("ms", "items_per_s_0_workers", "items_per_s_2_workers"):
+            assert found.pop(f"loader_{way}_two_{ending}") > 0
+    assert len(found) == 6

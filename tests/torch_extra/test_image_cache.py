@@ -1,0 +1,135 @@
+"""Items whose images come out of a cache, and decoding at a smaller scale."""
+
+import multiprocessing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_array_equal
+from torch.utils.data import DataLoader
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ConfigError, MissingFileError
+from deepaccident_devkit.export.bulk import export_release
+from deepaccident_devkit.export.image_cache import CachedImages
+from deepaccident_devkit.export.torch import ImageConfig, V2XConfig, V2XDataset, collate_fusion
+
+IMAGES = ImageConfig(resize=(18, 30), crop=(2, 3, 12, 25), mean=(0.5, 0.4, 0.3), std=(0.2, 0.3, 0.4))
+CONFIG = V2XConfig(agents="all", past=2, step=2, points=False, boxes=None, images=IMAGES)
+
+
+def cached(dataset: DeepAccident, folder: Path, **fields: Any) -> Path:
+    form = CachedImages(images=IMAGES, where=("length>=1",), **fields)
+    return export_release(dataset, folder, form, workers=1).folder
+
+
+@pytest.fixture(scope="module")
+def folder(da: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return cached(da, tmp_path_factory.mktemp("cache") / "raw")
+
+
+def same(first: Any, second: Any) -> bool:
+    if isinstance(first, torch.Tensor):
+        return torch.equal(first, second)
+    return bool(first == second)
+
+
+def test_images_are_bit_by_bit_those_of_the_plain_recipe(da: DeepAccident, sample: str) -> None:
+    """What `full` gave before its images were written into one block."""
+    item = V2XDataset(da, [sample], CONFIG)[0]
+    assert item["images"].shape == (5, 2, 6, 3, 12, 25)
+    mean, std = (np.array(three, dtype=np.float32)[:, None, None] for three in (IMAGES.mean, IMAGES.std))
+    for a, name in enumerate(item["agents"]):
+        for p, frame in enumerate((2, 4)):
+            for c, camera in enumerate(IMAGES.cameras):
+                token = f"{da.scenario[0]['token']}/{name}/{frame:03d}/{camera}"
+                pixels = np.ascontiguousarray(IMAGES.load(da, token)[0].transpose(2, 0, 1))
+                expected = (pixels.astype(np.float32) / np.float32(255) - mean) / std
+                assert_array_equal(item["images"][a, p, c].numpy(), expected)
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "float32"])
+def test_a_cached_item_is_the_same(da: DeepAccident, folder: Path, tokens: list[str], dtype: Any) -> None:
+    images = replace(IMAGES, dtype="uint8", mean=(0, 0, 0), std=(1, 1, 1)) if dtype == "uint8" else IMAGES
+    config = replace(CONFIG, images=images)
+    plain, quick = (V2XDataset(da, tokens[:3], each) for each in (config, replace(config, images_cache=folder)))
+    for expected, found in zip(plain, quick, strict=True):
+        assert expected.keys() == found.keys()
+        assert all(same(expected[key], found[key]) for key in expected)
+        found["images"][:] = 0  # an item is its receiver's own
+    assert all(same(plain[0][key], quick[0][key]) for key in plain[0])
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+@pytest.mark.parametrize("context", ["fork", "spawn"])
+def test_workers_read_the_cache(da: DeepAccident, folder: Path, tokens: list[str], context: str) -> None:
+    data = V2XDataset(da, tokens, replace(CONFIG, images_cache=folder))
+    here = [data[index] for index in range(len(data))]  # files are open when workers are forked
+    loader = DataLoader(
+        data,
+        batch_size=None,
+        num_workers=2,
+        multiprocessing_context=multiprocessing.get_context(context),
+    )
+    for expected, found in zip(here, loader, strict=True):
+        assert found["token"] == expected["token"]
+        assert torch.equal(found["images"], expected["images"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"images": replace(IMAGES, resize=(36, 60))}, r"has resize=\(18, 30\), wanted is \(36, 60\)"),
+        ({"images": replace(IMAGES, decode="scaled")}, "has decode='full', wanted is 'scaled'"),
+        ({"images_cache": "nowhere"}, "nowhere holds no cache of images"),
+    ],
+)
+def test_what_the_cache_cannot_serve_is_refused(
+    da: DeepAccident, folder: Path, sample: str, changes: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(ConfigError, match=words):
+        V2XDataset(da, [sample], replace(CONFIG, **{"images_cache": folder, **changes}))
+
+
+def test_a_cache_without_images_is_refused() -> None:
+    with pytest.raises(ConfigError, match="images_cache: changes nothing without images"):
+        V2XConfig(images_cache="somewhere")
+
+
+def test_samples_and_agents_that_are_not_in_it_are_refused(da: DeepAccident, sample: str, tmp_path: Path) -> None:
+    alone = cached(da, tmp_path / "out", agents=("ego_vehicle",))
+    config = replace(CONFIG, agents="single", images_cache=alone)
+    assert len(V2XDataset(da, [sample], config)) == 1
+    with pytest.raises(ConfigError, match=r"has no images of .*/other_vehicle; choose other samples or agents"):
+        V2XDataset(da, [sample, sample.replace("ego_vehicle", "other_vehicle")], config)
+    with pytest.raises(ConfigError, match=r"has no images of .*/infrastructure; choose other samples or agents"):
+        V2XDataset(da, [sample], replace(config, agents="+infrastructure"))
+
+
+def test_images_that_the_release_lacked_are_skipped_or_refused(
+    da_partial: DeepAccident, sample: str, tmp_path: Path
+) -> None:
+    out = cached(da_partial, tmp_path / "out")
+    token = sample.replace("ego_vehicle", "other_vehicle")
+    config = V2XConfig(agents=("ego_vehicle",), points=False, images=IMAGES, images_cache=out)
+    with pytest.raises(MissingFileError, match=r"has no image .*/004/Camera_Front, which the release lacked"):
+        V2XDataset(da_partial, [token], config)[0]
+    skipping = replace(config, on_missing="skip")
+    item, expected = (
+        V2XDataset(da_partial, [token], each)[0] for each in (skipping, replace(skipping, images_cache=None))
+    )
+    assert item["agent_valid"].tolist() == [[True], [False]]
+    assert all(same(item[key], expected[key]) for key in item)
+
+
+def test_scaled_items_are_about_the_same(da: DeepAccident, sample: str) -> None:
+    full, scaled = (
+        V2XDataset(da, [sample], replace(CONFIG, images=ImageConfig(resize=(9, 16), dtype="uint8", decode=decode)))[0]
+        for decode in ("full", "scaled")
+    )
+    assert (full["images"].int() - scaled["images"].int()).abs().float().mean() < 6
+    assert torch.equal(full["image_from_ego"], scaled["image_from_ego"])
+    assert collate_fusion([scaled])["images"].dtype == torch.uint8

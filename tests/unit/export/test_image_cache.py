@@ -1,0 +1,201 @@
+"""Resized images in a folder: what is written, what is read back, and what is refused."""
+
+import pickle
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.errors import ChoiceError, ConfigError, ExportError, MissingFileError, SensorFileError
+from deepaccident_devkit.export.bulk import export_release
+from deepaccident_devkit.export.image_cache import CachedImages, ImageCache
+from deepaccident_devkit.export.images import ImageConfig
+from deepaccident_devkit.taxonomy import CAMERAS
+
+IMAGES = ImageConfig(resize=(18, 30), crop=(2, 3, 12, 25))
+ALL = ("length>=1",)
+FEW = ("ego_vehicle", "infrastructure")
+
+
+def made(dataset: DeepAccident, folder: Path, images: ImageConfig = IMAGES, **fields: Any) -> ImageCache:
+    form = CachedImages(**{"images": images, "where": ALL, "agents": FEW, **fields})
+    export_release(dataset, folder, form, workers=1)
+    return ImageCache(folder)
+
+
+@pytest.fixture(scope="module")
+def cache(da: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> ImageCache:
+    return made(da, tmp_path_factory.mktemp("cache") / "raw")
+
+
+def cameras_of(dataset: DeepAccident) -> list[str]:
+    tokens = [record["token"] for record in dataset.sample if record["agent"] in FEW]
+    return [f"{token}/{camera}" for token in tokens for camera in CAMERAS]
+
+
+@pytest.mark.parametrize("decode", ["full", "scaled"])
+def test_raw_images_are_the_uncached_ones(da: DeepAccident, tmp_path: Path, decode: Any) -> None:
+    images = replace(IMAGES, decode=decode)
+    cache = pickle.loads(pickle.dumps(made(da, tmp_path / "out", images)))
+    for camera in cameras_of(da):
+        for found, expected in zip(cache.load(images, da, camera), images.load(da, camera), strict=True):
+            np.testing.assert_array_equal(found, expected)
+        assert cache.has(camera)
+
+
+def test_whole_images_can_be_cropped_later_and_cameras_chosen(da: DeepAccident, tmp_path: Path) -> None:
+    cache = made(da, tmp_path / "out", replace(IMAGES, crop=None))
+    wanted = replace(IMAGES, cameras=("Camera_Back", "Camera_Front"))
+    cache.check(wanted)
+    camera = cameras_of(da)[5]
+    for found, expected in zip(cache.load(wanted, da, camera), wanted.load(da, camera), strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_jpeg_images_are_nearly_the_uncached_ones(da: DeepAccident, cache: ImageCache, tmp_path: Path) -> None:
+    smaller = made(da, tmp_path / "out", codec="jpeg")
+    for camera in cameras_of(da)[::7]:
+        found, intrinsic = smaller.load(IMAGES, da, camera)
+        raw, expected = cache.load(IMAGES, da, camera)
+        assert found.shape == (12, 25, 3)
+        assert np.abs(found.astype(int) - raw).mean() < 6
+        np.testing.assert_array_equal(intrinsic, expected)
+    sizes = [sum(path.stat().st_size for path in each.folder.glob("*.images")) for each in (smaller, cache)]
+    assert sizes[0] < sizes[1]
+
+
+def test_the_plan_is_what_is_written(da: DeepAccident, tmp_path: Path) -> None:
+    for codec, exact in (("raw", 0), ("jpeg", 0.5)):
+        form = CachedImages(images=IMAGES, where=ALL, codec=codec)  # type: ignore[arg-type]
+        done = export_release(da, tmp_path / codec, form, workers=1)
+        assert done.plan.samples == len(da.sample)
+        assert done.plan.files == done.tally.files == len(da.scenario)
+        assert done.plan.bytes == pytest.approx(done.tally.bytes, rel=exact)
+        assert not done.tally.left_out
+
+
+def test_what_a_partial_release_lacks_is_absent(da_partial: DeepAccident, tmp_path: Path) -> None:
+    form = CachedImages(images=IMAGES, where=ALL, agents=("ego_vehicle", "other_vehicle_behind"))
+    done = export_release(da_partial, tmp_path / "out", form, workers=1)
+    frames = sum(record["num_frames"] for record in da_partial.scenario)
+    assert done.tally.left_out == {
+        "agents of scenarios that are not in this release": len(da_partial.scenario),
+        "images that are not in this release": frames,
+    }
+    cache, sample = ImageCache(tmp_path / "out"), f"{da_partial.scenario[0]['token']}/ego_vehicle/003"
+    assert [cache.has(f"{sample}/{camera}") for camera in CAMERAS] == [camera != "Camera_Front" for camera in CAMERAS]
+    assert not cache.has(f"{da_partial.scenario[0]['token']}/other_vehicle_behind/003/Camera_Back")
+    with pytest.raises(MissingFileError, match=r"has no image .*/003/Camera_Front, which the release lacked; unpack"):
+        cache.load(IMAGES, da_partial, f"{sample}/Camera_Front")
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"resize": (36, 60)}, r"has resize=\(18, 30\), wanted is \(36, 60\); choose the same, or make another"),
+        ({"crop": None}, r"has crop=\(2, 3, 12, 25\), wanted is None"),
+        ({"crop": (2, 3, 12, 24)}, r"has crop=\(2, 3, 12, 25\), wanted is \(2, 3, 12, 24\)"),
+        ({"decode": "scaled"}, "has decode='full', wanted is 'scaled'"),
+    ],
+)
+def test_other_images_are_refused(cache: ImageCache, changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        cache.check(replace(IMAGES, **changes))
+    cache.check(replace(IMAGES, dtype="uint8"))
+
+
+def test_a_camera_that_was_left_out_is_refused(da: DeepAccident, tmp_path: Path) -> None:
+    front = replace(IMAGES, cameras=("Camera_Front",))
+    cache = made(da, tmp_path / "out", front)
+    cache.check(front)
+    with pytest.raises(ConfigError, match=r"has cameras=\('Camera_Front',\), wanted is"):
+        cache.check(IMAGES)
+
+
+def test_another_release_and_agents_without_images_are_refused(
+    da: DeepAccident, cache: ImageCache, release_root: Path, tmp_path: Path
+) -> None:
+    scenario = da.scenario[0]["token"]
+    cache.check_release(da, [f"{scenario}/ego_vehicle"])
+    for token in (f"{scenario}/other_vehicle", "elsewhere/unknown/ego_vehicle"):
+        with pytest.raises(ConfigError, match=f"has no images of {token}; choose other samples or agents"):
+            cache.check_release(da, [token])
+    shutil.copytree(release_root, tmp_path / "edited", ignore=shutil.ignore_patterns(".deepaccident", "Camera_*"))
+    edited = DeepAccident("v1", tmp_path / "edited", verbose=False)
+    cache.check_release(edited, [f"{scenario}/ego_vehicle"])  # the images themselves need not be there
+    kind, name = scenario.split("/")
+    label = next((tmp_path / "edited" / kind / "ego_vehicle" / "label" / name).glob("*_002.txt"))
+    label.write_text(label.read_text() + "\n")
+    with pytest.raises(ConfigError, match=f"another release .another state of {scenario}.; make a cache"):
+        cache.check_release(edited, [f"{scenario}/ego_vehicle"])
+
+
+def test_what_is_no_complete_cache_is_refused(da: DeepAccident, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"holds no cache of images \(.*\); make one with deepaccident cache"):
+        ImageCache(tmp_path)
+    form = CachedImages(images=IMAGES, where=ALL, agents=("infrastructure",))
+    export_release(da, tmp_path / "out", form, workers=1, part="1/2")
+    with pytest.raises(ConfigError, match="is not complete; run the deepaccident cache that makes it again"):
+        ImageCache(tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [lambda content: content[:-1], lambda content: content[:20], lambda _: b"", lambda content: b"x" + content],
+)
+def test_a_damaged_file_is_refused(da: DeepAccident, cache: ImageCache, tmp_path: Path, damage: Any) -> None:
+    shutil.copytree(cache.folder, tmp_path / "out")
+    for path in (tmp_path / "out").glob("*.images"):
+        path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(SensorFileError, match=r"\.images: .*; remove the cache of images and make it again"):
+        ImageCache(tmp_path / "out").load(IMAGES, da, cameras_of(da)[0])
+
+
+def test_impossible_caches() -> None:
+    with pytest.raises(ConfigError, match="a cache holds images of one size; give ImageConfig"):
+        CachedImages(images=ImageConfig())
+    with pytest.raises(ChoiceError, match="codec: expected one of raw, jpeg"):
+        CachedImages(images=IMAGES, codec="png")  # type: ignore[arg-type]
+
+
+def command(*words: str | Path) -> Any:
+    return CliRunner().invoke(deepaccident, ["cache", *map(str, words)])
+
+
+def test_on_the_command_line(da: DeepAccident, tmp_path: Path) -> None:
+    words = [da.dataroot, "--out", tmp_path / "out", "--workers", "1", "--resize", "30x18", "--crop", "3,2,25,12"]
+    words += ["--agents", "ego_vehicle", "--cameras", "Camera_Back,Camera_Front", "--decode", "scaled"]
+    refused = command(*words)
+    assert isinstance(refused.exception, ConfigError)
+    assert "as raw images; choose a split or a filter (--split, --where)" in str(refused.exception)
+    assert not (tmp_path / "out").exists()
+    assert "samples:" in refused.output  # the size is said first
+    dry = command(*words, "--where", "length>=1", "--dry-run")
+    assert (dry.exit_code, (tmp_path / "out").exists()) == (0, False)
+    done = command(*words, "--where", "length>=1")
+    assert done.exit_code == 0, done.output
+    cache = ImageCache(tmp_path / "out")
+    assert cache.images == replace(IMAGES, decode="scaled", cameras=("Camera_Back", "Camera_Front"))
+    again = command(*words, "--where", "length>=1")
+    assert "0 written now" in again.output
+    other = command(*words, "--where", "length>=1", "--codec", "jpeg")
+    assert isinstance(other.exception, ConfigError)
+
+
+def test_a_disk_that_is_too_small_is_refused(da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usage = shutil.disk_usage(tmp_path)._replace(free=100_000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
+    with pytest.raises(ExportError, match=r"the export needs about .* are free"):
+        made(da, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("words", [["--resize", "30"], ["--resize", "30x18", "--crop", "3,2,25"]])
+def test_sizes_that_cannot_be_read(da: DeepAccident, tmp_path: Path, words: list[str]) -> None:
+    assert "expected " in command(da.dataroot, "--out", tmp_path / "out", *words).output
