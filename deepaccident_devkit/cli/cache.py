@@ -5,8 +5,8 @@ from typing import Any, get_args
 
 import click
 
-from deepaccident_devkit.cli.export_bulk import export_parameters, run_export
-from deepaccident_devkit.cli.options import WordChoice, pixel_size, refuse_unused
+from deepaccident_devkit.cli.export_bulk import bulk_parameters, run_export
+from deepaccident_devkit.cli.options import WordChoice, pixel_size
 from deepaccident_devkit.export.image_cache import CachedImages, Codec
 from deepaccident_devkit.export.images import Decoding, ImageConfig
 from deepaccident_devkit.taxonomy import CAMERAS
@@ -26,7 +26,7 @@ def _part(context: click.Context, parameter: click.Parameter, value: str | None)
 
 
 @click.command(short_help="Write resized images for training.")
-@export_parameters
+@bulk_parameters
 @click.option(
     "--resize", required=True, callback=pixel_size, metavar="WxH", help="Size of a whole image, such as 704x396."
 )
@@ -61,7 +61,6 @@ def cache(
     Give --split or --where: all images at 704x256 take 0.9 TB as raw pixels. --dry-run says how much yours take. If a
     run is interrupted, the same command continues it.
     """
-    refuse_unused("here: no file is linked", "link")
     names = tuple(name for text in cameras for name in text.split(","))
     images = ImageConfig(resize=resize[::-1], crop=crop, cameras=names or CAMERAS, decode=decode)
     run_export(CachedImages, {"images": images, "codec": codec}, **options)

@@ -28,22 +28,27 @@ _OPTIONS = (
     click.option("--split", help="Only this split: train, val, test, …, or a split file (.txt).  [default: all]"),
     where_parameter,
     agents_parameter,
-    click.option(
-        "--link",
-        type=WordChoice(get_args(Link)),
-        default="hard",
-        show_default=True,
-        help="How images are put there: hard links, else symbolic ones, else copies.",
-    ),
     click.option("--dry-run", is_flag=True, help="Only say how much would be written."),
+)
+_LINK = click.option(
+    "--link",
+    type=WordChoice(get_args(Link)),
+    default="hard",
+    show_default=True,
+    help="How images are put there: hard links, else symbolic ones, else copies.",
 )
 
 
-def export_parameters(verb: Verb) -> Verb:
-    """Give a verb the arguments of a release and of parts, --out, --split, --where, --agents, --link and --dry-run."""
+def bulk_parameters(verb: Verb) -> Verb:
+    """Give a verb the arguments of a release and of parts, --out, --split, --where, --agents and --dry-run."""
     for option in reversed(_OPTIONS):
         verb = option(verb)
     return release_parameters(part_parameters(verb))
+
+
+def export_parameters(verb: Verb) -> Verb:
+    """Give a verb what `bulk_parameters` gives, and --link."""
+    return bulk_parameters(_LINK(verb))
 
 
 def run_export(
@@ -54,7 +59,7 @@ def run_export(
     split: str | None,
     where: tuple[str, ...],
     agents: tuple[str, ...],
-    link: Link,
+    link: Link = "hard",
     dry_run: bool,
     **options: Any,
 ) -> Exported:

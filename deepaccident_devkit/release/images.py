@@ -74,7 +74,7 @@ def write_image(path: Path, image: ByteArray) -> None:
     write_bytes(path, encode_jpeg(path, image))
 
 
-def encode_jpeg(path: Path, image: ByteArray, quality: int = JPEG_QUALITY) -> bytes:
+def encode_jpeg(path: ReleasePath, image: ByteArray, quality: int = JPEG_QUALITY) -> bytes:
     """An RGB image (H, W, 3) uint8 as the bytes of a JPEG file, which errors name; raises SensorFileError."""
     import cv2
 

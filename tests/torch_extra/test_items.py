@@ -211,7 +211,7 @@ def test_a_missing_file_is_named(da_b: DeepAccident) -> None:
 def test_a_broken_file_is_named(da: DeepAccident, sample: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     broken = tmp_path / "broken.jpg"
     broken.write_bytes(b"no image")
-    monkeypatch.setattr(type(da), "get_sample_data_path", lambda *_: broken)
+    monkeypatch.setattr(type(da), "sensor_path", lambda *_: broken)
     with pytest.raises(SensorFileError, match=r"broken\.jpg: not a readable image"):
         V2XDataset(da, [sample], V2XConfig(points=False, images=ImageConfig()))[0]
 

@@ -156,14 +156,14 @@ def _opened_archives(path: Path, archives: Sequence[Path], places: Sequence[Path
     files = [*archives, *(each for each in _split_paths(path) if each.is_file())]
     states = {file.relative_to(base).as_posix(): state_of(file) for file in files}
     name = list_name(sorted(states.items()))
-    known = next((place / name for place in places if (place / name).is_file()), None)
-    if known is None:
-        jobs = [(str(archive), archive.relative_to(base).as_posix()) for archive in archives]
-        how = {"label": "listing archives", **how}
-        listings = run_batch(_listed_archive, jobs, places=Places(reads=(base,)), **how)
-        known = _written(
-            places, name, _with_loose(listings, {each: states[each] for each in states if _is_split(each)})
-        )
+    for known in (place / name for place in places if (place / name).is_file()):
+        with suppress(IndexStoreError):  # a damaged list is made again
+            return StorePath(opened_store(str(path), str(base), known))
+    jobs = [(str(archive), archive.relative_to(base).as_posix()) for archive in archives]
+    how = {"label": "listing archives", **how}
+    listings = run_batch(_listed_archive, jobs, places=Places(reads=(base,)), **how)
+    beside = {file: state for file, state in states.items() if _is_split(file)}
+    known = _written(places, name, _with_loose(listings, beside))
     return StorePath(opened_store(str(path), str(base), known))
 
 

@@ -170,7 +170,7 @@ def test_a_damaged_image_is_an_error_and_the_old_file_stays(
     damaged.write_bytes(b"\xff\xd8no picture")
     old = tmp_path / "a.mcap"
     old.write_bytes(b"before")
-    monkeypatch.setattr(type(da), "get_sample_data_path", lambda *_: damaged)
+    monkeypatch.setattr(type(da), "sensor_path", lambda *_: damaged)
     with pytest.raises(SensorFileError, match=r"damaged\.jpg: not a readable image .*; restore the file"):
         export_mcap(da, scenario, old, channels=["Camera_Front"])
     assert old.read_bytes() == b"before"
@@ -180,7 +180,7 @@ def test_a_damaged_image_is_an_error_and_the_old_file_stays(
 def test_something_else_in_an_images_place_is_an_error(
     da: DeepAccident, scenario: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(type(da), "get_sample_data_path", lambda *_: tmp_path)
+    monkeypatch.setattr(type(da), "sensor_path", lambda *_: tmp_path)
     with pytest.raises(SensorFileError, match=r"not a regular file \(a folder\); restore the file"):
         export_mcap(da, scenario, tmp_path / "a.mcap", channels=["Camera_Front"], on_missing="raise")
 

@@ -139,7 +139,7 @@ def test_an_image_that_was_stored_smaller_has_a_calibration_of_its_size(
 ) -> None:
     small = tmp_path / "small.jpg"
     Image.new("RGB", (32, 18)).save(small)
-    monkeypatch.setattr(type(da), "get_sample_data_path", lambda *_: small)
+    monkeypatch.setattr(type(da), "sensor_path", lambda *_: small)
     made = read_mcap(
         export_mcap(da, scenario, tmp_path / "a.mcap", agents=["ego_vehicle"], channels=["Camera_Front"], frames=[1])
     )

@@ -115,13 +115,13 @@ def test_points_of_the_sweeps_that_are_there(da: DeepAccident, own_sweeps: DeepA
 def own_sweeps(da: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> DeepAccident:
     """`da`, opened again, without the ego's second point cloud."""
     opened = DeepAccident("v1", da.dataroot, verbose=False)
-    path = opened.get_sample_data_path
+    path = opened.sensor_path
 
     def without_second(sample_data: Any) -> Path:
         found: Path = path(sample_data)
         return found.with_name("gone.npz") if "ego_vehicle/lidar01" in str(found) and "_002" in found.name else found
 
-    monkeypatch.setattr(opened, "get_sample_data_path", without_second)
+    monkeypatch.setattr(opened, "sensor_path", without_second)
     return opened
 
 

@@ -18,6 +18,7 @@ from deepaccident_devkit.errors import (
     SensorFileError,
 )
 from deepaccident_devkit.release.store import open_dataroot
+from deepaccident_devkit.release.store.members import Members
 from deepaccident_devkit.release.store.store import opened_store
 from deepaccident_devkit.validation import validate_release
 
@@ -185,13 +186,16 @@ def test_a_changed_archive_at_a_url_is_noticed_and_loose_files_when_asked(small:
     assert kept.store.state != asked.store.state  # type: ignore[union-attr]
 
 
-def test_a_damaged_list_is_told(small: Path, tmp_path: Path) -> None:
+def test_a_damaged_list_is_made_again(small: Path, tmp_path: Path) -> None:
     _opened(small, tmp_path)
     (file,) = (tmp_path / "index").glob("files-*")
-    file.write_bytes(file.read_bytes()[:200])
+    content = file.read_bytes()
+    file.write_bytes(content[:200])
     opened_store.cache_clear()
     with pytest.raises(IndexStoreError, match=r"cannot be read .*; remove it with: deepaccident index clear DATAROOT"):
-        open_dataroot(small, tmp_path / "index", workers=1)
+        Members(file)
+    open_dataroot(small, tmp_path / "index", workers=1)
+    assert file.read_bytes() == content
 
 
 def test_full_disks_are_told(release_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
