@@ -18,7 +18,7 @@ from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.export.sensor_files import sensor_files
 from deepaccident_devkit.release.images import encode_jpeg
 from deepaccident_devkit.tables.tokens import sample_data_token, sample_token
-from deepaccident_devkit.text import choice
+from deepaccident_devkit.text import choice, size_text
 from deepaccident_devkit.v2x.configurations import agents_of
 
 Codec = Literal["raw", "jpeg"]
@@ -63,7 +63,7 @@ class CachedImages(Format):
         if self.split is None and not self.where:
             size = len(dataset.sample) * len(self.images.cameras) * _pixels(self.images) * 3
             raise ConfigError(
-                f"{folder}: all scenarios would take {size / 1e9:,.1f} GB as raw images; choose a split or a filter "
+                f"{folder}: all scenarios would take {size_text(size)} as raw images; choose a split or a filter "
                 "(--split, --where)"
             )
 

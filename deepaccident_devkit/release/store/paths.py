@@ -123,7 +123,7 @@ ReleasePath: TypeAlias = Path | StorePath
 
 
 def real_path(path: ReleasePath) -> Path:
-    """A path that can be written to, and that other programs understand; raises NotAvailableError if it is none."""
+    """A path that other programs can write to; raises NotAvailableError if this has no path of the system."""
     if isinstance(path, Path):
         return path
     raise NotAvailableError(f"{path}: lies in an archive or at a URL, and has no path of its own; unpack it first")

@@ -132,7 +132,7 @@ class UrlSource(Source):
         return bool(_asked(lambda: files.isfile(root)))
 
     def _files(self) -> tuple[Any, str]:
-        """Fsspec's file system, made anew in a forked process, and the path of the URL in it."""
+        """Fsspec's file system, made again in a forked process, and the path of the URL in it."""
         if self._opened is None or self._opened[0] != os.getpid():
             fsspec = _fsspec(self.url)
             files, root = _asked(lambda: fsspec.core.url_to_fs(self.url))

@@ -89,7 +89,7 @@ def member_bytes(content: bytes, member: Member) -> bytes:
 
 
 def head_length(head: bytes) -> int:
-    """Bytes before a member's content, by the beginning of its head; raises RefusedFileError if it is none."""
+    """Bytes before a member's content, by the beginning of its head; raises RefusedFileError if there is no head."""
     if len(head) < HEAD_LENGTH:
         raise damaged("the archive ends before it")
     signature, name, extra = _HEAD.unpack_from(head)

@@ -61,6 +61,7 @@ def test_labels_metrics_and_hashes_are_the_same(opened: dict[str, DeepAccident],
     assert scenario_hashes(other, [token], workers=1) == scenario_hashes(folder, [token], workers=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", STORES)
 def test_a_release_in_a_store_is_valid_and_whole(
     places: dict[str, str], opened: dict[str, DeepAccident], kind: str
@@ -107,6 +108,7 @@ def test_a_file_that_no_archive_holds_is_missing(release_root: Path, tmp_path: P
         dataset.local_path(dataset.sample[0], "lidar01")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", LOCAL_STORES)
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
@@ -119,6 +121,7 @@ def test_workers_read_what_was_pickled(opened: dict[str, DeepAccident], kind: st
         assert list(pool.map(image_sum, [dataset] * 4, [token] * 4)) == [expected] * 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", LOCAL_STORES)
 def test_verbs_take_archives(places: dict[str, str], kind: str, tmp_path: Path) -> None:
     """Every verb opens a dataroot in one of three ways: by the facade, by files alone, by the index."""
@@ -140,6 +143,7 @@ def test_verbs_take_archives(places: dict[str, str], kind: str, tmp_path: Path) 
         assert result.exit_code == 0, (number, result.output)
 
 
+@pytest.mark.slow
 def test_exports_copy_what_they_would_link(opened: dict[str, DeepAccident], tmp_path: Path) -> None:
     from deepaccident_devkit.export.bulk import export_release
     from deepaccident_devkit.export.opencood import OpenCood
