@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, CancelledError
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -102,11 +102,23 @@ def _dask_client(address: str | None, scheduler_file: Path | None) -> Iterator[C
         from distributed import Client
     except ImportError as error:
         raise MissingExtraError("dask is not installed; in a checkout: pip install '.[distributed]'") from error
+
+    class ClosedIfNotMade(Client):  # type: ignore[misc]  # its types are not read
+        """dask closes a client that could not connect when it is collected, which hangs while another one begins."""
+
+        def __init__(self, **options: Any) -> None:
+            try:
+                super().__init__(**options)
+            except BaseException:
+                with suppress(Exception):
+                    self.close(timeout=1)
+                raise
+
     place = str(scheduler_file or address)
     try:
         if scheduler_file is not None:
             _wait_for(scheduler_file)
-        client = Client(address, scheduler_file=scheduler_file, set_as_default=False)
+        client = ClosedIfNotMade(address=address, scheduler_file=scheduler_file, set_as_default=False)
     except (OSError, ValueError, TypeError, KeyError, AssertionError) as error:  # the last ones: an odd file
         raise WorkerError(
             f"{place}: no dask scheduler answers ({error}); start one with `dask scheduler`, and give its address"
