@@ -95,6 +95,8 @@ class Members:
                 raise OSError(fault)
             batch = pa.ipc.open_file(pa.memory_map(str(path))).get_batch(0)
             head = json.loads(batch.schema.metadata[_HEAD])
+            if head["form"] != FORM:
+                raise ValueError("of another version of the devkit")
             names = batch.column("name")
             _, offsets, content = names.buffers()
             self.archives: tuple[str, ...] = tuple(map(str, head["archives"]))
@@ -192,7 +194,7 @@ def write_members(path: Path, listings: Sequence[Listing], states: Mapping[str, 
     _check_once(table, folder, folders, archives)
     last = np.cumsum(np.bincount(folder, minlength=len(folders)))
     rows = zip(folders, [0, *last.tolist()], last.tolist(), strict=False)
-    head = json.dumps({"archives": archives, "folders": list(rows), "states": states})
+    head = json.dumps({"form": FORM, "archives": archives, "folders": list(rows), "states": states})
     table = table.select(["name", "member"]).replace_schema_metadata({_HEAD: head.encode()})
     with replacing(path) as temporary, pa.ipc.new_file(str(temporary), table.schema) as writer:
         writer.write_batch(pa.RecordBatch.from_arrays([_one(column) for column in table.columns], schema=table.schema))

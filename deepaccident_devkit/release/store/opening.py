@@ -82,16 +82,17 @@ def open_dataroot(
         if not (refresh and dataroot.store.is_remote):
             return dataroot
         dataroot = dataroot.store.place
-    text = os.fspath(dataroot)
-    if "://" in text and urlsplit(text).scheme != "file":
-        return _opened_url(UrlSource(text), _places(text, index_dir, outside=outside), refresh=refresh)
-    path = Path(unquote(urlsplit(text).path)) if "://" in text else Path(text)
-    path = Path(os.path.abspath(path.expanduser()))  # noqa: PTH100 - symbolic links stay
-    archives = _archives(path)
+    located = _located(dataroot)
+    places = list(index_places(located, index_dir))
+    if outside:
+        places.reverse()
+    if isinstance(located, str):
+        return _opened_url(UrlSource(located), places, refresh=refresh)
+    archives = _archives(located)
     if not archives:
-        return path
+        return located
     how: dict[str, Any] = {"workers": workers, "executor": executor, "progress": progress}
-    return _opened_archives(path, archives, _places(path, index_dir, outside=outside), **how)
+    return _opened_archives(located, archives, places, **how)
 
 
 def index_places(dataroot: Dataroot, index_dir: Path | None = None) -> Iterator[Path]:
@@ -99,12 +100,11 @@ def index_places(dataroot: Dataroot, index_dir: Path | None = None) -> Iterator[
     if index_dir is not None:
         yield index_dir
         return
-    text = str(dataroot)
-    identity = os.fsencode(text)
-    if "://" not in text:
-        path = Path(text)
-        yield path.parent / INDEX_FOLDER / path.name if path.is_file() else path / INDEX_FOLDER
-        identity = os.fsencode(path.resolve())
+    located = _located(dataroot.store.place if isinstance(dataroot, StorePath) else dataroot)
+    identity = os.fsencode(located)
+    if isinstance(located, Path):
+        yield located.parent / INDEX_FOLDER / located.name if located.is_file() else located / INDEX_FOLDER
+        identity = os.fsencode(located.resolve())
     from platformdirs import user_cache_path
 
     yield user_cache_path("deepaccident_devkit") / hashlib.blake2b(identity, digest_size=8).hexdigest()
@@ -120,10 +120,15 @@ def places_of(root: ReleasePath) -> tuple[Path, ...]:
     return (root,) if isinstance(root, Path) else root.store.places
 
 
-def _places(dataroot: Dataroot, index_dir: Path | None, *, outside: bool) -> list[Path]:
-    """Where a list of files is looked for, and written where that can be done first."""
-    places = list(index_places(dataroot, index_dir))
-    return places[::-1] if outside else places
+def _located(dataroot: str | os.PathLike[str]) -> Path | str:
+    """The absolute path of what a caller names, symbolic links as they are; or the URL."""
+    text = os.fspath(dataroot)
+    if "://" in text:
+        parts = urlsplit(text)
+        if parts.scheme != "file":
+            return text
+        text = unquote(parts.path)
+    return Path(os.path.abspath(Path(text).expanduser()))  # noqa: PTH100
 
 
 def _archives(path: Path) -> list[Path]:
@@ -246,7 +251,7 @@ def _with_loose(listings: Sequence[Listing], files: _States) -> list[Listing]:
 
 
 def _loose(files: _States) -> list[Listing]:
-    """The files at a URL, a listing for each folder."""
+    """Files that are in no archive, a listing for each folder."""
     folders: dict[str, list[str]] = {}
     for path in files:
         folders.setdefault(path.rpartition("/")[0], []).append(path)

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import total_ordering
 from pathlib import Path, PurePath, PurePosixPath
 from typing import TypeAlias
 
-from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.reading import FileKind
+from deepaccident_devkit.errors import DatarootError, NotAvailableError
+from deepaccident_devkit.reading import FileKind, fault_text
 from deepaccident_devkit.release.store.store import COMPARES, READ_BEFORE, Store
 
 
@@ -177,12 +177,27 @@ def listed(folder: ReleasePath) -> list[Entry]:
     return [*folders, *files]
 
 
+def _fetched(paths: Sequence[StorePath]) -> dict[str, bytes] | None:
+    if not paths:
+        return None
+    store = paths[0].store
+    try:
+        return store.fetch(path.inside for path in paths)
+    except FileNotFoundError:  # one after the other they say which one is gone
+        return None
+    except OSError as error:
+        raise DatarootError(f"{store.place}: {fault_text(error)}; check the connection and the credentials") from error
+
+
 @contextmanager
 def fetched(paths: Iterable[ReleasePath]) -> Iterator[None]:
-    """Have small files read together if they are at a URL; in the block, in this thread, they are read from memory."""
+    """Have small files read together if they are at a URL; in the block, in this thread, they are read from memory.
+
+    Raises:
+        DatarootError: the URL cannot be read.
+    """
     remote = [path for path in paths if isinstance(path, StorePath) and path.store.is_remote]
-    known = remote[0].store.fetch(path.inside for path in remote) if remote else None
-    token = READ_BEFORE.set(known)
+    token = READ_BEFORE.set(_fetched(remote))
     try:
         yield
     finally:

@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
-from typing import Any, BinaryIO, Final, TypeVar, cast
+from typing import Any, Final, TypeVar, cast
 from urllib.parse import urlsplit
 
 from deepaccident_devkit.errors import DatarootError, MissingExtraError
@@ -22,6 +22,8 @@ _SECRETS: Final = re.compile(r"\?\S*|(?<=://)[^/@\s]+@")
 _LARGEST_GAP: Final = 1 << 16
 _LARGEST_RANGE: Final = 64 << 20
 """Bytes between two members that are fetched with them, and that are fetched at once."""
+_MOST_OPEN: Final = 256
+"""Archives that are open at once in a process; a system allows some 1,000 files."""
 Range = tuple[str, int, int]
 """An archive, and the first byte and the one after the last."""
 
@@ -38,27 +40,37 @@ class Source(ABC):
         return [self.read(*each) for each in ranges]
 
 
+class _Archive:
+    """An open archive, which is closed when nobody reads it any more."""
+
+    def __init__(self, descriptor: int) -> None:
+        self.descriptor = descriptor
+
+    def __del__(self) -> None:
+        os.close(self.descriptor)
+
+
 class LocalSource(Source):
     """A folder of this machine. An open archive is read by several threads and forked processes at once."""
 
     def __init__(self, folder: Path) -> None:
         """Read below this folder."""
         self._folder = folder
-        self._opened: dict[str, BinaryIO] = {}
-
-    def __del__(self) -> None:
-        """Close the archives."""
-        for file in self._opened.values():
-            file.close()
+        self._opened: dict[str, _Archive] = {}
 
     def read(self, archive: str, start: int, stop: int) -> bytes:
         """Bytes of an archive."""
-        file = self._opened.get(archive)
-        if file is None:  # two threads may open it, and one of the two files is closed when nobody has it any more
-            file = self._opened.setdefault(archive, open_file(self._folder / archive))
-        descriptor = file.fileno()
+        opened = self._opened.get(archive) or self._open(archive)
+        descriptor = opened.descriptor
         content = os.pread(descriptor, stop - start, start)
         return content if len(content) == stop - start else self._rest(descriptor, content, start, stop)
+
+    def _open(self, archive: str) -> _Archive:
+        with open_file(self._folder / archive) as file:
+            opened = self._opened[archive] = _Archive(os.dup(file.fileno()))
+        if len(self._opened) > _MOST_OPEN:
+            self._opened.pop(next(iter(self._opened)), None)
+        return opened
 
     @staticmethod
     def _rest(descriptor: int, content: bytes, start: int, stop: int) -> bytes:
@@ -178,8 +190,8 @@ def _asked(call: Callable[[], Result]) -> Result:
 def _state(detail: Any) -> tuple[int, str]:
     for name in ("ETag", "etag", "md5Hash", "mtime", "LastModified", "last_modified", "created"):
         if detail.get(name) is not None:
-            return int(detail["size"] or 0), str(detail[name])
-    return int(detail["size"] or 0), ""
+            return int(detail.get("size") or 0), str(detail[name])
+    return int(detail.get("size") or 0), ""
 
 
 def source_of(base: str) -> Source:

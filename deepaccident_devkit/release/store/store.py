@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterable
+from contextlib import suppress
 from contextvars import ContextVar
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Final
 
 from deepaccident_devkit.errors import MissingFileError, SensorFileError
-from deepaccident_devkit.reading import FileKind, check_size, fault_text
+from deepaccident_devkit.reading import FileKind, RefusedFileError, check_size, fault_text
 from deepaccident_devkit.release.store.cache import FileCache
 from deepaccident_devkit.release.store.members import Member, Members
 from deepaccident_devkit.release.store.sources import Range, Source, source_of
@@ -72,7 +73,8 @@ class Store:
         member = self._member(name)
         check_size(member.size, kind)
         if self.is_remote and kind in _SENSOR_KINDS:
-            return self._kept(name, member).read_bytes()
+            with suppress(FileNotFoundError):  # another process has just made room
+                return self._kept(name, member).read_bytes()
         return self._bytes(name, member)
 
     def local_path(self, name: str) -> Path:
@@ -91,17 +93,20 @@ class Store:
             raise SensorFileError(f"{self.place}/{name}: {fault_text(error)}") from error
 
     def fetch(self, names: Iterable[str]) -> dict[str, bytes]:
-        """Small files by name, read together; those that are not there, or cannot be read so, are left out."""
+        """Small files by name, read together; those that are not there, or are damaged, are left out.
+
+        Raises:
+            FileNotFoundError: an archive or a file is gone.
+            OSError: nothing can be read.
+        """
         wanted = [(name, member) for name in names if (member := self.members.find(name)) is not None]
         if not wanted:
             return {}
         contents = self._source.read_all([self._range(name, member) for name, member in wanted])
         found = {}
         for (name, member), content in zip(wanted, contents, strict=True):
-            if member.offset >= 0:
-                start = head_length(content[:HEAD_LENGTH])
-                content = _decoded(content[start : start + member.stored], member)  # noqa: PLW2901
-            found[name] = content
+            with suppress(RefusedFileError):  # read by itself it says why
+                found[name] = content if member.offset < 0 else _cut_out(content, member)
         return found
 
     @cached_property
@@ -135,18 +140,20 @@ class Store:
         if member.offset < 0:
             return self._source.read(archive, first, last)
         if self.is_remote:  # one question costs more than the bytes that are too many
-            content = self._source.read(archive, first, last)
-            start = head_length(content[:HEAD_LENGTH])
-            content = content[start : start + member.stored]
-        else:
-            start = member.offset + head_length(self._source.read(archive, first, first + HEAD_LENGTH))
-            content = self._source.read(archive, start, start + member.stored)
-        if len(content) < member.stored:
-            raise damaged(f"{archive} ends before it")
-        return _decoded(content, member)
+            return _cut_out(self._source.read(archive, first, last), member)
+        start = member.offset + head_length(self._source.read(archive, first, first + HEAD_LENGTH))
+        return _decoded(self._source.read(archive, start, start + member.stored), member)
+
+
+def _cut_out(content: bytes, member: Member) -> bytes:
+    """A member's bytes, from those of an archive from its head on."""
+    start = head_length(content[:HEAD_LENGTH])
+    return _decoded(content[start : start + member.stored], member)
 
 
 def _decoded(content: bytes, member: Member) -> bytes:
+    if len(content) < member.stored:
+        raise damaged("the archive ends before it")
     content = member_bytes(content, member)
     if COMPARES.get() and zlib.crc32(content) != member.version:
         raise damaged("its bytes do not agree with its checksum")

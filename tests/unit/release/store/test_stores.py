@@ -13,9 +13,12 @@ from packing import files_of, image_sum, packed
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
-from deepaccident_devkit.errors import MissingFileError, NotAvailableError
+from deepaccident_devkit.errors import DatarootError, MissingFileError, NotAvailableError
 from deepaccident_devkit.evaluation import MotionEvaluator, instances_of
+from deepaccident_devkit.reading import RefusedFileError
 from deepaccident_devkit.release.fingerprints import scenario_hashes
+from deepaccident_devkit.release.store.cache import FileCache
+from deepaccident_devkit.release.store.sources import LocalSource, UrlSource
 from deepaccident_devkit.taxonomy import CHANNELS
 from deepaccident_devkit.validation import release_completeness, validate_release
 
@@ -186,3 +189,33 @@ def test_where_nothing_can_be_written_lists_are_kept_in_the_cache(
     dataset = DeepAccident(dataroot=tmp_path / "all.zip", workers=1, verbose=False)
     assert tmp_path / "cache" in dataset.tables_folder.parents
     assert not (tmp_path / ".deepaccident").exists()
+
+
+def test_as_many_archives_are_open_as_the_system_allows(
+    opened: dict[str, DeepAccident], places: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("deepaccident_devkit.release.store.sources._MOST_OPEN", 2)
+    source = LocalSource(Path(places["zips"]))
+    for path in [*sorted(Path(places["zips"]).rglob("*.zip"))] * 2:
+        assert source.read(path.relative_to(places["zips"]).as_posix(), 0, 4) == b"PK\x03\x04"
+        assert len(source._opened) <= 2
+
+
+def test_a_copy_that_another_process_removes_is_read_from_the_url(
+    opened: dict[str, DeepAccident], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sample = opened["folder"].sample[5]["token"]
+    monkeypatch.setattr(FileCache, "put", lambda *_: None)
+    assert image_sum(opened["memory"], sample) == image_sum(opened["folder"], sample)
+
+
+@pytest.mark.parametrize("kind", ["memory", "memory zips"])
+def test_a_url_that_fails_amid_indexing_is_told(
+    places: dict[str, str], kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def gone(*_: object) -> None:
+        raise RefusedFileError(5, "cannot be read (the line is dead)")
+
+    monkeypatch.setattr(UrlSource, "read_all", gone)
+    with pytest.raises(DatarootError, match=r"memory://.*: cannot be read \(the line is dead\); check the connection"):
+        DeepAccident(dataroot=places[kind], index_dir=tmp_path, workers=1, verbose=False)
