@@ -76,6 +76,7 @@ NOT_RUN = {
     "synth ": "tests/test_cli_synth.py has them; some take minutes",
     "render accident OUT": "tests/unit/synth/test_own_files.py has it, on a release of a scenario file",
     "baseline v2x": "tests/test_cli_baseline.py has it, on smaller releases",
+    "info s3:": "tests/cloud has releases on S3",
     "results from": "tests/unit/export/test_nuscenes_detections.py has it, and makes the file",
     "export mcap": "tests/unit/export has it, which has the extra",
 }
