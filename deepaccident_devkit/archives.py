@@ -22,7 +22,7 @@ _LOCAL_LENGTH, _END_LENGTH, _LARGE_END_LENGTH, _LOCATOR_LENGTH = 30, 22, 56, 20
 _LONGEST_END: Final = _LARGE_END_LENGTH + _LOCATOR_LENGTH + _END_LENGTH + (1 << 16) - 1
 """Bytes at the end of a file among which its archive's end is: the last of it is a comment."""
 _MOST_DIRECTORY: Final = 4 << 20
-"""Bytes of an archive's directory: Python needs some twenty times as many for it."""
+"""Bytes of the directory of a results file or a bundle."""
 _UTF8: Final = 1 << 11
 """Of a member's flags: its name is not in code page 437."""
 _HEADER_READERS: Final = {(1, 0): "read_array_header_1_0", (2, 0): "read_array_header_2_0"}
@@ -53,7 +53,7 @@ def open_zip(source: Path | bytes) -> zipfile.ZipFile:
         zipfile.BadZipFile: it is no zip, or does not begin at its first and end at its last byte.
     """
     with io.BytesIO(source) if isinstance(source, bytes) else open_file(source) as file:
-        _check_end(file)
+        check_end(file, _MOST_DIRECTORY)
     # opened again by its path, so that the archive closes the file
     archive = zipfile.ZipFile(io.BytesIO(source) if isinstance(source, bytes) else source)
     if min([entry.header_offset for entry in archive.infolist()], default=0):
@@ -116,8 +116,13 @@ def array_of(content: bytes, kind: FileKind) -> AnyArray:
     return flat.reshape(shape[::-1]).T if fortran else flat.reshape(shape)
 
 
-def _check_end(file: BinaryIO) -> None:
-    """Raise unless a file ends with an archive's end, whose directory is not too large."""
+def check_end(file: BinaryIO, most: int) -> None:
+    """Look at the end of an archive before Python reads its directory, which takes some twenty times as much memory.
+
+    Raises:
+        RefusedFileError: the directory has more than `most` bytes.
+        zipfile.BadZipFile: the file does not end with an archive's end.
+    """
     size = file.seek(0, os.SEEK_END)
     start = file.seek(max(0, size - _LONGEST_END))
     tail = file.read(_LONGEST_END)
@@ -132,10 +137,8 @@ def _check_end(file: BinaryIO) -> None:
         if not tail.startswith(_LARGE_END, max(0, record)) or _number(tail, large + 8, 8) != start + record:
             raise zipfile.BadZipFile("its end is damaged")
         directory = _number(tail, record + 40, 8)
-    if directory > _MOST_DIRECTORY:
-        raise RefusedFileError(
-            errno.EFBIG, f"the archive's directory has {directory:,} bytes, more than {_MOST_DIRECTORY:,}"
-        )
+    if directory > most:
+        raise RefusedFileError(errno.EFBIG, f"the archive's directory has {directory:,} bytes, more than {most:,}")
 
 
 def _stored(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:

@@ -31,6 +31,7 @@ FileKind: TypeAlias = Literal[
     "motion_labels",
     "cloud",
     "spec",
+    "archive",
 ]
 _MIB: Final = 1 << 20
 LIMITS: Final[Mapping[str, int]] = MappingProxyType(
@@ -48,6 +49,7 @@ LIMITS: Final[Mapping[str, int]] = MappingProxyType(
         "motion_labels": 256 * _MIB,
         "cloud": 256 * _MIB,
         "spec": _MIB,
+        "archive": 512 * _MIB,
     }
 )
 """Kind of file → bytes that may be read of it at once, and that may be decoded from it at once.

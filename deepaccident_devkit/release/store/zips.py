@@ -11,8 +11,9 @@ from typing import BinaryIO, Final
 
 import numpy as np
 
+from deepaccident_devkit.archives import check_end
 from deepaccident_devkit.errors import DatarootError
-from deepaccident_devkit.reading import MOST_TOLD, RefusedFileError, shortened
+from deepaccident_devkit.reading import LIMITS_VARIABLE, MOST_TOLD, RefusedFileError, fault_text, limit_of, shortened
 from deepaccident_devkit.release.store.members import Listing, Member
 from deepaccident_devkit.release.store.names import is_release_file, release_folder
 
@@ -45,10 +46,14 @@ def list_zip(file: BinaryIO, archive: str, shown: str, size: int) -> Listing:
         DatarootError: it is no zip, truncated or damaged, or a member is encrypted or compressed by an unknown method.
     """
     try:
+        check_end(file, limit_of("archive"))
         with zipfile.ZipFile(file) as opened:
             entries = opened.infolist()
+    except RefusedFileError as error:  # by the gate, or by a URL
+        sound = f"; if the archive is sound, set {LIMITS_VARIABLE}=archive=4G" if error.errno == errno.EFBIG else ""
+        raise DatarootError(f"{shown}: {fault_text(error)}{sound}") from error
     except _DAMAGED as error:
-        told = shortened(str(error) or type(error).__name__, MOST_TOLD)
+        told = shortened(fault_text(error), MOST_TOLD)
         raise DatarootError(f"{shown}: not a readable zip archive ({told}); {_REMEDY}") from error
     leading = PurePosixPath(archive).with_suffix("").parts
     folder_of: dict[str, str | None] = {}

@@ -134,6 +134,17 @@ def test_a_bomb_is_not_unpacked(tmp_path: Path) -> None:
         (root / _NAME).content("calib")  # type: ignore[union-attr]
 
 
+def test_a_list_of_members_that_is_too_large_is_refused(
+    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DEEPACCIDENT_LIMITS", "archive=10")
+    with pytest.raises(
+        DatarootError,
+        match=r"small\.zip: .*the archive's directory has \d+ bytes, more than 10; if .* set DEEPACCIDENT_LIMITS=archive=4G",
+    ):
+        _opened(small, tmp_path)
+
+
 def test_names_that_lead_out_of_an_archive_are_of_no_release(tmp_path: Path) -> None:
     path = tmp_path / "odd.zip"
     with zipfile.ZipFile(path, "w") as archive:
