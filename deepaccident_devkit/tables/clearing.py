@@ -8,7 +8,7 @@ from pathlib import Path
 
 from deepaccident_devkit.errors import IndexStoreError, VersionError
 from deepaccident_devkit.files import temporary_of
-from deepaccident_devkit.release.store import Dataroot, list_files_in
+from deepaccident_devkit.release.store import Dataroot, index_places, list_files_in
 from deepaccident_devkit.tables.index import index_folders
 from deepaccident_devkit.tables.indexing import MARK_FILE, SHARDS_FOLDER
 from deepaccident_devkit.tables.locking import LOCK_FILE, index_lock
@@ -68,11 +68,12 @@ def clear_index(dataroot: Dataroot, *, version: str = "v1", index_dir: Path | No
             removed = _remove(folder)
         if had_index:
             cleared.append(removed)
-        for listing in list_files_in(folder.parent):
-            listing.unlink(missing_ok=True)
-        if index_dir is None:
-            with suppress(OSError):  # not empty: another version's index
-                folder.parent.rmdir()
+    for place in index_places(dataroot, index_dir):
+        with suppress(OSError):  # not there, or not empty: another version's index
+            for listing in list_files_in(place):
+                listing.unlink(missing_ok=True)
+            if index_dir is None:
+                place.rmdir()
     return cleared
 
 

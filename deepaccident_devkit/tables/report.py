@@ -122,7 +122,7 @@ class IndexReport(ShortRepr):
 def index_report(
     dataroot: Dataroot, *, version: str | None = None, index_dir: Path | None = None, check_files: bool = False
 ) -> IndexReport:
-    """Look at the indexes of a dataroot, in its own folder and in the user's cache; changes nothing.
+    """Look at the indexes of a dataroot, in its own folder and in the user's cache; changes none.
 
     Args:
         dataroot: the release, as of `DeepAccident`.

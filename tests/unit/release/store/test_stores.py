@@ -17,8 +17,10 @@ from deepaccident_devkit.errors import DatarootError, MissingFileError, NotAvail
 from deepaccident_devkit.evaluation import MotionEvaluator, instances_of
 from deepaccident_devkit.reading import RefusedFileError
 from deepaccident_devkit.release.fingerprints import scenario_hashes
+from deepaccident_devkit.release.store import open_dataroot
 from deepaccident_devkit.release.store.cache import FileCache
 from deepaccident_devkit.release.store.sources import LocalSource, UrlSource
+from deepaccident_devkit.tables import clear_index
 from deepaccident_devkit.taxonomy import CHANNELS
 from deepaccident_devkit.validation import release_completeness, validate_release
 
@@ -219,3 +221,12 @@ def test_a_url_that_fails_amid_indexing_is_told(
     monkeypatch.setattr(UrlSource, "read_all", gone)
     with pytest.raises(DatarootError, match=r"memory://.*: cannot be read \(the line is dead\); check the connection"):
         DeepAccident(dataroot=places[kind], index_dir=tmp_path, workers=1, verbose=False)
+
+
+def test_clear_removes_the_lists_too(release_root: Path, tmp_path: Path) -> None:
+    archive = packed(release_root, tmp_path / "all.zip")
+    DeepAccident(dataroot=archive, workers=1, verbose=False)
+    assert [each.folder.name for each in clear_index(archive)] == ["v1"]
+    open_dataroot(archive, workers=1)
+    assert clear_index(archive) == []
+    assert [each for each in (tmp_path / ".deepaccident").rglob("*") if each.is_file()] == []
