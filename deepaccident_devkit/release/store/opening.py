@@ -29,7 +29,7 @@ from deepaccident_devkit.release.store.names import (
     release_folder,
 )
 from deepaccident_devkit.release.store.paths import Dataroot, ReleasePath, StorePath, listed
-from deepaccident_devkit.release.store.sources import UrlSource
+from deepaccident_devkit.release.store.sources import UrlSource, asked
 from deepaccident_devkit.release.store.store import opened_store
 from deepaccident_devkit.release.store.zips import list_zip
 
@@ -234,8 +234,11 @@ def _files_at(base: UrlSource, url: str) -> tuple[_States, _States]:
 
 
 def _listed_at(base: UrlSource, archive: str, size: int) -> Listing:
-    with base.opened(archive) as file:
-        return list_zip(file, archive, f"{base.url}/{archive}", size)
+    def listing() -> Listing:
+        with base.opened(archive) as file:
+            return list_zip(file, archive, f"{base.url}/{archive}", size)
+
+    return asked(listing)
 
 
 def _is_split(path: str) -> bool:

@@ -71,18 +71,9 @@ class StorePath:
         return PurePosixPath(self.name).stem
 
     @property
-    def suffix(self) -> str:
-        """The ending of the last name, with its dot."""
-        return PurePosixPath(self.name).suffix
-
-    @property
     def parent(self) -> StorePath:
         """The folder above; the release's folder is its own."""
         return StorePath(self.store, self.inside.rpartition("/")[0])
-
-    def relative_to(self, other: StorePath) -> PurePosixPath:
-        """The path from another one above it; raises ValueError if that is not above it."""
-        return PurePosixPath(self.inside).relative_to(other.inside)
 
     def resolve(self) -> StorePath:
         """Itself: there are no links."""

@@ -9,7 +9,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, Final, TypeVar, cast
 from urllib.parse import urlsplit
 
@@ -93,7 +93,7 @@ class UrlSource(Source):
     def read(self, archive: str, start: int, stop: int) -> bytes:
         """Bytes of an archive, or of a file."""
         files, root = self._files()
-        content = _asked(lambda: files.cat_file(f"{root}/{archive}", start=start, end=stop))
+        content = asked(lambda: files.cat_file(f"{root}/{archive}", start=start, end=stop))
         return cast("bytes", content)
 
     def read_all(self, ranges: Sequence[Range]) -> list[bytes]:
@@ -105,7 +105,7 @@ class UrlSource(Source):
         merged = merge_offset_ranges(names, starts, stops, max_gap=_LARGEST_GAP, max_block=_LARGEST_RANGE, sort=True)
         names, starts, stops = merged
         paths = [f"{root}/{name}" for name in names]
-        blocks = _asked(lambda: files.cat_ranges(paths, starts, stops, on_error="raise"))
+        blocks = asked(lambda: files.cat_ranges(paths, starts, stops, on_error="raise"))
         found = {(name, start): block for name, start, block in zip(names, starts, blocks, strict=True)}
         firsts: dict[str, list[int]] = {}
         for name, start in sorted(found):
@@ -119,35 +119,26 @@ class UrlSource(Source):
     def list_files(self) -> dict[str, tuple[int, str]]:
         """The files below the URL: path from there → bytes, and a text that changes with the file; raises OSError."""
         files, root = self._files()
-        found = _asked(lambda: files.find(root, detail=True))
-        return {
-            PurePosixPath(path).relative_to(PurePosixPath(root)).as_posix(): _state(detail)
-            for path, detail in found.items()
-            if path != root
-        }
+        found = asked(lambda: files.find(root, detail=True))
+        return {path.removeprefix(f"{root}/"): _state(detail) for path, detail in found.items() if path != root}
 
     def state_of(self, archive: str) -> tuple[int, str]:
         """An archive's bytes, and a text that changes with it; raises OSError."""
         files, root = self._files()
-        return _state(_asked(lambda: files.info(f"{root}/{archive}")))
+        return _state(asked(lambda: files.info(f"{root}/{archive}")))
 
     @contextmanager
     def opened(self, archive: str) -> Iterator[Any]:
         """An archive as a file in which one can move; raises OSError."""
         files, root = self._files()
-        with _asked(lambda: files.open(f"{root}/{archive}", "rb")) as file:
+        with asked(lambda: files.open(f"{root}/{archive}", "rb")) as file:
             yield file
-
-    def is_file(self) -> bool:
-        """Whether the URL is that of one file; raises OSError."""
-        files, root = self._files()
-        return bool(_asked(lambda: files.isfile(root)))
 
     def _files(self) -> tuple[Any, str]:
         """Fsspec's file system, made again in a forked process, and the path of the URL in it."""
         if self._opened is None or self._opened[0] != os.getpid():
             fsspec = _fsspec(self.url)
-            files, root = _asked(lambda: fsspec.core.url_to_fs(self.url))
+            files, root = asked(lambda: fsspec.core.url_to_fs(self.url))
             self._opened = (os.getpid(), files, root.rstrip("/"))
         return self._opened[1:]
 
@@ -172,7 +163,7 @@ def _fsspec(url: str) -> Any:
     return fsspec
 
 
-def _asked(call: Callable[[], Result]) -> Result:
+def asked(call: Callable[[], Result]) -> Result:
     """What a call of fsspec returns; whatever a library below raises becomes an OSError whose words hold no secret."""
     try:
         return call()
