@@ -244,7 +244,12 @@ class Dataset(OpenTables):
         return PinholeCamera(self._intrinsic(row), view["width"].item(row), view["height"].item(row))
 
     def load_image(
-        self, sample_data: RowArgument, channel: str | None = None, *, least: tuple[int, int] | None = None
+        self,
+        sample_data: RowArgument,
+        channel: str | None = None,
+        *,
+        least: tuple[int, int] | None = None,
+        size: tuple[int, int] | None = None,
     ) -> ByteArray:
         """A camera's image (H, W, 3) uint8, RGB.
 
@@ -253,6 +258,7 @@ class Dataset(OpenTables):
             channel: the camera, such as `Camera_Front`; None where `sample_data` names it.
             least: a height and width that suffice, for speed: a JPEG is decoded at 1/2, 1/4 or 1/8 of its size if that
                 is no smaller. None decodes all of it.
+            size: a height and width to resize it to, by Pillow's bilinear filter; None keeps its own.
 
         Raises:
             TokenError: no such sensor file.
@@ -263,7 +269,7 @@ class Dataset(OpenTables):
         _, name = self._sensor(sample_data, channel)
         if name not in CAMERAS:
             raise ChoiceError(f"{name} holds no images; the cameras are {', '.join(CAMERAS)}")
-        return read_image(self.sensor_path(sample_data, channel), least=least)
+        return read_image(self.sensor_path(sample_data, channel), least=least, size=size)
 
     def load_point_cloud(self, sample: RowArgument, frame: Frame = "world") -> LidarPointCloud:
         """A sample's LiDAR points in `world`, `ego` or `lidar`.

@@ -85,11 +85,7 @@ class ImageConfig:
         if self.decode == "scaled" and self.resize is not None:
             image = dataset.load_image(camera, least=self.resize)
             return _resized_part(image, self.resize, self.crop), self.intrinsic(lens, self.resize)
-        image = dataset.load_image(camera)
-        if self.resize is not None and image.shape[:2] != self.resize:
-            from PIL import Image
-
-            image = np.asarray(Image.fromarray(image).resize(self.resize[::-1], Image.Resampling.BILINEAR))
+        image = dataset.load_image(camera, size=self.resize)
         height, width = image.shape[:2]
         return self.cropped(image), self.intrinsic(lens, (height, width))
 

@@ -26,7 +26,13 @@ _BYTES_A_PIXEL = 3
 _REMEDY = "restore the file from its archive"
 
 
-def read_image(path: ReleasePath, *, raw: bool = False, least: tuple[int, int] | None = None) -> ByteArray:
+def read_image(
+    path: ReleasePath,
+    *,
+    raw: bool = False,
+    least: tuple[int, int] | None = None,
+    size: tuple[int, int] | None = None,
+) -> ByteArray:
     """An image as (H, W, 3) uint8, RGB.
 
     Args:
@@ -34,13 +40,14 @@ def read_image(path: ReleasePath, *, raw: bool = False, least: tuple[int, int] |
         raw: return the pixels in the file's own mode, without conversion to RGB: (H, W) for a grey image.
         least: a height and width that suffice: a JPEG is decoded at 1/2, 1/4 or 1/8 of its size (rounded up) if that
             is no smaller, which takes less time. None decodes all of it.
+        size: height and width to which what was decoded is resized, by Pillow's bilinear filter; None keeps its own.
 
     Raises:
         MissingFileError: there is no such file.
         SensorFileError: it is truncated, neither JPEG nor PNG, too large, or no file. (Of a truncated one, OpenCV
             returns a half-grey picture.)
     """
-    return decode_image(path, read_image_bytes(path), raw=raw, least=least)
+    return decode_image(path, read_image_bytes(path), raw=raw, least=least, size=size)
 
 
 def read_image_bytes(path: ReleasePath) -> bytes:
@@ -49,14 +56,24 @@ def read_image_bytes(path: ReleasePath) -> bytes:
 
 
 def decode_image(
-    path: ReleasePath, content: bytes, *, raw: bool = False, least: tuple[int, int] | None = None
+    path: ReleasePath,
+    content: bytes,
+    *,
+    raw: bool = False,
+    least: tuple[int, int] | None = None,
+    size: tuple[int, int] | None = None,
 ) -> ByteArray:
     """The image in the bytes of a file, which errors name; as `read_image` returns it."""
+    from PIL import Image
+
     with _opened(path, content, _FORMATS) as image:
         if least is not None:
             image.draft(None, least[::-1])
         image.load()
-        return np.array(image if raw or image.mode == "RGB" else image.convert("RGB"))
+        picture = image if raw or image.mode == "RGB" else image.convert("RGB")
+        if size is not None and picture.size != size[::-1]:
+            picture = picture.resize(size[::-1], Image.Resampling.BILINEAR)
+        return np.array(picture)
 
 
 def read_jpeg(path: ReleasePath) -> tuple[bytes, tuple[int, int]]:

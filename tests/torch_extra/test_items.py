@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
+from PIL import Image
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import (
@@ -120,14 +121,16 @@ def test_a_resized_and_cropped_image_hits_the_same_pixels(da: DeepAccident, samp
 
 
 def test_what_an_image_shows_moves_with_its_intrinsic(
-    da: DeepAccident, sample: str, monkeypatch: pytest.MonkeyPatch
+    da: DeepAccident, sample: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """A picture whose colours say where they are: each pixel of the result is what stood where its centre maps to."""
     u, v = np.meshgrid(np.arange(64) + 0.5, np.arange(36) + 0.5)
     ramp = np.stack([2 * u, 4 * v, 0 * u], axis=-1).round().astype(np.uint8)
-    monkeypatch.setattr(type(da), "load_image", lambda *_: ramp)
+    file = tmp_path / "ramp.png"
+    Image.fromarray(ramp).save(file)
+    monkeypatch.setattr(type(da), "sensor_path", lambda *_: file)
     image, intrinsic = ImageConfig(resize=(18, 32), crop=(2, 4, 12, 20)).load(da, f"{sample}/Camera_Front")
-    old = da.get_sample_data(f"{sample}/Camera_Front")[2]
+    old = da.camera(f"{sample}/Camera_Front").intrinsic
     back = old @ np.linalg.inv(intrinsic)
     rows, columns = np.mgrid[0:12, 0:20] + 0.5
     was = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ back.T
@@ -301,7 +304,7 @@ def test_a_crop_beyond_the_stored_image(da: DeepAccident, sample: str) -> None:
 
 def test_images_of_different_sizes(da: DeepAccident, sample: str, monkeypatch: pytest.MonkeyPatch) -> None:
     sizes = iter([(4, 5), (4, 6)])
-    monkeypatch.setattr(type(da), "load_image", lambda *_: np.zeros((*next(sizes), 3), dtype=np.uint8))
+    monkeypatch.setattr(type(da), "load_image", lambda *_, **__: np.zeros((*next(sizes), 3), dtype=np.uint8))
     with pytest.raises(ConfigError, match=r"different sizes, \(4, 5\) and \(4, 6\); choose resize="):
         V2XDataset(da, [sample], V2XConfig(points=False, images=ImageConfig()))[0]
 
