@@ -103,7 +103,7 @@ def _dask_client(address: str | None, scheduler_file: Path | None) -> Iterator[C
     except ImportError as error:
         raise MissingExtraError("dask is not installed; in a checkout: pip install '.[distributed]'") from error
 
-    class ClosedIfNotMade(Client):  # type: ignore[misc]  # its types are not read
+    class ClosedIfNotMade(Client):  # type: ignore[misc]
         """dask closes a client that could not connect when it is collected, which hangs while another one begins."""
 
         def __init__(self, **options: Any) -> None:

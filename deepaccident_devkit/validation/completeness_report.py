@@ -50,7 +50,7 @@ class FileCount:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LackingScenario:
+class LackingScenario(ShortRepr):
     """A scenario that is not whole.
 
     Attributes:
