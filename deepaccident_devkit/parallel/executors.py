@@ -102,23 +102,11 @@ def _dask_client(address: str | None, scheduler_file: Path | None) -> Iterator[C
         from distributed import Client
     except ImportError as error:
         raise MissingExtraError("dask is not installed; in a checkout: pip install '.[distributed]'") from error
-
-    class ClosedIfNotMade(Client):  # type: ignore[misc]
-        """dask closes a client that could not connect when it is collected, which hangs while another one begins."""
-
-        def __init__(self, **options: Any) -> None:
-            try:
-                super().__init__(**options)
-            except BaseException:
-                with suppress(Exception):
-                    self.close(timeout=1)
-                raise
-
     place = str(scheduler_file or address)
     try:
         if scheduler_file is not None:
             _wait_for(scheduler_file)
-        client = ClosedIfNotMade(address=address, scheduler_file=scheduler_file, set_as_default=False)
+        client = _made(Client, address=address, scheduler_file=scheduler_file, set_as_default=False)
     except (OSError, ValueError, TypeError, KeyError, AssertionError) as error:  # the last ones: an odd file
         raise WorkerError(
             f"{place}: no dask scheduler answers ({error}); start one with `dask scheduler`, and give its address"
@@ -126,6 +114,18 @@ def _dask_client(address: str | None, scheduler_file: Path | None) -> Iterator[C
     with client:
         _check_workers(client, place)
         yield client
+
+
+def _made(kind: Any, **options: Any) -> Client:
+    """A dask client; one that cannot connect is closed at once: closed when it is collected, it may hang the next one."""
+    client: Any = kind.__new__(kind)
+    try:
+        client.__init__(**options)
+    except BaseException:
+        with suppress(Exception):
+            client.close(timeout=1)
+        raise
+    return client
 
 
 def _wait_for(file: Path) -> None:

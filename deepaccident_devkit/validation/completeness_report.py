@@ -69,7 +69,7 @@ class LackingScenario(ShortRepr):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SplitFiles:
+class SplitFiles(ShortRepr):
     """What is here of the scenarios of a split.
 
     Attributes:

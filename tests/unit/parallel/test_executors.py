@@ -40,9 +40,7 @@ def test_a_wrong_scheduler_file(tmp_path: Path, content: str | None, monkeypatch
     with pytest.raises(WorkerError, match=rf"^{path}: no dask scheduler answers"), cluster_executor(None, path):
         pass
     # one that is left would be closed when it is collected, which may hang the next one
-    assert not [
-        each for each in gc.get_objects() if type(each).__name__ == "ClosedIfNotMade" and each.status != "closed"
-    ]
+    assert not [each for each in gc.get_objects() if type(each).__name__ == "Client" and each.status != "closed"]
 
 
 @pytest.mark.parametrize(("package", "address"), [("distributed", "tcp://127.0.0.1:1"), ("mpi4py", "mpi")])
