@@ -117,7 +117,7 @@ def _dask_client(address: str | None, scheduler_file: Path | None) -> Iterator[C
 
 
 def _made(kind: Any, **options: Any) -> Client:
-    """A dask client; one that cannot connect is closed at once: closed when it is collected, it may hang the next one."""
+    """A dask client; one that cannot connect is closed at once: when it is collected, that may hang the next one."""
     client: Any = kind.__new__(kind)
     try:
         client.__init__(**options)
