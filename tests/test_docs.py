@@ -176,6 +176,13 @@ def test_the_code_on_evaluating_runs(in_labels_demo: Path, capsys: pytest.Captur
     assert "all numbers are equal" in capsys.readouterr().out
 
 
+def test_the_code_on_dataroots_runs(in_demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DEEPACCIDENT_CACHE", str(tmp_path / "copies"))
+    names = run_page(DOCS / "dataroots.md")
+    assert names["image"].shape == (36, 64, 3)
+    assert tmp_path / "copies" in names["path"].parents
+
+
 def test_the_commands_of_the_gallery_run(da_motion: DeepAccident, in_demo: Path) -> None:
     """`docs/make_pictures.py` runs them, too, and takes minutes."""
     (in_demo / "many").symlink_to(da_motion.dataroot, target_is_directory=True)
