@@ -85,18 +85,21 @@ def rigid_inverse(matrix: Float32Array) -> Float32Array:
 
 
 def inverse(matrix: Float32Array) -> Float32Array:
-    """The inverses of transforms (N, 4, 4) whose last row is (0, 0, 0, 1), by elimination with row exchanges."""
+    """The inverses of transforms (N, 4, 4) whose last row is (0, 0, 0, 1), by elimination with row exchanges.
+
+    Of the last row all products are zero, and its own number is one: its steps change nothing and are left out.
+    """
     mixed, order = _eliminated(matrix)
     every = np.arange(len(matrix))[:, None]
     solved = np.zeros_like(matrix)
     solved[every, np.arange(4), order] = 1
-    for row in range(1, 4):
-        solved[:, row] -= product(mixed[:, row, None, :row], solved[:, :row])[:, 0]
-    for row in reversed(range(4)):
-        if row < 3:
-            rest = slice(None, row, -1)
-            solved[:, row] -= product(mixed[:, row, None, rest], solved[:, rest])[:, 0]
-        solved[:, row] *= np.float32(1) / mixed[:, row, row, None]
+    for row, others in ((1, (0,)), (2, (0, 1)), (2, (3,)), (1, (3, 2)), (0, (3, 2, 1))):
+        total = mixed[:, row, others[0], None] * solved[:, others[0]]
+        for other in others[1:]:
+            total += mixed[:, row, other, None] * solved[:, other]
+        solved[:, row] -= total
+        if others[0] == 3:
+            solved[:, row] *= np.float32(1) / mixed[:, row, row, None]
     return solved
 
 
@@ -106,18 +109,15 @@ def _eliminated(matrix: Float32Array) -> tuple[Float32Array, IntArray]:
     count = np.arange(len(mixed))
     order: IntArray = np.empty((len(mixed), 4), dtype=np.int64)
     order[:] = np.arange(4)
-    for step in range(3):
-        pivot = step + np.abs(mixed[:, step:, step]).argmax(axis=1)
+    for step in range(2):
+        pivot = step + np.abs(mixed[:, step:3, step]).argmax(axis=1)
         if (pivot != step).any():
             for rows in (mixed, order):
                 rows[count, step], rows[count, pivot] = rows[count, pivot], rows[count, step]
-        below = slice(step + 1, None)
-        # getrf multiplies by the reciprocal of the pivot, but divides by it in the last step
-        if step < 2:
-            mixed[:, below, step] *= np.float32(1) / mixed[:, step, step, None]
-        else:
-            mixed[:, below, step] /= mixed[:, step, step, None]
-        mixed[:, below, below] -= mixed[:, below, step, None] * mixed[:, step, None, below]
+        below = slice(step + 1, 3)
+        # getrf multiplies by the reciprocal of the pivot
+        mixed[:, below, step] *= np.float32(1) / mixed[:, step, step, None]
+        mixed[:, below, step + 1 :] -= mixed[:, below, step, None] * mixed[:, step, None, step + 1 :]
     return mixed, order
 
 
