@@ -62,7 +62,8 @@ MOST_QUOTED: Final = 100
 """Characters of a stranger's text in a message."""
 MOST_TOLD: Final = 300
 """Characters of what a library or the gate says of a fault: numbers, a remedy, perhaps a stranger's text."""
-_LIMIT: Final = re.compile(r"([a-z_]+)=([1-9][0-9]{0,11})([KMGT]?)")
+_LIMIT: Final = re.compile(r"([a-z_]+)=(\w+)", re.ASCII)
+_SIZE: Final = re.compile(r"([1-9][0-9]{0,11})([KMGT]?)")
 _FACTORS: Final = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 _FLAGS: Final = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)  # no waiting for a pipe
 
@@ -89,6 +90,12 @@ def limit_of(kind: FileKind) -> int:
     """
     changed = os.environ.get(LIMITS_VARIABLE)
     return LIMITS[kind] if not changed else _changed_limits(changed).get(kind, LIMITS[kind])
+
+
+def bytes_of(text: str) -> int | None:
+    """The number that a size in the environment stands for, such as `200M`; None if it cannot be understood."""
+    found = _SIZE.fullmatch(text)
+    return None if found is None else int(found[1]) * _FACTORS[found[2]]
 
 
 def read_bytes(path: Path | StoredFile, kind: FileKind) -> bytes:
@@ -221,9 +228,10 @@ def _changed_limits(text: str) -> Mapping[str, int]:
     limits = {}
     for word in text.replace(",", " ").split():
         found = _LIMIT.fullmatch(word)
-        if found is None or found[1] not in LIMITS:
+        size = None if found is None else bytes_of(found[2])
+        if found is None or size is None or found[1] not in LIMITS:
             known = ", ".join(LIMITS)
             said = f"{LIMITS_VARIABLE}: expected <kind>=<bytes> with K, M or G, such as label=200M, of {known}; found"
             raise RefusedFileError(errno.EINVAL, f"{said} {shortened(word)!r}")
-        limits[found[1]] = int(found[2]) * _FACTORS[found[3]]
+        limits[found[1]] = size
     return limits

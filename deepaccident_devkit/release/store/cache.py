@@ -7,20 +7,17 @@ from __future__ import annotations
 
 import hashlib
 import os
-import re
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.files import replacing, temporary_of
-from deepaccident_devkit.reading import fault_text
+from deepaccident_devkit.reading import bytes_of, fault_text
 
 FOLDER_VARIABLE: Final = "DEEPACCIDENT_CACHE"
 SIZE_VARIABLE: Final = "DEEPACCIDENT_CACHE_SIZE"
 _DEFAULT_SIZE: Final = "20G"
-_SIZE: Final = re.compile(r"([1-9][0-9]{0,11})([KMGT]?)")
-_FACTORS: Final = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 _LOOKED_AFTER: Final = 0.05
 """Part of the size that a process may add before it looks at the whole folder again."""
 _KEPT: Final = 0.9
@@ -40,13 +37,12 @@ class FileCache:
         """The one that the environment names, else in the user's cache folder; raises ConfigError for a wrong size."""
         from platformdirs import user_cache_path
 
-        text = os.environ.get(SIZE_VARIABLE) or _DEFAULT_SIZE
-        found = _SIZE.fullmatch(text)
-        if found is None:
+        most = bytes_of(os.environ.get(SIZE_VARIABLE) or _DEFAULT_SIZE)
+        if most is None:
             raise ConfigError(f"{SIZE_VARIABLE}: expected bytes with K, M, G or T, such as {_DEFAULT_SIZE}")
         folder = os.environ.get(FOLDER_VARIABLE)
         place = Path(folder).expanduser() if folder else user_cache_path("deepaccident_devkit") / "files"
-        return cls(place.absolute(), int(found[1]) * _FACTORS[found[2]])
+        return cls(place.absolute(), most)
 
     def path_of(self, identity: str, name: str) -> Path:
         """Where the copy of a file lies if it is there: `identity` tells it from all others, `name` is its own."""
