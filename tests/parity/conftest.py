@@ -6,14 +6,19 @@ and takes `golden_row`. Where the folder, the file, the list or the array is mis
 """
 
 import functools
+import importlib.util
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from golden_model import GoldenModel
+
+if importlib.util.find_spec("torch") is None:
+    collect_ignore_glob = ["test_model*"]
 
 
 @dataclass(frozen=True)
@@ -100,3 +105,9 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 def _parametrize(metafunc: pytest.Metafunc, name: str, cases: Sequence[GoldenCase | GoldenRow]) -> None:
     metafunc.parametrize(name, cases, ids=lambda case: f"{case.part}-{case.index}")
+
+
+@pytest.fixture
+def golden_model(request: pytest.FixtureRequest) -> Callable[[str], GoldenModel]:
+    """A golden part of the model by its name."""
+    return functools.partial(GoldenModel, request.config.getoption("golden"))
