@@ -122,8 +122,8 @@ def test_a_loader_without_collate_fn_batches_as_collate_does(da: DeepAccident, s
     assert same(batch, collate([data[0], data[1]]))
     assert type(batch) is dict
     assert repr(data[0]) == (
-        f"V2XItem({sample}, agents {data[0]['agents']}: agent_valid, ego_from_agent, world_from_ego, augmentation, "
-        "points, boxes, velocity_known, categories, actor_ids)"
+        f"V2XItem({sample}, agents {data[0]['agents']}: agent_valid, ego_from_agent, agent_from_past, world_from_ego, "
+        "augmentation, points, boxes, velocity_known, categories, actor_ids)"
     )
 
 

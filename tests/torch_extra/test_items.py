@@ -79,13 +79,15 @@ def test_past_frames_end_with_the_present(da: DeepAccident, sample: str) -> None
     for a, name in enumerate(item["agents"]):
         assert len(item["points"][a][0]) == 0
         assert not item["images"][a, 0].any()
-        for key in ("ego_from_agent", "intrinsics", "ego_from_camera", "image_from_ego"):
+        for key in ("ego_from_agent", "agent_from_past", "intrinsics", "ego_from_camera", "image_from_ego"):
             blank = item[key][a, 0]
             assert_array_equal(blank, np.broadcast_to(np.eye(blank.shape[-1]), blank.shape))
         for p, frame in ((1, 2), (2, 4)):
             then = da.get_sample(scenario, name, frame)
             assert_allclose(item["points"][a][p][:, :3], da.load_point_cloud(then, "ego").xyz, atol=1e-4)
             assert_allclose(item["ego_from_agent"][a, p], da.transform(sample, then).matrix, atol=1e-4)
+            now = da.get_sample(scenario, name, 4)
+            assert_allclose(item["agent_from_past"][a, p], da.transform(now, then).matrix, atol=1e-4)
 
 
 def test_images_and_cameras_are_the_devkits(da: DeepAccident, sample: str) -> None:

@@ -25,6 +25,17 @@ def test_late_data_are_an_earlier_frames(da: DeepAccident, sample: str) -> None:
         assert_array_equal(late["images"][a, 0, 3].permute(1, 2, 0), image)
 
 
+def test_pose_noise_does_not_reach_a_senders_own_motion(da: DeepAccident, sample: str) -> None:
+    """With latency, the last data are two frames old, and the motion ends there."""
+    noise = Link(latency=0.1, pose_noise=1.0, seed=2)
+    item = V2XDataset(da, [sample], V2XConfig(agents="all", past=2, step=2, link=noise, points=False))[0]
+    for a, name in enumerate(item["agents"]):
+        late = 0 if a == 0 else 1
+        last, before = (da.get_sample(da.scenario[0], name, frame - late) for frame in (4, 2))
+        assert_allclose(item["agent_from_past"][a, 0], da.transform(last, before).matrix, atol=1e-4)
+        assert_allclose(item["agent_from_past"][a, 1], np.eye(4))
+
+
 def test_points_where_the_ego_places_them(da: DeepAccident, sample: str) -> None:
     """All agents' points in the ego frame are the devkit's aggregated cloud, link and all."""
     link = Link(latency=0.1, pose_noise=0.5, seed=2)

@@ -10,7 +10,8 @@
     loader = DataLoader(data, batch_size=2, shuffle=True, num_workers=4, collate_fn=collate)
 
 `V2XDataset` describes an item, `collate` and `collate_fusion` describe a batch; without `collate_fn` a loader uses
-`collate`. docs/training.md has a training loop. `EvaluationSampler` and `merged_evaluator` are for several GPUs.
+`collate`. `AllEgosDataset` and `collate_all_egos` have the targets of all agents for one reading of their sensors.
+docs/training.md has a training loop. `EvaluationSampler` and `merged_evaluator` are for several GPUs.
 Only this package imports torch; importing it without torch raises MissingExtraError.
 """
 
@@ -25,19 +26,22 @@ except ModuleNotFoundError as error:
     ) from error
 
 from deepaccident_devkit.export.images import ImageConfig
+from deepaccident_devkit.export.torch.all_egos import AllEgosDataset
 from deepaccident_devkit.export.torch.augmentation import RandomAugmentation
-from deepaccident_devkit.export.torch.collate import collate, collate_fusion
+from deepaccident_devkit.export.torch.collate import collate, collate_all_egos, collate_fusion
 from deepaccident_devkit.export.torch.config import V2XConfig
 from deepaccident_devkit.export.torch.dataset import V2XDataset
 from deepaccident_devkit.export.torch.distributed import EvaluationSampler, merged_evaluator
 
 __all__ = [
+    "AllEgosDataset",
     "EvaluationSampler",
     "ImageConfig",
     "RandomAugmentation",
     "V2XConfig",
     "V2XDataset",
     "collate",
+    "collate_all_egos",
     "collate_fusion",
     "merged_evaluator",
 ]

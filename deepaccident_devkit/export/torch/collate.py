@@ -12,12 +12,14 @@ from deepaccident_devkit.taxonomy import AGENTS
 if TYPE_CHECKING:
     from torch import Tensor
 
-_MATRICES: Final = ("ego_from_agent", "intrinsics", "ego_from_camera", "image_from_ego")
+_MATRICES: Final = ("ego_from_agent", "agent_from_past", "intrinsics", "ego_from_camera", "image_from_ego")
 _OF_AGENTS: Final = ("agent_valid", "files_missing", "images", *_MATRICES)
 """Tensors whose first axis counts agents."""
 _OF_BOXES: Final = ("boxes", "velocity_known", "categories", "actor_ids")
 _LISTS: Final = ("token", "agents", "points", *_OF_BOXES)
 """Keys that stay lists with one entry for each item: texts, and tensors of different lengths."""
+_OF_EGOS: Final = ("egos", "partners", "targets")
+"""Keys of `AllEgosDataset` items alone."""
 
 
 class V2XItem(dict[str, Any]):
@@ -90,9 +92,38 @@ def collate_fusion(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return batch
 
 
+def collate_all_egos(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """B moments as one dict, with an axis of the G egos of all of them one after another.
+
+    Sensor data are as of `collate`, (B, A, …). In addition:
+
+    - `egos`: list of G tokens. `ego_rows` (G, 2) int64: the item and the agent that each ego is.
+    - `partners` (G, A) bool: which agents of that item cooperate with it.
+    - the targets: stacked, (G, …), or for boxes lists of G.
+
+    Raises:
+        ConfigError: as of `collate`.
+    """
+    import torch
+
+    _check_alike(items)
+    batch = collate([{key: value for key, value in item.items() if key not in _OF_EGOS} for item in items])
+    batch["egos"] = [ego for item in items for ego in item["egos"]]
+    names = [(b, item["agents"].index(ego.rsplit("/", 2)[1])) for b, item in enumerate(items) for ego in item["egos"]]
+    batch["ego_rows"] = torch.tensor(names, dtype=torch.int64).reshape(-1, 2)
+    agents = max(len(item["agents"]) for item in items)
+    padded = [torch.nn.functional.pad(item["partners"], (0, agents - len(item["agents"]))) for item in items]
+    batch["partners"] = torch.cat(padded)
+    targets = [target for item in items for target in item["targets"]]
+    for key in targets[0]:
+        values = [target[key] for target in targets]
+        batch[key] = values if key in _OF_BOXES else torch.stack(values)
+    return batch
+
+
 def _collate_by_default(items: Sequence[V2XItem], **_: object) -> dict[str, Any]:
-    """`collate`, as torch calls it for a type of item."""
-    return collate(items)
+    """`collate` or, for all egos, `collate_all_egos`, as torch calls it for a type of item."""
+    return collate_all_egos(items) if "egos" in items[0] else collate(items)
 
 
 with suppress(ImportError):  # torch's documented registry, which has no public place

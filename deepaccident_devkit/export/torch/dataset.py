@@ -47,6 +47,8 @@ class V2XDataset(TorchDataset):
       files are skipped. Then clouds are empty, images are 0 and matrices are the identity.
     - `ego_from_agent` (A, P, 4, 4) float32: the sender's ego frame at that frame → the present ego frame of the
       sample's agent, as this agent believes, with pose noise. [0, −1] is the identity, [0, :] the agent's own motion.
+    - `agent_from_past` (A, P, 4, 4) float32: the sender's ego frame at that frame → its ego frame at its last one, by
+      its own exact poses: with it, senders can join their own frames before they send anything.
     - `world_from_ego` (4, 4) float64: of the sample's agent at the present; for augmented coordinates.
     - `augmentation` (4, 4) float32: A.
 
@@ -151,15 +153,7 @@ class V2XDataset(TorchDataset):
         position = range(len(self))[operator.index(index)]
         sample = self._dataset.sample[int(self._rows[position])]["token"]
         augmentation = self.config.augmentation_of(int(self._epoch), position)
-        item = self._received_item(sample, augmentation)
-        if self.config.boxes is not None:
-            item |= self._box_item(sample, augmentation)
-        if isinstance(self.config.labels, MotionLabelConfig):
-            item |= self._label_item(sample, self.config.labels, augmentation)
-        if self.config.bev_segmentation is not None:
-            target = bev_segmentation(self._dataset, sample, self.config.bev_segmentation, augmentation=augmentation)
-            item |= {"bev_segmentation": _tensor(target.masks), "bev_known": _tensor(target.known)}
-        return V2XItem(item)
+        return V2XItem(self._received_item(sample, augmentation) | self._target_item(sample, augmentation))
 
     def _received_item(self, sample: str, augmentation: Augmentation) -> dict[str, Any]:
         """The sample's own tensors, and the sensor data that arrived."""
@@ -173,19 +167,32 @@ class V2XDataset(TorchDataset):
         item: dict[str, Any] = {
             "token": sample,
             "agents": names,
-            "agent_valid": _tensor(sensor_data.valid_mask(names, arrived)),
-            "ego_from_agent": _tensor(sensor_data.relative_poses(dataset, sample, names, arrived, augmentation)),
-            "world_from_ego": _tensor(world_from_ego),
-            "augmentation": _tensor(augmentation.matrix, np.float32),
+            "agent_valid": tensor(sensor_data.valid_mask(names, arrived)),
+            "ego_from_agent": tensor(sensor_data.relative_poses(dataset, sample, names, arrived, augmentation)),
+            "agent_from_past": tensor(sensor_data.own_motions(dataset, names, arrived, augmentation)),
+            "world_from_ego": tensor(world_from_ego),
+            "augmentation": tensor(augmentation.matrix, np.float32),
         }
         if config.on_missing == "skip":
-            item["files_missing"] = _tensor(lacking)
+            item["files_missing"] = tensor(lacking)
         if config.points:
             clouds = sensor_data.point_clouds(dataset, names, arrived, augmentation)
-            item["points"] = [[_tensor(cloud) for cloud in of_agent] for of_agent in clouds]
+            item["points"] = [[tensor(cloud) for cloud in of_agent] for of_agent in clouds]
         if config.images is not None:
             arrays = sensor_data.camera_arrays(dataset, names, arrived, augmentation, config.images, self._cache)
             item |= {name: torch.from_numpy(array) for name, array in arrays.items()}  # new arrays: no copy
+        return item
+
+    def _target_item(self, sample: str, augmentation: Augmentation) -> dict[str, Any]:
+        """The tensors to be predicted, with the sample's agent as the ego."""
+        item: dict[str, Any] = {}
+        if self.config.boxes is not None:
+            item |= self._box_item(sample, augmentation)
+        if isinstance(self.config.labels, MotionLabelConfig):
+            item |= self._label_item(sample, self.config.labels, augmentation)
+        if self.config.bev_segmentation is not None:
+            target = bev_segmentation(self._dataset, sample, self.config.bev_segmentation, augmentation=augmentation)
+            item |= {"bev_segmentation": tensor(target.masks), "bev_known": tensor(target.known)}
         return item
 
     def _box_item(self, sample: str, augmentation: Augmentation) -> dict[str, Tensor]:
@@ -196,10 +203,10 @@ class V2XDataset(TorchDataset):
         else:
             boxes = self._dataset.boxes(sample, "ego", visible)
         return {
-            "boxes": _tensor(np.nan_to_num(augmented_boxes(boxes, augmentation)), np.float32),
-            "velocity_known": _tensor(np.isfinite(boxes.velocity).all(axis=1)),
-            "categories": _tensor(boxes.category, np.int64),
-            "actor_ids": _tensor(boxes.actor_id),
+            "boxes": tensor(np.nan_to_num(augmented_boxes(boxes, augmentation)), np.float32),
+            "velocity_known": tensor(np.isfinite(boxes.velocity).all(axis=1)),
+            "categories": tensor(boxes.category, np.int64),
+            "actor_ids": tensor(boxes.actor_id),
         }
 
     def _label_item(self, sample: str, config: MotionLabelConfig, augmentation: Augmentation) -> dict[str, Tensor]:
@@ -209,13 +216,13 @@ class V2XDataset(TorchDataset):
         if self.config.to_present is not None:
             labels = labels.to_present(centerness=self.config.to_present)
         return {
-            "segmentation": _tensor(labels.segmentation, np.int64),
-            "instance": _tensor(labels.instance, np.int64),
-            "centerness": _tensor(labels.centerness),
-            "offset": _tensor(labels.offset),
-            "flow": _tensor(labels.flow),
-            "future_egomotion": _tensor(augmented_six_vectors(labels.future_egomotion, augmentation), np.float32),
-            "label_valid": _tensor(labels.label_valid),
+            "segmentation": tensor(labels.segmentation, np.int64),
+            "instance": tensor(labels.instance, np.int64),
+            "centerness": tensor(labels.centerness),
+            "offset": tensor(labels.offset),
+            "flow": tensor(labels.flow),
+            "future_egomotion": tensor(augmented_six_vectors(labels.future_egomotion, augmentation), np.float32),
+            "label_valid": tensor(labels.label_valid),
         }
 
     def _opened_cache(self) -> ImageCache | None:
@@ -268,7 +275,7 @@ class V2XDataset(TorchDataset):
             )
 
 
-def _tensor(values: ArrayLike, dtype: DTypeLike | None = None) -> Tensor:
+def tensor(values: ArrayLike, dtype: DTypeLike | None = None) -> Tensor:
     """A tensor with memory of its own: the devkit's arrays are read-only, and torch has no read-only tensors."""
     import torch
 

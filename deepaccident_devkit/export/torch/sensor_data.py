@@ -118,6 +118,22 @@ def relative_poses(
     return poses.astype(np.float32)
 
 
+def own_motions(
+    dataset: Dataset, names: Sequence[AgentName], arrived: Received, augmentation: Augmentation
+) -> AnyArray:
+    """`agent_from_past` (A, P, 4, 4) float32: augmented, exact; the identity without a message."""
+    poses = np.tile(np.eye(4), (len(names), len(arrived), 1, 1))
+    for a, name in enumerate(names):
+        if name not in arrived[-1]:
+            continue
+        agent_from_world = dataset.world_from(arrived[-1][name].sample, "ego").inverse()
+        for p, moment in enumerate(arrived[:-1]):
+            if name in moment:
+                pose = (agent_from_world @ dataset.world_from(moment[name].sample, "ego")).matrix
+                poses[a, p] = augmented_pose(pose, augmentation)
+    return poses.astype(np.float32)
+
+
 def point_clouds(
     dataset: Dataset, names: Sequence[AgentName], arrived: Received, augmentation: Augmentation
 ) -> list[list[AnyArray]]:

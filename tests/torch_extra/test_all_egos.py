@@ -1,0 +1,82 @@
+"""Items and batches with the targets of all egos equal those of each ego by itself."""
+
+import pytest
+import torch
+from torch.testing import assert_close
+from torch.utils.data import DataLoader
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ConfigError, NotAvailableError
+from deepaccident_devkit.export.torch import (
+    AllEgosDataset,
+    ImageConfig,
+    RandomAugmentation,
+    V2XConfig,
+    V2XDataset,
+    collate_all_egos,
+)
+from deepaccident_devkit.taxonomy import AGENTS
+from deepaccident_devkit.v2x import Link
+
+CONFIG = {"past": 2, "step": 1, "images": ImageConfig(dtype="uint8"), "labels": "deepaccident"}
+SENSORS = ("images", "intrinsics", "ego_from_camera", "agent_from_past")
+
+
+@pytest.fixture(scope="module")
+def moment(sample: str) -> list[str]:
+    """The samples of all agents at one moment, not in the usual order."""
+    scenario, _, frame = sample.rsplit("/", 2)
+    return [f"{scenario}/{agent}/{frame}" for agent in reversed(AGENTS)]
+
+
+@pytest.mark.parametrize("agents", ["single", "+other", "all", None])
+def test_each_ego_has_its_own_targets_and_its_partners(da: DeepAccident, moment: list[str], agents: str | None) -> None:
+    config = V2XConfig(agents=agents, augmentation=RandomAugmentation(), **CONFIG)
+    [item] = AllEgosDataset(da, moment, config)
+    assert item["egos"] == tuple(moment)
+    assert item["agents"][0] == AGENTS[-1]
+    for row, ego in enumerate(moment):
+        alone = V2XDataset(da, [ego], config)[0]  # the first item in both: the same augmentation
+        for key, value in item["targets"][row].items():
+            assert torch.equal(value, alone[key])
+        assert {name for name, is_one in zip(item["agents"], item["partners"][row], strict=True) if is_one} == set(
+            alone["agents"]
+        )
+        places = [item["agents"].index(name) for name in alone["agents"]]
+        for key in SENSORS:
+            assert torch.equal(item[key][places], alone[key])
+        ego_from_first = torch.linalg.inv(item["ego_from_agent"][places[0], -1].double())
+        assert_close((ego_from_first @ item["ego_from_agent"][places].double()).float(), alone["ego_from_agent"])
+
+
+def test_a_batch_lists_the_egos_of_all_moments(da: DeepAccident, moment: list[str]) -> None:
+    later = [token.replace("/004", "/005") for token in moment[2:]]
+    data = AllEgosDataset(da, [*moment, *later], V2XConfig(agents="all", **CONFIG))
+    batch = collate_all_egos([data[1], data[0]])
+    assert batch["egos"] == [*later, *moment]
+    names = [batch["agents"][b][a] for b, a in batch["ego_rows"].tolist()]
+    assert names == [token.split("/")[-2] for token in batch["egos"]]
+    assert batch["partners"].shape == (8, 5)
+    assert batch["instance"].shape == (8, 5, 200, 200)
+    assert len(batch["boxes"]) == 8
+    [by_default] = DataLoader(data, batch_size=2)
+    assert by_default["egos"] == [*moment, *later]
+
+
+def test_absent_agents_are_neither_egos_nor_partners(da_partial: DeepAccident, moment: list[str]) -> None:
+    """The release has no other_vehicle_behind, and lacks the ego's front camera, which may be skipped for others."""
+    there = [token for token in moment if "other_vehicle_behind" not in token]
+    with pytest.raises(NotAvailableError, match="other_vehicle_behind is not in this release"):
+        AllEgosDataset(da_partial, there, V2XConfig(agents="all", points=False, **CONFIG))
+    config = V2XConfig(agents="available", points=False, on_missing="skip", **CONFIG)
+    whole, single = AllEgosDataset(da_partial, there, config)[0], AllEgosDataset(da_partial, there[-2:], config)[0]
+    batch = collate_all_egos([whole, single])
+    assert batch["partners"].shape == (6, 4)
+    assert batch["partners"].all()
+    ego = whole["agents"].index("ego_vehicle")
+    assert whole["agent_valid"].all(dim=1).tolist() == [a != ego for a in range(4)]
+
+
+def test_a_link_is_refused(da: DeepAccident, moment: list[str]) -> None:
+    with pytest.raises(ConfigError, match="each ego receives its own messages; use V2XDataset"):
+        AllEgosDataset(da, moment, V2XConfig(link=Link(latency=0.1)))
