@@ -32,6 +32,7 @@ FileKind: TypeAlias = Literal[
     "cloud",
     "spec",
     "archive",
+    "weights",
 ]
 _MIB: Final = 1 << 20
 LIMITS: Final[Mapping[str, int]] = MappingProxyType(
@@ -50,6 +51,7 @@ LIMITS: Final[Mapping[str, int]] = MappingProxyType(
         "cloud": 256 * _MIB,
         "spec": _MIB,
         "archive": 512 * _MIB,
+        "weights": 4096 * _MIB,
     }
 )
 """Kind of file → bytes that may be read of it at once, and that may be decoded from it at once.

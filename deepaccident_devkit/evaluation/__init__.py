@@ -17,6 +17,7 @@ from deepaccident_devkit.evaluation.metrics.accident import (
     accident_context,
     accidents_of,
     box_truth,
+    foreseen_accident,
 )
 from deepaccident_devkit.evaluation.metrics.attributes import SampleAttributes, sample_attributes
 from deepaccident_devkit.evaluation.metrics.breakdowns import Breakdown, breakdown
@@ -83,6 +84,7 @@ __all__ = [
     "breakdown",
     "detection_truth",
     "evaluate_samples",
+    "foreseen_accident",
     "instances_of",
     "lost_instances",
     "match_trajectories",

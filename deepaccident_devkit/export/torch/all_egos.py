@@ -61,9 +61,13 @@ class AllEgosDataset(V2XDataset):
 
     def __getitem__(self, index: int) -> V2XItem:
         """The item of a moment, as described for the class; the errors are those of `V2XDataset`."""
+        return self.item(index, int(self._epoch))
+
+    def item(self, index: int, epoch: int) -> V2XItem:
+        """The same in an epoch that is given here, and not by `set_epoch`: for loaders that run on through epochs."""
         position = range(len(self))[operator.index(index)]
         egos = self._egos[position]
-        augmentation = self.config.augmentation_of(int(self._epoch), position)
+        augmentation = self.config.augmentation_of(epoch, position)
         item = self._received_item(egos[0], augmentation)
         heard = [sensor_data.participants(self._dataset, ego, self._agents) for ego in egos]
         item["egos"] = tuple(egos)

@@ -6,7 +6,7 @@ from deepaccident_devkit.evaluation.metrics.accident.evaluator import PROTOCOLS,
 from deepaccident_devkit.evaluation.metrics.accident.paper import PaperAccidents
 from deepaccident_devkit.evaluation.metrics.accident.released import ReleasedAccidents
 from deepaccident_devkit.evaluation.metrics.accident.scoring import DISTANCES, AccidentResult, AccidentsWithin
-from deepaccident_devkit.evaluation.metrics.alarms.raised import accidents_of
+from deepaccident_devkit.evaluation.metrics.alarms.raised import accidents_of, foreseen_accident
 from deepaccident_devkit.evaluation.metrics.alarms.reading import AccidentReading
 from deepaccident_devkit.evaluation.metrics.alarms.truth import AccidentContext, BoxTruth, accident_context, box_truth
 from deepaccident_devkit.evaluation.metrics.predictions import Prediction
@@ -30,4 +30,5 @@ __all__ = [
     "accidents_of",
     "box_truth",
     "compared_accidents",
+    "foreseen_accident",
 ]

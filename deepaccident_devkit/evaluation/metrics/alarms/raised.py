@@ -12,6 +12,8 @@ from deepaccident_devkit.arrays import FloatArray, IntArray
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.metrics.alarms.reading import (
     AccidentReading,
+    Contact,
+    InstanceAccident,
     InstanceTracks,
     accident_of,
     match_tracks,
@@ -19,7 +21,7 @@ from deepaccident_devkit.evaluation.metrics.alarms.reading import (
 from deepaccident_devkit.evaluation.metrics.alarms.truth import SLACK, BoxTruth
 from deepaccident_devkit.evaluation.metrics.predictions import Accident, MotionOutput, instances_of
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionLabelConfig, MotionLabels
+from deepaccident_devkit.motion import LABEL_PROTOCOLS, LabelProtocol, MotionLabelConfig, MotionLabels
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.text import choice
 
@@ -154,17 +156,61 @@ def _named(alarm: Accident, truth: BoxTruth, rules: AlarmRules) -> Pair | None:
     return nearest_two(alarm.positions, truth.actor_id, truth.footprint[frame, :, :2], rules.match_distance)
 
 
+def foreseen_accident(
+    output: MotionOutput,
+    *,
+    step: float = LABEL_STEP,
+    labels: str | None = "released",
+    reading: AccidentReading | None = None,
+) -> Accident | None:
+    """The accident that K motion predictions of a sample foresee together, as the protocol `boxes` reads them.
+
+    Its score is the share of the predictions that have one. The mean sample (the last) says where and when or, if it
+    has none, the first that has one.
+
+    Args:
+        output: the predictions.
+        step: seconds from one frame to the next.
+        labels: protocol of the labels that they were learned from, as of `accidents_of`.
+        reading: how an accident is read off maps; None for the protocol `paper`'s.
+
+    Returns:
+        The accident without ids, which maps do not know; None if no prediction has one.
+
+    Raises:
+        ChoiceError: no such labels.
+    """
+    labels = choice("labels", labels, (None, *LABEL_PROTOCOLS))
+    read = _read_off(output, None if labels is None else LABEL_PROTOCOLS[labels], reading or AccidentReading())
+    there = _surest_first(read)
+    return _joint(there, len(read), step) if there else None
+
+
+def _read_off(output: MotionOutput, rules: LabelProtocol | None, reading: AccidentReading) -> list[InstanceAccident]:
+    """What each prediction shows."""
+    maps = output.instances if output.heads is None else [reading.instances(heads) for heads in output.heads]
+    return [accident_of(each, output.grid, rules, reading) for each in (() if maps is None else maps)]
+
+
+def _surest_first(read: list[InstanceAccident]) -> list[tuple[InstanceAccident, Contact]]:
+    """Those with an accident; the mean's before all others."""
+    return [(each, each.contact) for each in (*read[-1:], *read[:-1]) if each.contact is not None]
+
+
+def _joint(there: list[tuple[InstanceAccident, Contact]], predictions: int, step: float) -> Accident:
+    found, contact = there[0]
+    return Accident(positions=found.positions, time=contact.frame * step, score=len(there) / predictions)
+
+
 def _alarms_of_maps(
     output: MotionOutput, config: MotionLabelConfig, truth: BoxTruth, rules: AlarmRules
 ) -> list[NamedAlarm]:
     """At most one alarm of K predictions."""
-    reading, seconds = rules.reading, config.step * FRAME_PERIOD
-    maps = output.instances if output.heads is None else [reading.instances(heads) for heads in output.heads]
-    read = [accident_of(each, output.grid, config.rules, reading) for each in (() if maps is None else maps)]
-    there = [(each, each.contact) for each in (*read[-1:], *read[:-1]) if each.contact is not None]
+    seconds = config.step * FRAME_PERIOD
+    read = _read_off(output, config.rules, rules.reading)
+    there = _surest_first(read)
     if not there:
         return []
     found, contact = there[0]
-    accident = Accident(positions=found.positions, time=contact.frame * seconds, score=len(there) / len(read))
     match = match_tracks(found.tracks, truth.tracks(seconds, len(found.tracks.center)), rules.match_distance)
-    return [(accident, (match.get(contact.ids[0]), match.get(contact.ids[1])))]
+    return [(_joint(there, len(read), seconds), (match.get(contact.ids[0]), match.get(contact.ids[1])))]

@@ -1,0 +1,185 @@
+"""Weights in files: our own as safetensors, foreign ones of the release, BEVerse, Swin or torchvision.
+
+Names are the release's (tests/data/golden/model/released_keys_*.txt), so that the key table is the identity, except
+for what `_UNUSED` names. A foreign file is read by `torch.load(weights_only=True)`, which runs no code of it.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from torch import Tensor, nn
+
+from deepaccident_devkit.arrays import ShortRepr
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.json_text import parsed_json
+from deepaccident_devkit.model.images.swin_weights import from_official
+from deepaccident_devkit.reading import read_bytes
+
+_META: Final = "deepaccident"
+_UNUSED: Final = ("v2x_fusion.", "pts_bbox_head.taskfeat_encoders.map.", "pts_bbox_head.task_decoders.map.")
+"""Beginnings of names that only the release or BEVerse has: its dead V2X layers, and the map task."""
+_MADE: Final = ("relative_position_index", "transformer.frustum", "num_batches_tracked")
+"""Ends of names whose values follow from the configuration, or do not matter."""
+_TOLD: Final = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Weights(ShortRepr):
+    """Tensors by name, and what is known of them.
+
+    Attributes:
+        tensors: by the model's names.
+        meta: of our own files: the preset, and how they were made; empty for foreign ones.
+        path: of the file.
+    """
+
+    tensors: Mapping[str, Tensor]
+    meta: Mapping[str, Any]
+    path: Path
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Loaded(ShortRepr):
+    """What `load_weights` did.
+
+    Attributes:
+        loaded: names of the model's tensors that the file had.
+        kept: names that it did not have: they stay as they were.
+        unused: names that only the file has.
+    """
+
+    loaded: tuple[str, ...]
+    kept: tuple[str, ...]
+    unused: tuple[str, ...]
+
+    def to_text(self) -> str:
+        """One line."""
+        whole = len(self.loaded) + len(self.kept)
+        kept = f"; as they were: {_some(self.kept)}" if self.kept else ""
+        unused = f"; of the file not used: {_some(self.unused)}" if self.unused else ""
+        return f"{len(self.loaded)} of {whole} tensors loaded{kept}{unused}"
+
+
+def read_weights(path: str | Path) -> Weights:
+    """The weights in a file: safetensors, or a foreign checkpoint (`.pth`, `.pt`).
+
+    Raises:
+        ConfigError: the file is not there, cannot be read, or holds no state dict.
+    """
+    path = Path(path)
+    try:
+        content = read_bytes(path, "weights")
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: weights cannot be read ({error.strerror or error}); give a file of weights"
+        ) from error
+    if content[:2] == b"PK" or content[:1] == b"\x80":  # what torch.save writes, or wrote
+        return Weights(tensors=_foreign(content, path), meta={}, path=path)
+    try:
+        tensors = load(content)
+        length = int.from_bytes(content[:8], "little")
+        header = parsed_json(content[8 : 8 + length])
+        meta = parsed_json(header.get("__metadata__", {}).get(_META, "{}").encode())
+    except (SafetensorError, ValueError) as error:
+        raise ConfigError(f"{path}: is no file of weights ({error}); give a safetensors file, or a .pth") from error
+    return Weights(tensors=tensors, meta=meta, path=path)
+
+
+def write_weights(path: Path, tensors: Mapping[str, Tensor], meta: Mapping[str, Any], *, half: bool = False) -> None:
+    """Write weights as safetensors, completely or not at all; the same ones give the same bytes.
+
+    Args:
+        path: of the file.
+        tensors: by name.
+        meta: what to note with them, as JSON holds it.
+        half: whether floats are rounded to float16.
+    """
+    stored = {name: (each.half() if half and each.is_floating_point() else each) for name, each in tensors.items()}
+    ready = {name: each.detach().cpu().contiguous() for name, each in stored.items()}
+    write_bytes(path, save(ready, metadata={_META: json.dumps(dict(meta), sort_keys=True)}))
+
+
+def load_weights(model: nn.Module, weights: Weights, *, whole: bool = False) -> Loaded:
+    """Put weights into a model.
+
+    Args:
+        model: whose names are compared.
+        weights: from `read_weights`.
+        whole: whether they must have every tensor of the model that training changes.
+
+    Returns:
+        Which tensors were loaded, and which not.
+
+    Raises:
+        ConfigError: the file has none of the model's tensors, tensors of other shapes, or lacks some though `whole`.
+    """
+    own = model.state_dict()
+    given = {name: each for name, each in weights.tensors.items() if not name.endswith(_MADE)}
+    wanted = [name for name in own if not name.endswith(_MADE)]
+    loaded = [name for name in wanted if name in given]
+    missing = [name for name in wanted if name not in given]
+    other = [name for name in loaded if own[name].shape != given[name].shape]
+    unused = [name for name in given if name not in own and not name.startswith(_UNUSED)]
+    if other or not loaded or (whole and missing):
+        raise ConfigError(f"{weights.path}: {_difference(weights, own, other, missing, unused)}")
+    model.load_state_dict({name: given[name].to(own[name].dtype) for name in loaded}, strict=False)
+    return Loaded(loaded=tuple(loaded), kept=tuple(missing), unused=tuple(unused))
+
+
+def _difference(
+    weights: Weights, own: Mapping[str, Tensor], other: Sequence[str], missing: Sequence[str], unused: Sequence[str]
+) -> str:
+    """What keeps weights from fitting a model, with the remedy."""
+    told = []
+    if other:
+        shapes = f"{other[0]} is {tuple(weights.tensors[other[0]].shape)}, not {tuple(own[other[0]].shape)}"
+        told.append(f"{len(other)} tensors have another shape ({shapes})")
+    if missing:
+        told.append(f"{len(missing)} of the model are missing ({_some(missing)})")
+    if unused:
+        told.append(f"{len(unused)} are not the model's ({_some(unused)})")
+    preset = weights.meta.get("preset")
+    whose = f"weights of the preset {preset!r}" if preset else "weights"
+    return (
+        f"{whose} do not fit this model: {', '.join(told)}; give the preset and the options that they were trained with"
+    )
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:_TOLD]) + (f", … ({len(names)})" if len(names) > _TOLD else "")
+
+
+def _foreign(content: bytes, path: Path) -> dict[str, Tensor]:
+    """A foreign checkpoint's tensors under our names."""
+    try:
+        found = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+    except Exception as error:  # noqa: BLE001 - a stranger's file may fail in any way
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ConfigError(f"{path}: is no plain checkpoint ({reason}); give one that holds tensors alone") from error
+    for name in ("state_dict", "model"):  # mmcv's, Swin's
+        if isinstance(found, dict) and isinstance(found.get(name), dict):
+            found = found[name]
+    tensors = (
+        {name: each for name, each in found.items() if isinstance(each, Tensor)} if isinstance(found, dict) else {}
+    )
+    if not tensors:
+        raise ConfigError(f"{path}: holds no tensors by name; give a state dict")
+    named = {name.removeprefix("module."): each for name, each in tensors.items()}
+    if "patch_embed.proj.weight" in named:
+        named = from_official(named)
+    if not any("." in name and name.split(".")[0] in _PARTS for name in named):
+        named = {f"img_backbone.{name}": each for name, each in named.items()}  # an image encoder alone
+    return named
+
+
+_PARTS: Final = ("img_backbone", "img_neck", "transformer", "temporal_model", "pts_bbox_head")

@@ -1,0 +1,163 @@
+"""`V2XFormer`: all agents' images → the ego's future maps and boxes.
+
+| step | from → to | where |
+|---|---|---|
+| the devkit's batch | tensors in the model's frame | `entry` |
+| images | features of each image | `images` |
+| lift | features → a map from above, each frame of each agent | `lift` |
+| time | P frames → one map of each agent | `temporal` |
+| placement | agents' maps → the ego's frame | `warps` |
+| fusion | agents' maps → one | `fusion` |
+| heads | crop, encoder, decoder of each task | `bev`, `motion`, `detection` |
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from deepaccident_devkit.model.bev import BevEncode, BevEncodeConfig, BevUNet, crop
+from deepaccident_devkit.model.config import ModelConfig
+from deepaccident_devkit.model.detection import CenterHead, TaskMaps
+from deepaccident_devkit.model.entry import ModelInputs
+from deepaccident_devkit.model.fusion import fusion
+from deepaccident_devkit.model.images import image_encoder, normalised
+from deepaccident_devkit.model.lift import LiftSplat
+from deepaccident_devkit.model.motion import MotionHead, MotionOutputs, MotionTargets
+from deepaccident_devkit.model.temporal import temporal_model
+from deepaccident_devkit.model.warps import agents_mask, agents_to_ego
+
+_DETECTION, _MOTION, _BOTH = "3dod", "motion", "shared"
+"""Keys of encoders and decoders; the first two are the release's."""
+
+
+class Predictions(NamedTuple):
+    """What the model says for G egos.
+
+    Attributes:
+        motion: maps of the present and the future frames, and the latent's distributions.
+        detection: maps of each detection task.
+    """
+
+    motion: MotionOutputs
+    detection: list[TaskMaps]
+
+
+class V2XFormer(nn.Module):
+    """The model that a configuration describes; its state dict has the release's names."""
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.img_backbone, self.img_neck = image_encoder(config.encoder)
+        self.transformer = LiftSplat(config.lift)
+        self.temporal_model = temporal_model(config.temporal)
+        self.v2x_fusion = fusion(config.fusion)
+        self.pts_bbox_head = TaskHeads(config)
+
+    def forward(
+        self,
+        inputs: ModelInputs,
+        targets: MotionTargets | None = None,
+        *,
+        noise: Tensor | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Predictions:
+        """Predict for each ego.
+
+        Args:
+            inputs: of B moments with A agents, G egos.
+            targets: the egos' labels, for the posterior of a training step; None for a prediction.
+            noise: of the latents (`motion.MotionHead`); drawn if None.
+            generator: draws it.
+        """
+        return self.pts_bbox_head(self.fused(self.encoded(inputs), inputs), targets, noise=noise, generator=generator)
+
+    def encoded(self, inputs: ModelInputs) -> Tensor:
+        """Each agent's own map (B, A, C, H, W) of the present, in its own frame: what it would send."""
+        agents = inputs.images.shape[:2]
+        images = normalised(inputs.images.flatten(0, 3))
+        if self.config.rows is not None:
+            images = functional.pad(images, (0, 0, 0, self.config.rows - images.shape[-2]))
+        features = self.img_neck(self.img_backbone(images))
+        features = features.unflatten(0, (agents.numel(), *inputs.images.shape[2:4]))
+        maps = self.transformer(features, inputs.cameras.flattened())
+        maps = self.temporal_model(
+            maps,
+            inputs.egomotion.flatten(0, 1),
+            inputs.frame_valid.flatten(0, 1),
+            inputs.bev_transform.repeat_interleave(agents[1], 0),
+        )
+        return maps.unflatten(0, agents)
+
+    def fused(self, maps: Tensor, inputs: ModelInputs) -> Tensor:
+        """One map (G, C, H, W) of each ego, in its own frame.
+
+        Args:
+            maps: (B, A, C, H, W) of `encoded`.
+            inputs: who hears whom, and from where.
+        """
+        moment, agent = inputs.ego_rows.unbind(1)
+        order = _ego_first(inputs.partners, agent)
+        rows, egos = moment[:, None], torch.arange(len(order), device=order.device)[:, None]
+        heard, ego_from_agent = inputs.partners[egos, order], inputs.ego_from_agent[egos, order]
+        temporal = self.config.temporal
+        where = {"grid": temporal.grid, "warp": temporal.warp}
+        return self.v2x_fusion(
+            agents_to_ego(maps[rows, order], ego_from_agent, **where),
+            agents_mask(heard, ego_from_agent, **where),
+            inputs.is_infrastructure[rows, order],
+            inputs.delay[rows, order],
+        )
+
+
+class TaskHeads(nn.Module):
+    """Crop, encoder and decoder of each task."""
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        kind = BevEncode if isinstance(config.bev, BevEncodeConfig) else BevUNet
+        names = (_BOTH,) if config.one_bev else (_DETECTION, _MOTION)
+        self.config = config
+        self.taskfeat_encoders = nn.ModuleDict({name: kind(config.bev) for name in names})  # type: ignore[arg-type]
+        self.task_decoders = nn.ModuleDict(
+            {_DETECTION: CenterHead(config.detection), _MOTION: MotionHead(config.motion)}
+        )
+
+    def forward(
+        self,
+        fused: Tensor,
+        targets: MotionTargets | None = None,
+        *,
+        noise: Tensor | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Predictions:
+        """The predictions from fused maps (G, C, H, W); the other arguments are those of `V2XFormer.forward`."""
+        detection, motion = self._features(fused)
+        return Predictions(
+            motion=self.task_decoders[_MOTION](motion, targets, noise=noise, generator=generator),
+            detection=self.task_decoders[_DETECTION](detection),
+        )
+
+    def _features(self, fused: Tensor) -> tuple[Tensor, Tensor]:
+        config = self.config
+        grid = config.grid
+        motion_grid = config.labels.grid.with_orientation(grid.orientation)
+        if config.one_bev:
+            both = self.taskfeat_encoders[_BOTH](crop(fused, grid, motion_grid))
+            return both, both
+        return (
+            self.taskfeat_encoders[_DETECTION](fused),
+            self.taskfeat_encoders[_MOTION](crop(fused, grid, motion_grid)),
+        )
+
+
+def _ego_first(partners: Tensor, agent: Tensor) -> Tensor:
+    """For each ego, columns of agents (G, A'): itself, those that it hears, and others to fill up to the most heard."""
+    own = torch.nn.functional.one_hot(agent, partners.shape[1])
+    order = (2 * own + partners.long()).argsort(dim=1, descending=True, stable=True)
+    most = int((partners | own.bool()).sum(1).max()) if len(partners) else 1
+    return order[:, :most]

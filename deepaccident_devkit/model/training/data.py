@@ -1,0 +1,111 @@
+"""What a model is trained on: moments of a release, each with all its agents."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING, Any
+
+from torch.utils.data import DataLoader, Sampler
+
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import NotAvailableError
+from deepaccident_devkit.export.torch import AllEgosDataset, RandomAugmentation, V2XConfig, collate_all_egos
+from deepaccident_devkit.model.config import ModelConfig
+from deepaccident_devkit.model.training.config import TrainConfig
+from deepaccident_devkit.motion import samples
+from deepaccident_devkit.v2x import Agents, Link
+
+if TYPE_CHECKING:
+    TorchSampler = Sampler[int]
+    TorchDataset = object
+else:
+    from torch.utils.data import Dataset as TorchDataset
+
+    TorchSampler = Sampler
+
+
+def inputs_config(model: ModelConfig, agents: Agents, *, link: Link | None = None, **changes: Any) -> V2XConfig:
+    """What an item needs for the model's inputs alone; `changes` are other fields of `V2XConfig`.
+
+    Args:
+        model: its images and frames.
+        agents: who cooperates.
+        link: what happens to partners' data.
+        changes: other fields.
+    """
+    given: dict[str, Any] = {"points": False, "boxes": None, "on_missing": "skip", **changes}
+    labels = model.labels
+    return V2XConfig(
+        agents=agents, link=link, past=labels.receptive_field, step=labels.step, images=model.images, **given
+    )
+
+
+class Moments(TorchDataset):
+    """The moments of a split as `AllEgosDataset` has them, numbered on through the epochs."""
+
+    def __init__(self, dataset: Dataset, model: ModelConfig, config: TrainConfig, *, images_cache: Any = None) -> None:
+        """Find them.
+
+        Args:
+            dataset: the release.
+            model: what it learns and sees.
+            config: the split, who cooperates, and the augmentation.
+            images_cache: of `V2XConfig`.
+
+        Raises:
+            NotAvailableError: the split has no labelled samples.
+            DeepAccidentError: as of `AllEgosDataset`.
+        """
+        tokens = samples(dataset, config.split, config.samples)
+        if not tokens:
+            raise NotAvailableError(f"{config.split}: has no samples to learn from; choose another split")
+        self.data = AllEgosDataset(
+            dataset,
+            tokens,
+            inputs_config(
+                model,
+                config.agents,
+                boxes="sample",
+                labels=model.labels,
+                augmentation=RandomAugmentation() if config.augment else None,
+                seed=config.seed,
+                images_cache=images_cache,
+            ),
+        )
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+    def __getitem__(self, number: int) -> dict[str, Any]:
+        """The moment of a number (epoch · moments + position)."""
+        epoch, position = divmod(number, len(self.data))
+        return self.data.item(position, epoch)
+
+
+class _Given(TorchSampler):
+    """Numbers that an iterator gives."""
+
+    def __init__(self, numbers: Iterable[int]) -> None:
+        self._numbers = numbers
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._numbers)
+
+
+def batches(moments: Moments, numbers: Iterable[int], config: TrainConfig, *, workers: int = 0) -> DataLoader[Any]:
+    """Batches of moments in the order of their numbers; worker processes change nothing.
+
+    Args:
+        moments: the moments.
+        numbers: `schedule.positions`.
+        config: how many a batch has.
+        workers: processes that read; 0 for this one.
+    """
+    return DataLoader(
+        moments,  # type: ignore[arg-type]
+        batch_size=config.moments,
+        sampler=_Given(numbers),
+        collate_fn=collate_all_egos,
+        num_workers=workers,
+        pin_memory=False,
+    )

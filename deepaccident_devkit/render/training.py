@@ -1,0 +1,90 @@
+"""Curves of a training run: losses by step, and scores on the validation split. They take plain numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from deepaccident_devkit.render.axes import axes_or_new, detached_figure, figure_or_new, with_light_grid
+from deepaccident_devkit.render.colors import MUTED_COLOR, OWN_COLOR, PREDICTED_COLOR
+from deepaccident_devkit.render.pictures import write_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_PANEL: Final = (3.4, 2.4)
+_COLUMNS: Final = 3
+_DPI: Final = 120
+_MEANS: Final = 60
+"""Steps are averaged in at most so many groups, so that a curve shows its way and not its noise."""
+
+
+def render_curve(steps: Sequence[int], values: Sequence[float], title: str, *, ax: Axes | None = None) -> Axes:
+    """Render one number by step: each value as a dot, and means of groups of steps as a line.
+
+    Args:
+        steps: of the optimizer, ascending.
+        values: one a step.
+        title: what the number is.
+        ax: axes to render on; new ones if None.
+
+    Returns:
+        The axes.
+    """
+    ax = axes_or_new(ax, _PANEL)
+    crowded = len(values) > _MEANS
+    ax.plot(steps, values, ".", color=MUTED_COLOR if crowded else PREDICTED_COLOR, markersize=2 if crowded else 6)
+    groups = [np.array_split(np.asarray(each, dtype=float), min(_MEANS, len(values)) or 1) for each in (steps, values)]
+    ax.plot(*([group.mean() for group in each] for each in groups), color=OWN_COLOR if crowded else PREDICTED_COLOR)
+    ax.set_title(title, fontsize=9)
+    ax.set_ylim(bottom=0)
+    return with_light_grid(ax, "both")
+
+
+def render_training(rows: Sequence[Mapping[str, Any]], title: str, *, fig: Figure | None = None) -> Figure:
+    """Render the curves of a run.
+
+    Args:
+        rows: of its log, each with a `step` and numbers by name, or for a validation `validation`, numbers by name.
+        title: of the figure.
+        fig: an empty figure to render on; a new one if None.
+
+    Returns:
+        The figure.
+    """
+    curves = _curves(rows)
+    fig = figure_or_new(fig, _size(len(curves)))
+    axes = fig.subplots(-(-len(curves) // _COLUMNS), _COLUMNS, squeeze=False).ravel()
+    for ax, (name, points) in zip(axes, curves.items(), strict=False):
+        render_curve([step for step, _ in points], [value for _, value in points], name, ax=ax)
+    for ax in axes[len(curves) :]:
+        ax.set_axis_off()
+    for ax in axes[max(len(curves) - _COLUMNS, 0) : len(curves)]:
+        ax.set_xlabel("step")
+    fig.suptitle(title)
+    return fig
+
+
+def save_training(rows: Sequence[Mapping[str, Any]], title: str, path: Path) -> None:
+    """Write `render_training` into a PNG file, which it replaces. Raises OSError."""
+    write_figure(render_training(rows, title, fig=detached_figure(_size(len(_curves(rows))))), path, dpi=_DPI)
+
+
+def _curves(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[tuple[int, float]]]:
+    """Name → (step, value): losses first, then scores."""
+    losses: dict[str, list[tuple[int, float]]] = {}
+    scores: dict[str, list[tuple[int, float]]] = {}
+    for row in rows:
+        for name, value in (row.get("losses") or {}).items():
+            losses.setdefault(name, []).append((row["step"], value))
+        for name, value in (row.get("validation") or {}).items():
+            scores.setdefault(f"validation: {name}", []).append((row["step"], value))
+    return losses | scores
+
+
+def _size(curves: int) -> tuple[float, float]:
+    return _PANEL[0] * _COLUMNS, _PANEL[1] * max(-(-curves // _COLUMNS), 1) + 0.4
