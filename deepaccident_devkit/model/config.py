@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.export.images import ImageConfig
+from deepaccident_devkit.export.torch import V2XConfig
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.model.bev import BevEncodeConfig, BevUNetConfig
 from deepaccident_devkit.model.detection import DecodingConfig, DetectionConfig, DetectionLossConfig, TargetConfig
@@ -16,6 +18,7 @@ from deepaccident_devkit.model.lift import LiftConfig
 from deepaccident_devkit.model.motion import MotionHeadConfig, MotionLossConfig
 from deepaccident_devkit.model.temporal import TemporalConfig
 from deepaccident_devkit.motion import MotionLabelConfig
+from deepaccident_devkit.v2x import Agents, Link
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,3 +80,15 @@ class ModelConfig:
     def grid(self) -> BevGrid:
         """The cells of the maps that are fused."""
         return BevGrid(x=self.temporal.grid.x, y=self.temporal.grid.y)
+
+    def inputs(self, agents: Agents, *, link: Link | None = None, **changes: Any) -> V2XConfig:
+        """What an item of a dataset needs for the model's inputs alone.
+
+        Args:
+            agents: who cooperates.
+            link: what happens to the partners' data.
+            changes: other fields of `V2XConfig`, such as those of targets.
+        """
+        given: dict[str, Any] = {"points": False, "boxes": None, "on_missing": "skip", **changes}
+        past, step = self.labels.receptive_field, self.labels.step
+        return V2XConfig(agents=agents, link=link, past=past, step=step, images=self.images, **given)

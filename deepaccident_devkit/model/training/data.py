@@ -9,11 +9,10 @@ from torch.utils.data import DataLoader, Sampler
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.export.torch import AllEgosDataset, RandomAugmentation, V2XConfig, collate_all_egos
+from deepaccident_devkit.export.torch import AllEgosDataset, RandomAugmentation, collate_all_egos
 from deepaccident_devkit.model.config import ModelConfig
 from deepaccident_devkit.model.training.config import TrainConfig
 from deepaccident_devkit.motion import samples
-from deepaccident_devkit.v2x import Agents, Link
 
 if TYPE_CHECKING:
     TorchSampler = Sampler[int]
@@ -22,22 +21,6 @@ else:
     from torch.utils.data import Dataset as TorchDataset
 
     TorchSampler = Sampler
-
-
-def inputs_config(model: ModelConfig, agents: Agents, *, link: Link | None = None, **changes: Any) -> V2XConfig:
-    """What an item needs for the model's inputs alone; `changes` are other fields of `V2XConfig`.
-
-    Args:
-        model: its images and frames.
-        agents: who cooperates.
-        link: what happens to partners' data.
-        changes: other fields.
-    """
-    given: dict[str, Any] = {"points": False, "boxes": None, "on_missing": "skip", **changes}
-    labels = model.labels
-    return V2XConfig(
-        agents=agents, link=link, past=labels.receptive_field, step=labels.step, images=model.images, **given
-    )
 
 
 class Moments(TorchDataset):
@@ -62,8 +45,7 @@ class Moments(TorchDataset):
         self.data = AllEgosDataset(
             dataset,
             tokens,
-            inputs_config(
-                model,
+            model.inputs(
                 config.agents,
                 boxes="sample",
                 labels=model.labels,
