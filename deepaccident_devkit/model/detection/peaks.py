@@ -30,7 +30,7 @@ def draw_peaks(heatmap: Tensor, layer: Tensor, cell: Tensor, radius: Tensor) -> 
     Args:
         heatmap: (L, H, W), changed in place.
         layer: (N,) int64, where each is drawn.
-        cell: (N, 2) int64, column and row of each peak.
+        cell: (N, 2) int64, column and row of each peak, inside the map.
         radius: (N,) int64, r in cells.
     """
     if not len(layer):
@@ -41,8 +41,8 @@ def draw_peaks(heatmap: Tensor, layer: Tensor, cell: Tensor, radius: Tensor) -> 
     column, row = cell[:, :1] + offset, cell[:, 1:] + offset  # (N, side)
     sigma = (2 * radius[:, None].to(heatmap.dtype) + 1) / 6
     bell = torch.exp(-(offset.to(heatmap.dtype) ** 2) / (2 * sigma**2)) * (offset.abs() <= radius[:, None])
-    along, across = bell * ((column >= 0) & (column < columns)), bell * ((row >= 0) & (row < rows))
+    # what lies beyond an edge is moved onto it, where the Gaussian itself is larger
     place = row.clamp(0, rows - 1)[:, :, None] * columns + column.clamp(0, columns - 1)[:, None]
     place = place + layer[:, None, None] * (rows * columns)
-    peaks = across[:, :, None] * along[:, None]
+    peaks = bell[:, :, None] * bell[:, None]
     heatmap.view(-1).scatter_reduce_(0, place.flatten(), peaks.flatten(), "amax")

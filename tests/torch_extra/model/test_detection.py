@@ -107,6 +107,7 @@ def test_mixed_precision_gives_finite_single_precision_losses_and_boxes(config: 
         (found,) = decode_detections(maps, config, DecodingConfig(score_threshold=0.0))
     assert {(value.dtype, bool(value.isfinite())) for value in losses.values()} == {(torch.float32, True)}
     assert found.boxes.dtype == torch.float32
+    assert bool((found.scores.diff() <= 0).all())
     assert len(found.boxes) > 0
 
 
@@ -306,6 +307,12 @@ def test_scales_are_those_of_the_slots() -> None:
     assert suppress(boxes, scores, slots, NmsConfig()).tolist() == [0, 1, 2, 3]
     assert suppress(boxes, scores, slots, NmsConfig(scale=(1.0, 3.0))).tolist() == [0, 1, 2]
     assert suppress(boxes, scores, slots, NmsConfig(scale=(3.0,))).tolist() == [0, 2]
+
+
+def test_the_circle_s_threshold_is_a_distance() -> None:
+    boxes = as_boxes(np.array([[0.0, 0, 4, 2, 0], [1.8, 0, 4, 2, 0], [2.2, 0, 4, 2, 0]]))
+    rules = NmsConfig(method="circle", threshold=2.0)
+    assert suppress(boxes, np.array([0.9, 0.8, 0.7]), np.zeros(3, dtype=int), rules).tolist() == [0, 2]
 
 
 def test_the_best_stay_if_there_are_too_many() -> None:
