@@ -66,13 +66,13 @@ class _Placed(NamedTuple):
     """All boxes of a batch, N, on the grid."""
 
     sample: Tensor  # (N,)
-    task: Tensor  # (N,) −1 for those that no task has, or outside
+    task: Tensor  # (N,) −1 for those that no task has
     slot: Tensor  # (N,) in the task
     cell: Tensor  # (N, 2) column, row
     code: Tensor  # (N, 10)
     radius: Tensor  # (N,) cells
     velocity_known: Tensor  # (N,)
-    inside: Tensor  # (N,)
+    inside: Tensor  # (N,) whether they have a cell
 
 
 def detection_targets(
@@ -140,11 +140,9 @@ def _placed(
 
 def _slots_of(category: Tensor, head: DetectionConfig) -> tuple[Tensor, Tensor]:
     """Task, and slot in it, of each category; task −1 for those that have none."""
-    table = torch.full((len(CATEGORIES) + 1, 2), -1, device=category.device)
-    for task, slots in enumerate(head.class_slots):
-        for slot, each in enumerate(slots):
-            if each is not None:
-                table[each] = torch.tensor([task, slot], device=category.device)
+    places = {each: (task, slot) for task, slots in enumerate(head.class_slots) for slot, each in enumerate(slots)}
+    rows = [places.get(each, (-1, -1)) for each in range(len(CATEGORIES))]
+    table = torch.tensor([*rows, (-1, -1)], device=category.device)
     known = (category >= 0) & (category < len(CATEGORIES))
     found = table[torch.where(known, category, len(CATEGORIES))]
     return found[:, 0], found[:, 1]
