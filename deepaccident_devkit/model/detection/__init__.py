@@ -1,0 +1,45 @@
+"""Detection: boxes as peaks on the ground (CenterPoint), with the released quirks as settings."""
+
+from deepaccident_devkit.model.detection.decoding import (
+    Candidates,
+    DecodingConfig,
+    Detections,
+    decode_candidates,
+    decode_detections,
+    detected_boxes,
+)
+from deepaccident_devkit.model.detection.head import (
+    CLASS_SLOTS,
+    ONE_TASK,
+    RELEASED_CLASS_SLOTS,
+    CenterHead,
+    DetectionConfig,
+    TaskMaps,
+)
+from deepaccident_devkit.model.detection.losses import DetectionLossConfig, detection_losses
+from deepaccident_devkit.model.detection.nms import RELEASED_NMS, NmsConfig, rotated_iou, suppress
+from deepaccident_devkit.model.detection.targets import TargetConfig, TaskTargets, detection_targets
+
+__all__ = [
+    "CLASS_SLOTS",
+    "ONE_TASK",
+    "RELEASED_CLASS_SLOTS",
+    "RELEASED_NMS",
+    "Candidates",
+    "CenterHead",
+    "DecodingConfig",
+    "DetectionConfig",
+    "DetectionLossConfig",
+    "Detections",
+    "NmsConfig",
+    "TargetConfig",
+    "TaskMaps",
+    "TaskTargets",
+    "decode_candidates",
+    "decode_detections",
+    "detected_boxes",
+    "detection_losses",
+    "detection_targets",
+    "rotated_iou",
+    "suppress",
+]

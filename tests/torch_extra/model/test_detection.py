@@ -1,0 +1,384 @@
+"""The detection head's own laws: targets, losses, decoding and suppression."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from deepaccident_devkit.errors import ConfigError, DeepAccidentError, GeometryError
+from deepaccident_devkit.geometry import SE3
+from deepaccident_devkit.model.detection import (
+    ONE_TASK,
+    RELEASED_CLASS_SLOTS,
+    RELEASED_NMS,
+    CenterHead,
+    DecodingConfig,
+    DetectionConfig,
+    DetectionLossConfig,
+    Detections,
+    NmsConfig,
+    TargetConfig,
+    TaskMaps,
+    TaskTargets,
+    decode_candidates,
+    decode_detections,
+    detected_boxes,
+    detection_losses,
+    detection_targets,
+    rotated_iou,
+    suppress,
+)
+from deepaccident_devkit.model.detection.peaks import draw_peaks
+
+GRID: dict[str, Any] = {"x": (-8.0, 8.0, 1.0), "y": (-6.0, 6.0, 1.0)}
+SMALL = DetectionConfig(in_channels=4, shared_channels=4, **GRID)
+JOINT = replace(SMALL, class_slots=ONE_TASK, branches="joint", upsample=2)
+SEEDS = st.integers(0, 2**32 - 1)
+HEADS = pytest.mark.parametrize("config", [SMALL, JOINT], ids=["separate", "joint"])
+BUILT = settings(max_examples=20)
+
+
+def features_of(config: DetectionConfig, samples: int = 2) -> Tensor:
+    rows, columns = (count // config.upsample for count in config.shape)
+    return torch.randn(samples, config.in_channels, rows, columns, generator=torch.Generator().manual_seed(0))
+
+
+def random_boxes(seed: int, count: int) -> tuple[Tensor, Tensor]:
+    """Boxes in cells of their own, and categories."""
+    random = np.random.default_rng(seed)
+    cell = random.choice(16 * 12, count, replace=False)
+    place = np.stack([cell % 16 - 8, cell // 16 - 6], axis=1) + random.uniform(0.01, 0.99, (count, 2))
+    size = random.uniform(0.5, 6.0, (count, 3))
+    others = np.column_stack([random.uniform(-3.0, 3.0, (count, 1)), size, random.uniform(-3.1, 3.1, (count, 1))])
+    rows = np.column_stack([place, others, random.uniform(-20.0, 20.0, (count, 2))])
+    return torch.from_numpy(rows).float(), torch.from_numpy(random.integers(0, 6, count))
+
+
+def perfect_maps(targets: list[TaskTargets]) -> list[TaskMaps]:
+    """Maps that say exactly what the targets say."""
+    maps = []
+    for target in targets:
+        samples, _, rows, columns = target.heatmap.shape
+        code = torch.zeros(samples, 10, rows * columns)
+        for sample in range(samples):
+            there = target.mask[sample]
+            code[sample, :, target.place[sample, there]] = target.box[sample, there].T
+        parts = code.view(samples, 10, rows, columns).split([2, 1, 3, 2, 2], dim=1)
+        maps.append(TaskMaps(*parts, torch.where(target.heatmap == 1, 9.0, -9.0)))
+    return maps
+
+
+@HEADS
+def test_maps_have_the_cells_of_the_grid(config: DetectionConfig) -> None:
+    maps = CenterHead(config)(features_of(config))
+    assert [len(slots) for slots in config.class_slots] == [task.heatmap.shape[1] for task in maps]
+    assert {tuple(task.code.shape) for task in maps} == {(2, 10, 12, 16)}
+
+
+@HEADS
+def test_a_new_head_expects_few_boxes(config: DetectionConfig) -> None:
+    for task in CenterHead(config)(torch.zeros_like(features_of(config))):
+        assert task.heatmap.sigmoid().mean().item() == pytest.approx(0.1, abs=0.07)
+
+
+@HEADS
+def test_gradients_reach_every_parameter(config: DetectionConfig) -> None:
+    head = CenterHead(config)
+    boxes, categories = zip(*(random_boxes(seed, 20) for seed in (1, 2)), strict=True)
+    losses = detection_losses(head(features_of(config)), detection_targets(boxes, categories, config))
+    torch.stack(list(losses.values())).sum().backward()
+    assert all(weight.grad is not None and bool(weight.grad.abs().sum() > 0) for weight in head.parameters())
+
+
+@HEADS
+def test_mixed_precision_gives_finite_single_precision_losses_and_boxes(config: DetectionConfig) -> None:
+    boxes, categories = random_boxes(1, 20)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        maps = CenterHead(config)(features_of(config, 1))
+        losses = detection_losses(maps, detection_targets([boxes], [categories], config))
+        (found,) = decode_detections(maps, config, DecodingConfig(score_threshold=0.0))
+    assert {(value.dtype, bool(value.isfinite())) for value in losses.values()} == {(torch.float32, True)}
+    assert found.boxes.dtype == torch.float32
+    assert bool((found.scores.diff() <= 0).all())
+    assert len(found.boxes) > 0
+
+
+def test_features_of_another_size_are_refused() -> None:
+    with pytest.raises(ConfigError, match="features: 24 × 32 cells after upsampling by 2, expected 12 × 16"):
+        CenterHead(JOINT)(torch.zeros(1, 4, 12, 16))
+
+
+@pytest.mark.parametrize("head", [SMALL, replace(SMALL, class_slots=ONE_TASK)], ids=["tasks", "one task"])
+@given(seed=SEEDS, count=st.integers(0, 30))
+@BUILT
+def test_perfect_maps_give_the_boxes_back(head: DetectionConfig, seed: int, count: int) -> None:
+    boxes, categories = random_boxes(seed, count)
+    no_suppression = DecodingConfig(nms=(NmsConfig(threshold=1.0),))
+    (found,) = decode_detections(perfect_maps(detection_targets([boxes], [categories], head)), head, no_suppression)
+    assert len(found.boxes) == count
+    ours, truth = found.boxes[:, 0].argsort(), boxes[:, 0].argsort()
+    torch.testing.assert_close(found.boxes[ours], boxes[truth], rtol=0, atol=1e-4)
+    assert torch.equal(found.categories[ours], categories[truth])
+
+
+def test_released_slots_lead_back_to_the_same_categories() -> None:
+    """The release's names are off, its numbers are consistent."""
+    boxes, categories = random_boxes(3, 12)
+    head = replace(SMALL, class_slots=RELEASED_CLASS_SLOTS)
+    targets = detection_targets([boxes], [categories], head)
+    assert [bool(target.mask.any()) for target in targets[4:]] == [False, False]
+    config = DecodingConfig(nms=tuple(replace(each, threshold=0.0, method="circle") for each in RELEASED_NMS))
+    (found,) = decode_detections(perfect_maps(targets), head, config)
+    assert found.categories.sort().values.tolist() == categories.sort().values.tolist()
+
+
+def test_slots_without_a_category_give_no_boxes() -> None:
+    head = replace(SMALL, class_slots=((None, 4),))
+    code = torch.zeros(1, 10, 12, 16).split([2, 1, 3, 2, 2], dim=1)
+    heatmap = torch.full((1, 2, 12, 16), -9.0)
+    heatmap[0, 0, 2, 3] = heatmap[0, 1, 9, 9] = 9.0
+    (found,) = decode_detections([TaskMaps(*code, heatmap)], head)
+    assert found.categories.tolist() == [4]
+
+
+@given(seed=SEEDS)
+@BUILT
+def test_targets_do_not_depend_on_the_other_samples(seed: int) -> None:
+    first, second, empty = random_boxes(seed, 20), random_boxes(seed + 1, 9), random_boxes(seed, 0)
+    together = detection_targets(*zip(first, empty, second, strict=True), SMALL)
+    for number, (boxes, categories) in enumerate((first, empty, second)):
+        alone = detection_targets([boxes], [categories], SMALL)
+        for task, expected in zip(together, alone, strict=True):
+            assert all(torch.equal(ours[number], theirs[0]) for ours, theirs in zip(task, expected, strict=True))
+
+
+def test_boxes_outside_or_of_no_category_are_left_out() -> None:
+    boxes = torch.tensor([[0.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0, 0.0, 0.0]]).repeat(6, 1)
+    boxes[1, 0], boxes[2, 1], boxes[3, 4] = -8.9, 6.01, 0.0  # in the folded first column; beyond the last row; no width
+    categories = torch.tensor([0, 0, 0, 0, -1, 5])
+    cars, *_ = detection_targets([boxes], [categories], replace(SMALL, class_slots=((0,), (1, 2))))
+    assert cars.mask[0].nonzero()[:, 0].tolist() == [0, 1]
+    assert cars.place[0, :2].tolist() == [6 * 16 + 8, 6 * 16]
+    assert cars.box[0, 1, 0] == pytest.approx(-0.9, abs=1e-5)
+
+
+def test_at_most_so_many_boxes_of_a_task() -> None:
+    boxes, _ = random_boxes(5, 9)
+    cars, *_ = detection_targets([boxes], [torch.zeros(9, dtype=torch.long)], SMALL, TargetConfig(max_boxes=4))
+    assert cars.mask.tolist() == [[True] * 4]
+    assert int((cars.heatmap == 1).sum()) == 4
+
+
+@given(seed=SEEDS)
+@BUILT
+def test_peaks_equal_the_plain_formula(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    column, row, radius = random.integers(0, 9, 5), random.integers(0, 7, 5), random.integers(0, 6, 5)
+    ours = torch.zeros(2, 7, 9, dtype=torch.float64)
+    layer = torch.tensor([0, 0, 0, 0, 1])
+    draw_peaks(ours, layer, torch.from_numpy(np.stack([column, row], axis=1)), torch.from_numpy(radius))
+    expected = np.zeros((2, 7, 9))
+    for which, y, x in np.ndindex(expected.shape):
+        for peak in np.flatnonzero(layer.numpy() == which):
+            apart = np.abs([x - column[peak], y - row[peak]])
+            if apart.max() <= radius[peak]:
+                sigma = (2 * radius[peak] + 1) / 6
+                expected[which, y, x] = max(expected[which, y, x], math.exp(-(apart @ apart) / (2 * sigma**2)))
+    np.testing.assert_allclose(ours.numpy(), expected, atol=1e-12)
+
+
+def test_unknown_velocities_are_trained_to_zero_or_not_at_all() -> None:
+    boxes, categories = random_boxes(7, 10)
+    boxes[:4, 7:] = torch.nan
+    known = [torch.arange(10) > 4]  # and one more, which is finite
+    losses = {}
+    for rule in ("zero", "ignore"):
+        config = TargetConfig(unknown_velocity=rule)
+        targets = detection_targets([boxes], [categories], SMALL, config, velocity_known=known)
+        assert all(bool(target.box.isfinite().all()) for target in targets)
+        wrong = [task._replace(vel=task.vel + 1) for task in perfect_maps(targets)]
+        found = detection_losses(wrong, targets, DetectionLossConfig(weight=1.0, box_weight=1.0))
+        counts = [float(target.mask.sum()) + 1e-4 for target in targets]
+        losses[rule] = sum(float(found[f"task{task}.loss_bbox"]) * count for task, count in enumerate(counts))
+    assert losses["zero"] == pytest.approx(20, abs=1e-3)  # ten boxes, off by 1 in vx and vy
+    assert losses["ignore"] == pytest.approx(10, abs=1e-3)
+
+
+def test_perfect_maps_have_almost_no_loss_and_weights_multiply() -> None:
+    boxes, categories = random_boxes(8, 15)
+    targets = detection_targets([boxes], [categories], SMALL)
+    maps = perfect_maps(targets)
+    whole = detection_losses(maps, targets, DetectionLossConfig(weight=1.0))
+    assert all(float(loss) < 0.01 for loss in whole.values())
+    halved = detection_losses(maps, targets)
+    assert all(float(halved[name]) == pytest.approx(float(loss) / 2) for name, loss in whole.items())
+
+
+def test_no_boxes_have_a_finite_loss() -> None:
+    config = replace(SMALL, class_slots=ONE_TASK)
+    empty = detection_targets([torch.zeros(0, 9)], [torch.zeros(0, dtype=torch.long)], config)
+    losses = detection_losses(CenterHead(config)(features_of(config, 1)), empty)
+    assert losses["task0.loss_heatmap"].item() > 0
+    assert losses["task0.loss_bbox"].item() == 0
+
+
+def test_candidates_outside_the_range_or_not_finite_are_not_valid() -> None:
+    code = torch.zeros(1, 10, 12, 16)
+    code[0, 2, 0, 0] = 11.0  # too high
+    code[0, 3, 0, 1] = 100.0  # of infinite length
+    code[0, 0, 0, 2] = 80.0  # too far
+    heatmap = torch.full((1, 1, 12, 16), -9.0)
+    heatmap[0, 0, 0, :4] = torch.tensor([4.0, 3.0, 2.0, 1.0])
+    found = decode_candidates(TaskMaps(*code.split([2, 1, 3, 2, 2], dim=1), heatmap), SMALL)
+    assert found.valid[0, :6].tolist() == [False, False, False, True, False, False]
+    torch.testing.assert_close(found.boxes[0, 3, :3], torch.tensor([-5.0, -6.0, 0.0]))
+
+
+def rectangles(seed: int, count: int) -> np.ndarray:
+    random = np.random.default_rng(seed)
+    columns = [random.uniform(-6, 6, (count, 2)), random.uniform(0.2, 6, (count, 2)), random.uniform(-4, 4, (count, 1))]
+    return np.column_stack(columns)
+
+
+def as_boxes(rectangle: np.ndarray) -> np.ndarray:
+    x, y, length, width, yaw = rectangle.T
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    return np.column_stack([x, y, zero, length, width, one, yaw, zero, zero])
+
+
+def polygon(rectangle: np.ndarray) -> shapely.Polygon:
+    x, y, length, width, yaw = rectangle
+    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2 * [length, width]
+    turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+    return shapely.Polygon(corners @ turn.T + [x, y])
+
+
+@given(seed=SEEDS)
+@BUILT
+def test_rotated_iou_is_shapely_s(seed: int) -> None:
+    first, second = rectangles(seed, 6), rectangles(seed + 1, 5)
+    one, two = [polygon(each) for each in first], [polygon(each) for each in second]
+    expected = [[a.intersection(b).area / a.union(b).area for b in two] for a in one]
+    np.testing.assert_allclose(rotated_iou(first, second), expected, atol=1e-9)
+
+
+@given(seed=SEEDS, threshold=st.sampled_from([0.01, 0.2, 0.5]))
+@BUILT
+def test_kept_boxes_do_not_overlap_and_cover_those_that_went(seed: int, threshold: float) -> None:
+    flat = rectangles(seed, 25)
+    scores = np.random.default_rng(seed).random(25)
+    kept = suppress(as_boxes(flat), scores, np.zeros(25, dtype=int), NmsConfig(threshold=threshold))
+    over = rotated_iou(flat, flat) > threshold
+    assert (np.diff(scores[kept]) <= 0).all()
+    assert over[np.ix_(kept, kept)].sum() == len(kept)
+    for gone in set(range(25)) - set(kept.tolist()):
+        assert any(over[gone, better] and scores[better] >= scores[gone] for better in kept)
+
+
+@pytest.mark.parametrize("method", ["rotated", "circle"])
+@given(seed=SEEDS)
+@BUILT
+def test_suppression_depends_neither_on_the_order_nor_on_the_axes(method: Any, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    boxes, scores, slots = as_boxes(rectangles(seed, 20)), random.random(20), random.integers(0, 2, 20)
+    rules = NmsConfig(method=method, scale=(0.6, 1.3))
+    kept = suppress(boxes, scores, slots, rules)
+    order = random.permutation(20)
+    np.testing.assert_array_equal(order[suppress(boxes[order], scores[order], slots[order], rules)], kept)
+    angle, moved = random.uniform(-3, 3), boxes.copy()
+    moved[:, :2] = SE3.from_yaw(angle, (3.0, -40.0, 0.0)).apply(boxes[:, :3])[:, :2]
+    moved[:, 6] += angle
+    np.testing.assert_array_equal(suppress(moved, scores, slots, rules), kept)
+    mirrored = boxes * [1, -1, 1, 1, 1, 1, -1, 1, -1]  # the left-handed frame
+    np.testing.assert_array_equal(suppress(mirrored, scores, slots, rules), kept)
+
+
+def test_scales_are_those_of_the_slots() -> None:
+    boxes = as_boxes(np.array([[0.0, 0, 2, 2, 0], [1.5, 0, 2, 2, 0], [10.0, 0, 2, 2, 0], [11.5, 0, 2, 2, 0]]))
+    scores, slots = np.array([0.4, 0.3, 0.2, 0.1]), np.array([0, 0, 1, 1])
+    assert suppress(boxes, scores, slots, NmsConfig()).tolist() == [0, 1, 2, 3]
+    assert suppress(boxes, scores, slots, NmsConfig(scale=(1.0, 3.0))).tolist() == [0, 1, 2]
+    assert suppress(boxes, scores, slots, NmsConfig(scale=(3.0,))).tolist() == [0, 2]
+
+
+def test_the_circle_s_threshold_is_a_distance() -> None:
+    boxes = as_boxes(np.array([[0.0, 0, 4, 2, 0], [1.8, 0, 4, 2, 0], [2.2, 0, 4, 2, 0]]))
+    rules = NmsConfig(method="circle", threshold=2.0)
+    assert suppress(boxes, np.array([0.9, 0.8, 0.7]), np.zeros(3, dtype=int), rules).tolist() == [0, 2]
+
+
+def test_the_best_stay_if_there_are_too_many() -> None:
+    boxes = as_boxes(np.column_stack([np.arange(9) * 10.0, *np.ones((4, 9))]))
+    assert suppress(boxes, np.arange(9.0), np.zeros(9, dtype=int), NmsConfig(keep=3)).tolist() == [8, 7, 6]
+    none = suppress(boxes[:0], np.zeros(0), np.zeros(0, dtype=int), NmsConfig(scale=(1.0, 2.0)))
+    assert none.tolist() == []
+
+
+def test_detected_boxes_stand_in_the_world() -> None:
+    boxes = torch.tensor([[10.0, 2.0, 1.0, 4.0, 2.0, 1.5, 0.25, 5.0, 1.0]])
+    found = Detections(boxes=boxes.requires_grad_(), scores=torch.tensor([0.5]), categories=torch.tensor([3]))
+    pose = SE3.from_yaw(math.pi / 2, (100.0, 200.0, 3.0))
+    for given_pose in (pose, pose.matrix, torch.from_numpy(pose.matrix.copy())):
+        world = detected_boxes(found, given_pose)
+        assert world.boxes.frame == "world"
+        np.testing.assert_allclose(world.boxes.center, [[98.0, 210.0, 4.0]], atol=1e-6)
+        np.testing.assert_allclose(world.boxes.size, [[4.0, 2.0, 1.5]], atol=1e-6)
+        np.testing.assert_allclose(world.boxes.yaw, [0.25 + math.pi / 2], atol=1e-6)
+        np.testing.assert_allclose(world.boxes.velocity, [[-1.0, 5.0, 0.0]], atol=1e-6)
+        assert world.boxes.category_names == ["cyclist"]
+        assert world.scores.tolist() == [0.5]
+    with pytest.raises(GeometryError, match=r"SE3\.matrix"):
+        detected_boxes(found, np.ones((4, 4)))
+
+
+def test_a_sample_without_boxes_gives_none() -> None:
+    maps = TaskMaps(*torch.zeros(2, 10, 12, 16).split([2, 1, 3, 2, 2], dim=1), torch.full((2, 6, 12, 16), -9.0))
+    found = decode_detections([maps], replace(SMALL, class_slots=ONE_TASK))
+    assert [len(detected_boxes(each, SE3.identity())) for each in found] == [0, 0]
+
+
+def two_suppressions() -> object:
+    maps = CenterHead(SMALL)(features_of(SMALL))
+    return decode_detections(maps, SMALL, DecodingConfig(nms=(NmsConfig(), NmsConfig())))
+
+
+def three_scales() -> object:
+    maps = CenterHead(SMALL)(features_of(SMALL))
+    return decode_detections(maps, SMALL, DecodingConfig(nms=(NmsConfig(scale=(1.0, 1.0, 1.0)),)))
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda: DetectionConfig(class_slots=((0,), ())), "class_slots: expected tasks of one slot or more"),
+        (lambda: DetectionConfig(class_slots=((0, 0),)), "class_slots: expected each category 0 to 5 at most once"),
+        (lambda: DetectionConfig(class_slots=((6,),)), "class_slots: expected each category 0 to 5 at most once"),
+        (lambda: DetectionConfig(x=(0.0, 1.0, 0.3)), "x: 0 to 1 m is not a whole number of cells"),
+        (lambda: DetectionConfig(upsample=0), "upsample: expected a whole number from 1, found 0"),
+        (lambda: DetectionConfig(branches="shared"), "branches: expected one of separate, joint, found 'shared'"),
+        (lambda: TargetConfig(min_overlap=1.0), "min_overlap: expected a number between 0 and 1, found 1.0"),
+        (lambda: TargetConfig(max_boxes=0), "max_boxes: expected a whole number from 1, found 0"),
+        (lambda: TargetConfig(unknown_velocity="nan"), "unknown_velocity: expected one of ignore, zero, found 'nan'"),
+        (lambda: DetectionLossConfig(weight=-1.0), "weight: expected a number from 0, found -1.0"),
+        (lambda: DecodingConfig(candidates=0), "candidates: expected a whole number from 1, found 0"),
+        (lambda: DecodingConfig(center_range=(1, 1, 1, 0, 2, 2)), "center_range: expected least x, y, z, then"),
+        (lambda: DecodingConfig(nms=()), "nms: expected one NmsConfig, or one a task, found none"),
+        (lambda: NmsConfig(method="oval"), "method: expected one of rotated, circle, found 'oval'"),
+        (lambda: NmsConfig(threshold=-0.1), "threshold: expected a number from 0, found -0.1"),
+        (lambda: NmsConfig(scale=(1.0, 0.0)), "scale: expected one number above 0, or one a slot"),
+        (lambda: NmsConfig(keep=0), "keep: expected a whole number from 1, found 0"),
+        (two_suppressions, "nms: expected one NmsConfig, or 4, one a task; found 2"),
+        (three_scales, "nms: task 0 has 1 slots, found 3 scales"),
+    ],
+)
+def test_what_cannot_be_is_refused(make: Callable[[], object], sentence: str) -> None:
+    with pytest.raises(DeepAccidentError, match=sentence):
+        make()
