@@ -1,0 +1,312 @@
+"""`train`: from a release to a folder with weights, log and curves; a killed run goes on where it was."""
+
+from __future__ import annotations
+
+import copy
+import json
+import logging
+import os
+import time
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
+from torch.optim import AdamW
+from tqdm.auto import tqdm
+
+from deepaccident_devkit._version import __version__
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.files import writable_folder, write_bytes
+from deepaccident_devkit.json_text import parsed_json
+from deepaccident_devkit.model.checkpoint import load_weights, read_weights, write_weights
+from deepaccident_devkit.model.network import V2XFormer
+from deepaccident_devkit.model.predicting import PredictConfig, check_images
+from deepaccident_devkit.model.presets import ModelChoice
+from deepaccident_devkit.model.training.config import TrainConfig
+from deepaccident_devkit.model.training.data import Moments, batches
+from deepaccident_devkit.model.training.log import add_to_log, cut_log, read_log
+from deepaccident_devkit.model.training.place import Place, processes
+from deepaccident_devkit.model.training.schedule import freeze, generator_of, learning_rate, optimizer_of, positions
+from deepaccident_devkit.model.training.state import BEST, Progress, load_state, save_state
+from deepaccident_devkit.model.training.step import TrainingStep, training_batch, with_dropped_partners
+from deepaccident_devkit.model.training.validation import SCORE, validated, validation_samples
+from deepaccident_devkit.reading import read_bytes
+from deepaccident_devkit.render.training import save_training
+
+logger = logging.getLogger(__name__)
+RUN: Final = "run.json"
+CURVES: Final = "curves.png"
+_TIMED: Final = 2
+"""Steps that are timed before a run, and then not taken."""
+Say = Callable[[str], None]
+
+
+def train(  # noqa: PLR0913 - on what, to where, what, how, from what, and on which machine
+    dataset: Dataset,
+    out: str | os.PathLike[str],
+    choice: ModelChoice,
+    config: TrainConfig | None = None,
+    *,
+    weights: str | os.PathLike[str] | None = None,
+    device: str = "auto",
+    workers: int = 0,
+    images_cache: str | os.PathLike[str] | None = None,
+    say: Say | None = None,
+) -> Path:
+    """Train a model; the same call goes on with a run that was stopped or killed.
+
+    On one CPU, with the same number of threads, a run that was resumed has the bits of one that was not. `torchrun`
+    starts it on several GPUs.
+
+    Args:
+        dataset: the release.
+        out: the run's folder: `run.json`, `log.jsonl`, `curves.png`, `best.safetensors`, `last.safetensors`.
+        choice: the preset and its changes.
+        config: how to train; None for the defaults.
+        weights: to begin from (`checkpoint.read_weights`); what they lack begins at random.
+        device: `auto`, `cpu`, `cuda`, …
+        workers: processes that read; 0 for this one.
+        images_cache: of `V2XConfig`.
+        say: told how long it will take, and each validation; None for silence, and no progress bar.
+
+    Returns:
+        The path of the best weights; the last ones if nothing was validated.
+
+    Raises:
+        ConfigError: another run is in the folder, there is no such device, or weights do not fit.
+        NotAvailableError: the split has no labelled samples, or the release no images.
+        DeepAccidentError: as of `AllEgosDataset`.
+    """
+    config = TrainConfig() if config is None else config
+    with processes(device) as place:
+        say = say if place.is_first else None
+        folder = writable_folder(out)
+        moments = Moments(dataset, choice.config, config, images_cache=images_cache)
+        check_images(dataset, moments.data.egos[0])
+        run = _Run(
+            folder=folder,
+            notes=_notes(dataset, choice, config, weights),
+            dataset=dataset,
+            moments=moments,
+            config=config,
+            place=place,
+            predict=PredictConfig(
+                agents=config.agents, device=place.device, workers=workers, images_cache=images_cache
+            ),
+            say=say or (lambda _text: None),
+            bar=say is not None,
+        )
+        if place.is_first:
+            _claim(folder, run.notes)
+        return run.trained(_model(choice, config, weights, run.say).to(place.device))
+
+
+def _model(choice: ModelChoice, config: TrainConfig, weights: str | os.PathLike[str] | None, say: Say) -> V2XFormer:
+    """The model before the first step."""
+    torch.manual_seed(config.seed)
+    model = V2XFormer(choice.config)
+    if weights is not None:
+        say(f"{weights}: {load_weights(model, read_weights(Path(weights))).to_text()}")
+    freeze(model, config.freeze)
+    return model
+
+
+def _notes(
+    dataset: Dataset, choice: ModelChoice, config: TrainConfig, weights: str | os.PathLike[str] | None
+) -> dict[str, Any]:
+    """What a run notes of itself, and what must be the same to go on with it."""
+    return {
+        **choice.as_dict(),
+        "training": config.as_dict(),
+        "from": None if weights is None else os.fspath(weights),
+        "release": {"version": dataset.version, "index": dataset.tables_folder.name},
+        "devkit": __version__,
+    }
+
+
+def _claim(folder: Path, notes: Mapping[str, Any]) -> None:
+    """Write a run's notes, or compare them with those that are there; raises ConfigError if they differ."""
+    path = folder / RUN
+    if path.is_file():
+        there = parsed_json(read_bytes(path, "bundle"))
+        told = json.loads(json.dumps(notes))
+        differing = [name for name in told if there.get(name) != told[name]] if isinstance(there, dict) else [RUN]
+        if differing:
+            raise ConfigError(
+                f"{path}: is of another run, its {', '.join(differing)} differ; give the same options to go on with it, "
+                "or another folder"
+            )
+        return
+    write_bytes(path, json.dumps(notes, indent=1).encode())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Run:
+    """A run on one process."""
+
+    folder: Path
+    notes: Mapping[str, Any]
+    dataset: Dataset
+    moments: Moments
+    config: TrainConfig
+    place: Place
+    predict: PredictConfig
+    say: Say
+    bar: bool
+
+    def trained(self, model: V2XFormer) -> Path:
+        """Take all steps that are left."""
+        optimizer = optimizer_of(model, self.config)
+        progress = load_state(self.folder, model, optimizer)
+        step = self._wrapped(model)
+        tokens = validation_samples(self.dataset, self.config)
+        if self.place.is_first:
+            cut_log(self.folder, progress.step)
+        if progress.step < self.config.steps:
+            self.say(self._estimate(model, progress, len(tokens)))
+        numbers = positions(
+            len(self.moments),
+            self.config,
+            first=progress.step * self.config.moments * self.config.accumulate,
+            rank=self.place.rank,
+            ranks=self.place.ranks,
+        )
+        given = iter(batches(self.moments, numbers, self.config, workers=self.predict.workers))
+        steps = range(progress.step, self.config.steps)
+        with tqdm(steps, initial=progress.step, total=self.config.steps, unit="step", disable=not self.bar) as bar:
+            for number in bar:
+                row = self._step(number, step, optimizer, given)
+                bar.set_postfix(loss=f"{row['loss']:.3g}")
+                progress = self._after(number + 1, row, model, optimizer, progress, tokens)
+        best = self.folder / BEST
+        return best if best.is_file() else self._weights(model, progress)
+
+    def _wrapped(self, model: V2XFormer) -> nn.Module:
+        if self.place.ranks == 1:
+            return TrainingStep(model)
+        if self.place.device.startswith("cuda"):
+            model = nn.SyncBatchNorm.convert_sync_batchnorm(model)
+        return DistributedDataParallel(TrainingStep(model))
+
+    def _step(self, number: int, step: nn.Module, optimizer: AdamW, given: Any) -> dict[str, Any]:
+        """One step of the optimizer; all that is random depends on its number."""
+        config, began, waited = self.config, time.perf_counter(), 0.0
+        step.train()
+        for group in optimizer.param_groups:
+            group["lr"] = learning_rate(number, config)
+        optimizer.zero_grad(set_to_none=True)
+        sums: dict[str, float] = {}
+        for part in range(config.accumulate):
+            asked = time.perf_counter()
+            batch = next(given)
+            waited += time.perf_counter() - asked
+            losses = self._losses(step, batch, (number, part))
+            torch.stack(list(losses.values())).sum().div(config.accumulate).backward()
+            for name, value in losses.items():
+                sums[name] = sums.get(name, 0.0) + float(value.detach()) / config.accumulate
+        trained = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+        norm = float(nn.utils.clip_grad_norm_(trained, config.clip))
+        optimizer.step()
+        return {
+            "step": number + 1,
+            "loss": sum(sums.values()),
+            "losses": sums,
+            "rate": learning_rate(number, config),
+            "norm": norm,
+            "seconds": time.perf_counter() - began,
+            "waiting": waited,
+        }
+
+    def _losses(self, step: nn.Module, batch: Mapping[str, Any], numbers: tuple[int, int]) -> dict[str, Tensor]:
+        seeds = (self.config.seed, *numbers, self.place.rank)
+        generator = generator_of(*seeds)
+        torch.manual_seed(generator_of(*seeds).initial_seed())  # dropout, and the latents' noise
+        inputs, targets = training_batch(batch, self.moments.model, self.config, generator)
+        inputs = with_dropped_partners(inputs, self.config, generator)
+        device = self.place.device
+        kind = torch.device(device).type
+        with torch.autocast(kind, dtype=torch.bfloat16, enabled=self.config.bf16):
+            losses: dict[str, Tensor] = step(inputs.to(device), targets.to(device))
+        return losses
+
+    def _after(
+        self,
+        done: int,
+        row: Mapping[str, Any],
+        model: V2XFormer,
+        optimizer: AdamW,
+        progress: Progress,
+        tokens: list[str],
+    ) -> Progress:
+        """Log a step and, every now and then, validate and save."""
+        config, last = self.config, done == self.config.steps
+        progress = replace(progress, step=done)
+        row = dict(row)
+        if tokens and (done % config.validate_every == 0 or last):
+            scores = validated(model, self.dataset, tokens, self.predict)
+            row["validation"] = scores
+            self.say(f"step {done:,}: {', '.join(f'{name} {value:.3f}' for name, value in scores.items())}")
+            if progress.best is None or scores[SCORE] > progress.best:
+                progress = replace(progress, best=scores[SCORE])
+                if self.place.is_first:
+                    self._weights(model, progress, BEST)
+        if self.place.is_first:
+            add_to_log(self.folder, row)
+            if last or done % config.save_every == 0 or "validation" in row:
+                save_state(self.folder, model, optimizer, progress, self.notes)
+            if last or "validation" in row:
+                self._draw()
+        return progress
+
+    def _weights(self, model: V2XFormer, progress: Progress, name: str = "weights.safetensors") -> Path:
+        """Write the weights alone."""
+        path = self.folder / name
+        write_weights(path, model.state_dict(), {**self.notes, "step": progress.step, "score": progress.best})
+        return path
+
+    def _draw(self) -> None:
+        save_training(read_log(self.folder), self.folder.name, self.folder / CURVES)
+
+    def _estimate(self, model: V2XFormer, progress: Progress, samples: int) -> str:
+        """How long the run will take, by steps on a copy of the model that are not taken."""
+        config, left = self.config, self.config.steps - progress.step
+        trial = TrainingStep(copy.deepcopy(model))
+        numbers = positions(len(self.moments), config, first=0)
+        took = []
+        with closing(_Timer()) as timer:
+            for index, batch in zip(range(_TIMED), batches(self.moments, numbers, config), strict=False):
+                torch.stack(list(self._losses(trial, batch, (index, 0)).values())).sum().backward()
+                took.append(timer.lap())
+        each = min(took) * config.accumulate
+        times = samples and -(-config.steps // config.validate_every) - progress.step // config.validate_every
+        return (
+            f"{left:,} steps on {self.place.device}, {each:.2f} s each: some {_duration(left * each)}"
+            + (f", and {times} validations of {samples} samples" if times else "")
+        )
+
+
+class _Timer:
+    """Seconds since the last lap."""
+
+    def __init__(self) -> None:
+        self._last = time.perf_counter()
+
+    def lap(self) -> float:
+        now = time.perf_counter()
+        took, self._last = now - self._last, now
+        return took
+
+    def close(self) -> None:
+        """Nothing to give back."""
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
