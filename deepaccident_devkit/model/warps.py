@@ -166,9 +166,7 @@ def inside_mask(target_from_source: Tensor, grid: GridBounds, *, warp: WarpRule 
     return warp_features(ones, target_from_source, grid, warp=warp, mode="nearest")[:, 0] > 0.5
 
 
-def agents_to_ego(
-    features: Tensor, ego_from_agent: Tensor, grid: GridBounds, *, warp: WarpRule = "exact"
-) -> Tensor:
+def agents_to_ego(features: Tensor, ego_from_agent: Tensor, grid: GridBounds, *, warp: WarpRule = "exact") -> Tensor:
     """All agents' maps of one moment in the ego's frame, bilinear; the ego's own, slot 0, stays as it is.
 
     Args:
@@ -185,9 +183,7 @@ def agents_to_ego(
     return torch.cat([features[:, :1], warped.view_as(partners)], 1)
 
 
-def agents_mask(
-    agent_valid: Tensor, ego_from_agent: Tensor, grid: GridBounds, *, warp: WarpRule = "exact"
-) -> Tensor:
+def agents_mask(agent_valid: Tensor, ego_from_agent: Tensor, grid: GridBounds, *, warp: WarpRule = "exact") -> Tensor:
     """(B, A, H, W) bool: where each agent has something to say in the ego's frame; the ego, slot 0, everywhere.
 
     Args:
