@@ -12,17 +12,15 @@ import torch
 from torch import Tensor, nn
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.model.temporal_blocks import TemporalBlock
-from deepaccident_devkit.model.warps import (
+from deepaccident_devkit.model.poses import (
     Chain,
-    GridBounds,
-    WarpRule,
     between_augmented,
     matrices_from_six,
     present_from_past,
     six_from_matrices,
-    warp_features,
 )
+from deepaccident_devkit.model.temporal_blocks import TemporalBlock
+from deepaccident_devkit.model.warps import GridBounds, WarpRule, warp_features
 from deepaccident_devkit.text import settle_choices
 
 EGOMOTION = 6
@@ -40,7 +38,7 @@ class TemporalConfig:
         frames: P, the past ones and the present.
         kind: `blocks`, the released 3D convolutions, or `concat`, two 2D convolutions over all frames at once.
         warp: where a warp samples (`warps.warp_features`).
-        chain: the order in which motions are multiplied (`warps.present_from_past`).
+        chain: the order in which motions are multiplied (`poses.present_from_past`).
         egomotion_input: with a BEV augmentation A, the motion that the convolutions see: `augmented` is
             A · E · A⁻¹, as the maps move; `raw` is E, the released code's.
         with_skip: `blocks` adds the present's own map to its result, as the released code does.

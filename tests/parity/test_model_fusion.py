@@ -12,7 +12,7 @@ import pytest
 import torch
 from golden_model import GoldenModel, check_close
 
-from deepaccident_devkit.model import warps
+from deepaccident_devkit.model import poses, warps
 from deepaccident_devkit.model.fusion import (
     Agent3D,
     Agent3DConfig,
@@ -56,10 +56,10 @@ def test_chains_of_warps_equal_the_released_warper(
     matrix = given["aug"] if augmented else None
     if kind == "temporal":
         moved = slice(0, 2)
-        chain = warps.present_from_past(given["egomotion"][:, :2], chain="released", bev_transform=matrix)
+        chain = poses.present_from_past(given["egomotion"][:, :2], chain="released", bev_transform=matrix)
     else:
         moved = slice(1, 3)
-        chain = warps.present_from_frames(given["egomotion"], bev_transform=matrix)[:, 1:]
+        chain = poses.present_from_frames(given["egomotion"], bev_transform=matrix)[:, 1:]
     ours = given["x"].clone()
     ours[:, moved] = warps.warp_features(
         given["x"][:, moved].flatten(0, 1), chain.flatten(0, 1), bounds(golden), warp="stretched", mode=mode
@@ -71,13 +71,13 @@ def test_partners_are_placed_as_by_the_released_warper(golden_model: Golden) -> 
     """The maps; the poses' matrices within 1e-6; also with the released transforms of augmented maps, and the right."""
     golden = golden_model("warps")
     given, expected, grid = golden.inputs(), golden.outputs(), bounds(golden)
-    poses = warps.matrices_from_six(given["relative_pose"])
-    check_close(poses, expected["pose_mats"], 1e-6)
-    check_close(warps.agents_to_ego(given["xv"], poses, grid, warp="stretched"), expected["v2x"])
+    ego_from_agent = poses.matrices_from_six(given["relative_pose"])
+    check_close(ego_from_agent, expected["pose_mats"], 1e-6)
+    check_close(warps.agents_to_ego(given["xv"], ego_from_agent, grid, warp="stretched"), expected["v2x"])
     own = given["aug_v"]
-    as_released = warps.between_augmented(poses, own, own)
+    as_released = poses.between_augmented(ego_from_agent, own, own)
     check_close(warps.agents_to_ego(given["xv"], as_released, grid, warp="stretched"), expected["v2x_aug_released"])
-    right = warps.between_augmented(poses, own[:, :1], own)
+    right = poses.between_augmented(ego_from_agent, own[:, :1], own)
     check_close(warps.agents_to_ego(given["xv"], right, grid, warp="stretched"), expected["v2x_aug_right"])
 
 
@@ -85,7 +85,7 @@ def test_partners_are_placed_as_by_the_released_warper(golden_model: Golden) -> 
 def test_a_full_map_is_warped_as_by_the_released_warper(golden_model: Golden, name: str, pose: list[float]) -> None:
     """128 × 128 cells of 0.8 m."""
     golden = golden_model("warps")
-    target_from_source = warps.matrices_from_six(torch.tensor([pose]))
+    target_from_source = poses.matrices_from_six(torch.tensor([pose]))
     features = golden.inputs()["xf"][:, 0]
     ours = warps.warp_features(features[:, None], target_from_source, bounds(golden, "full"), warp="stretched")
     check_close(ours, golden.outputs()[name])
@@ -112,8 +112,8 @@ def test_released_fusion_equals_the_released_one(golden_model: Golden) -> None:
     golden = golden_model("fusion_released")
     given, expected = golden.inputs(), golden.outputs()
     x = given["x"].requires_grad_()
-    poses = warps.matrices_from_six(given["relative_pose"])
-    placed = warps.agents_to_ego(x, poses, bounds(golden), warp="stretched")
+    ego_from_agent = poses.matrices_from_six(given["relative_pose"])
+    placed = warps.agents_to_ego(x, ego_from_agent, bounds(golden), warp="stretched")
     check_close(placed, expected["warped"])
     config = ReleasedFusionConfig(
         channels=64, ego_channels=tuple(golden.config["ego_channels"]), fill_below=golden.config["fill_threshold"]
@@ -231,7 +231,10 @@ def v2xvit_state(state: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         (r"\.split_attn\.fc1\.", ".split_attention.weigh.0."),
         (r"\.split_attn\.bn1\.", ".split_attention.weigh.1."),
         (r"\.split_attn\.fc2\.", ".split_attention.weigh.3."),
-        *((rf"\.{old}_linears\.", f".{new}.") for old, new in zip("qkva", ("query", "key", "value", "out"))),
+        *(
+            (rf"\.{old}_linears\.", f".{new}.")
+            for old, new in zip("qkva", ("query", "key", "value", "out"), strict=True)
+        ),
     ]
     ours, by_kind = {}, re.compile(r"(.*\.(?:query|key|value|out))\.([01])\.(weight|bias)")
     for key, value in renamed(state, table).items():

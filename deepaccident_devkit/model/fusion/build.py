@@ -2,6 +2,7 @@
 
 from typing import TypeAlias
 
+from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.model.fusion.cobevt import CobevtConfig, CobevtFusion
 from deepaccident_devkit.model.fusion.disconet import DiscoNetConfig, DiscoNetFusion
 from deepaccident_devkit.model.fusion.interface import Fusion
@@ -17,7 +18,7 @@ FusionConfig: TypeAlias = PoolFusionConfig | ReleasedFusionConfig | DiscoNetConf
 
 
 def fusion(config: FusionConfig) -> Fusion:
-    """The fusion module that a config describes, with fresh weights."""
+    """The fusion module that a config describes, with fresh weights. Raises ConfigError: another object."""
     match config:
         case PoolFusionConfig():
             return PoolFusion(config)
@@ -29,3 +30,5 @@ def fusion(config: FusionConfig) -> Fusion:
             return CobevtFusion(config)
         case V2XViTConfig():
             return V2XViTFusion(config)
+        case _:
+            raise ConfigError(f"fusion: expected the config of a fusion module, found {config!r}")

@@ -77,8 +77,8 @@ class ReleasedFusion(Fusion):
 
     The release knows no missing agents and no masks: it takes cells outside a partner's map for those with almost
     nothing in them, fills them with the ego's and counts them in the mean. Here masked cells are filled, too, and
-    count, so that a missing partner moves the mean towards the ego's. Its batches of more than one sample are wrong; ours
-    treats each sample as the release treats its only one.
+    count, so that a missing partner moves the mean towards the ego's. The release is right for batches of one sample
+    alone; here each sample of a batch is treated so.
 
     With `agent3d` there are the released unused layers as well; no gradient is asked of them.
     """

@@ -24,7 +24,7 @@ class Windows:
     strided: bool = False
 
     def split(self, x: Tensor) -> Tensor:
-        """Maps (B, A, H, W, C) → tokens (B · windows, A · size², C) in the order agent, row, column; added cells are 0."""
+        """Maps (B, A, H, W, C) → tokens (B · windows, A · size², C), by agent, row and column; added cells are 0."""
         size = self.size
         padded = functional.pad(x, (0, 0, 0, -x.shape[3] % size, 0, -x.shape[2] % size))
         batch, agents, height, width, channels = padded.shape
