@@ -1,0 +1,99 @@
+"""Transforms between frames of moments and agents, in torch: 6-vectors, products of motions, BEV augmentation.
+
+The sibling of `geometry.six_vectors` and `motion.warps.chains`, for whole batches. Nothing here depends on the
+handedness, so long as all that goes in has the same. Products are written as sums, because autocast would round a
+matmul to bfloat16, and metres need more digits than that.
+"""
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+Chain = Literal["released", "exact"]
+
+
+def matrices_from_six(six: Tensor) -> Tensor:
+    """6-vectors (…, 6), metres and radians → rigid matrices (…, 4, 4), as `geometry.six_vectors.to_matrices`."""
+    cx, cy, cz = torch.cos(six[..., 3:]).unbind(-1)
+    sx, sy, sz = torch.sin(six[..., 3:]).unbind(-1)
+    tx, ty, tz = six[..., :3].unbind(-1)
+    zero, one = torch.zeros_like(tx), torch.ones_like(tx)
+    rows = (
+        (cy * cz, -cy * sz, sy, tx),
+        (cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy, ty),
+        (sx * sz - cx * sy * cz, sx * cz + cx * sy * sz, cx * cy, tz),
+        (zero, zero, zero, one),
+    )
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def six_from_matrices(matrix: Tensor) -> Tensor:
+    """Rigid matrices (…, 4, 4) → 6-vectors (…, 6), metres and radians; the inverse of `matrices_from_six`."""
+    m12, m22 = matrix[..., 1, 2], matrix[..., 2, 2]
+    rx = torch.atan2(-m12, m22)
+    ry = torch.atan2(matrix[..., 0, 2], torch.hypot(m12, m22))
+    rz = torch.atan2(-matrix[..., 0, 1], matrix[..., 0, 0])
+    return torch.cat([matrix[..., :3, 3], torch.stack([rx, ry, rz], -1)], -1)
+
+
+def between_augmented(target_from_source: Tensor, target_bev: Tensor | None, source_bev: Tensor | None) -> Tensor:
+    """A transform of frames → the one between their augmented maps: A_target · transform · A_source⁻¹.
+
+    Args:
+        target_from_source: (…, 4, 4).
+        target_bev: (…, 4, 4) the BEV augmentation of the frame that the transform leads to; None is the identity.
+        source_bev: (…, 4, 4) that of the frame it comes from.
+    """
+    if target_bev is not None:
+        target_from_source = _product(target_bev, target_from_source)
+    if source_bev is not None:
+        target_from_source = _product(target_from_source, torch.linalg.inv(source_bev))
+    return target_from_source
+
+
+def present_from_past(egomotion: Tensor, *, chain: Chain = "exact", bev_transform: Tensor | None = None) -> Tensor:
+    """Transforms of the past frames to the present.
+
+    Args:
+        egomotion: (N, P − 1, 6) rows `next_from_this` of the past frames, the oldest first.
+        chain: the order of the product. `exact`: E_{P−2} … E_t. `released`: E_t … E_{P−2}, which is wrong from the
+            second frame before the present on.
+        bev_transform: (N, 4, 4) the BEV augmentation A of all frames; the product becomes A · product · A⁻¹.
+
+    Returns:
+        (N, P − 1, 4, 4), the oldest first.
+    """
+    steps = matrices_from_six(egomotion).unbind(1)
+    products = list(steps[-1:])
+    for step in steps[-2::-1]:
+        products.append(_product(products[-1], step) if chain == "exact" else _product(step, products[-1]))
+    stacked = torch.stack(products[::-1], 1) if products else egomotion.new_zeros(len(egomotion), 0, 4, 4)
+    return _augmented(stacked, bev_transform)
+
+
+def present_from_frames(egomotion: Tensor, *, bev_transform: Tensor | None = None) -> Tensor:
+    """Transforms of the present and each future frame to the present: C_i = E_0⁻¹ E_1⁻¹ … E_{i−1}⁻¹.
+
+    Args:
+        egomotion: (N, T, 6) rows `next_from_this` from the present on; the last one is not used.
+        bev_transform: (N, 4, 4) the BEV augmentation A of all frames; C becomes A · C · A⁻¹.
+
+    Returns:
+        (N, T, 4, 4); without augmentation the first is the identity.
+    """
+    this_from_next = torch.linalg.inv(matrices_from_six(egomotion)).unbind(1)
+    products = [torch.eye(4, dtype=egomotion.dtype, device=egomotion.device).expand(len(egomotion), 4, 4)]
+    for step in this_from_next[:-1]:
+        products.append(_product(products[-1], step))
+    return _augmented(torch.stack(products, 1), bev_transform)
+
+
+def _product(first: Tensor, second: Tensor) -> Tensor:
+    return (first[..., :, :, None] * second[..., None, :, :]).sum(-2)
+
+
+def _augmented(transforms: Tensor, bev_transform: Tensor | None) -> Tensor:
+    """A · transforms · A⁻¹ of transforms (N, T, 4, 4) and A (N, 4, 4)."""
+    matrix = None if bev_transform is None else bev_transform[:, None]
+    return between_augmented(transforms, matrix, matrix)

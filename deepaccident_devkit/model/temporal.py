@@ -1,0 +1,181 @@
+"""Temporal models: one agent's BEV maps of the past and the present → one map of the present, before any fusion.
+
+Both take the same arguments; `temporal_model` makes the one that a config names.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor, nn
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.model.poses import (
+    Chain,
+    between_augmented,
+    matrices_from_six,
+    present_from_past,
+    six_from_matrices,
+)
+from deepaccident_devkit.model.temporal_blocks import TemporalBlock
+from deepaccident_devkit.model.warps import GridBounds, WarpRule, warp_features
+from deepaccident_devkit.text import settle_choices
+
+EGOMOTION = 6
+"""Channels that an egomotion takes: a 6-vector, the same in all cells."""
+EgomotionInput = Literal["raw", "augmented"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TemporalConfig:
+    """A temporal model.
+
+    Attributes:
+        channels: C of the maps, in and out.
+        grid: the maps' cells.
+        frames: P, the past ones and the present.
+        kind: `blocks`, the released 3D convolutions, or `concat`, two 2D convolutions over all frames at once.
+        warp: where a warp samples (`warps.warp_features`).
+        chain: the order in which motions are multiplied (`poses.present_from_past`).
+        egomotion_input: with a BEV augmentation A, the motion that the convolutions see: `augmented` is
+            A · E · A⁻¹, as the maps move; `raw` is E, the released code's.
+        with_skip: `blocks` adds the present's own map to its result, as the released code does.
+    """
+
+    channels: int
+    grid: GridBounds
+    frames: int = 3
+    kind: Literal["blocks", "concat"] = "blocks"
+    warp: WarpRule = "exact"
+    chain: Chain = "exact"
+    egomotion_input: EgomotionInput = "augmented"
+    with_skip: bool = True
+
+    def __post_init__(self) -> None:
+        """Check the numbers and words; raises ConfigError."""
+        if self.channels < 1 or self.frames < 1:
+            raise ConfigError(
+                f"TemporalConfig: expected at least 1 channel and 1 frame, found {self.channels} and {self.frames}"
+            )
+        words = {
+            "kind": ("blocks", "concat"),
+            "warp": get_args(WarpRule),
+            "chain": get_args(Chain),
+            "egomotion_input": get_args(EgomotionInput),
+        }
+        settle_choices(self, words, error=ConfigError)
+
+
+def temporal_model(config: TemporalConfig) -> Temporal3D | TemporalConcat:
+    """The temporal model that a config names."""
+    return Temporal3D(config) if config.kind == "blocks" else TemporalConcat(config)
+
+
+class Temporal3D(nn.Module):
+    """The released Temporal3DConvModel: P − 1 causal blocks over the warped frames; one frame stays as it is.
+
+    State-dict keys are the released ones (`temporal_model.` and these).
+    """
+
+    def __init__(self, config: TemporalConfig) -> None:
+        super().__init__()
+        self.config = config
+        widths = [config.channels + EGOMOTION] + [config.channels] * (config.frames - 1)
+        self.model = nn.Sequential(*map(TemporalBlock, widths[:-1], widths[1:]))
+
+    def forward(
+        self, features: Tensor, egomotion: Tensor, valid: Tensor, bev_transform: Tensor | None = None
+    ) -> Tensor:
+        """One map of the present.
+
+        Frames up to the *first* one that is not valid are replaced by the frame after it, as the released code does;
+        of [no, no, yes] frame 0 so becomes frame 1. In its batches invalid frames repeat the present with identity
+        motion, so that this does no harm.
+
+        Args:
+            features: (N, P, C, H, W) each in its own frame, the present last.
+            egomotion: (N, P, 6) row t moves frame t to t + 1, in the handedness of the maps, without augmentation
+                where `bev_transform` is given; the last row is not used.
+            valid: (N, P) bool; the present is.
+            bev_transform: (N, 4, 4) the maps' BEV augmentation.
+
+        Returns:
+            (N, C, H, W).
+        """
+        present = features[:, -1]
+        if self.config.frames == 1:
+            return present
+        warped = _warped_to_present(features, egomotion, bev_transform, self.config)
+        motion = _motion_input(egomotion[:, :-1], bev_transform, self.config)
+        motion = torch.cat([torch.zeros_like(motion[:, :1]), motion], 1)
+        frames = torch.cat([warped, _as_maps(motion, warped)], 2)
+        result = self.model(_without_invalid(frames, valid).transpose(1, 2))[:, :, -1]
+        return result + present if self.config.with_skip else result
+
+
+class TemporalConcat(nn.Module):
+    """All warped frames and motions through a 1×1 and a 3×3 convolution, each with batch norm and ReLU."""
+
+    def __init__(self, config: TemporalConfig) -> None:
+        super().__init__()
+        self.config = config
+        width, past = config.channels, config.frames - 1
+        self.mix = nn.Sequential(
+            nn.Conv2d(config.frames * width + past * EGOMOTION, width, 1, bias=False),
+            nn.BatchNorm2d(width),
+            nn.ReLU(),
+            nn.Conv2d(width, width, 3, padding=1, bias=False),
+            nn.BatchNorm2d(width),
+            nn.ReLU(),
+        )
+
+    def forward(
+        self, features: Tensor, egomotion: Tensor, valid: Tensor, bev_transform: Tensor | None = None
+    ) -> Tensor:
+        """One map of the present; arguments and result as `Temporal3D.forward`.
+
+        A past frame that is not valid is replaced by the present, and its motion by none at all.
+        """
+        past = valid[:, :-1]
+        egomotion = torch.cat(
+            [egomotion[:, :-1].masked_fill(~past[..., None], 0), torch.zeros_like(egomotion[:, -1:])], 1
+        )
+        warped = _warped_to_present(features, egomotion, bev_transform, self.config)
+        present = features[:, -1:]
+        warped = torch.where(valid[..., None, None, None], warped, present)
+        motion = _motion_input(egomotion[:, :-1], bev_transform, self.config)
+        return self.mix(torch.cat([warped.flatten(1, 2), _as_maps(motion, warped).flatten(1, 2)], 1))
+
+
+def _warped_to_present(
+    features: Tensor, egomotion: Tensor, bev_transform: Tensor | None, config: TemporalConfig
+) -> Tensor:
+    """(N, P, C, H, W) in the present's frame; the present itself is not warped."""
+    past = features[:, :-1]
+    chain = present_from_past(egomotion[:, :-1], chain=config.chain, bev_transform=bev_transform)
+    warped = warp_features(past.flatten(0, 1), chain.flatten(0, 1), config.grid, warp=config.warp)
+    return torch.cat([warped.view_as(past), features[:, -1:]], 1)
+
+
+def _motion_input(egomotion: Tensor, bev_transform: Tensor | None, config: TemporalConfig) -> Tensor:
+    """(N, T, 6) the motions that the convolutions see."""
+    if bev_transform is None or config.egomotion_input == "raw":
+        return egomotion
+    matrix = bev_transform[:, None]
+    return six_from_matrices(between_augmented(matrices_from_six(egomotion), matrix, matrix))
+
+
+def _as_maps(motion: Tensor, maps: Tensor) -> Tensor:
+    """(N, T, 6) → (N, T, 6, H, W) of the maps' dtype, the same in all cells."""
+    return motion.to(maps.dtype)[..., None, None].expand(-1, -1, -1, *maps.shape[-2:])
+
+
+def _without_invalid(frames: Tensor, valid: Tensor) -> Tensor:
+    """Frames (N, P, …) in which those up to the first invalid one are the frame after it."""
+    first = (~valid).to(torch.uint8).argmax(1, keepdim=True)
+    steps = torch.arange(frames.shape[1], device=frames.device)
+    replaced = (steps <= first) & ~valid.all(1, keepdim=True)
+    source = torch.where(replaced, first + 1, steps).clamp(max=frames.shape[1] - 1)
+    return frames[torch.arange(len(frames), device=frames.device)[:, None], source]

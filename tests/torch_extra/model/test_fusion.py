@@ -1,0 +1,266 @@
+"""Fusion modules: the laws that all of them keep, their options, windows, and wrong configs."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.model.fusion import (
+    Agent3D,
+    Agent3DConfig,
+    CobevtConfig,
+    DiscoNetConfig,
+    Fusion,
+    FusionConfig,
+    PoolFusionConfig,
+    ReleasedFusionConfig,
+    V2XViTConfig,
+    fusion,
+)
+from deepaccident_devkit.model.fusion.v2xvit import sinusoid
+from deepaccident_devkit.model.fusion.windows import Windows, relative_positions
+
+C = 8
+MEAN = PoolFusionConfig()
+MAX = PoolFusionConfig(by="max")
+RELEASED = ReleasedFusionConfig(channels=C, ego_channels=(1, 4))
+DISCONET = DiscoNetConfig(channels=C, hidden=(16, 4))
+COBEVT = CobevtConfig(channels=C, depth=2, window=4)
+V2XVIT = V2XViTConfig(channels=C, depth=2, heads=2, windows=(2, 4), window_heads=(2, 1))
+ALL = pytest.mark.parametrize("config", [MEAN, MAX, RELEASED, DISCONET, COBEVT, V2XVIT], ids=lambda c: type(c).__name__)
+LEARNED = pytest.mark.parametrize("config", [DISCONET, COBEVT, V2XVIT], ids=lambda c: type(c).__name__)
+Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
+
+
+def module(config: FusionConfig) -> Fusion:
+    torch.manual_seed(0)
+    return fusion(config).eval()
+
+
+def batch(agents: int = 4, height: int = 7, width: int = 9) -> Batch:
+    """Sizes that no window divides; slot 2 is at the roadside, one partner is a step late."""
+    generator = torch.Generator().manual_seed(5)
+    x = torch.randn(2, agents, C, height, width, generator=generator)
+    mask = torch.rand(2, agents, height, width, generator=generator) > 0.3
+    mask[:, 0] = True
+    slots = torch.arange(agents).expand(2, agents)
+    return x, mask, slots == 2, (slots == 1).long()
+
+
+@ALL
+def test_masked_partners_leave_the_ego_alone(config: FusionConfig) -> None:
+    x, mask, infra, delay = batch()
+    mask[:, 1:] = False
+    alone = module(config)(x[:, :1], mask[:, :1], infra[:, :1], delay[:, :1])
+    assert alone.shape == (2, C, 7, 9)
+    torch.testing.assert_close(module(config)(x, mask, infra, delay), alone, atol=2e-6, rtol=0)
+
+
+@ALL
+def test_partners_count_in_any_order(config: FusionConfig) -> None:
+    x, mask, infra, delay = batch()
+    order = [0, 3, 1, 2]
+    fused = module(config)(x, mask, infra, delay)
+    swapped = module(config)(x[:, order], mask[:, order], infra[:, order], delay[:, order])
+    torch.testing.assert_close(swapped, fused, atol=1e-5, rtol=0)
+
+
+@ALL
+@pytest.mark.parametrize("training", [False, True])
+def test_what_the_mask_hides_has_no_effect(config: FusionConfig, training: bool) -> None:
+    x, mask, infra, delay = batch()
+    garbage = torch.where(mask[:, :, None], x, torch.nan)
+    results = []
+    for given_x in (x, garbage):
+        model = module(config).train(training)
+        torch.manual_seed(1)
+        results.append(model(given_x, mask, infra, delay))
+    assert torch.equal(results[1], results[0])
+
+
+@ALL
+def test_every_partner_counts_where_it_is_seen_and_each_sample_for_itself(config: FusionConfig) -> None:
+    x, mask, infra, delay = batch()
+    mask[:] = True
+    model = module(config)
+    fused = model(x, mask, infra, delay)
+    for slot in range(4):
+        changed = x.clone()
+        changed[0, slot] *= 3
+        other = model(changed, mask, infra, delay)
+        assert not torch.allclose(other[0], fused[0], atol=1e-4)
+        torch.testing.assert_close(other[1], fused[1])
+
+
+@LEARNED
+def test_gradients_reach_every_weight(config: FusionConfig) -> None:
+    """With a delay; without one, V2X-ViT's weights of the sines have none."""
+    x, mask, infra, delay = batch()
+    model = module(config).train()
+    (model(x.requires_grad_(), mask, infra, delay) ** 2).sum().backward()
+    assert all(weight.grad is not None and weight.grad.ne(0).any() for weight in model.parameters())
+    assert torch.equal(x.grad.ne(0).any(2) & ~mask, torch.zeros_like(mask))
+    assert x.grad[:, 1:].ne(0).any()
+
+
+def test_without_delay_v2xvit_s_weights_of_the_sines_have_no_gradient() -> None:
+    x, mask, infra, delay = batch()
+    model = module(V2XVIT)
+    model(x, mask, infra, torch.zeros_like(delay)).sum().backward()
+    grad = model.delay_encoding.linear.weight.grad
+    assert not grad[:, 0::2].any()
+    assert grad[:, 1::2].any()
+
+
+@ALL
+def test_autocast_changes_digits_only(config: FusionConfig) -> None:
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        rounded = module(config)(*batch())
+    torch.testing.assert_close(rounded.float(), module(config)(*batch()), atol=0.1, rtol=0.1)
+
+
+def test_mean_and_maximum_are_over_those_that_are_seen() -> None:
+    x, mask, infra, delay = batch()
+    x[:, 1:] = x[:, 1:].abs() + 5
+    shown = [x[0, slot, :, 3, 4] for slot in range(4) if mask[0, slot, 3, 4]]
+    assert 1 < len(shown) < 4
+    torch.testing.assert_close(module(MEAN)(x, mask, infra, delay)[0, :, 3, 4], torch.stack(shown).mean(0))
+    torch.testing.assert_close(module(MAX)(x, mask, infra, delay)[0, :, 3, 4], torch.stack(shown).amax(0))
+
+
+def test_released_fusion_fills_near_empty_and_masked_cells_and_keeps_channels_of_the_ego() -> None:
+    x, mask, infra, delay = (each[:1, :3] for each in batch())
+    mask[:] = True
+    mask[0, 1, 0, 0] = False
+    x[0, 2, :, 1, 1] = 1e-4
+    fused = module(RELEASED)(x, mask, infra, delay)
+    expected = x.clone()
+    expected[0, 1, :, 0, 0] = x[0, 0, :, 0, 0]
+    expected[0, 2, :, 1, 1] = x[0, 0, :, 1, 1]
+    expected = expected.mean(1)
+    expected[:, [1, 4]] = x[:, 0, [1, 4]]
+    torch.testing.assert_close(fused, expected)
+    kept = module(replace(RELEASED, fill_below=1e-5))(x, mask, infra, delay)
+    changed = (kept - fused)[0].abs().amax(0) > 1e-6
+    assert changed.nonzero().tolist() == [[1, 1]]
+
+
+def test_released_fusion_can_hold_its_unused_layers() -> None:
+    plain, holding = (module(replace(RELEASED, agent3d=unused)) for unused in (None, Agent3DConfig(channels=C)))
+    assert not plain.state_dict()
+    assert {key.split(".")[0] for key in holding.state_dict()} == {"model", "compression"}
+    assert torch.equal(holding(*batch()), plain(*batch()))
+
+
+def test_unreached_layers_fuse_all_agents_and_poses() -> None:
+    model = Agent3D(Agent3DConfig(channels=C, agents=3, bottlenecks=1)).train()
+    x, pose = torch.randn(2, 3, C, 7, 9, requires_grad=True), torch.randn(2, 3, 6, requires_grad=True)
+    fused = model(x, pose)
+    assert fused.shape == (2, C, 7, 9)
+    (fused**2).sum().backward()
+    assert all(weight.grad.ne(0).any() for weight in model.parameters())
+    assert x.grad.flatten(2).ne(0).any(2).all()
+    assert not pose.grad[:, 0].any()
+    assert pose.grad[:, 1:].ne(0).any(2).all()
+
+
+def test_disconet_s_weights_are_shares() -> None:
+    x, mask, infra, delay = batch()
+    for config in (DISCONET, replace(DISCONET, last_relu=True)):
+        weights = module(config).weights(x, mask)
+        torch.testing.assert_close(weights.sum(1), torch.ones(2, 7, 9))
+        assert not weights[~mask].any()
+    assert not torch.allclose(module(DISCONET).weights(x, mask), weights)
+
+
+def test_cobevt_by_slots_depends_on_the_order_and_has_an_end_of_slots() -> None:
+    x, mask, infra, delay = batch()
+    model = module(replace(COBEVT, agent_relation="slots", agents=4))
+    for name, table in model.named_parameters():
+        if name.endswith("bias_table"):
+            torch.nn.init.normal_(table)
+    order = [0, 3, 1, 2]
+    fused = model(x, mask, infra, delay)
+    assert not torch.allclose(model(x[:, order], mask[:, order], infra, delay), fused, atol=1e-4)
+    with pytest.raises(ConfigError, match="for 4 slots, found 5; raise CobevtConfig.agents"):
+        model(*batch(agents=5))
+
+
+def test_cobevt_can_average_what_the_mask_hides() -> None:
+    x, mask, infra, delay = batch()
+    averaging = module(replace(COBEVT, masked_cells="averaged"))
+    fused = averaging(x, mask, infra, delay)
+    louder = torch.where(mask[:, :, None], x, 3 * x)
+    assert not torch.allclose(averaging(louder, mask, infra, delay), fused, atol=1e-4)
+
+
+def test_v2xvit_knows_kinds_and_delays() -> None:
+    x, mask, infra, delay = batch()
+    model = module(V2XVIT)
+    fused = model(x, mask, infra, delay)
+    assert not torch.allclose(model(x, mask, ~infra, delay), fused, atol=1e-4)
+    assert not torch.allclose(model(x, mask, infra, 3 * delay), fused, atol=1e-4)
+    assert not torch.allclose(module(replace(V2XVIT, delay_rate=1))(x, mask, infra, delay), fused, atol=1e-4)
+
+
+def test_v2xvit_s_windows_can_see_what_the_mask_hides() -> None:
+    x, mask, infra, delay = batch()
+    windowed = module(replace(V2XVIT, masked_cells="windowed"))
+    fused = windowed(x, mask, infra, delay)
+    louder = torch.where(mask[:, :, None], x, 3 * x)
+    assert not torch.allclose(windowed(louder, mask, infra, delay), fused, atol=1e-4)
+
+
+def test_sinusoids_begin_with_no_sine_and_whole_cosines() -> None:
+    code = sinusoid(torch.tensor([0, 1]), 6) * 6**0.5
+    torch.testing.assert_close(code[0], torch.tensor([0.0, 1, 0, 1, 0, 1]))
+    rate = torch.tensor([1, 10000 ** (-1 / 3), 10000 ** (-2 / 3)])
+    torch.testing.assert_close(code[1, 0::2], rate.sin())
+    torch.testing.assert_close(code[1, 1::2], rate.cos())
+
+
+@settings(max_examples=30)
+@given(st.integers(1, 4), st.integers(1, 9), st.integers(1, 9), st.booleans())
+def test_windows_are_joined_as_they_were_split(size: int, height: int, width: int, strided: bool) -> None:
+    windows = Windows(size=size, strided=strided)
+    maps = torch.rand(2, 3, height, width, 2) + 1
+    tokens = windows.split(maps)
+    assert torch.equal(windows.join(tokens, maps.shape[:4]), maps)
+    known = windows.split_mask(torch.ones(2, 3, height, width, dtype=torch.bool))
+    assert torch.equal(known, tokens[..., 0] > 0)
+    assert known.any(1).all()
+    assert int(known.sum()) == 2 * 3 * height * width
+
+
+def test_windows_hold_neighbours_or_cells_spread_over_the_map() -> None:
+    numbers = torch.arange(24).view(1, 1, 4, 6, 1)
+    assert Windows(size=2).split(numbers)[1, :, 0].tolist() == [2, 3, 8, 9]
+    assert Windows(size=2, strided=True).split(numbers)[1, :, 0].tolist() == [1, 4, 13, 16]
+
+
+def test_relative_positions_are_query_minus_key() -> None:
+    """Cells of a 3 × 3 window: the middle of the 5 × 5 differences is no difference at all."""
+    positions = relative_positions(3)
+    assert positions.diagonal().tolist() == [12] * 9
+    assert positions[5, 0].item() == (1 + 2) * 5 + (2 + 2)
+    assert positions[0, 5].item() == (-1 + 2) * 5 + (-2 + 2)
+
+
+def test_wrong_configs_say_so() -> None:
+    with pytest.raises(ConfigError, match="ego_channels: expected numbers from 0 to 7, found .31, 41"):
+        ReleasedFusionConfig(channels=C)
+    with pytest.raises(ConfigError, match="heads: 3 do not divide 8 channels"):
+        replace(COBEVT, heads=3)
+    with pytest.raises(ConfigError, match="window_heads: 3 do not divide 8 channels"):
+        replace(V2XVIT, window_heads=(2, 3))
+    with pytest.raises(ConfigError, match="one number for each of 2 windows, found .2,"):
+        replace(V2XVIT, window_heads=(2,))
+    with pytest.raises(ConfigError, match="by: expected one of mean, max, found 'sum'"):
+        PoolFusionConfig(by="sum")
+    with pytest.raises(ConfigError, match="agents: expected at least 2, found 1"):
+        Agent3DConfig(channels=C, agents=1)
+    with pytest.raises(ConfigError, match="the config of a fusion module, found 'mean'"):
+        fusion("mean")

@@ -1,0 +1,142 @@
+"""Temporal models: which frames count, in which order, with which motion; blocks look only backwards."""
+
+import pytest
+import torch
+from torch.nn import functional
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.model.poses import between_augmented, matrices_from_six, six_from_matrices
+from deepaccident_devkit.model.temporal import Temporal3D, TemporalConcat, TemporalConfig, temporal_model
+from deepaccident_devkit.model.temporal_blocks import PooledStep, TemporalBlock
+from deepaccident_devkit.model.warps import GridBounds
+
+GRID = GridBounds(x=(-6, 6, 1), y=(-4, 4, 1))
+KINDS = ["blocks", "concat"]
+TURNED = torch.diag(torch.tensor([1.1, -1.1, 1, 1])) @ matrices_from_six(torch.tensor([0, 0, 0, 0, 0, 0.3]))
+
+
+def batch(frames: int = 3, samples: int = 2) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(3)
+    features = torch.randn(samples, frames, 6, 8, 12, generator=generator)
+    egomotion = torch.zeros(samples, frames, 6)
+    egomotion[..., [0, 1, 5]] = torch.rand(samples, frames, 3, generator=generator)
+    return features, egomotion, torch.ones(samples, frames, dtype=torch.bool)
+
+
+def model_of(kind: str, frames: int = 3, **options: object) -> Temporal3D | TemporalConcat:
+    torch.manual_seed(0)
+    return temporal_model(TemporalConfig(channels=6, grid=GRID, kind=kind, frames=frames, **options)).eval()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("frames", [1, 2, 3])
+def test_gradients_reach_every_weight_and_frame(kind: str, frames: int) -> None:
+    model = model_of(kind, frames).train()
+    features, egomotion, valid = batch(frames)
+    result = model(features.requires_grad_(), egomotion, valid)
+    assert result.shape == (2, 6, 8, 12)
+    (result**2).sum().backward()
+    assert features.grad.ne(0).flatten(2).any(2).all()
+    assert all(weight.grad is not None and weight.grad.ne(0).any() for weight in model.parameters())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_frame_its_motion_and_the_warp_count(kind: str) -> None:
+    model = model_of(kind)
+    features, egomotion, valid = batch()
+    result = model(features, egomotion, valid)
+    for frame in range(2):
+        changed = egomotion.clone()
+        changed[:, frame, 5] += 0.4
+        assert not torch.allclose(model(features, changed, valid), result)
+    unused = egomotion.clone()
+    unused[:, 2] = 9
+    assert torch.equal(model(features, unused, valid), result)
+    assert not torch.allclose(model_of(kind, warp="stretched")(features, egomotion, valid), result)
+    assert not torch.allclose(model_of(kind, chain="released")(features, egomotion, valid), result)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_augmentation_is_the_same_as_augmented_motion(kind: str) -> None:
+    model = model_of(kind)
+    features, egomotion, valid = batch()
+    moved = six_from_matrices(between_augmented(matrices_from_six(egomotion), TURNED, TURNED))
+    augmented = model(features, egomotion, valid, TURNED.expand(2, 4, 4))
+    torch.testing.assert_close(augmented, model(features, moved, valid), atol=1e-4, rtol=0)
+    raw = model_of(kind, egomotion_input="raw")
+    assert not torch.allclose(raw(features, egomotion, valid, TURNED.expand(2, 4, 4)), augmented, atol=1e-3)
+    assert torch.equal(raw(features, egomotion, valid), model(features, egomotion, valid))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_oldest_frame_that_is_not_valid_does_not_count(kind: str) -> None:
+    model = model_of(kind)
+    features, egomotion, valid = batch()
+    valid[1, 0] = False
+    result = model(features, egomotion, valid)
+    features[1, 0] = 1e3
+    changed = model(features, egomotion, valid)
+    assert torch.equal(changed, result)
+    assert not torch.allclose(result[1], model(batch()[0], egomotion, torch.ones_like(valid))[1])
+
+
+def test_concat_takes_the_present_without_motion_for_frames_that_are_not_valid() -> None:
+    model = model_of("concat", frames=2)
+    features, egomotion, valid = batch(frames=2)
+    valid[:, 0] = False
+    egomotion[:, 0, 0] = torch.nan
+    result = model(features, egomotion, valid)
+    copies = features[:, 1:].expand_as(features)
+    torch.testing.assert_close(result, model(copies, torch.zeros_like(egomotion), torch.ones_like(valid)))
+
+
+def test_blocks_fill_up_to_the_first_invalid_frame_only() -> None:
+    """As released: of [no, no, yes] frame 0 becomes frame 1, whose own content counts."""
+    model = model_of("blocks")
+    features, egomotion, valid = batch()
+    valid[:, :2] = False
+    result = model(features, egomotion, valid)
+    features[:, 0] = 7
+    assert torch.equal(model(features, egomotion, valid), result)
+    features[:, 1] = 7
+    assert not torch.allclose(model(features, egomotion, valid), result)
+
+
+def test_the_skip_adds_the_present() -> None:
+    features, egomotion, valid = batch()
+    with_skip, without = (model_of("blocks", with_skip=skip)(features, egomotion, valid) for skip in (True, False))
+    torch.testing.assert_close(with_skip - without, features[:, -1])
+
+
+def test_a_block_sees_no_later_step() -> None:
+    torch.manual_seed(0)
+    block = TemporalBlock(6, 8).eval()
+    steps = torch.randn(1, 6, 4, 5, 7)
+    later = steps.clone()
+    later[:, :, 2:] += 1
+    before, after = block(steps), block(later)
+    torch.testing.assert_close(before[:, :, :2], after[:, :, :2])
+    assert not torch.allclose(before[:, :, 2], after[:, :, 2])
+
+
+def test_pooled_steps_are_means_over_the_map_and_two_steps() -> None:
+    torch.manual_seed(0)
+    pooled = PooledStep(6, 4).eval()
+    steps = torch.randn(2, 6, 3, 5, 7)
+    means = functional.avg_pool3d(steps, (2, 5, 7), (1, 5, 7), (1, 0, 0), count_include_pad=False)[:, :, :3]
+    torch.testing.assert_close(pooled(steps), pooled.conv_bn_relu(means).expand(-1, -1, -1, 5, 7))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_autocast_changes_digits_only(kind: str) -> None:
+    model = model_of(kind)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        rounded = model(*batch())
+    torch.testing.assert_close(rounded.float(), model(*batch()), atol=0.1, rtol=0.1)
+
+
+def test_wrong_configs_say_so() -> None:
+    with pytest.raises(ConfigError, match="at least 1 channel and 1 frame, found 6 and 0"):
+        TemporalConfig(channels=6, grid=GRID, frames=0)
+    with pytest.raises(ConfigError, match="chain: expected one of released, exact, found 'reverse'"):
+        TemporalConfig(channels=6, grid=GRID, chain="reverse")

@@ -1,0 +1,161 @@
+"""Poses and warps of feature maps: against numpy, against the geometry itself, and what a wrong grid says."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.geometry import six_vectors
+from deepaccident_devkit.model.poses import (
+    between_augmented,
+    matrices_from_six,
+    present_from_frames,
+    present_from_past,
+    six_from_matrices,
+)
+from deepaccident_devkit.model.warps import GridBounds, agents_mask, agents_to_ego, inside_mask, warp_features
+
+GRID = GridBounds(x=(-8, 12, 1), y=(-6, 6, 0.5))
+"""Neither square nor centred, and with other steps along x than along y."""
+MIRRORED = torch.tensor([[[-1.1, 0, 0, 0], [0, 1.1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]])
+six = st.tuples(*[st.floats(-3, 3, width=32)] * 3, *[st.floats(-1.5, 1.5, width=32)] * 3).map(
+    lambda values: torch.tensor(values, dtype=torch.float64)
+)
+planar = st.tuples(st.floats(-4, 4), st.floats(-4, 4), st.floats(-3, 3)).map(
+    lambda pose: matrices_from_six(torch.tensor([[pose[0], pose[1], 0, 0, 0, pose[2]]], dtype=torch.float64))
+)
+
+
+def turned(*values: float) -> torch.Tensor:
+    return torch.tensor([values])
+
+
+def centres() -> tuple[torch.Tensor, torch.Tensor]:
+    y, x = torch.arange(24) * 0.5 - 5.75, torch.arange(20) - 7.5
+    return torch.meshgrid(y, x, indexing="ij")[::-1]
+
+
+@given(six)
+def test_matrices_equal_those_of_the_geometry_and_give_the_vectors_back(vector: torch.Tensor) -> None:
+    matrix = matrices_from_six(vector)
+    np.testing.assert_allclose(matrix.numpy(), six_vectors.to_matrices(vector.numpy()), atol=1e-12)
+    np.testing.assert_allclose(six_from_matrices(matrix).numpy(), vector.numpy(), atol=1e-7)
+
+
+@settings(max_examples=25)
+@given(st.lists(six, min_size=3, max_size=3))
+def test_exact_chains_lead_from_each_frame_to_the_present(vectors: list[torch.Tensor]) -> None:
+    world_from_frame = matrices_from_six(torch.stack(vectors))
+    next_from_this = torch.linalg.inv(world_from_frame[1:]) @ world_from_frame[:-1]
+    motion = six_from_matrices(next_from_this)[None]
+    expected = torch.linalg.inv(world_from_frame[-1]) @ world_from_frame[:-1]
+    torch.testing.assert_close(present_from_past(motion)[0], expected, atol=1e-6, rtol=0)
+    future = torch.cat([motion, motion[:, :1]], 1)
+    expected = torch.linalg.inv(world_from_frame[0]) @ world_from_frame
+    torch.testing.assert_close(present_from_frames(future)[0], expected, atol=1e-6, rtol=0)
+
+
+def test_the_released_chain_is_another_one_before_the_last_step_only() -> None:
+    motion = torch.stack([turned(4, 0, 0, 0, 0, 0.5), turned(3, 1, 0, 0, 0, -0.2)], 1)
+    exact, released = present_from_past(motion), present_from_past(motion, chain="released")
+    torch.testing.assert_close(exact[:, 1], released[:, 1])
+    first, second = matrices_from_six(motion[0])
+    torch.testing.assert_close(exact[0, 0], second @ first)
+    torch.testing.assert_close(released[0, 0], first @ second)
+
+
+def test_augmented_transforms_lead_between_augmented_points() -> None:
+    target_from_source = matrices_from_six(turned(2, -1, 0, 0, 0, 0.7))
+    other = matrices_from_six(turned(0, 0, 0, 0, 0, -0.3))
+    point = torch.tensor([1.5, -2.5, 0, 1])
+    moved = between_augmented(target_from_source, other, MIRRORED)[0] @ (MIRRORED[0] @ point)
+    torch.testing.assert_close(moved, other[0] @ target_from_source[0] @ point)
+    torch.testing.assert_close(between_augmented(target_from_source, None, None), target_from_source)
+
+
+@settings(max_examples=40)
+@given(planar)
+def test_an_exact_warp_gives_a_linear_field_its_values_in_the_other_frame(target_from_source: torch.Tensor) -> None:
+    """Bilinear sampling has no error on such a field, but next to the border, where zeros mix in."""
+    x, y = (each.double() for each in centres())
+    field = (3 + 0.5 * x - 0.25 * y)[None, None]
+    warped = warp_features(field, target_from_source, GRID)[0, 0]
+    source = torch.linalg.inv(target_from_source)[0]
+    source_x, source_y = (source[row, 0] * x + source[row, 1] * y + source[row, 3] for row in (0, 1))
+    inner = (source_x > -7.4) & (source_x < 11.4) & (source_y > -5.7) & (source_y < 5.7)
+    expected = 3 + 0.5 * source_x - 0.25 * source_y
+    torch.testing.assert_close(warped[inner], expected[inner], atol=1e-9, rtol=0)
+    outside = (source_x < -8.6) | (source_x > 12.6) | (source_y < -6.3) | (source_y > 6.3)
+    assert not warped[outside].any()
+    covered = (source_x > -8) & (source_x < 12) & (source_y > -6) & (source_y < 6)
+    at_border = torch.stack([source_x + 8, source_x - 12, source_y + 6, source_y - 6]).abs().amin(0) < 1e-6
+    assert torch.equal(inside_mask(target_from_source, GRID)[0][~at_border], covered[~at_border])
+
+
+@pytest.mark.parametrize("mode", ["bilinear", "nearest"])
+def test_a_shift_by_whole_cells_moves_cells(mode: str) -> None:
+    features = torch.rand(1, 2, 24, 20)
+    warped = warp_features(features, matrices_from_six(turned(3, -1, 0, 0, 0, 0)), GRID, mode=mode)
+    torch.testing.assert_close(warped[:, :, :-2, 3:], features[:, :, 2:, :-3])
+    assert warped[:, :, -2:].max() < 1e-5
+    assert warped[:, :, :, :3].max() < 1e-5
+
+
+def test_a_stretched_warp_blurs_without_motion_as_the_released_one() -> None:
+    """128 cells of 0.8 m: cell i samples at 0.4961 + 0.99609 i."""
+    grid = GridBounds(x=(-51.2, 51.2, 0.8), y=(-51.2, 51.2, 0.8))
+    rising = torch.arange(128.0).expand(1, 1, 128, 128)
+    warped = warp_features(rising, torch.eye(4)[None], grid, warp="stretched")
+    torch.testing.assert_close(warped[0, 0, 5], 0.49609375 + 0.99609375 * torch.arange(128), atol=1e-4, rtol=0)
+    torch.testing.assert_close(warp_features(rising, torch.eye(4)[None], grid), rising, atol=1e-4, rtol=0)
+
+
+def test_height_and_tilt_count_only_in_the_inverse_s_plane() -> None:
+    """Of a tilted pose, rows x, y and columns x, y, translation of the inverse are used; height alone does nothing."""
+    features = torch.rand(1, 1, 24, 20)
+    flat, raised = (matrices_from_six(turned(1, 2, z, 0, 0, 0.4)) for z in (0.0, 5.0))
+    torch.testing.assert_close(warp_features(features, flat, GRID), warp_features(features, raised, GRID))
+
+
+def test_the_ego_is_neither_warped_nor_hidden_and_missing_agents_are() -> None:
+    features = torch.rand(2, 3, 4, 24, 20, requires_grad=True)
+    pose = matrices_from_six(turned(2, 1, 0, 0, 0, 0.4)).expand(2, 3, 4, 4)
+    placed = agents_to_ego(features, pose, GRID)
+    assert torch.equal(placed[:, 0], features[:, 0])
+    torch.testing.assert_close(placed[:, 2], warp_features(features[:, 2], pose[:, 2], GRID))
+    valid = torch.tensor([[False, True, False], [True, True, True]])
+    mask = agents_mask(valid, pose, GRID)
+    inside = inside_mask(pose[0], GRID)[0]
+    assert 0 < inside.float().mean() < 1
+    assert mask[:, 0].all()
+    assert torch.equal(mask[0, 1], inside)
+    assert not mask[0, 2].any()
+    assert torch.equal(mask[1, 2], inside)
+    placed.sum().backward()
+    assert features.grad.ne(0).flatten(2).any(2).all()
+
+
+def test_a_batch_without_partners_has_an_ego_map_alone() -> None:
+    features, pose = torch.rand(2, 1, 4, 24, 20), torch.eye(4).expand(2, 1, 4, 4)
+    assert torch.equal(agents_to_ego(features, pose, GRID), features)
+    assert agents_mask(torch.ones(2, 1, dtype=torch.bool), pose, GRID).all()
+
+
+def test_autocast_does_not_round_poses() -> None:
+    """In bfloat16, 37.3 m would be 37.25 m."""
+    motion = torch.stack([turned(37.3, 0, 0, 0, 0, 0.4)] * 2, 1)
+    features, far = torch.rand(1, 1, 24, 20), matrices_from_six(turned(0.3, 0.2, 0, 0, 0, 0.1))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        chain = present_from_past(motion, bev_transform=MIRRORED)
+        rounded = warp_features(features.bfloat16(), far, GRID)
+    assert torch.equal(chain, present_from_past(motion, bev_transform=MIRRORED))
+    assert rounded.dtype == torch.bfloat16
+    torch.testing.assert_close(rounded.float(), warp_features(features, far, GRID), atol=1e-2, rtol=0)
+
+
+def test_a_grid_of_no_whole_cells_is_refused() -> None:
+    with pytest.raises(ConfigError, match="not a whole number of cells"):
+        GridBounds(x=(-8, 8, 0.7), y=(-8, 8, 1))
+    assert GRID.shape == (24, 20)
