@@ -1,0 +1,212 @@
+"""BEV features cut to a task's grid, and the encoders that stand before a task's head.
+
+Every task has a crop and an encoder of its own, as in BEVerse (the released `BevFeatureSlicer` and `BevEncode`).
+`BevUNet` is our small encoder; its result has half the grid's resolution.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from deepaccident_devkit.errors import ConfigError, GeometryError
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.geometry.bev_grid import Axis
+from deepaccident_devkit.motion.orientations import axes_of
+
+__all__ = ["BevEncode", "BevEncodeConfig", "BevUNet", "BevUNetConfig", "crop"]
+
+
+def crop(features: Tensor, source: BevGrid, target: BevGrid) -> Tensor:
+    """Features of one grid, bilinearly sampled at another grid's cell centres (the released `BevFeatureSlicer`).
+
+    Both grids are in metres of the same ego frame. Outside the source grid features are zero; within half a cell of its
+    edge, on either side, they fade. If the grids are equal, nothing is sampled.
+
+    Args:
+        features: (N, C, H, W) in the orientation of `source`.
+        source: the features' cells.
+        target: the wanted cells, in the same orientation.
+
+    Returns:
+        (N, C, H', W').
+
+    Raises:
+        GeometryError: the features do not have the shape of `source`, or the grids' orientations differ.
+    """
+    rows, columns = source.shape
+    if features.dim() != 4 or tuple(features.shape[-2:]) != (rows, columns):
+        raise GeometryError(f"features: expected (N, C, {rows}, {columns}), found {tuple(features.shape)}")
+    if source.orientation != target.orientation:
+        raise GeometryError(
+            f"target: expected a grid in the source's orientation, {source.orientation!r}, found "
+            f"{target.orientation!r}; take target.with_orientation({source.orientation!r})"
+        )
+    if source == target:
+        return features
+    down, along = (
+        _sample_points(inside, outside, features.device)
+        for inside, outside in zip(axes_of(target), axes_of(source), strict=True)
+    )
+    points = torch.stack(torch.meshgrid(along, down, indexing="xy"), dim=-1)
+    # half precision cannot tell neighbouring cells of a large grid apart
+    dtype = torch.promote_types(features.dtype, torch.float32)
+    points = points.to(dtype).expand(len(features), -1, -1, -1)
+    return functional.grid_sample(features.to(dtype), points, align_corners=True).to(features.dtype)
+
+
+def _sample_points(target: Axis, source: Axis, device: torch.device) -> Tensor:
+    """A target axis's cell centres; −1 and 1 are the centres of the source axis's first and last cell."""
+    low, high, size = target
+    centers = low + (torch.arange(round((high - low) / size), device=device, dtype=torch.float64) + 0.5) * size
+    low, high, size = source
+    return (2 * centers - (low + high)) / (high - low - size)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BevEncodeConfig:
+    """Sizes of the released encoder; the defaults are the released ones.
+
+    Attributes:
+        in_channels: of the features after fusion.
+        out_channels: of the result.
+        widths: channels of the three stages, at 1/2, 1/4 and 1/8 of the input's resolution.
+    """
+
+    in_channels: int = 64
+    out_channels: int = 256
+    widths: tuple[int, int, int] = (128, 256, 512)
+
+    def __post_init__(self) -> None:
+        """Check the sizes; raises ConfigError."""
+        _check_widths(self.widths, 3)
+        _check_positive(in_channels=self.in_channels, out_channels=self.out_channels)
+
+
+class BevEncode(nn.Module):
+    """The released `BevEncode`: three stages of two residual blocks, and a decoder back to the input's resolution."""
+
+    def __init__(self, config: BevEncodeConfig) -> None:
+        """Make the layers of the given sizes."""
+        super().__init__()
+        inputs = (config.in_channels, *config.widths[:-1])
+        self.layers = nn.ModuleList(_stage(*widths) for widths in zip(inputs, config.widths, strict=True))
+        middle = 2 * config.out_channels
+        self.up1 = _UpAndJoin(config.widths[0] + config.widths[-1], middle)
+        self.up2 = nn.Sequential(
+            nn.Upsample(scale_factor=2, mode="bilinear", align_corners=True),
+            *_convolution(middle, config.out_channels),
+            nn.Conv2d(config.out_channels, config.out_channels, 1),
+        )
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Encode.
+
+        Args:
+            features: (N, in_channels, H, W); H and W even.
+
+        Returns:
+            (N, out_channels, H, W).
+        """
+        fine = self.layers[0](features)
+        coarse = self.layers[2](self.layers[1](fine))
+        return self.up2(self.up1(coarse, fine))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BevUNetConfig:
+    """Sizes of our small encoder; the defaults are those of `tiny`.
+
+    Attributes:
+        in_channels: of the features after fusion.
+        out_channels: of the result.
+        widths: channels of the two stages, at 1/2 and 1/4 of the input's resolution.
+    """
+
+    in_channels: int = 32
+    out_channels: int = 32
+    widths: tuple[int, int] = (32, 64)
+
+    def __post_init__(self) -> None:
+        """Check the sizes; raises ConfigError."""
+        _check_widths(self.widths, 2)
+        _check_positive(in_channels=self.in_channels, out_channels=self.out_channels)
+
+
+class BevUNet(nn.Module):
+    """Our small encoder: a residual block at 1/2 and one at 1/4 of the input's resolution, joined at 1/2."""
+
+    def __init__(self, config: BevUNetConfig) -> None:
+        """Make the layers of the given sizes."""
+        super().__init__()
+        fine, coarse = config.widths
+        self.fine = _ResidualBlock(config.in_channels, fine, stride=2)
+        self.coarse = _ResidualBlock(fine, coarse, stride=2)
+        self.join = nn.Sequential(*_convolution(fine + coarse, config.out_channels))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Encode.
+
+        Args:
+            features: (N, in_channels, H, W).
+
+        Returns:
+            (N, out_channels, H / 2, W / 2), odd sizes rounded up.
+        """
+        fine = self.fine(features)
+        coarse = functional.interpolate(self.coarse(fine), size=fine.shape[-2:], mode="bilinear", align_corners=False)
+        return self.join(torch.cat([fine, coarse], dim=1))
+
+
+class _ResidualBlock(nn.Module):
+    """Two convolutions and a skip; as released, a skip that changes the size is a 3 × 3 convolution without norm."""
+
+    def __init__(self, inputs: int, outputs: int, *, stride: int = 1) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1, bias=False)
+        self.bn1 = nn.BatchNorm2d(outputs)
+        self.conv2 = nn.Conv2d(outputs, outputs, 3, padding=1, bias=False)
+        self.bn2 = nn.BatchNorm2d(outputs)
+        self.downsample = nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1) if stride > 1 else nn.Identity()
+
+    def forward(self, features: Tensor) -> Tensor:
+        inner = functional.relu(self.bn1(self.conv1(features)), inplace=True)
+        return functional.relu(self.bn2(self.conv2(inner)) + self.downsample(features), inplace=True)
+
+
+class _UpAndJoin(nn.Module):
+    """Coarse features brought to the size of fine ones, joined with them, and two convolutions."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.conv = nn.Sequential(*_convolution(inputs, outputs), *_convolution(outputs, outputs))
+
+    def forward(self, coarse: Tensor, fine: Tensor) -> Tensor:
+        coarse = functional.interpolate(coarse, size=fine.shape[-2:], mode="bilinear", align_corners=True)
+        return self.conv(torch.cat([fine, coarse], dim=1))
+
+
+def _stage(inputs: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(_ResidualBlock(inputs, outputs, stride=2), _ResidualBlock(outputs, outputs))
+
+
+def _convolution(inputs: int, outputs: int) -> tuple[nn.Module, nn.Module, nn.Module]:
+    return (
+        nn.Conv2d(inputs, outputs, 3, padding=1, bias=False),
+        nn.BatchNorm2d(outputs),
+        nn.ReLU(inplace=True),
+    )
+
+
+def _check_widths(widths: tuple[int, ...], stages: int) -> None:
+    if len(widths) != stages or min(widths) < 1:
+        raise ConfigError(
+            f"widths: expected the channels of {stages} stages, such as {(32, 64, 128)[:stages]}, found {widths!r}"
+        )
+
+
+def _check_positive(**channels: int) -> None:
+    for name, count in channels.items():
+        if count < 1:
+            raise ConfigError(f"{name}: expected at least one channel, found {count!r}")

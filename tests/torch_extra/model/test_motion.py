@@ -1,0 +1,323 @@
+"""The motion head: its latent, its future states, its maps and its losses."""
+
+import dataclasses
+import itertools
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from deepaccident_devkit.errors import ConfigError, GeometryError, NotAvailableError
+from deepaccident_devkit.model.motion import (
+    LatentDistribution,
+    MotionHead,
+    MotionHeadConfig,
+    MotionLossConfig,
+    MotionMaps,
+    MotionOutputs,
+    MotionTargets,
+    frame_mask,
+    motion_losses,
+)
+from deepaccident_devkit.model.motion.decoders import SharedDecoder
+from deepaccident_devkit.model.motion.flow_gru import FlowGru, warp_with_flow
+from deepaccident_devkit.model.motion.losses import center_loss, latent_loss, segmentation_loss, vector_loss
+
+SEPARATE = MotionHeadConfig(in_channels=4, latent=2, future_frames=2, samples=3)
+SHARED = dataclasses.replace(SEPARATE, decoders="shared", hidden=6, upsample=2)
+LOSSES = MotionLossConfig()
+ROWS, COLUMNS = 10, 12
+CHANNELS = {"segmentation": 2, "instance_center": 1, "instance_offset": 2, "instance_flow": 2}
+
+
+@pytest.fixture(autouse=True)
+def _seeded() -> None:
+    torch.manual_seed(0)
+
+
+@pytest.mark.parametrize("config", [SEPARATE, SHARED])
+def test_shapes_with_and_without_targets(config) -> None:
+    head, features, targets = head_and_data(config)
+    size = (config.upsample * ROWS, config.upsample * COLUMNS)
+    outputs = head(features, targets)
+    assert shapes(outputs.maps) == {name: (2, 3, count, *size) for name, count in CHANNELS.items()}
+    assert tuple(outputs.present.mu.shape) == tuple(outputs.future.log_sigma.shape) == (2, 2, 3, 3)
+    predicted = head.eval()(features)
+    assert shapes(predicted.maps) == {name: (4, 2, 3, count, *size) for name, count in CHANNELS.items()}
+    assert predicted.future is None
+
+
+@pytest.mark.parametrize("config", [SEPARATE, SHARED])
+@pytest.mark.parametrize("hidden_warp", ["none", "warped"])
+@pytest.mark.parametrize("detach", [True, False])
+def test_every_weight_learns(config, hidden_warp, detach) -> None:
+    head, features, targets = head_and_data(dataclasses.replace(config, hidden_warp=hidden_warp, detach=detach))
+    sum(motion_losses(head(features, targets), targets, LOSSES).values()).backward()
+    unused = [name for name, values in head.named_parameters() if values.grad is None or not values.grad.any()]
+    assert not unused
+
+
+def test_a_generator_repeats_the_draws() -> None:
+    head, features, targets = head_and_data(SEPARATE)
+    head.eval()
+    for given in (None, targets):
+        first, second, other = (
+            head(features, given, generator=torch.Generator().manual_seed(seed)).maps for seed in (1, 1, 2)
+        )
+        assert torch.equal(first.instance_flow, second.instance_flow)
+        assert not torch.equal(first.instance_flow, other.instance_flow)
+
+
+def test_the_mean_is_the_last_prediction_and_needs_no_draws() -> None:
+    head, features, _ = head_and_data(SHARED)
+    drawn = head.eval()(features).maps
+    head.config = dataclasses.replace(SHARED, samples=0)
+    mean = head(features).maps
+    for several, one in zip(drawn, mean, strict=True):
+        assert len(one) == 1
+        assert torch.equal(several[-1], one[0])
+    assert not torch.equal(drawn.instance_center[0], drawn.instance_center[-1])
+
+
+def test_noise_decides_the_draws() -> None:
+    head, features, _ = head_and_data(SEPARATE)
+    noise = torch.zeros(3, 2, 2, 3, 3)
+    noise[1] = 1
+    center = head.eval()(features, noise=noise).maps.instance_center
+    assert torch.equal(center[0], center[3])
+    assert torch.equal(center[2], center[3])
+    assert not torch.equal(center[1], center[3])
+
+
+def test_the_first_frame_is_the_present_whatever_the_latent() -> None:
+    head, features, _ = head_and_data(SEPARATE)
+    flow = head.eval()(features).maps.instance_flow
+    assert torch.equal(flow[0, :, 0], flow[1, :, 0])
+    assert not torch.equal(flow[0, :, 1], flow[1, :, 1])
+
+
+@pytest.mark.parametrize("config", [SEPARATE, SHARED])
+def test_at_first_one_cell_in_ten_is_a_centre(config) -> None:
+    head, features, targets = head_and_data(config)
+    probability = head(features * 0, targets).maps.instance_center.sigmoid()
+    assert 0.03 < probability.mean().item() < 0.3
+
+
+def test_the_posterior_sees_the_future_and_not_the_present() -> None:
+    head, features, targets = head_and_data(SEPARATE)
+    head.eval()
+    before = head(features, targets)
+    for frame, is_seen in ((0, False), (1, True), (2, True)):
+        changed = targets._replace(centerness=targets.centerness.clone())
+        changed.centerness[:, frame] += 1
+        after = head(features, changed)
+        assert torch.equal(before.future.mu, after.future.mu) is not is_seen
+        assert torch.equal(before.present.mu, after.present.mu)
+
+
+@pytest.mark.parametrize(("posterior_ignore", "is_seen"), [("keep", True), ("zero", False)])
+def test_the_posterior_sees_the_mark_of_ignored_cells_only_where_it_is_kept(posterior_ignore, is_seen) -> None:
+    head, features, targets = head_and_data(dataclasses.replace(SEPARATE, posterior_ignore=posterior_ignore))
+    head.eval()
+    cleared = targets._replace(offset=targets.offset.where(targets.offset != 255, 0))
+    marked, zero = (head(features, given).future.mu for given in (targets, cleared))
+    assert torch.equal(marked, zero) is not is_seen
+
+
+def test_the_posterior_sees_every_second_label_cell_if_maps_are_twice_as_fine() -> None:
+    _, _, targets = head_and_data(SHARED)
+    seen = targets.posterior_input(stride=2, ignore="keep", ignore_index=255).unflatten(1, (2, 6))
+    assert torch.equal(seen[:, 1, 0], targets.segmentation[:, 2, ::2, ::2].float())
+    assert torch.equal(seen[:, 0, 2:4], targets.offset[:, 1, :, ::2, ::2])
+    assert torch.equal(seen[:, 1, 4:], targets.flow[:, 2, :, ::2, ::2])
+
+
+def test_whole_flows_fetch_whole_cells() -> None:
+    features = torch.rand(2, 3, 6, 7)
+    flow = torch.zeros(2, 2, 6, 7)
+    flow[:, 0], flow[:, 1] = 2, -1
+    expected = torch.zeros_like(features)
+    expected[:, :, 1:, :-2] = features[:, :, :-1, 2:]
+    torch.testing.assert_close(warp_with_flow(features, flow), expected)
+
+
+@pytest.mark.parametrize("hidden_warp", ["none", "warped"])
+def test_the_state_that_the_gru_keeps_moves_only_if_it_is_warped(hidden_warp) -> None:
+    future = FlowGru(3, 2, 2, hidden_warp=hidden_warp, detach=True).eval()
+    keep_everything(future)
+    state = torch.rand(1, 3, 5, 6)
+    expected = [state, state]
+    if hidden_warp == "warped":
+        expected = [torch.cat([state[..., step:], torch.zeros(1, 3, 5, step)], dim=-1) for step in (1, 2)]
+    torch.testing.assert_close(future(torch.rand(1, 2, 5, 6), state), torch.stack(expected, dim=1))
+
+
+@pytest.mark.parametrize("detach", [True, False])
+def test_gradients_pass_from_frame_to_frame_only_if_not_detached(detach) -> None:
+    future = FlowGru(3, 2, 2, hidden_warp="warped", detach=detach)
+    state = torch.rand(1, 3, 5, 6, requires_grad=True)
+    future(torch.rand(1, 2, 5, 6), state)[:, 1].sum().backward()
+    reached = state.grad is not None and bool(state.grad.any())
+    assert reached is not detach
+
+
+def test_the_shared_decoder_may_project_before_it_upsamples() -> None:
+    decoder = SharedDecoder(4, 6, 2).eval()
+    states = torch.rand(3, 4, 5, 6)
+    inner = decoder.layers[:-1](states)
+    finer = nn.functional.interpolate(inner, scale_factor=2, mode="bilinear", align_corners=False)
+    torch.testing.assert_close(torch.cat(decoder(states), dim=1), decoder.layers[-1](finer))
+
+
+def test_frames_that_do_not_count_change_no_loss() -> None:
+    head, features, targets = head_and_data(SEPARATE)
+    targets.frame_mask[0, 2] = targets.frame_mask[1] = False
+    outputs = head(features, targets)
+    before = motion_losses(outputs, targets, LOSSES)
+    changed = MotionMaps(*(maps.clone() for maps in outputs.maps))
+    for maps in changed:
+        maps[0, 2], maps[1] = 7, -7
+    present = LatentDistribution(*(torch.cat([each[:1], each[1:] + 3]) for each in outputs.present))
+    after = motion_losses(MotionOutputs(changed, present, outputs.future), targets, LOSSES)
+    assert all(loss.item() > 0 for loss in before.values())
+    assert {name: loss.item() for name, loss in before.items()} == {name: loss.item() for name, loss in after.items()}
+
+
+def test_a_batch_without_a_frame_that_counts_gives_zero_gradients() -> None:
+    head, features, targets = head_and_data(SHARED)
+    nothing = targets._replace(frame_mask=torch.zeros_like(targets.frame_mask))
+    losses = motion_losses(head(features.requires_grad_(), nothing), nothing, LOSSES)
+    assert list(losses) == ["motion_seg", "motion_centerness", "motion_offset", "motion_flow", "motion_prob"]
+    assert not any(loss.item() for loss in losses.values())
+    sum(losses.values()).backward()
+    assert torch.equal(features.grad, torch.zeros_like(features))
+
+
+def test_ignored_cells_change_no_vector_loss() -> None:
+    target = torch.full((1, 2, 2, 3, 4), 255.0)
+    mask = torch.ones(1, 2, dtype=torch.bool)
+    vectors = torch.rand(target.shape)
+    assert vector_loss(vectors, target, mask, LOSSES).item() == 0
+    target[0, 1, :, 2, 3] = vectors[0, 1, :, 2, 3] + torch.tensor([2.0, -1.0])
+    torch.testing.assert_close(vector_loss(vectors, target, mask, LOSSES), torch.tensor(3 * 0.95))
+
+
+def test_only_the_hardest_cells_count_in_the_segmentation() -> None:
+    logits = torch.zeros(1, 1, 2, 4, 4)
+    target = torch.zeros(1, 1, 4, 4, dtype=torch.int64)
+    mask = torch.ones(1, 1, dtype=torch.bool)
+    logits[:, :, 1, 0] = 5  # four of sixteen cells wrongly foreground
+    hardest, every = (segmentation_loss(logits, target, mask, MotionLossConfig(top_k=share)) for share in (0.25, 1.0))
+    wrong, undecided = torch.tensor(5.0).exp().add(1).log(), torch.tensor(2.0).log()
+    torch.testing.assert_close(hardest, wrong)
+    torch.testing.assert_close(every, (wrong + 3 * undecided) / 4)
+
+
+def test_losses_fall_towards_the_truth() -> None:
+    """Logits and vectors between a wrong and the right prediction."""
+    _, _, targets = head_and_data(SEPARATE)
+    right = nn.functional.one_hot(targets.segmentation, 2).movedim(-1, 2) * 20.0 - 10
+    centers = torch.where(targets.centerness == 1, 8.0, -8.0)
+    steps = [
+        (
+            segmentation_loss(right * share, targets.segmentation, targets.frame_mask, LOSSES),
+            center_loss(centers * share, targets.centerness, targets.frame_mask, LOSSES),
+            vector_loss(targets.flow * share, targets.flow, targets.frame_mask, LOSSES),
+        )
+        for share in (-1, 0, 0.5, 1)
+    ]
+    for earlier, later in itertools.pairwise(steps):
+        assert all(after.item() < before.item() for before, after in zip(earlier, later, strict=True))
+    assert all(loss.item() < 1e-2 for loss in steps[-1])
+
+
+def test_the_divergence_is_torchs() -> None:
+    present, future = (LatentDistribution(torch.randn(2, 3, 4, 5), torch.randn(2, 3, 4, 5)) for _ in range(2))
+    normal = [torch.distributions.Normal(each.mu, each.log_sigma.exp()) for each in (future, present)]
+    expected = torch.distributions.kl_divergence(*normal).sum(dim=1).mean()
+    both = torch.ones(2, dtype=torch.bool)
+    torch.testing.assert_close(latent_loss(present, future, both), expected)
+    assert latent_loss(future, future, both).item() == pytest.approx(0, abs=1e-6)
+
+
+def test_weights_weigh() -> None:
+    head, features, targets = head_and_data(SEPARATE)
+    outputs = head(features, targets)
+    once = motion_losses(outputs, targets, LOSSES)
+    for field, name in [("segmentation", "seg"), *((same, same) for same in ("centerness", "offset", "flow", "prob"))]:
+        twice = motion_losses(outputs, targets, dataclasses.replace(LOSSES, **{field: 2 * getattr(LOSSES, field)}))
+        ratio = {key: (loss / once[key]).item() for key, loss in twice.items()}
+        assert ratio == pytest.approx(dict.fromkeys(once, 1) | {f"motion_{name}": 2})
+
+
+def test_half_precision_trains() -> None:
+    head, features, targets = head_and_data(SHARED)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        losses = motion_losses(head(features, targets), targets, LOSSES)
+        predicted = head.eval()(features)
+    assert {loss.dtype for loss in losses.values()} == {torch.float32}
+    sum(losses.values()).backward()
+    assert all(values.grad.isfinite().all() for values in head.parameters())
+    assert predicted.maps.segmentation.isfinite().all()
+
+
+def test_a_sample_without_its_past_has_no_frame_that_counts() -> None:
+    label_valid = torch.tensor([[True, True, False], [True, True, True]])
+    past_valid = torch.tensor([[True, True], [False, True]])
+    assert frame_mask(label_valid, past_valid).tolist() == [[True, True, False], [False, False, False]]
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    head, features, targets = head_and_data(SHARED)
+    with pytest.raises(GeometryError, match=r"segmentation of shape \(2, 3, 10, 10\), found \(2, 3, 20, 24\)"):
+        head(features[..., :5, :5], targets)
+    with pytest.raises(GeometryError, match=r"noise: expected shape \(2, 2, 3, 3\), found \(2, 2, 1, 1\)"):
+        head(features, targets, noise=torch.zeros(2, 2, 1, 1))
+    with pytest.raises(GeometryError, match="noise: expected that of 3 draws, found 5"):
+        head(features, noise=torch.zeros(5, 2, 2, 3, 3))
+    with pytest.raises(NotAvailableError, match=r"outputs: .* found no posterior; give the targets"):
+        motion_losses(head(features), targets, LOSSES)
+
+
+@pytest.mark.parametrize(
+    ("config", "values", "message"),
+    [
+        (MotionHeadConfig, {"hidden_warp": "moved"}, "hidden_warp: expected one of none, warped, found 'moved'"),
+        (MotionHeadConfig, {"posterior_ignore": "drop"}, "posterior_ignore: expected one of keep, zero, found 'drop'"),
+        (MotionHeadConfig, {"decoders": "none"}, "decoders: expected one of separate, shared, found 'none'"),
+        (MotionHeadConfig, {"latent": 0}, "latent: expected at least 1, found 0"),
+        (MotionHeadConfig, {"log_sigma": (5, -5)}, r"smaller limit first, such as \(-5, 5\), found \(5, -5\)"),
+        (MotionHeadConfig, {"upsample": 2}, "separate decoders keep the states' resolution, found 2; choose 1, or"),
+        (MotionLossConfig, {"top_k": 0}, "top_k: expected a share above 0 and at most 1, found 0"),
+        (MotionLossConfig, {"class_weights": (1.0,)}, r"those of background and foreground, found \(1.0,\)"),
+    ],
+)
+def test_impossible_values_are_refused(config, values, message) -> None:
+    with pytest.raises(ConfigError, match=message):
+        config(**values)
+
+
+def head_and_data(config: MotionHeadConfig) -> tuple[MotionHead, Tensor, MotionTargets]:
+    """A head in training, features of two samples, and labels of a few moving blobs."""
+    frames, size = config.future_frames + 1, (config.upsample * ROWS, config.upsample * COLUMNS)
+    segmentation = torch.zeros(2, frames, *size, dtype=torch.int64)
+    segmentation[..., 2:8, 2:10] = 1
+    centerness = 0.5 * segmentation[:, :, None].float()
+    centerness[..., 4, 6] = 1
+    vectors = [torch.randn(2, frames, 2, *size).where(segmentation[:, :, None] == 1, 255.0) for _ in range(2)]
+    mask = torch.ones(2, frames, dtype=torch.bool)
+    features = torch.randn(2, config.in_channels, ROWS, COLUMNS)
+    return MotionHead(config).train(), features, MotionTargets(segmentation, centerness, *vectors, mask)
+
+
+def keep_everything(future: FlowGru) -> None:
+    """Flow one column to the right everywhere, never update the state, and return it as it is."""
+    nn.init.zeros_(future.offset_pred.weight)
+    future.offset_pred.bias.data[:] = torch.tensor([1.0, 0.0])
+    nn.init.zeros_(future.gru_cells[0].conv_update.weight)
+    nn.init.constant_(future.gru_cells[0].conv_update.bias, -100.0)
+    future.spatial_conv = nn.Identity()
+
+
+def shapes(maps: MotionMaps) -> dict[str, tuple[int, ...]]:
+    return {name: tuple(values.shape) for name, values in maps._asdict().items()}
