@@ -19,7 +19,7 @@ __all__ = ["BevEncode", "BevEncodeConfig", "BevUNet", "BevUNetConfig", "crop"]
 
 
 def crop(features: Tensor, source: BevGrid, target: BevGrid) -> Tensor:
-    """Features of one grid, bilinearly sampled at another grid's cell centres (the released `BevFeatureSlicer`).
+    """Features of one grid at another grid's cell centres, by bilinear sampling (the released `BevFeatureSlicer`).
 
     Both grids are in metres of the same ego frame. Outside the source grid features are zero; within half a cell of its
     edge, on either side, they fade. If the grids are equal, nothing is sampled.

@@ -63,7 +63,7 @@ class SharedDecoder(nn.Module):
         self.layers = _decoder(channels, hidden, sum(_CHANNELS.values()), rare=_CHANNELS["segmentation"])
 
     def forward(self, states: Tensor) -> MotionMaps:
-        """Decode states (M, C, H, W) to maps (M, …, upsample · H, upsample · W)."""
+        """Decode states (M, C, H, W) to maps (M, …, H', W') on the finer grid."""
         maps = self.layers(states)
         if self._upsample > 1:
             # after the 1 × 1 convolution: the same values as before it, from fewer channels

@@ -18,7 +18,7 @@ _FLOW_DEVIATION: Final = 0.02
 
 
 def warp_with_flow(features: Tensor, flow: Tensor) -> Tensor:
-    """Features at each cell plus its flow, bilinearly; zero outside (the released `warp_with_flow`).
+    """Features at each cell plus its flow, by bilinear sampling; zero outside (the released `warp_with_flow`).
 
     Args:
         features: (N, C, H, W).
@@ -83,7 +83,7 @@ class FlowGru(nn.Module):
 
 
 class _GruCell(nn.Module):
-    """A convolutional GRU whose reset gate is the share that is *forgotten*, as in FIERY."""
+    """A GRU of convolutions whose reset gate is the share that is *forgotten*, as in FIERY."""
 
     def __init__(self, inputs: int, channels: int) -> None:
         super().__init__()

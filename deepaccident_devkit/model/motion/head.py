@@ -124,8 +124,8 @@ class MotionHead(nn.Module):
         """Predict the maps of the present and the future frames; with targets as in training, without as in a test.
 
         Args:
-            features: (N, in_channels, H, W), encoded, on the motion grid or, with `upsample`, on a coarser one.
-            targets: the labels, (upsample · H) × (upsample · W) cells, for a latent from the posterior.
+            features: (N, in_channels, H, W), encoded; `upsample` says how much coarser than the motion grid.
+            targets: the labels on the motion grid, for a latent from the posterior.
             noise: standard normal, (N, latent, H / 4, W / 4) with targets, (samples, N, …) without; drawn if None.
             generator: draws the noise, on the features' device; None for torch's own.
 
@@ -152,7 +152,7 @@ class MotionHead(nn.Module):
     def _draws(
         self, present: LatentDistribution, noise: Tensor | None, generator: torch.Generator | None
     ) -> Iterator[Tensor]:
-        """The random latents and, last, the mean."""
+        """The latent of each draw and, last, the mean."""
         count = self.config.samples
         if noise is not None and len(noise) != count:
             raise GeometryError(f"noise: expected that of {count} draws, found {len(noise)}; change noise or samples")

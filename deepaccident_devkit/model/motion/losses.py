@@ -137,7 +137,7 @@ def vector_loss(vectors: Tensor, target: Tensor, frame_mask: Tensor, config: Mot
 
 
 def latent_loss(present: LatentDistribution, future: LatentDistribution, sample_mask: Tensor) -> Tensor:
-    """Kullback–Leibler divergence of the present's distribution from the posterior, KL(future ‖ present).
+    """The divergence KL(future ‖ present): what the posterior says that the present's distribution does not.
 
     Summed over the latent's channels, averaged over its cells and over the samples in `sample_mask` (N,) bool.
     """

@@ -141,6 +141,13 @@ def test_whole_flows_fetch_whole_cells() -> None:
     torch.testing.assert_close(warp_with_flow(features, flow), expected)
 
 
+def test_half_precision_features_are_fetched_from_the_same_cells() -> None:
+    features, flow = torch.rand(1, 2, 3, 300).bfloat16(), torch.zeros(1, 2, 3, 300).bfloat16()
+    flow[:, 0] = 1
+    found = warp_with_flow(features, flow)
+    torch.testing.assert_close(found[..., :-1], features[..., 1:])
+
+
 @pytest.mark.parametrize("hidden_warp", ["none", "warped"])
 def test_the_state_that_the_gru_keeps_moves_only_if_it_is_warped(hidden_warp) -> None:
     future = FlowGru(3, 2, 2, hidden_warp=hidden_warp, detach=True).eval()
@@ -200,6 +207,17 @@ def test_ignored_cells_change_no_vector_loss() -> None:
     assert vector_loss(vectors, target, mask, LOSSES).item() == 0
     target[0, 1, :, 2, 3] = vectors[0, 1, :, 2, 3] + torch.tensor([2.0, -1.0])
     torch.testing.assert_close(vector_loss(vectors, target, mask, LOSSES), torch.tensor(3 * 0.95))
+    target[0, 0, 1] = 3.0  # one channel alone is no vector
+    torch.testing.assert_close(vector_loss(vectors, target, mask, LOSSES), torch.tensor(3 * 0.95))
+
+
+def test_a_certain_and_wrong_centre_costs_a_finite_loss() -> None:
+    logits = torch.tensor([-1000.0, 1000.0]).view(1, 1, 1, 1, 2).requires_grad_()
+    target = torch.tensor([1.0, 0.0]).view(1, 1, 1, 1, 2)
+    loss = center_loss(logits, target, torch.ones(1, 1, dtype=torch.bool), LOSSES)
+    loss.backward()
+    assert loss.isfinite()
+    assert logits.grad.isfinite().all()
 
 
 def test_only_the_hardest_cells_count_in_the_segmentation() -> None:
