@@ -22,7 +22,7 @@ from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.json_text import parsed_json
-from deepaccident_devkit.model.images.swin_weights import from_official
+from deepaccident_devkit.model.images import from_official
 from deepaccident_devkit.reading import read_bytes
 
 _META: Final = "deepaccident"

@@ -79,7 +79,9 @@ class V2XFormer(nn.Module):
     def encoded(self, inputs: ModelInputs) -> Tensor:
         """Each agent's own map (B, A, C, H, W) of the present, in its own frame: what it would send."""
         agents = inputs.images.shape[:2]
-        images = normalised(inputs.images.flatten(0, 3))
+        images = inputs.images.flatten(0, 3)
+        if not images.is_floating_point():
+            images = normalised(images)
         if self.config.rows is not None:
             images = functional.pad(images, (0, 0, 0, self.config.rows - images.shape[-2]))
         features = self.img_neck(self.img_backbone(images))

@@ -22,7 +22,7 @@ def learning_rate(step: int, config: TrainConfig) -> float:
     return config.learning_rate * 0.5 * (1 + math.cos(math.pi * done))
 
 
-def frozen(model: nn.Module, beginnings: Sequence[str]) -> None:
+def freeze(model: nn.Module, beginnings: Sequence[str]) -> None:
     """Stop parameters from being trained whose names begin so; their batch statistics go on.
 
     Raises:

@@ -1,0 +1,199 @@
+"""The presets: `released`, the model of the release with its quirks, and `tiny`, which a laptop trains."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any, Final, Literal, get_args
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.export.images import ImageConfig
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.model.bev import BevEncodeConfig, BevUNetConfig
+from deepaccident_devkit.model.config import ModelConfig
+from deepaccident_devkit.model.detection import (
+    ONE_TASK,
+    RELEASED_CLASS_SLOTS,
+    RELEASED_NMS,
+    DecodingConfig,
+    DetectionConfig,
+    TargetConfig,
+)
+from deepaccident_devkit.model.fusion import (
+    CobevtConfig,
+    DiscoNetConfig,
+    FusionConfig,
+    PoolFusionConfig,
+    ReleasedFusionConfig,
+    V2XViTConfig,
+)
+from deepaccident_devkit.model.images import SmallConvConfig, SwinConfig
+from deepaccident_devkit.model.lift import LiftConfig
+from deepaccident_devkit.model.motion import MotionHeadConfig
+from deepaccident_devkit.model.temporal import TemporalConfig
+from deepaccident_devkit.model.warps import GridBounds
+from deepaccident_devkit.motion import MotionLabelConfig
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.text import choice as chosen_word
+from deepaccident_devkit.text import settle_choices
+
+PresetName = Literal["released", "tiny"]
+FusionName = Literal["mean", "max", "released", "disconet", "cobevt", "v2xvit"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelChoice:
+    """A preset and what is changed in it: all that is needed to build a model again.
+
+    Attributes:
+        preset: `released` or `tiny`.
+        fusion: how agents are joined; None for the preset's.
+        horizon: seconds that motion is predicted; None for 2.
+    """
+
+    preset: PresetName = "tiny"
+    fusion: FusionName | None = None
+    horizon: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check; raises ChoiceError or ConfigError."""
+        settle_choices(self, {"preset": get_args(PresetName), "fusion": (None, *get_args(FusionName))})
+        if self.horizon is not None:
+            self._frames(PRESETS[self.preset]())
+
+    @property
+    def config(self) -> ModelConfig:
+        """The whole configuration."""
+        config = PRESETS[self.preset]()
+        if self.fusion is not None:
+            config = replace(config, fusion=fusion_config(self.fusion, config.lift.channels))
+        if self.horizon is not None:
+            frames = self._frames(config)
+            config = replace(
+                config,
+                motion=replace(config.motion, future_frames=frames),
+                labels=replace(config.labels, future_frames=frames),
+            )
+        return config
+
+    def as_dict(self) -> dict[str, Any]:
+        """All of it, as JSON holds it."""
+        return {"preset": self.preset, "fusion": self.fusion, "horizon": self.horizon}
+
+    @classmethod
+    def from_dict(cls, described: Mapping[str, Any]) -> ModelChoice:
+        """The choice that notes of weights or a run describe.
+
+        Raises:
+            ConfigError: they do not describe one.
+        """
+        try:
+            return cls(**{name: described[name] for name in ("preset", "fusion", "horizon")})
+        except (KeyError, TypeError, ValueError) as error:
+            raise ConfigError(f"model: expected preset, fusion and horizon ({error}); give weights of the devkit") from error
+
+    def _frames(self, config: ModelConfig) -> int:
+        step = config.labels.step * FRAME_PERIOD
+        frames = (self.horizon or 0.0) / step
+        if not (1 <= frames < 100 and abs(frames - round(frames)) < 1e-6):
+            raise ConfigError(f"horizon: {self.horizon!r} s is no number of steps of {step:g} s; choose 0.5, 1, 1.5, …")
+        return round(frames)
+
+
+def fusion_config(name: str, channels: int) -> FusionConfig:
+    """A fusion by its name, in the size that fits so many channels.
+
+    The release's own fusion is `released`. `disconet`, `cobevt` and `v2xvit` are written from those models' papers: the
+    paper's table names them, and the release has none of them.
+
+    Raises:
+        ChoiceError: no such fusion.
+    """
+    small = channels < 64
+    made: Mapping[str, Callable[[], FusionConfig]] = {
+        "mean": PoolFusionConfig,
+        "max": lambda: PoolFusionConfig(by="max"),
+        "released": lambda: ReleasedFusionConfig(channels=channels),
+        "disconet": lambda: DiscoNetConfig(channels=channels),
+        "cobevt": lambda: (
+            CobevtConfig(channels=channels, depth=1, window=5) if small else CobevtConfig(channels=channels)
+        ),
+        "v2xvit": lambda: (
+            V2XViTConfig(channels=channels, depth=1, windows=(5, 10, 20)) if small else V2XViTConfig(channels=channels)
+        ),
+    }
+    return made[chosen_word("fusion", name, get_args(FusionName))]()
+
+
+def released() -> ModelConfig:
+    """BEVerse-tiny with the released fusion: 83 million parameters, 704 × 256 pixels, 200 × 200 cells of 0.5 m.
+
+    Images are cut as in the released tests, in training too: its random scales, flips and turns of images are left out,
+    and so are an augmentation of its own for each agent and the mixed order of agents in batches, which are mistakes.
+    """
+    along = (-51.2, 51.2, 0.8)
+    grid = GridBounds(x=along, y=along)
+    return ModelConfig(
+        images=ImageConfig(resize=(432, 768), crop=(176, 32, 256, 704), dtype="uint8"),
+        encoder=SwinConfig(checkpointing=True),
+        lift=LiftConfig(
+            in_channels=512,
+            channels=64,
+            depth=(1.0, 60.0, 1.0),
+            x=along,
+            y=along,
+            z=(-30.0, 30.0, 60.0),
+            image_size=(256, 704),
+            stride=16,
+            frustum="corners",
+            voxel_rounding="trunc",
+        ),
+        temporal=TemporalConfig(
+            channels=64, grid=grid, frames=3, warp="stretched", chain="released", egomotion_input="raw"
+        ),
+        fusion=ReleasedFusionConfig(channels=64),
+        bev=BevEncodeConfig(),
+        motion=MotionHeadConfig(posterior_ignore="keep", hidden_warp="none"),
+        detection=DetectionConfig(class_slots=RELEASED_CLASS_SLOTS, x=along, y=along),
+        targets=TargetConfig(unknown_velocity="zero"),
+        decoding=DecodingConfig(nms=RELEASED_NMS),
+        labels=MotionLabelConfig.preset("deepaccident", orientation="released"),
+        handedness="left",
+    )
+
+
+def tiny() -> ModelConfig:
+    """Half a million parameters, 160 × 90 pixels, 100 × 100 cells of 1 m, labels `clean`, none of the quirks.
+
+    Thresholds of the metrics are counted in cells, and so are twice as long in metres as the released ones: its numbers
+    never stand beside those of the released grid.
+    """
+    along = (-50.0, 50.0, 1.0)
+    return ModelConfig(
+        images=ImageConfig(resize=(90, 160), dtype="uint8", decode="scaled"),
+        rows=96,
+        encoder=SmallConvConfig(),
+        lift=LiftConfig(
+            in_channels=48,
+            channels=32,
+            depth=(2.0, 50.0, 2.0),
+            x=along,
+            y=along,
+            z=(-10.0, 10.0, 20.0),
+            image_size=(96, 160),
+            stride=8,
+        ),
+        temporal=TemporalConfig(channels=32, grid=GridBounds(x=along, y=along), frames=2, kind="concat"),
+        fusion=PoolFusionConfig(),
+        bev=BevUNetConfig(),
+        one_bev=True,
+        motion=MotionHeadConfig(in_channels=32, latent=8, decoders="shared", upsample=2),
+        detection=DetectionConfig(
+            in_channels=32, shared_channels=24, class_slots=ONE_TASK, x=along, y=along, branches="joint", upsample=2
+        ),
+        labels=MotionLabelConfig(grid=BevGrid(x=along, y=along), receptive_field=2, protocol="clean"),
+    )
+
+
+PRESETS: Final[Mapping[str, Callable[[], ModelConfig]]] = MappingProxyType({"released": released, "tiny": tiny})
