@@ -1,0 +1,26 @@
+"""Images → features: backbones, and the neck that joins the two maps that a backbone gives.
+
+backbone, neck = image_encoder(SwinConfig())
+features = neck(backbone(normalised(images)))  # (N, 3, h, w) uint8 → (N, 512, h / 16, w / 16)
+"""
+
+from deepaccident_devkit.model.images.encoder import EncoderConfig, image_encoder, normalised
+from deepaccident_devkit.model.images.necks import FpnNeck
+from deepaccident_devkit.model.images.resnet import ResNet, ResNetConfig
+from deepaccident_devkit.model.images.small_conv import SmallConv, SmallConvConfig
+from deepaccident_devkit.model.images.swin import Swin, SwinConfig
+from deepaccident_devkit.model.images.swin_weights import from_official
+
+__all__ = [
+    "EncoderConfig",
+    "FpnNeck",
+    "ResNet",
+    "ResNetConfig",
+    "SmallConv",
+    "SmallConvConfig",
+    "Swin",
+    "SwinConfig",
+    "from_official",
+    "image_encoder",
+    "normalised",
+]

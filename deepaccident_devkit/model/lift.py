@@ -1,0 +1,247 @@
+"""`LiftSplat`: image features → a map seen from above, by a distribution over depths (Philion and Fidler, ECCV 2020).
+
+Each pixel of a feature map stands for a ray. The points of the ray at fixed depths receive its features, weighed by the
+probability of the depth, and each cell of the map is the sum of the points in it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any, Literal, get_args
+
+import torch
+from torch import Tensor, nn
+
+from deepaccident_devkit.errors import ConfigError, GeometryError
+from deepaccident_devkit.geometry import BevGrid
+from deepaccident_devkit.geometry.bev_grid import Axis
+from deepaccident_devkit.text import settle_choices
+
+Frustum = Literal["corners", "centres"]
+Rounding = Literal["trunc", "floor"]
+_WHOLE = 1e-6
+"""Share of a step by which a range may miss a whole number of steps, as in `geometry.BevGrid`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LiftConfig:
+    """Sizes and rules of the lift. Ranges are metres (start, end, step) in the ego frame.
+
+    Attributes:
+        in_channels: of the image features.
+        channels: of the map.
+        depth: the depths along the optical axis; the end is not among them.
+        x: columns of the map, ascending.
+        y: rows of the map, ascending.
+        z: height of the points that count: one step.
+        image_size: height and width of the images, pixels.
+        stride: pixels of the image a step of the features.
+        frustum: where a feature's ray passes through the image: `centres` of its cells; `corners` spreads the rays from
+            the first to the last pixel, the release's rule.
+        voxel_rounding: `floor`, or the release's `trunc`: rounding to zero, by which points up to a step below a range
+            fall into its first cell.
+    """
+
+    in_channels: int
+    channels: int
+    depth: Axis
+    x: Axis
+    y: Axis
+    z: Axis
+    image_size: tuple[int, int]
+    stride: int
+    frustum: Frustum = "centres"
+    voxel_rounding: Rounding = "floor"
+
+    def __post_init__(self) -> None:
+        """Check the ranges and words; raises ConfigError, or ChoiceError for an unknown word."""
+        settle_choices(self, {"frustum": get_args(Frustum), "voxel_rounding": get_args(Rounding)})
+        grid = BevGrid(x=self.x, y=self.y)
+        object.__setattr__(self, "x", grid.x)
+        object.__setattr__(self, "y", grid.y)
+        _steps("depth", self.depth)
+        if _steps("z", self.z) != 1:
+            raise ConfigError(f"z: expected one step, as in ({self.z[0]}, {self.z[1]}, {self.z[1] - self.z[0]})")
+        if any(size < self.stride or size % self.stride for size in self.image_size):
+            raise ConfigError(
+                f"image_size: expected height and width in multiples of the stride {self.stride}, found "
+                f"{self.image_size}; resize, crop or fill the images"
+            )
+
+    @property
+    def grid_shape(self) -> tuple[int, int]:
+        """Rows and columns of the map."""
+        return BevGrid(x=self.x, y=self.y).shape
+
+    @property
+    def frustum_shape(self) -> tuple[int, int, int]:
+        """Depths of a ray, rows and columns of the features."""
+        height, width = self.image_size
+        return _steps("depth", self.depth), height // self.stride, width // self.stride
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CameraGeometry:
+    """The cameras of B samples, P frames, N cameras: from the pixels that the network sees to the ego frame.
+
+    Attributes:
+        rotation: (B, P, N, 3, 3) of `ego_from_camera`; camera axes are x right, y down, z forward.
+        translation: (B, P, N, 3) of `ego_from_camera`, metres.
+        intrinsics: (B, P, N, 3, 3) K, pixels of the image before the affine map below.
+        image_rotation: (B, P, N, 3, 3) the linear part of the augmentation of images, which acts on (u, v, depth); None
+            for the identity.
+        image_translation: (B, P, N, 3) its shift, pixels; None for 0.
+        bev_transform: (B, 4, 4) applied to points of the ego frame, `augmented_from_ego`; None if the poses hold it.
+        valid: (B, P, N) bool, False for cameras whose images are missing and must not count; None for all.
+    """
+
+    rotation: Tensor
+    translation: Tensor
+    intrinsics: Tensor
+    image_rotation: Tensor | None = None
+    image_translation: Tensor | None = None
+    bev_transform: Tensor | None = None
+    valid: Tensor | None = None
+
+    def flattened(self) -> CameraGeometry:
+        """The cameras of (B, A, P, N, …) tensors, with A agents, as those of B · A samples."""
+        given = {each.name: getattr(self, each.name) for each in fields(self)}
+        merged: dict[str, Any] = {name: None if each is None else each.flatten(0, 1) for name, each in given.items()}
+        return CameraGeometry(**merged)
+
+
+class LiftSplat(nn.Module):
+    """Lifts features of all cameras into one map (the released TransformerLSS); a state dict has the released names.
+
+    `frustum`, (D, h', w', 3) pixels u, v of the image and depth in metres, is part of the state dict as in the release.
+    """
+
+    frustum: Tensor
+
+    def __init__(self, config: LiftConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.depthnet = nn.Conv2d(config.in_channels, config.frustum_shape[0] + config.channels, 1)
+        self.register_buffer("frustum", _frustum(config))
+
+    def forward(self, features: Tensor, cameras: CameraGeometry | Tensor) -> Tensor:
+        """One map of each frame.
+
+        Args:
+            features: (B, P, N, C, h', w').
+            cameras: their cameras, or what `cells` gave for them.
+
+        Returns:
+            (B, P, `channels`, Y, X), row = y ascending, column = x ascending; float32 under autocast too.
+
+        Raises:
+            GeometryError: features or cells do not have the configured shape.
+        """
+        depths, rows, columns = self.config.frustum_shape
+        if tuple(features.shape[-2:]) != (rows, columns):
+            raise GeometryError(
+                f"features: expected (…, {rows}, {columns}) of images of {self.config.image_size} pixels, found "
+                f"{tuple(features.shape)}"
+            )
+        cells = cameras if isinstance(cameras, Tensor) else self.cells(cameras)
+        expected = (*features.shape[:3], depths, rows, columns)
+        if cells.shape != expected:
+            raise GeometryError(f"cameras: expected cells {expected} for these features, found {tuple(cells.shape)}")
+        logits = self.depthnet(features.flatten(0, 2))
+        # sums of thousands of points need more than half precision
+        logits = logits.to(torch.promote_types(logits.dtype, torch.float32))
+        return self._splat(logits[:, :depths].softmax(1), logits[:, depths:], cells)
+
+    @torch.no_grad()
+    def cells(self, cameras: CameraGeometry) -> Tensor:
+        """The cell of the map in which each point of the frustum lies.
+
+        It depends on the cameras alone: for cameras that stay, compute it once and give it to `forward`.
+
+        Returns:
+            (B, P, N, D, h', w') int64, row · X + column, −1 for points that do not count.
+        """
+        config = self.config
+        points = self.points(cameras)
+        lower, _, step = points.new_tensor([config.x, config.y, config.z]).unbind(1)
+        steps = (points - lower) / step
+        steps = steps.trunc() if config.voxel_rounding == "trunc" else steps.floor()
+        rows, columns = config.grid_shape
+        inside = ((steps >= 0) & (steps < steps.new_tensor([columns, rows, 1]))).all(-1)
+        if cameras.valid is not None:
+            inside &= cameras.valid[..., None, None, None]
+        column, row, _ = torch.where(inside[..., None], steps, 0).long().unbind(-1)
+        return torch.where(inside, row * columns + column, -1)
+
+    @torch.no_grad()
+    def points(self, cameras: CameraGeometry) -> Tensor:
+        """The frustum's points (B, P, N, D, h', w', 3) in the ego frame, metres: with `bev_transform`, augmented."""
+        dtype = torch.promote_types(cameras.rotation.dtype, torch.float32)
+        with torch.autocast(self.frustum.device.type, enabled=False):
+            rotation, shift = cameras.rotation.to(dtype), cameras.translation.to(dtype)
+            if cameras.bev_transform is not None:
+                transform = cameras.bev_transform.to(dtype)[:, None, None]
+                rotation = transform[..., :3, :3] @ rotation
+                shift = (transform[..., :3, :3] @ shift[..., None]).squeeze(-1) + transform[..., :3, 3]
+            pixels = self._pixels(cameras, dtype)
+            rays = torch.cat([pixels[..., :2] * pixels[..., 2:], pixels[..., 2:]], -1)
+            ego_from_ray = rotation @ _inverse(cameras.intrinsics.to(dtype), cameras.valid)
+            points = rays @ ego_from_ray.transpose(-1, -2) + shift[..., None, :]
+        return points.unflatten(-2, self.config.frustum_shape)
+
+    def _pixels(self, cameras: CameraGeometry, dtype: torch.dtype) -> Tensor:
+        """The frustum (…, D · h' · w', 3) as u, v, depth in images before their augmentation."""
+        pixels = self.frustum.to(dtype).flatten(0, 2)
+        if cameras.image_translation is not None:
+            pixels = pixels - cameras.image_translation.to(dtype)[..., None, :]
+        if cameras.image_rotation is not None:
+            pixels = pixels @ _inverse(cameras.image_rotation.to(dtype), cameras.valid).transpose(-1, -2)
+        return pixels
+
+    def _splat(self, depth: Tensor, context: Tensor, cells: Tensor) -> Tensor:
+        """Sum (M, D, h', w') · (M, C, h', w') of M = B · P · N cameras over the cells."""
+        samples, frames = cells.shape[:2]
+        rows, columns = self.config.grid_shape
+        of_camera = cells.shape[3:].numel()
+        of_pixel = cells.shape[4:].numel()
+        # the product is made for points that count only: most of the memory of this model is here
+        flat = cells.flatten()
+        point = (flat >= 0).nonzero().squeeze(1)
+        pixel = point.div(of_camera, rounding_mode="floor") * of_pixel + point % of_pixel
+        frame = point.div(of_camera * cells.shape[2], rounding_mode="floor")
+        features = context.flatten(2).transpose(1, 2).flatten(0, 1).index_select(0, pixel)
+        features = features * depth.flatten().index_select(0, point)[:, None]
+        maps = features.new_zeros(samples * frames * rows * columns, context.shape[1])
+        maps = maps.index_add_(0, flat[point] + frame * (rows * columns), features)
+        return maps.view(samples, frames, rows, columns, -1).permute(0, 1, 4, 2, 3).contiguous()
+
+
+def _frustum(config: LiftConfig) -> Tensor:
+    """(D, h', w', 3): u, v in pixels of the image, depth in metres."""
+    height, width = config.image_size
+    depths, rows, columns = config.frustum_shape
+    if config.frustum == "corners":
+        u, v = torch.linspace(0, width - 1, columns), torch.linspace(0, height - 1, rows)
+    else:
+        u, v = ((torch.arange(count) + 0.5) * config.stride for count in (columns, rows))
+    start, _, step = config.depth
+    depth = start + step * torch.arange(depths, dtype=u.dtype)
+    frustum = torch.meshgrid(depth, v, u, indexing="ij")
+    return torch.stack(frustum[::-1], -1)
+
+
+def _inverse(matrices: Tensor, valid: Tensor | None) -> Tensor:
+    """Inverses of (…, 3, 3); what a missing camera's matrix is does not matter."""
+    if valid is not None:
+        identity = torch.eye(3, dtype=matrices.dtype, device=matrices.device)
+        matrices = torch.where(valid[..., None, None], matrices, identity)
+    return torch.linalg.inv(matrices)
+
+
+def _steps(name: str, axis: Axis) -> int:
+    """Steps of a range; raises ConfigError if they are not a whole number from 1."""
+    start, end, step = axis
+    count = (end - start) / step if step > 0 else 0.0
+    if round(count) < 1 or abs(count - round(count)) > _WHOLE:
+        raise ConfigError(f"{name}: expected start, end and step with a whole number of steps between, found {axis}")
+    return round(count)

@@ -1,0 +1,251 @@
+"""Image encoders: shapes, names, windows, and that official Swin weights mean the same after their conversion."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import nn
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.model.images import (
+    ResNet,
+    ResNetConfig,
+    SmallConvConfig,
+    Swin,
+    SwinConfig,
+    from_official,
+    image_encoder,
+    normalised,
+)
+from deepaccident_devkit.model.images.swin import PatchMerging
+from deepaccident_devkit.model.images.swin_attention import ShiftedWindowAttention, map_of, neighbours, windows_of
+
+SMALL_SWIN = {"embed_dims": 8, "depths": (2, 2, 2, 2), "num_heads": (1, 2, 2, 4), "neck_channels": 16}
+ENCODERS = [
+    SwinConfig(**SMALL_SWIN),
+    SwinConfig(embed_dims=8, depths=(1, 2), num_heads=(1, 2), window_size=4, out_stages=(0, 1), neck_channels=16),
+    ResNetConfig(depth=18, neck_channels=16),
+    SmallConvConfig(),
+]
+
+
+def noise(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("config", ENCODERS, ids=lambda config: f"{type(config).__name__}-{config.stride}")
+def test_features_have_the_stated_size_and_all_weights_learn(config):
+    backbone, neck = image_encoder(config)
+    maps = backbone(noise(2, 3, 90, 100))
+    features = neck(maps)
+    assert features.shape == (2, config.neck_channels, -(-90 // config.stride), -(-100 // config.stride))
+    assert tuple(each.shape[1] for each in maps) == backbone.out_channels
+    assert neck.out_channels == config.neck_channels
+    (features * noise(*features.shape, seed=1)).sum().backward()
+    for name, weight in (*backbone.named_parameters(), *neck.named_parameters()):
+        assert weight.grad is not None, name
+        assert weight.grad.abs().sum() > 0, name
+
+
+@pytest.mark.parametrize("config", ENCODERS, ids=lambda config: f"{type(config).__name__}-{config.stride}")
+def test_half_precision_gives_about_the_same(config):
+    torch.manual_seed(0)
+    backbone, neck = image_encoder(config)
+    images = noise(2, 3, 64, 64)
+    expected = neck(backbone(images))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = neck(backbone(images))
+    assert (found.float() - expected).abs().mean() < 0.05 * expected.abs().mean()
+
+
+def test_the_small_encoder_is_small_and_its_size_follows_the_configuration():
+    """Convolutions 432 + 3456 + 6912 + 18432 · 2 + 73728, of the neck 4608 + 20736; norms of 424 channels."""
+    count = sum(weight.numel() for module in image_encoder(SmallConvConfig()) for weight in module.parameters())
+    assert count == 147_584
+    backbone, neck = image_encoder(SmallConvConfig(widths=(4, 6, 8), branch=10, neck_channels=12))
+    fine, coarse = backbone(noise(1, 3, 32, 48))
+    assert (fine.shape, coarse.shape) == ((1, 8, 4, 6), (1, 10, 2, 3))
+    assert neck((fine, coarse)).shape == (1, 12, 4, 6)
+
+
+def test_an_image_does_not_depend_on_the_others_of_its_batch():
+    images = noise(3, 3, 64, 96)
+    for config in ENCODERS:
+        backbone, neck = (module.eval() for module in image_encoder(config))
+        torch.testing.assert_close(neck(backbone(images))[1:2], neck(backbone(images[1:2])), atol=1e-5, rtol=1e-4)
+
+
+def test_images_are_normalised_channel_by_channel():
+    images = torch.tensor([0, 128, 255], dtype=torch.uint8)[None, :, None, None].expand(2, 3, 2, 2)
+    expected = [(0 - 0.485) / 0.229, (128 / 255 - 0.456) / 0.224, (1 - 0.406) / 0.225]
+    found = normalised(images)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found, torch.tensor(expected)[None, :, None, None].expand(2, 3, 2, 2))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: normalised(torch.zeros(1, 3, 4, 4)), "expected uint8, found torch.float32"),
+        (lambda: image_encoder("swin"), "expected a SwinConfig, a ResNetConfig or a SmallConvConfig, found 'swin'"),
+        (lambda: ResNetConfig(depth=34), "depth: expected 18 or 50, found 34"),
+        (lambda: SmallConvConfig(widths=(8, 8)), "widths: expected three"),
+        (lambda: SwinConfig(num_heads=(3, 6)), "num_heads: expected 4"),
+        (lambda: SwinConfig(num_heads=(3, 6, 12, 25)), "768 channels cannot be shared by 25 heads"),
+        (lambda: SwinConfig(out_stages=(1, 3)), r"out_stages: expected one of \[\(0, 1\), .* found \(1, 3\)"),
+        (lambda: from_official({"model": torch.zeros(1)}), "found 'model'; .* give its entry 'model'"),
+    ],
+)
+def test_what_does_not_fit_is_named(make, message):
+    with pytest.raises(ConfigError, match=message):
+        make()
+
+
+# --- ResNet
+
+
+def torchvision_shapes(depth: int) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of torchvision's ResNet without `fc`, by the rule of its paper."""
+    blocks, kernels, expansion = {
+        18: ((2, 2, 2, 2), (3, 3), 1),
+        50: ((3, 4, 6, 3), (1, 3, 1), 4),
+    }[depth]
+    shapes = {"conv1.weight": (64, 3, 7, 7), **norm_shapes("bn1", 64)}
+    before = 64
+    for layer, count in enumerate(blocks, start=1):
+        width = 32 * 2**layer
+        for b in range(count):
+            name, inner = f"layer{layer}.{b}", before
+            for c, kernel in enumerate(kernels, start=1):
+                out = width * expansion if c == len(kernels) else width
+                shapes[f"{name}.conv{c}.weight"] = (out, inner, kernel, kernel)
+                shapes |= norm_shapes(f"{name}.bn{c}", out)
+                inner = out
+            if b == 0 and (layer > 1 or expansion > 1):
+                shapes[f"{name}.downsample.0.weight"] = (inner, before, 1, 1)
+                shapes |= norm_shapes(f"{name}.downsample.1", inner)
+            before = inner
+    return shapes
+
+
+def norm_shapes(name: str, channels: int) -> dict[str, tuple[int, ...]]:
+    parts = ("weight", "bias", "running_mean", "running_var")
+    return {**{f"{name}.{part}": (channels,) for part in parts}, f"{name}.num_batches_tracked": ()}
+
+
+@pytest.mark.parametrize(("depth", "weights"), [(18, 11_176_512), (50, 23_508_032)])
+def test_resnet_has_the_names_of_torchvision(depth, weights):
+    """The counts are those that torchvision states, less the classifier's."""
+    with torch.device("meta"):
+        network = ResNet(ResNetConfig(depth=depth))
+        fine, coarse = network(torch.zeros(1, 3, 256, 704))
+    assert {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()} == torchvision_shapes(depth)
+    assert sum(weight.numel() for weight in network.parameters()) == weights
+    assert (fine.shape, coarse.shape) == ((1, network.out_channels[0], 16, 44), (1, network.out_channels[1], 8, 22))
+
+
+# --- Swin
+
+
+def test_checkpointing_changes_neither_values_nor_gradients():
+    torch.manual_seed(0)
+    plain = Swin(SwinConfig(**SMALL_SWIN)).train()
+    again = Swin(SwinConfig(**SMALL_SWIN, checkpointing=True)).train()
+    again.load_state_dict(plain.state_dict())
+    for network in (plain, again):
+        sum(each.square().sum() for each in network(noise(1, 3, 64, 96))).backward()
+    for (name, weight), other in zip(plain.named_parameters(), again.parameters(), strict=True):
+        torch.testing.assert_close(weight.grad, other.grad, msg=name)
+
+
+@given(st.integers(1, 3), st.integers(1, 3), st.integers(1, 5))
+def test_windows_are_parts_of_the_map_and_go_back(down, along, window):
+    features = torch.arange(2.0 * down * along * window**2 * 3).view(2, down * window, along * window, 3)
+    windows = windows_of(features, window)
+    last = windows[1, -1].view(window, window, 3)
+    assert torch.equal(last, features[1, -window:, -window:])
+    if along > 1:
+        assert torch.equal(windows[0, 1, 0], features[0, 0, window])
+    assert torch.equal(map_of(windows, down * window, along * window), features)
+
+
+@given(st.integers(1, 3), st.integers(1, 3), st.integers(2, 5))
+def test_tokens_from_two_sides_of_a_map_do_not_see_each_other(down, along, window):
+    shift = window // 2
+    row, column = torch.meshgrid(torch.arange(down * window), torch.arange(along * window), indexing="ij")
+    came_around = torch.stack([row < shift, column < shift], -1)[None].roll((-shift, -shift), (1, 2))
+    tokens = windows_of(came_around, window)[0]
+    expected = (tokens[:, :, None] == tokens[:, None, :]).all(-1)
+    assert torch.equal(neighbours(down * window, along * window, window, shift), expected)
+
+
+@pytest.mark.parametrize(("shift", "rows", "columns"), [(0, (4, 8), (0, 4)), (2, (2, 6), (2, 6)), (2, (6, 8), (0, 2))])
+def test_a_token_sees_its_window_alone(shift, rows, columns):
+    torch.manual_seed(0)
+    attention = ShiftedWindowAttention(8, 2, window=4, shift=shift)
+    features = noise(1, 8, 8, 8).requires_grad_()
+    attention(features)[0, rows[0], columns[0]].sum().backward()
+    seen = features.grad[0].abs().sum(-1) > 0
+    expected = torch.zeros(8, 8, dtype=torch.bool)
+    expected[rows[0] : rows[1], columns[0] : columns[1]] = True
+    assert torch.equal(seen, expected)
+
+
+def test_a_position_beside_counts_by_where_it_lies():
+    """A bias on the pair (0 down, 1 along) makes each token the copy of its right neighbour."""
+    attention = ShiftedWindowAttention(2, 1, window=3, shift=0)
+    window = attention.w_msa
+    nn.init.zeros_(window.qkv.weight)
+    nn.init.zeros_(window.qkv.bias)
+    window.qkv.weight.data[4:] = torch.eye(2)
+    window.proj.weight.data = torch.eye(2)
+    nn.init.zeros_(window.proj.bias)
+    window.relative_position_bias_table.data[2 * 5 + 2 - 1] = 100.0  # key one step to the right: Δ = −1
+    features = noise(1, 3, 3, 2)
+    torch.testing.assert_close(attention(features)[:, :, :2], features[:, :, 1:])
+
+
+def test_converted_weights_merge_patches_as_the_official_model():
+    """Official: the tokens (0, 0), (1, 0), (0, 1), (1, 1) beside each other, LayerNorm, then the reduction."""
+    norm, reduction = nn.LayerNorm(12), nn.Linear(12, 6, bias=False)
+    nn.init.uniform_(norm.weight)
+    nn.init.uniform_(norm.bias)
+    official = {
+        "layers.0.downsample.norm.weight": norm.weight,
+        "layers.0.downsample.norm.bias": norm.bias,
+        "layers.0.downsample.reduction.weight": reduction.weight,
+    }
+    features = noise(2, 4, 6, 3)
+    tokens = [features[:, down::2, along::2] for along in (0, 1) for down in (0, 1)]
+    merging = PatchMerging(3)
+    merging.load_state_dict(
+        {name[len("stages.0.downsample.") :]: each for name, each in from_official(official).items()}
+    )
+    torch.testing.assert_close(merging(features), reduction(norm(torch.cat(tokens, -1))))
+
+
+def test_all_official_names_are_converted():
+    renamed = [
+        ("stages.", "layers."),
+        ("attn.w_msa.", "attn."),
+        ("ffn.layers.0.0.", "mlp.fc1."),
+        ("ffn.layers.1.", "mlp.fc2."),
+        ("patch_embed.projection.", "patch_embed.proj."),
+    ]
+    swin = Swin(SwinConfig(**SMALL_SWIN))
+    official = {"head.weight": torch.zeros(5, 64), "layers.0.blocks.1.attn_mask": torch.zeros(4, 49, 49)}
+    for name, tensor in swin.state_dict().items():
+        if not name.startswith(("norm2.", "norm3.")):
+            for ours, theirs in renamed:
+                name = name.replace(ours, theirs)  # noqa: PLW2901 - one name after several replacements
+            official[name] = torch.zeros_like(tensor)
+    left = swin.load_state_dict(from_official(official), strict=False)
+    assert left.unexpected_keys == []
+    assert left.missing_keys == ["norm2.weight", "norm2.bias", "norm3.weight", "norm3.bias"]
+
+
+def test_maps_of_odd_sizes_are_filled_to_be_halved():
+    merging = PatchMerging(2)
+    features = noise(1, 3, 5, 2)
+    filled = nn.functional.pad(features, (0, 0, 0, 1, 0, 1))
+    torch.testing.assert_close(merging(features), merging(filled))

@@ -1,0 +1,282 @@
+"""The lift: its geometry is the devkit's, sums are whole, missing cameras count for nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import ANGLES, arrays, rotation_matrix
+
+from deepaccident_devkit.errors import ConfigError, GeometryError
+from deepaccident_devkit.geometry import SE3, BevGrid, PinholeCamera
+from deepaccident_devkit.model.lift import CameraGeometry, LiftConfig, LiftSplat
+
+CONFIG = LiftConfig(
+    in_channels=5,
+    channels=3,
+    depth=(2, 18, 2),
+    x=(-12, 20, 1),
+    y=(-16, 16, 0.5),
+    z=(-4, 6, 10),
+    image_size=(24, 40),
+    stride=8,
+)
+WIDE = replace(CONFIG, x=(-200, 200, 10), y=(-200, 200, 10), z=(-200, 200, 400))
+# optical axes (x right, y down, z forward) of a camera that looks along the ego's x axis
+FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+
+
+def noise(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+
+
+def rig(seed: int = 0, shape: tuple[int, int, int] = (2, 2, 3)) -> CameraGeometry:
+    """Cameras at heights of a car's that look around."""
+    random = np.random.default_rng(seed)
+    count = int(np.prod(shape))
+    yaw, tilt = random.uniform(-np.pi, np.pi, count), random.uniform(-0.1, 0.1, count)
+    rotations = np.stack([rotation_matrix(a, b, 0) @ FORWARD for a, b in zip(yaw, tilt, strict=True)])
+    intrinsics = np.tile([[30.0, 0, 20], [0, 30, 12], [0, 0, 1]], (count, 1, 1))
+    given = (rotations, random.uniform(-2, 2, (count, 3)), intrinsics)
+    return CameraGeometry(
+        **{
+            name: torch.tensor(each, dtype=torch.float32).view(*shape, *each.shape[1:])
+            for name, each in zip(("rotation", "translation", "intrinsics"), given, strict=True)
+        }
+    )
+
+
+def lift_of(config: LiftConfig) -> LiftSplat:
+    torch.manual_seed(0)
+    return LiftSplat(config)
+
+
+def one_camera(camera: PinholeCamera, ego_from_camera: SE3) -> CameraGeometry:
+    parts = (ego_from_camera.matrix[:3, :3], ego_from_camera.matrix[:3, 3], camera.intrinsic)
+    rotation, translation, intrinsics = (torch.tensor(np.array(each))[None, None, None] for each in parts)
+    return CameraGeometry(rotation=rotation, translation=translation, intrinsics=intrinsics)
+
+
+# --- geometry
+
+
+@given(ANGLES, ANGLES, ANGLES, arrays((3,), 5.0), st.floats(10, 200), st.floats(10, 200), arrays((2,), 30.0))
+def test_points_lie_where_the_devkit_sees_them(yaw, pitch, roll, position, fx, fy, centre):
+    """Points project onto the centres of their pixels at their depths, and their cells are those of a BevGrid."""
+    lift = lift_of(replace(CONFIG, z=(-100, 100, 200)))
+    camera = PinholeCamera(np.array([[fx, 0, 20 + centre[0]], [0, fy, 12 + centre[1]], [0, 0, 1]]), 40, 24)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation_matrix(yaw, pitch, roll), position
+    ego_from_camera = SE3(pose)
+    cameras = one_camera(camera, ego_from_camera)
+
+    points = lift.points(cameras)[0, 0, 0].numpy()
+    pixels, depth = camera.project(ego_from_camera.inverse().apply(points.reshape(-1, 3)))
+    d, i, j = np.meshgrid(np.arange(8), np.arange(3), np.arange(5), indexing="ij")
+    np.testing.assert_allclose(depth, 2.0 + 2 * d.ravel(), atol=1e-4)
+    np.testing.assert_allclose(pixels, np.stack([8 * j.ravel() + 4, 8 * i.ravel() + 4], 1), atol=1e-3)
+
+    index, inside = BevGrid(x=CONFIG.x, y=CONFIG.y).index_of(points.reshape(-1, 3))
+    inside &= np.abs(points.reshape(-1, 3)[:, 2]) < 100
+    cells = lift.cells(cameras).flatten().numpy()
+    np.testing.assert_array_equal(cells, np.where(inside, index @ (32, 1), -1))
+
+
+def test_one_pixel_at_one_depth_lights_one_cell():
+    """A camera 1 m above the ego's origin that looks ahead: pixel row 1, column 3 at 10 m is at (10, −8/3, 1)."""
+    lift = lift_of(CONFIG)
+    torch.nn.init.zeros_(lift.depthnet.weight)
+    torch.nn.init.zeros_(lift.depthnet.bias)
+    lift.depthnet.bias.data[4] = 100.0  # the fifth depth: 10 m
+    lift.depthnet.weight.data[8:, :3, 0, 0] = torch.eye(3)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = FORWARD, (0, 0, 1)
+    cameras = one_camera(PinholeCamera(np.array([[30.0, 0, 20], [0, 30, 12], [0, 0, 1]]), 40, 24), SE3(pose))
+    features = torch.zeros(1, 1, 1, 5, 3, 5)
+    features[0, 0, 0, :3, 1, 3] = torch.tensor([1.0, 2.0, 3.0])
+
+    bev = lift(features, cameras)[0, 0]
+
+    assert bev.shape == (3, 64, 32)
+    expected = torch.zeros_like(bev)
+    expected[:, 26, 22] = torch.tensor([1.0, 2.0, 3.0])  # row (−8/3 + 16) / 0.5, column 10 + 12
+    torch.testing.assert_close(bev, expected)
+
+
+def test_rays_pass_through_the_centres_or_from_corner_to_corner():
+    centres, corners = LiftSplat(CONFIG).frustum, LiftSplat(replace(CONFIG, frustum="corners")).frustum
+    assert centres.shape == (8, 3, 5, 3)
+    assert centres[0, 0, :, 0].tolist() == [4, 12, 20, 28, 36]
+    assert centres[0, :, 0, 1].tolist() == [4, 12, 20]
+    assert centres[:, 1, 1, 2].tolist() == [2, 4, 6, 8, 10, 12, 14, 16]
+    assert corners[0, 0, :, 0].tolist() == [0, 9.75, 19.5, 29.25, 39]
+    assert corners[0, :, 0, 1].tolist() == [0, 11.5, 23]
+
+
+def test_truncation_takes_points_from_a_step_below_the_range():
+    """The map's points are moved, so that the first lie below the range in x, y and z by less than a step."""
+    floor, trunc = lift_of(CONFIG), lift_of(replace(CONFIG, voxel_rounding="trunc"))
+    cameras = rig()
+    points = floor.points(cameras)
+    lower, step = torch.tensor([-12.0, -16, -4]), torch.tensor([1, 0.5, 10])
+    upper = torch.tensor([20.0, 16, 6])
+    plain = ((points >= lower) & (points < upper)).all(-1)
+    wide = ((points > lower - step) & (points < upper)).all(-1)
+    assert torch.equal(floor.cells(cameras) >= 0, plain)
+    assert torch.equal(trunc.cells(cameras) >= 0, wide)
+    assert int((wide & ~plain).sum()) > 20
+    assert torch.equal(floor.cells(cameras)[plain], trunc.cells(cameras)[plain])
+
+
+def test_a_mirrored_world_gives_the_mirrored_map():
+    lift, features, cameras = lift_of(CONFIG), noise(2, 2, 3, 5, 3, 5), rig()
+    mirror = torch.tensor([1.0, -1, 1])
+    mirrored = replace(cameras, rotation=mirror[:, None] * cameras.rotation, translation=mirror * cameras.translation)
+    torch.testing.assert_close(lift(features, mirrored), lift(features, cameras).flip(3))
+
+
+def test_the_transform_of_the_map_can_be_part_of_the_poses():
+    lift, cameras = lift_of(CONFIG), rig()
+    transform = torch.eye(4).repeat(2, 1, 1)
+    transform[1, :3, :3] = torch.tensor(1.05 * rotation_matrix(0.3, 0, 0) @ np.diag([1, -1, 1]))
+    transform[1, :3, 3] = torch.tensor([1.0, 2, 3])
+    linear, shift = transform[:, None, None, :3, :3], transform[:, None, None, :3, 3]
+    folded = replace(
+        cameras,
+        rotation=linear @ cameras.rotation,
+        translation=torch.einsum("b...ij,bpnj->bpni", linear.squeeze((1, 2)), cameras.translation) + shift,
+    )
+    given = replace(cameras, bev_transform=transform)
+    torch.testing.assert_close(lift.points(given), lift.points(folded))
+    moved = lift.points(cameras).flatten(1, -2) @ transform[:, :3, :3].mT + transform[:, None, :3, 3]
+    torch.testing.assert_close(lift.points(given).flatten(1, -2), moved)
+
+
+def test_an_image_that_was_scaled_and_cropped_can_have_its_own_intrinsics():
+    lift, cameras = lift_of(CONFIG), rig()
+    affine = torch.diag(torch.tensor([0.5, 0.4, 1.0])).expand(2, 2, 3, 3, 3)
+    shift = torch.tensor([-3.0, 5.0, 0.0]).expand(2, 2, 3, 3)
+    augmented = replace(cameras, image_rotation=affine, image_translation=shift)
+    pixels = affine.clone()
+    pixels[..., :2, 2] = shift[..., :2]
+    own = replace(cameras, intrinsics=pixels @ cameras.intrinsics)
+    torch.testing.assert_close(lift.points(augmented), lift.points(own), atol=1e-4, rtol=1e-5)
+
+
+# --- sums
+
+
+def test_a_wide_map_holds_all_that_the_pixels_have():
+    """Probabilities of depths sum to 1, so that the map's sum is the sum over pixels, frame by frame."""
+    lift, features = lift_of(WIDE), noise(2, 2, 3, 5, 3, 5)
+    pixels = lift.depthnet(features.flatten(0, 2))[:, 8:].unflatten(0, (2, 2, 3))
+    torch.testing.assert_close(lift(features, rig()).sum((3, 4)), pixels.sum((2, 4, 5)), atol=1e-4, rtol=1e-4)
+
+
+def test_frames_and_samples_keep_apart_and_the_order_of_cameras_does_not_matter():
+    lift, features, cameras = lift_of(CONFIG), noise(2, 2, 3, 5, 3, 5), rig()
+    whole = lift(features, cameras)
+    names = ("rotation", "translation", "intrinsics")
+    part = CameraGeometry(**{name: getattr(cameras, name)[1:, :1] for name in names})
+    torch.testing.assert_close(lift(features[1:, :1], part), whole[1:, :1])
+    turned = CameraGeometry(**{name: getattr(cameras, name).flip(2) for name in names})
+    torch.testing.assert_close(lift(features.flip(2), turned), whole)
+
+
+def test_cells_can_be_computed_once():
+    lift, features, cameras = lift_of(CONFIG), noise(2, 2, 3, 5, 3, 5), rig()
+    cells = lift.cells(cameras)
+    assert cells.dtype == torch.int64
+    assert torch.equal(lift(features, cells), lift(features, cameras))
+    assert torch.equal(lift(features[1:], cells[1:]), lift(features[1:], replace_all(cameras, lambda each: each[1:])))
+
+
+def replace_all(cameras: CameraGeometry, change) -> CameraGeometry:
+    return CameraGeometry(
+        **{name: change(getattr(cameras, name)) for name in ("rotation", "translation", "intrinsics")}
+    )
+
+
+@pytest.mark.parametrize("filling", [0.0, 1.0, float("nan")])
+def test_missing_cameras_count_for_nothing_whatever_their_matrices_are(filling):
+    lift, features, cameras = lift_of(CONFIG), noise(2, 2, 3, 5, 3, 5), rig()
+    valid = torch.tensor([[[1, 1, 0], [0, 1, 0]], [[1, 0, 1], [0, 0, 0]]], dtype=torch.bool)
+    expected = lift(features, lift.cells(cameras).where(valid[..., None, None, None], -1))
+    spoiled = replace_all(
+        cameras, lambda each: torch.where(valid.view(*valid.shape, *[1] * (each.dim() - 3)), each, filling)
+    )
+    found = lift(features, replace(spoiled, valid=valid))
+    assert torch.equal(found, expected)
+    assert not found[1, 1].any()
+    assert found[0, 0].any()
+
+
+def test_gradients_reach_the_features_and_every_weight():
+    lift, features = lift_of(CONFIG), noise(1, 2, 3, 5, 3, 5).requires_grad_()
+    bev = lift(features, rig(shape=(1, 2, 3)))
+    (bev * noise(*bev.shape, seed=1)).sum().backward()
+    assert all((weight.grad != 0).all() for weight in lift.parameters())
+    assert (features.grad != 0).any()
+    assert not lift.frustum.requires_grad
+
+
+def test_gradients_are_those_of_finite_differences():
+    config = replace(CONFIG, in_channels=2, channels=1, depth=(2, 8, 2), image_size=(16, 16))
+    lift, cameras = lift_of(config).double(), rig(shape=(1, 1, 2))
+    features = noise(1, 1, 2, 2, 2, 2).double().requires_grad_()
+    cells = lift.cells(cameras)
+    assert torch.autograd.gradcheck(lambda each: lift(each, cells), (features,))
+
+
+def test_half_precision_is_summed_in_single_precision():
+    lift, features, cameras = lift_of(WIDE), noise(2, 2, 3, 5, 3, 5), rig()
+    expected = lift(features, cameras)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = lift(features, cameras)
+        assert torch.equal(lift.points(cameras), LiftSplat(WIDE).points(cameras))
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found, expected, atol=0.05, rtol=0.05)
+
+
+def test_agents_become_samples():
+    cameras = rig(shape=(6, 2, 3))
+    agents = replace_all(cameras, lambda each: each.unflatten(0, (2, 3)))
+    flat = agents.flattened()
+    assert torch.equal(flat.rotation, cameras.rotation)
+    assert torch.equal(flat.translation, cameras.translation)
+    assert flat.valid is None
+
+
+# --- errors
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"depth": (1, 10, 2)}, r"depth: expected start, end and step .* found \(1, 10, 2\)"),
+        ({"depth": (1, 10, 0)}, "depth: expected start, end and step"),
+        ({"z": (-10, 10, 5)}, "z: expected one step"),
+        ({"x": (-10, 10, 3)}, "x: -10 to 10 m is not a whole number of cells"),
+        ({"image_size": (90, 160), "stride": 8}, r"multiples of the stride 8, found \(90, 160\)"),
+    ],
+)
+def test_a_wrong_configuration_is_named(change, message):
+    with pytest.raises(ConfigError, match=message):
+        replace(CONFIG, **change)
+
+
+def test_words_are_checked():
+    with pytest.raises(ValueError, match="frustum: expected one of corners, centres, found 'centers'"):
+        replace(CONFIG, frustum="centers")
+    with pytest.raises(ValueError, match="voxel_rounding: expected one of trunc, floor"):
+        replace(CONFIG, voxel_rounding="round")
+
+
+def test_features_of_another_shape_are_named():
+    lift = lift_of(CONFIG)
+    with pytest.raises(GeometryError, match=r"features: expected \(…, 3, 5\)"):
+        lift(noise(2, 2, 3, 5, 5, 3), rig())
+    with pytest.raises(GeometryError, match=r"cameras: expected cells \(2, 2, 3, 8, 3, 5\)"):
+        lift(noise(2, 2, 3, 5, 3, 5), rig(shape=(2, 2, 2)))
