@@ -50,7 +50,8 @@ def attention(qkv: Tensor, heads: int, bias: Tensor, keys: Tensor | None) -> Ten
         (M, L, C).
     """
     query, key, value = qkv.unflatten(-1, (3, heads, -1)).permute(2, 0, 3, 1, 4)
-    score = (query * query.shape[-1] ** -0.5) @ key.transpose(-1, -2) + bias
+    score = (query * query.shape[-1] ** -0.5) @ key.transpose(-1, -2)
+    score += bias  # in place, here and below: scores are by far the largest tensors of a module
     if keys is not None:
-        score = score.masked_fill(~keys[:, None, None, :], -torch.inf)
+        score.masked_fill_(~keys[:, None, None, :], -torch.inf)
     return (score.softmax(-1).to(value.dtype) @ value).transpose(1, 2).flatten(2)
