@@ -163,7 +163,7 @@ def _foreign(content: bytes, path: Path) -> dict[str, Tensor]:
     """A foreign checkpoint's tensors under our names."""
     try:
         found = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
-    except Exception as error:  # noqa: BLE001 - a stranger's file may fail in any way
+    except Exception as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ConfigError(f"{path}: is no plain checkpoint ({reason}); give one that holds tensors alone") from error
     for name in ("state_dict", "model"):  # mmcv's, Swin's

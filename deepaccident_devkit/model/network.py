@@ -106,14 +106,24 @@ class V2XFormer(nn.Module):
         order = _ego_first(inputs.partners, agent)
         rows, egos = moment[:, None], torch.arange(len(order), device=order.device)[:, None]
         heard, ego_from_agent = inputs.partners[egos, order], inputs.ego_from_agent[egos, order]
-        temporal = self.config.temporal
-        where = {"grid": temporal.grid, "warp": temporal.warp}
+        grid, warp = self.config.temporal.grid, self.config.temporal.warp
+        mask = (
+            agents_mask(heard, ego_from_agent, grid, warp=warp)
+            if self.v2x_fusion.hides_outside
+            else heard[:, :, None, None].expand(*heard.shape, *maps.shape[-2:])
+        )
         return self.v2x_fusion(
-            agents_to_ego(maps[rows, order], ego_from_agent, **where),
-            agents_mask(heard, ego_from_agent, **where),
+            agents_to_ego(maps[rows, order], ego_from_agent, grid, warp=warp),
+            mask,
             inputs.is_infrastructure[rows, order],
             inputs.delay[rows, order],
         )
+
+    def noise(self, egos: int, generator: torch.Generator) -> Tensor:
+        """What the draws of a prediction need, (draws, egos, latent, rows, columns), on the generator's device."""
+        motion = self.config.motion
+        cells = [-(-size // motion.upsample // 4) for size in self.config.labels.grid.shape]
+        return torch.randn(motion.samples, egos, motion.latent, *cells, generator=generator, device=generator.device)
 
 
 class TaskHeads(nn.Module):

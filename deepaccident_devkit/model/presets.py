@@ -91,7 +91,9 @@ class ModelChoice:
         try:
             return cls(**{name: described[name] for name in ("preset", "fusion", "horizon")})
         except (KeyError, TypeError, ValueError) as error:
-            raise ConfigError(f"model: expected preset, fusion and horizon ({error}); give weights of the devkit") from error
+            raise ConfigError(
+                f"model: expected preset, fusion and horizon ({error}); give weights of the devkit"
+            ) from error
 
     def _frames(self, config: ModelConfig) -> int:
         step = config.labels.step * FRAME_PERIOD

@@ -31,6 +31,9 @@ class AllEgosDataset(V2XDataset):
     - `targets`: E dicts with the boxes, labels and segmentation of a `V2XDataset` item, each in its ego's own frame.
 
     `collate_all_egos` makes batches of them.
+
+    Attributes:
+        egos: the samples of each item.
     """
 
     def __init__(self, dataset: Dataset, tokens: Iterable[RowArgument], config: V2XConfig | None = None) -> None:
@@ -53,10 +56,10 @@ class AllEgosDataset(V2XDataset):
             sample = dataset.get("sample", token)["token"]
             scenario, _, frame = sample.rsplit("/", 2)
             moments.setdefault((scenario, frame), []).append(sample)
-        self._egos = list(moments.values())
+        self.egos = list(moments.values())
         self._agents = config.agents
-        super().__init__(dataset, [egos[0] for egos in self._egos], replace(config, agents=None))
-        for ego in (ego for egos in self._egos[:1] for ego in egos):  # a mistake is the same for all moments
+        super().__init__(dataset, [egos[0] for egos in self.egos], replace(config, agents=None))
+        for ego in (ego for egos in self.egos[:1] for ego in egos):  # a mistake is the same for all moments
             sensor_data.participants(dataset, ego, config.agents)
 
     def __getitem__(self, index: int) -> V2XItem:
@@ -66,7 +69,7 @@ class AllEgosDataset(V2XDataset):
     def item(self, index: int, epoch: int) -> V2XItem:
         """The same in an epoch that is given here, and not by `set_epoch`: for loaders that run on through epochs."""
         position = range(len(self))[operator.index(index)]
-        egos = self._egos[position]
+        egos = self.egos[position]
         augmentation = self.config.augmentation_of(epoch, position)
         item = self._received_item(egos[0], augmentation)
         heard = [sensor_data.participants(self._dataset, ego, self._agents) for ego in egos]

@@ -1,6 +1,7 @@
 """What every fusion module takes and gives, and the two operations on agents that they share."""
 
 from abc import ABC, abstractmethod
+from typing import ClassVar
 
 from torch import Tensor, nn
 
@@ -10,7 +11,12 @@ class Fusion(nn.Module, ABC):
 
     Every module gives exactly the result of the ego alone where no partner has anything to say, and does not depend on
     the partners' order, except with options that say so. What the mask hides has no effect, in training neither.
+
+    Attributes:
+        hides_outside: whether masks are to hide the cells outside a partner's own map, beside agents that are missing.
     """
+
+    hides_outside: ClassVar[bool] = True
 
     @abstractmethod
     def forward(self, x: Tensor, mask: Tensor, agent_is_infra: Tensor, delay: Tensor) -> Tensor:

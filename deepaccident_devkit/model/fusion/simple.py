@@ -75,14 +75,15 @@ class ReleasedFusionConfig:
 class ReleasedFusion(Fusion):
     """The released V2X_fusion as far as its early return: fill, mean over all slots, then channels of the ego's.
 
-    The release knows no missing agents and no masks: it takes cells outside a partner's map for those with almost
-    nothing in them, fills them with the ego's and counts them in the mean. Here masked cells are filled, too, and
-    count, so that a missing partner moves the mean towards the ego's. The release is right for batches of one sample
-    alone; here each sample of a batch is treated so.
+    The release knows no masks: it takes cells outside a partner's map for those with almost nothing in them, fills them
+    with the ego's and counts them in the mean. So this module is to be given masks of whole agents
+    (`hides_outside`). Masked cells are filled, too, and count; an agent that is masked everywhere is not there, and not
+    in the mean. The release is right for batches of one sample alone; here each sample of a batch is treated so.
 
     With `agent3d` there are the released unused layers as well; no gradient is asked of them.
     """
 
+    hides_outside = False
     from_ego: Tensor
 
     def __init__(self, config: ReleasedFusionConfig) -> None:
@@ -97,8 +98,8 @@ class ReleasedFusion(Fusion):
 
     def forward(self, x: Tensor, mask: Tensor, agent_is_infra: Tensor, delay: Tensor) -> Tensor:  # noqa: ARG002
         """As `Fusion.forward`; kinds of agents and delays do not count."""
-        ego = x[:, :1]
-        filled = ~mask | (x.abs().mean(2) < self.config.fill_below)
+        ego, there = x[:, :1], mask.flatten(2).any(2)[:, :, None, None, None]
+        filled = ~mask[:, :, None] | (x.abs().mean(2, keepdim=True) < self.config.fill_below)
         filled[:, 0] = False
-        mean = torch.where(filled[:, :, None], ego, x).mean(1)
+        mean = torch.where(filled, ego, x).masked_fill(~there, 0).sum(1) / there.sum(1)
         return torch.where(self.from_ego[:, None, None], ego[:, 0], mean)

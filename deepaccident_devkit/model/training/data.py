@@ -39,6 +39,7 @@ class Moments(TorchDataset):
             NotAvailableError: the split has no labelled samples.
             DeepAccidentError: as of `AllEgosDataset`.
         """
+        self.model = model
         tokens = samples(dataset, config.split, config.samples)
         if not tokens:
             raise NotAvailableError(f"{config.split}: has no samples to learn from; choose another split")

@@ -37,7 +37,7 @@ def freeze(model: nn.Module, beginnings: Sequence[str]) -> None:
             )
     for name, parameter in model.named_parameters():
         if name.startswith(tuple(beginnings)):
-            parameter.requires_grad_(requires_grad=False)
+            parameter.requires_grad = False
     if not any(parameter.requires_grad for parameter in model.parameters()):
         raise ConfigError("freeze: nothing is left to train; freeze less")
 

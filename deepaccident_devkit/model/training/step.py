@@ -65,7 +65,7 @@ def training_batch(
     names = ("segmentation", "centerness", "offset", "flow")
     kept = rows.tolist()
     targets = Targets(
-        motion=MotionTargets(*(batch[name][rows] for name in names), mask),
+        motion=MotionTargets(**{name: batch[name][rows] for name in names}, frame_mask=mask),
         boxes=[mirrored_boxes(batch["boxes"][row], model.handedness) for row in kept],
         categories=[batch["categories"][row] for row in kept],
         velocity_known=[batch["velocity_known"][row] for row in kept],

@@ -285,9 +285,8 @@ class _Run:
                 took.append(timer.lap())
         each = min(took) * config.accumulate
         times = samples and -(-config.steps // config.validate_every) - progress.step // config.validate_every
-        return (
-            f"{left:,} steps on {self.place.device}, {each:.2f} s each: some {_duration(left * each)}"
-            + (f", and {times} validations of {samples} samples" if times else "")
+        return f"{left:,} steps on {self.place.device}, {each:.2f} s each: some {_duration(left * each)}" + (
+            f", and {times} validations of {samples} samples" if times else ""
         )
 
 
