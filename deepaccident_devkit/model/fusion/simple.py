@@ -99,6 +99,5 @@ class ReleasedFusion(Fusion):
         """As `Fusion.forward`; kinds of agents and delays do not count."""
         ego = x[:, :1]
         filled = ~mask | (x.abs().mean(2) < self.config.fill_below)
-        filled[:, 0] = False
         mean = torch.where(filled[:, :, None], ego, x).mean(1)
         return torch.where(self.from_ego[:, None, None], ego[:, 0], mean)
