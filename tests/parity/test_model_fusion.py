@@ -6,7 +6,6 @@ seeded random weights; within 1e-4 of the largest value where nothing else is sa
 
 import re
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import torch
@@ -136,14 +135,19 @@ def test_the_released_fusion_s_unreached_layers_equal_its_own(golden_model: Gold
     check_close(model(given["warped"], given["relative_pose"]), expected["compressed"])
 
 
-def test_released_fusion_has_the_keys_of_the_released_state_dict(golden_model: Golden) -> None:
-    """`v2x_fusion.*` of the full released V2X config: names and shapes."""
-    listing = Path(golden_model.args[0]) / "model" / "released_keys_DeepAccident_tiny_v2x.txt"
-    lines = [line.split(" ", 1) for line in listing.read_text().splitlines() if line.startswith("v2x_fusion.")]
+@pytest.mark.parametrize("part", ["temporal_model", "v2x_fusion"])
+def test_keys_are_those_of_the_released_state_dict(pytestconfig: pytest.Config, part: str) -> None:
+    """The full released V2X config: names and shapes. No gradient is asked of the fusion's unused layers."""
+    listing = pytestconfig.getoption("golden") / "model" / "released_keys_DeepAccident_tiny_v2x.txt"
+    lines = [line.split(" ", 1) for line in listing.read_text().splitlines() if line.startswith(f"{part}.")]
     expected = {key: shape.rsplit(" ", 1)[0] for key, shape in lines}
-    model = fusion(ReleasedFusionConfig(channels=64, agent3d=Agent3DConfig(channels=64)))
-    assert {f"v2x_fusion.{key}": str(tuple(value.shape)) for key, value in model.state_dict().items()} == expected
-    assert not any(weight.requires_grad for weight in model.parameters())
+    if part == "temporal_model":
+        axis = (-51.2, 51.2, 0.8)
+        model = temporal_model(TemporalConfig(channels=64, grid=GridBounds(x=axis, y=axis)))
+    else:
+        model = fusion(ReleasedFusionConfig(channels=64, agent3d=Agent3DConfig(channels=64)))
+    assert {f"{part}.{key}": str(tuple(value.shape)) for key, value in model.state_dict().items()} == expected
+    assert all(weight.requires_grad == (part == "temporal_model") for weight in model.parameters())
 
 
 def test_disconet_equals_the_original(golden_model: Golden) -> None:

@@ -32,7 +32,7 @@ class DiscoNetConfig:
 
 
 class DiscoNetFusion(Fusion):
-    """Linear(Σ w_k x_k); w is a `softmax` over the agents of what a small network finds in an agent's cell and the ego's.
+    """Linear(Σ w_k x_k); w is a `softmax` over agents of what a small network finds in an agent's cell and the ego's.
 
     The network sees only cells that the mask shows, so the batch statistics depend on no others.
     """
