@@ -1,8 +1,8 @@
 """Transforms between frames of moments and agents, in torch: 6-vectors, products of motions, BEV augmentation.
 
 The sibling of `geometry.six_vectors` and `motion.warps.chains`, for whole batches. Nothing here depends on the
-handedness, so long as all that goes in has the same. Products are written as sums, because autocast would round a
-matmul to bfloat16, and metres need more digits than that.
+handedness, so long as all that goes in has the same. Products are written as sums, because `autocast` would
+round a matrix product to bfloat16, and metres need more digits than that.
 """
 
 from typing import Literal

@@ -1,4 +1,4 @@
-"""BEV feature maps in another frame, differentiably: of past moments in the present, of partners in the ego's frame.
+"""BEV feature maps in another frame, with gradients: of past moments in the present, of partners in the ego's frame.
 
 The torch sibling of `motion.warps.warping`, for whole batches. Maps lie [row = y ascending, column = x ascending], and
 transforms have the maps' handedness; nothing here depends on which it is.

@@ -1,4 +1,4 @@
-"""V2X-ViT's heterogeneous attention over agents: vehicles and roadside units have weights of their own."""
+"""V2X-ViT's heterogeneous attention over agents: vehicles and infrastructure have weights of their own."""
 
 import torch
 from torch import Tensor, nn
@@ -24,7 +24,7 @@ class LinearByKind(nn.Module):
 class AgentAttention(nn.Module):
     """Each agent attends to all agents' features of the same cell.
 
-    With kinds τ: a_ij = q_iᵀ W_att[τ_i, τ_j] k_j / √d, a softmax over the agents j that the mask shows,
+    With kinds τ: a_ij = q_iᵀ W_att[τ_i, τ_j] k_j / √d, a `softmax` over the agents j that the mask shows,
     o_i = Out_{τ_i} Σ_j a_ij (v_j W_msg[τ_i, τ_j]); for each head.
     """
 

@@ -100,7 +100,7 @@ class AgentWindowAttention(nn.Module):
 
 
 class AxialLayer(nn.Module):
-    """Attention in windows and over the strided grid, each followed by a feed-forward layer."""
+    """Attention in windows and over the whole map, each followed by a feed-forward layer."""
 
     def __init__(self, config: CobevtConfig) -> None:
         super().__init__()

@@ -1,7 +1,7 @@
 """DiscoNet's fusion: for each cell, learned weights of the agents.
 
-After Li et al., Learning Distilled Collaboration Graph for Multi-Agent Perception (NeurIPS 2021); the layers' sizes are
-those of its version in CoBEVT's code. The DeepAccident paper names it; the released code has none. There is no
+After Li et al., Learning Distilled Collaboration Graph (NeurIPS 2021); the layers' sizes are those of its version in
+CoBEVT's code. The DeepAccident paper names it; the released code has none. There is no
 distillation from a teacher that sees all sensors.
 """
 
@@ -22,7 +22,7 @@ class DiscoNetConfig:
     Attributes:
         channels: C.
         hidden: channels of the layers that find a weight.
-        last_relu: the original's ReLU on the weights before the softmax. Off: it takes the gradient away from all
+        last_relu: the original's ReLU on the weights before the `softmax`. Off: it takes the gradient away from all
             negative ones, and makes them equal.
     """
 
@@ -32,7 +32,7 @@ class DiscoNetConfig:
 
 
 class DiscoNetFusion(Fusion):
-    """Linear(Σ w_k x_k); w is a softmax over the agents of what a small network finds in an agent's cell and the ego's.
+    """Linear(Σ w_k x_k); w is a `softmax` over agents of what a small network finds in an agent's cell and the ego's.
 
     The network sees only cells that the mask shows, so the batch statistics depend on no others.
     """

@@ -25,7 +25,7 @@ class Fusion(nn.Module, ABC):
         Args:
             x: (B, A, C, H, W) maps, already in the ego's frame (`warps.agents_to_ego`); slot 0 is the ego.
             mask: (B, A, H, W) bool, where an agent has something to say (`warps.agents_mask`); the ego has everywhere.
-            agent_is_infra: (B, A) bool, whether the agent is at the roadside and not a vehicle.
+            agent_is_infra: (B, A) bool, whether the agent is infrastructure, not a vehicle.
             delay: (B, A) integer steps by which an agent's map is older than the ego's; not negative.
 
         Returns:

@@ -1,4 +1,4 @@
-"""V2X-ViT's multi-scale window attention: each agent's map for itself, in windows of several sizes."""
+"""V2X-ViT's attention in windows of several sizes, each agent's map for itself."""
 
 from collections.abc import Sequence
 
@@ -35,7 +35,7 @@ class WindowAttention(nn.Module):
 
 
 class SplitAttention(nn.Module):
-    """Σ of branches, each channel with a softmax over the branches of weights found in the mean over the map."""
+    """Σ of branches, each channel with a `softmax` over the branches of weights found in the mean over the map."""
 
     def __init__(self, channels: int, branches: int) -> None:
         super().__init__()

@@ -100,6 +100,5 @@ class ReleasedFusion(Fusion):
         """As `Fusion.forward`; kinds of agents and delays do not count."""
         ego, there = x[:, :1], mask.flatten(2).any(2)[:, :, None, None, None]
         filled = ~mask[:, :, None] | (x.abs().mean(2, keepdim=True) < self.config.fill_below)
-        filled[:, 0] = False
         mean = torch.where(filled, ego, x).masked_fill(~there, 0).sum(1) / there.sum(1)
         return torch.where(self.from_ego[:, None, None], ego[:, 0], mean)

@@ -139,8 +139,8 @@ def _claim(folder: Path, notes: Mapping[str, Any]) -> None:
         differing = [name for name in told if there.get(name) != told[name]] if isinstance(there, dict) else [RUN]
         if differing:
             raise ConfigError(
-                f"{path}: is of another run, its {', '.join(differing)} differ; give the same options to go on with it, "
-                "or another folder"
+                f"{path}: is of another run, its {', '.join(differing)} differ; give the same options to go on with "
+                "it, or another folder"
             )
         return
     write_bytes(path, json.dumps(notes, indent=1).encode())

@@ -48,6 +48,6 @@ def validated(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config:
         boxes = DetectedBoxes(boxes=found.boxes.boxes.transform(pose, rules.frame), scores=found.boxes.scores)
         detection.update(found.token, boxes, detection_truth(dataset, found.token, rules))
     wide = motion.compute().ranges[_WIDE]
-    scores = {"iou": wide.iou, "vpq": wide.pq, "map": detection.compute().mean_ap}
+    scores = {"iou": wide.iou, "vpq": wide.pq, "map": detection.compute().mean_average_precision / 100}
     known = {name: value if value == value else 0.0 for name, value in scores.items()}  # noqa: PLR0124 - NaN
     return {**known, SCORE: (known["iou"] + known["vpq"]) / 2}
