@@ -8,7 +8,7 @@ from deepaccident_devkit.synth.roads import MAP_CELLS, MAP_RESOLUTION
 from deepaccident_devkit.synth.sensors.caster import GROUND, NOTHING
 from deepaccident_devkit.synth.sensors.images.buffers import look, ray_directions, slopes
 from deepaccident_devkit.synth.sensors.images.facades import facades_of, on_facades
-from deepaccident_devkit.synth.sensors.images.light import light_of
+from deepaccident_devkit.synth.sensors.images.light import light_of, make_sky
 from deepaccident_devkit.synth.sensors.images.shadows import add_shadows, wall_shadows
 from deepaccident_devkit.synth.solids import FACES_A_SOLID, FRONT, REAR, Block, build
 from deepaccident_devkit.taxonomy import TIMES_OF_DAY, WEATHERS
@@ -55,6 +55,16 @@ def test_every_sky_has_a_light(weather, time_of_day):
     assert 0 < light.in_shadow <= 1
     assert np.linalg.norm(light.to_sun) == pytest.approx(1)
     assert (light.rain > 0) == ("Rain" in weather)
+
+
+def test_the_sky_has_no_seam(rng):
+    """Straight ahead, just left and just right of it, where the picture begins and ends."""
+    sky = make_sky(light_of("Cloudy", "Sunset"), rng)
+    ahead = np.ones((1, 3), dtype=np.float32)
+    across = np.array([[1e-5, 0.0, -1e-5]], dtype=np.float32)
+    for height in (0.0, 0.3, 0.9):
+        colors = sky.toward(ahead, across, height * ahead)[0].astype(int)
+        assert np.abs(colors - colors[1]).max() <= 1
 
 
 def test_noon_is_brighter_than_sunset_and_sunset_than_night(world, rig_of):
