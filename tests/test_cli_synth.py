@@ -83,6 +83,15 @@ def test_every_option_reaches_the_configuration(tmp_path, made):
     ]
 
 
+def test_sensors_are_chosen_by_a_word_and_left_out_by_an_option(tmp_path, made):
+    for words in ("--sensors all", "--sensors Cameras", "--sensors none", "--no-sensors"):
+        assert CliRunner().invoke(synth, [str(tmp_path), *words.split()]).exit_code == 0
+    assert [config.sensors for config in made] == ["all", "cameras", "none", "none"]
+    result = CliRunner().invoke(synth, [str(tmp_path), "--sensors", "cameras", "--no-sensors"])
+    assert (result.exit_code, len(made)) == (2, 4)
+    assert "--sensors changes nothing with --no-sensors; leave it out" in result.output
+
+
 def test_a_release_for_the_released_code_is_asked_for_by_one_word(tmp_path, made):
     CliRunner().invoke(synth, [str(tmp_path), "--for-released-code"])
     CliRunner().invoke(synth, [str(tmp_path), "--for-released-code", "--image-size", "1600x900", "--layout", "A"])
@@ -108,9 +117,10 @@ def test_without_options_scenarios_have_their_natural_length(tmp_path, made):
     assert f"{tmp_path}: 4 scenarios with five agents, layout A" in result.output
 
 
-def test_labels_without_embree_are_said_to_take_long(tmp_path, made, monkeypatch):
+@pytest.mark.parametrize("words", ["--no-sensors", "--sensors none"])
+def test_labels_without_embree_are_said_to_take_long(tmp_path, made, monkeypatch, words):
     monkeypatch.setattr(sys.modules[synth.callback.__module__], "has_embree", lambda: False)
-    result = CliRunner().invoke(synth, [str(tmp_path), "--no-sensors"])
+    result = CliRunner().invoke(synth, [str(tmp_path), *words.split()])
     assert "slow without the package embreex; in a checkout: pip install '.[synth]'" in result.stderr
     assert made == [SynthConfig(frames=None, sensors=False)]
 
@@ -202,6 +212,7 @@ def test_how_to_see_an_accident_is_the_last_line(mine, made):
     picture = "deepaccident render accident out{} --out countdown.png"
     assert last() == "or:   " + picture.format("")
     assert last("--spec", "mine.yaml", "--no-sensors") == "or:   " + picture.format(" --layers boxes")
+    assert last("--sensors", "cameras") == "or:   " + picture.format("")
     mine.write_text(MINE.replace("meet: {offset: 0}", ""), encoding="utf-8")
     assert last("--spec", "mine.yaml") == "next: deepaccident info out"
 
@@ -216,5 +227,5 @@ def test_a_design_is_shown_as_a_file_to_begin_with():
 def test_help_names_every_option():
     text = CliRunner().invoke(synth, ["--help"]).output
     named = {option for parameter in synth.params for option in parameter.opts if option.startswith("--")}
-    assert len(named) == 21
+    assert len(named) == 22
     assert all(option in text for option in named)

@@ -18,14 +18,14 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.parallel import Shard
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.synth.checking import checked_text
-from deepaccident_devkit.synth.config import IMAGE_SIZE, RELEASED_IMAGE_SIZE
+from deepaccident_devkit.synth.config import IMAGE_SIZE, RELEASED_IMAGE_SIZE, Sensors
 from deepaccident_devkit.synth.sensors.caster import has_embree
 from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, View, design_text, designs_text, read_spec
 from deepaccident_devkit.taxonomy import Layout
 
 _DEFAULTS = SynthConfig()
 _OF_FILES = (
-    *("scenarios", "image_size", "layout", "no_sensors", "unlabelled_test", "exact", "for_released_code"),
+    *("scenarios", "image_size", "layout", "sensors", "no_sensors", "unlabelled_test", "exact", "for_released_code"),
     *("unplanned", "workers", "scheduler", "scheduler_file", "shard", "merge"),
 )
 """Options of what is written."""
@@ -80,8 +80,14 @@ def _show_design(context: click.Context, _parameter: click.Parameter, number: in
 )
 @click.option("--seed", default=_DEFAULTS.seed, show_default=True, help="The same seed gives the same bytes.")
 @click.option(
-    "--no-sensors", is_flag=True, help="Write only labels, calib and meta: no images, point clouds, BEV arrays."
+    "--sensors",
+    type=WordChoice(get_args(Sensors)),
+    default=_DEFAULTS.sensors,
+    show_default=True,
+    help="What to write besides labels, calib and meta. all: images, point clouds, BEV arrays. cameras: images alone. "
+    "none: nothing.",
 )
+@click.option("--no-sensors", is_flag=True, help="The same as --sensors none.")
 @click.option("--unlabelled-test", is_flag=True, help="Write no labels for the test split, as in the real release.")
 @click.option(
     "--exact", is_flag=True, help="Leave out the small errors of calib and point counts that the real release has."
@@ -153,8 +159,11 @@ def synth(context: click.Context, /, out: Path | None, *, no_sensors: bool, chec
         raise click.UsageError("Missing argument 'OUT': the folder to make.", context)
     if options["spec"] is not None or options["view"] == "hidden":
         refuse_unused("with --spec or --view hidden, which ask for one certain accident", "unplanned")
-    config = SynthConfig(sensors=not no_sensors, **options)
-    if no_sensors and not has_embree():
+    if no_sensors:
+        refuse_unused("with --no-sensors", "sensors")
+        options["sensors"] = "none"
+    config = SynthConfig(**options)
+    if config.sensors == "none" and not has_embree():
         click.echo("slow without the package embreex; in a checkout: pip install '.[synth]'", err=True)
     made = make_release(out, config, progress=True, **how)
     if isinstance(how["part"], Shard):
@@ -166,7 +175,7 @@ def synth(context: click.Context, /, out: Path | None, *, no_sensors: bool, chec
     click.echo(f"{made}: {scenarios}{frames} with five agents, layout {config.layout}")
     click.echo(f"next: deepaccident info {made}")
     if config.spec is None or read_spec(config.spec).meets:
-        layers = " --layers boxes" if no_sensors else ""
+        layers = " --layers boxes" if config.sensors == "none" else ""
         click.echo(f"or:   deepaccident render accident {made}{layers} --out countdown.png")
 
 

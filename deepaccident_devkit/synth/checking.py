@@ -27,7 +27,7 @@ def checked_text(config: SynthConfig, *, progress: bool = False) -> str:
     if config.spec is None:
         raise ConfigError("spec: nothing to check; give a scenario file")
     began = perf_counter()
-    plans = plan_scenarios(replace(config, scenarios=2, sensors=False))
+    plans = plan_scenarios(replace(config, scenarios=2, sensors="none"))
     made = [build_scenario(config, plan, progress=progress) for plan in plans if plan.pair == 0]
     lines = [f"{config.spec}: can be simulated; one draw of it, with seed {config.seed}:"]
     for scenario in made:

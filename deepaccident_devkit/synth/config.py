@@ -2,13 +2,15 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, get_args
+from typing import Final, Literal, get_args
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.synth.spec import DESIGN_NUMBERS, View
 from deepaccident_devkit.taxonomy import Layout
 from deepaccident_devkit.text import settle_choices
 
+Sensors = Literal["all", "cameras", "none"]
+"""Which sensors' files a release has: of all, the images alone, or of none."""
 MAX_FRAMES = 999
 MIN_IMAGE_SIZE = (16, 9)
 IMAGE_SIZE: Final = (480, 270)
@@ -35,7 +37,9 @@ class SynthConfig:
             one it computes wrong camera geometry.
         layout: `A`, all splits in one folder, or `B`, one folder for each split.
         seed: the same seed gives the same bytes (on the same machine with the same package versions).
-        sensors: whether to write images, point clouds and BEV arrays too, not only labels, calib and meta.
+        sensors: what to write besides labels, calib and meta: `all` sensors' files, with `cameras` the images alone (no
+            point clouds, no BEV arrays), or `none`. Files that two of them write are the same. True and False mean
+            `all` and `none`.
         view: `hidden` puts a house on the kerb of the corner between ego and other, who drive a little faster than
             with the view `open`. They see each other only about a second before they meet; the infrastructure sees
             both all the time. With None the scenario files decide.
@@ -57,7 +61,7 @@ class SynthConfig:
     image_size: tuple[int, int] | None = None
     layout: Layout = "A"
     seed: int = 0
-    sensors: bool = True
+    sensors: Sensors | bool = "all"
     view: View | None = None
     designs: tuple[int, ...] = ()
     unplanned: float = 0.1
@@ -72,7 +76,9 @@ class SynthConfig:
         if self.frames is not None:
             _check_range("frames", self.frames, 1, MAX_FRAMES)
         _check_range("seed", self.seed, 0, None)
-        words = {"layout": get_args(Layout), "view": (None, *get_args(View))}
+        if isinstance(self.sensors, bool):
+            object.__setattr__(self, "sensors", "all" if self.sensors else "none")
+        words = {"layout": get_args(Layout), "sensors": get_args(Sensors), "view": (None, *get_args(View))}
         settle_choices(self, words, error=ConfigError)
         if len(self.pixels) != 2:
             raise ConfigError(f"image_size: expected (width, height), found {self.image_size!r}")

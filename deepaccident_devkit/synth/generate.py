@@ -55,13 +55,13 @@ def make_release(
         ConfigError: `out` is a file, is not empty or cannot be made; an unfinished release of another
             configuration is there, or another process makes it; the scenario file cannot be read or simulated.
         ChoiceError: there is no such part, or `workers` is less than 1.
-        MissingExtraError: sensors are wanted and the package embreex is not installed.
+        MissingExtraError: files of sensors are wanted and the package embreex is not installed.
         UnfinishedError: `part` is `merge`, and some scenarios are not recorded.
         WorkerError: a worker was killed, or cannot do the work.
     """
     wanted, part = config or SynthConfig(), part_of(part)
     check_free(out)
-    if wanted.sensors:
+    if wanted.sensors != "none":
         require_embree()
     plans = plan_scenarios(wanted)
     if not is_writable_folder(out.parent):
@@ -154,4 +154,4 @@ def _record(part: _Part) -> None:
 def _worker_count(config: SynthConfig, scenarios: int) -> int:
     """One worker for each core, or 1 if the work is too short for it: a frame with sensors takes up to a second."""
     frames = scenarios * (config.frames or _USUAL_FRAMES)
-    return (os.cpu_count() or 1) if frames >= (20 if config.sensors else 400) else 1
+    return (os.cpu_count() or 1) if frames >= (400 if config.sensors == "none" else 20) else 1

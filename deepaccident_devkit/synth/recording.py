@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
+from typing import cast
 
 from deepaccident_devkit.release import (
     ScenarioFolder,
@@ -20,12 +21,12 @@ from deepaccident_devkit.release import (
     write_meta,
 )
 from deepaccident_devkit.release.store import real_path
-from deepaccident_devkit.synth.config import SynthConfig
+from deepaccident_devkit.synth.config import Sensors, SynthConfig
 from deepaccident_devkit.synth.plan import ScenarioPlan
 from deepaccident_devkit.synth.roads import Arm
 from deepaccident_devkit.synth.scenario import Scenario, build_scenario
 from deepaccident_devkit.synth.sensors.agents import Agent
-from deepaccident_devkit.synth.sensors.images.shading import Surroundings
+from deepaccident_devkit.synth.sensors.lidar import Scan
 from deepaccident_devkit.synth.sensors.rig import Rig, make_rig
 from deepaccident_devkit.synth.sensors.scene import Scene
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, LIDAR, frame_timestamp
@@ -63,7 +64,7 @@ class RecordingJob:
 
 def parts_of(config: SynthConfig) -> int:
     """The number of parts in which each scenario is recorded."""
-    return min(_PARTS, config.frames or _PARTS) if config.sensors else 1
+    return 1 if config.sensors == "none" else min(_PARTS, config.frames or _PARTS)
 
 
 def record_scenario(job: RecordingJob) -> None:
@@ -111,7 +112,7 @@ def _made_ready(task: _Task) -> tuple[Scenario, Rig]:
         sky=(scenario.weather, scenario.time_of_day),
         image_size=config.pixels,
         seed=(config.seed, plan.pair, int(plan.accident)),
-        images=config.sensors,
+        sensors=cast(Sensors, config.sensors),  # never True or False once the configuration is made
         exact=config.exact,
     )
     return scenario, rig
@@ -129,7 +130,7 @@ _KEPT = _Kept()
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Recorder:
-    """Writes the files of one scenario; if the rig makes no images, only the files that need no sensor."""
+    """Writes the files of one scenario: those that need no sensor, and what the rig makes of the others."""
 
     folder: ScenarioFolder
     scenario: Scenario
@@ -146,20 +147,19 @@ class _Recorder:
             write_calib(real_path(self.folder.calib_path(agent.name, frame)), sighting.calib)
             if self.labelled:
                 write_label(real_path(self.folder.label_path(agent.name, frame)), sighting.labels)
+            if rig.clouds:
+                self._record_arrays(scene, sighting.points, agent, frame)
             if around:
-                intensity = rig.intensity(sighting.points)
-                write_lidar(
-                    real_path(self.folder.channel_path(agent.name, LIDAR, frame)), sighting.points.xyz, intensity
-                )
-                self._record_pictures(scene, around, agent, frame)
+                for channel, image in rig.images(scene, around, agent, frame):
+                    write_image(real_path(self.folder.channel_path(agent.name, channel, frame)), image)
 
-    def _record_pictures(self, scene: Scene, around: Surroundings, agent: Agent, frame: int) -> None:
-        """Write the images, and if there are labels also the BEV arrays, whose instances are labels too."""
+    def _record_arrays(self, scene: Scene, points: Scan, agent: Agent, frame: int) -> None:
+        """Write the point cloud, and if there are labels also the BEV array, whose instances are labels too."""
+        place = real_path(self.folder.channel_path(agent.name, LIDAR, frame))
+        write_lidar(place, points.xyz, self.rig.intensity(points))
         if self.labelled:
             bev = self.rig.bev(scene, agent)
             write_bev(real_path(self.folder.channel_path(agent.name, BEV_CAMERA, frame)), bev.semantic, bev.instance)
-        for channel, image in self.rig.images(scene, around, agent, frame):
-            write_image(real_path(self.folder.channel_path(agent.name, channel, frame)), image)
 
     def _signals(self, time: float) -> Mapping[Arm, int]:
         """Arm → the state of its traffic light."""

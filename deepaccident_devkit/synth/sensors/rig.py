@@ -8,6 +8,7 @@ import numpy as np
 from deepaccident_devkit.arrays import ByteArray, Float32Array
 from deepaccident_devkit.release import BevImage, Calib, Labels
 from deepaccident_devkit.synth.actors import Actors
+from deepaccident_devkit.synth.config import Sensors
 from deepaccident_devkit.synth.roads import Arm
 from deepaccident_devkit.synth.sensors.agents import Agent, make_agents, with_single_precision
 from deepaccident_devkit.synth.sensors.annotate import annotate
@@ -31,7 +32,7 @@ class Sighting:
     Attributes:
         labels: its label file.
         calib: its calib file.
-        points: its point cloud; if the rig makes no images, only the points that may lie in a box, as in `lidar.scan`.
+        points: its point cloud; if the rig makes none, only the points that may lie in a box, as in `lidar.scan`.
     """
 
     labels: Labels
@@ -48,6 +49,7 @@ class Rig:
         agents: the agents.
         lidars: their LiDARs.
         air: what the weather does to the LiDARs' rays.
+        clouds: whether it makes whole point clouds, not only the points that labels count.
         studio: it makes the images; None if there are none.
         seed: seed of all noise, so that the noise of a moment does not depend on what was recorded before.
         exact: whether calib files are ideal, and numbers of points exact.
@@ -57,6 +59,7 @@ class Rig:
     agents: tuple[Agent, ...]
     lidars: Mapping[AgentName, Lidar]
     air: Air
+    clouds: bool
     studio: Studio | None
     seed: tuple[int, ...]
     exact: bool
@@ -71,7 +74,7 @@ class Rig:
         ground_from_ego = agent.ground_from_ego(scene)
         ground_from_lidar = ground_from_ego @ agent.ego_from_lidar
         rng = self._random(_LIDAR, frame, agent)
-        points = scan(scene, self.lidars[agent.name], ground_from_lidar, self.air, rng, boxed=self.studio is None)
+        points = scan(scene, self.lidars[agent.name], ground_from_lidar, self.air, rng, boxed=not self.clouds)
         labels = annotate(scene, agent, world_from_ground, points, exact=self.exact)
         calib = agent.calib(world_from_ground @ ground_from_ego)
         return Sighting(labels, calib if self.exact else with_single_precision(calib), points)
@@ -111,7 +114,7 @@ def make_rig(
     sky: tuple[str, str],
     image_size: tuple[int, int],
     seed: tuple[int, ...],
-    images: bool = True,
+    sensors: Sensors = "all",
     exact: bool = False,
 ) -> Rig:
     """The sensors of a scenario.
@@ -123,7 +126,7 @@ def make_rig(
         sky: weather and time of day, as in the taxonomy.
         image_size: width and height of the images, pixels.
         seed: seed of noise, clouds and the ground's grain.
-        images: whether images are wanted; labels do not depend on it, points do, as in `Sighting`.
+        sensors: as in `SynthConfig`; labels do not depend on it, points do, as in `Sighting`.
         exact: as in `Rig`.
     """
     weather, time_of_day = sky
@@ -135,7 +138,8 @@ def make_rig(
         agents=agents,
         lidars={agent.name: make_lidar(setting, agent) for agent in agents},
         air=AIR_OF_WEATHER[weather],
-        studio=Studio(setting, weather, time_of_day, rng) if images else None,
+        clouds=sensors == "all",
+        studio=None if sensors == "none" else Studio(setting, weather, time_of_day, rng),
         seed=seed,
         exact=exact,
     )

@@ -17,6 +17,7 @@ from deepaccident_devkit.synth import SynthConfig
         ("image_size", (16, 8), "height: 8"),
         ("image_size", (16,), r"expected \(width, height\)"),
         ("layout", "C", "layout: expected one of A, B, found 'C'"),
+        ("sensors", "lidar", "sensors: expected one of all, cameras, none, found 'lidar'"),
         ("view", "close", "view: expected one of open, hidden, or None, found 'close'"),
         ("designs", (1, 13), "designs: 13 is not possible; choose a number from 1 to 12"),
         ("unplanned", 1.5, "unplanned: 1.5 is not a share; choose a number from 0 to 1"),
@@ -31,6 +32,12 @@ def test_smallest_and_largest_are_accepted():
     SynthConfig(scenarios=1, frames=1, image_size=(16, 9))
     SynthConfig(frames=999)
     SynthConfig(frames=None)
+
+
+def test_sensors_may_be_said_by_yes_and_no():
+    assert SynthConfig(sensors=True) == SynthConfig() == SynthConfig(sensors="all")
+    assert SynthConfig(sensors=False) == SynthConfig(sensors="None") != SynthConfig(sensors="cameras")
+    assert SynthConfig(sensors=False).sensors == "none"
 
 
 def test_a_scenario_file_and_designs_exclude_each_other():

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.errors import ConfigError, MissingFileError
 from deepaccident_devkit.release import find_release, read_calib, read_image, read_label, read_meta, read_split_file
 from deepaccident_devkit.synth import SynthConfig, generate, make_release, recording
 from deepaccident_devkit.synth.plan import plan_scenarios
 from deepaccident_devkit.synth.recording import RecordingJob, _Recorder, parts_of, record_scenario
 from deepaccident_devkit.synth.scenario import build_scenario
 from deepaccident_devkit.synth.unfinished import Unfinished, unfinished_release
-from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, CHANNELS, MINI_SPLITS, SPLITS
-from deepaccident_devkit.validation import validate_release
+from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CAMERAS, CHANNELS, LIDAR, MINI_SPLITS, SPLITS
+from deepaccident_devkit.validation import release_completeness, validate_release
 
 pytestmark = pytest.mark.slow
 
@@ -106,7 +106,8 @@ def test_parts_of_any_number_make_the_same_scenario(tmp_path, digests):
 def test_one_scenario_gives_work_to_several_processes():
     assert parts_of(SynthConfig(frames=None)) == parts_of(SynthConfig(frames=60)) >= 4
     assert parts_of(SynthConfig(frames=2)) == 2
-    assert parts_of(SynthConfig(frames=60, sensors=False)) == 1
+    assert parts_of(SynthConfig(frames=60, sensors="cameras")) >= 4
+    assert parts_of(SynthConfig(frames=60, sensors="none")) == 1
 
 
 @pytest.fixture
@@ -230,6 +231,9 @@ def test_another_configuration_does_not_go_on_with_it(tmp_path, break_off):
         ConfigError, match=r"another configuration \(seed: 0 there, 1 asked for\); ask for the same to finish it"
     ):
         make_release(out, replace(config, seed=1), workers=1)
+    for sensors in ("all", "cameras"):
+        with pytest.raises(ConfigError, match=f"sensors: 'none' there, '{sensors}' asked for"):
+            make_release(out, replace(config, sensors=sensors), workers=1)
     assert not out.exists()
 
 
@@ -285,13 +289,29 @@ def test_another_seed_another_release(tmp_path, digests):
     assert not {content for name, content in releases[0].items() if "label" in name} & set(releases[1].values())
 
 
-def test_without_sensors_the_other_files_are_the_same(tmp_path, release_root, config, digests):
-    bare = SynthConfig(
-        scenarios=config.scenarios, frames=config.frames, image_size=config.image_size, seed=config.seed, sensors=False
-    )
-    without = digests(make_release(tmp_path / "bare", bare, workers=1))
+@pytest.mark.parametrize(
+    ("sensors", "endings"), [("none", (".txt", ".pkl")), ("cameras", (".txt", ".pkl", ".jpg"))], ids=str
+)
+def test_with_fewer_sensors_the_other_files_are_the_same(tmp_path, release_root, config, digests, sensors, endings):
+    fewer = digests(make_release(tmp_path / sensors, replace(config, sensors=sensors), workers=1))
     full = digests(release_root)
-    assert without == {name: content for name, content in full.items() if name.endswith((".txt", ".pkl"))}
+    assert fewer == {name: content for name, content in full.items() if name.endswith(endings)}
+
+
+def test_a_release_of_images_alone_is_as_a_partial_download(tmp_path):
+    """Nothing is wrong with it; what is missing is named, and labels can be made."""
+    config = SynthConfig(scenarios=2, frames=1, image_size=(32, 18), sensors="cameras")
+    root = make_release(tmp_path / "out", config, workers=1)
+    assert validate_release(root, deep=True, workers=1).is_good
+    counts = [each for split in release_completeness(root).splits.values() for each in split.files]
+    assert {each.channel for each in counts if each.missing} == {LIDAR, BEV_CAMERA}
+    assert not any(each.here for each in counts if each.channel in (LIDAR, BEV_CAMERA))
+    da = DeepAccident("v1", root, verbose=False)
+    sample = da.sample[0]["token"]
+    assert len(da.boxes(sample)) > 3
+    assert da.load_image(f"{sample}/Camera_Front").shape == (18, 32, 3)
+    with pytest.raises(MissingFileError, match=r"lidar01.*no such file"):
+        da.load_point_cloud(sample)
 
 
 def test_a_folder_with_something_in_it_is_left_alone(tmp_path):

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deepaccident_devkit.arrays import ByteArray, Float32Array, FloatArray
+from deepaccident_devkit.arrays import ByteArray, Float32Array, FloatArray, IntArray
 from deepaccident_devkit.synth import roads
 from deepaccident_devkit.synth.roads import MAP_CELLS, MAP_EXTENT, GroundMap
 from deepaccident_devkit.synth.sensors.images.light import Light
-from deepaccident_devkit.synth.sensors.images.shadows import above_ground, with_shadows
+from deepaccident_devkit.synth.sensors.images.shadows import above_ground, add_shadows
 from deepaccident_devkit.synth.sensors.scene import Scene
 from deepaccident_devkit.synth.sensors.setting import Setting, moved
 
@@ -56,28 +56,55 @@ class Ground:
         return np.asarray(found)
 
 
-def still_ground(setting: Setting, light: Light, rng: np.random.Generator) -> ByteArray:
-    """The ground with the shadows of all that stands still, (3000, 3000, 3) uint8; `rng` draws its grain."""
+def still_ground(setting: Setting, light: Light, rng: np.random.Generator) -> Ground:
+    """The ground with the shadows of all that stands still; `rng` draws its grain."""
     lit = light.sky + light.sun * light.to_sun[2]
     plain = _picture(setting.world.ground, lit, light.wet_ground, rng)
     corners = above_ground(setting.still.corners, setting.terrain)
-    return with_shadows(plain, corners, light.to_sun, light.in_shadow)
+    add_shadows(plain, corners, light.to_sun, light.in_shadow)
+    return _with_coarser(plain, _coarser(plain, len(plain) // SHRINK))
 
 
-def ground_of(still: ByteArray, scene: Scene, light: Light) -> Ground:
+def ground_of(still: Ground, scene: Scene, light: Light) -> Ground:
     """The ground at a moment: with the shadows of moving road users, and a dark edge around every vehicle."""
-    import cv2
-
+    finest, coarser = still.levels[0].copy(), still.levels[1].copy()
     corners = above_ground(scene.movers.corners[scene.movers.solids.main], scene.setting.terrain)
-    finest = with_shadows(still, corners, light.to_sun, light.in_shadow)
+    cells = [add_shadows(finest, corners, light.to_sun, light.in_shadow)]
     upwards = np.array([0.0, 0.0, 1.0])
     for beyond, brightness in _CLOSE_BY:
-        finest = with_shadows(finest, _slabs(scene, beyond), upwards, brightness)
-    levels = [finest]
-    for _ in range(LEVELS - 1):
-        side = len(levels[-1]) // SHRINK
-        levels.append(np.asarray(cv2.resize(levels[-1], (side, side), interpolation=cv2.INTER_AREA), dtype=np.uint8))
-    return Ground(tuple(levels))
+        cells.append(add_shadows(finest, _slabs(scene, beyond), upwards, brightness))
+    _follow(coarser, finest, np.concatenate(cells))
+    return _with_coarser(finest, coarser)
+
+
+def _with_coarser(*levels: ByteArray) -> Ground:
+    """The ground with these pictures, fine to coarse, and with coarser ones of the last of them."""
+    while len(levels) < LEVELS:
+        levels = (*levels, _coarser(levels[-1], len(levels[-1]) // SHRINK))
+    return Ground(levels)
+
+
+def _coarser(picture: ByteArray, width: int) -> ByteArray:
+    """A picture (R, C, 3) with `width` columns and as many times fewer rows, each cell the mean of those it covers."""
+    import cv2
+
+    size = width, len(picture) * width // picture.shape[1]
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def _follow(coarser: ByteArray, finest: ByteArray, cells: IntArray) -> None:
+    """Make the second picture agree with the finest one, in place, where cells of that (K,) have changed.
+
+    To make all of it again would take most of a moment's time if the images are small.
+    """
+    row, column = np.divmod(cells, MAP_CELLS)
+    changed = np.zeros(coarser.shape[:2], dtype=bool)
+    changed[row // SHRINK, column // SHRINK] = True
+    rows, columns = np.nonzero(changed)
+    squares = finest.reshape(len(coarser), SHRINK, -1, SHRINK, 3)[rows, :, columns]
+    if len(squares):
+        side_by_side = squares.transpose(1, 0, 2, 3).reshape(SHRINK, -1, 3)
+        coarser[rows, columns] = _coarser(side_by_side, len(squares))[0]
 
 
 def _slabs(scene: Scene, beyond: float) -> FloatArray:

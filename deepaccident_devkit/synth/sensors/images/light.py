@@ -141,7 +141,10 @@ _DRIFT = 2.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sky:
-    """A picture (192, 1024, 3) uint8, RGB: columns by azimuth from x counter-clockwise, rows by slope."""
+    """A picture (192, 1025, 3) uint8, RGB: columns by azimuth from x counter-clockwise, rows by slope.
+
+    The last column is the first one again, so that colours between the two can be mixed.
+    """
 
     picture: ByteArray
 
@@ -153,8 +156,7 @@ class Sky:
         column = np.asarray(azimuth) * np.float32(_COLUMNS / (2 * np.pi))
         rise = np.clip(z / np.maximum(np.asarray(run), np.float32(1e-6)), 0, np.float32(_STEEPEST))
         row = rise * np.float32((_ROWS - 1) / _STEEPEST)
-        wrapped = cv2.copyMakeBorder(self.picture, 0, 0, 0, 1, cv2.BORDER_WRAP)
-        return np.asarray(cv2.remap(wrapped, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+        return np.asarray(cv2.remap(self.picture, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 def make_sky(light: Light, rng: np.random.Generator) -> Sky:
@@ -170,7 +172,8 @@ def make_sky(light: Light, rng: np.random.Generator) -> Sky:
     color += strength * light.tint * (90 * glow**12 + 400 * glow**900)
     cover = _clouds(azimuth, rise, light.cover, rng)[..., None] * np.minimum(rise / 0.12, 1.0)[:, None, None]
     lit = light.horizon * (0.92 + 0.12 * glow**4)
-    return Sky((color * (1 - cover) + lit * cover).clip(0, 255).astype(np.uint8))
+    picture = (color * (1 - cover) + lit * cover).clip(0, 255).astype(np.uint8)
+    return Sky(np.concatenate([picture, picture[:, :1]], axis=1))
 
 
 def _clouds(azimuth: FloatArray, rise: FloatArray, cover: float, rng: np.random.Generator) -> FloatArray:

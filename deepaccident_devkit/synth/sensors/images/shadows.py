@@ -13,29 +13,39 @@ from deepaccident_devkit.synth.sensors.images.paint import Colors
 from deepaccident_devkit.synth.sensors.setting import Setting
 
 
-def with_shadows(picture: ByteArray, corners: FloatArray, to_sun: FloatArray, brightness: float) -> ByteArray:
-    """A new picture of the ground with the shadows of solids.
+def add_shadows(picture: ByteArray, corners: FloatArray, to_sun: FloatArray, brightness: float) -> IntArray:
+    """Paint the shadows of solids into a picture of the ground, in place.
 
     Args:
         picture: (3000, 3000, 3) uint8, cells as in `roads.GroundMap`.
         corners: (P, 8, 3) corners of convex solids, metres, ground frame, z above the ground below them.
         to_sun: (3,) direction to the sun.
         brightness: brightness of the ground in the shadow, as a share of that in the sun.
+
+    Returns:
+        the cells in the shadow (K,), as rows of 3000 · 3000; those in two shadows are there twice.
     """
+    cells = _shadowed(_outlines(corners, to_sun))
+    dimmed, flat = (np.arange(256) * brightness).astype(np.uint8), picture.reshape(-1, 3)
+    # all cells are read before one is written, so that two shadows together are not darker than one
+    flat[cells] = dimmed[flat[cells]]
+    return cells
+
+
+def _shadowed(outlines: IntArray) -> IntArray:
+    """The cells (K,) inside convex outlines (P, 8, 2), column and row of each corner; one outline after the other."""
     import cv2
 
-    shadowed = picture.copy()
-    dimmed = (np.arange(256) * brightness).astype(np.uint8)
-    for outline in _outlines(corners, to_sun):
+    cells = [np.zeros(0, dtype=np.int64)]
+    for outline in outlines:
         low, high = np.maximum(outline.min(axis=0), 0), np.minimum(outline.max(axis=0) + 1, MAP_CELLS)
         if (low >= high).any():
             continue
         mask = np.zeros(high[::-1] - low[::-1], dtype=np.uint8)
         cv2.fillConvexPoly(mask, cv2.convexHull((outline - low).astype(np.int32)), 1)
         rows, columns = np.nonzero(mask)
-        # always darker than the given picture, so that two shadows together are not darker than one
-        shadowed[rows + low[1], columns + low[0]] = dimmed[picture[rows + low[1], columns + low[0]]]
-    return shadowed
+        cells.append((rows + low[1]) * MAP_CELLS + columns + low[0])
+    return np.concatenate(cells)
 
 
 def above_ground(corners: FloatArray, terrain: Terrain) -> FloatArray:

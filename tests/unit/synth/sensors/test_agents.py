@@ -13,7 +13,7 @@ from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 
 @pytest.fixture(scope="module")
 def rig(world, rig_of):
-    return rig_of(world, images=False, image_size=(96, 54))
+    return rig_of(world, sensors="none", image_size=(96, 54))
 
 
 def test_all_agents_have_six_cameras(rig):
@@ -83,7 +83,7 @@ def test_a_tall_vehicle_has_its_lidar_above_the_roof(world, actor):
 
     trucks = [actor(k, "truck", -20.0 - 12 * k, -1.75) for k in range(4)]
     ids = {name: truck.actor_id for name, truck in zip(VEHICLE_AGENTS, trucks, strict=True)}
-    rig = make_rig(world, Actors.of(trucks), ids, sky=("Clear", "Noon"), image_size=(96, 54), seed=(0,), images=False)
+    rig = make_rig(world, Actors.of(trucks), ids, sky=("Clear", "Noon"), image_size=(96, 54), seed=(0,), sensors="none")
     scene = rig.scene(0.0)
     assert rig.agents[0].ground_from_lidar(scene).translation[2] > trucks[0].size[2] + 0.4
     labels = rig.sighting(scene, rig.agents[0], 1).labels
@@ -103,7 +103,7 @@ def test_rays_go_through_the_middles_of_the_pixels(rig):
 
 
 def test_no_camera_sees_its_own_vehicle(world, rig_of):
-    rig = rig_of(world, images=False, image_size=(96, 54))
+    rig = rig_of(world, sensors="none", image_size=(96, 54))
     scene = rig.scene(0.0)
     for agent in rig.agents[:4]:
         for camera in agent.cameras:

@@ -6,7 +6,7 @@ from deepaccident_devkit.synth.roads import tag_of_code
 
 @pytest.fixture(scope="module")
 def rig(world, actor, rig_of):
-    return rig_of(world, [actor(9, "truck", -20.0, 1.75, np.pi), actor(10, "pedestrian", -20.0, 1.75)], images=False)
+    return rig_of(world, [actor(9, "truck", -20.0, 1.75, np.pi), actor(10, "pedestrian", -20.0, 1.75)], sensors="none")
 
 
 def test_bev_shows_the_map_around_the_agent(world, rig):

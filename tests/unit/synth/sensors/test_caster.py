@@ -90,7 +90,7 @@ def test_labels_without_embree_are_nearly_the_same(monkeypatch, world, actor, ri
     labels = []
     for available in (True, False):
         monkeypatch.setattr(caster, "has_embree", lambda available=available: available)
-        rig = rig_of(world, others, images=False)
+        rig = rig_of(world, others, sensors="none")
         labels.append(rig.sighting(rig.scene(0.0), rig.agents[0], 1).labels)
     fast, slow = labels
     np.testing.assert_array_equal(fast.center, slow.center)

@@ -37,7 +37,7 @@ def poses_of(scene, ground_from_lidar):
 
 def test_points_lie_on_surfaces_within_the_noise(world, bare, rig_of):
     wall = Block((-20.0, -19.0), (-30.0, 30.0), (-0.1, 6.0), RED)
-    _, pose, points = scan_of(rig_of(bare(world, [wall]), images=False))
+    _, pose, points = scan_of(rig_of(bare(world, [wall]), sensors="none"))
     on_wall = pose.apply(points.xyz[points.face == 1].astype(np.float64))
     assert len(on_wall) > 3000
     reach = np.linalg.norm(on_wall - pose.translation, axis=1)
@@ -50,7 +50,7 @@ def test_points_lie_on_surfaces_within_the_noise(world, bare, rig_of):
 @pytest.mark.parametrize("kind", ["flat", "hilly"])
 def test_points_of_the_ground_lie_on_the_terrain(world, hilly_world, rig_of, kind):
     place = world if kind == "flat" else hilly_world
-    rig = rig_of(place, images=False, places={"ego_vehicle": (-48.0, -1.75, 0.0)})
+    rig = rig_of(place, sensors="none", places={"ego_vehicle": (-48.0, -1.75, 0.0)})
     scene, pose, points = scan_of(rig)
     ground = pose.apply(points.xyz[points.face == GROUND].astype(np.float64))
     above = ground[:, 2] - scene.setting.terrain.height(ground[:, :2])
@@ -60,7 +60,7 @@ def test_points_of_the_ground_lie_on_the_terrain(world, hilly_world, rig_of, kin
 
 
 def test_a_car_on_a_slope_is_tilted_with_its_sensors(hilly_world, rig_of):
-    rig = rig_of(hilly_world, images=False, places={"ego_vehicle": (-70.0, -1.75, 0.0)})
+    rig = rig_of(hilly_world, sensors="none", places={"ego_vehicle": (-70.0, -1.75, 0.0)})
     scene = rig.scene(0.0)
     up = rig.agents[0].ground_from_lidar(scene).rotation[:, 2]
     normal = scene.setting.terrain.normal(np.array([[-70.0, -1.75]]))[0]
@@ -83,7 +83,7 @@ def crowd(actor):
 
 @pytest.mark.parametrize("place", ["world", "hilly_world"])
 def test_windows_hold_every_ray_that_meets_someone(request, crowd, rig_of, place):
-    rig = rig_of(request.getfixturevalue(place), crowd, images=False)
+    rig = rig_of(request.getfixturevalue(place), crowd, sensors="none")
     scene = rig.scene(0.0)
     everybody = np.arange(len(scene.actors))
     for agent in rig.agents:
@@ -114,7 +114,7 @@ def test_rays_through_a_box_are_those_with_a_point_in_it():
 @pytest.mark.parametrize("air", [DRY, RAIN, Air(drops=0.7)])
 def test_boxed_all_points_in_boxes_are_there(request, crowd, rig_of, place, air):
     """Of what lies in a box, raindrops too; far fewer rays are followed."""
-    rig = rig_of(request.getfixturevalue(place), crowd, images=False)
+    rig = rig_of(request.getfixturevalue(place), crowd, sensors="none")
     for agent in range(5):
         scene, pose, full = scan_of(rig, agent, air)
         _, _, boxed = scan_of(rig, agent, air, boxed=True)
@@ -132,7 +132,7 @@ def test_boxed_all_points_in_boxes_are_there(request, crowd, rig_of, place, air)
 
 def test_the_own_body_is_met_where_it_is(world, rig_of):
     """What is worked out once for all moments, against a cast at one."""
-    rig = rig_of(world, images=False)
+    rig = rig_of(world, sensors="none")
     scene, agent = rig.scene(0.0), rig.agents[0]
     pose, lidar = agent.ground_from_lidar(scene), rig.lidars[agent.name]
     distance, face = scene.cast(pose.translation, pose.rotate(ray_directions()[lidar.body]).astype(np.float32))
@@ -148,7 +148,7 @@ def test_the_own_body_is_met_where_it_is(world, rig_of):
 
 def test_more_gets_lost_in_rain_and_of_what_comes_back_weak(world, bare, rig_of):
     far = Block((19.0, 20.0), (-60.0, 60.0), (-0.1, 12.0), RED)
-    rig = rig_of(bare(world, [far]), images=False)
+    rig = rig_of(bare(world, [far]), sensors="none")
     clear, rain = (len(scan_of(rig, air=air)[2].xyz) for air in (DRY, RAIN))
     assert rain < 0.95 * clear
     reach = np.repeat(np.array([5.0, 30.0, 69.0], dtype=np.float32), 10_000)
@@ -160,14 +160,14 @@ def test_more_gets_lost_in_rain_and_of_what_comes_back_weak(world, bare, rig_of)
 
 
 def test_rain_sends_rays_back(world, rig_of):
-    rig = rig_of(world, images=False)
+    rig = rig_of(world, sensors="none")
     assert (scan_of(rig)[2].face == -1).sum() == 0
     assert (scan_of(rig, air=RAIN)[2].face == -1).sum() > 20
 
 
 def test_intensity_is_that_of_the_distance_before_the_noise(world, rig_of):
     """As in a real scenario: exp(−0.03 · distance), whatever the point lies on."""
-    _, _, points = scan_of(rig_of(world, images=False))
+    _, _, points = scan_of(rig_of(world, sensors="none"))
     bright = intensity(points, DRY)
     assert bright.dtype == np.float32
     off = np.linalg.norm(points.xyz, axis=1) + np.log(bright) / 0.03
@@ -177,7 +177,7 @@ def test_intensity_is_that_of_the_distance_before_the_noise(world, rig_of):
 
 
 def test_noise_is_the_seeds_alone(world, rig_of):
-    rig = rig_of(world, images=False)
+    rig = rig_of(world, sensors="none")
     first, again, other = (scan_of(rig, seed=seed)[2].xyz for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert first.shape != other.shape or (first != other).any()

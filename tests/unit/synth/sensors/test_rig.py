@@ -35,22 +35,23 @@ def same(first, second):
 @pytest.mark.parametrize("place", ["world", "hilly_world"])
 def test_labels_do_not_depend_on_images(request, rig_of, others, place):
     town = request.getfixturevalue(place)
-    without = sightings(rig_of(town, others, images=False))
+    without = sightings(rig_of(town, others, sensors="none"))
     large = sightings(rig_of(town, others, image_size=(800, 450)))
     assert all(map(same, without, large))
-    assert not all(map(same, without, sightings(rig_of(town, others, images=False, seed=(1,)))))
+    assert all(map(same, without, sightings(rig_of(town, others, sensors="cameras"))))
+    assert not all(map(same, without, sightings(rig_of(town, others, sensors="none", seed=(1,)))))
 
 
 def test_a_moment_does_not_depend_on_what_was_recorded_before(world, rig_of, others):
-    rig = rig_of(world, others, images=False)
-    alone = sightings(rig_of(world, others, images=False), 0.9, 10)
+    rig = rig_of(world, others, sensors="none")
+    alone = sightings(rig_of(world, others, sensors="none"), 0.9, 10)
     sightings(rig, 0.0, 1)
     assert all(map(same, alone, sightings(rig, 0.9, 10)))
 
 
 @pytest.mark.parametrize("place", ["world", "hilly_world"])
 def test_exact_counts_are_the_points_in_the_boxes(request, rig_of, others, place):
-    for sighting in sightings(rig_of(request.getfixturevalue(place), others, images=False, exact=True)):
+    for sighting in sightings(rig_of(request.getfixturevalue(place), others, sensors="none", exact=True)):
         np.testing.assert_array_equal(sighting.labels.num_lidar_pts, recount(sighting))
         assert sighting.labels.num_lidar_pts.max() > 100
 
@@ -64,7 +65,7 @@ def recount(sighting):
 def test_counts_of_those_who_move_differ_a_little_from_a_recount(world, rig_of, others):
     """As in a real scenario; those of parked vehicles and of the agent itself do not."""
     differing = []
-    for sighting in sightings(rig_of(world, others, images=False)):
+    for sighting in sightings(rig_of(world, others, sensors="none")):
         labels, found = sighting.labels, recount(sighting)
         still = (labels.actor_id == -100) | (np.hypot(*labels.velocity.T) == 0)
         np.testing.assert_array_equal(labels.num_lidar_pts[still], found[still])
@@ -85,7 +86,7 @@ def test_calib_varies_in_its_last_digits_from_frame_to_frame(hilly_world, rig_of
     cars = [actor(k, "car", -60.0 + 11 * k, -1.75, 0.0, 9.0) for k in range(4)]
     ids = {name: car.actor_id for name, car in zip(VEHICLE_AGENTS, cars, strict=True)}
     rig = make_rig(
-        hilly_world, Actors.of(cars), ids, sky=("Clear", "Noon"), image_size=(96, 54), seed=(0,), images=False
+        hilly_world, Actors.of(cars), ids, sky=("Clear", "Noon"), image_size=(96, 54), seed=(0,), sensors="none"
     )
     of_frames = [[each.calib for each in sightings(rig, 0.1 * k, k + 1)] for k in range(12)]
     for agent, calibs in enumerate(zip(*of_frames, strict=True)):
@@ -106,8 +107,8 @@ def test_calib_varies_in_its_last_digits_from_frame_to_frame(hilly_world, rig_of
 
 
 def test_exact_calib_is_ideal(hilly_world, rig_of, others):
-    exact = [each.calib for each in sightings(rig_of(hilly_world, others, images=False, exact=True))]
-    usual = [each.calib for each in sightings(rig_of(hilly_world, others, images=False))]
+    exact = [each.calib for each in sightings(rig_of(hilly_world, others, sensors="none", exact=True))]
+    usual = [each.calib for each in sightings(rig_of(hilly_world, others, sensors="none"))]
     for ideal, other in zip(exact, usual, strict=True):
         np.testing.assert_array_equal(ideal.ego_from_lidar.rotation, np.eye(3))
         assert (ideal.ego_from_lidar.translation[:2] == 0).all()
@@ -119,7 +120,7 @@ def test_exact_calib_is_ideal(hilly_world, rig_of, others):
 
 def test_velocities_are_written_as_the_release_does(hilly_world, rig_of, others):
     """The world's, turned by the box's yaw in the agent's LiDAR frame; of the own row, whose yaw is 0, the world's."""
-    rig = rig_of(hilly_world, others, images=False)
+    rig = rig_of(hilly_world, others, sensors="none")
     scene = rig.scene(0.4)
     ground = np.column_stack([scene.snapshot.velocities, np.zeros(len(scene.actors))])
     flat = np.hypot(*(hilly_world.world_from_ground.rotate(ground)[:, :2]).T)
@@ -140,7 +141,7 @@ def test_velocities_are_written_as_the_release_does(hilly_world, rig_of, others)
 
 def test_labels_list_parked_vehicles_then_vehicles_then_pedestrians_in_one_order(world, rig_of, others, actor):
     more = [actor(30 + k, category, -20.0 + 6 * k, 8.0) for k, category in enumerate(["truck", "cyclist", "car"])]
-    rig = rig_of(world, [*others, *more], images=False)
+    rig = rig_of(world, [*others, *more], sensors="none")
     orders = []
     for sighting in sightings(rig):
         labels = sighting.labels
@@ -153,7 +154,7 @@ def test_labels_list_parked_vehicles_then_vehicles_then_pedestrians_in_one_order
 def test_boxes_have_one_place_in_the_world(hilly_world, rig_of, others):
     """Every agent's labels, brought into the world by its calib, show the same corners where the ground is flat."""
     seen = {}
-    for sighting in sightings(rig_of(hilly_world, others, images=False)):
+    for sighting in sightings(rig_of(hilly_world, others, sensors="none")):
         labels, calib = sighting.labels, sighting.calib
         boxes = Boxes.from_arrays(labels.center, labels.size, labels.yaw, frame="lidar", actor_id=labels.actor_id)
         world_boxes = boxes.transform(calib.world_from_ego @ calib.ego_from_lidar, "world")
@@ -190,7 +191,7 @@ def test_images_show_road_users_where_their_boxes_project(request, rig_of, actor
 
 
 def test_bev_shows_every_road_user_by_its_id(world, rig_of, others):
-    rig = rig_of(world, others, images=False)
+    rig = rig_of(world, others, sensors="none")
     scene = rig.scene(0.0)
     picture = rig.bev(scene, rig.agents[0])
     assert set(np.unique(picture.instance)) >= set(scene.actors.object_id.tolist())

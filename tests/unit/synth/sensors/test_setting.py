@@ -29,7 +29,7 @@ def parked(actor):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("place", ["world", "hilly_world"])
 def test_rays_that_are_not_cast_would_have_met_the_same(request, rig_of, parked, place, kind):
-    rig = rig_of(request.getfixturevalue(place), parked, images=False)
+    rig = rig_of(request.getfixturevalue(place), parked, sensors="none")
     scene = rig.scene(0.0)
     for agent in rig.agents:
         origin, rays = rays_of(scene, agent, kind)
@@ -42,7 +42,7 @@ def test_rays_that_are_not_cast_would_have_met_the_same(request, rig_of, parked,
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_over_flat_ground_many_are_not_cast(world, rig_of, parked, kind, monkeypatch):
-    rig = rig_of(world, parked, images=False)
+    rig = rig_of(world, parked, sensors="none")
     scene = rig.scene(0.0)
     origin, rays = rays_of(scene, rig.agents[0], kind)
     cast, counts = scene.setting.caster.cast, []
@@ -57,7 +57,7 @@ def test_over_flat_ground_many_are_not_cast(world, rig_of, parked, kind, monkeyp
 
 
 def test_up_to_a_limit_all_is_right(world, rig_of, parked):
-    rig = rig_of(world, parked, images=False)
+    rig = rig_of(world, parked, sensors="none")
     scene = rig.scene(0.0)
     origin, rays = rays_of(scene, rig.agents[0], "lidar")
     near, far = (scene.setting.cast_columns(origin, rays, limit) for limit in (30.0, np.inf))
@@ -69,7 +69,7 @@ def test_up_to_a_limit_all_is_right(world, rig_of, parked):
 
 def test_rays_of_a_leaning_sensor_are_all_cast(world, rig_of, parked):
     """They do not stand above each other, so that none can be left out."""
-    rig = rig_of(world, parked, images=False)
+    rig = rig_of(world, parked, sensors="none")
     scene = rig.scene(0.0)
     origin, rays = rays_of(scene, rig.agents[0], "camera")
     lean = np.deg2rad(20.0)
