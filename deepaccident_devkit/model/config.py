@@ -81,6 +81,11 @@ class ModelConfig:
         """The cells of the maps that are fused."""
         return BevGrid(x=self.temporal.grid.x, y=self.temporal.grid.y)
 
+    @property
+    def labels_protocol(self) -> str | None:
+        """The name of the labels' protocol, for results and evaluators; None for one of one's own."""
+        return self.labels.protocol if isinstance(self.labels.protocol, str) else None
+
     def inputs(self, agents: Agents, *, link: Link | None = None, **changes: Any) -> V2XConfig:
         """What an item of a dataset needs for the model's inputs alone.
 

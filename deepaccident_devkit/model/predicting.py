@@ -86,12 +86,11 @@ def predictions(
     given = model.config.inputs(config.agents, link=config.link, images_cache=config.images_cache)
     data = V2XDataset(dataset, tokens, given)
     loader: DataLoader[Any] = DataLoader(data, collate_fn=collate, num_workers=config.workers)  # type: ignore[arg-type]
-    delay = 0 if config.link is None else config.link.latency_frames
     training = model.training
     model.eval()
     try:
         for batch in tqdm(loader, desc="predicting", unit="sample", disable=not progress):
-            yield _predicted(model, batch, delay, config)
+            yield prediction_of(model, batch, config)
     finally:
         model.train(training)
 
@@ -107,8 +106,16 @@ def check_images(dataset: Dataset, tokens: Sequence[str]) -> None:
             )
 
 
-def _predicted(model: V2XFormer, batch: dict[str, Any], delay: int, config: PredictConfig) -> SamplePrediction:
+def prediction_of(model: V2XFormer, batch: dict[str, Any], config: PredictConfig) -> SamplePrediction:
+    """The prediction of a batch of one item.
+
+    Args:
+        model: in evaluation mode.
+        batch: of `export.torch.collate`, as `ModelConfig.inputs` describes it.
+        config: its seed, device and latency.
+    """
     [token] = batch["token"]
+    delay = 0 if config.link is None else config.link.latency_frames
     inputs = model_inputs(batch, model.config.handedness, delay=delay).to(config.device)
     generator = torch.Generator().manual_seed(zlib.crc32(f"{config.seed} {token}".encode()))
     with torch.inference_mode():
@@ -116,8 +123,7 @@ def _predicted(model: V2XFormer, batch: dict[str, Any], delay: int, config: Pred
     [found] = decode_detections(predicted.detection, model.config.detection, model.config.decoding)
     motion = motion_output(MotionMaps(*(each[:, 0] for each in predicted.motion.maps)), model)
     labels = model.config.labels
-    protocol = labels.protocol if isinstance(labels.protocol, str) else None
-    accident = foreseen_accident(motion, step=labels.step * FRAME_PERIOD, labels=protocol)
+    accident = foreseen_accident(motion, step=labels.step * FRAME_PERIOD, labels=model.config.labels_protocol)
     return SamplePrediction(
         token=token,
         motion=motion,

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.evaluation import DetectionEvaluator, MotionEvaluator, detection_truth
 from deepaccident_devkit.evaluation.metrics.detection import DETECTION_PROTOCOLS, DetectedBoxes
+from deepaccident_devkit.evaluation.metrics.motion.protocol import MOTION_PROTOCOLS
 from deepaccident_devkit.model.network import V2XFormer
 from deepaccident_devkit.model.predicting import PredictConfig, predictions
 from deepaccident_devkit.model.training.config import TrainConfig
@@ -40,14 +43,15 @@ def validated(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config:
     Raises:
         DeepAccidentError: as of `predicting.predictions`.
     """
-    motion, detection = MotionEvaluator("paper", trajectories=False), DetectionEvaluator("paper")
-    rules = DETECTION_PROTOCOLS["paper"]
+    labels, rules = model.config.labels, DETECTION_PROTOCOLS["paper"]
+    counted = replace(MOTION_PROTOCOLS["paper"], labels=model.config.labels_protocol)
+    motion, detection = MotionEvaluator(counted, trajectories=False), DetectionEvaluator(rules)
     for found in predictions(model, dataset, tokens, config):
-        motion.update(found.token, found.motion, motion_labels(dataset, found.token, model.config.labels))
+        motion.update(found.token, found.motion, motion_labels(dataset, found.token, labels))
         pose = dataset.world_from(found.token, rules.frame).inverse()
         boxes = DetectedBoxes(boxes=found.boxes.boxes.transform(pose, rules.frame), scores=found.boxes.scores)
         detection.update(found.token, boxes, detection_truth(dataset, found.token, rules))
     wide = motion.compute().ranges[_WIDE]
-    scores = {"iou": wide.iou, "vpq": wide.pq, "map": detection.compute().mean_average_precision / 100}
-    known = {name: value if value == value else 0.0 for name, value in scores.items()}  # noqa: PLR0124 - NaN
+    percent = {"iou": wide.iou, "vpq": wide.pq, "map": detection.compute().mean_average_precision}
+    known = {name: 0.0 if math.isnan(value) else value / 100 for name, value in percent.items()}
     return {**known, SCORE: (known["iou"] + known["vpq"]) / 2}
