@@ -58,7 +58,6 @@ class SpatialDistribution(nn.Module):
         last = nn.Conv2d(hidden, 2 * latent, 1)
         # two distributions that begin far apart have a divergence of thousands, beside which nothing else is learned
         nn.init.normal_(last.weight, std=0.01)
-        nn.init.zeros_(last.bias)
         self.last_conv = nn.Sequential(last)
 
     def forward(self, features: Tensor) -> LatentDistribution:
