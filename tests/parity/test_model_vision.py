@@ -5,6 +5,8 @@ TransformerLSS ran on CPU with random weights (tests/data/golden/model/README.md
 value; converted weights are exact.
 """
 
+from dataclasses import replace
+
 import pytest
 import torch
 from golden_model import check_close
@@ -17,7 +19,10 @@ from deepaccident_devkit.model.lift import CameraGeometry, LiftConfig, LiftSplat
 def swin_neck(golden_model):
     """The golden set, the backbone and the neck with its weights."""
     golden = golden_model("swin_neck")
-    swin, neck = golden.config["swin"], golden.config["neck"]
+    return golden, *encoder_of(golden, golden.config["swin"], golden.config["neck"])
+
+
+def encoder_of(golden, swin, neck):
     config = SwinConfig(
         embed_dims=swin["embed_dims"],
         depths=tuple(swin["depths"]),
@@ -30,7 +35,7 @@ def swin_neck(golden_model):
     for module, prefix in zip(modules, ("img_backbone.", "img_neck."), strict=True):
         module.load_state_dict(golden.state(prefix))
         module.eval()
-    return golden, *modules
+    return modules
 
 
 def test_swin_and_its_neck_equal_the_released_ones(swin_neck):
@@ -94,31 +99,38 @@ def test_names_and_shapes_are_those_of_the_released_model(request, config):
 def lss(golden_model):
     """The golden set, a lift with its weights and its cameras."""
     golden = golden_model("lss")
-    grid = golden.config["grid_conf"]
+    return golden, lift_of(golden, golden.config), cameras_of(golden.inputs())
+
+
+def lift_of(golden, released):
+    grid = released["grid_conf"]
     config = LiftConfig(
-        in_channels=golden.config["numC_input"],
-        channels=golden.config["numC_Trans"],
+        in_channels=released["numC_input"],
+        channels=released["numC_Trans"],
         depth=tuple(grid["dbound"]),
         x=tuple(grid["xbound"]),
         y=tuple(grid["ybound"]),
         z=tuple(grid["zbound"]),
-        image_size=tuple(golden.config["input_dim"]),
-        stride=golden.config["downsample"],
+        image_size=tuple(released["input_dim"]),
+        stride=16,
         frustum="corners",
         voxel_rounding="trunc",
     )
-    given = golden.inputs()
-    cameras = CameraGeometry(
-        rotation=given["rots"],
-        translation=given["trans"],
-        intrinsics=given["intrins"],
-        image_rotation=given["post_rots"],
-        image_translation=given["post_trans"],
-    )
     lift = LiftSplat(config).eval()
-    assert torch.equal(lift.frustum, golden.state("transformer.")["frustum"])
-    lift.load_state_dict(golden.state("transformer."))
-    return golden, lift, cameras
+    state = golden.state("transformer.")
+    assert torch.equal(lift.frustum, state["frustum"])
+    lift.load_state_dict(state)
+    return lift
+
+
+def cameras_of(given, prefix=""):
+    return CameraGeometry(
+        rotation=given[f"{prefix}rots"],
+        translation=given[f"{prefix}trans"],
+        intrinsics=given[f"{prefix}intrins"],
+        image_rotation=given[f"{prefix}post_rots"],
+        image_translation=given[f"{prefix}post_trans"],
+    )
 
 
 def test_the_lift_equals_the_released_one(lss):
@@ -134,7 +146,7 @@ def test_the_lift_equals_the_released_one(lss):
 def test_truncation_folds_the_points_that_the_released_one_folds(lss):
     golden, lift, cameras = lss
     folded = golden.outputs()["folded_points"]
-    floor = LiftSplat(LiftConfig(**{**_fields(lift.config), "voxel_rounding": "floor"}))
+    floor = LiftSplat(replace(lift.config, voxel_rounding="floor"))
     floor.load_state_dict(lift.state_dict())
     theirs, ours = lift.cells(cameras).flatten(0, 1), floor.cells(cameras).flatten(0, 1)
     assert torch.equal(theirs != ours, folded)
@@ -142,5 +154,19 @@ def test_truncation_folds_the_points_that_the_released_one_folds(lss):
     assert (int(folded.sum()), int((ours >= 0).sum())) == (52, 2953)
 
 
-def _fields(config):
-    return {name: getattr(config, name) for name in config.__dataclass_fields__}
+def test_images_of_all_agents_become_the_released_maps(golden_model):
+    """Golden end_to_end: the whole released model; within the 1e-3 that float16 leaves of its maps."""
+    golden = golden_model("end_to_end")
+    config, given, out = golden.config, golden.inputs(), golden.outputs()
+    backbone, neck = encoder_of(golden, config["img_backbone"], config["img_neck"])
+    lift = lift_of(golden, config["transformer"])
+    agents = [f"agent{a}." for a in range(config["num_agents"])]
+    images = torch.cat([given[f"{agent}images"] for agent in agents]).float()
+    with torch.no_grad():
+        features = neck(backbone(images.flatten(0, 2)))
+        maps = [
+            lift(part, cameras_of(given, agent))
+            for part, agent in zip(features.unflatten(0, images.shape[:3]).split(1), agents, strict=True)
+        ]
+    check_close(features, out["neck"])
+    check_close(torch.cat(maps), out["lss"], 1e-3)
