@@ -163,10 +163,10 @@ class LiftSplat(nn.Module):
         """
         config = self.config
         points = self.points(cameras)
-        lower, _, step = points.new_tensor([config.x, config.y, config.z]).unbind(1)
-        if config.voxel_rounding == "trunc":
-            # as the release computes it, from the first cell's centre: its last bit decides for points on an edge
-            lower = points.new_tensor([low + size / 2 for low, _, size in (config.x, config.y, config.z)]) - step / 2
+        axes = (config.x, config.y, config.z)
+        step = points.new_tensor([size for _, _, size in axes])
+        # in this order rounding lets points on a border fall where the release has them
+        lower = points.new_tensor([low + size / 2 for low, _, size in axes]) - step / 2
         steps = (points - lower) / step
         steps = steps.trunc() if config.voxel_rounding == "trunc" else steps.floor()
         rows, columns = config.grid_shape

@@ -10,6 +10,7 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.model.images import (
     ResNet,
     ResNetConfig,
+    SmallConv,
     SmallConvConfig,
     Swin,
     SwinConfig,
@@ -17,6 +18,7 @@ from deepaccident_devkit.model.images import (
     image_encoder,
     normalised,
 )
+from deepaccident_devkit.model.images.resnet import BasicBlock, Bottleneck
 from deepaccident_devkit.model.images.swin import PatchMerging
 from deepaccident_devkit.model.images.swin_attention import ShiftedWindowAttention, map_of, neighbours, windows_of
 
@@ -133,6 +135,22 @@ def norm_shapes(name: str, channels: int) -> dict[str, tuple[int, ...]]:
     return {**{f"{name}.{part}": (channels,) for part in parts}, f"{name}.num_batches_tracked": ()}
 
 
+@pytest.mark.parametrize(
+    ("block", "last_norm"),
+    [
+        (BasicBlock(32, 32), "bn2"),
+        (Bottleneck(32, 8), "bn3"),
+        (SmallConv(SmallConvConfig()).fine[3], "layers.4"),
+    ],
+    ids=["BasicBlock", "Bottleneck", "SmallConv"],
+)
+def test_a_block_without_its_last_norm_is_its_shortcut(block, last_norm):
+    features = noise(2, 32, 4, 6)
+    assert not torch.equal(block(features), features.relu())
+    nn.init.zeros_(block.get_submodule(last_norm).weight)
+    assert torch.equal(block(features), features.relu())
+
+
 @pytest.mark.parametrize(("depth", "weights"), [(18, 11_176_512), (50, 23_508_032)])
 def test_resnet_has_the_names_of_torchvision(depth, weights):
     """The counts are those that torchvision states, less the classifier's."""
@@ -145,6 +163,16 @@ def test_resnet_has_the_names_of_torchvision(depth, weights):
 
 
 # --- Swin
+
+
+def test_checkpointing_computes_blocks_again_in_training_alone():
+    network = Swin(SwinConfig(**SMALL_SWIN, checkpointing=True))
+    calls = []
+    network.stages[0].blocks[1].norm1.register_forward_hook(lambda *_: calls.append(1))
+    network.eval()(noise(1, 3, 32, 32))[1].sum().backward()
+    assert len(calls) == 1
+    network.train()(noise(1, 3, 32, 32))[1].sum().backward()
+    assert len(calls) == 3
 
 
 def test_checkpointing_changes_neither_values_nor_gradients():
