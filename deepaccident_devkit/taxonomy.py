@@ -9,6 +9,9 @@ AgentName = Literal["ego_vehicle", "ego_vehicle_behind", "other_vehicle", "other
 Frame = Literal["world", "ego", "lidar"]
 OnError = Literal["raise", "skip"]
 Layout = Literal["A", "B"]
+ModelPreset = Literal["released", "tiny"]
+ModelFusion = Literal["mean", "max", "released", "disconet", "cobevt", "v2xvit"]
+"""Of `deepaccident_devkit.model`; here, so that they can be listed without torch."""
 
 AGENTS: Final[tuple[AgentName, ...]] = (
     "ego_vehicle",

@@ -37,6 +37,8 @@ _VERBS = (
     "evaluate",
     "results",
     "baseline",
+    "train",
+    "predict",
     "render",
     "replay",
     "export",

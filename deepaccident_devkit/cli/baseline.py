@@ -10,9 +10,12 @@ from deepaccident_devkit.baselines.predict_results import is_predicted, samples_
 from deepaccident_devkit.baselines.study_parts import StudyInParts
 from deepaccident_devkit.cli.evaluate_options import resamples_parameter
 from deepaccident_devkit.cli.options import (
+    LINK_OPTIONS,
     WordChoice,
     cooperating_parameter,
     engine_of,
+    link_of,
+    link_parameters,
     names_or_configuration,
     part_parameters,
     refuse_unused,
@@ -28,7 +31,6 @@ from deepaccident_devkit.files import writable_folder, write_bytes
 from deepaccident_devkit.motion.sample_lists import Scope, no_samples_text
 from deepaccident_devkit.parallel import Part, Shard, mine
 from deepaccident_devkit.taxonomy import AGENTS
-from deepaccident_devkit.v2x import Link
 
 _ALONE = "single"
 _RELEASED_HORIZON = Baseline().horizon
@@ -42,7 +44,6 @@ _MODEL = click.option(
     show_default=True,
     help="How the baseline moves each actor into the future.",
 )
-_SEED = click.option("--seed", default=0, show_default=True, help="Seed of the pose noise.")
 _SCOPE = click.option(
     "--scope",
     type=WordChoice(get_args(Scope)),
@@ -72,16 +73,7 @@ def baseline() -> None:
 )
 @cooperating_parameter("Agents that share what they see", _ALONE)
 @_MODEL
-@click.option(
-    "--latency", default=0.0, show_default=True, help="Delay of the partners' data, in seconds, in steps of 0.1."
-)
-@click.option(
-    "--pose-noise",
-    default=0.0,
-    show_default=True,
-    help="Mean position error of the partners' poses, in metres.",
-)
-@_SEED
+@link_parameters
 @click.option(
     "--horizon", default=_RELEASED_HORIZON, show_default=True, help="How many seconds to predict, in steps of 0.5."
 )
@@ -100,13 +92,12 @@ def predict(split: str, tasks: tuple[str, ...], purpose: Any, scope: Scope, out:
 
     The files are motion/, accident.json and detection.json. If the command is interrupted, the same command continues.
     """
-    noise, latency, seed = options.pop("pose_noise"), options.pop("latency"), options.pop("seed")
-    link = Link(latency=latency, pose_noise=noise or None, seed=seed) if noise or latency else None
+    link = link_of(options)
     options["agents"] = names_or_configuration(options["agents"]) or _ALONE
     if options["agents"] == _ALONE:
-        refuse_unused("with --agents single, which has no partners", "latency", "pose_noise", "seed")
-    if not noise:
-        refuse_unused("without --pose-noise", "seed")
+        refuse_unused("with --agents single, which has no partners", *LINK_OPTIONS)
+    if link is None or not (link.pose_noise or link.packet_loss):
+        refuse_unused("without --pose-noise or --packet-loss", "seed")
     if purpose == "all":
         refuse_unused("with --samples all, which are those of all scenarios", "scope")
     part: Part = options.pop("part")

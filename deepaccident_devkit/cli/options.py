@@ -15,7 +15,7 @@ from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.parallel import MERGE, Part, Shard, cluster_executor
 from deepaccident_devkit.taxonomy import AGENTS, VERSIONS
 from deepaccident_devkit.text import choice, meant_text
-from deepaccident_devkit.v2x import AGENT_SETS, AVAILABLE
+from deepaccident_devkit.v2x import AGENT_SETS, AVAILABLE, Link
 
 _ALL = ("all", AVAILABLE)
 Verb = TypeVar("Verb", bound=Callable[..., Any])
@@ -90,9 +90,33 @@ _UNUSED = tuple(
 )
 
 
+LINK_OPTIONS = ("latency", "pose_noise", "packet_loss", "seed")
+"""Their names as parameters of a verb."""
+_LINK = (
+    click.option(
+        "--latency", default=0.0, show_default=True, help="Delay of the partners' data, in seconds, in steps of 0.1."
+    ),
+    click.option(
+        "--pose-noise",
+        default=0.0,
+        show_default=True,
+        help="Mean position error of the partners' poses, in metres.",
+    ),
+    click.option(
+        "--packet-loss", default=0.0, show_default=True, help="Probability that a partner's data do not arrive."
+    ),
+    click.option("--seed", default=0, show_default=True, help="Seed of all that is drawn."),
+)
+
+
 def release_parameters(verb: Verb) -> Verb:
     """Give a verb DATAROOT, --version, --index-dir, --on-error and what `engine_parameters` gives."""
     return _DATAROOT(_VERSION(_INDEX_DIR(engine_parameters(on_error_parameter(verb)))))
+
+
+def reader_parameters(verb: Verb) -> Verb:
+    """Give a verb that runs in one process DATAROOT, --version, --index-dir, --workers and --on-error."""
+    return _DATAROOT(_VERSION(_INDEX_DIR(_WORKERS(on_error_parameter(verb)))))
 
 
 def engine_parameters(verb: Verb) -> Verb:
@@ -204,6 +228,36 @@ def cooperating_parameter(whose: str, default: str) -> Callable[[Verb], Verb]:
         metavar="NAME[,NAME…]",
         help=f"{whose}: names, or one of {', '.join(AGENT_SETS)} (those that are there).  [default: {default}]",
     )
+
+
+def model_parameters(verb: Verb) -> Verb:
+    """Give a verb that runs the model `device` and `images_cache`."""
+    options = (
+        click.option(
+            "--device", default="auto", show_default=True, help="cpu, cuda, …; auto takes a GPU where there is one."
+        ),
+        click.option(
+            "--images-cache", type=click.Path(path_type=Path), help="Folder of `deepaccident cache` with the images."
+        ),
+    )
+    for option in reversed(options):
+        verb = option(verb)
+    return verb
+
+
+def link_parameters(verb: Verb) -> Verb:
+    """Give a verb `latency`, `pose_noise`, `packet_loss` and `seed` (`link_of` reads them)."""
+    for option in reversed(_LINK):
+        verb = option(verb)
+    return verb
+
+
+def link_of(options: dict[str, Any]) -> Link | None:
+    """Take the link's options out of a verb's; None if nothing happens to the partners' data."""
+    latency, noise, loss, seed = (options.pop(name) for name in LINK_OPTIONS)
+    if not (latency or noise or loss):
+        return None
+    return Link(latency=latency, pose_noise=noise or None, packet_loss=loss, seed=seed)
 
 
 def names_or_configuration(given: tuple[str, ...]) -> str | list[str] | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,9 @@ from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.model.images import from_official
 from deepaccident_devkit.reading import read_bytes
 
+BEST: Final = "best.safetensors"
+FINAL: Final = "final.safetensors"
+"""In a run's folder: the weights with the best score or, of a run that was not validated, those of the last step."""
 _META: Final = "deepaccident"
 _UNUSED: Final = ("v2x_fusion.", "pts_bbox_head.taskfeat_encoders.map.", "pts_bbox_head.task_decoders.map.")
 """Beginnings of names that only the release or BEVerse has: its dead V2X layers, and the map task."""
@@ -70,13 +74,15 @@ class Loaded(ShortRepr):
         return f"{len(self.loaded)} of {whole} tensors loaded{kept}{unused}"
 
 
-def read_weights(path: str | Path) -> Weights:
-    """The weights in a file: safetensors, or a foreign checkpoint (`.pth`, `.pt`).
+def read_weights(path: str | os.PathLike[str]) -> Weights:
+    """The weights in a file: safetensors, or a foreign checkpoint (`.pth`, `.pt`); of a run's folder, the best.
 
     Raises:
         ConfigError: the file is not there, cannot be read, or holds no state dict.
     """
     path = Path(path)
+    if path.is_dir():
+        path = next((path / name for name in (BEST, FINAL) if (path / name).is_file()), path / BEST)
     try:
         content = read_bytes(path, "weights")
     except OSError as error:

@@ -18,6 +18,7 @@ from deepaccident_devkit.model.lift import LiftConfig
 from deepaccident_devkit.model.motion import MotionHeadConfig, MotionLossConfig
 from deepaccident_devkit.model.temporal import TemporalConfig
 from deepaccident_devkit.motion import MotionLabelConfig
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x import Agents, Link
 
 
@@ -80,6 +81,11 @@ class ModelConfig:
     def grid(self) -> BevGrid:
         """The cells of the maps that are fused."""
         return BevGrid(x=self.temporal.grid.x, y=self.temporal.grid.y)
+
+    @property
+    def horizon(self) -> float:
+        """Seconds that motion is predicted."""
+        return self.labels.future_frames * self.labels.step * FRAME_PERIOD
 
     @property
     def labels_protocol(self) -> str | None:

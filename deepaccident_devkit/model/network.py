@@ -13,7 +13,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -47,11 +48,19 @@ class Predictions(NamedTuple):
 
 
 class V2XFormer(nn.Module):
-    """The model that a configuration describes; its state dict has the release's names."""
+    """The model that a configuration describes; its state dict has the release's names.
+
+    Attributes:
+        config: what it was made of.
+        notes: what is known of its weights (`checkpoint.Weights.meta`).
+    """
+
+    notes: Mapping[str, Any]
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
         self.config = config
+        self.notes = {}
         self.img_backbone, self.img_neck = image_encoder(config.encoder)
         self.transformer = LiftSplat(config.lift)
         self.temporal_model = temporal_model(config.temporal)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, get_args
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.model.bev import BevEncodeConfig, BevUNetConfig
+from deepaccident_devkit.model.checkpoint import load_weights, read_weights
 from deepaccident_devkit.model.config import ModelConfig
 from deepaccident_devkit.model.detection import (
     ONE_TASK,
@@ -31,15 +34,13 @@ from deepaccident_devkit.model.fusion import (
 from deepaccident_devkit.model.images import SmallConvConfig, SwinConfig
 from deepaccident_devkit.model.lift import LiftConfig
 from deepaccident_devkit.model.motion import MotionHeadConfig
+from deepaccident_devkit.model.network import V2XFormer
 from deepaccident_devkit.model.temporal import TemporalConfig
 from deepaccident_devkit.model.warps import GridBounds
 from deepaccident_devkit.motion import MotionLabelConfig
-from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.taxonomy import FRAME_PERIOD, ModelFusion, ModelPreset
 from deepaccident_devkit.text import choice as chosen_word
 from deepaccident_devkit.text import settle_choices
-
-PresetName = Literal["released", "tiny"]
-FusionName = Literal["mean", "max", "released", "disconet", "cobevt", "v2xvit"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,13 +53,13 @@ class ModelChoice:
         horizon: seconds that motion is predicted; None for 2.
     """
 
-    preset: PresetName = "tiny"
-    fusion: FusionName | None = None
+    preset: ModelPreset = "tiny"
+    fusion: ModelFusion | None = None
     horizon: float | None = None
 
     def __post_init__(self) -> None:
         """Check; raises ChoiceError or ConfigError."""
-        settle_choices(self, {"preset": get_args(PresetName), "fusion": (None, *get_args(FusionName))})
+        settle_choices(self, {"preset": get_args(ModelPreset), "fusion": (None, *get_args(ModelFusion))})
         if self.horizon is not None:
             self._frames(PRESETS[self.preset]())
 
@@ -82,8 +83,8 @@ class ModelChoice:
         return {"preset": self.preset, "fusion": self.fusion, "horizon": self.horizon}
 
     @classmethod
-    def from_dict(cls, described: Mapping[str, Any]) -> ModelChoice:
-        """The choice that notes of weights or a run describe.
+    def from_dict(cls, described: Mapping[str, Any], path: Path) -> ModelChoice:
+        """The choice that the notes of a file's weights describe.
 
         Raises:
             ConfigError: they do not describe one.
@@ -92,7 +93,8 @@ class ModelChoice:
             return cls(**{name: described[name] for name in ("preset", "fusion", "horizon")})
         except (KeyError, TypeError, ValueError) as error:
             raise ConfigError(
-                f"model: expected preset, fusion and horizon ({error}); give weights of the devkit"
+                f"{path}: does not say which model its weights are of ({error}); give weights of deepaccident train, "
+                "or begin a training from these: deepaccident train --from"
             ) from error
 
     def _frames(self, config: ModelConfig) -> int:
@@ -101,6 +103,19 @@ class ModelChoice:
         if not (1 <= frames < 100 and abs(frames - round(frames)) < 1e-6):
             raise ConfigError(f"horizon: {self.horizon!r} s is no number of steps of {step:g} s; choose 0.5, 1, 1.5, …")
         return round(frames)
+
+
+def load_model(path: str | os.PathLike[str]) -> V2XFormer:
+    """The model of a run's folder, or of a file of our own weights; on the CPU.
+
+    Raises:
+        ConfigError: there are no weights, they are not the devkit's, or they do not fit their own notes.
+    """
+    weights = read_weights(path)
+    model = V2XFormer(ModelChoice.from_dict(weights.meta, weights.path).config)
+    load_weights(model, weights, whole=True)
+    model.notes = dict(weights.meta)
+    return model
 
 
 def fusion_config(name: str, channels: int) -> FusionConfig:
@@ -125,7 +140,7 @@ def fusion_config(name: str, channels: int) -> FusionConfig:
             V2XViTConfig(channels=channels, depth=1, windows=(5, 10, 20)) if small else V2XViTConfig(channels=channels)
         ),
     }
-    return made[chosen_word("fusion", name, get_args(FusionName))]()
+    return made[chosen_word("fusion", name, get_args(ModelFusion))]()
 
 
 def released() -> ModelConfig:

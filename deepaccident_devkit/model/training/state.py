@@ -15,7 +15,6 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.model.checkpoint import read_weights, write_weights
 
 LAST: Final = "last.safetensors"
-BEST: Final = "best.safetensors"
 _MODEL, _OPTIMIZER = "model.", "optimizer."
 
 

@@ -8,7 +8,6 @@ import logging
 import os
 import time
 from collections.abc import Callable, Mapping
-from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -24,7 +23,7 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.files import writable_folder, write_bytes
 from deepaccident_devkit.json_text import parsed_json
-from deepaccident_devkit.model.checkpoint import load_weights, read_weights, write_weights
+from deepaccident_devkit.model.checkpoint import BEST, FINAL, load_weights, read_weights, write_weights
 from deepaccident_devkit.model.network import V2XFormer
 from deepaccident_devkit.model.predicting import PredictConfig, check_images
 from deepaccident_devkit.model.presets import ModelChoice
@@ -33,7 +32,7 @@ from deepaccident_devkit.model.training.data import Moments, batches
 from deepaccident_devkit.model.training.log import add_to_log, cut_log, read_log
 from deepaccident_devkit.model.training.place import Place, processes
 from deepaccident_devkit.model.training.schedule import freeze, generator_of, learning_rate, optimizer_of, positions
-from deepaccident_devkit.model.training.state import BEST, Progress, load_state, save_state
+from deepaccident_devkit.model.training.state import Progress, load_state, save_state
 from deepaccident_devkit.model.training.step import TrainingStep, training_batch, with_dropped_partners
 from deepaccident_devkit.model.training.validation import SCORE, validated, validation_samples
 from deepaccident_devkit.reading import read_bytes
@@ -112,7 +111,7 @@ def _model(choice: ModelChoice, config: TrainConfig, weights: str | os.PathLike[
     torch.manual_seed(config.seed)
     model = V2XFormer(choice.config)
     if weights is not None:
-        say(f"{weights}: {load_weights(model, read_weights(Path(weights))).to_text()}")
+        say(f"{weights}: {load_weights(model, read_weights(weights)).to_text()}")
     freeze(model, config.freeze)
     return model
 
@@ -264,7 +263,7 @@ class _Run:
                 self._draw()
         return progress
 
-    def _weights(self, model: V2XFormer, progress: Progress, name: str = "weights.safetensors") -> Path:
+    def _weights(self, model: V2XFormer, progress: Progress, name: str = FINAL) -> Path:
         """Write the weights alone."""
         path = self.folder / name
         write_weights(path, model.state_dict(), {**self.notes, "step": progress.step, "score": progress.best})
@@ -279,30 +278,15 @@ class _Run:
         trial = TrainingStep(copy.deepcopy(model))
         numbers = positions(len(self.moments), config, first=0)
         took = []
-        with closing(_Timer()) as timer:
-            for index, batch in zip(range(_TIMED), batches(self.moments, numbers, config), strict=False):
-                torch.stack(list(self._losses(trial, batch, (index, 0)).values())).sum().backward()
-                took.append(timer.lap())
+        for index, batch in zip(range(_TIMED), batches(self.moments, numbers, config), strict=False):
+            began = time.perf_counter()
+            torch.stack(list(self._losses(trial, batch, (index, 0)).values())).sum().backward()
+            took.append(time.perf_counter() - began)
         each = min(took) * config.accumulate
         times = samples and -(-config.steps // config.validate_every) - progress.step // config.validate_every
         return f"{left:,} steps on {self.place.device}, {each:.2f} s each: some {_duration(left * each)}" + (
             f", and {times} validations of {samples} samples" if times else ""
         )
-
-
-class _Timer:
-    """Seconds since the last lap."""
-
-    def __init__(self) -> None:
-        self._last = time.perf_counter()
-
-    def lap(self) -> float:
-        now = time.perf_counter()
-        took, self._last = now - self._last, now
-        return took
-
-    def close(self) -> None:
-        """Nothing to give back."""
 
 
 def _duration(seconds: float) -> str:

@@ -1,0 +1,106 @@
+"""`deepaccident train`: train the model on a release."""
+
+from pathlib import Path
+from typing import Any, get_args
+
+import click
+
+from deepaccident_devkit.cli.options import (
+    WordChoice,
+    cooperating_parameter,
+    model_parameters,
+    names_or_configuration,
+    reader_parameters,
+)
+from deepaccident_devkit.deepaccident import DeepAccident
+from deepaccident_devkit.taxonomy import ModelFusion, ModelPreset
+
+_CHOICE = ("preset", "fusion", "horizon")
+_TRAINING = ("steps", "moments", "egos", "accumulate", "split", "validation", "samples", "seed", "bf16")
+_EXAMPLES = """\b
+Examples:
+  deepaccident train DATAROOT --preset tiny --agents all --out runs/all
+  deepaccident train DATAROOT --from runs/single --agents all --freeze img_backbone. --out runs/warm
+  torchrun --nproc-per-node 4 -m deepaccident_devkit.cli train DATAROOT --preset released --bf16 --out runs/big"""
+
+
+@click.command(epilog=_EXAMPLES)
+@reader_parameters
+@click.option(
+    "--preset",
+    type=WordChoice(get_args(ModelPreset)),
+    default="tiny",
+    show_default=True,
+    help="The model: the released one, or one that a laptop trains.",
+)
+@click.option(
+    "--fusion", type=WordChoice(get_args(ModelFusion)), help="How the agents' maps are joined.  [default: the preset's]"
+)
+@click.option("--horizon", type=float, help="How many seconds to predict, in steps of 0.5.  [default: 2]")
+@cooperating_parameter("Agents that cooperate with each ego", "all")
+@click.option("--split", default="train", show_default=True, help="Name of a split, or a split file (.txt).")
+@click.option(
+    "--validation", default="val", show_default=True, help="Split whose score chooses the best weights; none for none."
+)
+@click.option(
+    "--samples",
+    type=WordChoice(["train", "all", "every"]),
+    default="all",
+    show_default=True,
+    help="train: one a second, as released. all: two a second. every: ten a second.",
+)
+@click.option("--steps", type=click.IntRange(min=1), default=1500, show_default=True, help="Steps of the optimizer.")
+@click.option(
+    "--moments", type=click.IntRange(min=1), default=1, show_default=True, help="Moments a step, each with all agents."
+)
+@click.option("--accumulate", type=click.IntRange(min=1), default=1, show_default=True, help="Batches a step.")
+@click.option("--egos", type=click.IntRange(min=1), help="Agents of a moment that are the ego in turn.  [default: all]")
+@click.option("--learning-rate", type=float, default=2e-3, show_default=True, help="The highest learning rate.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of all that is drawn.")
+@click.option(
+    "--from",
+    "weights",
+    type=click.Path(path_type=Path),
+    help="Run or file of weights to begin from; or a checkpoint of the release, BEVerse, Swin or ResNet.",
+)
+@click.option(
+    "--freeze", multiple=True, metavar="NAME", help="Do not train parameters whose names begin so; you can repeat this."
+)
+@model_parameters
+@click.option("--bf16", is_flag=True, help="Compute in bfloat16, on GPUs.")
+@click.option(
+    "--images-cache", type=click.Path(path_type=Path), help="Folder of `deepaccident cache` to take images from."
+)
+@click.option(
+    "--out", required=True, type=click.Path(path_type=Path), metavar="RUN", help="Folder of weights, log and curves."
+)
+def train(weights: Path | None, **options: Any) -> None:
+    """Train the model on the release in DATAROOT.
+
+    If the command is interrupted or killed, the same command goes on from the last checkpoint.
+    """
+    from deepaccident_devkit.model import ModelChoice, TrainConfig
+    from deepaccident_devkit.model import train as train_model
+
+    validation = options["validation"]
+    config = TrainConfig(
+        agents=names_or_configuration(options["agents"]) or "all",
+        learning_rate=options["learning_rate"],
+        freeze=options["freeze"],
+        **{**{name: options[name] for name in _TRAINING}, "validation": None if validation == "none" else validation},
+    )
+    choice = ModelChoice(**{name: options[name] for name in _CHOICE})
+    dataset = DeepAccident(**{name: options[name] for name in ("dataroot", "version", "index_dir", "on_error")})
+    best = train_model(
+        dataset,
+        options["out"],
+        choice,
+        config,
+        weights=weights,
+        device=options["device"],
+        workers=options["workers"] or 0,
+        images_cache=options["images_cache"],
+        say=click.echo,
+    )
+    click.echo(f"weights: {best}")
+    click.echo(f"next: deepaccident predict {options['out']} {options['dataroot']} --split val --out results")
