@@ -245,6 +245,14 @@ def model_parameters(verb: Verb) -> Verb:
     return verb
 
 
+def use_threads_sparingly() -> None:
+    """Let threads that have nothing to do sleep, unless the environment says otherwise; before torch is imported.
+
+    By default they spin, and on a machine with other work each step then takes several times as long.
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+
 def link_parameters(verb: Verb) -> Verb:
     """Give a verb `latency`, `pose_noise`, `packet_loss` and `seed` (`link_of` reads them)."""
     for option in reversed(_LINK):

@@ -15,6 +15,7 @@ from deepaccident_devkit.cli.options import (
     names_or_configuration,
     reader_parameters,
     refuse_unused,
+    use_threads_sparingly,
 )
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
@@ -50,9 +51,6 @@ Examples:
     help="Accident scenarios only, or all scenarios.",
 )
 @model_parameters
-@click.option(
-    "--images-cache", type=click.Path(path_type=Path), help="Folder of `deepaccident cache` to take images from."
-)
 @click.option("--out", required=True, type=click.Path(path_type=Path), metavar="DIR", help="Folder to write into.")
 def predict(run: Path, split: str, purpose: Any, scope: Scope, out: Path, **options: Any) -> None:
     """Predict a split of the release in DATAROOT with the model that was trained in RUN.
@@ -60,6 +58,7 @@ def predict(run: Path, split: str, purpose: Any, scope: Scope, out: Path, **opti
     RUN is a run's folder, or a file of weights. It writes motion/, accident.json and detection.json, which
     `deepaccident evaluate` takes.
     """
+    use_threads_sparingly()
     from deepaccident_devkit.model import PredictConfig, checked_device, load_model, predict_results
 
     seed, link = options["seed"], link_of(options)

@@ -11,6 +11,7 @@ from deepaccident_devkit.cli.options import (
     model_parameters,
     names_or_configuration,
     reader_parameters,
+    use_threads_sparingly,
 )
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.taxonomy import ModelFusion, ModelPreset
@@ -69,9 +70,6 @@ Examples:
 @model_parameters
 @click.option("--bf16", is_flag=True, help="Compute in bfloat16, on GPUs.")
 @click.option(
-    "--images-cache", type=click.Path(path_type=Path), help="Folder of `deepaccident cache` to take images from."
-)
-@click.option(
     "--out", required=True, type=click.Path(path_type=Path), metavar="RUN", help="Folder of weights, log and curves."
 )
 def train(weights: Path | None, **options: Any) -> None:
@@ -79,6 +77,7 @@ def train(weights: Path | None, **options: Any) -> None:
 
     If the command is interrupted or killed, the same command goes on from the last checkpoint.
     """
+    use_threads_sparingly()
     from deepaccident_devkit.model import ModelChoice, TrainConfig
     from deepaccident_devkit.model import train as train_model
 

@@ -285,7 +285,7 @@ class _Run:
         each = min(took) * config.accumulate
         times = samples and -(-config.steps // config.validate_every) - progress.step // config.validate_every
         return f"{left:,} steps on {self.place.device}, {each:.2f} s each: some {_duration(left * each)}" + (
-            f", and {times} validations of {samples} samples" if times else ""
+            f", and {times} × {samples} samples to validate" if times else ""
         )
 
 
