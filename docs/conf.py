@@ -41,7 +41,7 @@ myst_heading_anchors = 3
 
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
-autodoc_mock_imports = ["torch"]  # its adapter is described without it
+autodoc_mock_imports = ["torch", "safetensors"]  # the adapter and the model are described without them
 napoleon_numpy_docstring = False
 napoleon_attr_annotations = False  # signatures have the types
 napoleon_use_ivar = True  # attributes are a list below their class, not an entry each

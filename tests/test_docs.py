@@ -77,6 +77,8 @@ NOT_RUN = {
     "render accident OUT": "tests/unit/synth/test_own_files.py has it, on a release of a scenario file",
     "baseline v2x": "tests/test_cli_baseline.py has it, on smaller releases",
     "info s3:": "tests/cloud has releases on S3",
+    "train ": "tests/torch_extra/model/test_commands.py has them; they need torch",
+    "predict ": "likewise",
     "results from": "tests/unit/export/test_nuscenes_detections.py has it, and makes the file",
     "export mcap": "tests/unit/export has it, which has the extra",
 }

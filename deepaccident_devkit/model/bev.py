@@ -4,6 +4,8 @@ Every task has a crop and an encoder of its own, as in BEVerse (the released `Be
 `BevUNet` is our small encoder; its result has half the grid's resolution.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import torch

@@ -5,6 +5,8 @@ handedness, so long as all that goes in has the same. Products are written as su
 round a matrix product to bfloat16, and metres need more digits than that.
 """
 
+from __future__ import annotations
+
 from typing import Literal
 
 import torch

@@ -4,6 +4,8 @@ The released TemporalBlock and Bottleneck3D, which it has from FIERY. The sequen
 agents in the released fusion's unused part. Attributes have the names of the released state dict.
 """
 
+from __future__ import annotations
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional

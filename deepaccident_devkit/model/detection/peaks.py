@@ -1,5 +1,7 @@
 """Peaks of the heatmap: a Gaussian at the cell of each box, wide enough for its size (CornerNet, CenterNet)."""
 
+from __future__ import annotations
+
 import torch
 from torch import Tensor
 

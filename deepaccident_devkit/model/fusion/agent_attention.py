@@ -1,5 +1,7 @@
 """V2X-ViT's heterogeneous attention over agents: vehicles and infrastructure have weights of their own."""
 
+from __future__ import annotations
+
 import torch
 from torch import Tensor, nn
 

@@ -1,5 +1,7 @@
 """Which module a config stands for."""
 
+from __future__ import annotations
+
 from typing import TypeAlias
 
 from deepaccident_devkit.errors import ConfigError

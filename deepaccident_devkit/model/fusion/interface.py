@@ -1,5 +1,7 @@
 """What every fusion module takes and gives, and the two operations on agents that they share."""
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from typing import ClassVar
 

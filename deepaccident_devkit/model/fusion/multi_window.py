@@ -1,5 +1,7 @@
 """V2X-ViT's attention in windows of several sizes, each agent's map for itself."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import torch

@@ -1,5 +1,7 @@
 """The parts that the transformers CoBEVT and V2X-ViT share; tokens have their channels last."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import torch

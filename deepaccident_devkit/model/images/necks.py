@@ -1,5 +1,7 @@
 """`FpnNeck`: a fine and a coarse feature map → one map of the fine one's size."""
 
+from __future__ import annotations
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional

@@ -1,5 +1,7 @@
 """`SmallConv`: an image backbone small enough to be trained on a CPU, of 0.1 million weights."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -1,5 +1,7 @@
 """What is read off each frame's state: segmentation, instances' centres, and their offset and flow vectors."""
 
+from __future__ import annotations
+
 from typing import Final, NamedTuple
 
 import torch

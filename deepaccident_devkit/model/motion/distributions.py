@@ -4,6 +4,8 @@ As in FIERY and BEVerse (the released `SpatialDistributionModule`): a diagonal n
 a quarter as fine as the features.
 """
 
+from __future__ import annotations
+
 from collections import OrderedDict
 from typing import NamedTuple
 

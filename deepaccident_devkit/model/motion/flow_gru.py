@@ -3,6 +3,8 @@
 BEVerse's iterative flow (the released `ResFuturePrediction`).
 """
 
+from __future__ import annotations
+
 from typing import Final, Literal
 
 import torch

@@ -1,5 +1,7 @@
 """The motion head: a latent, the future states of the BEV features, and the maps that are read off each of them."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple

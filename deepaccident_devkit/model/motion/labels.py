@@ -1,5 +1,7 @@
 """The labels that the motion head learns from, as tensors."""
 
+from __future__ import annotations
+
 from typing import Final, Literal, NamedTuple
 
 import torch

@@ -1,5 +1,7 @@
 """The losses of the motion head, FIERY's as BEVerse weighs them."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Final
 
