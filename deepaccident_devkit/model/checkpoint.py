@@ -89,7 +89,7 @@ def read_weights(path: str | os.PathLike[str]) -> Weights:
         raise ConfigError(
             f"{path}: weights cannot be read ({error.strerror or error}); give a file of weights"
         ) from error
-    if content[:2] == b"PK" or content[:1] == b"\x80":  # what torch.save writes, or wrote
+    if content[8:9] != b"{" and content[:2] in (b"PK", b"\x80\x02"):  # what torch.save writes, or wrote
         return Weights(tensors=_foreign(content, path), meta={}, path=path)
     try:
         tensors = load(content)

@@ -6,7 +6,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
+from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import MissingExtraError
 
 
@@ -16,6 +18,20 @@ def test_without_torch_the_adapter_names_the_extra(monkeypatch: pytest.MonkeyPat
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(MissingExtraError, match=r"pip install '\.\[torch\]'"):
         from deepaccident_devkit.export.torch import V2XDataset  # noqa: F401
+
+
+@pytest.mark.parametrize("words", [["train", "x", "--out", "y"], ["predict", "x", "x", "--out", "y"]])
+def test_without_torch_the_models_commands_name_the_extra(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, words: list[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("x").mkdir()
+    for name in [name for name in sys.modules if name.startswith("deepaccident_devkit.model")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(MissingExtraError, match=r"the model needs PyTorch.*pip install '\.\[torch\]'"):
+        CliRunner().invoke(deepaccident, words, catch_exceptions=False)
+    assert CliRunner().invoke(deepaccident, [words[0], "--help"]).exit_code == 0
 
 
 def test_the_devkit_itself_does_not_import_torch() -> None:

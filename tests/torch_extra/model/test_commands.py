@@ -1,0 +1,147 @@
+"""`deepaccident train` and `predict`, and the commands of docs/training.md, on the session's small release."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+import torch
+from click.testing import CliRunner, Result
+
+from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.errors import ConfigError, DeepAccidentError, NotAvailableError
+from deepaccident_devkit.evaluation import read_results
+from deepaccident_devkit.model import load_model, read_weights
+
+QUICK = ("--validation", "none", "--device", "cpu")
+PAGE = Path(__file__).parents[3] / "docs" / "training.md"
+
+
+def run(*words: object) -> Result:
+    return CliRunner().invoke(deepaccident, [str(word) for word in words], catch_exceptions=False)
+
+
+def refusal(kind: type[DeepAccidentError], *words: object) -> str:
+    """The error of a command, one line."""
+    with pytest.raises(kind) as caught:
+        run(*words)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.fixture(scope="module")
+def trained(release_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run of two steps."""
+    out = tmp_path_factory.mktemp("model") / "a run"
+    result = run("train", release_root, "--steps", 2, "--out", out, *QUICK)
+    assert result.exit_code == 0
+    assert re.search(r"2 steps on cpu, \d+\.\d\d s each: some \d+ s", result.output)
+    assert f"weights: {out / 'final.safetensors'}" in result.output
+    return out
+
+
+def test_a_run_has_weights_log_and_curves(trained: Path) -> None:
+    names = {path.name for path in trained.iterdir()}
+    assert names == {"run.json", "log.jsonl", "curves.png", "final.safetensors", "last.safetensors"}
+    rows = [json.loads(line) for line in (trained / "log.jsonl").read_text(encoding="utf-8").splitlines()]
+    assert [row["step"] for row in rows] == [1, 2]
+    assert set(rows[0]["losses"]) >= {"motion_seg", "motion_prob", "task0.loss_heatmap"}
+    notes = read_weights(trained).meta
+    assert (notes["preset"], notes["step"], notes["training"]["agents"]) == ("tiny", 2, "all")
+
+
+def test_the_same_command_again_finds_all_steps_done(trained: Path, release_root: Path) -> None:
+    before = (trained / "final.safetensors").read_bytes()
+    result = run("train", release_root, "--steps", 2, "--out", trained, *QUICK)
+    assert "steps on cpu" not in result.output
+    assert (trained / "final.safetensors").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("agents", "link"), [("all", ()), ("single", ()), ("+other", ("--pose-noise", 0.3, "--packet-loss", 0.5))]
+)
+def test_one_set_of_weights_predicts_for_any_agents(
+    trained: Path, release_root: Path, tmp_path: Path, agents: str, link: tuple[object, ...]
+) -> None:
+    """The release's scenarios are as short as 0.6 s, so that each agent has two samples, the first without a past."""
+    out = tmp_path / "results"
+    split = tmp_path / "later.txt"
+    folder = next(path for path in sorted(release_root.iterdir()) if path.name.startswith("type1"))
+    scenario = next((folder / "meta").iterdir()).stem
+    split.write_text(f"{folder.name} {scenario}\n", encoding="utf-8")
+    chosen = ("--split", split, "--samples", "evaluate", "--scope", "all", "--device", "cpu")
+    result = run("predict", trained, release_root, "--agents", agents, *link, *chosen, "--out", out)
+    assert result.exit_code == 0
+    for task, name in {"motion": "motion", "accident": "accident.json", "detection": "detection.json"}.items():
+        found = read_results(out / name)
+        assert found.task == task
+        assert found.meta["agents"] == agents
+        assert found.meta["model"]["preset"] == "tiny"
+        assert f"{task}: {len(found.tokens)} samples in {out / name}" in result.output
+    assert read_results(out / "motion").form.grid.shape == (100, 100)
+    for task in ("motion", "accident", "detection"):
+        results = out / {"motion": "motion"}.get(task, f"{task}.json")
+        protocol = ("--protocol", "boxes") if task == "accident" else ("--switch", "labels=clean") * (task == "motion")
+        judged = ("--split", split, "--scope", "all", "--json")
+        evaluated = run("evaluate", task, release_root, "--results", results, *protocol, *judged)
+        assert evaluated.exit_code == 0
+
+
+def test_what_is_there_already_is_not_overwritten(trained: Path, release_root: Path, tmp_path: Path) -> None:
+    (tmp_path / "accident.json").write_text("mine", encoding="utf-8")
+    said = refusal(
+        DeepAccidentError,
+        *("predict", trained, release_root, "--split", "train", "--scope", "all", "--out", tmp_path, "--device", "cpu"),
+    )
+    assert "accident.json: is there already" in said
+    assert (tmp_path / "accident.json").read_text(encoding="utf-8") == "mine"
+    assert not (tmp_path / "motion").exists()
+
+
+def test_weights_of_another_model_say_which_keys_differ(trained: Path, release_root: Path, tmp_path: Path) -> None:
+    words = ("train", release_root, "--fusion", "disconet", "--steps", 1, "--out", tmp_path / "run", *QUICK)
+    warm = run(*words, "--from", trained)
+    assert "as they were: v2x_fusion." in warm.output
+    other = ("train", release_root, "--preset", "released", "--steps", 1, "--out", tmp_path / "big", *QUICK)
+    said = refusal(ConfigError, *other, "--from", trained)
+    assert "weights of the preset 'tiny' do not fit this model" in said
+    assert re.search(r"\d+ of the model are missing \(img_backbone\.", said)
+
+
+def test_a_release_without_images(release_root_b: Path, trained: Path, tmp_path: Path) -> None:
+    for words in (("train", release_root_b, "--out", tmp_path / "run"), ("predict", trained, release_root_b)):
+        named = words if words[0] == "train" else (*words, "--out", tmp_path / "results", "--samples", "all")
+        said = refusal(NotAvailableError, *named, "--split", "train", "--device", "cpu")
+        assert "this release has no images" in said
+        assert "deepaccident synth OUT --sensors cameras" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--device", "nowhere"), "device: 'nowhere' cannot be used"),
+        (("--horizon", 0.7), "horizon: 0.7 s is no number of steps of 0.5 s"),
+        (("--freeze", "nothing"), "no parameter's name begins with 'nothing'"),
+        (("--from", "absent.pth"), "absent.pth: weights cannot be read"),
+        (("--split", "nowhere"), "nowhere"),
+    ],
+)
+def test_wrong_options_are_one_line(release_root: Path, tmp_path: Path, words: tuple[object, ...], said: str) -> None:
+    found = refusal(DeepAccidentError, "train", release_root, "--steps", 1, *QUICK, *words, "--out", tmp_path / "run")
+    assert said in found
+
+
+def test_weights_that_do_not_say_what_they_are_of(trained: Path, tmp_path: Path) -> None:
+    torch.save(load_model(trained).state_dict(), tmp_path / "foreign.pth")
+    said = refusal(ConfigError, "predict", tmp_path / "foreign.pth", tmp_path, "--out", tmp_path / "results")
+    assert "does not say which model its weights are of" in said
+
+
+def test_the_pages_commands_exist() -> None:
+    """They would take half an hour; here they are only parsed."""
+    lines = re.findall(r"^    deepaccident (train|predict) (.+)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    assert {verb for verb, _ in lines} == {"train", "predict"}
+    for verb, words in lines:
+        command = deepaccident.get_command(None, verb)
+        assert command is not None
+        command.make_context(verb, words.split(), resilient_parsing=True)
