@@ -110,10 +110,10 @@ CHOICES = (
 
 
 def public_classes() -> dict[str, type]:
-    """Name with its package → each public class that is no choice, enum or error; torch's adapter has none."""
+    """Name with its package → each public class that is no choice, enum or error; what needs torch is left out."""
     found: dict[type, str] = {}
     for module in pkgutil.walk_packages(deepaccident_devkit.__path__, "deepaccident_devkit."):
-        if module.ispkg and ".torch" not in module.name and "._" not in module.name:
+        if module.ispkg and not re.search(r"\.(torch|model)\b", module.name) and "._" not in module.name:
             for kind in exported(import_module(module.name)):
                 found.setdefault(kind, f"{module.name}.{kind.__name__}")
     return {name: kind for kind, name in found.items()}
