@@ -6,7 +6,7 @@ from torch.testing import assert_close
 from torch.utils.data import DataLoader
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import ConfigError, NotAvailableError
+from deepaccident_devkit.errors import ConfigError, MissingFileError, NotAvailableError
 from deepaccident_devkit.export.torch import (
     AllEgosDataset,
     ImageConfig,
@@ -71,10 +71,17 @@ def test_absent_agents_are_neither_egos_nor_partners(da_partial: DeepAccident, m
     config = V2XConfig(agents="available", points=False, on_missing="skip", **CONFIG)
     whole, single = AllEgosDataset(da_partial, there, config)[0], AllEgosDataset(da_partial, there[-2:], config)[0]
     batch = collate_all_egos([whole, single])
-    assert batch["partners"].shape == (6, 4)
+    assert batch["partners"].shape == (4, 4)
     assert batch["partners"].all()
     ego = whole["agents"].index("ego_vehicle")
     assert whole["agent_valid"].all(dim=1).tolist() == [a != ego for a in range(4)]
+    assert whole["egos"] == tuple(there[:-1])
+    first = AllEgosDataset(da_partial, there[::-1], config)[0]  # the one without its files is the first
+    assert first["egos"] == tuple(there[-2::-1])
+    for key, value in first["targets"][0].items():
+        assert torch.equal(value, whole["targets"][-1][key])
+    with pytest.raises(MissingFileError, match="no agent has all its sensor files"):
+        AllEgosDataset(da_partial, there[-1:], config)[0]
 
 
 def test_a_link_is_refused(da: DeepAccident, moment: list[str]) -> None:

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.errors import ConfigError, MissingFileError
 from deepaccident_devkit.export.torch import sensor_data
 from deepaccident_devkit.export.torch.collate import V2XItem
 from deepaccident_devkit.export.torch.config import V2XConfig
@@ -25,7 +25,7 @@ class AllEgosDataset(V2XDataset):
     An item has what a `V2XDataset` item has of sensor data, for the first ego of the moment and all agents that the
     release has there, all with the same augmentation, and:
 
-    - `egos`: tokens of the E samples of this moment.
+    - `egos`: tokens of the E samples of this moment, without agents whose own sensor files are skipped.
     - `partners` (E, A) bool: the agents that cooperate with each ego, as the configuration's `agents` says, itself
       included.
     - `targets`: E dicts with the boxes, labels and segmentation of a `V2XDataset` item, each in its ego's own frame.
@@ -35,6 +35,8 @@ class AllEgosDataset(V2XDataset):
     Attributes:
         egos: the samples of each item.
     """
+
+    _needs_own = False
 
     def __init__(self, dataset: Dataset, tokens: Iterable[RowArgument], config: V2XConfig | None = None) -> None:
         """Choose the egos' samples, in any order; those of one moment become one item.
@@ -69,9 +71,15 @@ class AllEgosDataset(V2XDataset):
     def item(self, index: int, epoch: int) -> V2XItem:
         """The same in an epoch that is given here, and not by `set_epoch`: for loaders that run on through epochs."""
         position = range(len(self))[operator.index(index)]
-        egos = self.egos[position]
         augmentation = self.config.augmentation_of(epoch, position)
-        item = self._received_item(egos[0], augmentation)
+        item = self._received_item(self.egos[position][0], augmentation)
+        there = [name for name, valid in zip(item["agents"], item["agent_valid"][:, -1], strict=True) if valid]
+        egos = [ego for ego in self.egos[position] if ego.rsplit("/", 2)[1] in there]
+        if not egos:
+            raise MissingFileError(
+                f"{self.egos[position][0]}: no agent has all its sensor files at this moment; leave it out, or "
+                "choose fewer cameras"
+            )
         heard = [sensor_data.participants(self._dataset, ego, self._agents) for ego in egos]
         item["egos"] = tuple(egos)
         item["partners"] = tensor(np.array([[name in names for name in item["agents"]] for names in heard]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
@@ -86,6 +86,9 @@ class V2XDataset(TorchDataset):
     works in forked and in spawned workers.
     """
 
+    _needs_own: ClassVar[bool] = True
+    """Whether an item cannot be made without the files of the sample's own agent."""
+
     def __init__(self, dataset: Dataset, tokens: Iterable[RowArgument], config: V2XConfig | None = None) -> None:
         """Choose samples, such as those of `motion.training_samples`, and the contents of their items.
 
@@ -162,7 +165,9 @@ class V2XDataset(TorchDataset):
         dataset, config = self._dataset, self.config
         names = sensor_data.participants(dataset, sample, config.agents)
         received = sensor_data.received(dataset, sample, names, config)
-        arrived, lacking = sensor_data.with_files(dataset, sample, names, received, config, self._cache)
+        arrived, lacking = sensor_data.with_files(
+            dataset, sample, names, received, config, self._cache, needs_own=self._needs_own
+        )
         world_from_ego = dataset.world_from(sample, "ego").matrix @ np.linalg.inv(augmentation.matrix)
         item: dict[str, Any] = {
             "token": sample,

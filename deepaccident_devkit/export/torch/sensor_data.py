@@ -66,13 +66,16 @@ def with_files(
     arrived: Received,
     config: V2XConfig,
     cache: ImageCache | None,
+    *,
+    needs_own: bool = True,
 ) -> tuple[Received, IntArray]:
     """The messages whose sensor files are all there, and how many files each agent and frame (A, P) lacks.
 
     With a cache, images are there if it has them.
 
     Raises:
-        MissingFileError: a file is not there, and it is the sample's own of the present or `on_missing` is `raise`.
+        MissingFileError: a file is not there, and `on_missing` is `raise`, or it is the sample's own of the present,
+            which it needs.
     """
     channels = (*[LIDAR] * config.points, *(() if config.images is None else config.images.cameras))
     files = MissingFiles(dataset.dataroot, config.on_missing)
@@ -86,7 +89,7 @@ def with_files(
     for p, moment in enumerate(arrived):
         for name, message in moment.items():
             lacking[names.index(name), p] = sum(lacks(f"{message.sample}/{channel}", channel) for channel in channels)
-    if lacking[0, -1]:
+    if needs_own and lacking[0, -1]:
         raise MissingFileError(
             f"{sample}: {lacking[0, -1]} of {len(channels)} sensor files of this sample's own agent are not there, and "
             "on_missing='skip' leaves out other agents and frames alone; leave out such samples, or choose "

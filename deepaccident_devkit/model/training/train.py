@@ -248,7 +248,7 @@ class _Run:
         progress = replace(progress, step=done)
         row = dict(row)
         if tokens and (done % config.validate_every == 0 or last):
-            scores = validated(model, self.dataset, tokens, self.predict)
+            scores = validated(model, self.dataset, tokens[self.place.rank :: self.place.ranks], self.predict)
             row["validation"] = scores
             self.say(f"step {done:,}: {', '.join(f'{name} {value:.3f}' for name, value in scores.items())}")
             if progress.best is None or scores[SCORE] > progress.best:

@@ -10,6 +10,7 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.evaluation import DetectionEvaluator, MotionEvaluator, detection_truth
 from deepaccident_devkit.evaluation.metrics.detection import DETECTION_PROTOCOLS, DetectedBoxes
 from deepaccident_devkit.evaluation.metrics.motion.protocol import MOTION_PROTOCOLS
+from deepaccident_devkit.export.torch import merged_evaluator
 from deepaccident_devkit.model.network import V2XFormer
 from deepaccident_devkit.model.predicting import PredictConfig, predictions
 from deepaccident_devkit.model.training.config import TrainConfig
@@ -37,7 +38,7 @@ def validated(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config:
     Args:
         model: on the configuration's device.
         dataset: the release.
-        tokens: of the samples.
+        tokens: of the samples; where several processes train, this one's, and the scores are of all of them.
         config: who cooperates.
 
     Raises:
@@ -51,7 +52,7 @@ def validated(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config:
         pose = dataset.world_from(found.token, rules.frame).inverse()
         boxes = DetectedBoxes(boxes=found.boxes.boxes.transform(pose, rules.frame), scores=found.boxes.scores)
         detection.update(found.token, boxes, detection_truth(dataset, found.token, rules))
-    wide = motion.compute().ranges[_WIDE]
-    percent = {"iou": wide.iou, "vpq": wide.pq, "map": detection.compute().mean_average_precision}
+    wide = merged_evaluator(motion).compute().ranges[_WIDE]
+    percent = {"iou": wide.iou, "vpq": wide.pq, "map": merged_evaluator(detection).compute().mean_average_precision}
     known = {name: 0.0 if math.isnan(value) else value / 100 for name, value in percent.items()}
     return {**known, SCORE: (known["iou"] + known["vpq"]) / 2}
