@@ -21,7 +21,7 @@ from deepaccident_devkit.model.detection import decode_detections, detected_boxe
 from deepaccident_devkit.model.entry import mirrored_boxes, model_inputs
 from deepaccident_devkit.model.motion import MotionMaps
 from deepaccident_devkit.model.network import V2XFormer
-from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD
 from deepaccident_devkit.v2x import Agents, Link
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def predictions(
         DeepAccidentError: as of `V2XDataset`.
         NotAvailableError: the release has no images.
     """
-    check_images(dataset, tokens)
+    check_images(dataset, tokens[:1])
     given = model.config.inputs(config.agents, link=config.link, images_cache=config.images_cache)
     data = V2XDataset(dataset, tokens, given)
     loader: DataLoader[Any] = DataLoader(data, collate_fn=collate, num_workers=config.workers)  # type: ignore[arg-type]
@@ -96,14 +96,13 @@ def predictions(
 
 
 def check_images(dataset: Dataset, tokens: Sequence[str]) -> None:
-    """Raise NotAvailableError, with the remedy, if the first sample has no images."""
-    for token in tokens[:1]:
-        path = dataset.sensor_path(f"{token}/Camera_Front")
-        if not path.exists():
-            raise NotAvailableError(
-                f"{path}: the model sees with cameras, and this release has no images of {token}; unpack its camera "
-                "folders, or make a release with them: deepaccident synth OUT --sensors cameras"
-            )
+    """Raise NotAvailableError, with the remedy, if none of these samples has an image."""
+    paths = [dataset.sensor_path(f"{token}/{channel}") for token in tokens for channel in CAMERAS]
+    if paths and not any(path.exists() for path in paths):
+        raise NotAvailableError(
+            f"{paths[0]}: the model sees with cameras, and this release has no images of {tokens[0]}; unpack its camera "
+            "folders, or make a release with them: deepaccident synth OUT --sensors cameras"
+        )
 
 
 def prediction_of(model: V2XFormer, batch: dict[str, Any], config: PredictConfig) -> SamplePrediction:

@@ -8,6 +8,7 @@ import pytest
 import torch
 from click.testing import CliRunner, Result
 
+from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ConfigError, DeepAccidentError, NotAvailableError
 from deepaccident_devkit.evaluation import read_results
@@ -145,3 +146,10 @@ def test_the_pages_commands_exist() -> None:
         command = deepaccident.get_command(None, verb)
         assert command is not None
         command.make_context(verb, words.split(), resilient_parsing=True)
+
+
+def test_a_partial_release_trains_with_the_agents_that_are_there(da_partial: DeepAccident, tmp_path: Path) -> None:
+    """It has no other_vehicle_behind, and the ego no front camera."""
+    words = ("train", da_partial.dataroot, "--steps", 1, "--out", tmp_path / "run", *QUICK)
+    assert "other_vehicle_behind is not in this release" in refusal(NotAvailableError, *words)
+    assert run(*words, "--agents", "available").exit_code == 0
