@@ -100,8 +100,8 @@ def check_images(dataset: Dataset, tokens: Sequence[str]) -> None:
     paths = [dataset.sensor_path(f"{token}/{channel}") for token in tokens for channel in CAMERAS]
     if paths and not any(path.exists() for path in paths):
         raise NotAvailableError(
-            f"{paths[0]}: the model sees with cameras, and this release has no images of {tokens[0]}; unpack its camera "
-            "folders, or make a release with them: deepaccident synth OUT --sensors cameras"
+            f"{paths[0]}: the model sees with cameras, and this release has no images of {tokens[0]}; unpack its "
+            "camera folders, or make a release with them: deepaccident synth OUT --sensors cameras"
         )
 
 
