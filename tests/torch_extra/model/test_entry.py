@@ -1,0 +1,171 @@
+"""The model's door: its frame, frames that did not arrive, and egomotion."""
+
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.export.torch import AllEgosDataset, V2XConfig, V2XDataset, collate, collate_all_egos
+from deepaccident_devkit.geometry.handedness import flip_points, flip_pose, flip_six_vector, flip_vectors2, flip_yaw
+from deepaccident_devkit.model.config import ModelConfig
+from deepaccident_devkit.model.entry import ModelInputs, mirrored_boxes, model_inputs
+from deepaccident_devkit.model.poses import matrices_from_six
+from deepaccident_devkit.motion import Augmentation
+
+PAST = 3
+TURNED = Augmentation(rotation=0.3, scale=1.04, flip=True)
+
+
+@pytest.fixture(scope="module")
+def given(config: ModelConfig) -> V2XConfig:
+    """Three frames, so that there may be a gap."""
+    labels = replace(config.labels, receptive_field=PAST)
+    return V2XConfig(agents="all", past=PAST, step=1, images=config.images, points=False, labels=labels)
+
+
+@pytest.fixture(scope="module", params=[Augmentation(), TURNED], ids=["plain", "augmented"])
+def batch(request: pytest.FixtureRequest, da: DeepAccident, moment: list[str], given: V2XConfig) -> dict[str, Any]:
+    """Of one item; with an augmentation, too."""
+    return collate([V2XDataset(da, moment[1:2], replace(given, augmentation=request.param))[0]])
+
+
+def points(inputs: ModelInputs) -> torch.Tensor:
+    """What cameras see in the middle of a pixel, in each agent's frame."""
+    cameras = inputs.cameras
+    seen = torch.linalg.inv(cameras.intrinsics) @ torch.tensor([120.0, 70.0, 8.0])
+    return (cameras.rotation @ seen[..., None])[..., 0] + cameras.translation
+
+
+def test_a_left_handed_model_sees_all_in_the_mirror(batch: dict[str, Any]) -> None:
+    """Against the functions of the devkit's one place of signs."""
+    bend = matrices_from_six(torch.tensor([0.1, 0.3, 0.02, 0.01, 0.02, 0.2]))  # cars of the release drive straight on
+    augmented = batch["augmentation"] @ bend @ torch.linalg.inv(batch["augmentation"])
+    bent = batch | {"agent_from_past": augmented @ batch["agent_from_past"]}
+    right, left = model_inputs(bent), model_inputs(bent, "left")
+    flips = {"ego_from_agent": flip_pose, "bev_transform": flip_pose, "egomotion": flip_six_vector}
+    for name, flip in flips.items():
+        mirrored = flip(getattr(right, name).numpy())
+        np.testing.assert_allclose(getattr(left, name).numpy(), mirrored, atol=1e-5)
+        assert name == "bev_transform" or np.abs(mirrored - getattr(right, name).numpy()).max() > 1e-3
+    np.testing.assert_allclose(points(left).numpy(), flip_points(points(right).numpy()), atol=1e-4)
+    for name in ("images", "frame_valid", "ego_rows", "partners", "is_infrastructure", "delay"):
+        assert torch.equal(getattr(left, name), getattr(right, name))
+    assert torch.equal(left.cameras.intrinsics, right.cameras.intrinsics)
+
+
+def test_a_right_handed_model_sees_the_batch_as_it_is(batch: dict[str, Any]) -> None:
+    inputs = model_inputs(batch)
+    assert torch.equal(inputs.images, batch["images"])
+    assert torch.equal(inputs.bev_transform, batch["augmentation"])
+    assert torch.equal(inputs.cameras.rotation, batch["ego_from_camera"][..., :3, :3])
+    assert torch.equal(inputs.cameras.translation, batch["ego_from_camera"][..., :3, 3])
+    assert torch.equal(inputs.cameras.intrinsics, batch["intrinsics"])
+    assert_close(inputs.ego_from_agent, batch["ego_from_agent"][:, :, -1])
+    assert inputs.ego_rows.tolist() == [[0, 0]]
+    assert inputs.partners.tolist() == [[True] * 5]
+    assert [name == "infrastructure" for name in batch["agents"][0]] == inputs.is_infrastructure[0].tolist()
+
+
+def test_boxes_are_mirrored_as_the_devkit_does() -> None:
+    boxes = torch.randn(6, 9, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert mirrored_boxes(boxes, "right") is boxes
+    left = mirrored_boxes(boxes, "left").numpy()
+    np.testing.assert_array_equal(left[:, :3], flip_points(boxes[:, :3]))
+    np.testing.assert_array_equal(left[:, 3:6], boxes[:, 3:6])
+    np.testing.assert_array_equal(left[:, 6], flip_yaw(boxes[:, 6]))
+    np.testing.assert_array_equal(left[:, 7:], flip_vectors2(boxes[:, 7:]))
+    assert torch.equal(mirrored_boxes(torch.as_tensor(left), "left"), boxes)
+
+
+def test_egomotion_is_that_of_the_labels_without_the_augmentation(
+    da: DeepAccident, moment: list[str], given: V2XConfig, batch: dict[str, Any]
+) -> None:
+    """Each agent's own, against the labels of a sample of that agent."""
+    rows = model_inputs(batch).egomotion
+    assert not rows[:, :, -1].any()
+    for column, name in enumerate(batch["agents"][0]):
+        [token] = [each for each in moment if each.split("/")[-2] == name]
+        wanted = V2XDataset(da, [token], replace(given, images=None))[0]["future_egomotion"]
+        assert_close(rows[0, column, :-1], wanted[: PAST - 1], atol=1e-4, rtol=0)
+    assert rows[:, :, :-1, 0].abs().max() > 0.1  # somebody drives
+
+
+@pytest.mark.parametrize(
+    ("arrived", "valid"),
+    [
+        ([True, True, True], [True, True, True]),
+        ([True, False, True], [False, False, True]),
+        ([False, True, True], [False, True, True]),
+        ([False, False, True], [False, False, True]),
+    ],
+)
+def test_a_frame_that_did_not_arrive_is_the_present(
+    batch: dict[str, Any], arrived: list[bool], valid: list[bool]
+) -> None:
+    """What lies before a gap cannot be joined, and so is lost too."""
+    changed = batch | {"agent_valid": batch["agent_valid"].clone()}
+    changed["agent_valid"][0, 2] = torch.tensor(arrived)
+    whole, inputs = model_inputs(batch), model_inputs(changed)
+    assert inputs.frame_valid[0, 2].tolist() == valid
+    for frame, there in enumerate(valid):
+        source = frame if there else PAST - 1
+        assert torch.equal(inputs.images[0, 2, frame], batch["images"][0, 2, source])
+        assert torch.equal(inputs.cameras.rotation[0, 2, frame], batch["ego_from_camera"][0, 2, source, :, :3, :3])
+        assert torch.equal(inputs.cameras.intrinsics[0, 2, frame], batch["intrinsics"][0, 2, source])
+        expected = whole.egomotion[0, 2, frame] if there else torch.zeros(6)
+        assert torch.equal(inputs.egomotion[0, 2, frame], expected)
+    others = [0, 1, 3, 4]
+    assert torch.equal(inputs.images[:, others], whole.images[:, others])
+    assert inputs.frame_valid[:, others].all()
+
+
+def test_an_agent_whose_present_did_not_arrive_is_no_partner(batch: dict[str, Any]) -> None:
+    changed = batch | {"agent_valid": batch["agent_valid"].clone()}
+    changed["agent_valid"][0, 3, -1] = False
+    inputs = model_inputs(changed)
+    assert inputs.partners.tolist() == [[True, True, True, False, True]]
+    assert not inputs.frame_valid[0, 3].any()
+
+
+def test_the_first_frames_of_a_recording_have_no_past(da: DeepAccident, moment: list[str], given: V2XConfig) -> None:
+    first = moment[0].replace("/004", "/002")
+    inputs = model_inputs(collate([V2XDataset(da, [first], given)[0]]))
+    assert inputs.frame_valid[0].tolist() == [[False, True, True]] * 5
+    assert torch.equal(inputs.images[:, :, 0], inputs.images[:, :, 2])
+    assert not torch.equal(inputs.images[:, :, 1], inputs.images[:, :, 2])
+
+
+def test_only_partners_data_are_late(batch: dict[str, Any]) -> None:
+    assert model_inputs(batch, delay=3).delay.tolist() == [[0, 3, 3, 3, 3]]
+    assert not model_inputs(batch).delay.any()
+
+
+def test_egos_have_their_own_places(da: DeepAccident, moment: list[str], given: V2XConfig) -> None:
+    """Poses of each ego, whichever agent's frame the moment is given in."""
+    data = AllEgosDataset(da, moment[1:4], replace(given, agents="+other"))
+    inputs = model_inputs(collate_all_egos([data[0]]))
+    agents = data[0]["agents"]
+    assert [agents[column] for column in inputs.ego_rows[:, 1].tolist()] == [each.split("/")[-2] for each in moment[1:4]]
+    for row, token in enumerate(moment[1:4]):
+        ego_from_world = da.world_from(token, "ego").inverse()
+        for column, name in enumerate(agents):
+            partner = next(each for each in moment if each.split("/")[-2] == name)
+            expected = (ego_from_world @ da.world_from(partner, "ego")).matrix
+            np.testing.assert_allclose(inputs.ego_from_agent[row, column], expected, atol=1e-4)
+        assert inputs.partners[row, inputs.ego_rows[row, 1]]
+    some = inputs.of_egos(torch.tensor([2, 0]))
+    for name in ("ego_rows", "ego_from_agent", "partners"):
+        assert torch.equal(getattr(some, name), getattr(inputs, name)[[2, 0]])
+    assert some.images is inputs.images
+
+
+def test_all_tensors_go_to_a_device(batch: dict[str, Any]) -> None:
+    moved = model_inputs(batch).to("meta")
+    tensors = [getattr(moved, each.name) for each in fields(moved) if each.name != "cameras"]
+    tensors += [moved.cameras.rotation, moved.cameras.translation, moved.cameras.intrinsics]
+    assert {str(each.device) for each in tensors} == {"meta"}
+    assert moved.cameras.image_rotation is None
