@@ -1,5 +1,6 @@
 """Models in a small size, their data, and runs that several tests look at."""
 
+import functools
 import importlib.util
 from collections.abc import Callable
 from typing import Any
@@ -13,8 +14,9 @@ if importlib.util.find_spec("torch") is not None:
     import torch
     from torch_extra.model.small_model import small
 
+    from deepaccident_devkit.export.torch import ImageConfig, V2XConfig, V2XDataset, collate
     from deepaccident_devkit.model.config import ModelConfig
-    from deepaccident_devkit.model.entry import ModelInputs
+    from deepaccident_devkit.model.entry import Handedness, ModelInputs, model_inputs
     from deepaccident_devkit.model.network import V2XFormer
 
 
@@ -31,16 +33,26 @@ def moment(sample: str) -> list[str]:
     return [f"{scenario}/{agent}/{frame}" for agent in AGENTS]
 
 
-@pytest.fixture
-def seeded() -> Callable[..., "V2XFormer"]:
-    """A model with weights and batch statistics that depend on a seed alone, in evaluation mode."""
+@pytest.fixture(scope="session")
+def seeded(da: DeepAccident, moment: list[str]) -> Callable[..., "V2XFormer"]:
+    """A model whose weights depend on a seed alone, in evaluation mode.
+
+    Its batch statistics are those of a moment, so that signals neither fade nor grow on their way.
+    """
+
+    @functools.cache
+    def inputs(images: "ImageConfig", past: int, handedness: "Handedness") -> "ModelInputs":
+        given = V2XConfig(agents="all", past=past, step=1, images=images, points=False, boxes=None)
+        return model_inputs(collate([V2XDataset(da, moment[:1], given)[0]]), handedness)
 
     def made(config: "ModelConfig", seed: int = 0) -> "V2XFormer":
         torch.manual_seed(seed)
         model = V2XFormer(config)
-        for name, buffer in model.named_buffers():
-            if name.endswith("running_mean"):
-                buffer.normal_(std=0.1)
+        norms = [each for each in model.modules() if isinstance(each, torch.nn.modules.batchnorm._BatchNorm)]
+        for norm in norms:
+            norm.momentum = 1.0
+        with torch.no_grad():
+            model(inputs(config.images, config.temporal.frames, config.handedness))
         return model.eval()
 
     return made

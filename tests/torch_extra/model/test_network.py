@@ -1,0 +1,224 @@
+"""The whole model: egos, partners, order, and gradients."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, get_args
+
+import pytest
+import torch
+from torch.testing import assert_close
+from torch_extra.model.small_model import RUN, small, small_released
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.export.torch import AllEgosDataset, V2XDataset, collate, collate_all_egos
+from deepaccident_devkit.model.config import ModelConfig
+from deepaccident_devkit.model.entry import model_inputs
+from deepaccident_devkit.model.fusion import ReleasedFusionConfig
+from deepaccident_devkit.model.network import V2XFormer
+from deepaccident_devkit.model.presets import FusionName, fusion_config
+from deepaccident_devkit.model.training.step import TrainingStep, training_batch
+from deepaccident_devkit.v2x import Link
+
+Seeded = Callable[..., V2XFormer]
+Predicted = Callable[..., list[torch.Tensor]]
+FUSIONS = get_args(FusionName)
+_NO_BOXES = tuple(f"pts_bbox_head.task_decoders.3dod.task_heads.{task}." for task in (2, 4, 5))
+"""Released tasks whose categories the release of the tests lacks, or that have none: no gradient but of heatmaps."""
+
+
+def assert_same(found: list[torch.Tensor], expected: list[torch.Tensor], tolerance: float = 1e-4) -> None:
+    for one, other in zip(found, expected, strict=True):
+        assert_close(one, other, atol=tolerance, rtol=tolerance)
+
+
+def apart(one: list[torch.Tensor], other: list[torch.Tensor]) -> float:
+    return max(float((a - b).abs().max()) for a, b in zip(one, other, strict=True))
+
+
+def of_fusion(name: str, make: Callable[[], ModelConfig] = small) -> ModelConfig:
+    config = make()
+    channels = config.lift.channels
+    own = ReleasedFusionConfig(channels=channels, ego_channels=(1, 5))  # the released numbers are of 64 channels
+    return replace(config, fusion=own if name == "released" else fusion_config(name, channels))
+
+
+def alone(da: DeepAccident, token: str, config: ModelConfig, agents: Any, **options: Any) -> dict[str, Any]:
+    return V2XDataset(da, [token], config.inputs(agents, **options))[0]
+
+
+@pytest.mark.parametrize("agents", ["all", "single", "+other"])
+@pytest.mark.parametrize("make", [small, small_released])
+def test_all_egos_at_once_are_each_by_itself(
+    da: DeepAccident,
+    moment: list[str],
+    seeded: Seeded,
+    predicted: Predicted,
+    agents: str,
+    make: Callable[[], ModelConfig],
+) -> None:
+    """With the devkit's own items of each ego."""
+    config = make()
+    model = seeded(config)
+    [item] = AllEgosDataset(da, moment, config.inputs(agents))
+    together = predicted(model, model_inputs(collate_all_egos([item]), config.handedness))
+    egos = range(5) if make is small else (3,)
+    for row in egos:
+        inputs = model_inputs(collate([alone(da, moment[row], config, agents)]), config.handedness)
+        assert_same([each[row : row + 1] for each in together], predicted(model, inputs))
+
+
+def test_other_moments_of_a_batch_change_nothing(
+    da: DeepAccident, moment: list[str], config: ModelConfig, seeded: Seeded, predicted: Predicted
+) -> None:
+    """Nor does it matter that an item has fewer agents."""
+    model = seeded(config)
+    items = [
+        alone(da, moment[0], config, "all"),
+        alone(da, moment[1].replace("/004", "/001"), config, "single"),
+        alone(da, moment[4].replace("/004", "/006"), config, "+other"),
+    ]
+    together = predicted(model, model_inputs(collate(items)))
+    for row, item in enumerate(items):
+        one = predicted(model, model_inputs(collate([item])))
+        assert_same([each[row : row + 1] for each in together], one)
+    moments = AllEgosDataset(
+        da, [*moment, *(each.replace("/004", "/006") for each in moment[2:])], config.inputs("all")
+    )
+    both = predicted(model, model_inputs(collate_all_egos([moments[1], moments[0]])))
+    assert_same(
+        [torch.cat([each[3:], each[:3]]) for each in both],
+        [torch.cat(pair) for pair in zip(*each_alone, strict=True)],
+    )
+
+
+@pytest.mark.parametrize("name", FUSIONS)
+def test_the_order_of_partners_does_not_matter(
+    da: DeepAccident, moment: list[str], seeded: Seeded, predicted: Predicted, name: str
+) -> None:
+    config = of_fusion(name)
+    model = seeded(config)
+    item = alone(da, moment[0], config, "all")
+    order = [0, 3, 1, 4, 2]
+    tensors = ("agent_valid", "files_missing", "images", "ego_from_agent", "agent_from_past", "intrinsics")
+    shuffled = item | {key: item[key][order] for key in (*tensors, "ego_from_camera", "image_from_ego")}
+    shuffled["agents"] = tuple(item["agents"][row] for row in order)
+    results = [predicted(model, model_inputs(collate([each]))) for each in (item, shuffled)]
+    assert_same(*results)
+    single = predicted(model, model_inputs(collate([alone(da, moment[0], config, "single")])))
+    assert apart(results[0], single) > 1e-2
+
+
+@pytest.mark.parametrize("name", FUSIONS)
+def test_partners_that_are_not_heard_leave_the_ego_alone(
+    da: DeepAccident, moment: list[str], seeded: Seeded, predicted: Predicted, name: str
+) -> None:
+    """Exactly the single agent's prediction, whether masked or beside another item's partners."""
+    config = of_fusion(name)
+    model = seeded(config)
+    item, single = (alone(da, moment[1], config, agents) for agents in ("all", "single"))
+    inputs = model_inputs(collate([item]))
+    masked = replace(inputs, partners=torch.tensor([[True, False, False, False, False]]))
+    expected = predicted(model, model_inputs(collate([single])))
+    assert_same(predicted(model, masked), expected, 1e-5)
+    assert apart(predicted(model, inputs), expected) > 1e-2
+    beside = predicted(model, model_inputs(collate([single, item])))
+    assert_same([each[:1] for each in beside], expected)
+
+
+def test_absent_partners_change_nothing_else(
+    da: DeepAccident,
+    da_partial: DeepAccident,
+    moment: list[str],
+    config: ModelConfig,
+    seeded: Seeded,
+    predicted: Predicted,
+) -> None:
+    """A partial release, which lacks one vehicle and another one's camera, and those agents chosen by name."""
+    model = seeded(config)
+    ego = moment[2]
+    partial = alone(da_partial, ego, config, "available")
+    assert partial["agents"] == ("other_vehicle", "ego_vehicle", "ego_vehicle_behind", "infrastructure")
+    assert partial["agent_valid"][:, -1].tolist() == [True, False, True, True]
+    chosen = alone(da, ego, config, ["ego_vehicle_behind", "infrastructure"])
+    results = [predicted(model, model_inputs(collate([each]))) for each in (partial, chosen)]
+    assert_same(*results)
+    assert apart(results[0], predicted(model, model_inputs(collate([alone(da, ego, config, "all")])))) > 1e-2
+
+
+def test_lost_messages_change_nothing_else(
+    da: DeepAccident, moment: list[str], config: ModelConfig, seeded: Seeded, predicted: Predicted
+) -> None:
+    model = seeded(config)
+    single = predicted(model, model_inputs(collate([alone(da, moment[0], config, "single")])))
+    every = alone(da, moment[0], config, "all", link=Link(packet_loss=1.0))
+    assert every["agent_valid"][:, -1].tolist() == [True, False, False, False, False]
+    assert_same(predicted(model, model_inputs(collate([every]))), single)
+    draws = (alone(da, moment[0], config, "all", link=Link(packet_loss=0.4, seed=seed)) for seed in range(20))
+    some = next(each for each in draws if partly_heard(each["agent_valid"]))
+    heard = [name for name, valid in zip(some["agents"], some["agent_valid"][:, -1], strict=True) if valid]
+    chosen = alone(da, moment[0], config, heard[1:])
+    assert_same(*(predicted(model, model_inputs(collate([each]))) for each in (some, chosen)))
+
+
+def partly_heard(valid: torch.Tensor) -> bool:
+    """Whether some partners arrived with their past, and others did not."""
+    present = valid[1:, -1]
+    return 0 < int(present.sum()) < len(present) and bool(valid[1:, 0][present].all())
+
+
+def test_a_late_partner_is_told_to_fusions_that_ask(
+    da: DeepAccident, moment: list[str], seeded: Seeded, predicted: Predicted
+) -> None:
+    for name, differs in (("v2xvit", True), ("mean", False)):
+        config = of_fusion(name)
+        batch = collate([alone(da, moment[0], config, "all")])
+        fresh, late = (predicted(seeded(config), model_inputs(batch, delay=delay)) for delay in (0, 2))
+        assert (apart(fresh, late) > 1e-3) == differs
+
+
+def test_a_left_handed_model_maps_the_mirror_image(
+    da: DeepAccident, moment: list[str], config: ModelConfig, seeded: Seeded
+) -> None:
+    """The mean of all agents' lifted maps has no layers that could tell left from right: its rows are turned round."""
+    batch = collate([alone(da, moment[0], config, "all")])
+    fused = []
+    for model in (seeded(config), seeded(replace(config, handedness="left"))):
+        inputs = model_inputs(batch, model.config.handedness)
+        pixels = torch.nn.functional.pad(inputs.images.flatten(0, 3) / 255, (0, 0, 0, 12))
+        with torch.inference_mode():
+            features = model.img_neck(model.img_backbone(pixels)).unflatten(0, (5, 2, 6))
+            lifted = model.transformer(features, inputs.cameras.flattened())
+            fused.append(model.fused(lifted[None, :, -1], inputs))
+    assert_close(fused[0], fused[1].flip(-2), atol=1e-3, rtol=1e-3)
+    assert apart(fused[:1], fused[1:]) > 0.1
+
+
+@pytest.mark.parametrize("name", FUSIONS)
+def test_gradients_reach_every_parameter_of_tiny(da: DeepAccident, moment: list[str], name: str) -> None:
+    assert without_gradient(da, moment, of_fusion(name)) == []
+
+
+@pytest.mark.parametrize("name", FUSIONS)
+def test_gradients_reach_every_parameter_of_released(da: DeepAccident, moment: list[str], name: str) -> None:
+    """But those of boxes of tasks that see none: a heatmap alone learns that there is nothing."""
+    lacking = without_gradient(da, moment, of_fusion(name, small_released))
+    assert all(each.startswith(_NO_BOXES) and ".heatmap." not in each for each in lacking), lacking
+    assert len(lacking) == 3 * 5 * 5
+
+
+def without_gradient(da: DeepAccident, moment: list[str], config: ModelConfig) -> list[str]:
+    """Names of parameters whose gradient is 0, or was never made, with some egos and with the others.
+
+    The signs of a few boxes may cancel out in the gradient of a bias: hence not all at once.
+    """
+    torch.manual_seed(1)
+    model = V2XFormer(config)
+    given = config.inputs("all", boxes="sample", labels=config.labels)
+    batch = collate_all_egos([AllEgosDataset(da, moment, given)[0]])
+    lacking = {name for name, parameter in model.named_parameters() if parameter.requires_grad}
+    for seed in range(2):
+        inputs, targets = training_batch(batch, config, RUN, torch.Generator().manual_seed(seed))
+        model.zero_grad(set_to_none=True)
+        torch.stack(list(TrainingStep(model)(inputs, targets).values())).sum().backward()
+        lacking -= {name for name, each in model.named_parameters() if each.grad is not None and each.grad.any()}
+    return sorted(lacking)
