@@ -1,0 +1,131 @@
+"""Presets, what is changed in them, and configurations whose parts do not fit."""
+
+from dataclasses import replace
+from typing import Any, get_args
+
+import pytest
+import torch
+from torch_extra.model.small_model import small
+
+from deepaccident_devkit.errors import ChoiceError, ConfigError
+from deepaccident_devkit.export.images import ImageConfig
+from deepaccident_devkit.model.bev import BevUNetConfig
+from deepaccident_devkit.model.fusion import CobevtConfig, DiscoNetConfig, PoolFusionConfig, V2XViTConfig
+from deepaccident_devkit.model.network import V2XFormer
+from deepaccident_devkit.model.presets import PRESETS, FusionName, ModelChoice, fusion_config, released, tiny
+from deepaccident_devkit.v2x import Link
+
+
+def parameters(model: torch.nn.Module) -> int:
+    return sum(each.numel() for each in model.parameters())
+
+
+def test_tiny_has_half_a_million_parameters() -> None:
+    assert 0.4e6 < parameters(V2XFormer(tiny())) < 0.6e6
+
+
+def test_released_has_the_sizes_of_the_release() -> None:
+    """83.0 million, less the frustum; and its quirks, each in its field (model.md section 9)."""
+    config = released()
+    with torch.device("meta"):
+        assert 82.5e6 < parameters(V2XFormer(config)) < 83.5e6
+    assert (config.lift.frustum, config.lift.voxel_rounding) == ("corners", "trunc")
+    assert (config.temporal.warp, config.temporal.chain, config.temporal.egomotion_input) == (
+        "stretched",
+        "released",
+        "raw",
+    )
+    assert (config.motion.posterior_ignore, config.motion.hidden_warp) == ("keep", "none")
+    assert (config.handedness, config.labels.grid.orientation) == ("left", "released")
+    assert config.labels_protocol == "released"
+    assert len(config.detection.class_slots) == 6
+
+
+@pytest.mark.parametrize(
+    ("fusion", "kind"),
+    [("mean", PoolFusionConfig), ("disconet", DiscoNetConfig), ("cobevt", CobevtConfig), ("v2xvit", V2XViTConfig)],
+)
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_fusion_fits_its_preset(fusion: FusionName, kind: type, preset: Any) -> None:
+    config = ModelChoice(preset=preset, fusion=fusion).config
+    assert isinstance(config.fusion, kind)
+    assert replace(config, fusion=PRESETS[preset]().fusion) == PRESETS[preset]()
+    with torch.device("meta"):
+        V2XFormer(config)
+
+
+def test_every_fusion_has_a_config() -> None:
+    assert {type(fusion_config(name, 64)).__name__ for name in get_args(FusionName)} == {
+        "PoolFusionConfig",
+        "ReleasedFusionConfig",
+        "DiscoNetConfig",
+        "CobevtConfig",
+        "V2XViTConfig",
+    }
+    assert fusion_config("max", 64) != fusion_config("mean", 64)
+    with pytest.raises(ChoiceError, match="fusion: expected one of mean, max"):
+        fusion_config("sum", 64)
+
+
+def test_the_released_fusion_has_channels_that_a_small_model_lacks() -> None:
+    with pytest.raises(ConfigError, match="ego_channels: expected numbers from 0 to 31"):
+        _ = ModelChoice(preset="tiny", fusion="released").config
+
+
+@pytest.mark.parametrize(("horizon", "frames"), [(0.5, 1), (2.0, 4), (4, 8)])
+def test_a_horizon_is_a_number_of_frames(horizon: float, frames: int) -> None:
+    config = ModelChoice(horizon=horizon).config
+    assert config.motion.future_frames == config.labels.future_frames == frames
+
+
+@pytest.mark.parametrize("horizon", [0.0, -1.0, 0.7, 1000.0, float("nan")])
+def test_other_horizons_are_refused(horizon: float) -> None:
+    with pytest.raises(ConfigError, match=r"horizon: .* s is no number of steps of 0\.5 s; choose 0\.5, 1"):
+        ModelChoice(horizon=horizon)
+
+
+def test_unknown_words_are_refused() -> None:
+    with pytest.raises(ChoiceError, match="preset: expected one of released, tiny"):
+        ModelChoice(preset="large")  # type: ignore[arg-type]
+    with pytest.raises(ChoiceError, match="fusion"):
+        ModelChoice(fusion="sum")  # type: ignore[arg-type]
+
+
+def test_a_choice_can_be_noted_and_made_again() -> None:
+    choice = ModelChoice(preset="released", fusion="cobevt", horizon=3)
+    assert ModelChoice.from_dict({**choice.as_dict(), "step": 7}) == choice
+    for described in ({}, {"preset": "tiny"}, {"preset": "large", "fusion": None, "horizon": None}):
+        with pytest.raises(ConfigError, match="model: expected preset, fusion and horizon"):
+            ModelChoice.from_dict(described)
+    with pytest.raises(ConfigError, match="give weights of the devkit"):
+        ModelChoice.from_dict({"preset": "tiny", "fusion": None, "horizon": "long"})
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"images": ImageConfig(resize=(36, 64))}, "images.dtype: expected 'uint8'"),
+        (
+            {"temporal": replace(small().temporal, channels=9)},
+            "temporal.channels: expected 8, as lift.channels, found 9",
+        ),
+        ({"bev": BevUNetConfig(in_channels=9, out_channels=16)}, "bev.in_channels: expected 8"),
+        ({"motion": replace(small().motion, in_channels=9)}, "motion.in_channels: expected 16, as bev.out_channels"),
+        ({"detection": replace(small().detection, in_channels=9)}, "detection.in_channels: expected 16"),
+        ({"motion": replace(small().motion, future_frames=9)}, "motion.future_frames: expected 2, as labels.future"),
+        ({"temporal": replace(small().temporal, frames=3)}, "temporal.frames: expected 2, as labels.receptive_field"),
+    ],
+)
+def test_parts_that_do_not_fit_are_named(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        replace(small(), **changes)
+
+
+def test_inputs_are_what_the_model_sees() -> None:
+    config = small()
+    link = Link(latency=0.2)
+    given = config.inputs("all", link=link, boxes="sample")
+    assert (given.past, given.step, given.images) == (2, 1, config.images)
+    assert (given.agents, given.link, given.boxes, given.points) == ("all", link, "sample", False)
+    assert given.on_missing == "skip"
+    assert given.labels is None
