@@ -81,10 +81,10 @@ def test_other_moments_of_a_batch_change_nothing(
     for row, item in enumerate(items):
         one = predicted(model, model_inputs(collate([item])))
         assert_same([each[row : row + 1] for each in together], one)
-    moments = AllEgosDataset(
-        da, [*moment, *(each.replace("/004", "/006") for each in moment[2:])], config.inputs("all")
-    )
-    both = predicted(model, model_inputs(collate_all_egos([moments[1], moments[0]])))
+    later = [each.replace("/004", "/006") for each in moment[2:]]
+    moments = list(AllEgosDataset(da, [*moment, *later], config.inputs("all")))
+    both = predicted(model, model_inputs(collate_all_egos(moments[::-1])))
+    each_alone = [predicted(model, model_inputs(collate_all_egos([each]))) for each in moments]
     assert_same(
         [torch.cat([each[3:], each[:3]]) for each in both],
         [torch.cat(pair) for pair in zip(*each_alone, strict=True)],

@@ -1,0 +1,303 @@
+"""Weights in files: ours bit for bit, foreign ones by their names, and files that are none."""
+
+import json
+import pickle
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import save_file
+from torch_extra.model.small_model import small, small_released
+
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.model.checkpoint import load_weights, read_weights, write_weights
+from deepaccident_devkit.model.images import ResNetConfig, SwinConfig
+from deepaccident_devkit.model.network import V2XFormer
+
+Model = Callable[[int], V2XFormer]
+Tensors = dict[str, torch.Tensor]
+META = {"preset": "tiny", "fusion": None, "horizon": 2.0, "note": 'a "quoted" ä'}
+
+
+@pytest.fixture
+def model() -> Model:
+    """The small model with other weights for each seed."""
+
+    def made(seed: int) -> V2XFormer:
+        torch.manual_seed(seed)
+        return V2XFormer(small())
+
+    return made
+
+
+def same(one: Tensors, other: Tensors) -> bool:
+    assert one.keys() == other.keys()
+    return all(torch.equal(one[name], other[name]) and one[name].dtype == other[name].dtype for name in one)
+
+
+def trained_alone(model: torch.nn.Module) -> Tensors:
+    """What training changes, and a file must have."""
+    return {name: each for name, each in model.state_dict().items() if not name.endswith("num_batches_tracked")}
+
+
+def test_weights_come_back_bit_for_bit(model: Model, tmp_path: Path) -> None:
+    first, second = model(0), model(1)
+    path = tmp_path / "weights.safetensors"
+    write_weights(path, first.state_dict(), META)
+    weights = read_weights(path)
+    assert weights.meta == META
+    assert same(dict(weights.tensors), first.state_dict())
+    assert not same(trained_alone(first), trained_alone(second))
+    done = load_weights(second, weights, whole=True)
+    assert same(trained_alone(first), trained_alone(second))
+    assert (done.kept, done.unused) == ((), ())
+    assert done.to_text() == f"{len(done.loaded)} of {len(done.loaded)} tensors loaded"
+    before = path.read_bytes()
+    write_weights(path, first.state_dict(), META)
+    assert path.read_bytes() == before
+    assert [each.name for each in tmp_path.iterdir()] == [path.name]
+
+
+def test_half_precision_is_half_the_size(model: Model, tmp_path: Path) -> None:
+    first, second = model(0), model(1)
+    sizes = []
+    for half in (False, True):
+        path = tmp_path / f"{half}.safetensors"
+        write_weights(path, first.state_dict(), META, half=half)
+        sizes.append(path.stat().st_size)
+    assert 0.4 < sizes[1] / sizes[0] < 0.7
+    weights = read_weights(path)
+    assert {each.dtype for each in weights.tensors.values()} == {torch.float16, torch.int64}
+    load_weights(second, weights, whole=True)
+    for name, each in trained_alone(second).items():
+        assert torch.equal(each, trained_alone(first)[name].half().float()), name
+
+
+def test_weights_of_another_preset_name_the_keys(model: Model, tmp_path: Path) -> None:
+    path = tmp_path / "released.safetensors"
+    write_weights(path, V2XFormer(small_released()).state_dict(), META | {"preset": "released"})
+    with pytest.raises(ConfigError) as error:
+        load_weights(model(0), read_weights(path))
+    message = str(error.value)
+    assert "\n" not in message
+    assert message.startswith(f"{path}: weights of the preset 'released' do not fit this model: ")
+    assert "img_backbone.fine.0.0.weight" in message
+    assert "img_backbone.patch_embed.projection.weight" in message
+    assert message.endswith("give the preset and the options that they were trained with")
+
+
+def test_other_shapes_are_told(model: Model, tmp_path: Path) -> None:
+    path = tmp_path / "tiny.safetensors"
+    changed = dict(model(0).state_dict())
+    name = "pts_bbox_head.task_decoders.motion.task_heads.out.weight"
+    name = name if name in changed else next(each for each in changed if each.endswith("weight"))
+    changed[name] = changed[name][:1]
+    write_weights(path, changed, META)
+    fresh = model(1)
+    with pytest.raises(ConfigError, match=rf"1 tensors have another shape \({re.escape(name)} is \(1, .*, not \("):
+        load_weights(fresh, read_weights(path))
+    assert same(fresh.state_dict(), model(1).state_dict())  # nothing was loaded by halves
+
+
+def test_what_is_missing_begins_at_random_unless_all_are_needed(model: Model, tmp_path: Path) -> None:
+    path = tmp_path / "part.safetensors"
+    part = {name: each for name, each in model(0).state_dict().items() if name.startswith("img_")}
+    write_weights(path, part | {"other.weight": torch.zeros(2)}, {})
+    weights, fresh = read_weights(path), model(1)
+    done = load_weights(fresh, weights)
+    assert done.unused == ("other.weight",)
+    assert all(name.startswith("img_") for name in done.loaded)
+    assert not any(name.startswith("img_") for name in done.kept)
+    assert re.search(
+        r"\d+ of \d+ tensors loaded; as they were: .*, … \(\d+\); .* not used: other\.weight", done.to_text()
+    )
+    kept = {name: each for name, each in fresh.state_dict().items() if name in done.kept}
+    assert same(kept, {name: model(1).state_dict()[name] for name in kept})
+    with pytest.raises(ConfigError, match=r"weights do not fit this model: \d+ of the model are missing"):
+        load_weights(fresh, weights, whole=True)
+    write_weights(path, {"other.weight": torch.zeros(2)}, {})
+    with pytest.raises(ConfigError, match=r"1 are not the model's \(other\.weight\)"):
+        load_weights(fresh, read_weights(path))
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+@pytest.mark.parametrize("prefix", ["", "module."])
+@pytest.mark.parametrize("wrapped", [True, False])
+def test_foreign_checkpoints_have_our_names(
+    model: Model, tmp_path: Path, *, zipped: bool, prefix: str, wrapped: bool
+) -> None:
+    """Of mmcv, with or without what it wraps around them; new and old files of torch."""
+    path = tmp_path / "epoch_20.pth"
+    tensors: Any = {f"{prefix}{name}": each for name, each in model(0).state_dict().items()}
+    content = {"meta": {"epoch": 20, "config": "text"}, "state_dict": tensors} if wrapped else tensors
+    torch.save(content, path, _use_new_zipfile_serialization=zipped)
+    weights, fresh = read_weights(path), model(1)
+    assert weights.meta == {}
+    load_weights(fresh, weights, whole=True)
+    assert same(trained_alone(fresh), trained_alone(model(0)))
+
+
+def test_the_release_s_further_layers_are_told(tmp_path: Path) -> None:
+    """Its dead V2X layers, and BEVerse's map task."""
+    torch.manual_seed(0)
+    config = small_released()
+    first, path = V2XFormer(config), tmp_path / "beverse.pth"
+    further = {
+        "v2x_fusion.model.0.conv.weight": torch.zeros(2),
+        "v2x_fusion.compression.0.weight": torch.zeros(2),
+        "pts_bbox_head.taskfeat_encoders.map.layer.weight": torch.zeros(2),
+        "pts_bbox_head.task_decoders.map.layer.weight": torch.zeros(2),
+        "img_backbone.stages.0.blocks.0.attn.w_msa.relative_position_index": torch.zeros(16, 16),
+    }
+    torch.save({"state_dict": dict(first.state_dict()) | further}, path)
+    second = V2XFormer(config)
+    done = load_weights(second, read_weights(path), whole=True)
+    assert same(trained_alone(first), trained_alone(second))
+    assert sorted(done.unused) == sorted(list(further)[:4])
+    assert "of the file not used: v2x_fusion.model.0.conv.weight" in done.to_text()
+
+
+def test_a_released_checkpoint_without_its_fusion_fits_another_fusion(tmp_path: Path) -> None:
+    """The released fusion has no weights, so that cobevt's begin at random."""
+    first, path = V2XFormer(small_released()), tmp_path / "beverse.pth"
+    torch.save({"state_dict": first.state_dict()}, path)
+    config = replace(small_released(), fusion=cobevt())
+    done = load_weights(V2XFormer(config), read_weights(path))
+    assert done.unused == ()
+    assert done.kept
+    assert all(name.startswith("v2x_fusion.") for name in done.kept)
+
+
+def cobevt() -> Any:
+    from deepaccident_devkit.model.fusion import CobevtConfig
+
+    return CobevtConfig(channels=8, depth=1, window=4)
+
+
+def test_official_swin_weights_go_into_the_image_encoder(tmp_path: Path) -> None:
+    """Microsoft's names and order of tokens, under `model`."""
+    config = replace(small(), encoder=SwinConfig(embed_dims=8, depths=(1, 1), num_heads=(1, 1), out_stages=(0, 1)))
+    model, path = V2XFormer(replace(config, lift=lift_of(config, 4, 512))), tmp_path / "swin.pth"
+    weight = torch.arange(16.0 * 32).view(16, 32)
+    official = {
+        "patch_embed.proj.weight": torch.full((8, 3, 4, 4), 2.0),
+        "layers.0.blocks.0.mlp.fc1.bias": torch.full((32,), 3.0),
+        "layers.0.downsample.reduction.weight": weight,
+        "head.weight": torch.zeros(5, 16),
+        "norm.weight": torch.zeros(16),
+    }
+    torch.save({"model": official}, path)
+    done = load_weights(model, read_weights(path))
+    assert done.unused == ("img_backbone.norm.weight",)
+    assert all(name.startswith("img_backbone.") for name in done.loaded)
+    state = model.state_dict()
+    assert (state["img_backbone.patch_embed.projection.weight"] == 2).all()
+    assert (state["img_backbone.stages.0.blocks.0.ffn.layers.0.0.bias"] == 3).all()
+    merged = state["img_backbone.stages.0.downsample.reduction.weight"]
+    assert torch.equal(merged.view(16, 8, 4)[:, :, 1], weight.view(16, 4, 8)[:, 2])
+
+
+def test_torchvision_s_resnet_goes_into_the_image_encoder(tmp_path: Path) -> None:
+    config = replace(small(), encoder=ResNetConfig(depth=18))
+    model, path = V2XFormer(replace(config, lift=lift_of(config, 16, 512))), tmp_path / "resnet18.pth"
+    own = {name: each for name, each in model.state_dict().items() if name.startswith("img_backbone.")}
+    given = {name.removeprefix("img_backbone."): torch.full_like(each, 0.5) for name, each in own.items()}
+    torch.save(given | {"fc.weight": torch.zeros(5, 512), "fc.bias": torch.zeros(5)}, path)
+    done = load_weights(model, read_weights(path))
+    assert done.unused == ("img_backbone.fc.weight", "img_backbone.fc.bias")
+    assert set(done.loaded) == {name for name in own if not name.endswith("num_batches_tracked")}
+    assert (model.state_dict()["img_backbone.layer4.1.conv2.weight"] == 0.5).all()
+
+
+def lift_of(config: Any, stride: int, channels: int) -> Any:
+    return replace(config.lift, stride=stride, in_channels=channels)
+
+
+class Opens:
+    """What a malicious file would do: write a file while it is read."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (self.path,)
+
+
+@pytest.mark.parametrize("how", ["pickle", "torch", "old torch"])
+def test_code_in_a_file_is_refused_and_not_run(tmp_path: Path, how: str) -> None:
+    path, written = tmp_path / "weights.pth", tmp_path / "written"
+    content = {"state_dict": {"img_neck.weight": torch.zeros(1)}, "meta": Opens(written)}
+    if how == "pickle":
+        path.write_bytes(pickle.dumps(content))
+    else:
+        torch.save(content, path, _use_new_zipfile_serialization=how == "torch")
+    assert_refused(path, "is no plain checkpoint")
+    assert not written.exists()
+
+
+def assert_refused(path: Path, message: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        read_weights(path)
+    assert str(error.value).startswith(f"{path}: {message}")
+    assert "\n" not in str(error.value)
+    assert "; give " in str(error.value)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 0.999])
+@pytest.mark.parametrize("ours", [True, False])
+def test_truncated_files_are_refused(model: Model, tmp_path: Path, share: float, *, ours: bool) -> None:
+    path = tmp_path / "weights"
+    if ours:
+        write_weights(path, model(0).state_dict(), META)
+    else:
+        torch.save(model(0).state_dict(), path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(len(whole) * share)])
+    assert_refused(path, "is no ")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"lr: 0.002\nsteps: 1500\n", "is no file of weights"),
+        (b"PK\x03\x04 and no more", "is no plain checkpoint"),
+        (b"\x80", "is no plain checkpoint"),
+        (b"\x08\0\0\0\0\0\0\0[1,2,3] ", "is no file of weights"),
+        (b'{"epoch": 20}', "is no file of weights"),
+    ],
+)
+def test_other_files_are_refused(tmp_path: Path, content: bytes, message: str) -> None:
+    path = tmp_path / "weights.pth"
+    path.write_bytes(content)
+    assert_refused(path, message)
+
+
+@pytest.mark.parametrize("content", [[1, 2], {"state_dict": {"epoch": 3}}, {}, torch.zeros(3)])
+def test_files_without_named_tensors_are_refused(tmp_path: Path, content: Any) -> None:
+    path = tmp_path / "weights.pth"
+    torch.save(content, path)
+    assert_refused(path, "holds no tensors by name")
+
+
+def test_absent_files_and_folders_are_refused(tmp_path: Path) -> None:
+    assert_refused(tmp_path / "none.pth", "weights cannot be read (No such file or directory)")
+    assert_refused(tmp_path, "")
+
+
+@pytest.mark.parametrize("noted", ["{", "tiny", "[1]", '"tiny"', "3"])
+def test_notes_that_are_no_json_object_are_refused(tmp_path: Path, noted: str) -> None:
+    path = tmp_path / "weights.safetensors"
+    save_file({"img_neck.weight": torch.zeros(1)}, path, metadata={"deepaccident": noted})
+    assert_refused(path, "is no file of weights")
+
+
+def test_safetensors_of_others_have_no_notes(tmp_path: Path) -> None:
+    path = tmp_path / "weights.safetensors"
+    for metadata in (None, {"format": "pt"}):
+        save_file({"img_neck.weight": torch.ones(1)}, path, metadata=metadata)
+        assert read_weights(path).meta == {}
+        assert json.loads(json.dumps(dict(read_weights(path).meta))) == {}
