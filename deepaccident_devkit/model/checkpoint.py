@@ -1,7 +1,7 @@
 """Weights in files: our own as safetensors, foreign ones of the release, BEVerse, Swin or torchvision.
 
-Names are the release's (tests/data/golden/model/released_keys_*.txt), so that the key table is the identity, except
-for what `_UNUSED` names. A foreign file is read by `torch.load(weights_only=True)`, which runs no code of it.
+Names are the release's (tests/data/golden/model/released_keys_*.txt), so that the key table is the identity.
+A foreign file is read by `torch.load(weights_only=True)`, which runs no code of it.
 """
 
 from __future__ import annotations
@@ -30,8 +30,6 @@ BEST: Final = "best.safetensors"
 FINAL: Final = "final.safetensors"
 """In a run's folder: the weights with the best score or, of a run that was not validated, those of the last step."""
 _META: Final = "deepaccident"
-_UNUSED: Final = ("v2x_fusion.", "pts_bbox_head.taskfeat_encoders.map.", "pts_bbox_head.task_decoders.map.")
-"""Beginnings of names that only the release or BEVerse has: its dead V2X layers, and the map task."""
 _MADE: Final = ("relative_position_index", "transformer.frustum", "num_batches_tracked")
 """Ends of names whose values follow from the configuration, or do not matter."""
 _TOLD: Final = 3
@@ -96,6 +94,8 @@ def read_weights(path: str | os.PathLike[str]) -> Weights:
         length = int.from_bytes(content[:8], "little")
         header = parsed_json(content[8 : 8 + length])
         meta = parsed_json(header.get("__metadata__", {}).get(_META, "{}").encode())
+        if not isinstance(meta, dict):
+            raise ValueError("its notes are no JSON object")
     except (SafetensorError, ValueError) as error:
         raise ConfigError(f"{path}: is no file of weights ({error}); give a safetensors file, or a .pth") from error
     return Weights(tensors=tensors, meta=meta, path=path)
@@ -135,7 +135,7 @@ def load_weights(model: nn.Module, weights: Weights, *, whole: bool = False) -> 
     loaded = [name for name in wanted if name in given]
     missing = [name for name in wanted if name not in given]
     other = [name for name in loaded if own[name].shape != given[name].shape]
-    unused = [name for name in given if name not in own and not name.startswith(_UNUSED)]
+    unused = sorted(name for name in given if name not in own)
     if other or not loaded or (whole and missing):
         raise ConfigError(f"{weights.path}: {_difference(weights, own, other, missing, unused)}")
     model.load_state_dict({name: given[name].to(own[name].dtype) for name in loaded}, strict=False)

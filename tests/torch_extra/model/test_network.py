@@ -15,13 +15,14 @@ from deepaccident_devkit.model.config import ModelConfig
 from deepaccident_devkit.model.entry import model_inputs
 from deepaccident_devkit.model.fusion import ReleasedFusionConfig
 from deepaccident_devkit.model.network import V2XFormer
-from deepaccident_devkit.model.presets import FusionName, fusion_config
+from deepaccident_devkit.model.presets import fusion_config
 from deepaccident_devkit.model.training.step import TrainingStep, training_batch
+from deepaccident_devkit.taxonomy import ModelFusion
 from deepaccident_devkit.v2x import Link
 
 Seeded = Callable[..., V2XFormer]
 Predicted = Callable[..., list[torch.Tensor]]
-FUSIONS = get_args(FusionName)
+FUSIONS = get_args(ModelFusion)
 _NO_BOXES = tuple(f"pts_bbox_head.task_decoders.3dod.task_heads.{task}." for task in (2, 4, 5))
 """Released tasks whose categories the release of the tests lacks, or that have none: no gradient but of heatmaps."""
 

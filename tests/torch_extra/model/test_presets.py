@@ -1,6 +1,7 @@
 """Presets, what is changed in them, and configurations whose parts do not fit."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, get_args
 
 import pytest
@@ -9,10 +10,13 @@ from torch_extra.model.small_model import small
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.export.images import ImageConfig
+from deepaccident_devkit.model import presets
 from deepaccident_devkit.model.bev import BevUNetConfig
+from deepaccident_devkit.model.checkpoint import FINAL, write_weights
 from deepaccident_devkit.model.fusion import CobevtConfig, DiscoNetConfig, PoolFusionConfig, V2XViTConfig
 from deepaccident_devkit.model.network import V2XFormer
-from deepaccident_devkit.model.presets import PRESETS, FusionName, ModelChoice, fusion_config, released, tiny
+from deepaccident_devkit.model.presets import PRESETS, ModelChoice, fusion_config, load_model, released, tiny
+from deepaccident_devkit.taxonomy import ModelFusion
 from deepaccident_devkit.v2x import Link
 
 
@@ -46,7 +50,7 @@ def test_released_has_the_sizes_of_the_release() -> None:
     [("mean", PoolFusionConfig), ("disconet", DiscoNetConfig), ("cobevt", CobevtConfig), ("v2xvit", V2XViTConfig)],
 )
 @pytest.mark.parametrize("preset", PRESETS)
-def test_a_fusion_fits_its_preset(fusion: FusionName, kind: type, preset: Any) -> None:
+def test_a_fusion_fits_its_preset(fusion: ModelFusion, kind: type, preset: Any) -> None:
     config = ModelChoice(preset=preset, fusion=fusion).config
     assert isinstance(config.fusion, kind)
     assert replace(config, fusion=PRESETS[preset]().fusion) == PRESETS[preset]()
@@ -55,7 +59,7 @@ def test_a_fusion_fits_its_preset(fusion: FusionName, kind: type, preset: Any) -
 
 
 def test_every_fusion_has_a_config() -> None:
-    assert {type(fusion_config(name, 64)).__name__ for name in get_args(FusionName)} == {
+    assert {type(fusion_config(name, 64)).__name__ for name in get_args(ModelFusion)} == {
         "PoolFusionConfig",
         "ReleasedFusionConfig",
         "DiscoNetConfig",
@@ -93,12 +97,34 @@ def test_unknown_words_are_refused() -> None:
 
 def test_a_choice_can_be_noted_and_made_again() -> None:
     choice = ModelChoice(preset="released", fusion="cobevt", horizon=3)
-    assert ModelChoice.from_dict({**choice.as_dict(), "step": 7}) == choice
+    path = Path("weights.safetensors")
+    assert ModelChoice.from_dict({**choice.as_dict(), "step": 7}, path) == choice
     for described in ({}, {"preset": "tiny"}, {"preset": "large", "fusion": None, "horizon": None}):
-        with pytest.raises(ConfigError, match="model: expected preset, fusion and horizon"):
-            ModelChoice.from_dict(described)
-    with pytest.raises(ConfigError, match="give weights of the devkit"):
-        ModelChoice.from_dict({"preset": "tiny", "fusion": None, "horizon": "long"})
+        with pytest.raises(ConfigError, match=r"^weights\.safetensors: does not say which model its weights are of"):
+            ModelChoice.from_dict(described, path)
+    with pytest.raises(ConfigError, match="deepaccident train --from"):
+        ModelChoice.from_dict({"preset": "tiny", "fusion": None, "horizon": "long"}, path)
+
+
+def test_a_model_is_loaded_by_its_notes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(presets, "PRESETS", {"tiny": small})
+    choice = ModelChoice(fusion="cobevt")
+    torch.manual_seed(3)
+    model = V2XFormer(choice.config)
+    notes = {**choice.as_dict(), "step": 7}
+    write_weights(tmp_path / FINAL, model.state_dict(), notes)
+    loaded = load_model(tmp_path)
+    assert loaded.config == model.config
+    assert loaded.notes == notes
+    assert all(torch.equal(each, loaded.state_dict()[name]) for name, each in model.state_dict().items())
+    write_weights(tmp_path / FINAL, model.state_dict(), {**notes, "fusion": "mean"})
+    assert load_model(tmp_path).config.fusion == PoolFusionConfig()
+    write_weights(tmp_path / FINAL, model.state_dict(), {**notes, "fusion": "disconet"})
+    with pytest.raises(ConfigError, match=r"of the model are missing \(v2x_fusion\.score"):
+        load_model(tmp_path)
+    write_weights(tmp_path / FINAL, model.state_dict(), {})
+    with pytest.raises(ConfigError, match="does not say which model"):
+        load_model(tmp_path)
 
 
 @pytest.mark.parametrize(
