@@ -58,7 +58,7 @@ def render_training(rows: Sequence[Mapping[str, Any]], title: str, *, fig: Figur
     """
     curves = _curves(rows)
     fig = figure_or_new(fig, _size(len(curves)))
-    axes = fig.subplots(-(-len(curves) // _COLUMNS), _COLUMNS, squeeze=False).ravel()
+    axes = fig.subplots(_lines(len(curves)), _COLUMNS, squeeze=False).ravel()
     for ax, (name, points) in zip(axes, curves.items(), strict=False):
         render_curve([step for step, _ in points], [value for _, value in points], name, ax=ax)
     for ax in axes[len(curves) :]:
@@ -87,4 +87,9 @@ def _curves(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[tuple[int, floa
 
 
 def _size(curves: int) -> tuple[float, float]:
-    return _PANEL[0] * _COLUMNS, _PANEL[1] * max(-(-curves // _COLUMNS), 1) + 0.4
+    return _PANEL[0] * _COLUMNS, _PANEL[1] * _lines(curves) + 0.4
+
+
+def _lines(curves: int) -> int:
+    """Rows of panels; one, though empty, of a log without any numbers."""
+    return max(-(-curves // _COLUMNS), 1)

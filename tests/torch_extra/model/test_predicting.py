@@ -1,0 +1,276 @@
+"""Predictions of samples: they stand by themselves, and the devkit's evaluators and writers take them."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch_extra.model.small_model import small, small_released
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import NotAvailableError
+from deepaccident_devkit.evaluation import (
+    AccidentEvaluator,
+    DetectionEvaluator,
+    MotionEvaluator,
+    ResultsWriter,
+    accident_context,
+    detection_truth,
+    read_results,
+)
+from deepaccident_devkit.evaluation.metrics.motion.protocol import MOTION_PROTOCOLS
+from deepaccident_devkit.export.torch import V2XConfig, V2XDataset
+from deepaccident_devkit.model.config import ModelConfig
+from deepaccident_devkit.model.detection import TaskMaps, detection_targets
+from deepaccident_devkit.model.entry import mirrored_boxes
+from deepaccident_devkit.model.motion import MotionMaps
+from deepaccident_devkit.model.network import V2XFormer
+from deepaccident_devkit.model.predicting import PredictConfig, SamplePrediction, motion_output, predictions
+from deepaccident_devkit.model.results import predict_results
+from deepaccident_devkit.motion import MotionHeads, motion_labels
+from deepaccident_devkit.v2x import Link
+
+Seeded = Callable[..., V2XFormer]
+ALL = PredictConfig()
+
+
+def predict(
+    model: V2XFormer, da: DeepAccident, tokens: list[str], config: PredictConfig = ALL
+) -> list[SamplePrediction]:
+    return list(predictions(model, da, tokens, config))
+
+
+def arrays(found: SamplePrediction) -> Iterator[np.ndarray]:
+    """All numbers of a prediction."""
+    assert found.motion.heads is not None
+    for heads in found.motion.heads:
+        yield from (heads.segmentation, heads.centerness, heads.offset, heads.flow)
+    boxes = found.boxes
+    yield from (boxes.boxes.center, boxes.boxes.size, boxes.boxes.yaw, boxes.boxes.velocity, boxes.scores)
+    yield from (each.positions for each in found.accidents)
+    yield np.array([[each.time, each.score] for each in found.accidents])
+
+
+def same(one: SamplePrediction, other: SamplePrediction) -> bool:
+    pairs = list(zip(arrays(one), arrays(other), strict=True))
+    return one.token == other.token and all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
+
+
+def motion_evaluator(model: V2XFormer) -> MotionEvaluator:
+    """For the labels that a model learns."""
+    return MotionEvaluator(replace(MOTION_PROTOCOLS["paper"], labels=model.config.labels_protocol))
+
+
+@pytest.fixture(scope="module")
+def model(seeded: Seeded) -> V2XFormer:
+    return seeded(small())
+
+
+@pytest.fixture(scope="module")
+def tokens(moment: list[str]) -> list[str]:
+    return [moment[0], moment[4], moment[2].replace("/004", "/005")]
+
+
+@pytest.fixture(scope="module")
+def found(model: V2XFormer, da: DeepAccident, tokens: list[str]) -> list[SamplePrediction]:
+    return predict(model, da, tokens)
+
+
+def test_a_prediction_does_not_depend_on_others(
+    model: V2XFormer, da: DeepAccident, tokens: list[str], found: list[SamplePrediction]
+) -> None:
+    """Nor on torch's own generator."""
+    assert [each.token for each in found] == tokens
+    torch.manual_seed(99)
+    for one, other in zip(found, predict(model, da, tokens[::-1])[::-1], strict=True):
+        assert same(one, other)
+    assert not same(found[0], replace(found[1], token=tokens[0]))
+
+
+@pytest.mark.slow
+def test_workers_change_nothing(
+    model: V2XFormer, da: DeepAccident, tokens: list[str], found: list[SamplePrediction]
+) -> None:
+    read = predict(model, da, tokens, PredictConfig(workers=1))
+    assert all(same(one, other) for one, other in zip(found, read, strict=True))
+
+
+def test_the_seed_changes_the_draws_but_not_the_mean(
+    model: V2XFormer, da: DeepAccident, tokens: list[str], found: list[SamplePrediction]
+) -> None:
+    [other] = predict(model, da, tokens[:1], PredictConfig(seed=1))
+    assert found[0].motion.heads is not None
+    assert other.motion.heads is not None
+    pairs = list(zip(found[0].motion.heads, other.motion.heads, strict=True))
+    equal = [np.array_equal(a.segmentation, b.segmentation) for a, b in pairs]
+    assert equal == [False, False, True]
+    first, second, _ = found[0].motion.heads
+    assert not np.array_equal(first.segmentation, second.segmentation)
+
+
+def test_partners_and_the_link_matter(
+    model: V2XFormer, da: DeepAccident, tokens: list[str], found: list[SamplePrediction]
+) -> None:
+    single, late, lost = (
+        predict(model, da, tokens[:1], config)[0]
+        for config in (
+            PredictConfig(agents="single"),
+            PredictConfig(link=Link(latency=0.2)),
+            PredictConfig(link=Link(packet_loss=1.0)),
+        )
+    )
+    assert not same(single, found[0])
+    assert not same(late, found[0])
+    for a, b in zip(arrays(lost), arrays(single), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4)
+
+
+def test_the_model_is_left_in_its_mode(model: V2XFormer, da: DeepAccident, tokens: list[str]) -> None:
+    for mode in (True, False):
+        model.train(mode)
+        statistics = {name: each.clone() for name, each in model.named_buffers()}
+        predict(model, da, tokens[:1])
+        assert model.training == mode
+        assert all(torch.equal(each, statistics[name]) for name, each in model.named_buffers())
+
+
+def test_a_release_without_images_is_refused(model: V2XFormer, da_partial: DeepAccident, moment: list[str]) -> None:
+    """It lacks those of the ego's front camera."""
+    with pytest.raises(NotAvailableError, match=r"no images of .*; unpack its camera folders, .* --sensors cameras"):
+        predict(model, da_partial, moment[:1])
+    assert predict(model, da_partial, []) == []
+
+
+def test_the_evaluators_take_predictions(
+    model: V2XFormer, da: DeepAccident, tokens: list[str], found: list[SamplePrediction]
+) -> None:
+    motion, detection, accident = motion_evaluator(model), DetectionEvaluator(), AccidentEvaluator("boxes")
+    for each in found:
+        motion.update(each.token, each.motion, motion_labels(da, each.token, model.config.labels))
+        pose = da.world_from(each.token, detection.protocol.frame).inverse()
+        moved = replace(each.boxes, boxes=each.boxes.boxes.transform(pose, detection.protocol.frame))
+        detection.update(each.token, moved, detection_truth(da, each.token, detection.protocol))
+        accident.update(each.token, each.accidents, context=accident_context(da, each.token, horizon=2.0))
+    for evaluator in (motion, detection, accident):
+        assert evaluator.tokens == set(tokens)
+        evaluator.compute()
+
+
+def test_results_are_written_and_read(
+    model: V2XFormer, da: DeepAccident, tokens: list[str], found: list[SamplePrediction], tmp_path: Path
+) -> None:
+    paths = predict_results(model, da, tokens, tmp_path / "results")
+    for task, path in paths.items():
+        results = read_results(path)
+        assert results.task == task
+        assert set(results.tokens) == set(tokens)
+        assert results.meta["agents"] == "all"
+    form: Any = {"grid": model.config.labels.grid, "step": 0.1, "labels": "clean", "store": "heads"}
+    with ResultsWriter(tmp_path / "heads", "motion", **form) as writer:
+        for each in found:
+            writer.add(each.token, each.motion)
+    assert (tmp_path / "heads").is_dir()
+
+
+class TestPerfectMaps:
+    """Maps that say exactly what is there, in the place of the heads', come out where it is."""
+
+    @pytest.fixture(params=[small, small_released])
+    def perfect(self, request: pytest.FixtureRequest) -> V2XFormer:
+        return V2XFormer(request.param()).eval()
+
+    @pytest.mark.parametrize("row", [0, 3, 4])
+    def test_boxes_are_at_their_places_in_the_world(
+        self, perfect: V2XFormer, da: DeepAccident, moment: list[str], monkeypatch: pytest.MonkeyPatch, row: int
+    ) -> None:
+        config, token = perfect.config, moment[row]
+        head = config.detection
+        item = V2XDataset(da, [token], V2XConfig(points=False))[0]
+        inside = (item["boxes"][:, :2].abs() < 45).all(1)
+        boxes, categories = item["boxes"][inside], item["categories"][inside]
+        monkeypatch.setattr(type(perfect), "forward", told(perfect, detection=encoded(config, boxes, categories)))
+        [found] = predict(perfect, da, [token])
+        truth = da.boxes(token, "world", "released")[inside.numpy()]
+        assert len(truth) > 3
+        assert len(found.boxes) == len(truth), head
+        assert found.boxes.boxes.frame == "world"
+        apart = np.linalg.norm(found.boxes.boxes.center[:, None] - truth.center, axis=-1)
+        match = apart.argmin(1)
+        assert sorted(match) == list(range(len(truth)))
+        np.testing.assert_allclose(found.boxes.boxes.center, truth.center[match], atol=2e-3)
+        np.testing.assert_allclose(found.boxes.boxes.size, truth.size[match], atol=2e-3)
+        turned = found.boxes.boxes.yaw - truth.yaw[match]
+        np.testing.assert_allclose(np.exp(1j * turned), 1, atol=2e-3)
+        velocity = np.nan_to_num(truth.velocity[match])
+        np.testing.assert_allclose(found.boxes.boxes.velocity[:, :2], velocity[:, :2], atol=2e-3)
+        np.testing.assert_array_equal(found.boxes.boxes.category, truth.category[match])
+
+    def test_motion_maps_score_as_their_labels(
+        self, perfect: V2XFormer, da: DeepAccident, moment: list[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        config, token = perfect.config, moment[0]
+        label = motion_labels(da, token, config.labels).to_present("bilinear")
+        heads = MotionHeads.from_labels(label)
+        fields = (heads.segmentation, heads.centerness, heads.offset, heads.flow)
+        maps = [torch.as_tensor(np.array(each))[None, None].float() for each in fields]
+        maps[1] = maps[1].clamp(1e-6, 1 - 1e-6).logit()
+        monkeypatch.setattr(type(perfect), "forward", told(perfect, motion=MotionMaps(*maps)))
+        [found] = predict(perfect, da, [token])
+        evaluator = motion_evaluator(perfect)
+        evaluator.update(token, found.motion, label)
+        scores = evaluator.compute().ranges["100x100"]
+        assert scores.iou == pytest.approx(100)
+        assert scores.pq > 90
+
+
+def encoded(config: ModelConfig, boxes: torch.Tensor, categories: torch.Tensor) -> list[TaskMaps]:
+    """Heads' maps of one sample that say exactly these boxes."""
+    head = config.detection
+    maps = []
+    for task in detection_targets([mirrored_boxes(boxes, config.handedness)], [categories], head, config.targets):
+        code = torch.zeros(1, 10, *head.shape)
+        rows, columns = task.place[0][task.mask[0]] // head.shape[1], task.place[0][task.mask[0]] % head.shape[1]
+        code[0, :, rows, columns] = task.box[0][task.mask[0]].T
+        peak = torch.where(task.heatmap == 1, 5.0, -9.0)
+        maps.append(TaskMaps(*code.split([2, 1, 3, 2, 2], dim=1), peak))
+    return maps
+
+
+def told(model: V2XFormer, *, detection: Any = None, motion: Any = None) -> Callable[..., Any]:
+    """A `forward` whose maps are given for one of the tasks."""
+    forward = type(model).forward
+
+    def of(self: V2XFormer, *arguments: Any, **options: Any) -> Any:
+        found = forward(self, *arguments, **options)
+        if motion is not None:
+            found = found._replace(motion=found.motion._replace(maps=motion))
+        return found if detection is None else found._replace(detection=detection)
+
+    return of
+
+
+def test_centres_become_probabilities(model: V2XFormer) -> None:
+    shape = (2, 3, 1, 40, 40)
+    maps = MotionMaps(torch.zeros(2, 3, 2, 40, 40), torch.full(shape, 2.0), *[torch.zeros(2, 3, 2, 40, 40)] * 2)
+    output = motion_output(maps, model)
+    assert output.heads is not None
+    assert len(output.heads) == 2
+    np.testing.assert_allclose(output.heads[0].centerness, 1 / (1 + np.exp(-2.0)), rtol=1e-6)
+    assert output.grid == model.config.labels.grid
+
+
+def test_delays_reach_the_model(model: V2XFormer, da: DeepAccident, tokens: list[str], monkeypatch: Any) -> None:
+    """From the link, for fusions that know them."""
+    seen = []
+    forward = V2XFormer.forward
+
+    def watched(self: V2XFormer, inputs: Any, *arguments: Any, **options: Any) -> Any:
+        seen.append(inputs.delay.tolist())
+        return forward(self, inputs, *arguments, **options)
+
+    monkeypatch.setattr(V2XFormer, "forward", watched)
+    predict(model, da, tokens[:1], PredictConfig(link=Link(latency=0.3)))
+    assert seen == [[[0, 3, 3, 3, 3]]]

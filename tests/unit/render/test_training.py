@@ -1,0 +1,78 @@
+"""Curves of a training run: a panel for each number, and a file that is there whole or not at all."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib import pyplot as plt
+from picture_texts import text_faults
+
+from deepaccident_devkit.render import detached_figure
+from deepaccident_devkit.render.training import render_curve, render_training, save_training
+
+
+def rows(steps: int) -> list[dict]:
+    """A log with two losses, and two scores at every fourth step."""
+    log = []
+    for step in range(1, steps + 1):
+        row = {"step": step, "loss": 3.0, "losses": {"seg": 2.0 / step, "flow": 1.0 + step}, "rate": 0.1}
+        if step % 4 == 0:
+            row["validation"] = {"iou": step / 100, "score": 0.5}
+        log.append(row)
+    return log
+
+
+def test_each_number_has_a_panel() -> None:
+    figure = detached_figure((10, 5))
+    assert render_training(rows(8), "a run", fig=figure) is figure
+    titles = [ax.get_title() for ax in figure.axes]
+    assert titles == ["seg", "flow", "validation: iou", "validation: score", "", ""]
+    assert [ax.axison for ax in figure.axes] == [True] * 4 + [False] * 2
+    dots, line = figure.axes[2].get_lines()
+    for each in (dots, line):
+        np.testing.assert_allclose(each.get_xydata(), [[4, 0.04], [8, 0.08]])
+    assert figure.get_suptitle() == "a run"
+    assert [ax.get_xlabel() for ax in figure.axes] == ["", "step", "step", "step", "", ""]
+
+
+def test_many_steps_are_averaged() -> None:
+    """Each dot stays, and the line keeps the mean."""
+    values = np.random.default_rng(0).normal(2.0, 1.0, 600)
+    ax = render_curve(range(600), values, "loss", ax=detached_figure((3, 2)).subplots())
+    dots, line = ax.get_lines()
+    assert len(dots.get_xydata()) == 600
+    assert len(line.get_xydata()) == 60
+    assert line.get_ydata().mean() == pytest.approx(values.mean())
+    assert line.get_ydata().std() < values.std() / 2
+    np.testing.assert_allclose(line.get_xydata()[0], [4.5, values[:10].mean()])
+    assert ax.get_ylim()[0] == 0
+
+
+@pytest.mark.parametrize("log", [[], [{"step": 1, "losses": {"seg": 1.0}}], [{"step": 3}]])
+def test_short_logs_are_drawn(log: list[dict], tmp_path: Path) -> None:
+    save_training(log, "begun", tmp_path / "curves.png")
+    assert (tmp_path / "curves.png").stat().st_size > 1000
+
+
+def test_words_are_apart_and_large() -> None:
+    assert text_faults(render_training(rows(12), "a run")) == []
+
+
+def test_a_file_is_replaced_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "curves.png"
+    save_training(rows(4), "a run", path)
+    first = path.read_bytes()
+    assert first.startswith(b"\x89PNG")
+    save_training(rows(4), "a run", path)
+    assert path.read_bytes() == first
+
+    def broken(figure: object, target: object, **options: object) -> None:
+        Path(str(getattr(target, "name", target))).write_bytes(b"half")
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", broken)
+    with pytest.raises(OSError, match="no space left"):
+        save_training(rows(8), "a run", path)
+    assert path.read_bytes() == first
+    assert list(tmp_path.iterdir()) == [path]
+    assert plt.get_fignums() == []
