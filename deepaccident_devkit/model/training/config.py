@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import asdict, dataclass
 from typing import Any, Final, get_args
 
@@ -84,7 +85,7 @@ class TrainConfig:
             _check_whole("egos", self.egos, 1)
         for name in (*_SHARES, *_ABOVE_ZERO, "weight_decay"):
             value = checked_number(name, getattr(self, name), "a number", ConfigError)
-            if not 0 <= value <= (1 if name in _SHARES else value) or (name in _ABOVE_ZERO and not value):
+            if not 0 <= value <= (1 if name in _SHARES else sys.float_info.max) or (name in _ABOVE_ZERO and not value):
                 raise ConfigError(f"{name}: expected {_expected(name)}, found {value!r}")
         settle_choices(self, {"samples": get_args(Purpose)})
         object.__setattr__(self, "freeze", tuple(self.freeze))

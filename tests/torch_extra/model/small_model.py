@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -105,3 +106,21 @@ def killed_run(root: str, folder: str, step: int) -> None:
 
     with patch.object(training, "add_to_log", add_and_die):
         trained(DeepAccident("v1", root, verbose=False), Path(folder))
+
+
+def one_of_several(root: str, folder: Path) -> None:
+    """A run of two steps on one of several processes; leaves its parameters, as it has them at the end."""
+    made: list[torch.nn.Module] = []
+    model_of = training._model
+
+    def watched(*arguments: Any) -> Any:
+        made.append(model_of(*arguments))
+        return made[-1]
+
+    with patch.object(training, "_model", watched):
+        trained(DeepAccident("v1", root, verbose=False), folder, replace(RUN, steps=2, validation=None))
+    torch.save(dict(made[0].named_parameters()), folder / f"rank_{os.environ['RANK']}.pth")
+
+
+if __name__ == "__main__":  # under `torchrun`
+    one_of_several(sys.argv[1], Path(sys.argv[2]))

@@ -1,0 +1,509 @@
+"""Training: schedules, steps, runs that are killed and go on, several processes, and what is refused."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from safetensors.torch import load_file
+from torch_extra.model import small_model
+from torch_extra.model.small_model import RUN, small, small_released, trained
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError, NotAvailableError
+from deepaccident_devkit.export.torch import AllEgosDataset, V2XDataset, collate, collate_all_egos
+from deepaccident_devkit.model.checkpoint import BEST, FINAL, read_weights
+from deepaccident_devkit.model.config import ModelConfig
+from deepaccident_devkit.model.entry import ModelInputs, mirrored_boxes, model_inputs
+from deepaccident_devkit.model.network import V2XFormer
+from deepaccident_devkit.model.training import train as training
+from deepaccident_devkit.model.training.config import TrainConfig
+from deepaccident_devkit.model.training.data import Moments, batches
+from deepaccident_devkit.model.training.log import add_to_log, cut_log, read_log
+from deepaccident_devkit.model.training.place import checked_device
+from deepaccident_devkit.model.training.schedule import freeze, generator_of, learning_rate, optimizer_of, positions
+from deepaccident_devkit.model.training.state import LAST
+from deepaccident_devkit.model.training.step import TrainingStep, training_batch, with_dropped_partners
+
+SHORT = replace(RUN, steps=2, validation=None, save_every=1)
+TESTS = Path(__file__).parents[2]
+
+
+def tensors(folder: Path, name: str = LAST) -> dict[str, torch.Tensor]:
+    return load_file(folder / name)
+
+
+def differing(one: Path, other: Path) -> list[str]:
+    """Names of a checkpoint's tensors whose bits differ."""
+    a, b = tensors(one), tensors(other)
+    assert a.keys() == b.keys()
+    return [name for name in a if not torch.equal(a[name], b[name])]
+
+
+def rows(folder: Path) -> list[dict[str, Any]]:
+    """The log without what depends on the machine's speed."""
+    return [
+        {name: each for name, each in row.items() if name not in ("seconds", "waiting")} for row in read_log(folder)
+    ]
+
+
+# --- the schedule
+
+
+@given(st.integers(1, 400), st.floats(0, 1))
+def test_the_rate_rises_and_falls_to_nothing(steps: int, warm_up: float) -> None:
+    config = TrainConfig(steps=steps, warm_up=warm_up, learning_rate=0.5)
+    rates = [learning_rate(step, config) for step in range(steps)]
+    rising = round(warm_up * steps)
+    np.testing.assert_allclose(rates[:rising], np.arange(1, rising + 1) / max(rising, 1) * 0.5)
+    assert all(later <= earlier for earlier, later in zip(rates[rising:], rates[rising + 1 :], strict=False))
+    assert max(rates) == pytest.approx(0.5)
+    assert min(rates) > 0
+    assert learning_rate(steps, config) == pytest.approx(0.0 if rising < steps else 0.5, abs=1e-12)
+
+
+def test_the_rate_is_half_in_the_middle_of_the_cosine() -> None:
+    config = TrainConfig(steps=120, warm_up=0.1, learning_rate=1.0)
+    assert learning_rate(12 + 54, config) == pytest.approx(0.5)
+
+
+@given(st.integers(1, 12), st.integers(1, 4), st.integers(0, 30), st.integers(0, 5))
+def test_processes_share_each_epoch_and_go_on_in_its_middle(count: int, ranks: int, first: int, seed: int) -> None:
+    config = TrainConfig(seed=seed)
+    length = 3 * count
+    whole = list(islice(positions(count, config, first=0), length * ranks))
+    for epoch in range(3 * ranks):
+        assert sorted(whole[epoch * count : (epoch + 1) * count]) == list(range(epoch * count, (epoch + 1) * count))
+    parts = [list(islice(positions(count, config, first=0, rank=rank, ranks=ranks), length)) for rank in range(ranks)]
+    assert [part[index] for index in range(length) for part in parts] == whole
+    for rank, part in enumerate(parts):
+        rest = list(islice(positions(count, config, first=first, rank=rank, ranks=ranks), length))
+        assert rest[: max(length - first, 0)] == part[first:]
+
+
+def test_epochs_have_orders_of_their_own() -> None:
+    order = [number % 50 for number in islice(positions(50, TrainConfig(), first=0), 100)]
+    assert order[:50] != order[50:]
+    assert order[:50] != list(range(50))
+    other = [number % 50 for number in islice(positions(50, TrainConfig(seed=1), first=0), 50)]
+    assert order[:50] != other
+
+
+def test_each_step_draws_its_own_numbers() -> None:
+    drawn = {
+        float(torch.rand(1, generator=generator_of(*numbers), dtype=torch.float64))
+        for numbers in [(0, step, part, rank) for step in range(40) for part in range(3) for rank in range(3)]
+    }
+    assert len(drawn) == 40 * 3 * 3
+    twice = [torch.rand(3, generator=generator_of(7, 1)) for _ in range(2)]
+    assert torch.equal(*twice)
+    assert generator_of(1, 0).initial_seed() != generator_of(0, 1).initial_seed()
+
+
+def test_vectors_do_not_decay(config: ModelConfig) -> None:
+    model = V2XFormer(config)
+    groups = optimizer_of(model, TrainConfig(weight_decay=0.3)).param_groups
+    for group in groups:
+        assert {each.ndim > 1 for each in group["params"]} == {group["weight_decay"] == 0.3}
+    assert sum(len(group["params"]) for group in groups) == len(list(model.parameters()))
+
+
+# --- a step
+
+
+@pytest.fixture(scope="module")
+def batch(da: DeepAccident, moment: list[str], config: ModelConfig) -> dict[str, Any]:
+    """One moment with the targets of all egos."""
+    given = config.inputs("all", boxes="sample", labels=config.labels)
+    return collate_all_egos([AllEgosDataset(da, moment, given)[0]])
+
+
+@pytest.fixture(scope="module")
+def inputs(batch: dict[str, Any]) -> ModelInputs:
+    return model_inputs(batch)
+
+
+def test_partners_are_dropped_but_never_the_ego(inputs: ModelInputs) -> None:
+    config = replace(RUN, partner_dropout=0.3, alone=0.2)
+    draws = [with_dropped_partners(inputs, config, generator_of(0, n)).partners for n in range(800)]
+    egos = torch.eye(5).bool()
+    assert inputs.ego_rows[:, 1].tolist() == list(range(5))
+    heard = torch.stack(draws)
+    assert heard[:, egos].all()
+    partners = heard[:, ~egos].view(800, 5, 4)
+    assert partners.float().mean() == pytest.approx((1 - 0.3) * (1 - 0.2), abs=0.02)
+    assert (~partners.any(2)).float().mean() == pytest.approx(0.2 + 0.8 * 0.3**4, abs=0.02)
+    assert partners.all(2).float().mean() == pytest.approx(0.8 * 0.7**4, abs=0.02)
+    everyone = with_dropped_partners(inputs, replace(config, partner_dropout=0, alone=0), generator_of(0))
+    assert torch.equal(everyone.partners, inputs.partners)
+    for nobody in ({"partner_dropout": 1, "alone": 0}, {"partner_dropout": 0, "alone": 1}):
+        assert torch.equal(with_dropped_partners(inputs, replace(config, **nobody), generator_of(0)).partners, egos)
+
+
+def test_partners_who_are_not_there_are_not_heard(inputs: ModelInputs) -> None:
+    absent = replace(inputs, partners=inputs.partners & (torch.arange(5) != 2))
+    kept = with_dropped_partners(absent, replace(RUN, partner_dropout=0, alone=0), generator_of(0))
+    assert not kept.partners[:, 2].any()
+
+
+def test_egos_are_drawn_from_every_moment(da: DeepAccident, moment: list[str], config: ModelConfig) -> None:
+    given = config.inputs("all", boxes="sample", labels=config.labels)
+    later = [each.replace("/004", "/006") for each in moment[3:]]
+    data = AllEgosDataset(da, [*moment, *later], given)
+    joined = collate_all_egos([data[0], data[1]])
+    seen: Counter[tuple[int, int]] = Counter()
+    for number in range(60):
+        chosen, targets = training_batch(joined, config, replace(RUN, egos=2), generator_of(number))
+        pairs = [tuple(row) for row in chosen.ego_rows.tolist()]
+        assert Counter(moment for moment, _ in pairs) == {0: 2, 1: 2}
+        assert len(set(pairs)) == 4
+        seen.update(pairs)
+        whole = joined["ego_rows"].tolist()
+        for row, pair in enumerate(pairs):
+            source = whole.index(list(pair))
+            assert torch.equal(targets.boxes[row], joined["boxes"][source])
+            assert torch.equal(targets.motion.segmentation[row], joined["segmentation"][source])
+            assert torch.equal(targets.categories[row], joined["categories"][source])
+            assert torch.equal(targets.velocity_known[row], joined["velocity_known"][source])
+    assert len(seen) == 7
+    assert all(10 < seen[0, agent] < 40 for agent in range(5))
+    everyone, _ = training_batch(joined, config, replace(RUN, egos=None), generator_of(0))
+    assert torch.equal(everyone.ego_rows, joined["ego_rows"])
+
+
+def test_frames_beyond_the_recording_are_not_learned(da: DeepAccident, moment: list[str], config: ModelConfig) -> None:
+    """By the released rule, nor is any of a sample without its past."""
+    given = config.inputs("all", boxes="sample", labels=config.labels)
+    masks = []
+    for frame in ("/001", "/004", "/005", "/006"):
+        item = AllEgosDataset(da, [moment[0].replace("/004", frame)], given)[0]
+        _, targets = training_batch(collate_all_egos([item]), config, RUN, generator_of(0))
+        masks += targets.motion.frame_mask.tolist()
+    assert masks == [[False] * 3, [True] * 3, [True, True, False], [True, False, False]]
+
+
+def test_boxes_of_a_left_handed_model_are_mirrored(batch: dict[str, Any]) -> None:
+    _, targets = training_batch(batch, small_released(), replace(RUN, egos=None), generator_of(0))
+    for found, right in zip(targets.boxes, batch["boxes"], strict=True):
+        assert torch.equal(found, mirrored_boxes(right, "left"))
+        assert not torch.equal(found, right)
+
+
+@pytest.mark.parametrize("make", [small, small_released])
+@pytest.mark.parametrize("frame", ["/001", "/004"])
+def test_every_parameter_has_a_gradient_at_every_moment(
+    da: DeepAccident, moment: list[str], make: Callable[[], ModelConfig], frame: str
+) -> None:
+    """Though it may be 0, where a moment has no past and so no motion to learn: several processes wait for all."""
+    config = make()
+    given = config.inputs("all", boxes="sample", labels=config.labels)
+    item = AllEgosDataset(da, [each.replace("/004", frame) for each in moment], given)[0]
+    inputs, targets = training_batch(collate_all_egos([item]), config, RUN, generator_of(0))
+    step = TrainingStep(V2XFormer(config))
+    torch.stack(list(step(inputs, targets).values())).sum().backward()
+    assert [name for name, each in step.model.named_parameters() if each.grad is None] == []
+    assert all(each.grad.isfinite().all() for each in step.model.parameters())
+
+
+def test_a_batch_is_learned_by_heart(da: DeepAccident, moment: list[str], config: ModelConfig) -> None:
+    """Of one ego by itself: the loss falls below a third, and the mean prediction shows who is where."""
+    given = config.inputs("single", boxes="sample", labels=config.labels)
+    batch = collate([V2XDataset(da, moment[:1], given)[0]])
+    torch.manual_seed(0)
+    step = TrainingStep(V2XFormer(config))
+    inputs, targets = training_batch(batch, config, replace(RUN, egos=None), generator_of(0))
+    optimizer = torch.optim.AdamW(step.parameters(), lr=0.01)
+    losses = []
+    for _ in range(80):
+        optimizer.zero_grad()
+        total = torch.stack(list(step(inputs, targets).values())).sum()
+        total.backward()
+        optimizer.step()
+        losses.append(float(total.detach()))
+    assert losses[-1] < losses[0] / 3
+    step.eval()
+    with torch.inference_mode():
+        shown = (
+            step.model(inputs, noise=step.model.noise(1, generator_of(1))).motion.maps.segmentation[-1].argmax(2) == 1
+        )
+    wanted = targets.motion.segmentation == 1
+    assert wanted.sum() > 50
+    assert (shown & wanted).sum() / (shown | wanted).sum() > 0.5
+
+
+def test_half_precision_stays_finite(batch: dict[str, Any], config: ModelConfig) -> None:
+    inputs, targets = training_batch(batch, config, RUN, generator_of(0))
+    totals = []
+    for bf16 in (False, True):
+        torch.manual_seed(0)
+        step = TrainingStep(V2XFormer(config))
+        torch.manual_seed(1)
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=bf16):
+            losses = step(inputs, targets)
+        total = torch.stack(list(losses.values())).sum()
+        total.backward()
+        assert all(each.dtype == torch.float32 for each in losses.values())
+        assert all(each.grad.isfinite().all() for each in step.parameters())
+        totals.append(float(total.detach()))
+    assert np.isfinite(totals).all()
+    assert totals[0] != totals[1]
+    assert totals[1] == pytest.approx(totals[0], rel=0.1)
+
+
+# --- what is trained
+
+
+def test_frozen_parameters_stay_bit_for_bit(da: DeepAccident, tmp_path: Path) -> None:
+    torch.manual_seed(RUN.seed)
+    before = V2XFormer(small()).state_dict()
+    config = replace(SHORT, freeze=("img_", "transformer.depthnet"))
+    after = read_weights(trained(da, tmp_path, config)).tensors
+    for name, parameter in V2XFormer(small()).named_parameters():
+        assert torch.equal(before[name], after[name]) == name.startswith(config.freeze), (name, parameter.shape)
+
+
+def test_unknown_names_cannot_be_frozen(config: ModelConfig) -> None:
+    model = V2XFormer(config)
+    with pytest.raises(ConfigError, match=r"begins with 'img_bakbone'; the parts are img_backbone, img_neck, .*"):
+        freeze(model, ("img_neck", "img_bakbone"))
+    assert all(each.requires_grad for each in model.parameters())
+    with pytest.raises(ConfigError, match="nothing is left to train"):
+        freeze(model, ("",))
+
+
+# --- runs
+
+
+@pytest.fixture(scope="module")
+def whole(da: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An undisturbed run, with curves."""
+    folder = tmp_path_factory.mktemp("runs") / "whole"
+    said: list[str] = []
+    path = trained(da, folder, curves=True, say=said.append)
+    assert path == folder / BEST
+    assert said[0].startswith("6 steps on cpu, ")
+    assert said[0].endswith("2 × 1 samples to validate")
+    assert [each.split(":")[0] for each in said[1:]] == ["step 4", "step 6"]
+    return folder
+
+
+def test_a_run_leaves_its_files(whole: Path) -> None:
+    names = {path.name for path in whole.iterdir()}
+    assert names == {"run.json", "log.jsonl", "curves.png", BEST, LAST}
+    log = read_log(whole)
+    assert [row["step"] for row in log] == [1, 2, 3, 4, 5, 6]
+    assert [row["step"] for row in log if "validation" in row] == [4, 6]
+    for row in log:
+        assert row["loss"] == pytest.approx(sum(row["losses"].values()))
+        assert row["rate"] == learning_rate(row["step"] - 1, RUN)
+        assert 0 <= row["waiting"] <= row["seconds"]
+    weights = read_weights(whole)
+    assert weights.meta["training"] == json.loads(json.dumps(RUN.as_dict()))
+    assert weights.meta["step"] == 4  # the first of two equal scores
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("step", [3, 4])
+def test_a_killed_run_goes_on_as_if_nothing_had_been(
+    da: DeepAccident, root: str, whole: Path, tmp_path: Path, step: int
+) -> None:
+    """Bit for bit: killed after a step in the log that is in no checkpoint, the second time at a validation."""
+    folder = tmp_path / "killed"
+    code = f"from torch_extra.model.small_model import killed_run; killed_run({root!r}, {str(folder)!r}, {step})"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS), *sys.path]), "OMP_NUM_THREADS": "1"}
+    ended = subprocess.run([sys.executable, "-c", code], env=environment, check=False, capture_output=True)
+    assert ended.returncode == -signal.SIGKILL, ended.stderr.decode()
+    assert [row["step"] for row in read_log(folder)] == list(range(1, step + 1))
+    assert read_weights(folder / LAST).meta["step"] == 2
+    trained(da, folder)
+    assert rows(folder) == rows(whole)
+    assert differing(folder, whole) == []
+    best, expected = tensors(folder, BEST), tensors(whole, BEST)
+    assert all(torch.equal(each, expected[name]) for name, each in best.items())
+
+
+def test_a_finished_run_stays(da: DeepAccident, whole: Path) -> None:
+    before = {name: (whole / name).read_bytes() for name in ("run.json", "log.jsonl", BEST, LAST)}
+    assert trained(da, whole) == whole / BEST
+    assert {name: (whole / name).read_bytes() for name in before} == before
+
+
+def test_other_options_in_the_same_folder_are_refused(da: DeepAccident, whole: Path, tmp_path: Path) -> None:
+    before = {path.name: path.read_bytes() for path in whole.iterdir()}
+    with pytest.raises(ConfigError, match=r"run\.json: is of another run, its training differ; give the same options"):
+        trained(da, whole, replace(RUN, seed=1))
+    with pytest.raises(ConfigError, match=r"its from differ"):
+        trained(da, whole, weights=whole / BEST)
+    assert {path.name: path.read_bytes() for path in whole.iterdir()} == before
+    (tmp_path / "run.json").write_text("[]")
+    with pytest.raises(ConfigError, match=r"run\.json: is of another run"):
+        trained(da, tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b"no weights", None])
+def test_a_checkpoint_of_another_run_is_refused(da: DeepAccident, whole: Path, tmp_path: Path, content: Any) -> None:
+    (tmp_path / LAST).write_bytes((whole / BEST).read_bytes() if content is None else content)
+    with pytest.raises(ConfigError, match=r"last\.safetensors: is no "):
+        trained(da, tmp_path)
+
+
+def test_a_run_begins_from_weights(da: DeepAccident, whole: Path, tmp_path: Path) -> None:
+    said: list[str] = []
+    trained(da, tmp_path, replace(SHORT, learning_rate=1e-30, weight_decay=0), weights=whole / BEST, say=said.append)
+    assert said[0].startswith(f"{whole / BEST}: ")
+    assert " tensors loaded" in said[0]
+    expected = tensors(whole, BEST)
+    for name, parameter in V2XFormer(small()).named_parameters():
+        assert torch.equal(tensors(tmp_path, FINAL)[name], expected[name]), (name, parameter.shape)
+
+
+def test_the_best_weights_are_kept(da: DeepAccident, tmp_path: Path) -> None:
+    scores = iter([0.2, 0.6, 0.5])
+    run = replace(RUN, steps=3, validate_every=1, save_every=3)
+    states: list[dict[str, torch.Tensor]] = []
+
+    def validated(model: V2XFormer, *_: Any) -> dict[str, float]:
+        states.append({name: each.clone() for name, each in model.state_dict().items()})
+        return {"score": next(scores)}
+
+    with patch.object(training, "validated", validated):
+        path = trained(da, tmp_path, run)
+    weights = read_weights(path)
+    assert (weights.meta["step"], weights.meta["score"]) == (2, 0.6)
+    assert all(torch.equal(each, states[1][name]) for name, each in weights.tensors.items())
+    assert read_weights(tmp_path / LAST).meta["best"] == 0.6
+
+
+def test_accumulated_losses_are_the_mean(da: DeepAccident, tmp_path: Path) -> None:
+    """The log has the mean of the three batches of a step, which are different moments."""
+    run = replace(SHORT, steps=1, egos=None, accumulate=3, learning_rate=1e-30)
+    seen: list[dict[str, float]] = []
+    losses = training._Run._losses
+
+    def watched(self: Any, *arguments: Any) -> dict[str, torch.Tensor]:
+        found = losses(self, *arguments)
+        seen.append({name: float(each.detach()) for name, each in found.items()})
+        return found
+
+    with patch.object(training._Run, "_losses", watched):
+        trained(da, tmp_path, run)
+    parts = seen[-3:]
+    assert len({str(each) for each in parts}) == 3
+    [row] = read_log(tmp_path)
+    for name, value in row["losses"].items():
+        assert value == pytest.approx(sum(each[name] for each in parts) / 3, rel=1e-6)
+
+
+def test_workers_and_epochs_give_the_same_moments(da: DeepAccident, config: ModelConfig) -> None:
+    """A moment's augmentation is that of its number, which runs on through the epochs."""
+    moments = Moments(da, config, replace(RUN, egos=None))
+    assert len(moments) == 2 * 6
+    numbers = [3, 15, 4]
+    read = list(batches(moments, numbers, replace(RUN, moments=1)))
+    assert [each["egos"] for each in read[:2]] == [list(moments.data.egos[3])] * 2
+    assert not torch.equal(read[0]["augmentation"], read[1]["augmentation"])
+    for number, each in zip(numbers, read, strict=True):
+        assert torch.equal(collate_all_egos([moments[number]])["augmentation"], each["augmentation"])
+    [both] = batches(moments, numbers[:2], replace(RUN, moments=2))
+    assert torch.equal(both["augmentation"], torch.cat([each["augmentation"] for each in read[:2]]))
+
+
+@pytest.mark.slow
+def test_a_worker_process_changes_nothing(da: DeepAccident, whole: Path, tmp_path: Path) -> None:
+    trained(da, tmp_path, workers=1)
+    assert rows(tmp_path) == rows(whole)
+    assert differing(tmp_path, whole) == []
+
+
+@pytest.mark.slow
+def test_two_processes_train_one_model(root: str, tmp_path: Path) -> None:
+    """Under `torchrun` as users start it: equal weights at the end, and one log."""
+    folder = tmp_path / "run"
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS), *sys.path]), "OMP_NUM_THREADS": "1"}
+    script = str(Path(small_model.__file__))
+    ended = subprocess.run(
+        [*command, script, root, str(folder)], env=environment, check=False, capture_output=True, timeout=300
+    )
+    assert ended.returncode == 0, ended.stderr.decode()[-3000:]
+    first, second = (torch.load(folder / f"rank_{rank}.pth", weights_only=True) for rank in range(2))
+    assert first.keys() == second.keys()
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    stored = tensors(folder, FINAL)
+    assert all(torch.equal(each, stored[name]) for name, each in first.items())
+    log = read_log(folder)
+    assert [row["step"] for row in log] == [1, 2]
+    assert {path.name for path in folder.iterdir()} == {
+        "run.json", "log.jsonl", LAST, FINAL, "rank_0.pth", "rank_1.pth",
+    }  # fmt: skip
+
+
+# --- what is refused
+
+
+def test_the_log_is_read_up_to_a_line_that_is_cut_off(tmp_path: Path) -> None:
+    assert read_log(tmp_path) == []
+    for step in range(1, 4):
+        add_to_log(tmp_path, {"step": step})
+    path = tmp_path / "log.jsonl"
+    path.write_bytes(path.read_bytes() + b'{"step": 4, "lo')
+    assert [row["step"] for row in read_log(tmp_path)] == [1, 2, 3]
+    cut_log(tmp_path, 2)
+    assert path.read_bytes() == b'{"step": 1}\n{"step": 2}\n'
+    for line in (b"no json\n", b"[1]\n", b'{"loss": 1}\n', b'{"step": "1"}\n'):
+        path.write_bytes(b'{"step": 1}\n' + line)
+        with pytest.raises(ConfigError, match=r"log\.jsonl:2: expected a JSON object with a step; remove the line"):
+            read_log(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"steps": 0}, ConfigError, "steps: expected a whole number from 1, found 0"),
+        ({"moments": 1.5}, ConfigError, "moments: expected a whole number from 1"),
+        ({"egos": 0}, ConfigError, "egos: expected a whole number from 1"),
+        ({"accumulate": 0}, ConfigError, "accumulate: expected a whole number from 1"),
+        ({"seed": -1}, ConfigError, "seed: expected a whole number from 0"),
+        ({"save_every": 0}, ConfigError, "save_every"),
+        ({"partner_dropout": 1.1}, ConfigError, r"partner_dropout: expected a share from 0 to 1, found 1\.1"),
+        ({"alone": -0.1}, ConfigError, "alone: expected a share from 0 to 1"),
+        ({"warm_up": float("nan")}, ConfigError, "warm_up: expected a share"),
+        ({"learning_rate": 0.0}, ConfigError, "learning_rate: expected a number above 0"),
+        ({"learning_rate": float("inf")}, ConfigError, "learning_rate: expected a number above 0"),
+        ({"clip": -1}, ConfigError, "clip: expected a number above 0"),
+        ({"weight_decay": -1.0}, ConfigError, "weight_decay: expected a number from 0"),
+        ({"weight_decay": "much"}, ConfigError, "weight_decay: expected a number"),
+        ({"samples": "some"}, ChoiceError, "samples: expected one of"),
+    ],
+)
+def test_wrong_options_are_named(changes: dict[str, Any], error: type[DeepAccidentError], message: str) -> None:
+    with pytest.raises(error, match=message):
+        TrainConfig(**changes)
+
+
+def test_an_unknown_device_is_refused() -> None:
+    assert checked_device("cpu") == "cpu"
+    assert checked_device("auto") in ("cpu", "cuda")
+    for device in ("cuda:99", "gpu"):
+        with pytest.raises(ConfigError, match=rf"device: '{device}' cannot be used \(.*\); choose cpu"):
+            checked_device(device)
+
+
+def test_a_release_that_cannot_be_learned_from_is_refused(da: DeepAccident, tmp_path: Path) -> None:
+    with pytest.raises(NotAvailableError, match="test: no scenario of this split"):
+        trained(da, tmp_path / "a", replace(SHORT, split="test"))
+    with pytest.raises(ChoiceError, match="split"):
+        trained(da, tmp_path / "b", replace(SHORT, split="exam"))
