@@ -387,24 +387,27 @@ def test_the_best_weights_are_kept(da: DeepAccident, tmp_path: Path) -> None:
     assert read_weights(tmp_path / LAST).meta["best"] == 0.6
 
 
-def test_accumulated_losses_are_the_mean(da: DeepAccident, tmp_path: Path) -> None:
-    """The log has the mean of the three batches of a step, which are different moments."""
-    run = replace(SHORT, steps=1, egos=None, accumulate=3, learning_rate=1e-30)
-    seen: list[dict[str, float]] = []
+def test_accumulated_gradients_are_the_mean(da: DeepAccident, tmp_path: Path) -> None:
+    """Of the three batches of a step, which are different moments; and so are the losses in the log."""
+    run = replace(SHORT, steps=1, egos=None, accumulate=3, clip=1e6)
+    seen: list[tuple[dict[str, float], tuple[torch.Tensor, ...]]] = []
     losses = training._Run._losses
 
-    def watched(self: Any, *arguments: Any) -> dict[str, torch.Tensor]:
-        found = losses(self, *arguments)
-        seen.append({name: float(each.detach()) for name, each in found.items()})
+    def watched(self: Any, step: Any, *arguments: Any) -> dict[str, torch.Tensor]:
+        found = losses(self, step, *arguments)
+        gradients = torch.autograd.grad(sum(found.values()), list(step.parameters()), retain_graph=True)
+        seen.append(({name: float(each.detach()) for name, each in found.items()}, gradients))
         return found
 
     with patch.object(training._Run, "_losses", watched):
         trained(da, tmp_path, run)
-    parts = seen[-3:]
-    assert len({str(each) for each in parts}) == 3
+    parts = seen[-3:]  # the others were for the estimate
+    assert len({str(values) for values, _ in parts}) == 3
     [row] = read_log(tmp_path)
     for name, value in row["losses"].items():
-        assert value == pytest.approx(sum(each[name] for each in parts) / 3, rel=1e-6)
+        assert value == pytest.approx(sum(values[name] for values, _ in parts) / 3, rel=1e-6)
+    means = [torch.stack(each).mean(0) for each in zip(*(gradients for _, gradients in parts), strict=True)]
+    assert row["norm"] == pytest.approx(float(torch.stack([each.norm() for each in means]).norm()), rel=1e-4)
 
 
 def test_workers_and_epochs_give_the_same_moments(da: DeepAccident, config: ModelConfig) -> None:
