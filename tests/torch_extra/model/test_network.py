@@ -146,6 +146,20 @@ def test_absent_partners_change_nothing_else(
     assert apart(results[0], predicted(model, model_inputs(collate([alone(da, ego, config, "all")])))) > 1e-2
 
 
+def test_all_egos_of_a_partial_release_are_each_by_itself(
+    da_partial: DeepAccident, moment: list[str], config: ModelConfig, seeded: Seeded, predicted: Predicted
+) -> None:
+    """The moment's first agent lacks a camera: it is no ego and no partner, and the others' places stay right."""
+    model = seeded(config)
+    there = [token for token in moment if "other_vehicle_behind" not in token]
+    [item] = AllEgosDataset(da_partial, there, config.inputs("available"))
+    assert item["egos"] == tuple(there[1:])
+    together = predicted(model, model_inputs(collate_all_egos([item])))
+    for row, token in enumerate(item["egos"]):
+        own = predicted(model, model_inputs(collate([alone(da_partial, token, config, "available")])))
+        assert_same([each[row : row + 1] for each in together], own)
+
+
 def test_lost_messages_change_nothing_else(
     da: DeepAccident, moment: list[str], config: ModelConfig, seeded: Seeded, predicted: Predicted
 ) -> None:
