@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torch.utils.data import DataLoader, Sampler
+from torch.utils.data import Dataset as TorchDataset
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import NotAvailableError
@@ -14,16 +15,8 @@ from deepaccident_devkit.model.config import ModelConfig
 from deepaccident_devkit.model.training.config import TrainConfig
 from deepaccident_devkit.motion import samples
 
-if TYPE_CHECKING:
-    TorchSampler = Sampler[int]
-    TorchDataset = object
-else:
-    from torch.utils.data import Dataset as TorchDataset
 
-    TorchSampler = Sampler
-
-
-class Moments(TorchDataset):
+class Moments(TorchDataset[dict[str, Any]]):
     """The moments of a split as `AllEgosDataset` has them, numbered on through the epochs."""
 
     def __init__(self, dataset: Dataset, model: ModelConfig, config: TrainConfig, *, images_cache: Any = None) -> None:
@@ -65,7 +58,7 @@ class Moments(TorchDataset):
         return self.data.item(position, epoch)
 
 
-class _Given(TorchSampler):
+class _Given(Sampler[int]):
     """Numbers that an iterator gives."""
 
     def __init__(self, numbers: Iterable[int]) -> None:
@@ -85,7 +78,7 @@ def batches(moments: Moments, numbers: Iterable[int], config: TrainConfig, *, wo
         workers: processes that read; 0 for this one.
     """
     return DataLoader(
-        moments,  # type: ignore[arg-type]
+        moments,
         batch_size=config.moments,
         sampler=_Given(numbers),
         collate_fn=collate_all_egos,
