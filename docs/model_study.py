@@ -1,9 +1,9 @@
 """Measure whether cooperation helps a small model: `python docs/model_study.py WORKDIR`, from a checkout.
 
-It takes less than three hours of two cores. What is compared stands in `Protocol`, committed before the first test run.
-Each stage is skipped if its output is in WORKDIR, and one that broke off goes on: the same command ends what was begun.
-`--only STAGE` does one stage, `--smoke` a tiny version of all in minutes (in a WORKDIR of its own), `--publish` copies
-the summary and the counts to docs/, from which docs/make_model_page.py makes docs/model.md.
+It takes less than three hours of two cores. What is compared stands in docs/model_study_protocol.py. Each stage is
+skipped if its output is in WORKDIR, and one that broke off goes on: the same command ends what was begun. `--only` does
+one stage, `--smoke` a tiny version of all in minutes (in a WORKDIR of its own), `--publish` copies the summary and the
+counts to docs/, from which docs/make_model_page.py makes docs/model.md.
 """
 
 import argparse
@@ -14,15 +14,25 @@ import shutil
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
+from statistics import median
 from typing import Any, Final
 
 import torch
 from model_study_numbers import differences, row_numbers
+from model_study_protocol import (
+    ARMS,
+    COMPARED,
+    HEADLINE_NUMBER,
+    PROTOCOL,
+    SMOKE,
+    Protocol,
+    ReleasePlan,
+    rows_of,
+)
 from model_study_rows import (
-    Row,
     RowJob,
     count_results,
     evaluators_of,
@@ -46,107 +56,6 @@ from deepaccident_devkit.synth import SynthConfig, make_release
 HERE: Final = Path(__file__).parent
 SUMMARY: Final = "model_study.json"
 COUNTS: Final = "model_study_counts.json.gz"
-HEADLINE: Final = (
-    "IoU 100x100 on the test release, of the arm `all` with all agents less that of the arm `single` with the ego "
-    "alone, after equally many steps, the model seeds pooled: cooperation wins if the 95 % interval of this difference "
-    "over pairs of scenarios is above 0, loses if it is below 0, and else it is not decided"
-)
-HEADLINE_NUMBER: Final = "iou_100"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReleasePlan:
-    """A generated release: `scenarios` of `designs` by turns, half of them normal twins, from one seed."""
-
-    seed: int
-    scenarios: int
-    designs: tuple[int, ...]
-
-
-SEEN_DESIGNS: Final = (1, 2, 6, 7, 12)
-HELD_OUT: Final = 8
-"""The design that no model sees before the test. In 3, 4, 5, 9, 10 and 11 no house can hide the collider."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Protocol:
-    """All that decides the numbers."""
-
-    training: ReleasePlan = ReleasePlan(seed=101, scenarios=30, designs=SEEN_DESIGNS)
-    tuning: ReleasePlan = ReleasePlan(seed=102, scenarios=12, designs=SEEN_DESIGNS)
-    test: ReleasePlan = ReleasePlan(seed=103, scenarios=36, designs=(*SEEN_DESIGNS, HELD_OUT))
-    frames: int = 60
-    image_size: tuple[int, int] = (160, 90)
-    seeds: tuple[int, ...] = (1, 2, 3)
-    first_steps: int = 1000
-    """Of the ego alone, from random weights; both arms go on from there."""
-    arm_steps: int = 500
-    learning_rates: tuple[float, ...] = (1e-3, 2e-3, 4e-3)
-    """One round on the tuning release, of the ego alone, so that the choice cannot favour cooperation."""
-    tuning_steps: int = 300
-    tuning_pairs: int = 2
-    """Pairs of the tuning release that score the runs; they learn from the others."""
-    tuning_samples: int = 40
-    egos: int | None = None
-    configurations: tuple[str, ...] = ("+behind", "+other", "+infrastructure", "vehicles")
-    """Who cooperates in the rows of one seed; so with the links."""
-    pose_noises: tuple[float, ...] = (0.2, 0.5)
-    latencies: tuple[float, ...] = (0.2, 0.5)
-    headline: str = HEADLINE
-    resamples: int = 1000
-
-
-PROTOCOL: Final = Protocol()
-SMOKE: Final = Protocol(
-    training=ReleasePlan(seed=101, scenarios=2, designs=(1,)),
-    tuning=ReleasePlan(seed=102, scenarios=4, designs=(1,)),
-    test=ReleasePlan(seed=103, scenarios=4, designs=(1, HELD_OUT)),
-    frames=7,
-    image_size=(64, 36),
-    seeds=(1,),
-    first_steps=4,
-    arm_steps=2,
-    learning_rates=(1e-3, 2e-3),
-    tuning_steps=1,
-    tuning_pairs=1,
-    tuning_samples=1,
-    egos=1,
-    configurations=("+other",),
-    pose_noises=(),
-    latencies=(0.1,),
-)
-ARMS: Final = {"single": "single", "all": "all"}
-"""Arm → who cooperates in training; with `all`, partners drop out as `TrainConfig` has it."""
-
-
-def _once(name: str, says: str, **changes: Any) -> Row:
-    """A row of the first seed's weights of `all` alone."""
-    return Row(name=name, says=says, arm="all", first_seed_alone=True, **changes)
-
-
-def rows_of(protocol: Protocol) -> tuple[Row, ...]:
-    """All lines of the tables."""
-    return (
-        Row(name="single", says="trained and tested alone", arm="single", agents="single"),
-        Row(name="all", says="trained and tested with all agents", arm="all"),
-        Row(name="all, alone", says="the weights of `all`, tested alone", arm="all", agents="single"),
-        Row(name="all, blanked", says="the weights of `all`, all images black", arm="all", control="blank"),
-        Row(name="all, strangers", says="`all`, partners of another scenario", arm="all", control="strangers"),
-        *(
-            _once(f"all, {agents}", f"`all`, tested with `{agents}`", agents=agents)
-            for agents in protocol.configurations
-        ),
-        *(_once(f"all, {off:g} m", f"`all`, poses {off:g} m off", pose_noise=off) for off in protocol.pose_noises),
-        *(_once(f"all, {late:g} s", f"`all`, partners {late:g} s late", latency=late) for late in protocol.latencies),
-        Row(name="labels, single", says="baseline: labels that the ego sees", kind="baseline", agents="single"),
-        Row(name="labels, all", says="baseline: labels that any agent sees", kind="baseline"),
-        Row(name="nothing", says="an empty map, no box, no alarm", kind="nothing"),
-        Row(name="everything", says="the whole map is one actor", kind="everything"),
-    )
-
-
-COMPARED: Final = (("single", "all"), ("single", "all, alone"), ("all, alone", "all"), ("all, strangers", "all"))
-"""Pairs of rows whose differences, second less first, are given; the first pair has the headline."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -232,11 +141,12 @@ class TrainJob:
     config: TrainConfig
     weights: Path | None
     device: str
+    choice: ModelChoice = field(default_factory=ModelChoice)
 
 
 def trained(job: TrainJob) -> None:
     """Train; a run that is there goes on, and one that has ended is left as it is."""
-    train(opened(job.release), job.out, ModelChoice(), job.config, weights=job.weights, device=job.device)
+    train(opened(job.release), job.out, job.choice, job.config, weights=job.weights, device=job.device)
 
 
 def tuning(study: Study) -> dict[str, Any]:
@@ -305,6 +215,27 @@ def training(study: Study) -> dict[str, Any]:
     }
 
 
+def costs(study: Study) -> dict[str, Any]:
+    """Seconds of a step with each fusion, and with a longer horizon; one process alone."""
+    protocol, found = study.protocol, {}
+    for name in protocol.costs:
+        job = TrainJob(
+            release=study.release("tuning"),
+            out=study.folder / "runs" / f"cost-{name.replace(' ', '')}",
+            config=TrainConfig(
+                steps=protocol.cost_steps, egos=protocol.egos, split=str(study.split("tuning")), validation=None
+            ),
+            weights=None,
+            device=study.device,
+            choice=ModelChoice(horizon=float(name.removesuffix(" s")))
+            if name.endswith(" s")
+            else ModelChoice(fusion=name),
+        )
+        together(replace(study, processes=1), trained, [job])
+        found[name] = median(row["seconds"] for row in read_log(job.out))
+    return found
+
+
 def predicting(study: Study, *, controls: bool) -> dict[str, Any]:
     """Write the results of the rows with, or without, spoilt inputs."""
     jobs = {name: job for name, job in study.jobs().items() if (job.row.control is not None) == controls}
@@ -324,7 +255,7 @@ def bundles(study: Study) -> dict[str, Any]:
     found = {name: evaluators_of(job.out) for name, job in study.jobs().items()}
     write_counts(study.folder / COUNTS, found)
     seconds = json.loads((study.folder / "seconds.json").read_text())
-    notes = {name: study.stored(name) for name in ("releases", "tuning", "training")}
+    notes = {name: study.stored(name) for name in ("releases", "tuning", "training", "costs")}
     summary = {
         "protocol": json.loads(json.dumps(asdict(study.protocol))),
         "smoke": study.protocol != PROTOCOL,
@@ -339,7 +270,7 @@ def bundles(study: Study) -> dict[str, Any]:
 
 def summarised(found: Mapping[str, Any], protocol: Protocol) -> dict[str, Any]:
     """Every number of all rows and comparisons, from the evaluators of `ROW#SEED` or `ROW`."""
-    resampling, none = Resampling(resamples=protocol.resamples), Resampling(resamples=0)
+    resampling = Resampling(resamples=protocol.resamples)
     keys: dict[str, list[str]] = {}
     for key in found:
         keys.setdefault(key.partition("#")[0], []).append(key)
@@ -347,7 +278,11 @@ def summarised(found: Mapping[str, Any], protocol: Protocol) -> dict[str, Any]:
         row.name: {
             "says": row.says,
             "numbers": row_numbers([found[key] for key in keys[row.name]], resampling),
-            "seeds": {_seed(key): row_numbers([found[key]], none) for key in keys[row.name] if _seed(key)},
+            "seeds": {_seed(key): row_numbers([found[key]], resampling) for key in keys[row.name] if _seed(key)},
+            "designs": {
+                name: row_numbers([found[key] for key in keys[row.name]], resampling, tokens)
+                for name, tokens in by_design(found, protocol).items()
+            },
         }
         for row in rows_of(protocol)
     }
@@ -375,6 +310,16 @@ def summarised(found: Mapping[str, Any], protocol: Protocol) -> dict[str, Any]:
         "rows": rows,
         "differences": compared,
     }
+
+
+def by_design(found: Mapping[str, Any], protocol: Protocol) -> dict[str, list[str]]:
+    """The samples of designs that models have learned from, and of the one that was held out."""
+    groups: dict[str, list[str]] = {"seen": [], "held out": []}
+    for token in sorted(next(iter(found.values()))["motion"].tokens):
+        pair = int(token.split("/")[1].rpartition("scenario")[2]) - 1
+        design = protocol.test.designs[pair % len(protocol.test.designs)]
+        groups["seen" if design in protocol.training.designs else "held out"].append(token)
+    return groups
 
 
 def _seed(key: str) -> str:
@@ -430,6 +375,7 @@ STAGES: Final[Mapping[str, Callable[[Study], dict[str, Any]]]] = {
     "predictions": lambda study: predicting(study, controls=False),
     "controls": lambda study: predicting(study, controls=True),
     "evaluation": evaluation,
+    "costs": costs,
     "bundles": bundles,
 }
 

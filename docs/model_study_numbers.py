@@ -189,18 +189,26 @@ def clusters_of(tokens: Collection[str]) -> list[list[str]]:
     return [found[name] for name in sorted(found)]
 
 
-def row_numbers(seeds: Sequence[Evaluators], resampling: Resampling) -> dict[str, dict[str, Any]]:
-    """Number → `value`, and with an interval `low` and `high`; of all seeds together, each sample once a seed."""
+def row_numbers(
+    seeds: Sequence[Evaluators], resampling: Resampling, tokens: Collection[str] | None = None
+) -> dict[str, dict[str, Any]]:
+    """Number → `value`, and with an interval `low` and `high`; of all seeds together, each sample once a seed.
+
+    Args:
+        seeds: the evaluators of each of the row's models.
+        resampling: how intervals are made.
+        tokens: of which samples; None for all.
+    """
     found: dict[str, dict[str, Any]] = {}
-    for kind in dict.fromkeys(kind for kind, _, _ in PATHS.values()):
-        clusters = _counts(seeds, kind)
+    for kind in seeds[0]:
+        clusters = _counts(seeds, kind, tokens)
         evaluator = seeds[0][kind]
         result = evaluator.result_of([*chain.from_iterable(clusters)])
         ends, values = intervals_of(evaluator, clusters, result, resampling).ends, numbers_of(result)
         for name, path in _named(kind).items():
             low, high = ends.get(path, (None, None))
             found[name] = {"value": _known(values.get(path)), "low": low, "high": high}
-    return {name: found[name] for name in PATHS}
+    return {name: found[name] for name in PATHS if name in found}
 
 
 def differences(
@@ -208,7 +216,7 @@ def differences(
 ) -> dict[str, dict[str, Any]]:
     """Number → how much more the other has, with its interval: the same clusters are left out of both."""
     found: dict[str, dict[str, Any]] = {}
-    for kind in dict.fromkeys(kind for kind, _, _ in PATHS.values()):
+    for kind in base[0]:
         evaluator, pair = base[0][kind], (_counts(base, kind), _counts(other, kind))
         first, second = (numbers_of(evaluator.result_of([*chain.from_iterable(each)])) for each in pair)
         paths = _named(kind)
@@ -218,7 +226,7 @@ def differences(
             name: {"value": _known(more[path]), "low": ends[path][0], "high": ends[path][1]}
             for name, path in paths.items()
         }
-    return {name: found[name] for name in PATHS}
+    return {name: found[name] for name in PATHS if name in found}
 
 
 def _ends(
@@ -230,10 +238,10 @@ def _ends(
     return {path: (_known(float(low[at])), _known(float(high[at]))) for at, path in enumerate(more)}
 
 
-def _counts(seeds: Sequence[Evaluators], kind: str) -> Clusters:
+def _counts(seeds: Sequence[Evaluators], kind: str, tokens: Collection[str] | None = None) -> Clusters:
     """Of each cluster the counts of all its samples, with all seeds."""
     counts = [evaluators[kind].counts for evaluators in seeds]
-    return [[each[token] for token in cluster for each in counts] for cluster in clusters_of(counts[0])]
+    return [[each[token] for token in cluster for each in counts] for cluster in clusters_of(tokens or counts[0])]
 
 
 def _named(kind: str) -> dict[str, str]:

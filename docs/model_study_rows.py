@@ -160,8 +160,11 @@ def evaluators_of(folder: Path) -> Evaluators:
 
 
 def write_counts(path: Path, rows: Mapping[str, Evaluators]) -> None:
-    """All counts of all rows, packed; the same ones give the same bytes."""
-    told = {name: {kind: dict(each.counts) for kind, each in found.items()} for name, found in rows.items()}
+    """The counts of all rows but those of detection, which are many, packed; the same ones give the same bytes."""
+    told = {
+        name: {kind: dict(each.counts) for kind, each in found.items() if kind != "detection"}
+        for name, found in rows.items()
+    }
     write_bytes(path, gzip.compress(json.dumps(told, sort_keys=True).encode(), mtime=0))
 
 
