@@ -116,18 +116,18 @@ INTRO = """# The model, and whether cooperation helps it
 
 For everybody who wants to train V2XFormer, or to know what partners are worth to a small model. READING_TIME.
 
-V2XFormer is the model that was published with DeepAccident. It lifts the images of six cameras to a map seen from above,
-joins an agent's own past with its present, joins the maps of up to five agents, and predicts motion and boxes.
-`deepaccident_devkit.model` has it in plain PyTorch (`pip install '.[torch]'`) in two sizes: `released`, with the release's
-names of weights and its choices, and `tiny`, which a laptop trains.
+V2XFormer is the model that was published with DeepAccident. It lifts the images of six cameras to a map seen from
+above, joins an agent's own past with its present, joins the maps of up to five agents, and predicts motion and boxes.
+`deepaccident_devkit.model` has it in plain PyTorch (`pip install '.[torch]'`) in two sizes: `released`, with the
+release's names of weights and its choices, and `tiny`, which a laptop trains.
 
     deepaccident train DATAROOT --preset tiny --agents all --out runs/all
     deepaccident predict runs/all DATAROOT --split val --agents all --out results
     deepaccident evaluate motion DATAROOT --results results/motion --protocol paper --switch labels=clean
 
-`tiny` has cells of 1 m and learns the labels `clean`. So all numbers here are **clean, 1 m**: limits that the metrics count
-in cells are twice as long in metres as the released ones, and the labels are others. They never stand beside numbers of
-the released protocol, nor beside the paper's ([which numbers compare](comparable_numbers.md)).
+`tiny` has cells of 1 m and learns the labels `clean`. So all numbers here are **clean, 1 m**: limits that the metrics
+count in cells are twice as long in metres as the released ones, and the labels are others. They never stand beside
+numbers of the released protocol, nor beside the paper's ([which numbers compare](comparable_numbers.md)).
 
 ## Does cooperation help?
 
@@ -139,15 +139,15 @@ MEASURED = """
   twins. A house hides those who will collide from each other. The test also has the design {held}, which no model saw
   before.
 - For each model seed ({seeds}) a model is trained alone for {first_steps:,} steps. From its weights two arms go on for
-  {arm_steps:,} steps: `single` alone, and `all` with all agents, some of whom drop out at random. The arms are equal in all
-  else. The last weights are tested; nothing is chosen among them.
-- The test has {samples} samples of `ego_vehicle`, within the last two seconds of {pairs} pairs of an accident and its twin;
-  in {positives} of them an accident comes. In brackets are intervals of 95 % over these pairs ([how](statistics.md)); there
-  is none where too few of them change a number. The model seeds are pooled: the intervals say how a number varies from
-  scene to scene, not from training to training.
+  {arm_steps:,} steps: `single` alone, and `all` with all agents, some of whom drop out at random. The arms are equal in
+  all else. The last weights are tested; nothing is chosen among them.
+- The test has {samples} samples of `ego_vehicle`, within the last two seconds of {pairs} pairs of an accident and its
+  twin; in {positives} of them an accident comes. In brackets are intervals of 95 % over these pairs
+  ([how](statistics.md)); there is none where too few of them change a number. The model seeds are pooled: the intervals
+  say how a number varies from scene to scene, not from training to training.
 - Actors within 50 m that only a partner sees, by the released rule of visibility ({hidden}, beside {seen} that the ego
-  sees), are counted apart. One is on the map if the cell of its centre is foreground at the present, and detected if a box
-  is within 2 m. The false share beside it is of the foreground cells, so that covering everything does not win.
+  sees), are counted apart. One is on the map if the cell of its centre is foreground at the present, and detected if a
+  box is within 2 m. The false share beside it is of the foreground cells, so that covering everything does not win.
 """
 REPEAT = """
 ## How to repeat it
@@ -213,8 +213,8 @@ def _tables(summary: Summary) -> list[str]:
         "",
         rows_table(every, FOUND),
         "",
-        "Differences, with the same pairs left out of both rows for the interval. Only the first line was fixed beforehand.",
-        "All others are for exploration, and not corrected for their number:",
+        "Differences; for the intervals, the same pairs are left out of both rows. Only the first line was fixed",
+        "beforehand, all others are for exploration and not corrected for their number:",
         "",
         _compared(summary),
         "",
@@ -252,7 +252,7 @@ def _designs(summary: Summary) -> str:
 def _how(summary: Summary) -> list[str]:
     machine, tuning, seconds = summary["machine"], summary["tuning"], summary["seconds"]
     lines = [
-        [str(number), rate, *(f"{scores[name]:.3f}" for name in ("iou", "vpq", "map", "score"))]
+        [str(number), rate, *(f"{scores[name]:.3f}" for name in ("iou", "vpq", "map", "score", "loss"))]
         for number, each in enumerate(tuning["rounds"], start=1)
         for rate, scores in each.items()
     ]
@@ -270,7 +270,7 @@ def _how(summary: Summary) -> list[str]:
         "",
         f"All that was tried on the tuning release; the learning rate {tuning['learning_rate']:g} was chosen:",
         "",
-        table(["round", "learning rate", "IoU", "VPQ", "mAP", "score"], lines),
+        table(["round", "learning rate", "IoU", "VPQ", "mAP", "score", "loss"], lines),
         "",
         fill(
             f"Fingerprints of the releases: {prints}. docs/model_study.json has all numbers, and "

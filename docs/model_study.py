@@ -17,7 +17,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from dataclasses import asdict, dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
-from statistics import median
+from statistics import mean, median
 from typing import Any, Final
 
 import torch
@@ -150,7 +150,7 @@ def trained(job: TrainJob) -> None:
 
 
 def tuning(study: Study) -> dict[str, Any]:
-    """Short runs with each learning rate on the tuning release; the best score chooses."""
+    """Short runs with each learning rate on the tuning release; the best score chooses, then the lower loss."""
     protocol = study.protocol
     jobs = {
         rate: TrainJob(
@@ -172,9 +172,15 @@ def tuning(study: Study) -> dict[str, Any]:
         for rate in protocol.learning_rates
     }
     together(study, trained, jobs.values())
-    scores = {rate: read_log(job.out)[-1]["validation"] for rate, job in jobs.items()}
-    chosen = max(scores, key=lambda rate: (scores[rate]["score"], -rate))
+    logs = {rate: read_log(job.out) for rate, job in jobs.items()}
+    scores = {rate: {**log[-1]["validation"], "loss": _last_loss(log)} for rate, log in logs.items()}
+    chosen = max(scores, key=lambda rate: (scores[rate]["score"], -scores[rate]["loss"]))
     return {"rounds": [{f"{rate:g}": found for rate, found in scores.items()}], "learning_rate": chosen}
+
+
+def _last_loss(log: Sequence[Mapping[str, Any]]) -> float:
+    """The mean of the last 50 steps."""
+    return float(mean(row["loss"] for row in log[-50:]))
 
 
 def training(study: Study) -> dict[str, Any]:
@@ -208,7 +214,7 @@ def training(study: Study) -> dict[str, Any]:
     return {
         name: {
             "steps": len(log),
-            "loss": sum(row["loss"] for row in log[-50:]) / len(log[-50:]),
+            "loss": _last_loss(log),
             "seconds": sum(row["seconds"] for row in log),
         }
         for name, log in logs.items()
