@@ -1,0 +1,449 @@
+"""Measure whether cooperation helps a small model: `python docs/model_study.py WORKDIR`, from a checkout.
+
+It takes less than three hours of two cores. What is compared stands in docs/model_study_protocol.py. Each stage is
+skipped if its output is in WORKDIR, and one that broke off goes on: the same command ends what was begun. `--only` does
+one stage, `--smoke` a tiny version of all in minutes (in a WORKDIR of its own), `--publish` copies the summary and the
+counts to docs/, from which docs/make_model_page.py makes docs/model.md.
+"""
+
+import argparse
+import json
+import os
+import platform
+import shutil
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import asdict, dataclass, field, replace
+from multiprocessing import get_context
+from pathlib import Path
+from statistics import mean, median
+from typing import Any, Final
+
+import torch
+from model_study_numbers import differences, row_numbers
+from model_study_protocol import (
+    ARMS,
+    COMPARED,
+    HEADLINE_NUMBER,
+    PROTOCOL,
+    SMOKE,
+    Protocol,
+    ReleasePlan,
+    rows_of,
+)
+from model_study_rows import (
+    RowJob,
+    count_results,
+    evaluators_of,
+    opened,
+    write_counts,
+    write_results,
+)
+
+from deepaccident_devkit import __version__
+from deepaccident_devkit.evaluation import Resampling
+from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.model.checkpoint import FINAL
+from deepaccident_devkit.model.presets import ModelChoice
+from deepaccident_devkit.model.training.config import TrainConfig
+from deepaccident_devkit.model.training.log import read_log
+from deepaccident_devkit.model.training.train import train
+from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
+from deepaccident_devkit.release.split_files import write_split_file
+from deepaccident_devkit.synth import SynthConfig, make_release
+
+HERE: Final = Path(__file__).parent
+SUMMARY: Final = "model_study.json"
+COUNTS: Final = "model_study_counts.json.gz"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Study:
+    """A run of the protocol in a folder."""
+
+    folder: Path
+    protocol: Protocol
+    device: str = "cpu"
+    processes: int = 2
+
+    def release(self, name: str) -> Path:
+        """Folder of one of the three releases."""
+        return self.folder / "releases" / name
+
+    def split(self, name: str) -> Path:
+        """A split file."""
+        return self.folder / "releases" / f"{name}.txt"
+
+    def weights(self, arm: str, seed: int) -> Path:
+        """Where training puts the weights of an arm; `first` for those that both arms begin from."""
+        return self.folder / "runs" / f"{arm}-{seed}" / FINAL
+
+    def jobs(self) -> dict[str, RowJob]:
+        """Row, and for models its seed → the job."""
+        found = {}
+        for row in rows_of(self.protocol):
+            seeds: Sequence[int | None] = self.protocol.seeds if row.kind == "model" else (None,)
+            for seed in seeds[:1] if row.first_seed_alone else seeds:
+                key = row.name if seed is None else f"{row.name}#{seed}"
+                found[key] = RowJob(
+                    row=row,
+                    release=self.release("test"),
+                    split=self.split("test"),
+                    out=self.folder / "rows" / key.replace(", ", "_").replace(" ", "_"),
+                    weights=None if seed is None or row.arm is None else self.weights(row.arm, seed),
+                    device=self.device,
+                )
+        return found
+
+    def stored(self, name: str) -> Any:
+        """What a stage has noted; None before it ends."""
+        path = self.folder / "stages" / f"{name}.json"
+        return json.loads(path.read_text()) if path.exists() else None
+
+
+def releases(study: Study) -> dict[str, Any]:
+    """Generate the three releases, with images alone, and their split files."""
+    told = {}
+    for name in ("training", "tuning", "test"):
+        plan: ReleasePlan = getattr(study.protocol, name)
+        config = SynthConfig(
+            scenarios=plan.scenarios,
+            frames=study.protocol.frames,
+            image_size=study.protocol.image_size,
+            seed=plan.seed,
+            sensors="cameras",
+            view="hidden",
+            designs=plan.designs,
+        )
+        if not study.release(name).exists():
+            make_release(study.release(name), config, workers=study.processes, progress=True)
+        dataset = opened(study.release(name))
+        tokens = [record["token"] for record in dataset.scenario]
+        write_split_file(study.split(name), tokens)
+        told[name] = {"scenarios": len(tokens), "fingerprint": fingerprint(scenario_hashes(dataset, set(tokens)))}
+        if name == "tuning":
+            pairs = sorted({token.split("/")[1] for token in tokens})
+            scoring = pairs[-study.protocol.tuning_pairs :]
+            write_split_file(study.split("tuning-score"), [each for each in tokens if each.split("/")[1] in scoring])
+            write_split_file(
+                study.split("tuning-learn"), [each for each in tokens if each.split("/")[1] not in scoring]
+            )
+    return told
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainJob:
+    """One run of training; cheap to pickle."""
+
+    release: Path
+    out: Path
+    config: TrainConfig
+    weights: Path | None
+    device: str
+    choice: ModelChoice = field(default_factory=ModelChoice)
+
+
+def trained(job: TrainJob) -> None:
+    """Train; a run that is there goes on, and one that has ended is left as it is."""
+    train(opened(job.release), job.out, job.choice, job.config, weights=job.weights, device=job.device)
+
+
+def tuning(study: Study) -> dict[str, Any]:
+    """Short runs with each learning rate on the tuning release; the best score chooses, then the lower loss."""
+    protocol = study.protocol
+    jobs = {
+        rate: TrainJob(
+            release=study.release("tuning"),
+            out=study.folder / "runs" / f"tuning-{rate:g}",
+            config=TrainConfig(
+                steps=protocol.tuning_steps,
+                agents="single",
+                egos=protocol.egos,
+                learning_rate=rate,
+                split=str(study.split("tuning-learn")),
+                validation=str(study.split("tuning-score")),
+                validate_every=protocol.tuning_steps,
+                validation_samples=protocol.tuning_samples,
+            ),
+            weights=None,
+            device=study.device,
+        )
+        for rate in protocol.learning_rates
+    }
+    together(study, trained, jobs.values())
+    logs = {rate: read_log(job.out) for rate, job in jobs.items()}
+    scores = {rate: {**log[-1]["validation"], "loss": _last_loss(log)} for rate, log in logs.items()}
+    chosen = max(scores, key=lambda rate: (scores[rate]["score"], -scores[rate]["loss"]))
+    return {"rounds": [{f"{rate:g}": found for rate, found in scores.items()}], "learning_rate": chosen}
+
+
+def _last_loss(log: Sequence[Mapping[str, Any]]) -> float:
+    """The mean of the last 50 steps."""
+    return float(mean(row["loss"] for row in log[-50:]))
+
+
+def training(study: Study) -> dict[str, Any]:
+    """Each seed alone first, then both arms from its weights, equal but for the agents."""
+    protocol, rate = study.protocol, study.stored("tuning")["learning_rate"]
+
+    def job(arm: str, seed: int) -> TrainJob:
+        first = arm == "first"
+        return TrainJob(
+            release=study.release("training"),
+            out=study.weights(arm, seed).parent,
+            config=TrainConfig(
+                steps=protocol.first_steps if first else protocol.arm_steps,
+                agents="single" if first else ARMS[arm],
+                egos=protocol.egos,
+                learning_rate=rate,
+                split=str(study.split("training")),
+                validation=None,
+                seed=seed,
+            ),
+            weights=None if first else study.weights("first", seed),
+            device=study.device,
+        )
+
+    def then(done: TrainJob) -> list[TrainJob]:
+        return [job(arm, done.config.seed) for arm in ARMS] if done.weights is None else []
+
+    together(study, trained, [job("first", seed) for seed in protocol.seeds], then)
+    runs = [f"{arm}-{seed}" for arm in ("first", *ARMS) for seed in protocol.seeds]
+    logs = {name: read_log(study.folder / "runs" / name) for name in runs}
+    return {
+        name: {
+            "steps": len(log),
+            "loss": _last_loss(log),
+            "seconds": sum(row["seconds"] for row in log),
+        }
+        for name, log in logs.items()
+    }
+
+
+def costs(study: Study) -> dict[str, Any]:
+    """Seconds of a step with each fusion, and with a longer horizon; one process alone."""
+    protocol, found = study.protocol, {}
+    for name in protocol.costs:
+        job = TrainJob(
+            release=study.release("tuning"),
+            out=study.folder / "runs" / f"cost-{name.replace(' ', '')}",
+            config=TrainConfig(
+                steps=protocol.cost_steps, egos=protocol.egos, split=str(study.split("tuning")), validation=None
+            ),
+            weights=None,
+            device=study.device,
+            choice=ModelChoice(horizon=float(name.removesuffix(" s")))
+            if name.endswith(" s")
+            else ModelChoice(fusion=name),
+        )
+        together(replace(study, processes=1), trained, [job])
+        found[name] = median(row["seconds"] for row in read_log(job.out))
+    return found
+
+
+def predicting(study: Study, *, controls: bool) -> dict[str, Any]:
+    """Write the results of the rows with, or without, spoilt inputs."""
+    jobs = {name: job for name, job in study.jobs().items() if (job.row.control is not None) == controls}
+    together(study, write_results, jobs.values())
+    return {"rows": list(jobs)}
+
+
+def evaluation(study: Study) -> dict[str, Any]:
+    """Count all rows: bundles, and hidden actors."""
+    jobs = study.jobs()
+    together(study, count_results, jobs.values())
+    return {"rows": list(jobs)}
+
+
+def bundles(study: Study) -> dict[str, Any]:
+    """Write the summary and all counts."""
+    found = {name: evaluators_of(job.out) for name, job in study.jobs().items()}
+    write_counts(study.folder / COUNTS, found)
+    seconds = json.loads((study.folder / "seconds.json").read_text())
+    notes = {name: study.stored(name) for name in ("releases", "tuning", "training", "costs")}
+    summary = {
+        "protocol": json.loads(json.dumps(asdict(study.protocol))),
+        "smoke": study.protocol != PROTOCOL,
+        **summarised(found, study.protocol),
+        **notes,
+        "seconds": seconds,
+        "machine": machine(study),
+    }
+    write_bytes(study.folder / SUMMARY, (json.dumps(summary, indent=1) + "\n").encode())
+    return {"counts_bytes": (study.folder / COUNTS).stat().st_size}
+
+
+def summarised(found: Mapping[str, Any], protocol: Protocol) -> dict[str, Any]:
+    """Every number of all rows and comparisons, from the evaluators of `ROW#SEED` or `ROW`."""
+    resampling = Resampling(resamples=protocol.resamples)
+    keys: dict[str, list[str]] = {}
+    for key in found:
+        keys.setdefault(key.partition("#")[0], []).append(key)
+    rows = {
+        row.name: {
+            "says": row.says,
+            "numbers": row_numbers([found[key] for key in keys[row.name]], resampling),
+            "seeds": {_seed(key): row_numbers([found[key]], resampling) for key in keys[row.name] if _seed(key)},
+            "designs": {
+                name: row_numbers([found[key] for key in keys[row.name]], resampling, tokens)
+                for name, tokens in by_design(found, protocol).items()
+            },
+        }
+        for row in rows_of(protocol)
+    }
+    compared = [
+        {
+            "first": one,
+            "second": other,
+            "numbers": differences(*([found[key] for key in keys[name]] for name in (one, other)), resampling),
+            "seeds": {
+                _seed(first): differences([found[first]], [found[second]], resampling)
+                for first, second in zip(keys[one], keys[other], strict=True)
+            },
+        }
+        for one, other in COMPARED
+    ]
+    first = next(iter(found.values()))
+    tokens = first["motion"].tokens
+    hidden = first["hidden"].compute()
+    return {
+        "samples": len(tokens),
+        "pairs": len({token.split("/")[1] for token in tokens}),
+        "positives": first["accident"].compute().positives,
+        "actors": {"hidden": hidden.hidden, "seen": hidden.seen},
+        "headline_number": HEADLINE_NUMBER,
+        "rows": rows,
+        "differences": compared,
+    }
+
+
+def by_design(found: Mapping[str, Any], protocol: Protocol) -> dict[str, list[str]]:
+    """The samples of designs that models have learned from, and of the one that was held out."""
+    groups: dict[str, list[str]] = {"seen": [], "held out": []}
+    for token in sorted(next(iter(found.values()))["motion"].tokens):
+        pair = int(token.split("/")[1].rpartition("scenario")[2]) - 1
+        design = protocol.test.designs[pair % len(protocol.test.designs)]
+        groups["seen" if design in protocol.training.designs else "held out"].append(token)
+    return groups
+
+
+def _seed(key: str) -> str:
+    """The model's seed in `ROW#SEED`."""
+    return key.partition("#")[2]
+
+
+def machine(study: Study) -> dict[str, Any]:
+    """What it ran on."""
+    gpu = torch.cuda.get_device_name(study.device) if study.device.startswith("cuda") else None
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "processes": study.processes,
+        "gpu": gpu,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "devkit": __version__,
+    }
+
+
+def _processor() -> str:
+    path = Path("/proc/cpuinfo")
+    lines = path.read_text().splitlines() if path.exists() else []
+    named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return named[0] if named else platform.machine()
+
+
+def together(
+    study: Study,
+    work: Callable[[Any], None],
+    jobs: Iterable[Any],
+    then: Callable[[Any], Sequence[Any]] | None = None,
+) -> None:
+    """Do jobs in a few processes of one thread each; `then` says which ones follow one that is done."""
+    with ProcessPoolExecutor(
+        study.processes, mp_context=get_context("spawn"), initializer=torch.set_num_threads, initargs=(1,)
+    ) as pool:
+        running: dict[Future[None], Any] = {pool.submit(work, job): job for job in jobs}
+        while running:
+            done, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in done:
+                job = running.pop(future)
+                future.result()
+                print(f"  done: {job.out.name}", flush=True)
+                running |= {pool.submit(work, each): each for each in (then(job) if then else ())}
+
+
+STAGES: Final[Mapping[str, Callable[[Study], dict[str, Any]]]] = {
+    "releases": releases,
+    "tuning": tuning,
+    "training": training,
+    "predictions": lambda study: predicting(study, controls=False),
+    "controls": lambda study: predicting(study, controls=True),
+    "evaluation": evaluation,
+    "costs": costs,
+    "bundles": bundles,
+}
+
+
+def run(study: Study, only: Sequence[str] = tuple(STAGES)) -> None:
+    """Do the stages that are not done; the seconds of each are added up over interruptions, except by kill -9."""
+    _claim(study)
+    for name in only:
+        if study.stored(name) is not None:
+            continue
+        print(f"{name} …", flush=True)
+        began = time.monotonic()
+        try:
+            told = STAGES[name](study)
+        finally:
+            _add_seconds(study, name, time.monotonic() - began)
+        write_bytes(study.folder / "stages" / f"{name}.json", json.dumps(told, indent=1).encode())
+    times = json.loads((study.folder / "seconds.json").read_text())
+    print(
+        ", ".join(f"{name} {each:.0f} s" for name, each in times.items()), f"in all {sum(times.values()) / 3600:.2f} h"
+    )
+
+
+def _claim(study: Study) -> None:
+    """Refuse a folder of another protocol."""
+    path, told = study.folder / "protocol.json", json.dumps(asdict(study.protocol), indent=1)
+    (study.folder / "stages").mkdir(parents=True, exist_ok=True)
+    if path.exists() and path.read_text() != told:
+        raise SystemExit(f"{path}: is of another protocol; choose another folder")
+    write_bytes(path, told.encode())
+
+
+def _add_seconds(study: Study, name: str, seconds: float) -> None:
+    path = study.folder / "seconds.json"
+    known = json.loads(path.read_text()) if path.exists() else {}
+    write_bytes(path, json.dumps({**known, name: known.get(name, 0.0) + seconds}).encode())
+
+
+def main() -> None:
+    """Parse and run."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("workdir", type=Path)
+    parser.add_argument("--only", choices=STAGES, help="this stage alone")
+    parser.add_argument("--smoke", action="store_true", help="all of it, tiny")
+    parser.add_argument("--publish", action="store_true", help="copy summary and counts to docs/")
+    parser.add_argument("--device", default="cpu", help="of the models; a GPU is named in the summary")
+    given = parser.parse_args()
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # of the processes to come
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    study = Study(
+        folder=given.workdir.resolve(),
+        protocol=SMOKE if given.smoke else PROTOCOL,
+        device=given.device,
+        processes=2 if given.device == "cpu" else 1,
+    )
+    run(study, [given.only] if given.only else tuple(STAGES))
+    if given.publish:
+        if given.smoke:
+            raise SystemExit("--publish, --smoke: the numbers of the smoke run say nothing; leave one of the two out")
+        for name in (SUMMARY, COUNTS):
+            shutil.copyfile(study.folder / name, HERE / name)
+
+
+if __name__ == "__main__":
+    main()

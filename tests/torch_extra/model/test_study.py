@@ -1,0 +1,340 @@
+"""The experiment on cooperation (docs/model_study.py) and its page: what it counts, and a tiny run of all of it."""
+
+import importlib
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.evaluation import Resampling
+from deepaccident_devkit.model.presets import tiny
+from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
+from deepaccident_devkit.v2x import cooperating_agents, visible_instances
+from deepaccident_devkit.v2x.seen import seen_actors
+
+DOCS = Path(__file__).parents[3] / "docs"
+NAMES = ("model_study_numbers", "model_study_rows", "model_study_protocol", "model_study", "make_model_page")
+LABELS = tiny().labels
+
+
+@pytest.fixture(scope="module")
+def scripts() -> Iterator[dict[str, ModuleType]]:
+    """The experiment's scripts by name; they import each other, and so do processes that they start."""
+    sys.path.insert(0, str(DOCS))
+    yield {name: importlib.import_module(name) for name in NAMES}
+    sys.path.remove(str(DOCS))
+    for name in NAMES:
+        del sys.modules[name]
+
+
+@pytest.fixture
+def numbers(scripts: dict[str, ModuleType]) -> ModuleType:
+    return scripts["model_study_numbers"]
+
+
+@pytest.fixture
+def rows(scripts: dict[str, ModuleType]) -> ModuleType:
+    return scripts["model_study_rows"]
+
+
+@pytest.fixture
+def page(scripts: dict[str, ModuleType]) -> ModuleType:
+    return scripts["make_model_page"]
+
+
+@pytest.fixture
+def scene(numbers: ModuleType) -> Any:
+    """Three actors on the ego's left: one hidden and two seen, of which one stands beyond the hidden one."""
+    actors = np.array([[10.5, 5.5], [20.5, 5.5], [10.5, 15.5]])
+    foreground = np.zeros(LABELS.grid.shape, dtype=bool)
+    index, _ = LABELS.grid.index_of(actors)
+    foreground[tuple(index.T)] = True
+    hidden = np.array([True, False, False])
+    return numbers.Scene(labels=LABELS, foreground=foreground, actors=actors, hidden=hidden, every=actors)
+
+
+def test_hidden_and_seen_actors_are_counted_apart(numbers: ModuleType, scene: Any) -> None:
+    found = np.zeros(LABELS.grid.shape, dtype=bool)
+    index, _ = LABELS.grid.index_of(np.array([[10.5, 5.5], [10.5, 15.5], [-30.0, -30.0]]))
+    found[tuple(index.T)] = True  # the hidden one, one of the seen ones, and nobody
+    boxes = np.array([[20.5, 7.0], [21.5, 5.5], [10.5, 8.0], [-40.0, 0.0], [80.0, 0.0]])
+    assert numbers.found_counts(scene, found, boxes) == {
+        "hidden": 1,
+        "seen": 2,
+        "hidden_foreground": 1,
+        "seen_foreground": 1,
+        "hidden_detected": 0,  # the nearest box is 2.5 m away
+        "seen_detected": 1,
+        "cells": 3,
+        "false_cells": 1,
+        "false_boxes": 2,  # what lies beyond the grid does not count
+    }
+
+
+def test_who_covers_everything_finds_all_but_has_a_false_map(numbers: ModuleType, scene: Any) -> None:
+    evaluator = numbers.HiddenActors()
+    everything = np.ones(LABELS.grid.shape, dtype=bool)
+    evaluator.add("a", numbers.found_counts(scene, everything, np.zeros((0, 2))))
+    result = evaluator.compute()
+    assert (result.hidden_foreground, result.seen_foreground, result.hidden_detected) == (1.0, 1.0, 0.0)
+    assert result.false_foreground == pytest.approx(1 - 3 / LABELS.grid.cells)
+
+
+def test_hidden_actors_are_those_that_a_partner_alone_sees(numbers: ModuleType, da: DeepAccident) -> None:
+    hidden = seen = 0
+    for scenario in da.scenario:
+        token = f"{scenario['token']}/ego_vehicle/004"
+        scene = numbers.scene_of(da, token, LABELS)
+        assert len(cooperating_agents(da, token, "all")) == 5
+        view = seen_actors(da, token, agents="all", frame="ego")
+        alone = {each.rsplit("/", 1)[1] for each in visible_instances(da, token, agents="single")}
+        centers, ids = view.boxes.center[:, :2], view.boxes.actor_id
+        for actor, unseen in zip(scene.actors, scene.hidden, strict=True):
+            (at,) = np.flatnonzero((centers == actor).all(axis=1))
+            assert ids[at] != OWN_ACTOR_ID
+            assert (str(ids[at]) not in alone) == unseen
+        hidden, seen = hidden + int(scene.hidden.sum()), seen + int((~scene.hidden).sum())
+    assert hidden
+    assert seen
+
+
+def test_donors_are_of_another_pair_at_the_same_place(rows: ModuleType) -> None:
+    scenarios = [f"type1_subtype{kind}_{end}/x{kind}" for kind in (1, 2) for end in ("accident", "normal")]
+    tokens = [f"{scenario}/ego_vehicle/{frame:03d}" for scenario in scenarios for frame in (10, 15)]
+    given = rows.donors(tokens)
+    assert [each[-3:] for each in given] == [each[-3:] for each in tokens]
+    assert all(one.split("/")[1] != other.split("/")[1] for one, other in zip(given, tokens, strict=True))
+    with pytest.raises(AssertionError, match="no other pair"):
+        rows.donors(tokens[:4])
+
+
+def test_strangers_take_the_partners_places_alone(rows: ModuleType) -> None:
+    keys = rows._FOREIGN
+    item = {"agents": ("ego_vehicle", "infrastructure", "other_vehicle"), **{key: torch.zeros(3, 2) for key in keys}}
+    donor = {
+        "agents": ("ego_vehicle", "other_vehicle"),
+        **{key: torch.tensor([[1.0], [2.0]]).expand(2, 2) for key in keys},
+    }
+    changed = rows.with_strangers({**item, "token": "a"}, donor)
+    for key in keys:
+        assert changed[key].tolist() == [[0, 0], [0, 0], [2, 2]]
+        assert not item[key].any()
+    assert list(changed) == [*item, "token"]
+    images = rows.blanked({"images": torch.ones(2, dtype=torch.uint8), "token": "a"})["images"]
+    assert images.dtype == torch.uint8
+    assert not images.any()
+
+
+def evaluated(numbers: ModuleType, found: list[int]) -> Any:
+    """A row that finds so many of the four hidden actors of each of some pairs."""
+    evaluator = numbers.HiddenActors()
+    for at, each in enumerate(found):
+        for kind in ("accident", "normal"):
+            counts = dict.fromkeys(numbers._COUNTED, 0) | {"hidden": 2, "hidden_foreground": each / 2, "cells": 1}
+            evaluator.add(f"type1_subtype1_{kind}/x{at}/ego_vehicle/005", counts)
+    return {"hidden": evaluator}
+
+
+def test_differences_are_of_the_same_pairs(numbers: ModuleType) -> None:
+    base, other = evaluated(numbers, [0, 1, 2, 0, 1, 2, 1, 0]), evaluated(numbers, [2, 2, 3, 1, 3, 4, 2, 1])
+    found = numbers.differences([base], [other], Resampling())["hidden_foreground"]
+    assert found["value"] == pytest.approx(11 / 32)
+    assert 0 < found["low"] < found["value"] < found["high"]
+    back = numbers.differences([other], [base], Resampling())["hidden_foreground"]
+    assert (back["value"], back["low"], back["high"]) == pytest.approx((-found["value"], -found["high"], -found["low"]))
+    pooled = numbers.differences([base, base], [other, other], Resampling())["hidden_foreground"]
+    assert pooled == pytest.approx(found)  # twice the same model is no more evidence
+    few = numbers.differences([evaluated(numbers, [0, 1])], [evaluated(numbers, [1, 2])], Resampling())
+    assert few["hidden_foreground"] == {"value": pytest.approx(1 / 4), "low": None, "high": None}
+
+
+def test_a_row_of_some_samples(numbers: ModuleType) -> None:
+    row = evaluated(numbers, [0, 0, 0, 0, 0, 0, 0, 4])
+    assert numbers.row_numbers([row], Resampling())["hidden_foreground"]["value"] == pytest.approx(1 / 8)
+    last = [token for token in row["hidden"].tokens if "/x7/" in token]
+    assert numbers.row_numbers([row], Resampling(), last)["hidden_foreground"]["value"] == 1
+
+
+def test_the_protocol_keeps_its_releases_apart(scripts: dict[str, ModuleType]) -> None:
+    protocol = scripts["model_study_protocol"]
+    plans = [protocol.PROTOCOL.training, protocol.PROTOCOL.tuning, protocol.PROTOCOL.test]
+    assert len({plan.seed for plan in plans}) == 3
+    assert [protocol.HELD_OUT in plan.designs for plan in plans] == [False, False, True]
+    assert all(plan.scenarios >= 2 * len(plan.designs) for plan in plans)  # a pair of each design, at least
+    names = [row.name for row in protocol.rows_of(protocol.PROTOCOL)]
+    assert len(set(names)) == len(names)
+    assert {name for pair in protocol.COMPARED for name in pair} <= set(names)
+    assert protocol.COMPARED[0] == ("single", "all")
+
+
+def number(value: float | None = 1.5, low: float | None = None, high: float | None = None) -> dict[str, Any]:
+    return {"value": value, "low": low, "high": high}
+
+
+@pytest.fixture
+def summary(scripts: dict[str, ModuleType]) -> dict[str, Any]:
+    """A summary of the real protocol with numbers made up."""
+    protocol, paths = scripts["model_study_protocol"], scripts["model_study_numbers"].PATHS
+    some = {name: number() for name in paths}
+    rows = {
+        row.name: {
+            "says": row.says,
+            "numbers": some,
+            "seeds": dict.fromkeys(("1",) if row.first_seed_alone else ("1", "2", "3"), some) if row.arm else {},
+            "designs": {"seen": some, "held out": some},
+        }
+        for row in protocol.rows_of(protocol.PROTOCOL)
+    }
+    differences = [
+        {"first": one, "second": other, "numbers": dict(some), "seeds": dict.fromkeys(("1", "2", "3"), some)}
+        for one, other in protocol.COMPARED
+    ]
+    scores = {"iou": 0.1, "vpq": 0.1, "map": 0.0, "score": 0.1, "loss": 9.0}
+    return {
+        "protocol": asdict(protocol.PROTOCOL),
+        "smoke": False,
+        "samples": 144,
+        "pairs": 18,
+        "positives": 72,
+        "actors": {"hidden": 400, "seen": 1500},
+        "headline_number": "iou_100",
+        "rows": rows,
+        "differences": differences,
+        "releases": {name: {"scenarios": 2, "fingerprint": "abc"} for name in ("training", "tuning", "test")},
+        "tuning": {"rounds": [{"0.001": scores, "0.002": scores}], "learning_rate": 0.002},
+        "training": {},
+        "costs": {"mean": 1.5, "cobevt": 6.0},
+        "seconds": {"releases": 600.0, "training": 6000.0},
+        "machine": {
+            "processor": "a processor",
+            "cores": 2,
+            "processes": 2,
+            "gpu": None,
+            "python": "3.11",
+            "torch": "2.3",
+            "devkit": "0.1",
+        },
+    }
+
+
+@pytest.mark.parametrize(
+    ("ends", "verdict", "told"),
+    [
+        ((0.5, 3.0), "more", "Cooperation wins: with all agents the model has more than alone, by +1.5 [0.5, 3.0]"),
+        (
+            (-3.0, -0.5),
+            "less",
+            "Cooperation loses: with all agents the model has less than alone, by -1.5 [-3.0, -0.5]",
+        ),
+        ((-0.5, 3.0), "not decided", "It is not decided whether cooperation helps: the difference is +1.5 [-0.5, 3.0]"),
+        ((None, None), "not decided", "It is not decided whether cooperation helps: the difference is +1.5 points"),
+    ],
+)
+def test_the_headline_follows_from_the_interval(
+    page: ModuleType, summary: dict[str, Any], ends: tuple[Any, Any], verdict: str, told: str
+) -> None:
+    found = number(-1.5 if verdict == "less" else 1.5, *ends)
+    summary["differences"][0]["numbers"]["iou_100"] = found
+    assert page.verdict(found) == verdict
+    assert told in page.headline_text(summary)
+    assert told.partition(":")[0] in page.page(summary).replace("\n", " ")
+
+
+def test_the_controls_say_why(page: ModuleType, summary: dict[str, Any]) -> None:
+    undecided = page.reasons_text(summary)
+    assert "nothing shows that their data are used" in undecided
+    summary["differences"][3]["numbers"]["iou_100"] = number(2.0, 1.0, 3.0)
+    summary["differences"][4]["numbers"]["iou_100"] = number(2.0, 1.0, 3.0)
+    summary["differences"][2]["numbers"]["hidden_foreground"] = number(0.2, 0.1, 0.3)
+    summary["differences"][2]["numbers"]["false_foreground"] = number(0.1, 0.05, 0.2)
+    decided = page.reasons_text(summary)
+    assert "it is their data that help" in decided
+    assert "it does look" in decided
+    assert "find more with partners than alone (+0.20 [0.10, 0.30]); a larger share of the map is false" in decided
+
+
+def test_the_page_has_all_rows_and_no_gap(page: ModuleType, summary: dict[str, Any], tmp_path: Path) -> None:
+    text = page.page(summary)
+    for row in summary["rows"]:
+        assert f"`{row}`" in text
+    for gap in ("None", "nan", "{", "READING_TIME"):
+        assert gap not in text
+    assert max(len(line) for line in text.splitlines() if not line.startswith("|")) <= 120
+    text = text.replace("\n", " ")
+    assert "clean, 1 m" in text
+    assert "nothing was measured on one" in text
+    summary["machine"]["gpu"] = "NVIDIA X"
+    assert "The models ran on NVIDIA X." in page.page(summary).replace("\n", " ")
+
+
+def test_the_page_is_compared_and_refuses_a_tiny_run(
+    page: ModuleType, summary: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(page, "SUMMARY", tmp_path / "model_study.json")
+    monkeypatch.setattr(page, "PAGE", tmp_path / "model.md")
+    page.SUMMARY.write_text(json.dumps(summary))
+    monkeypatch.setattr(sys, "argv", ["make_model_page.py"])
+    page.main()
+    monkeypatch.setattr(sys, "argv", ["make_model_page.py", "--check"])
+    page.main()
+    page.PAGE.write_text(page.PAGE.read_text().replace("1.5", "9.5"))
+    with pytest.raises(SystemExit, match="does not say what"):
+        page.main()
+    page.SUMMARY.write_text(json.dumps({**summary, "smoke": True}))
+    with pytest.raises(SystemExit, match="another protocol"):
+        page.main()
+
+
+def test_what_is_committed_agrees(page: ModuleType, scripts: dict[str, ModuleType]) -> None:
+    """The page, the summary and the counts, once the experiment was run; before, there is no page."""
+    if not page.SUMMARY.exists():
+        assert not page.PAGE.exists()
+        return
+    told = json.loads(page.SUMMARY.read_text(encoding="utf-8"))
+    assert page.PAGE.read_text(encoding="utf-8") == page.page(told)
+    study = scripts["model_study"]
+    again = study.summarised(scripts["model_study_rows"].read_counts(DOCS / study.COUNTS), study.PROTOCOL)
+    same_numbers(again["rows"], told["rows"])
+
+
+def same_numbers(again: dict[str, Any], told: dict[str, Any]) -> None:
+    """The numbers of all rows that the packed counts give, too."""
+    assert list(again) == list(told)
+    for name, row in again.items():
+        assert len(row["numbers"]) >= 10
+        for key, each in row["numbers"].items():
+            assert each == pytest.approx(told[name]["numbers"][key])
+
+
+@pytest.mark.slow
+def test_a_tiny_run_of_all_of_it(
+    scripts: dict[str, ModuleType], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    study, rows = scripts["model_study"], scripts["model_study_rows"]
+    run = study.Study(folder=tmp_path / "run", protocol=study.SMOKE)
+    study.run(run)
+    summary = json.loads((run.folder / study.SUMMARY).read_text())
+    assert summary["smoke"]
+    assert (summary["samples"], summary["pairs"]) == (4, 2)
+    found = {name: each["numbers"] for name, each in summary["rows"].items()}
+    assert found["labels, single"]["hidden_foreground"]["value"] == 0
+    assert found["labels, all"]["hidden_foreground"]["value"] == found["labels, all"]["hidden_detected"]["value"] == 1
+    assert found["labels, all"]["iou_100"]["value"] > 90 > found["everything"]["iou_100"]["value"] > 0
+    assert found["nothing"]["false_foreground"]["value"] is None
+    assert scripts["make_model_page"].page(summary).count("`all, strangers`") > 3
+    same_numbers(study.summarised(rows.read_counts(run.folder / study.COUNTS), study.SMOKE)["rows"], summary["rows"])
+
+    capsys.readouterr()
+    study.run(run)  # nothing is left to do
+    assert "…" not in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="another protocol"):
+        study.run(study.Study(folder=run.folder, protocol=study.PROTOCOL))
