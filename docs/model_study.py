@@ -150,7 +150,7 @@ def trained(job: TrainJob) -> None:
 
 
 def tuning(study: Study) -> dict[str, Any]:
-    """Short runs with each learning rate on the tuning release; the best score chooses, then the lower loss."""
+    """Short runs with each learning rate on the tuning release; the best score chooses."""
     protocol = study.protocol
     jobs = {
         rate: TrainJob(
@@ -174,7 +174,11 @@ def tuning(study: Study) -> dict[str, Any]:
     together(study, trained, jobs.values())
     logs = {rate: read_log(job.out) for rate, job in jobs.items()}
     scores = {rate: {**log[-1]["validation"], "loss": _last_loss(log)} for rate, log in logs.items()}
-    chosen = max(scores, key=lambda rate: (scores[rate]["score"], -scores[rate]["loss"]))
+    best = max(found["score"] for found in scores.values())
+    if best >= protocol.least_score:
+        chosen = max(scores, key=lambda rate: scores[rate]["score"])
+    else:
+        chosen = min(scores, key=lambda rate: scores[rate]["loss"])
     return {"rounds": [{f"{rate:g}": found for rate, found in scores.items()}], "learning_rate": chosen}
 
 
@@ -184,7 +188,7 @@ def _last_loss(log: Sequence[Mapping[str, Any]]) -> float:
 
 
 def training(study: Study) -> dict[str, Any]:
-    """Each seed alone first, then both arms from its weights, equal but for the agents."""
+    """Each seed alone first, then both arms from its weights, equal except for the agents."""
     protocol, rate = study.protocol, study.stored("tuning")["learning_rate"]
 
     def job(arm: str, seed: int) -> TrainJob:
@@ -365,13 +369,17 @@ def together(
         study.processes, mp_context=get_context("spawn"), initializer=torch.set_num_threads, initargs=(1,)
     ) as pool:
         running: dict[Future[None], Any] = {pool.submit(work, job): job for job in jobs}
-        while running:
-            done, _ = wait(running, return_when=FIRST_COMPLETED)
-            for future in done:
-                job = running.pop(future)
-                future.result()
-                print(f"  done: {job.out.name}", flush=True)
-                running |= {pool.submit(work, each): each for each in (then(job) if then else ())}
+        try:
+            while running:
+                done, _ = wait(running, return_when=FIRST_COMPLETED)
+                for future in done:
+                    job = running.pop(future)
+                    future.result()
+                    print(f"  done: {job.out.name}", flush=True)
+                    running |= {pool.submit(work, each): each for each in (then(job) if then else ())}
+        except BaseException:
+            pool.shutdown(cancel_futures=True)  # those that run end first: they keep what they have
+            raise
 
 
 STAGES: Final[Mapping[str, Callable[[Study], dict[str, Any]]]] = {

@@ -46,6 +46,8 @@ class Protocol:
     tuning_pairs: int = 2
     """Pairs of the tuning release that score the runs; they learn from the others."""
     tuning_samples: int = 40
+    least_score: float = 0.01
+    """If no run reaches it, scores say nothing yet, and the lowest loss of the last steps chooses."""
     egos: int | None = None
     configurations: tuple[str, ...] = ("+behind", "+other", "+infrastructure", "vehicles")
     """Who cooperates in the rows of one seed; so with the links."""
