@@ -10,7 +10,7 @@ from torch.testing import assert_close
 from torch_extra.model.small_model import RUN, small, small_released
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.export.torch import AllEgosDataset, V2XDataset, collate, collate_all_egos
+from deepaccident_devkit.export.torch import AllEgosDataset, RandomAugmentation, V2XDataset, collate, collate_all_egos
 from deepaccident_devkit.model.config import ModelConfig
 from deepaccident_devkit.model.entry import model_inputs
 from deepaccident_devkit.model.fusion import ReleasedFusionConfig
@@ -71,7 +71,7 @@ def test_all_egos_at_once_are_each_by_itself(
 def test_other_moments_of_a_batch_change_nothing(
     da: DeepAccident, moment: list[str], config: ModelConfig, seeded: Seeded, predicted: Predicted
 ) -> None:
-    """Nor does it matter that an item has fewer agents."""
+    """Nor does it matter that an item has fewer agents, or another augmentation."""
     model = seeded(config)
     items = [
         alone(da, moment[0], config, "all"),
@@ -83,7 +83,9 @@ def test_other_moments_of_a_batch_change_nothing(
         one = predicted(model, model_inputs(collate([item])))
         assert_same([each[row : row + 1] for each in together], one)
     later = [each.replace("/004", "/006") for each in moment[2:]]
-    moments = list(AllEgosDataset(da, [*moment, *later], config.inputs("all")))
+    given = config.inputs("all", augmentation=RandomAugmentation())
+    moments = list(AllEgosDataset(da, [*moment, *later], given))
+    assert not torch.equal(moments[0]["augmentation"], moments[1]["augmentation"])
     both = predicted(model, model_inputs(collate_all_egos(moments[::-1])))
     each_alone = [predicted(model, model_inputs(collate_all_egos([each]))) for each in moments]
     assert_same(
@@ -181,14 +183,22 @@ def partly_heard(valid: torch.Tensor) -> bool:
     return 0 < int(present.sum()) < len(present) and bool(valid[1:, 0][present].all())
 
 
-def test_a_late_partner_is_told_to_fusions_that_ask(
+def test_fusions_that_ask_know_kinds_and_delays(
     da: DeepAccident, moment: list[str], seeded: Seeded, predicted: Predicted
 ) -> None:
+    """Of the right agents, in whichever order they stand."""
     for name, differs in (("v2xvit", True), ("mean", False)):
         config = of_fusion(name)
-        batch = collate([alone(da, moment[0], config, "all")])
-        fresh, late = (predicted(seeded(config), model_inputs(batch, delay=delay)) for delay in (0, 2))
-        assert (apart(fresh, late) > 1e-3) == differs
+        model, batch = seeded(config), collate([alone(da, moment[0], config, "all")])
+        inputs = model_inputs(batch)
+        late, parked = model_inputs(batch, delay=2), replace(inputs, is_infrastructure=torch.zeros(1, 5).bool())
+        for changed in (late, parked):
+            assert (apart(predicted(model, inputs), predicted(model, changed)) > 1e-3) == differs
+    config = of_fusion("v2xvit")
+    model, [item] = seeded(config), AllEgosDataset(da, moment, config.inputs("all"))
+    together = predicted(model, model_inputs(collate_all_egos([item])))
+    own = predicted(model, model_inputs(collate([alone(da, moment[4], config, "all")])))
+    assert_same([each[4:] for each in together], own)
 
 
 def test_a_left_handed_model_maps_the_mirror_image(

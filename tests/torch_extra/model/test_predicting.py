@@ -1,5 +1,6 @@
 """Predictions of samples: they stand by themselves, and the devkit's evaluators and writers take them."""
 
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -137,11 +138,15 @@ def test_the_model_is_left_in_its_mode(model: V2XFormer, da: DeepAccident, token
         assert all(torch.equal(each, statistics[name]) for name, each in model.named_buffers())
 
 
-def test_a_release_without_images_is_refused(model: V2XFormer, da_partial: DeepAccident, moment: list[str]) -> None:
-    """It lacks those of the ego's front camera."""
+def test_a_release_without_images_is_refused(
+    model: V2XFormer, release_root: Path, moment: list[str], tmp_path: Path
+) -> None:
+    """Such as one whose camera archives were not unpacked."""
+    shutil.copytree(release_root, tmp_path / "blind", ignore=shutil.ignore_patterns(".deepaccident", "Camera_*"))
+    blind = DeepAccident("v1", tmp_path / "blind", verbose=False)
     with pytest.raises(NotAvailableError, match=r"no images of .*; unpack its camera folders, .* --sensors cameras"):
-        predict(model, da_partial, moment[:1])
-    assert predict(model, da_partial, []) == []
+        predict(model, blind, moment[:1])
+    assert predict(model, blind, []) == []
 
 
 def test_the_evaluators_take_predictions(

@@ -218,6 +218,7 @@ def test_every_parameter_has_a_gradient_at_every_moment(
     assert all(each.grad.isfinite().all() for each in step.model.parameters())
 
 
+@pytest.mark.slow
 def test_a_batch_is_learned_by_heart(da: DeepAccident, moment: list[str], config: ModelConfig) -> None:
     """Of one ego by itself: the loss falls below a third, and the mean prediction shows who is where."""
     given = config.inputs("single", boxes="sample", labels=config.labels)
@@ -387,6 +388,7 @@ def test_the_best_weights_are_kept(da: DeepAccident, tmp_path: Path) -> None:
     assert read_weights(tmp_path / LAST).meta["best"] == 0.6
 
 
+@pytest.mark.slow
 def test_accumulated_gradients_are_the_mean(da: DeepAccident, tmp_path: Path) -> None:
     """Of the three batches of a step, which are different moments; and so are the losses in the log."""
     run = replace(SHORT, steps=1, egos=None, accumulate=3, clip=1e6)
