@@ -28,7 +28,11 @@ from deepaccident_devkit.reading import read_bytes
 
 BEST: Final = "best.safetensors"
 FINAL: Final = "final.safetensors"
-"""In a run's folder: the weights with the best score or, of a run that was not validated, those of the last step."""
+LAST: Final = "last.safetensors"
+"""In a run's folder: the weights with the best score; of a run that was not validated, those of the last step; and the
+state from which it goes on."""
+OPTIMIZER: Final = "optimizer."
+"""Beginning of the names of the optimizer's tensors in that state."""
 _META: Final = "deepaccident"
 _MADE: Final = ("relative_position_index", "transformer.frustum", "num_batches_tracked")
 """Ends of names whose values follow from the configuration, or do not matter."""
@@ -80,7 +84,7 @@ def read_weights(path: str | os.PathLike[str]) -> Weights:
     """
     path = Path(path)
     if path.is_dir():
-        path = next((path / name for name in (BEST, FINAL) if (path / name).is_file()), path / BEST)
+        path = next((path / name for name in (BEST, FINAL, LAST) if (path / name).is_file()), path / BEST)
     try:
         content = read_bytes(path, "weights")
     except OSError as error:
@@ -130,8 +134,8 @@ def load_weights(model: nn.Module, weights: Weights, *, whole: bool = False) -> 
         ConfigError: the file has none of the model's tensors, tensors of other shapes, or lacks some though `whole`.
     """
     own = model.state_dict()
-    given = {name: each for name, each in weights.tensors.items() if not name.endswith(_MADE)}
-    wanted = [name for name in own if not name.endswith(_MADE)]
+    given = {name: each for name, each in weights.tensors.items() if not _is_apart(name)}
+    wanted = [name for name in own if not _is_apart(name)]
     loaded = [name for name in wanted if name in given]
     missing = [name for name in wanted if name not in given]
     other = [name for name in loaded if own[name].shape != given[name].shape]
@@ -140,6 +144,11 @@ def load_weights(model: nn.Module, weights: Weights, *, whole: bool = False) -> 
         raise ConfigError(f"{weights.path}: {_difference(weights, own, other, missing, unused)}")
     model.load_state_dict({name: given[name].to(own[name].dtype) for name in loaded}, strict=False)
     return Loaded(loaded=tuple(loaded), kept=tuple(missing), unused=tuple(unused))
+
+
+def _is_apart(name: str) -> bool:
+    """Whether a tensor is no weight: it follows from the configuration, or is the optimizer's."""
+    return name.endswith(_MADE) or name.startswith(OPTIMIZER)
 
 
 def _difference(

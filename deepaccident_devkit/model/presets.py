@@ -60,8 +60,7 @@ class ModelChoice:
     def __post_init__(self) -> None:
         """Check; raises ChoiceError or ConfigError."""
         settle_choices(self, {"preset": get_args(ModelPreset), "fusion": (None, *get_args(ModelFusion))})
-        if self.horizon is not None:
-            self._frames(PRESETS[self.preset]())
+        self.config  # noqa: B018 - refuses what does not go together
 
     @property
     def config(self) -> ModelConfig:

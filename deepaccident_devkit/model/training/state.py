@@ -5,17 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.optim import AdamW
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.model.checkpoint import read_weights, write_weights
-
-LAST: Final = "last.safetensors"
-_MODEL, _OPTIMIZER = "model.", "optimizer."
+from deepaccident_devkit.model.checkpoint import LAST, OPTIMIZER, read_weights, write_weights
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,9 +30,9 @@ class Progress:
 
 def save_state(folder: Path, model: nn.Module, optimizer: AdamW, progress: Progress, meta: Mapping[str, Any]) -> None:
     """Write the last checkpoint, completely or not at all."""
-    tensors = {f"{_MODEL}{name}": each for name, each in model.state_dict().items()}
+    tensors = dict(model.state_dict())
     for number, state in optimizer.state_dict()["state"].items():
-        tensors |= {f"{_OPTIMIZER}{number}.{name}": torch.as_tensor(each) for name, each in state.items()}
+        tensors |= {f"{OPTIMIZER}{number}.{name}": torch.as_tensor(each) for name, each in state.items()}
     noted = {**meta, "step": progress.step, "best": progress.best}
     write_weights(folder / LAST, tensors, noted)
 
@@ -52,10 +49,10 @@ def load_state(folder: Path, model: nn.Module, optimizer: AdamW) -> Progress:
     weights = read_weights(path)
     states: dict[int, dict[str, Tensor]] = {}
     for name, each in weights.tensors.items():
-        if name.startswith(_OPTIMIZER):
-            number, _, part = name.removeprefix(_OPTIMIZER).partition(".")
+        if name.startswith(OPTIMIZER):
+            number, _, part = name.removeprefix(OPTIMIZER).partition(".")
             states.setdefault(int(number), {})[part] = each
-    own = {name.removeprefix(_MODEL): each for name, each in weights.tensors.items() if name.startswith(_MODEL)}
+    own = {name: each for name, each in weights.tensors.items() if not name.startswith(OPTIMIZER)}
     try:
         model.load_state_dict(own)
         optimizer.load_state_dict({"state": states, "param_groups": optimizer.state_dict()["param_groups"]})

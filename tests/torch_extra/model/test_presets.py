@@ -73,7 +73,7 @@ def test_every_fusion_has_a_config() -> None:
 
 def test_the_released_fusion_has_channels_that_a_small_model_lacks() -> None:
     with pytest.raises(ConfigError, match="ego_channels: expected numbers from 0 to 31"):
-        _ = ModelChoice(preset="tiny", fusion="released").config
+        ModelChoice(preset="tiny", fusion="released")
 
 
 @pytest.mark.parametrize(("horizon", "frames"), [(0.5, 1), (2.0, 4), (4, 8)])

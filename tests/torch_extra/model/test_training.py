@@ -25,7 +25,7 @@ from torch_extra.model.small_model import RUN, small, small_released, trained
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError, NotAvailableError
 from deepaccident_devkit.export.torch import AllEgosDataset, V2XDataset, collate, collate_all_egos
-from deepaccident_devkit.model.checkpoint import BEST, FINAL, read_weights
+from deepaccident_devkit.model.checkpoint import BEST, FINAL, LAST, load_weights, read_weights
 from deepaccident_devkit.model.config import ModelConfig
 from deepaccident_devkit.model.entry import ModelInputs, mirrored_boxes, model_inputs
 from deepaccident_devkit.model.network import V2XFormer
@@ -35,7 +35,6 @@ from deepaccident_devkit.model.training.data import Moments, batches
 from deepaccident_devkit.model.training.log import add_to_log, cut_log, read_log
 from deepaccident_devkit.model.training.place import checked_device
 from deepaccident_devkit.model.training.schedule import freeze, generator_of, learning_rate, optimizer_of, positions
-from deepaccident_devkit.model.training.state import LAST
 from deepaccident_devkit.model.training.step import TrainingStep, training_batch, with_dropped_partners
 
 SHORT = replace(RUN, steps=2, validation=None, save_every=1)
@@ -314,6 +313,17 @@ def test_a_run_leaves_its_files(whole: Path) -> None:
     weights = read_weights(whole)
     assert weights.meta["training"] == json.loads(json.dumps(RUN.as_dict()))
     assert weights.meta["step"] == 4  # the first of two equal scores
+
+
+def test_the_state_of_a_run_can_be_begun_from(da: DeepAccident, whole: Path, tmp_path: Path) -> None:
+    """A run that was killed before its first validation has nothing else."""
+    folder = tmp_path / "killed early"
+    folder.mkdir()
+    (folder / LAST).write_bytes((whole / LAST).read_bytes())
+    model = V2XFormer(small())
+    done = load_weights(model, read_weights(folder), whole=True)
+    assert done.unused == ()
+    assert all(torch.equal(each, tensors(whole)[name]) for name, each in model.named_parameters())
 
 
 @pytest.mark.slow
