@@ -1,4 +1,4 @@
-"""Write docs/model.md from docs/model_study.json: `python docs/make_model_page.py`; with `--check` only compare.
+"""Write the page of the model from docs/model_study.json: `python docs/make_model_page.py`; `--check` only compares.
 
 docs/model_study.py measures the numbers. No number of the page stands here, and its sentences follow from them.
 """

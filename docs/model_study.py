@@ -3,7 +3,7 @@
 It takes less than three hours of two cores. What is compared stands in docs/model_study_protocol.py. Each stage is
 skipped if its output is in WORKDIR, and one that broke off goes on: the same command ends what was begun. `--only` does
 one stage, `--smoke` a tiny version of all in minutes (in a WORKDIR of its own), `--publish` copies the summary and the
-counts to docs/, from which docs/make_model_page.py makes docs/model.md.
+counts to docs/, from which docs/make_model_page.py makes the page of the model.
 """
 
 import argparse
