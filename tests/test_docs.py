@@ -79,6 +79,7 @@ NOT_RUN = {
     "info s3:": "tests/cloud has releases on S3",
     "train ": "tests/torch_extra/model/test_commands.py has them; they need torch",
     "predict ": "likewise",
+    "evaluate motion training_data": "of what predict makes; likewise",
     "results from": "tests/unit/export/test_nuscenes_detections.py has it, and makes the file",
     "export mcap": "tests/unit/export has it, which has the extra",
 }
