@@ -133,7 +133,10 @@ def _claim(folder: Path, notes: Mapping[str, Any]) -> None:
     """Write a run's notes, or compare them with those that are there; raises ConfigError if they differ."""
     path = folder / RUN
     if path.is_file():
-        there = parsed_json(read_bytes(path, "bundle"))
+        try:
+            there = parsed_json(read_bytes(path, "bundle"))
+        except ValueError as error:
+            raise ConfigError(f"{path}: cannot be read ({error}); remove it, or train elsewhere") from error
         told = json.loads(json.dumps(notes))
         differing = [name for name in told if there.get(name) != told[name]] if isinstance(there, dict) else [RUN]
         if differing:
@@ -253,8 +256,7 @@ class _Run:
             self.say(f"step {done:,}: {', '.join(f'{name} {value:.3f}' for name, value in scores.items())}")
             if progress.best is None or scores[SCORE] > progress.best:
                 progress = replace(progress, best=scores[SCORE])
-                if self.place.is_first:
-                    self._weights(model, progress, BEST)
+                self._weights(model, progress, BEST)
         if self.place.is_first:
             add_to_log(self.folder, row)
             if last or done % config.save_every == 0 or "validation" in row:
@@ -264,9 +266,10 @@ class _Run:
         return progress
 
     def _weights(self, model: V2XFormer, progress: Progress, name: str = FINAL) -> Path:
-        """Write the weights alone."""
+        """Write the weights alone, on the first process."""
         path = self.folder / name
-        write_weights(path, model.state_dict(), {**self.notes, "step": progress.step, "score": progress.best})
+        if self.place.is_first:
+            write_weights(path, model.state_dict(), {**self.notes, "step": progress.step, "score": progress.best})
         return path
 
     def _draw(self) -> None:

@@ -359,9 +359,10 @@ def test_other_options_in_the_same_folder_are_refused(da: DeepAccident, whole: P
     with pytest.raises(ConfigError, match=r"its from differ"):
         trained(da, whole, weights=whole / BEST)
     assert {path.name: path.read_bytes() for path in whole.iterdir()} == before
-    (tmp_path / "run.json").write_text("[]")
-    with pytest.raises(ConfigError, match=r"run\.json: is of another run"):
-        trained(da, tmp_path)
+    for content, said in (("[]", "is of another run"), ('{"preset": ', "cannot be read")):
+        (tmp_path / "run.json").write_text(content)
+        with pytest.raises(ConfigError, match=rf"run\.json: {said}"):
+            trained(da, tmp_path)
 
 
 @pytest.mark.parametrize("content", [b"", b"no weights", None])
