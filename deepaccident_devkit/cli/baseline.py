@@ -8,7 +8,7 @@ from deepaccident_devkit.baselines import MOTION_MODELS, Baseline, StudyConfig, 
 from deepaccident_devkit.baselines.figures import save_study
 from deepaccident_devkit.baselines.predict_results import is_predicted, samples_by_scenario
 from deepaccident_devkit.baselines.study_parts import StudyInParts
-from deepaccident_devkit.cli.evaluate_options import resamples_parameter
+from deepaccident_devkit.cli.evaluate_options import purpose_parameter, resamples_parameter, scope_parameter
 from deepaccident_devkit.cli.options import (
     LINK_OPTIONS,
     WordChoice,
@@ -26,7 +26,7 @@ from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.metrics.accident import PROTOCOLS
-from deepaccident_devkit.evaluation.results import ResultsTask
+from deepaccident_devkit.evaluation.results import RESULTS_NAMES, ResultsTask
 from deepaccident_devkit.files import writable_folder, write_bytes
 from deepaccident_devkit.motion.sample_lists import Scope, no_samples_text
 from deepaccident_devkit.parallel import Part, Shard, mine
@@ -34,7 +34,6 @@ from deepaccident_devkit.taxonomy import AGENTS
 
 _ALONE = "single"
 _RELEASED_HORIZON = Baseline().horizon
-_FILES: dict[str, str] = {"motion": "motion", "accident": "accident.json", "detection": "detection.json"}
 _SPLIT = click.option("--split", default="val", show_default=True, help="Name of a split, or a split file (.txt).")
 _OUT = click.option("--out", required=True, type=click.Path(), metavar="DIR", help="Folder to write the files into.")
 _MODEL = click.option(
@@ -43,13 +42,6 @@ _MODEL = click.option(
     default="constant_velocity",
     show_default=True,
     help="How the baseline moves each actor into the future.",
-)
-_SCOPE = click.option(
-    "--scope",
-    type=WordChoice(get_args(Scope)),
-    default="accident",
-    show_default=True,
-    help="Accident scenarios only, or all scenarios.",
 )
 
 
@@ -77,15 +69,8 @@ def baseline() -> None:
 @click.option(
     "--horizon", default=_RELEASED_HORIZON, show_default=True, help="How many seconds to predict, in steps of 0.5."
 )
-@click.option(
-    "--samples",
-    "purpose",
-    type=WordChoice(["evaluate", "all"]),
-    default="evaluate",
-    show_default=True,
-    help="evaluate: samples within the horizon before the end. all: two samples per second of each scenario.",
-)
-@_SCOPE
+@purpose_parameter
+@scope_parameter
 @_OUT
 def predict(split: str, tasks: tuple[str, ...], purpose: Any, scope: Scope, out: str, **options: Any) -> None:
     """Write results files of a baseline for one split of the release in DATAROOT.
@@ -111,7 +96,7 @@ def predict(split: str, tasks: tuple[str, ...], purpose: Any, scope: Scope, out:
     run = {**engine_of(options), "part": part, "progress": True}
     wanted = [task for task in get_args(ResultsTask) if task in tasks or "all" in tasks]
     for task in wanted:
-        path = folder / _FILES[task]
+        path = folder / RESULTS_NAMES[task]
         kept = is_predicted(dataset, task, tokens, path, chosen)
         predict_results(dataset, task, tokens, path, chosen, **run)
         if kept or not isinstance(part, Shard):
@@ -133,7 +118,7 @@ def predict(split: str, tasks: tuple[str, ...], purpose: Any, scope: Scope, out:
     type=WordChoice(AGENTS),
     help="Agent that predicts; you can repeat this option.  [default: ego_vehicle]",
 )
-@_SCOPE
+@scope_parameter
 @click.option(
     "--protocol",
     type=WordChoice(PROTOCOLS),

@@ -11,6 +11,7 @@ from deepaccident_devkit.evaluation.runs import SampleSelection, default_selecti
 from deepaccident_devkit.evaluation.runs.selection import SampleList, ScopeName
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.json_text import parsed_json
+from deepaccident_devkit.motion.sample_lists import Scope
 from deepaccident_devkit.taxonomy import AGENTS
 
 _SELECTION = (
@@ -33,6 +34,21 @@ _SELECTION = (
     ),
     agents_parameter,
     click.option("--horizon", default=2.0, show_default=True, help="How many seconds the predictions look ahead."),
+)
+purpose_parameter = click.option(
+    "--samples",
+    "purpose",
+    type=WordChoice(["evaluate", "all"]),
+    default="evaluate",
+    show_default=True,
+    help="evaluate: samples within the horizon before the end. all: two samples per second of each scenario.",
+)
+scope_parameter = click.option(
+    "--scope",
+    type=WordChoice(get_args(Scope)),
+    default="accident",
+    show_default=True,
+    help="Accident scenarios only, or all scenarios.",
 )
 resamples_parameter = click.option(
     "--resamples",

@@ -1,13 +1,13 @@
 """`deepaccident predict`: results files of a trained model."""
 
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import click
 
+from deepaccident_devkit.cli.evaluate_options import purpose_parameter, scope_parameter
 from deepaccident_devkit.cli.options import (
     LINK_OPTIONS,
-    WordChoice,
     cooperating_parameter,
     link_of,
     link_parameters,
@@ -35,21 +35,8 @@ Examples:
 @click.option("--split", default="val", show_default=True, help="Name of a split, or a split file (.txt).")
 @cooperating_parameter("Agents that cooperate with each ego", _ALL)
 @link_parameters
-@click.option(
-    "--samples",
-    "purpose",
-    type=WordChoice(["evaluate", "all"]),
-    default="evaluate",
-    show_default=True,
-    help="evaluate: samples within the horizon before the end. all: two samples per second of each scenario.",
-)
-@click.option(
-    "--scope",
-    type=WordChoice(get_args(Scope)),
-    default="accident",
-    show_default=True,
-    help="Accident scenarios only, or all scenarios.",
-)
+@purpose_parameter
+@scope_parameter
 @model_parameters
 @click.option("--out", required=True, type=click.Path(path_type=Path), metavar="DIR", help="Folder to write into.")
 def predict(run: Path, split: str, purpose: Any, scope: Scope, out: Path, **options: Any) -> None:

@@ -7,23 +7,17 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, Final
+from typing import Any
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.evaluation import ResultsWriter
-from deepaccident_devkit.evaluation.results import ResultsTask
+from deepaccident_devkit.evaluation.results import RESULTS_NAMES, ResultsTask
 from deepaccident_devkit.files import writable_folder
 from deepaccident_devkit.model.network import V2XFormer
 from deepaccident_devkit.model.predicting import PredictConfig, predictions
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x import AgentConfig
-
-FILES: Final = MappingProxyType[ResultsTask, str](
-    {"motion": "motion", "accident": "accident.json", "detection": "detection.json"}
-)
-"""Task → the name of its file, or folder, in the folder of all."""
 
 
 def predict_results(
@@ -54,7 +48,7 @@ def predict_results(
     """
     config = config or PredictConfig()
     folder = writable_folder(out)
-    paths = {task: folder / name for task, name in FILES.items()}
+    paths = {task: folder / name for task, name in RESULTS_NAMES.items()}
     meta = _meta(model, dataset, config)
     labels = model.config.labels
     form: dict[str, Any] = {

@@ -3,7 +3,7 @@
 schema/results/README.md describes them; `ResultsWriter` writes, `read_results` reads.
 """
 
-from deepaccident_devkit.evaluation.results.header import FORMAT, FORMAT_VERSION, MotionForm, ResultsTask
+from deepaccident_devkit.evaluation.results.header import FORMAT, FORMAT_VERSION, RESULTS_NAMES, MotionForm, ResultsTask
 from deepaccident_devkit.evaluation.results.reader import Prediction, Results, read_results
 from deepaccident_devkit.evaluation.results.schemas import RESULT_SCHEMAS
 from deepaccident_devkit.evaluation.results.writer import ResultsWriter
@@ -11,6 +11,7 @@ from deepaccident_devkit.evaluation.results.writer import ResultsWriter
 __all__ = [
     "FORMAT",
     "FORMAT_VERSION",
+    "RESULTS_NAMES",
     "RESULT_SCHEMAS",
     "MotionForm",
     "Prediction",

@@ -8,6 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar, Final, Literal, get_args
 
 from deepaccident_devkit.arrays import checked_number, checked_whole
@@ -19,6 +20,10 @@ from deepaccident_devkit.reading import shortened
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 ResultsTask = Literal["motion", "accident", "detection"]
+RESULTS_NAMES: Final[Mapping[ResultsTask, str]] = MappingProxyType(
+    {"motion": "motion", "accident": "accident.json", "detection": "detection.json"}
+)
+"""Task → the name of its file, of motion a folder, where results of all tasks are written into one folder."""
 Stored = Literal["instances", "heads"]
 FORMAT: Final = "DeepAccident results"
 FORMAT_VERSION: Final = 1
