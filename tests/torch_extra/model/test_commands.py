@@ -130,6 +130,7 @@ def test_a_release_without_images(release_root_b: Path, trained: Path, tmp_path:
 def test_wrong_options_are_one_line(release_root: Path, tmp_path: Path, words: tuple[object, ...], said: str) -> None:
     found = refusal(DeepAccidentError, "train", release_root, "--steps", 1, *QUICK, *words, "--out", tmp_path / "run")
     assert said in found
+    assert not list(tmp_path.glob("run/*"))
 
 
 def test_weights_that_do_not_say_what_they_are_of(trained: Path, tmp_path: Path) -> None:
