@@ -23,7 +23,8 @@ from deepaccident_devkit.model.motion.decoders import SharedDecoder
 from deepaccident_devkit.model.motion.flow_gru import FlowGru, warp_with_flow
 from deepaccident_devkit.model.motion.losses import center_loss, latent_loss, segmentation_loss, vector_loss
 
-SEPARATE = MotionHeadConfig(in_channels=4, latent=2, future_frames=2, samples=3)
+# eight channels: a bottleneck of one channel of 3 × 3 cells can pass back a gradient of exactly 0
+SEPARATE = MotionHeadConfig(in_channels=8, latent=2, future_frames=2, samples=3)
 SHARED = dataclasses.replace(SEPARATE, decoders="shared", hidden=6, upsample=2)
 LOSSES = MotionLossConfig()
 ROWS, COLUMNS = 10, 12
