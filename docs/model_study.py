@@ -45,10 +45,12 @@ from deepaccident_devkit import __version__
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.model.checkpoint import FINAL
-from deepaccident_devkit.model.presets import ModelChoice
+from deepaccident_devkit.model.predicting import PredictConfig
+from deepaccident_devkit.model.presets import ModelChoice, load_model
 from deepaccident_devkit.model.training.config import TrainConfig
 from deepaccident_devkit.model.training.log import read_log
 from deepaccident_devkit.model.training.train import train
+from deepaccident_devkit.model.training.validation import SCORE, validated, validation_samples
 from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
 from deepaccident_devkit.release.split_files import write_split_file
 from deepaccident_devkit.synth import SynthConfig, make_release
@@ -56,6 +58,7 @@ from deepaccident_devkit.synth import SynthConfig, make_release
 HERE: Final = Path(__file__).parent
 SUMMARY: Final = "model_study.json"
 COUNTS: Final = "model_study_counts.json.gz"
+_SCORES: Final = "scores.json"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,8 +79,12 @@ class Study:
         return self.folder / "releases" / f"{name}.txt"
 
     def weights(self, arm: str, seed: int) -> Path:
-        """Where training puts the weights of an arm; `first` for those that both arms begin from."""
+        """Where training puts the weights of an arm."""
         return self.folder / "runs" / f"{arm}-{seed}" / FINAL
+
+    def first(self, seed: int, rate: float) -> Path:
+        """Likewise, of the first steps with a learning rate: where both arms begin."""
+        return self.weights(f"first-{rate:g}", seed)
 
     def jobs(self) -> dict[str, RowJob]:
         """Row, and for models its seed → the job."""
@@ -122,13 +129,6 @@ def releases(study: Study) -> dict[str, Any]:
         tokens = [record["token"] for record in dataset.scenario]
         write_split_file(study.split(name), tokens)
         told[name] = {"scenarios": len(tokens), "fingerprint": fingerprint(scenario_hashes(dataset, set(tokens)))}
-        if name == "tuning":
-            pairs = sorted({token.split("/")[1] for token in tokens})
-            scoring = pairs[-study.protocol.tuning_pairs :]
-            write_split_file(study.split("tuning-score"), [each for each in tokens if each.split("/")[1] in scoring])
-            write_split_file(
-                study.split("tuning-learn"), [each for each in tokens if each.split("/")[1] not in scoring]
-            )
     return told
 
 
@@ -150,36 +150,42 @@ def trained(job: TrainJob) -> None:
 
 
 def tuning(study: Study) -> dict[str, Any]:
-    """Short runs with each learning rate on the tuning release; the best score chooses."""
+    """Take the first steps of the first seed with each learning rate; the best score on the tuning release chooses."""
     protocol = study.protocol
-    jobs = {
-        rate: TrainJob(
-            release=study.release("tuning"),
-            out=study.folder / "runs" / f"tuning-{rate:g}",
-            config=TrainConfig(
-                steps=protocol.tuning_steps,
-                agents="single",
-                egos=protocol.egos,
-                learning_rate=rate,
-                split=str(study.split("tuning-learn")),
-                validation=str(study.split("tuning-score")),
-                validate_every=protocol.tuning_steps,
-                validation_samples=protocol.tuning_samples,
-            ),
-            weights=None,
-            device=study.device,
-        )
-        for rate in protocol.learning_rates
-    }
+    jobs = {rate: _first_job(study, protocol.seeds[0], rate) for rate in protocol.learning_rates}
     together(study, trained, jobs.values())
-    logs = {rate: read_log(job.out) for rate, job in jobs.items()}
-    scores = {rate: {**log[-1]["validation"], "loss": _last_loss(log)} for rate, log in logs.items()}
-    best = max(found["score"] for found in scores.values())
+    together(study, scored, [ScoreJob(study=study, folder=job.out) for job in jobs.values()])
+    scores = {
+        rate: {**json.loads((job.out / _SCORES).read_text()), "loss": _last_loss(read_log(job.out))}
+        for rate, job in jobs.items()
+    }
+    best = max(found[SCORE] for found in scores.values())
     if best >= protocol.least_score:
-        chosen = max(scores, key=lambda rate: scores[rate]["score"])
+        chosen = max(scores, key=lambda rate: scores[rate][SCORE])
     else:
         chosen = min(scores, key=lambda rate: scores[rate]["loss"])
     return {"rounds": [{f"{rate:g}": found for rate, found in scores.items()}], "learning_rate": chosen}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScoreJob:
+    """A run that is scored on the tuning release; cheap to pickle."""
+
+    study: Study
+    folder: Path
+
+
+def scored(job: ScoreJob) -> None:
+    """Write the scores of a run's weights, of the ego alone."""
+    study = job.study
+    dataset = opened(study.release("tuning"))
+    config = TrainConfig(
+        validation=str(study.split("tuning")), validation_samples=study.protocol.tuning_samples, agents="single"
+    )
+    predict = PredictConfig(agents=config.agents, device=study.device)
+    model = load_model(job.folder / FINAL).to(study.device)
+    scores = validated(model, dataset, validation_samples(dataset, config), predict)
+    write_bytes(job.folder / _SCORES, json.dumps(scores).encode())
 
 
 def _last_loss(log: Sequence[Mapping[str, Any]]) -> float:
@@ -187,34 +193,49 @@ def _last_loss(log: Sequence[Mapping[str, Any]]) -> float:
     return float(mean(row["loss"] for row in log[-50:]))
 
 
+def _first_job(study: Study, seed: int, rate: float) -> TrainJob:
+    return _job(study, study.first(seed, rate), "single", study.protocol.first_steps, seed, rate)
+
+
+def _job(study: Study, weights: Path, agents: str, steps: int, seed: int, rate: float) -> TrainJob:  # noqa: PLR0913
+    """A run on the training release, from random weights."""
+    return TrainJob(
+        release=study.release("training"),
+        out=weights.parent,
+        config=TrainConfig(
+            steps=steps,
+            agents=agents,
+            egos=study.protocol.egos,
+            learning_rate=rate,
+            split=str(study.split("training")),
+            validation=None,
+            seed=seed,
+        ),
+        weights=None,
+        device=study.device,
+    )
+
+
 def training(study: Study) -> dict[str, Any]:
     """Each seed alone first, then both arms from its weights, equal except for the agents."""
     protocol, rate = study.protocol, study.stored("tuning")["learning_rate"]
 
-    def job(arm: str, seed: int) -> TrainJob:
-        first = arm == "first"
-        return TrainJob(
-            release=study.release("training"),
-            out=study.weights(arm, seed).parent,
-            config=TrainConfig(
-                steps=protocol.first_steps if first else protocol.arm_steps,
-                agents="single" if first else ARMS[arm],
-                egos=protocol.egos,
-                learning_rate=rate,
-                split=str(study.split("training")),
-                validation=None,
-                seed=seed,
-            ),
-            weights=None if first else study.weights("first", seed),
-            device=study.device,
-        )
-
     def then(done: TrainJob) -> list[TrainJob]:
-        return [job(arm, done.config.seed) for arm in ARMS] if done.weights is None else []
+        if done.weights is not None:
+            return []
+        seed, first = done.config.seed, done.out / FINAL
+        return [
+            replace(_job(study, study.weights(arm, seed), agents, protocol.arm_steps, seed, rate), weights=first)
+            for arm, agents in ARMS.items()
+        ]
 
-    together(study, trained, [job("first", seed) for seed in protocol.seeds], then)
-    runs = [f"{arm}-{seed}" for arm in ("first", *ARMS) for seed in protocol.seeds]
-    logs = {name: read_log(study.folder / "runs" / name) for name in runs}
+    together(study, trained, [_first_job(study, seed, rate) for seed in protocol.seeds], then)
+    runs = {
+        f"{arm}-{seed}": path.parent
+        for seed in protocol.seeds
+        for arm, path in {"first": study.first(seed, rate), **{arm: study.weights(arm, seed) for arm in ARMS}}.items()
+    }
+    logs = {name: read_log(folder) for name, folder in runs.items()}
     return {
         name: {
             "steps": len(log),

@@ -31,21 +31,19 @@ HELD_OUT: Final = 8
 class Protocol:
     """All that decides the numbers."""
 
-    training: ReleasePlan = ReleasePlan(seed=101, scenarios=30, designs=SEEN_DESIGNS)
+    training: ReleasePlan = ReleasePlan(seed=101, scenarios=80, designs=SEEN_DESIGNS)
     tuning: ReleasePlan = ReleasePlan(seed=102, scenarios=12, designs=SEEN_DESIGNS)
     test: ReleasePlan = ReleasePlan(seed=103, scenarios=36, designs=(*SEEN_DESIGNS, HELD_OUT))
-    frames: int = 60
+    frames: int = 40
     image_size: tuple[int, int] = (160, 90)
     seeds: tuple[int, ...] = (1, 2, 3)
-    first_steps: int = 1000
+    first_steps: int = 700
     """Of the ego alone, from random weights; both arms go on from there."""
-    arm_steps: int = 500
-    learning_rates: tuple[float, ...] = (1e-3, 2e-3, 4e-3)
-    """One round on the tuning release, of the ego alone, so that the choice cannot favour cooperation."""
-    tuning_steps: int = 300
-    tuning_pairs: int = 2
-    """Pairs of the tuning release that score the runs; they learn from the others."""
-    tuning_samples: int = 40
+    arm_steps: int = 350
+    learning_rates: tuple[float, ...] = (3e-3, 6e-3)
+    """One round: the first steps of the first seed with each rate, scored on the tuning release; the ego alone, so that
+    the choice cannot favour cooperation."""
+    tuning_samples: int = 120
     least_score: float = 0.01
     """If no run reaches it, scores say nothing yet, and the lowest loss of the last steps chooses."""
     egos: int | None = None
@@ -71,8 +69,6 @@ SMOKE: Final = Protocol(
     first_steps=4,
     arm_steps=2,
     learning_rates=(1e-3, 2e-3),
-    tuning_steps=1,
-    tuning_pairs=1,
     tuning_samples=1,
     egos=1,
     configurations=("+other",),

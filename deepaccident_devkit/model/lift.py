@@ -7,7 +7,7 @@ probability of the depth, and each cell of the map is the sum of the points in i
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any, Literal, get_args
+from typing import Any, Final, Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -19,6 +19,11 @@ from deepaccident_devkit.text import settle_choices
 
 Frustum = Literal["corners", "centres"]
 Rounding = Literal["trunc", "floor"]
+Pooling = Literal["sum", "mean"]
+_POLE: Final = 4.0
+"""Metres: the height over the road of a frame whose origin is among its cameras, between the release's 3 and 5."""
+_LEAST_MASS: Final = 0.01
+"""What is added to a cell's sum of probabilities, so that one that hardly any point reaches stays near 0."""
 _WHOLE = 1e-6
 """Share of a step by which a range may miss a whole number of steps, as in `geometry.BevGrid`."""
 
@@ -40,6 +45,11 @@ class LiftConfig:
             the first to the last pixel, the release's rule.
         voxel_rounding: `floor`, or the release's `trunc`: rounding to zero, by which points up to a step below a range
             fall into its first cell.
+        band: heights above the road of the points that count, so that depths need not be learned from nothing; None for
+            all in `z`, as in the release. The road is at the height of the origin, or `_POLE` below it for cameras that
+            are not above the origin (docs/format.md).
+        pooling: of the points in a cell: their `sum`, the release's rule, or their `mean` by their probabilities, which
+            does not grow with the number of pixels that see a cell.
     """
 
     in_channels: int
@@ -52,16 +62,21 @@ class LiftConfig:
     stride: int
     frustum: Frustum = "centres"
     voxel_rounding: Rounding = "floor"
+    band: tuple[float, float] | None = None
+    pooling: Pooling = "sum"
 
     def __post_init__(self) -> None:
         """Check the ranges and words; raises ConfigError, or ChoiceError for an unknown word."""
-        settle_choices(self, {"frustum": get_args(Frustum), "voxel_rounding": get_args(Rounding)})
+        words = {"frustum": Frustum, "voxel_rounding": Rounding, "pooling": Pooling}
+        settle_choices(self, {name: get_args(each) for name, each in words.items()})
         grid = BevGrid(x=self.x, y=self.y)
         object.__setattr__(self, "x", grid.x)
         object.__setattr__(self, "y", grid.y)
         _steps("depth", self.depth)
         if _steps("z", self.z) != 1:
             raise ConfigError(f"z: expected one step, as in ({self.z[0]}, {self.z[1]}, {self.z[1] - self.z[0]})")
+        if self.band is not None and not self.band[0] < self.band[1]:
+            raise ConfigError(f"band: expected a lower and a higher end, found {self.band}")
         if any(size < self.stride or size % self.stride for size in self.image_size):
             raise ConfigError(
                 f"image_size: expected height and width in multiples of the stride {self.stride}, found "
@@ -171,6 +186,10 @@ class LiftSplat(nn.Module):
         steps = steps.trunc() if config.voxel_rounding == "trunc" else steps.floor()
         rows, columns = config.grid_shape
         inside = ((steps >= 0) & (steps < steps.new_tensor([columns, rows, 1]))).all(-1)
+        if config.band is not None:
+            road = torch.where(cameras.translation[..., 2] > _POLE / 4, 0.0, -_POLE)[..., None, None, None]
+            above = points[..., 2] - road
+            inside &= (above >= config.band[0]) & (above < config.band[1])
         if cameras.valid is not None:
             inside &= cameras.valid[..., None, None, None]
         column, row, _ = torch.where(inside[..., None], steps, 0).long().unbind(-1)
@@ -213,9 +232,13 @@ class LiftSplat(nn.Module):
         pixel = point.div(of_camera, rounding_mode="floor") * of_pixel + point % of_pixel
         frame = point.div(of_camera * cells.shape[2], rounding_mode="floor")
         features = context.flatten(2).transpose(1, 2).flatten(0, 1).index_select(0, pixel)
-        features = features * depth.flatten().index_select(0, point)[:, None]
+        chances = depth.flatten().index_select(0, point)[:, None]
+        features = features * chances
+        cell = flat[point] + frame * (rows * columns)
         maps = features.new_zeros(samples * frames * rows * columns, context.shape[1])
-        maps = maps.index_add_(0, flat[point] + frame * (rows * columns), features)
+        maps = maps.index_add_(0, cell, features)
+        if self.config.pooling == "mean":
+            maps = maps / (chances.new_zeros(len(maps), 1).index_add_(0, cell, chances) + _LEAST_MASS)
         return maps.view(samples, frames, rows, columns, -1).permute(0, 1, 4, 2, 3).contiguous()
 
 

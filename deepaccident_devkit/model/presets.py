@@ -33,7 +33,7 @@ from deepaccident_devkit.model.fusion import (
 )
 from deepaccident_devkit.model.images import SmallConvConfig, SwinConfig
 from deepaccident_devkit.model.lift import LiftConfig
-from deepaccident_devkit.model.motion import MotionHeadConfig
+from deepaccident_devkit.model.motion import MotionHeadConfig, MotionLossConfig
 from deepaccident_devkit.model.network import V2XFormer
 from deepaccident_devkit.model.temporal import TemporalConfig
 from deepaccident_devkit.model.warps import GridBounds
@@ -199,12 +199,15 @@ def tiny() -> ModelConfig:
             z=(-10.0, 10.0, 20.0),
             image_size=(96, 160),
             stride=8,
+            band=(-0.5, 2.5),
+            pooling="mean",
         ),
         temporal=TemporalConfig(channels=32, grid=GridBounds(x=along, y=along), frames=2, kind="concat"),
         fusion=PoolFusionConfig(),
         bev=BevUNetConfig(),
         one_bev=True,
         motion=MotionHeadConfig(in_channels=32, latent=8, decoders="shared", upsample=2),
+        motion_loss=MotionLossConfig(class_weights=(1.0, 6.0)),
         detection=DetectionConfig(
             in_channels=32, shared_channels=24, class_slots=ONE_TASK, x=along, y=along, branches="joint", upsample=2
         ),
