@@ -3,7 +3,7 @@
 It takes less than three hours of two cores. What is compared stands in docs/model_study_protocol.py. Each stage is
 skipped if its output is in WORKDIR, and one that broke off goes on: the same command ends what was begun. `--only` does
 one stage, `--smoke` a tiny version of all in minutes (in a WORKDIR of its own), `--publish` copies the summary and the
-counts to docs/, from which docs/make_model_page.py makes the page of the model.
+counts to docs/, from which docs/make_model_page.py makes the page of the model, and the weights into the package.
 """
 
 import argparse
@@ -27,6 +27,7 @@ from model_study_protocol import (
     COMPARED,
     HEADLINE_NUMBER,
     PROTOCOL,
+    SHIPPED,
     SMOKE,
     Protocol,
     ReleasePlan,
@@ -44,7 +45,8 @@ from model_study_rows import (
 from deepaccident_devkit import __version__
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.files import write_bytes
-from deepaccident_devkit.model.checkpoint import FINAL
+from deepaccident_devkit.model.checkpoint import FINAL, read_weights, write_weights
+from deepaccident_devkit.model.checkpoint import SHIPPED as SHIPPED_WEIGHTS
 from deepaccident_devkit.model.predicting import PredictConfig
 from deepaccident_devkit.model.presets import ModelChoice, load_model
 from deepaccident_devkit.model.training.config import TrainConfig
@@ -59,6 +61,9 @@ HERE: Final = Path(__file__).parent
 SUMMARY: Final = "model_study.json"
 COUNTS: Final = "model_study_counts.json.gz"
 _SCORES: Final = "scores.json"
+WEIGHTS: Final = SHIPPED_WEIGHTS["tiny"].name
+_NOT_SHIPPED: Final = ("num_batches_tracked", "frustum")
+_SYNTH: Final = ("scenarios", "frames", "image_size", "seed", "sensors", "view", "designs")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,23 +118,31 @@ def releases(study: Study) -> dict[str, Any]:
     """Generate the three releases, with images alone, and their split files."""
     told = {}
     for name in ("training", "tuning", "test"):
-        plan: ReleasePlan = getattr(study.protocol, name)
-        config = SynthConfig(
-            scenarios=plan.scenarios,
-            frames=study.protocol.frames,
-            image_size=study.protocol.image_size,
-            seed=plan.seed,
-            sensors="cameras",
-            view="hidden",
-            designs=plan.designs,
-        )
-        if not study.release(name).exists():
-            make_release(study.release(name), config, workers=study.processes, progress=True)
-        dataset = opened(study.release(name))
-        tokens = [record["token"] for record in dataset.scenario]
-        write_split_file(study.split(name), tokens)
-        told[name] = {"scenarios": len(tokens), "fingerprint": fingerprint(scenario_hashes(dataset, set(tokens)))}
+        tokens = _made(study, name, getattr(study.protocol, name))
+        found = fingerprint(scenario_hashes(opened(study.release(name)), set(tokens)))
+        told[name] = {"scenarios": len(tokens), "fingerprint": found}
     return told
+
+
+def _made(study: Study, name: str, plan: ReleasePlan) -> list[str]:
+    """Make a release, if it is not there, and its split file; returns its scenarios."""
+    if not study.release(name).exists():
+        make_release(study.release(name), _synth(study, plan), workers=study.processes, progress=True)
+    tokens = [record["token"] for record in opened(study.release(name)).scenario]
+    write_split_file(study.split(name), tokens)
+    return tokens
+
+
+def _synth(study: Study, plan: ReleasePlan) -> SynthConfig:
+    return SynthConfig(
+        scenarios=plan.scenarios,
+        frames=study.protocol.frames,
+        image_size=study.protocol.image_size,
+        seed=plan.seed,
+        sensors="cameras",
+        view="hidden",
+        designs=plan.designs,
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -154,7 +167,7 @@ def tuning(study: Study) -> dict[str, Any]:
     protocol = study.protocol
     jobs = {rate: _first_job(study, protocol.seeds[0], rate) for rate in protocol.learning_rates}
     together(study, trained, jobs.values())
-    together(study, scored, [ScoreJob(study=study, folder=job.out) for job in jobs.values()])
+    together(study, scored, [ScoreJob(study=study, weights=job.out / FINAL) for job in jobs.values()])
     scores = {
         rate: {**json.loads((job.out / _SCORES).read_text()), "loss": _last_loss(read_log(job.out))}
         for rate, job in jobs.items()
@@ -169,23 +182,33 @@ def tuning(study: Study) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScoreJob:
-    """A run that is scored on the tuning release; cheap to pickle."""
+    """Weights that are scored on a release; cheap to pickle."""
 
     study: Study
-    folder: Path
+    weights: Path
+    release: str = "tuning"
+    agents: str = "single"
+    samples: int | None = None
+    """Of them, evenly chosen; 0 for all, and None for as many as the protocol says."""
+
+    @property
+    def out(self) -> Path:
+        """The folder of the scores."""
+        return self.weights.parent
 
 
 def scored(job: ScoreJob) -> None:
-    """Write the scores of a run's weights, of the ego alone."""
+    """Write the scores of weights beside them."""
     study = job.study
-    dataset = opened(study.release("tuning"))
+    dataset = opened(study.release(job.release))
     config = TrainConfig(
-        validation=str(study.split("tuning")), validation_samples=study.protocol.tuning_samples, agents="single"
+        validation=str(study.split(job.release)),
+        validation_samples=study.protocol.tuning_samples if job.samples is None else job.samples,
     )
-    predict = PredictConfig(agents=config.agents, device=study.device)
-    model = load_model(job.folder / FINAL).to(study.device)
+    predict = PredictConfig(agents=job.agents, device=study.device)
+    model = load_model(job.weights).to(study.device)
     scores = validated(model, dataset, validation_samples(dataset, config), predict)
-    write_bytes(job.folder / _SCORES, json.dumps(scores).encode())
+    write_bytes(job.out / _SCORES, json.dumps(scores).encode())
 
 
 def _last_loss(log: Sequence[Mapping[str, Any]]) -> float:
@@ -197,7 +220,7 @@ def _first_job(study: Study, seed: int, rate: float) -> TrainJob:
     return _job(study, study.first(seed, rate), "single", study.protocol.first_steps, seed, rate)
 
 
-def _job(study: Study, weights: Path, agents: str, steps: int, seed: int, rate: float) -> TrainJob:  # noqa: PLR0913
+def _job(study: Study, weights: Path, agents: str, steps: int, seed: int, rate: float) -> TrainJob:
     """A run on the training release, from random weights."""
     return TrainJob(
         release=study.release("training"),
@@ -246,6 +269,36 @@ def training(study: Study) -> dict[str, Any]:
     }
 
 
+def weights(study: Study) -> dict[str, Any]:
+    """Round the weights of the arm `all` and the first seed, score them, and note the scores with them: they ship."""
+    arm, seed = "all", study.protocol.seeds[0]
+    _made(study, "shipped", SHIPPED)
+    given = read_weights(study.weights(arm, seed)).tensors
+    tensors = {name: each for name, each in given.items() if not name.endswith(_NOT_SHIPPED)}
+    path = study.folder / "shipped" / WEIGHTS
+    synth = _synth(study, SHIPPED)
+    made = {
+        "command": "python docs/model_study.py WORKDIR --publish",
+        "protocol": json.loads(json.dumps(asdict(study.protocol))),
+        "arm": arm,
+        "seed": seed,
+        "learning_rate": study.stored("tuning")["learning_rate"],
+        "release": study.stored("releases")["training"]["fingerprint"],
+        "devkit": __version__,
+        "torch": torch.__version__,
+    }
+    notes = {**ModelChoice().as_dict(), "made": made}
+    write_weights(path, tensors, notes, half=True)
+    together(study, scored, [ScoreJob(study=study, weights=path, release="shipped", agents=arm, samples=0)])
+    told = {
+        "agents": arm,
+        "synth": {name: getattr(synth, name) for name in _SYNTH},
+        "scores": json.loads((path.parent / _SCORES).read_text()),
+    }
+    write_weights(path, tensors, {**notes, "scored": told}, half=True)
+    return {**told, "bytes": path.stat().st_size}
+
+
 def costs(study: Study) -> dict[str, Any]:
     """Seconds of a step with each fusion, and with a longer horizon; one process alone."""
     protocol, found = study.protocol, {}
@@ -286,7 +339,7 @@ def bundles(study: Study) -> dict[str, Any]:
     found = {name: evaluators_of(job.out) for name, job in study.jobs().items()}
     write_counts(study.folder / COUNTS, found)
     seconds = json.loads((study.folder / "seconds.json").read_text())
-    notes = {name: study.stored(name) for name in ("releases", "tuning", "training", "costs")}
+    notes = {name: study.stored(name) for name in ("releases", "tuning", "training", "costs", "weights")}
     summary = {
         "protocol": json.loads(json.dumps(asdict(study.protocol))),
         "smoke": study.protocol != PROTOCOL,
@@ -411,6 +464,7 @@ STAGES: Final[Mapping[str, Callable[[Study], dict[str, Any]]]] = {
     "controls": lambda study: predicting(study, controls=True),
     "evaluation": evaluation,
     "costs": costs,
+    "weights": weights,
     "bundles": bundles,
 }
 
@@ -472,6 +526,7 @@ def main() -> None:
             raise SystemExit("--publish, --smoke: the numbers of the smoke run say nothing; leave one of the two out")
         for name in (SUMMARY, COUNTS):
             shutil.copyfile(study.folder / name, HERE / name)
+        shutil.copyfile(study.folder / "shipped" / WEIGHTS, SHIPPED_WEIGHTS["tiny"])
 
 
 if __name__ == "__main__":

@@ -80,6 +80,7 @@ NOT_RUN = {
     "train ": "tests/torch_extra/model/test_commands.py has them; they need torch",
     "predict ": "likewise",
     "evaluate motion training_data": "of what predict makes; likewise",
+    "evaluate motion DATAROOT --results results/motion ": "likewise",
     "results from": "tests/unit/export/test_nuscenes_detections.py has it, and makes the file",
     "export mcap": "tests/unit/export has it, which has the extra",
 }

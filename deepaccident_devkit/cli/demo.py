@@ -8,27 +8,39 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 from tqdm import tqdm
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.baselines import demo_table, predict_results
-from deepaccident_devkit.cli.demo_page import PAGE, PICTURES, REPLAY, REPORT_FOLDER, NextStep, demo_page
+from deepaccident_devkit.cli.demo_page import (
+    MODEL_PICTURE,
+    PAGE,
+    PICTURES,
+    REPLAY,
+    REPORT_FOLDER,
+    NextStep,
+    demo_page,
+)
+from deepaccident_devkit.cli.options import use_threads_sparingly
 from deepaccident_devkit.dataset import RowArgument
 from deepaccident_devkit.deepaccident import DeepAccident
-from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.errors import ConfigError, MissingExtraError
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.files import remove_leftovers, write_bytes
-from deepaccident_devkit.motion import MotionLabelConfig
+from deepaccident_devkit.motion import MotionLabelConfig, motion_labels
 from deepaccident_devkit.render import detached_figure, render_replay
-from deepaccident_devkit.render.evaluation import save_report
+from deepaccident_devkit.render.evaluation import draw_motion_outcome, save_report
 from deepaccident_devkit.render.pictures import save_picture
 from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
+
+if TYPE_CHECKING:
+    from deepaccident_devkit.tables.records import FrameRecord, ScenarioRecord
 
 SCENARIO: Final = """\
 # The accident of `deepaccident demo`: in clear weather, by day, the other car runs a red light. A house hides it from
@@ -57,7 +69,15 @@ _SECONDS_BEFORE: Final = 1.0
 _LABELS: Final = MotionLabelConfig(future_frames=2)
 """The released labels, but they end at the impact."""
 _SELECTION: Final = SampleSelection(split="train", scope="all")
-_STEPS: Final = {"recording": 32.0, "indexing": 1.0, "pictures": 5.0, "table": 2.0, "evaluation": 4.0, "replay": 4.0}
+_STEPS: Final = {
+    "recording": 32.0,
+    "indexing": 1.0,
+    "pictures": 5.0,
+    "model": 5.0,
+    "table": 2.0,
+    "evaluation": 4.0,
+    "replay": 4.0,
+}
 """About how many seconds each step takes on two cores."""
 _BAR: Final = "{desc:<10} {percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
 
@@ -69,7 +89,8 @@ def demo(out: Path, workers: int | None) -> None:
     """Make a small synthetic release in the folder OUT, and a page that shows what the devkit does with it.
 
     The release has an accident and its normal twin. The page OUT/index.html has pictures, motion labels, a table of
-    what one car and five agents predict, a replay, the report of an evaluation, and five next steps.
+    what one car and five agents predict, a replay, the report of an evaluation, and five next steps. Where PyTorch is
+    installed, it also shows what a small trained model foresees.
 
     OUT must be missing, empty, or the folder of an earlier demo, which then keeps its release.
     """
@@ -82,13 +103,15 @@ def demo(out: Path, workers: int | None) -> None:
             release = DeepAccident("v1", out / "release", workers=workers, verbose=False)
         with _step(bar, "pictures"):
             draw_accident(release, out)
+        with _step(bar, "model"):
+            model = draw_model(release, out)
         with _step(bar, "table"):
             rows, table = demo_table(release)
         with _step(bar, "evaluation"):
             _evaluate(release, out)
         with _step(bar, "replay"):
             render_replay(release, None, out / REPLAY)
-    write_bytes(out / PAGE, demo_page(rows, steps).encode())
+    write_bytes(out / PAGE, demo_page(rows, steps, model=model).encode())
     click.echo(f"{table}\n\nNext steps:")
     for number, step in enumerate(steps, 1):
         click.echo(f"{number}. {step.sentence}\n   {step.command}")
@@ -97,9 +120,7 @@ def demo(out: Path, workers: int | None) -> None:
 
 def draw_accident(release: DeepAccident, out: Path) -> None:
     """Render the first accident: the countdown to it, and the five agents, ego's cameras and labels a second before."""
-    accident = next(scenario for scenario in release.scenario if scenario["collision"])
-    impact = release.getind("frame", accident["last_frame_token"])
-    before = release.frame[impact - round(_SECONDS_BEFORE / FRAME_PERIOD)]
+    accident, before = _accident_and_before(release)
     ego = release.samples_of(before)[0]
     countdown = partial(release.render_accident, seconds=_COUNTDOWN, agents=("ego_vehicle", "infrastructure"))
     labels = partial(release.render_motion_labels, config=_LABELS)
@@ -111,6 +132,42 @@ def draw_accident(release: DeepAccident, out: Path) -> None:
     )
     for name, (size, render, record) in zip(PICTURES, drawings, strict=True):
         save_picture(render(record, fig=detached_figure(size)), out / name, dpi=80)
+
+
+def draw_model(release: DeepAccident, out: Path) -> bool:
+    """Render what the shipped model foresees a second before, by ego's cameras and by all agents', beside the truth.
+
+    Returns:
+        Whether PyTorch is installed; without it there is no picture.
+    """
+    [name] = MODEL_PICTURE
+    (out / name).unlink(missing_ok=True)  # of an earlier demo
+    use_threads_sparingly()
+    try:
+        from deepaccident_devkit.model import PredictConfig, load_model, predictions
+
+        model = load_model("tiny")
+    except MissingExtraError:
+        return False
+    token = release.samples_of(_accident_and_before(release)[1])[0]["token"]
+    label = motion_labels(release, token, model.config.labels)
+    fig = detached_figure((13.0, 13.0))
+    for column, agents, title in zip(
+        fig.subplots(2, 2).T, ("single", "all"), ("ego alone", "five agents"), strict=True
+    ):
+        [found] = predictions(model, release, [token], PredictConfig(agents=agents))
+        for ax, frame in zip(column, (0, None), strict=True):
+            draw_motion_outcome(found.motion, label, frame=frame, ax=ax)
+            ax.set_title(f"{title}: {ax.get_title()}")
+    save_picture(fig, out / name, dpi=80)
+    return True
+
+
+def _accident_and_before(release: DeepAccident) -> tuple[ScenarioRecord, FrameRecord]:
+    """The first accident's scenario, and its frame a second before the impact."""
+    accident = next(scenario for scenario in release.scenario if scenario["collision"])
+    impact = release.getind("frame", accident["last_frame_token"])
+    return accident, release.frame[impact - round(_SECONDS_BEFORE / FRAME_PERIOD)]
 
 
 @contextmanager

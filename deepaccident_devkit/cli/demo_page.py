@@ -32,6 +32,17 @@ PICTURES: Final = {
     ),
 }
 """File beside the page → what it shows, in a few words, and what one sees."""
+MODEL_PICTURE: Final = {
+    "model_1s_before.png": (
+        "What a trained model foresees",
+        (
+            "The small model that the devkit ships sees with cameras alone: on the left with those of ego, on the "
+            "right with those of all five agents. One second before the impact, it says where everybody is now, and "
+            "where they will be at the impact. It is too small to see far or sharply."
+        ),
+    )
+}
+"""Likewise, of the picture that is made where PyTorch is installed."""
 REPLAY: Final = "replay.html"
 REPORT_FOLDER: Final = "evaluation"
 _POLICY: Final = "default-src 'none'; img-src 'self' file:; frame-src 'self' file:; style-src 'unsafe-inline'"
@@ -59,16 +70,17 @@ class NextStep:
     command: str
 
 
-def demo_page(rows: Sequence[HiddenCollider], steps: Sequence[NextStep]) -> str:
+def demo_page(rows: Sequence[HiddenCollider], steps: Sequence[NextStep], *, model: bool) -> str:
     """The complete page; it refers to the other files of its folder by their names.
 
     Args:
         rows: of `demo_table`.
         steps: what to try next.
+        model: whether there is a picture of a model's predictions.
     """
     heading, *lines = zip(*table_rows(rows), strict=True)  # a column for each set of agents: it fits a narrow window
     parts = [
-        *((*words, _image(name, *words)) for name, words in PICTURES.items()),
+        *((*words, _image(name, *words)) for name, words in (PICTURES | (MODEL_PICTURE if model else {})).items()),
         ("What one car and five agents foresee", _TABLE, table(heading, lines)),
         ("Replay", _REPLAY, _frame("Replay", REPLAY)),
         ("Report of an evaluation", _REPORT, _frame("Report", f"{REPORT_FOLDER}/report.html")),

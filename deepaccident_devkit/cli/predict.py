@@ -42,8 +42,8 @@ Examples:
 def predict(run: Path, split: str, purpose: Any, scope: Scope, out: Path, **options: Any) -> None:
     """Predict a split of the release in DATAROOT with the model that was trained in RUN.
 
-    RUN is a run's folder, or a file of weights. It writes motion/, accident.json and detection.json, which
-    `deepaccident evaluate` takes.
+    RUN is a run's folder, a file of weights, or `tiny` for those that the devkit ships. It writes motion/,
+    accident.json and detection.json, which `deepaccident evaluate` takes.
     """
     use_threads_sparingly()
     from deepaccident_devkit.model import PredictConfig, checked_device, load_model, predict_results

@@ -62,7 +62,7 @@ Examples:
     "--from",
     "weights",
     type=click.Path(path_type=Path),
-    help="Run or file of weights to begin from; or a checkpoint of the release, BEVerse, Swin or ResNet.",
+    help="Run or file of weights to begin from, or `tiny`; or a checkpoint of the release, BEVerse, Swin or ResNet.",
 )
 @click.option(
     "--freeze", multiple=True, metavar="NAME", help="Do not train parameters whose names begin so; you can repeat this."

@@ -12,6 +12,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 import torch
@@ -31,6 +32,8 @@ FINAL: Final = "final.safetensors"
 LAST: Final = "last.safetensors"
 """In a run's folder: the weights with the best score; of a run that was not validated, those of the last step; and the
 state from which it goes on."""
+SHIPPED: Final = MappingProxyType({"tiny": Path(__file__).with_name("tiny.safetensors")})
+"""Weights that come with the devkit, by name; their notes say how they were made, and what they score where."""
 OPTIMIZER: Final = "optimizer."
 """Beginning of the names of the optimizer's tensors in that state."""
 _META: Final = "deepaccident"
@@ -79,10 +82,14 @@ class Loaded(ShortRepr):
 def read_weights(path: str | os.PathLike[str]) -> Weights:
     """The weights in a file: safetensors, or a foreign checkpoint (`.pth`, `.pt`); of a run's folder, the best.
 
+    A name of `SHIPPED` that is no file or folder stands for those weights.
+
     Raises:
         ConfigError: the file is not there, cannot be read, or holds no state dict.
     """
     path = Path(path)
+    if not path.exists():
+        path = SHIPPED.get(str(path), path)
     if path.is_dir():
         path = next((path / name for name in (BEST, FINAL, LAST) if (path / name).is_file()), path / BEST)
     try:

@@ -65,12 +65,15 @@ def sample_figures(run: EvaluationRun, dataset: Dataset, results: Results) -> tu
     )
 
 
-def draw_motion_outcome(prediction: MotionOutput, label: MotionLabels, *, ax: Axes | None = None) -> Axes:
-    """Render the last frame's cells: actors that are predicted, predicted falsely, and missed.
+def draw_motion_outcome(
+    prediction: MotionOutput, label: MotionLabels, *, frame: int | None = None, ax: Axes | None = None
+) -> Axes:
+    """Render a frame's cells: actors that are predicted, predicted falsely, and missed.
 
     Args:
         prediction: of a model; the last of several predictions is rendered.
         label: the truth, on the same grid; frames in their own ego frames are warped to the present.
+        frame: which one, 0 for the present; None for the last that is recorded.
         ax: axes to render on; new ones if None.
 
     Returns:
@@ -82,7 +85,7 @@ def draw_motion_outcome(prediction: MotionOutput, label: MotionLabels, *, ax: Ax
     from matplotlib.colors import to_rgb
 
     ax, truth, grid = axes_or_new(ax, PANEL), labels_at_present(label), label.config.grid
-    frame = frames_there(label) - 1
+    frame = frames_there(label) - 1 if frame is None else frame
     there = prediction.grid.reorient(_actors(prediction, frame), "devkit")
     true = grid.reorient(truth.segmentation[frame] == 1, "devkit")
     picture = np.ones((*true.shape, 3))
@@ -91,7 +94,7 @@ def draw_motion_outcome(prediction: MotionOutput, label: MotionLabels, *, ax: Ax
     ax.imshow(picture, origin="lower", extent=(*grid.x[:2], *grid.y[:2]), interpolation="nearest")
     draw_legend_of_fills(ax, OUTCOME_COLORS)
     seconds = frame * label.config.step * FRAME_PERIOD
-    return titled_from_above(ax, f"actors {seconds:g} s ahead", grid=True)
+    return titled_from_above(ax, f"actors {seconds:g} s ahead" if frame else "actors now", grid=True)
 
 
 def _draw(load: SampleLoader, token: str, text: str, *, ax: Axes) -> Axes:

@@ -222,8 +222,9 @@ def test_gradients_reach_the_features_and_every_weight():
     assert not lift.frustum.requires_grad
 
 
-def test_gradients_are_those_of_finite_differences():
-    config = replace(CONFIG, in_channels=2, channels=1, depth=(2, 8, 2), image_size=(16, 16))
+@pytest.mark.parametrize("pooling", ["sum", "mean"])
+def test_gradients_are_those_of_finite_differences(pooling):
+    config = replace(CONFIG, in_channels=2, channels=1, depth=(2, 8, 2), image_size=(16, 16), pooling=pooling)
     lift, cameras = lift_of(config).double(), rig(shape=(1, 1, 2))
     features = noise(1, 1, 2, 2, 2, 2).double().requires_grad_()
     cells = lift.cells(cameras)
@@ -249,6 +250,39 @@ def test_agents_become_samples():
     assert flat.valid is None
 
 
+# --- what `tiny` has beside the release
+
+
+def test_only_points_in_the_band_above_the_road_count():
+    """The road is at the origin's height under cameras that stand above it, and 4 m below those of a pole."""
+    cameras = rig()
+    plain, banded = lift_of(CONFIG), lift_of(replace(CONFIG, band=(-0.5, 1.5)))
+    for height, road in ((1.8, 0.0), (0.0, -4.0)):
+        cameras.translation[..., 2] = height
+        above = plain.points(cameras)[..., 2] - road
+        inside = (plain.cells(cameras) >= 0) & (above >= -0.5) & (above < 1.5)
+        assert torch.equal(banded.cells(cameras) >= 0, inside)
+        assert torch.equal(banded.cells(cameras)[inside], plain.cells(cameras)[inside])
+        assert 10 < int(inside.sum()) < int((plain.cells(cameras) >= 0).sum()) - 10
+
+
+def test_a_mean_does_not_grow_with_the_number_of_points():
+    """Where all features are equal, each cell that is reached has them, or nearly."""
+    lift = lift_of(replace(CONFIG, pooling="mean"))
+    torch.nn.init.zeros_(lift.depthnet.weight)
+    torch.nn.init.zeros_(lift.depthnet.bias)
+    lift.depthnet.bias.data[8:] = torch.tensor([1.0, 2.0, 3.0])
+    cameras = rig()
+    maps = lift(noise(2, 2, 3, 5, 3, 5), cameras)
+    points = torch.zeros(2, 2, 64 * 32 + 1)
+    cells = lift.cells(cameras).flatten(2)
+    points.scatter_add_(2, torch.where(cells < 0, 64 * 32, cells), torch.ones(cells.shape))
+    mass = points[..., :-1].view(2, 2, 64, 32) / 8
+    expected = (mass / (mass + 0.01))[:, :, None] * torch.tensor([1.0, 2.0, 3.0])[:, None, None]
+    torch.testing.assert_close(maps, expected)
+    assert 0.9 < float(maps.detach()[:, :, 0].max()) < 1
+
+
 # --- errors
 
 
@@ -259,6 +293,7 @@ def test_agents_become_samples():
         ({"depth": (1, 10, 0)}, "depth: expected start, end and step"),
         ({"z": (-10, 10, 5)}, "z: expected one step"),
         ({"x": (-10, 10, 3)}, "x: -10 to 10 m is not a whole number of cells"),
+        ({"band": (2.5, -0.5)}, "band: expected a lower and a higher end"),
         ({"image_size": (90, 160), "stride": 8}, r"multiples of the stride 8, found \(90, 160\)"),
     ],
 )
@@ -272,6 +307,8 @@ def test_words_are_checked():
         replace(CONFIG, frustum="centers")
     with pytest.raises(ValueError, match="voxel_rounding: expected one of trunc, floor"):
         replace(CONFIG, voxel_rounding="round")
+    with pytest.raises(ValueError, match="pooling: expected one of sum, mean, found 'max'"):
+        replace(CONFIG, pooling="max")
 
 
 def test_features_of_another_shape_are_named():

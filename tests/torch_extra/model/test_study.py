@@ -15,6 +15,7 @@ import torch
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import Resampling
+from deepaccident_devkit.model.checkpoint import read_weights
 from deepaccident_devkit.model.presets import tiny
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
 from deepaccident_devkit.v2x import cooperating_agents, visible_instances
@@ -166,7 +167,7 @@ def test_a_row_of_some_samples(numbers: ModuleType) -> None:
 def test_the_protocol_keeps_its_releases_apart(scripts: dict[str, ModuleType]) -> None:
     protocol = scripts["model_study_protocol"]
     plans = [protocol.PROTOCOL.training, protocol.PROTOCOL.tuning, protocol.PROTOCOL.test]
-    assert len({plan.seed for plan in plans}) == 3
+    assert len({plan.seed for plan in (*plans, protocol.SHIPPED)}) == 4
     assert [protocol.HELD_OUT in plan.designs for plan in plans] == [False, False, True]
     assert all(plan.scenarios >= 2 * len(plan.designs) for plan in plans)  # a pair of each design, at least
     names = [row.name for row in protocol.rows_of(protocol.PROTOCOL)]
@@ -212,6 +213,12 @@ def summary(scripts: dict[str, ModuleType]) -> dict[str, Any]:
         "tuning": {"rounds": [{"0.001": scores, "0.002": scores}], "learning_rate": 0.002},
         "training": {},
         "costs": {"mean": 1.5, "cobevt": 6.0},
+        "weights": {
+            "agents": "all",
+            "synth": {"scenarios": 2, "seed": 104},
+            "scores": {"iou": 0.1, "vpq": 0.1, "map": 0.0, "score": 0.1},
+            "bytes": 1_000_000,
+        },
         "seconds": {"releases": 600.0, "training": 6000.0},
         "machine": {
             "processor": "a processor",
@@ -332,6 +339,13 @@ def test_a_tiny_run_of_all_of_it(
     assert found["nothing"]["false_foreground"]["value"] is None
     assert scripts["make_model_page"].page(summary).count("`all, strangers`") > 3
     same_numbers(study.summarised(rows.read_counts(run.folder / study.COUNTS), study.SMOKE)["rows"], summary["rows"])
+
+    shipped = read_weights(run.folder / "shipped" / study.WEIGHTS).meta
+    assert shipped["scored"]["scores"] == summary["weights"]["scores"]
+    assert (shipped["made"]["arm"], shipped["made"]["release"]) == (
+        "all",
+        summary["releases"]["training"]["fingerprint"],
+    )
 
     capsys.readouterr()
     study.run(run)  # nothing is left to do
