@@ -9,7 +9,8 @@
     predict_results(load_model("runs/all"), da, tokens, "results", PredictConfig(agents="all"))
 
 The preset `released` is equal to the released modules, with their quirks as fields of its configuration; `tiny` is
-trained by a laptop (docs/training.md). `network` says which module does what on the way from images to predictions.
+trained by a laptop (docs/training.md), and its weights come with the devkit (docs/model.md). `network` says which
+module does what on the way from images to predictions.
 Importing it without torch raises MissingExtraError.
 """
 
