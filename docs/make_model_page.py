@@ -31,9 +31,8 @@ Summary = Mapping[str, Any]
 
 def page(summary: Summary) -> str:
     """The page's text."""
-    body = (
-        "\n".join([*_measured(summary), *_tables(summary), *_weights(summary), *_how(summary), *_paper(summary)]) + "\n"
-    )
+    sections = (_measured, _tables, _weights, _how, _paper)
+    body = "\n".join(line for section in sections for line in section(summary)) + "\n"
     minutes = max(1, round(len(body.split()) / WORDS_A_MINUTE))
     told = f"{minutes} minute{'s' * (minutes != 1)}"
     return body.replace("READING_TIME", told)
@@ -275,8 +274,8 @@ def _how(summary: Summary) -> list[str]:
     trials = (
         f"The run of the chosen rate is also the first part of seed {seed}. Before all this was fixed, shorter trials "
         "on parts of the training release, without a tuning or test scene, led to what `tiny` has beside the release: "
-        "only points near the road count, a cell has their mean, and foreground weighs more. Without these, or with "
-        "few scenes of training, it found nothing in other scenes."
+        "only points near the road count, a cell has their mean, and foreground weighs more. They were too few and too "
+        "short to say what each is worth."
     )
     prints = ", ".join(f"{name} `{each['fingerprint']}`" for name, each in summary["releases"].items())
     return [

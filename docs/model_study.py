@@ -167,7 +167,8 @@ def tuning(study: Study) -> dict[str, Any]:
     protocol = study.protocol
     jobs = {rate: _first_job(study, protocol.seeds[0], rate) for rate in protocol.learning_rates}
     together(study, trained, jobs.values())
-    together(study, scored, [ScoreJob(study=study, weights=job.out / FINAL) for job in jobs.values()])
+    given = {"release": "tuning", "agents": "single", "samples": protocol.tuning_samples}
+    together(study, scored, [ScoreJob(study=study, weights=job.out / FINAL, **given) for job in jobs.values()])
     scores = {
         rate: {**json.loads((job.out / _SCORES).read_text()), "loss": _last_loss(read_log(job.out))}
         for rate, job in jobs.items()
@@ -186,10 +187,10 @@ class ScoreJob:
 
     study: Study
     weights: Path
-    release: str = "tuning"
-    agents: str = "single"
-    samples: int | None = None
-    """Of them, evenly chosen; 0 for all, and None for as many as the protocol says."""
+    release: str
+    agents: str
+    samples: int
+    """How many of the release's, evenly chosen; 0 for all."""
 
     @property
     def out(self) -> Path:
@@ -201,10 +202,7 @@ def scored(job: ScoreJob) -> None:
     """Write the scores of weights beside them."""
     study = job.study
     dataset = opened(study.release(job.release))
-    config = TrainConfig(
-        validation=str(study.split(job.release)),
-        validation_samples=study.protocol.tuning_samples if job.samples is None else job.samples,
-    )
+    config = TrainConfig(validation=str(study.split(job.release)), validation_samples=job.samples)
     predict = PredictConfig(agents=job.agents, device=study.device)
     model = load_model(job.weights).to(study.device)
     scores = validated(model, dataset, validation_samples(dataset, config), predict)
@@ -279,7 +277,7 @@ def weights(study: Study) -> dict[str, Any]:
     synth = _synth(study, SHIPPED)
     made = {
         "command": "python docs/model_study.py WORKDIR --publish",
-        "protocol": json.loads(json.dumps(asdict(study.protocol))),
+        "protocol": asdict(study.protocol),
         "arm": arm,
         "seed": seed,
         "learning_rate": study.stored("tuning")["learning_rate"],
@@ -341,7 +339,7 @@ def bundles(study: Study) -> dict[str, Any]:
     seconds = json.loads((study.folder / "seconds.json").read_text())
     notes = {name: study.stored(name) for name in ("releases", "tuning", "training", "costs", "weights")}
     summary = {
-        "protocol": json.loads(json.dumps(asdict(study.protocol))),
+        "protocol": asdict(study.protocol),
         "smoke": study.protocol != PROTOCOL,
         **summarised(found, study.protocol),
         **notes,

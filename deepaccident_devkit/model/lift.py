@@ -1,7 +1,7 @@
 """`LiftSplat`: image features → a map seen from above, by a distribution over depths (Philion and Fidler, ECCV 2020).
 
 Each pixel of a feature map stands for a ray. The points of the ray at fixed depths receive its features, weighed by the
-probability of the depth, and each cell of the map is the sum of the points in it.
+probability of the depth, and each cell of the map is the sum or the mean of the points in it.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ Rounding = Literal["trunc", "floor"]
 Pooling = Literal["sum", "mean"]
 _POLE: Final = 4.0
 """Metres: the height over the road of a frame whose origin is among its cameras, between the release's 3 and 5."""
+_LEAST_CAMERA: Final = 1.0
+"""Metres above its origin from which a camera is a vehicle's: those of the release are some 1.6 m above, or at 0."""
 _LEAST_MASS: Final = 0.01
 """What is added to a cell's sum of probabilities, so that one that hardly any point reaches stays near 0."""
 _WHOLE = 1e-6
@@ -46,8 +48,8 @@ class LiftConfig:
         voxel_rounding: `floor`, or the release's `trunc`: rounding to zero, by which points up to a step below a range
             fall into its first cell.
         band: heights above the road of the points that count, so that depths need not be learned from nothing; None for
-            all in `z`, as in the release. The road is at the height of the origin, or `_POLE` below it for cameras that
-            are not above the origin (docs/format.md).
+            all in `z`, as in the release. The road is at the height of the origin, or 4 m below it for cameras that are
+            not above the origin: a pole's (docs/format.md).
         pooling: of the points in a cell: their `sum`, the release's rule, or their `mean` by their probabilities, which
             does not grow with the number of pixels that see a cell.
     """
@@ -187,7 +189,7 @@ class LiftSplat(nn.Module):
         rows, columns = config.grid_shape
         inside = ((steps >= 0) & (steps < steps.new_tensor([columns, rows, 1]))).all(-1)
         if config.band is not None:
-            road = torch.where(cameras.translation[..., 2] > _POLE / 4, 0.0, -_POLE)[..., None, None, None]
+            road = torch.where(cameras.translation[..., 2] > _LEAST_CAMERA, 0.0, -_POLE)[..., None, None, None]
             above = points[..., 2] - road
             inside &= (above >= config.band[0]) & (above < config.band[1])
         if cameras.valid is not None:

@@ -182,9 +182,9 @@ def released() -> ModelConfig:
 def tiny() -> ModelConfig:
     """Half a million parameters, 160 × 90 pixels, 100 × 100 cells of 1 m, labels `clean`, none of the quirks.
 
-    Only points near the road count, and a cell has their mean: with the release's lift a short training finds nothing
-    in other scenes. Thresholds of the metrics are counted in cells, and so are twice as long in metres as the released
-    ones: its numbers (docs/model.md) never stand beside those of the released grid.
+    Only points near the road count, and a cell has their mean, so that depths need not be learned from nothing.
+    Thresholds of the metrics are counted in cells, and so are twice as long in metres as the released ones: its numbers
+    (docs/model.md) never stand beside those of the released grid.
     """
     along = (-50.0, 50.0, 1.0)
     return ModelConfig(

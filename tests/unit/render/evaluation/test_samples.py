@@ -38,14 +38,16 @@ def test_outcomes_of_cells_are_coloured(da_motion: DeepAccident, tokens: list[st
             else truth.config.grid.reorient(shifted, orientation),
             grid,
         )
-        ax = draw_motion_outcome(output, label, ax=detached_figure((4, 4)).add_subplot())
-        picture = np.asarray(ax.images[0].get_array())
-        frame = int(truth.label_valid.sum()) - 1
-        there = truth.config.grid.reorient(shifted[frame] > 0, "devkit")
-        true = truth.config.grid.reorient(truth.segmentation[frame] == 1, "devkit")
-        for kind, cells in (("right", there & true), ("false", there & ~true), ("missed", true & ~there)):
-            assert cells.any()
-            assert np.array_equal((picture == to_rgb(OUTCOME_COLORS[kind])).all(axis=-1), cells), kind
+        last = int(truth.label_valid.sum()) - 1
+        for frame, drawn in ((None, last), (0, 0)):
+            ax = draw_motion_outcome(output, label, frame=frame, ax=detached_figure((4, 4)).add_subplot())
+            assert ("now" in ax.get_title()) == (frame == 0)
+            picture = np.asarray(ax.images[0].get_array())
+            there = truth.config.grid.reorient(shifted[drawn] > 0, "devkit")
+            true = truth.config.grid.reorient(truth.segmentation[drawn] == 1, "devkit")
+            for kind, cells in (("right", there & true), ("false", there & ~true), ("missed", true & ~there)):
+                assert cells.any()
+                assert np.array_equal((picture == to_rgb(OUTCOME_COLORS[kind])).all(axis=-1), cells), kind
 
 
 @pytest.mark.parametrize("task", ["motion", "accident", "detection", "warning"])
