@@ -26,7 +26,7 @@ def time_to_collision(
     """
     normal, gap, reach = side_gaps(first, second)
     closing = along(normal, second_velocity - first_velocity)
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         ends = np.stack([(-reach - gap) / closing, (reach - gap) / closing])
     begin, end = ends.min(axis=0), ends.max(axis=0)
     still = closing == 0

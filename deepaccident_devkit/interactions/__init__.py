@@ -3,6 +3,7 @@
 from deepaccident_devkit.geometry import time_to_collision
 from deepaccident_devkit.geometry.footprints import gaps_of_pairs
 from deepaccident_devkit.interactions.approach import modified_ttc, nearest_approach
+from deepaccident_devkit.interactions.config import InteractionConfig
 from deepaccident_devkit.interactions.encroachment import conflict_area_pet, post_encroachment_time
 from deepaccident_devkit.interactions.masses import CLASS_MASSES, masses_of
 from deepaccident_devkit.interactions.measures import (
@@ -20,9 +21,14 @@ from deepaccident_devkit.interactions.measures import (
     time_integrated,
     time_to_collision_1d,
 )
+from deepaccident_devkit.interactions.scenario import interactions, interactions_of
+from deepaccident_devkit.interactions.table import InteractionPairs, Interactions
 
 __all__ = [
     "CLASS_MASSES",
+    "InteractionConfig",
+    "InteractionPairs",
+    "Interactions",
     "closing_speed",
     "closing_speed_of_boxes",
     "conflict_area_pet",
@@ -33,6 +39,8 @@ __all__ = [
     "gaps_of_pairs",
     "impact_direction",
     "impact_heading",
+    "interactions",
+    "interactions_of",
     "masses_of",
     "modified_ttc",
     "modified_ttc_1d",

@@ -47,7 +47,7 @@ def nearest_approach(
         *first.shape[:-1], 16, 2
     ) + (second[..., :2] - first[..., :2])[..., None, :]
     speed = (motion**2).sum(axis=-1)[..., None]
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         passing = np.where(speed > 0, -along(ways, motion) / speed, 0.0).clip(0, horizon)
     at_passing = np.hypot(*np.moveaxis(ways + passing[..., None] * motion[..., None, :], -1, 0))
     moved = np.concatenate([second[..., :2] + horizon * motion, second[..., 2:]], axis=-1)
@@ -129,7 +129,7 @@ def _accelerated(first: FloatArray, second: FloatArray, motion: FloatArray) -> F
 
 def _stops(speeds: FloatArray, rates: FloatArray) -> FloatArray:
     """When each comes to a stop, infinite if never; one that stands and is not sped up forward stays."""
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         braking = np.where(speeds * rates < 0, -speeds / rates, np.inf)
     return np.where((speeds == 0) & (rates <= 0), 0.0, braking)
 

@@ -155,7 +155,7 @@ def _times_inside(
     """When a moving box first and last touches an area, given by directions and its least and most along them."""
     normal, least, most = area
     start, speed, half = along(normal, box[..., :2] - origin), along(normal, velocity), half_extents(box, normal)
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         ends = np.stack([(least - half - start) / speed, (most + half - start) / speed])
     still = np.abs(speed) < _PARALLEL
     begin = np.where(still, -np.inf, ends.min(axis=0)).max(axis=-1)
@@ -172,7 +172,7 @@ def _range_of(g: FloatArray, a: FloatArray, b: FloatArray, r: FloatArray) -> tup
     g, a, b = np.broadcast_arrays(g * flipped, a * flipped, b * flipped)
     slope = a[..., None, :] * b[..., :, None] - a[..., :, None] * b[..., None, :]
     bound = a[..., None, :] * (r - g)[..., :, None] + a[..., :, None] * (r + g)[..., None, :]
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         at = bound / slope
     parallel = np.abs(slope) < _PARALLEL
     most = np.where(~parallel & (slope > 0), at, np.inf).min(axis=(-2, -1))

@@ -26,7 +26,7 @@ def time_to_collision_1d(
         (…,) infinite unless the two overlap sideways now and come closer; 0 if they overlap along the heading too.
     """
     gap, closing, beside = _along_heading(first, second, first_velocity, second_velocity)
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         times = np.where(gap <= 0, 0.0, gap / closing)
     meets = ~beside & ((closing > 0) | (gap <= 0))
     return _known(np.where(meets, times, np.inf), closing)
@@ -41,7 +41,7 @@ def drac_1d(
         (…,) 0 without a conflict, infinite at contact.
     """
     gap, closing, beside = _along_heading(first, second, first_velocity, second_velocity)
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         rates = np.where(gap <= 0, np.inf, closing**2 / (2 * gap))
     meets = ~beside & ((closing > 0) | (gap <= 0))
     return _known(np.where(meets, rates, 0.0), closing)
@@ -59,7 +59,7 @@ def drac(first: FloatArray, second: FloatArray, first_velocity: FloatArray, seco
 
 def drac_of(times: FloatArray, relative_speeds: FloatArray) -> FloatArray:
     """`drac` by known times to collision (…,) and relative speeds (…,)."""
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         rates = relative_speeds / (2 * times)
     return _known(np.where(times == 0, np.inf, rates), times)
 
@@ -189,7 +189,7 @@ def _along_heading(
 
 def _closing(way: FloatArray, relative_velocity: FloatArray) -> FloatArray:
     """Speed with which a way (…, 2) gets shorter; NaN where it has no length."""
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         speeds: FloatArray = -_dot(way, relative_velocity) / _length(way)
     return speeds
 
