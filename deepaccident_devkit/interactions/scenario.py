@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Generator, Iterator, Sequence
+from contextlib import closing
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,7 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.interactions.compute import measured_pairs, pair_summaries
 from deepaccident_devkit.interactions.config import InteractionConfig
 from deepaccident_devkit.interactions.motion import actor_motion
-from deepaccident_devkit.interactions.store import keep, read_kept
+from deepaccident_devkit.interactions.store import keep, kept_path, read_kept
 from deepaccident_devkit.interactions.table import InteractionPairs, Interactions, array_names
 from deepaccident_devkit.parallel import Places, Progress, in_order, run_unordered
 from deepaccident_devkit.v2x.tracks import scenario_tracks
@@ -61,7 +62,7 @@ def interactions_of(
     executor: Executor | None = None,
     progress: Progress = False,
 ) -> Iterator[Interactions]:
-    """`interactions` of many scenarios, all by default, in their order; those that are missing are made in parallel.
+    """`interactions` of many scenarios, all by default, in their order; those that are not kept are made in parallel.
 
     Args:
         dataset: the release.
@@ -77,17 +78,28 @@ def interactions_of(
         WorkerError: a worker was killed, or cannot do the work.
     """
     chosen = dataset.scenario[:] if scenarios is None else [dataset.get("scenario", each) for each in scenarios]
-    return in_order(
-        run_unordered(
-            partial(interactions, dataset, config=config),
-            [record["token"] for record in chosen],
-            workers=workers,
-            executor=executor,
-            label="interactions",
-            progress=progress,
-            places=Places(reads=dataset.places),
-        )
+    tokens = [record["token"] for record in chosen]
+    usual = (config or InteractionConfig()) == InteractionConfig()
+    absent = [token for token in tokens if not (usual and kept_path(dataset, token).is_file())]
+    made = run_unordered(
+        partial(interactions, dataset, config=config),
+        absent,
+        workers=workers,
+        executor=executor,
+        label="interactions",
+        progress=progress,
+        places=Places(reads=dataset.places),
     )
+    return _in_turn(dataset, tokens, set(absent), in_order(made))
+
+
+def _in_turn(
+    dataset: Dataset, tokens: Sequence[str], absent: Collection[str], made: Generator[Interactions, None, None]
+) -> Iterator[Interactions]:
+    """Those that were absent as they are made, the others as they are kept."""
+    with closing(made):
+        for token in tokens:
+            yield next(made) if token in absent else interactions(dataset, token)
 
 
 def _computed(dataset: Dataset, token: str, config: InteractionConfig) -> Interactions:
