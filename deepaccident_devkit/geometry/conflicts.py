@@ -63,7 +63,7 @@ def normals(yaw: FloatArray) -> FloatArray:
 
 def along(directions: FloatArray, vectors: FloatArray) -> FloatArray:
     """How far vectors (…, 2) go along each of their N directions (…, N, 2): (…, N)."""
-    result: FloatArray = np.einsum("...nk,...k->...n", directions, vectors)
+    result: FloatArray = directions[..., 0] * vectors[..., 0, None] + directions[..., 1] * vectors[..., 1, None]
     return result
 
 

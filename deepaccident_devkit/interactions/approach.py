@@ -14,7 +14,7 @@ from deepaccident_devkit.geometry.footprints import corner_offsets, gaps_of_pair
 
 _TOLERANCE = 1e-9
 """Metres by which two boxes may be apart where they touch by calculation."""
-_PAIRS_AT_ONCE = 1 << 12
+_PAIRS_AT_ONCE = 1 << 9
 """Pairs that are computed together: what they need then fits into the processor's cache."""
 
 
@@ -103,8 +103,9 @@ def _accelerated(first: FloatArray, second: FloatArray, motion: FloatArray) -> F
     normal, gap, reach = side_gaps(first, second)
     speeds, rates = motion[:, :2], motion[:, 2:]
     stops = _stops(speeds, rates)
-    heading = normals(np.stack([first[:, 4], second[:, 4]], axis=-1))
-    shares = np.einsum("pnk,pmk->pnm", normal, heading) * np.array([-1.0, 1.0])  # of the way of each, along a side
+    shares = [  # of the way of each, along a side
+        sign * along(normal, normals(box[:, 4]))[:, :, None] for sign, box in ((-1.0, first), (1.0, second))
+    ]
     edges = np.concatenate([np.zeros((len(first), 1)), np.sort(stops, axis=1)], axis=1)
     candidates = [np.zeros((len(first), 1))]
     for piece in range(3):
@@ -112,19 +113,39 @@ def _accelerated(first: FloatArray, second: FloatArray, motion: FloatArray) -> F
         moves = stops > begin  # a piece begins where one stops
         travelled = _travelled(begin, speeds, rates, stops)
         speed_then = np.where(moves, speeds + rates * np.where(np.isfinite(begin), begin, 0.0), 0.0)
-        constant = gap + (shares * travelled[:, None]).sum(axis=-1)
-        linear = (shares * speed_then[:, None]).sum(axis=-1)
-        square = (shares * np.where(moves, rates, 0.0)[:, None]).sum(axis=-1) / 2
-        roots = [_roots(square, linear, constant - side * reach) for side in (1.0, -1.0)]
-        candidates.append(begin + np.concatenate(roots, axis=-1).reshape(len(first), -1))
+        constant = gap + _along_sides(shares, travelled)
+        linear = _along_sides(shares, speed_then)
+        square = _along_sides(shares, np.where(moves, rates, 0.0)) / 2
+        offsets = np.concatenate([constant - reach, constant + reach], axis=1)
+        times = begin + _roots(np.tile(square, 2), np.tile(linear, 2), offsets)
+        candidates.append(np.where(times >= 0, times, np.inf))
+    return np.where(np.isnan(motion).any(axis=1), np.nan, _first_touch(candidates, (gap, reach), shares, motion))
+
+
+def _first_touch(
+    candidates: list[FloatArray],
+    sides: tuple[FloatArray, FloatArray],
+    shares: list[FloatArray],
+    motion: FloatArray,
+) -> FloatArray:
+    """The earliest (P,) of some times at which boxes touch along all four sides; infinite if they do at none."""
+    gap, reach = sides
+    speeds, rates = motion[:, :2], motion[:, 2:]
+    stops = _stops(speeds, rates)
     times = np.concatenate(candidates, axis=1)
-    times = np.where(times >= 0, times, np.inf)
-    ways = _travelled(times[..., None], speeds[:, None], rates[:, None], stops[:, None])
-    distance = np.abs(gap[:, None] + np.einsum("pnm,ptm->ptn", shares, ways))
-    with np.errstate(invalid="ignore"):
-        touch = (distance <= reach[:, None] + _TOLERANCE).all(axis=-1) & np.isfinite(times)
-    least = np.where(touch, times, np.inf).min(axis=1)
-    return np.where(np.isnan(motion).any(axis=1), np.nan, least)
+    touch = np.isfinite(times)
+    ways = [_travelled(times, *(each[:, which, None] for each in (speeds, rates, stops))) for which in (0, 1)]
+    for side in range(4):
+        distance = shares[0][:, side] * ways[0] + shares[1][:, side] * ways[1] + gap[:, side, None]
+        with np.errstate(invalid="ignore"):
+            touch &= np.abs(distance) <= reach[:, side, None] + _TOLERANCE
+    least: FloatArray = np.where(touch, times, np.inf).min(axis=1)
+    return least
+
+
+def _along_sides(shares: list[FloatArray], values: FloatArray) -> FloatArray:
+    """(P, 4) what the values (P, 2) of both come to along each direction of a side."""
+    return shares[0][..., 0] * values[:, None, 0] + shares[1][..., 0] * values[:, None, 1]
 
 
 def _stops(speeds: FloatArray, rates: FloatArray) -> FloatArray:
@@ -142,11 +163,11 @@ def _travelled(times: FloatArray, speeds: FloatArray, rates: FloatArray, stops: 
 
 
 def _roots(square: FloatArray, linear: FloatArray, constant: FloatArray) -> FloatArray:
-    """Both roots (…, 2) of parabolas, infinite where there are none."""
+    """Both roots (P, 2 N) of parabolas (P, N), infinite where there are none."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         inner = linear**2 - 4 * square * constant
         half = -(linear + np.copysign(np.sqrt(inner), linear)) / 2
-        roots = np.stack([constant / half, half / square], axis=-1)
+        roots = np.concatenate([constant / half, half / square], axis=1)
     return np.where(np.isfinite(roots), roots, np.inf)
 
 
