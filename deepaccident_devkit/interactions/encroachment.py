@@ -52,7 +52,7 @@ def delays(
     second_velocity: FloatArray,
     spans: tuple[FloatArray, FloatArray],
 ) -> tuple[FloatArray, FloatArray]:
-    """The range of delays, time of the second less that of the first, at which two steadily moving boxes would touch.
+    """The range of delays (the second's time less the first's) at which two steadily moving boxes would touch.
 
     Args:
         first: (…, 5) boxes at time 0.
