@@ -37,6 +37,15 @@ def test_who_waits_is_there_until_it_goes() -> None:
     assert len(pieces_of(track(waits)).spans) == 30  # standing is one piece
 
 
+def test_a_stop_on_the_way_is_a_piece_of_its_own() -> None:
+    path = [*straight(11, -10, 0, 10), *[(0.0, 0.0, 0.0)] * 20, *straight(11, 0, 0, 10)[1:]]
+    pieces = pieces_of(track(path))
+    np.testing.assert_allclose(pieces.velocity[:, 0], [10] * 10 + [0] + [10] * 10)
+    np.testing.assert_allclose(pieces.spans[10], [1, 3])
+    assert pet(path, straight(41, -20, 0, 10)) == 0
+    assert pet(path, straight(26, -30, 0, 10)) == pytest.approx(1.6)  # until 2.5 s it is behind the one that stands
+
+
 def test_gaps_are_bridged_and_one_frame_is_enough() -> None:
     east, north = straight(60, -20, 0, 10), straight(60, 0, -40, 10, 90)
     holes = [place if frame % 5 == 0 else None for frame, place in enumerate(east)]
