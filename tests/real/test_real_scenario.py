@@ -16,7 +16,15 @@ from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.motion import MotionLabelConfig, motion_labels
 from deepaccident_devkit.release import read_calib, read_label
 from deepaccident_devkit.statistics import dataset_statistics
-from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, INFRASTRUCTURE, LIDAR, OWN_ACTOR_ID, UNTRACKED_ID
+from deepaccident_devkit.taxonomy import (
+    AGENTS,
+    CAMERAS,
+    INFRASTRUCTURE,
+    LIDAR,
+    OWN_ACTOR_ID,
+    STATIC_ACTOR_ID,
+    UNTRACKED_ID,
+)
 from deepaccident_devkit.v2x import project_to_image
 from deepaccident_devkit.validation import validate_release
 from real.conftest import TOKEN
@@ -42,6 +50,19 @@ def test_it_opens_as_its_files_say(real: DeepAccident) -> None:
     assert (scenario["collision"], scenario["num_frames"], scenario["velocity_frame"]) == (None, 100, "released")
     assert [agent["name"] for agent in real.agent] == list(AGENTS)
     assert len(real.sample) == 500
+
+
+def test_few_pairs_interact_and_one_of_them_touches(real: DeepAccident) -> None:
+    found = real.interactions(TOKEN)
+    actors = len(real.instance)
+    assert 0 < len(found.pairs) < actors * (actors - 1) / 2 / 4
+    assert len(found) < 10 * real.scenario[0]["num_frames"]
+    assert not (found.pairs.actor_ids >= STATIC_ACTOR_ID).all(axis=1).any(), "parked cars are no pair"
+    touching = found.pairs.min_gap == 0
+    assert touching.sum() == 1, "a car drives over a pedestrian's box, which meta does not name"
+    assert found.pairs.min_ttc[touching] == found.pairs.pet[touching] == 0
+    pedestrian = real.get("instance", f"{TOKEN}/actor/{found.pairs.actor_ids[touching][0, 1]}")
+    assert pedestrian["category"] == "pedestrian"
 
 
 @pytest.mark.parametrize("deep", [False, True])

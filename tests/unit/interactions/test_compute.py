@@ -59,6 +59,21 @@ def test_thresholds_decide_and_so_does_the_radius() -> None:
     assert pairs_in(paths, config=InteractionConfig(radius=26.1)) == [(1, 2), (1, 3)]
 
 
+def test_one_dimension_is_that_of_the_one_who_drives_up() -> None:
+    for driver, turned in ((1, 2), (2, 1)):
+        _, measured, _ = of_scene({driver: straight(5, 0, 0, 10), turned: straight(5, 30, 0, 0, 90)})
+        np.testing.assert_allclose(measured.values["ttc_1d"][0], (27 - np.arange(5)) / 10)
+
+
+def test_side_by_side_there_is_a_gap_and_no_time() -> None:
+    _, measured, found = of_scene({1: straight(4, 0, 0, 10), 2: straight(4, 1, 4, 10)})
+    assert measured.rows.all()
+    assert (found["min_ttc"].item(), found["min_ttc_frame"].item()) == (math.inf, -1)
+    assert (found["min_gap"].item(), found["min_gap_frame"].item()) == (pytest.approx(2), 0)
+    assert (found["max_drac"].item(), found["tet"].sum(), found["tit"].sum()) == (0, 0, 0)
+    assert found["pet"].item() == math.inf
+
+
 def test_two_that_stand_are_none_and_frames_at_which_both_stand_do_not_count() -> None:
     assert pairs_in({1: straight(4, 0, 0, 0), 2: straight(4, 3, 0, 0.4)}) == []  # one in the other
     stops = [*straight(4, 0, 0, 10), *[(3.0, 0.0, 0.0)] * 4]
