@@ -16,7 +16,7 @@ from deepaccident_devkit.interactions.motion import actor_motion
 from deepaccident_devkit.interactions.store import keep, kept_path, read_kept
 from deepaccident_devkit.interactions.table import InteractionPairs, Interactions, array_names
 from deepaccident_devkit.parallel import Places, Progress, in_order, run_unordered
-from deepaccident_devkit.v2x.tracks import scenario_tracks
+from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -102,21 +102,23 @@ def _in_turn(
             yield next(made) if token in absent else interactions(dataset, token)
 
 
-def _computed(dataset: Dataset, token: str, config: InteractionConfig) -> Interactions:
-    tracks = scenario_tracks(dataset, token)
-    motion = actor_motion(tracks, dataset.get("scenario", token)["num_frames"], config)
+def interactions_of_tracks(
+    scenario: str, tracks: ScenarioTracks, num_frames: int, config: InteractionConfig
+) -> Interactions:
+    """The interactions of a scenario (its token) of so many frames, from its tracks; raises ConfigError."""
+    motion = actor_motion(tracks, num_frames, config)
     measured = measured_pairs(motion, config)
     summaries = pair_summaries(motion, measured, config)
     frame, pair = np.nonzero(measured.rows.T)
     ids = motion.ids[measured.pairs]
     return Interactions(
-        scenario=token,
+        scenario=scenario,
         config=config,
         labelled=len(tracks.index) > 0,
         frame=frame + 1,
         actor_ids=ids[pair],
         pairs=InteractionPairs(
-            scenario=token,
+            scenario=scenario,
             actor_ids=ids,
             min_ttc_frame=summaries["min_ttc_frame"] + 1,
             min_gap_frame=summaries["min_gap_frame"] + 1,
@@ -124,3 +126,8 @@ def _computed(dataset: Dataset, token: str, config: InteractionConfig) -> Intera
         ),
         **{name: measured.values[name][pair, frame] for name in array_names(Interactions)},
     )
+
+
+def _computed(dataset: Dataset, token: str, config: InteractionConfig) -> Interactions:
+    frames = dataset.get("scenario", token)["num_frames"]
+    return interactions_of_tracks(token, scenario_tracks(dataset, token), frames, config)

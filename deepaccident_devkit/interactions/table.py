@@ -117,7 +117,10 @@ class Interactions(FrozenArrays):
         """How many there are, and the most critical of two that move."""
         if not self.labelled:
             return f"Interactions({self.scenario}: no labels)"
-        text = f"Interactions({self.scenario}: {len(self.pairs)} pairs, {len(self)} rows"
+        count = len(self.pairs)
+        text = (
+            f"Interactions({self.scenario}: {count} pair{'s' * (count != 1)}, {len(self)} row{'s' * (len(self) != 1)}"
+        )
         times = np.where(self.pairs.moving, self.pairs.min_ttc, np.inf)
         if not np.isfinite(times).any():
             return f"{text})"

@@ -14,6 +14,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from interaction_scenes import straight, tracks_of
 from matplotlib import pyplot as plt
 from report_page import Page
 
@@ -32,6 +33,8 @@ from deepaccident_devkit.evaluation import (
 )
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.geometry import SE3, BevGrid, Boxes, LidarPointCloud
+from deepaccident_devkit.interactions import InteractionConfig, Interactions
+from deepaccident_devkit.interactions.scenario import interactions_of_tracks
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionHeads, MotionLabelConfig, MotionLabels
 from deepaccident_devkit.v2x import Contact
 
@@ -84,8 +87,15 @@ def contact() -> Contact:
     )
 
 
+def interactions() -> Interactions:
+    tracks = tracks_of({2: straight(3, 0, 0, 10), 1: straight(3, 30, 0, 1, 180)})
+    scenario = "type1_subtype1_accident/Town10HD_type001_subtype0001_scenario00024"
+    return interactions_of_tracks(scenario, tracks, 3, InteractionConfig())
+
+
 OWN = {
     "Boxes": boxes,
+    "Interactions": interactions,
     "AccidentResult": lambda: AccidentEvaluator().compute(),
     "AnticipationResult": lambda: WarningEvaluator("clean").compute(),
     "Contact": contact,
@@ -176,6 +186,14 @@ def test_texts() -> None:
     assert repr(detected) == "DetectedBoxes(boxes=Boxes(2 in Camera_Front_Left: 1 car, 1 truck), scores=(2,) float64)"
     alarm = Accident(positions=np.zeros((2, 2)), time=1.5, ids=(3, 7))
     assert repr(alarm) == "Accident(positions=(2, 2) float64, time=1.5, score=1, ids=(3, 7))"
+
+
+def test_interactions_print_the_most_critical_pair() -> None:
+    token = interactions().scenario
+    critical = "1 pair, 3 rows; least TTC of moving pairs 2.16 s: actors 1 and 2 at frame 3"
+    assert repr(interactions()) == f"Interactions({token}: {critical})"
+    standing = interactions_of_tracks(token, tracks_of({1: straight(3, 0, 0, 0)}), 3, InteractionConfig())
+    assert repr(standing) == f"Interactions({token}: 0 pairs, 0 rows)"
 
 
 def test_results_print_their_first_headlines() -> None:
