@@ -121,7 +121,7 @@ def impacts(pair: Pair, starts: ArrayLike, decelerations: ArrayLike, times: Floa
     speeds, velocities = np.full((len(times), 2), np.nan), np.full((2, len(times), 2), np.nan)
     plans = _plans(pair, starts, decelerations)
     for which, (motion, plan) in enumerate(zip(pair.motions, plans, strict=True)):
-        states = replay(motion, plan.take(hit), times[hit])
+        states = replay(motion, plan, hit, times[hit])
         speeds[hit, which] = states.speeds
         velocities[which, hit] = states.velocities(motion)
     return Impacts(speeds=speeds, relative_speeds=np.hypot(*(velocities[0] - velocities[1]).T))
@@ -149,7 +149,7 @@ class _Gaps:
     def at(self, rows: IntArray, times: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:
         """(N,) gaps less the margin, and metres moved; of pairs farther apart than a step's way, a lower bound."""
         one, two = (
-            replay(motion, plan.take(rows), times) for motion, plan in zip(self._pair.motions, self._plans, strict=True)
+            replay(motion, plan, rows, times) for motion, plan in zip(self._pair.motions, self._plans, strict=True)
         )
         moved = self._moved(one, 0) + self._moved(two, 1)
         apart = np.hypot(*(one.poses - two.poses)[:, :2].T) - self._reaches.sum()

@@ -14,7 +14,7 @@ from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntA
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.interactions.masses import MASS_UNCERTAINTY
 from deepaccident_devkit.safety.accidents import Accident
-from deepaccident_devkit.safety.contact import contact_times, impacts, pair_of
+from deepaccident_devkit.safety.contact import Pair, contact_times, impacts, pair_of
 
 OUTCOMES: Final = ("avoided", "stopped", "mitigated", "unchanged", "worsened")
 """What can become of an accident; their positions are the codes of `Outcomes.outcome`."""
@@ -170,21 +170,17 @@ def outcomes_of(
         GeometryError: the warning times have another shape.
     """
     pair = pair_of(accident.paths, accident.sizes)
-    warned = checked("warning_times", warning_times, (None,))
-    reactions = np.array([each.reaction for each in brakings])
-    hard = np.broadcast_to([each.deceleration for each in brakings], (len(warned), len(brakings)))
-    starts = np.round(warned[:, None] + latency + reactions, 9)  # equal sums of tenths are one replay
-    starts = np.where(any(brakers) & (starts < pair.duration), np.maximum(starts, 0.0), np.inf)
-    distinct, places = np.unique(np.stack([starts.ravel(), hard.ravel()], axis=1), axis=0, return_inverse=True)
+    starts, hard = _brakings_begun(pair, checked("warning_times", warning_times, (None,)) + latency, brakings)
+    if not any(brakers):
+        starts = np.full_like(starts, np.inf)
+    distinct, places = _distinct(starts, hard)
     begun = np.where(brakers, distinct[:, :1], np.inf)
     times = contact_times(pair, begun, distinct[:, 1])
     impact = impacts(pair, begun, distinct[:, 1], times)
-    recorded = undisturbed(accident)
     delta_v = np.nan_to_num(delta_v_of(accident.masses, impact.relative_speeds))
-    reduction = _reductions(delta_v[:, 0], recorded.delta_v[0])
-    outcome = _classes(impact.speeds[:, brakers], recorded.speeds[np.array(brakers)], times, reduction)
+    reduction = _reductions(delta_v[:, 0])
+    outcome = _classes(impact.speeds[:, brakers], times, reduction)
     outcome[np.isinf(distinct[:, 0])] = OUTCOMES.index("unchanged")
-    places = places.reshape(starts.shape)
     return Outcomes(
         outcome=outcome[places],
         extrapolated=(np.isfinite(times) & (times > pair.duration))[places],
@@ -195,16 +191,34 @@ def outcomes_of(
     )
 
 
-def _reductions(delta_v: FloatArray, recorded: float) -> FloatArray:
-    """(N,) shares of the recorded delta-v that are saved; −inf if there was none and now is."""
-    if recorded > 0:
-        return np.asarray(1 - delta_v / recorded)
+def _brakings_begun(
+    pair: Pair, warning_times: FloatArray, brakings: Sequence[Braking]
+) -> tuple[FloatArray, FloatArray]:
+    """(W, K) seconds at which the braking begins, inf for none before the recording ends; (W, K) decelerations."""
+    reactions = np.array([each.reaction for each in brakings])
+    starts = np.round(warning_times[:, None] + reactions, 9)  # equal sums of tenths are one replay
+    starts = np.where(starts < pair.duration, np.maximum(starts, 0.0), np.inf)
+    return starts, np.broadcast_to([each.deceleration for each in brakings], starts.shape)
+
+
+def _distinct(starts: FloatArray, decelerations: FloatArray) -> tuple[FloatArray, IntArray]:
+    """(N, 2) different starts and decelerations, the last one without braking; where those of W × K are among them."""
+    hard = np.where(np.isinf(starts), 1.0, decelerations)
+    asked = np.stack([starts.ravel(), hard.ravel()], axis=1)
+    distinct, places = np.unique(np.concatenate([asked, [[np.inf, 1.0]]]), axis=0, return_inverse=True)
+    return distinct, places.ravel()[:-1].reshape(starts.shape)
+
+
+def _reductions(delta_v: FloatArray) -> FloatArray:
+    """(N,) shares that are saved of the last one, which is without braking; −inf if that is 0 and another is not."""
+    if delta_v[-1] > 0:
+        return np.asarray(1 - delta_v / delta_v[-1])
     return np.where(delta_v > 0, -np.inf, 0.0)
 
 
-def _classes(speeds: FloatArray, recorded: FloatArray, times: FloatArray, reduction: FloatArray) -> IntArray:
-    """(N,) codes of outcomes, of the brakers' speeds (N, B) at the contacts and in the recording's (B,)."""
-    stopped = (speeds < STOPPED_SPEED).all(axis=1) & (recorded >= STOPPED_SPEED).any()
+def _classes(speeds: FloatArray, times: FloatArray, reduction: FloatArray) -> IntArray:
+    """(N,) codes of outcomes, of the brakers' speeds (N, B) at the contacts; the last one is without braking."""
+    stopped = (speeds < STOPPED_SPEED).all(axis=1) & (speeds[-1] >= STOPPED_SPEED).any()
     chosen = [np.isinf(times), stopped, reduction >= _CHANGE, reduction <= -_CHANGE]
     codes = [OUTCOMES.index(name) for name in ("avoided", "stopped", "mitigated", "worsened")]
     return np.select(chosen, codes, OUTCOMES.index("unchanged"))

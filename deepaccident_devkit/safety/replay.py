@@ -8,12 +8,12 @@ up. There are no limits of jerk or friction.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, FloatArray, FrozenArrays, IntArray, checked
+from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, checked
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
@@ -40,6 +40,9 @@ class Motion(FrozenArrays):
         arcs: (F + 1,) lengths of the path up to the nodes.
         turned: (F + 1,) sums of the absolute turns up to the nodes.
         speeds: (F,) between the nodes, m/s.
+        steps: (F, 3) changes of the poses from each node to the next.
+        periods: (F,) seconds from each node to the next.
+        lengths: (F,) metres from each node to the next.
     """
 
     poses: FloatArray
@@ -47,6 +50,9 @@ class Motion(FrozenArrays):
     arcs: FloatArray
     turned: FloatArray
     speeds: FloatArray
+    steps: FloatArray
+    periods: FloatArray
+    lengths: FloatArray
 
     @property
     def duration(self) -> float:
@@ -58,14 +64,15 @@ class Motion(FrozenArrays):
 
         The end of the recording is of its last stretch, since the speed there is the one of the impact.
         """
-        numbers = np.floor(times / FRAME_PERIOD + _SAME_TIME).astype(np.int64)
         last = len(self.speeds) - 1
-        return np.where(times > self.duration, last, np.clip(numbers, 0, last - 1))
+        numbers: IntArray = (times / FRAME_PERIOD + _SAME_TIME).astype(np.int64)
+        np.minimum(numbers, last - 1, out=numbers)
+        numbers[times > self.duration] = last
+        return numbers
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class BrakingPlans(FrozenArrays):
-    """When N replays of one actor begin to brake, and how hard; arrays are read-only.
+class BrakingPlans(NamedTuple):
+    """When N replays of one actor begin to brake, and how hard.
 
     Attributes:
         starts: (N,) seconds; inf for no braking.
@@ -91,19 +98,13 @@ class BrakingPlans(FrozenArrays):
         arcs: FloatArray = self.arcs + self.speeds**2 / (2 * self.decelerations)
         return arcs
 
-    def take(self, rows: AnyArray) -> BrakingPlans:
+    def take(self, rows: IntArray) -> BrakingPlans:
         """The plans of some rows."""
-        return BrakingPlans(
-            starts=self.starts[rows],
-            decelerations=self.decelerations[rows],
-            arcs=self.arcs[rows],
-            speeds=self.speeds[rows],
-        )
+        return BrakingPlans(*(each[rows] for each in self))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ReplayStates(FrozenArrays):
-    """Where N replays of one actor are, each at a time of its own; arrays are read-only.
+class ReplayStates(NamedTuple):
+    """Where replays of one actor are at N moments.
 
     Attributes:
         poses: (N, 3) x, y, yaw.
@@ -121,8 +122,7 @@ class ReplayStates(FrozenArrays):
 
     def velocities(self, motion: Motion) -> FloatArray:
         """(N, 2) m/s: along the path of `motion`, which need not be the heading."""
-        steps = np.diff(motion.poses[:, :2], axis=0)
-        lengths = np.diff(motion.arcs)[:, None]
+        steps, lengths = motion.steps[:, :2], motion.lengths[:, None]
         along = np.divide(steps, lengths, out=np.zeros_like(steps), where=lengths > 0)
         velocities: FloatArray = self.speeds[:, None] * along[self.stretches]
         return velocities
@@ -144,20 +144,25 @@ def motion_of(path: ArrayLike, *, horizon: float = HORIZON) -> Motion:
             f"path: expected two or more frames of finite x, y, yaw, found {poses.shape} or a NaN in it"
         )
     poses[:, 2] = np.unwrap(poses[:, 2])
-    steps = np.diff(poses[:, :2], axis=0)
-    lengths = np.hypot(*steps.T)
+    last_step = poses[-1, :2] - poses[-2, :2]
     onward = np.zeros(3)
-    if lengths[-1] > _STANDING:
-        onward[:2] = steps[-1] * (horizon / FRAME_PERIOD)
+    if np.hypot(*last_step) > _STANDING:
+        onward[:2] = last_step * (horizon / FRAME_PERIOD)
     poses = np.concatenate([poses, [poses[-1] + onward]])
-    lengths = np.append(lengths, np.hypot(*onward[:2]))
-    times = np.append(np.arange(len(poses) - 1) * FRAME_PERIOD, (len(poses) - 2) * FRAME_PERIOD + horizon)
+    steps = np.diff(poses, axis=0)
+    lengths = np.hypot(steps[:, 0], steps[:, 1])
+    periods = np.full(len(steps), FRAME_PERIOD)
+    periods[-1] = horizon
+    end = (len(steps) - 1) * FRAME_PERIOD
     return Motion(
         poses=poses,
-        times=times,
+        times=np.append(np.arange(len(steps)) * FRAME_PERIOD, end + horizon),
         arcs=np.concatenate([[0.0], np.cumsum(lengths)]),
-        turned=np.concatenate([[0.0], np.cumsum(np.abs(np.diff(poses[:, 2])))]),
-        speeds=lengths / np.diff(times),
+        turned=np.concatenate([[0.0], np.cumsum(np.abs(steps[:, 2]))]),
+        speeds=lengths / periods,
+        steps=steps,
+        periods=periods,
+        lengths=lengths,
     )
 
 
@@ -187,33 +192,34 @@ def braking_plans(motion: Motion, starts: ArrayLike, decelerations: ArrayLike) -
     )
 
 
-def replay(motion: Motion, plans: BrakingPlans, times: FloatArray) -> ReplayStates:
-    """N replays of one actor, each at a time of its own.
+def replay(motion: Motion, plans: BrakingPlans, rows: IntArray, times: FloatArray) -> ReplayStates:
+    """Where replays of one actor are.
 
     Args:
         motion: the recorded one.
         plans: of the replays.
+        rows: (N,) numbers of replays.
         times: (N,) seconds, from 0 to the end of the continuation.
     """
     stretches = motion.stretches(times)
     speeds = motion.speeds[stretches]
     passed = times - motion.times[stretches]
     arcs = motion.arcs[stretches] + speeds * passed
-    shares = passed / np.diff(motion.times)[stretches]
-    late = np.flatnonzero(times > plans.starts)
+    shares = passed / motion.periods[stretches]
+    late = np.flatnonzero(times > plans.starts[rows])
     if len(late):
-        behind, allowed, left = _braked(plans.take(late), times[late], arcs[late])
+        behind, allowed, left = _braked(plans.take(rows[late]), times[late], arcs[late])
         late = late[behind]
         speeds[late], arcs[late] = left, allowed
         stretches[late], shares[late] = _places(motion, allowed)
-    poses = motion.poses[stretches] + shares[:, None] * np.diff(motion.poses, axis=0)[stretches]
-    turned = motion.turned[stretches] + shares * np.diff(motion.turned)[stretches]
+    poses = motion.poses[stretches] + shares[:, None] * motion.steps[stretches]
+    turned = motion.turned[stretches] + shares * np.abs(motion.steps[stretches, 2])
     return ReplayStates(poses=poses, speeds=speeds, arcs=arcs, turned=turned, stretches=stretches)
 
 
-def _braked(plans: BrakingPlans, times: FloatArray, arcs: FloatArray) -> tuple[AnyArray, FloatArray, FloatArray]:
+def _braked(plans: BrakingPlans, times: FloatArray, arcs: FloatArray) -> tuple[BoolArray, FloatArray, FloatArray]:
     """Which replays are behind the recording's arc lengths; of these, the arc lengths and speeds."""
-    braking = np.clip(times - plans.starts, 0, plans.speeds / plans.decelerations)
+    braking = np.minimum(times - plans.starts, plans.speeds / plans.decelerations)
     lost = plans.decelerations * braking
     allowed = plans.arcs + (plans.speeds - lost / 2) * braking
     behind = allowed < arcs - _SAME_ARC
@@ -223,6 +229,6 @@ def _braked(plans: BrakingPlans, times: FloatArray, arcs: FloatArray) -> tuple[A
 def _places(motion: Motion, arcs: FloatArray) -> tuple[IntArray, FloatArray]:
     """Stretches, and the shares of them, at which the path first has some lengths."""
     numbers = np.maximum(np.searchsorted(motion.arcs, arcs, side="left") - 1, 0)
-    lengths = np.diff(motion.arcs)[numbers]
+    lengths = motion.lengths[numbers]
     shares = np.divide(arcs - motion.arcs[numbers], lengths, out=np.zeros_like(arcs), where=lengths > 0)
     return numbers, shares

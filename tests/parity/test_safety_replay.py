@@ -53,8 +53,8 @@ def separations(pair: Pair, starts: np.ndarray, deceleration: np.ndarray) -> np.
     times = np.arange(0, pair.duration + 3, 1e-3)
     corners, axes = [], []
     for motion, size, start in zip(pair.motions, pair.sizes, starts[0], strict=True):
-        plans = braking_plans(motion, np.full(len(times), start), deceleration)
-        x, y, yaw = replay(motion, plans, times).poses.T
+        plans = braking_plans(motion, [start], deceleration)
+        x, y, yaw = replay(motion, plans, np.zeros(len(times), dtype=np.int64), times).poses.T
         turns = np.stack([np.stack([np.cos(yaw), np.sin(yaw)], -1), np.stack([-np.sin(yaw), np.cos(yaw)], -1)], 1)
         corners.append(np.stack([x, y], -1)[:, None] + (CORNERS * size) @ turns)
         axes += [turns[:, 0], turns[:, 1]]
