@@ -207,6 +207,15 @@ def last_moments(pair: Pair, brakers: tuple[bool, bool], decelerations: ArrayLik
     )
 
 
+def unusable(accident: Accident, check: ReplayCheck) -> str:
+    """Why an accident whose check fails cannot be replayed, in words."""
+    first, second = accident.actor_ids
+    return (
+        f"{accident.scenario}: the outlines of {first} and {second} are {check.margin:.2f} m apart at their last "
+        f"frame, more than {MOST_MARGIN:g} m: the recording does not show the accident"
+    )
+
+
 def avoidability_of(
     accident: Accident, tracks: ScenarioTracks | None = None, *, brakings: Sequence[Braking] = BRAKINGS
 ) -> Avoidability:
@@ -223,11 +232,7 @@ def avoidability_of(
     """
     check = undisturbed(accident)
     if not check.usable:
-        raise NotAvailableError(
-            f"{accident.scenario}: the outlines of {accident.actor_ids[0]} and {accident.actor_ids[1]} are "
-            f"{check.margin:.2f} m apart at their last frame, more than {MOST_MARGIN:g} m: the recording does not show "
-            "the accident"
-        )
+        raise NotAvailableError(unusable(accident, check))
     pair = pair_of(accident.paths, accident.sizes)
     decelerations = np.unique([each.deceleration for each in brakings])
     scans = [last_moments(pair, brakers, decelerations) for brakers in MASKS]
