@@ -2,7 +2,14 @@
 
 import click
 
+from deepaccident_devkit.cli.safety_avoidability import avoidability
+from deepaccident_devkit.cli.safety_lead_time import lead_time
+
 
 @click.group()
 def safety() -> None:
     """Look into accidents: who saw the danger first, and how a normal twin differs."""
+
+
+safety.add_command(lead_time)
+safety.add_command(avoidability)

@@ -1,6 +1,14 @@
 """Accidents looked into: who saw the danger first, when it was too late, what a warning would have prevented."""
 
 from deepaccident_devkit.safety.accidents import Accident, Skipped, accident_of, accidents_of
+from deepaccident_devkit.safety.avoidability import Avoidability, avoidability, avoidability_of
+from deepaccident_devkit.safety.avoidability_report import AvoidabilityReport, avoidability_report
+from deepaccident_devkit.safety.avoidability_shares import OutcomeShares, outcome_shares
+from deepaccident_devkit.safety.lead_times import COALITIONS, PARTNERS, LeadTimes, lead_times
+from deepaccident_devkit.safety.leads import coalition_leads, shapley_values
+from deepaccident_devkit.safety.ledger import lead_time_ledger
+from deepaccident_devkit.safety.ledger_report import LeadTimeLedger, MeanTime
+from deepaccident_devkit.safety.observation import ObservationRule, observed_actors
 from deepaccident_devkit.safety.outcomes import (
     BRAKINGS,
     OUTCOMES,
@@ -13,14 +21,32 @@ from deepaccident_devkit.safety.outcomes import (
 
 __all__ = [
     "BRAKINGS",
+    "COALITIONS",
     "OUTCOMES",
+    "PARTNERS",
     "Accident",
+    "Avoidability",
+    "AvoidabilityReport",
     "Braking",
+    "LeadTimeLedger",
+    "LeadTimes",
+    "MeanTime",
+    "ObservationRule",
+    "OutcomeShares",
     "Outcomes",
     "ReplayCheck",
     "Skipped",
     "accident_of",
     "accidents_of",
+    "avoidability",
+    "avoidability_of",
+    "avoidability_report",
+    "coalition_leads",
+    "lead_time_ledger",
+    "lead_times",
+    "observed_actors",
+    "outcome_shares",
     "outcomes_of",
+    "shapley_values",
     "undisturbed",
 ]

@@ -1,0 +1,6 @@
+"""Pictures of what `deepaccident_devkit.safety` computes."""
+
+from deepaccident_devkit.render.safety.avoidability import render_avoidability
+from deepaccident_devkit.render.safety.lead_time import render_lead_times
+
+__all__ = ["render_avoidability", "render_lead_times"]
