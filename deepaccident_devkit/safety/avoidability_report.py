@@ -175,13 +175,13 @@ class AvoidabilityReport(ShortRepr):
     def _share_rows(self) -> Iterator[Row]:
         yield (
             *("group", "warned", "reaction", "deceleration", "lead", "accidents", *OUTCOMES),
-            *("extrapolated", "relative_speed", "delta_v"),
+            *("extrapolated", "relative_speed", "delta_v", "delta_v_least", "delta_v_most"),
         )
         for each in self.shares:
             for column, braking in enumerate(each.brakings):
                 for row, lead in enumerate(each.leads.tolist()):
                     values = [*each.shares[row, column], each.extrapolated[row, column]]
-                    values += [each.relative_speed[row, column], each.delta_v[row, column]]
+                    values += [each.relative_speed[row, column], *each.delta_v[row, column]]
                     key = (each.group, each.warned, braking.reaction, braking.deceleration, round(lead, 1))
                     yield (*key, int(each.accidents[row]), *(round(float(value), 6) for value in values))
 
@@ -280,8 +280,8 @@ def _secondary_text(accidents: Sequence[Avoidability]) -> str:
     before = [{each.replay for each in accident.secondary if not each.extrapolated} for accident in accidents]
     replays = sum(int(np.isfinite(accident.last_moments.time).sum()) for accident in accidents)
     return (
-        f"braking at the last moment: others are touched in {sum(map(len, touched))} of {replays} replays, in "
-        f"{sum(map(len, before))} before the recording ends (they do not react)"
+        f"other road users, who do not react, are touched in {sum(map(len, before))} of {replays} replays of the last "
+        f"moment before the recording ends, in {sum(map(len, touched))} if all go straight on for 3 s"
     )
 
 

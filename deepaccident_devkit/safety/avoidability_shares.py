@@ -10,7 +10,7 @@ import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray, FrozenArrays, IntArray, as_floats
 from deepaccident_devkit.safety.avoidability import BRAKERS, Avoidability
-from deepaccident_devkit.safety.outcomes import OUTCOMES, Braking, Outcomes
+from deepaccident_devkit.safety.outcomes import OUTCOMES, Braking, Outcomes, delta_v_ranges
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 GROUPS: Final = ("vehicles", "head-on", "pedestrians")
@@ -35,7 +35,8 @@ class OutcomeShares(FrozenArrays):
         shares: (L, K, 5) of `OUTCOMES`.
         extrapolated: (L, K) share in which they touch only after the end of the recording.
         relative_speed: (L, K) mean over all of these of the speed between the two at the contact, m/s; 0 if avoided.
-        delta_v: (L, K) the same of the larger delta-v of the two, with assumed masses.
+        delta_v: (L, K, 3) the same of the larger delta-v of the two: with the assumed masses; the least and the most
+            with masses that are wrong by up to `MASS_UNCERTAINTY`.
     """
 
     group: str
@@ -74,35 +75,39 @@ def outcome_shares(accidents: Sequence[Avoidability]) -> list[OutcomeShares]:
     for group in GROUPS:
         members = [each for each in accidents if group_of(each) == group]
         for warned in WARNED:
-            found = [outcomes_if_warned(each, warned) for each in members]
-            told = [each for each in found if each is not None]
+            told = [(each, found) for each in members if (found := outcomes_if_warned(each, warned)) is not None]
             if told:
-                result.append(_shares(group, warned, members[0].brakings, told))
+                result.append(_shares(group, warned, told))
     return result
 
 
-def _shares(group: str, warned: str, brakings: tuple[Braking, ...], outcomes: Sequence[Outcomes]) -> OutcomeShares:
-    longest = max(len(each.outcome) for each in outcomes)
-    counts = np.zeros((longest, len(brakings), len(OUTCOMES)))
-    sums = np.zeros((3, longest, len(brakings)))
+def _shares(group: str, warned: str, told: Sequence[tuple[Avoidability, Outcomes]]) -> OutcomeShares:
+    brakings = told[0][0].brakings
+    longest = max(len(outcomes.outcome) for _, outcomes in told)
+    sums = np.zeros((longest, len(brakings), len(OUTCOMES) + 5))
     accidents = np.zeros(longest, dtype=np.int64)
-    for each in outcomes:
-        rows = slice(0, len(each.outcome))
+    for accident, outcomes in told:
+        rows = slice(0, len(outcomes.outcome))
         accidents[rows] += 1
-        counts[rows] += each.outcome[..., None] == np.arange(len(OUTCOMES))
-        for total, values in zip(
-            sums, (each.extrapolated, each.delta_v.sum(axis=-1), each.delta_v.max(axis=-1)), strict=True
-        ):
-            total[rows] += values
-    extrapolated, relative, delta_v = sums / accidents[:, None]
+        sums[rows] += _figures(accident, outcomes)
+    means = sums / accidents[:, None, None]
+    shares, extrapolated, relative, delta_v = np.split(means, np.cumsum([len(OUTCOMES), 1, 1]), axis=2)
     return OutcomeShares(
         group=group,
         warned=warned,
         brakings=brakings,
         leads=as_floats(np.arange(longest) * FRAME_PERIOD),
         accidents=accidents,
-        shares=counts / accidents[:, None, None],
-        extrapolated=extrapolated,
-        relative_speed=relative,
+        shares=shares,
+        extrapolated=extrapolated[..., 0],
+        relative_speed=relative[..., 0],
         delta_v=delta_v,
     )
+
+
+def _figures(accident: Avoidability, outcomes: Outcomes) -> FloatArray:
+    """(L, K, 10) of one accident: each outcome 0 or 1, extrapolated 0 or 1, relative speed, delta-v, least, most."""
+    relative = outcomes.delta_v.sum(axis=-1)  # the shares of the two add up to 1
+    ranges = delta_v_ranges(accident.accident.masses, relative).max(axis=-2)
+    classes = outcomes.outcome[..., None] == np.arange(len(OUTCOMES))
+    return np.dstack([classes, outcomes.extrapolated, relative, outcomes.delta_v.max(axis=-1), ranges])
