@@ -14,8 +14,8 @@ from deepaccident_devkit.safety.outcomes import OUTCOMES, Braking, Outcomes, del
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 GROUPS: Final = ("vehicles", "head-on", "pedestrians")
-"""Kinds of accidents that are counted apart. Vehicles: all others. What becomes of vehicles that meet head-on and of
-which one brakes is decided by how the other goes on; and no pedestrian brakes as a vehicle does."""
+"""Kinds of accidents that are counted apart: with a pedestrian, who does not brake as a vehicle does; of vehicles that
+meet head-on, where it matters most how the other goes on if one of them brakes; and all others."""
 WARNED: Final = (*BRAKERS, "ego")
 """Who is warned and brakes; `ego` alone counts only the accidents of the ego."""
 

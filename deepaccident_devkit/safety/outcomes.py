@@ -154,9 +154,10 @@ def outcomes_of(
 ) -> Outcomes:
     """What becomes of an accident if colliders are warned at some times.
 
-    Avoided: they do not touch until 3 s after the recording. Stopped: they do, but the speed of whoever was to brake
-    is below 0.5 m/s then, and was not in the recording's contact. Mitigated, worsened: delta-v is less, or more, by a
-    tenth at least. Unchanged: the rest, and always if no braking begins before the recording ends.
+    Avoided: they do not touch until 3 s after the recording. Worsened: they do, and delta-v is more by a tenth at
+    least, as for a leader who stops in front of a striker. Stopped: it is not, and the speed of whoever was to brake is
+    below 0.5 m/s at the contact, and was not in the recording's. Mitigated: delta-v is less by a tenth at least.
+    Unchanged: the rest, and always if no braking begins before the recording ends.
 
     Args:
         accident: the recorded motion.
@@ -219,6 +220,6 @@ def _reductions(delta_v: FloatArray) -> FloatArray:
 def _classes(speeds: FloatArray, times: FloatArray, reduction: FloatArray) -> IntArray:
     """(N,) codes of outcomes, of the brakers' speeds (N, B) at the contacts; the last one is without braking."""
     stopped = (speeds < STOPPED_SPEED).all(axis=1) & (speeds[-1] >= STOPPED_SPEED).any()
-    chosen = [np.isinf(times), stopped, reduction >= _CHANGE, reduction <= -_CHANGE]
-    codes = [OUTCOMES.index(name) for name in ("avoided", "stopped", "mitigated", "worsened")]
+    chosen = [np.isinf(times), reduction <= -_CHANGE, stopped, reduction >= _CHANGE]
+    codes = [OUTCOMES.index(name) for name in ("avoided", "worsened", "stopped", "mitigated")]
     return np.select(chosen, codes, OUTCOMES.index("unchanged"))

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from deepaccident_devkit.safety import OUTCOMES, Accident, Braking, outcomes_of
+from deepaccident_devkit.safety.avoidability import last_moments
 from deepaccident_devkit.safety.contact import Pair, contact_made, contact_times, impacts, pair_of
 from deepaccident_devkit.safety.outcomes import delta_v_of
 from deepaccident_devkit.safety.replay import braking_plans, replay
@@ -90,6 +92,52 @@ def test_contact_and_speeds(golden: Mapping[str, Any], case: str, kind: str) -> 
         ("delta_v_B", delta_v[1], 0.05),
     ]:
         assert found == pytest.approx(expected[name], abs=0.3 if at_a_frame else tolerance), name
+
+
+def test_outcome_and_last_moment(golden: Mapping[str, Any], case: str) -> None:
+    """The classes are not in the golden numbers; here they follow from them by the definitions."""
+    paths = np.array([golden["path_A"], golden["path_B"]])
+    brakers = ("A" in golden["brakes"], "B" in golden["brakes"])
+    found = outcomes_of(
+        Accident(
+            scenario=case,
+            actor_ids=(1, 2),
+            categories=("car", "car"),
+            agents=(None, None),
+            first_frame=1,
+            num_frames=paths.shape[1],
+            paths=paths,
+            sizes=np.array([[*golden["size_A"], 1.5], [*golden["size_B"], 1.5]]),
+            masses=np.array([golden["mass_A"], golden["mass_B"]]),
+            interpolated=0,
+        ),
+        brakers,
+        [golden["t_warning"]],
+        brakings=[Braking(reaction=golden["reaction"], deceleration=golden["deceleration"])],
+    )
+    before, after = (golden["expected"][kind] for kind in ("no_braking", "braking"))
+    outcome = OUTCOMES[found.outcome[0, 0]]
+    assert (outcome == "avoided") == (not after["contact"])
+    if after["contact"]:
+        assert found.extrapolated[0, 0] == (not after["within_recording"])
+        change = after["rel_speed"] / before["rel_speed"]
+        assert found.reduction[0, 0] == pytest.approx(1 - change, abs=0.02)
+        stopped = all(after[f"speed_{name}"] < 0.5 <= before[f"speed_{name}"] for name in golden["brakes"])
+        told = "worsened" if change >= 1.1 else "stopped" if stopped else "mitigated" if change <= 0.9 else "unchanged"
+        assert outcome == told
+    scan = last_moments(pair_of(paths, [golden["size_A"], golden["size_B"]]), brakers, [golden["deceleration"]])
+    expected = golden["expected"]["last_moment"]
+    assert np.isfinite(scan.time[0]) == expected["avoidable"]
+    assert scan.switches[0] == expected["switches"]
+    if expected["avoidable"]:
+        assert scan.time[0] == pytest.approx(expected["last_moment"], abs=0.011)
+    assert avoids_from(golden, 0.0) == expected["avoids_at_0"]
+
+
+def avoids_from(golden: Mapping[str, Any], start: float) -> bool:
+    """Whether braking from a moment on avoids the contact."""
+    pair, starts, deceleration = pair_and_start(golden, braking=True)
+    return not contact_made(pair, np.where(np.isfinite(starts), start, np.inf), deceleration)[0]
 
 
 def test_where_braking_alone_ends(golden: Mapping[str, Any], case: str) -> None:
