@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray, as_floats, checked
+from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, as_floats, checked
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.safety.accidents import Accident, accident_of
@@ -284,8 +284,9 @@ def _secondary(
     return tuple(secondary_contacts(accident, tracks, starts, np.tile(decelerations, len(MASKS))))
 
 
-def _rounded(values: AnyArray | float, digits: int) -> Any:
+def _rounded(values: ArrayLike, digits: int) -> Any:
     """Rounded numbers for JSON, in lists; None for those that are not finite."""
-    if np.ndim(values):
-        return [_rounded(each, digits) for each in values]  # type: ignore[union-attr]  # an array
-    return round(float(values), digits) if np.isfinite(values) else None
+    array = np.asarray(values)
+    if array.ndim:
+        return [_rounded(each, digits) for each in array]
+    return round(array.item(), digits) if np.isfinite(array) else None

@@ -155,7 +155,7 @@ def outcomes_of(
     """What becomes of an accident if colliders are warned at some times.
 
     Avoided: they do not touch until 3 s after the recording. Worsened: they do, and delta-v is more by a tenth at
-    least, as for a leader who stops in front of a striker. Stopped: it is not, and the speed of whoever was to brake is
+    least, as for a leader who stops in front of a striker. Stopped: it is not, and the speed of those who brake is
     below 0.5 m/s at the contact, and was not in the recording's. Mitigated: delta-v is less by a tenth at least.
     Unchanged: the rest, and always if no braking begins before the recording ends.
 
