@@ -3,6 +3,7 @@
 import click
 
 from deepaccident_devkit.cli.safety_lead_time import lead_time
+from deepaccident_devkit.cli.safety_twins import twins
 
 
 @click.group()
@@ -11,3 +12,4 @@ def safety() -> None:
 
 
 safety.add_command(lead_time)
+safety.add_command(twins)

@@ -6,6 +6,10 @@ from deepaccident_devkit.safety.leads import coalition_leads, shapley_values
 from deepaccident_devkit.safety.ledger import lead_time_ledger
 from deepaccident_devkit.safety.ledger_report import LeadTimeLedger, MeanTime
 from deepaccident_devkit.safety.observation import ObservationRule, observed_actors
+from deepaccident_devkit.safety.twin_comparison import twin_diff
+from deepaccident_devkit.safety.twin_diff import Parting, TwinDiff
+from deepaccident_devkit.safety.twin_report import TwinReport, twin_report
+from deepaccident_devkit.safety.twins import TornTwins, torn_twins, twin_of
 
 __all__ = [
     "COALITIONS",
@@ -15,7 +19,11 @@ __all__ = [
     "LeadTimes",
     "MeanTime",
     "ObservationRule",
+    "Parting",
     "Skipped",
+    "TornTwins",
+    "TwinDiff",
+    "TwinReport",
     "accident_of",
     "accidents_of",
     "coalition_leads",
@@ -23,4 +31,8 @@ __all__ = [
     "lead_times",
     "observed_actors",
     "shapley_values",
+    "torn_twins",
+    "twin_diff",
+    "twin_of",
+    "twin_report",
 ]
