@@ -27,7 +27,7 @@ class Found(Generic[Result]):
     Attributes:
         results: in the order of the release.
         skipped: scenarios that lack what it needs, and why.
-        others: how many scenarios are none of its business.
+        others: how many scenarios it does not concern.
     """
 
     results: tuple[Result, ...]
@@ -49,8 +49,8 @@ def each_scenario(
 
     Args:
         work: an importable function of the devkit (or a `functools.partial` of one) of a release and a scenario's
-            record. It returns None for a scenario that is none of its business, and raises NotAvailableError for one
-            that lacks what it needs.
+            record. It returns None for a scenario that it does not concern, and raises NotAvailableError for one that
+            lacks what it needs.
         dataset: the release.
         scenarios: tokens or records; None for all.
         label: text of the progress bar.

@@ -40,7 +40,7 @@ def twin_of(dataset: Dataset, scenario: RowArgument) -> ScenarioRecord | None:
     Raises:
         TokenError: no such scenario.
     """
-    record = dataset.scenario[dataset.getind("scenario", scenario)]
+    record = dataset.get("scenario", scenario)
     family, _, ending = record["scenario_type"].rpartition("_")
     if ending not in _OTHER_ENDING:
         return None
