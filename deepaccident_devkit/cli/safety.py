@@ -4,6 +4,7 @@ import click
 
 from deepaccident_devkit.cli.safety_avoidability import avoidability
 from deepaccident_devkit.cli.safety_lead_time import lead_time
+from deepaccident_devkit.cli.safety_twins import twins
 
 
 @click.group()
@@ -13,3 +14,4 @@ def safety() -> None:
 
 safety.add_command(lead_time)
 safety.add_command(avoidability)
+safety.add_command(twins)

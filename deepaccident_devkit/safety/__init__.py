@@ -18,6 +18,10 @@ from deepaccident_devkit.safety.outcomes import (
     outcomes_of,
     undisturbed,
 )
+from deepaccident_devkit.safety.twin_comparison import twin_diff
+from deepaccident_devkit.safety.twin_diff import Parting, TwinDiff
+from deepaccident_devkit.safety.twin_report import TwinReport, twin_report
+from deepaccident_devkit.safety.twins import TornTwins, torn_twins, twin_of
 
 __all__ = [
     "BRAKINGS",
@@ -34,8 +38,12 @@ __all__ = [
     "ObservationRule",
     "OutcomeShares",
     "Outcomes",
+    "Parting",
     "ReplayCheck",
     "Skipped",
+    "TornTwins",
+    "TwinDiff",
+    "TwinReport",
     "accident_of",
     "accidents_of",
     "avoidability",
@@ -48,5 +56,9 @@ __all__ = [
     "outcome_shares",
     "outcomes_of",
     "shapley_values",
+    "torn_twins",
+    "twin_diff",
+    "twin_of",
+    "twin_report",
     "undisturbed",
 ]

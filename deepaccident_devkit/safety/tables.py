@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.text import fixed_text
 
 
 def write_csv(path: Path, rows: Iterable[Sequence[Any]]) -> Path:
@@ -27,4 +28,4 @@ def short_agent(agent: str) -> str:
 
 def number_text(value: float | None, digits: int) -> str:
     """A number with so many decimals; a dash for None and NaN."""
-    return "–" if value is None or math.isnan(value) else f"{value:.{digits}f}"
+    return "–" if value is None or math.isnan(value) else fixed_text(value, digits)

@@ -2,5 +2,6 @@
 
 from deepaccident_devkit.render.safety.avoidability import render_avoidability
 from deepaccident_devkit.render.safety.lead_time import render_lead_times
+from deepaccident_devkit.render.safety.twins import render_twins
 
-__all__ = ["render_avoidability", "render_lead_times"]
+__all__ = ["render_avoidability", "render_lead_times", "render_twins"]

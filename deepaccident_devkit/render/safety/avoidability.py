@@ -1,4 +1,4 @@
-"""Avoidability as a figure: what a warning so many seconds before the impact changes, for nine ways to brake."""
+"""What a warning so many seconds before the impact changes, for nine ways to brake, as a figure."""
 
 from __future__ import annotations
 
