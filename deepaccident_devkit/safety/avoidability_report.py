@@ -109,7 +109,8 @@ class AvoidabilityReport(ShortRepr):
         blocks += [
             self._group_text(group) for group in GROUPS if any(group_of(each) == group for each in self.accidents)
         ]
-        blocks.append(self._margins_text())
+        if self.margins:
+            blocks.append(self._margins_text())
         blocks += [
             "\n".join([f"{word}:", *(f"  {each.scenario}: {each.reason}" for each in which)])
             for word, which in left_out.items()
@@ -125,7 +126,7 @@ class AvoidabilityReport(ShortRepr):
         """A line for each who brakes and how hard: how many are avoidable, and how much warning they need."""
         members = self.members(group)
         reactions = sorted({braking.reaction for braking in members[0].brakings})
-        rows = [["brakes", "m/s²", "avoidable", "not if they go on", *(f"reaction {each:g} s" for each in reactions)]]
+        rows = [["brakes", "m/s²", "avoidable", "hit only after the end", *(f"reaction {each:g} s" for each in reactions)]]
         slack = np.stack([each.slack for each in members])
         extrapolated = np.stack([each.last_moments.extrapolated for each in members]).reshape(slack.shape)
         for row, brakers in enumerate(BRAKERS):
@@ -148,9 +149,8 @@ class AvoidabilityReport(ShortRepr):
         counts = np.histogram(values, bins=[*bounds, np.inf])[0].tolist()
         names = [f"below {bound:g} m" for bound in bounds[1:]] + [f"{MOST_MARGIN:g} m or more"]
         lines = [f"  {name}: {count}" for name, count in zip(names, counts, strict=True) if count]
-        if self.margins:
-            largest = max(self.margins, key=lambda name: self.margins[name])
-            lines.append(f"  the largest: {self.margins[largest]:.3f} m, {largest}")
+        largest = max(self.margins, key=lambda name: self.margins[name])
+        lines.append(f"  the largest: {self.margins[largest]:.3f} m, {largest}")
         return "\n".join(["gaps at the last frame, which count as contact:", *lines])
 
     def _last_moment_rows(self) -> Iterator[Row]:

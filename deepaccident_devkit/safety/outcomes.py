@@ -218,7 +218,7 @@ def _reductions(delta_v: FloatArray) -> FloatArray:
 
 
 def _classes(speeds: FloatArray, times: FloatArray, reduction: FloatArray) -> IntArray:
-    """(N,) codes of outcomes, of the speeds (N, B) of those who brake at the contacts; the last one is without braking."""
+    """(N,) codes of outcomes; `speeds` (N, B) are of those who brake. The last one is without braking."""
     stopped = (speeds < STOPPED_SPEED).all(axis=1) & (speeds[-1] >= STOPPED_SPEED).any()
     chosen = [np.isinf(times), reduction <= -_CHANGE, stopped, reduction >= _CHANGE]
     codes = [OUTCOMES.index(name) for name in ("avoided", "worsened", "stopped", "mitigated")]

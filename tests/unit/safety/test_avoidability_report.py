@@ -109,7 +109,7 @@ def test_head_on_answers_of_the_continuation_are_counted(report: AvoidabilityRep
 
 def test_an_empty_report() -> None:
     empty = AvoidabilityReport(dataroot="/data", version="v1", accidents=(), dropped=(), skipped=(), margins={})
-    assert "0 accidents" in empty.to_text()
+    assert empty.to_text() == "DeepAccident v1 at /data\n0 accidents"
     assert json.loads(empty.to_json())["accidents"] == []
     assert empty.shares == []
 

@@ -28,6 +28,10 @@ def test_without_braking_it_is_the_recording_and_goes_straight_on() -> None:
     between = at(motion, np.array([0.25]))
     assert abs(between.poses[0, 2]) == pytest.approx(np.pi)  # the shorter way from 3.1 to −3.1
     np.testing.assert_allclose(between.poses[0, :2], [3, 0.5])
+    backwards = at(motion, np.array([0.15, 0.25, 0.35]))  # turns add up, whichever way they go
+    np.testing.assert_allclose(backwards.turned, [1.55, np.pi, 2 * np.pi - 3.05])
+    left = at(motion_of([[0, 0, 0], [1, 0, 0.4], [2, 0, 0.1]]), np.array([0.1, 0.15, 0.2]))
+    np.testing.assert_allclose(left.turned, [0.4, 0.55, 0.7])
     after = at(motion, np.array([0.4 + HORIZON]))
     np.testing.assert_allclose(after.poses[0], [3.5 + 5 * 3, 2 + 10 * 3, motion.poses[4, 2]])
     np.testing.assert_allclose(after.velocities(motion)[0], [5, 10])
