@@ -126,7 +126,8 @@ class AvoidabilityReport(ShortRepr):
         """A line for each who brakes and how hard: how many are avoidable, and how much warning they need."""
         members = self.members(group)
         reactions = sorted({braking.reaction for braking in members[0].brakings})
-        rows = [["brakes", "m/s²", "avoidable", "hit only after the end", *(f"reaction {each:g} s" for each in reactions)]]
+        heading = ["brakes", "m/s²", "avoidable", "hit only after the end"]
+        rows = [heading + [f"reaction {each:g} s" for each in reactions]]
         slack = np.stack([each.slack for each in members])
         extrapolated = np.stack([each.last_moments.extrapolated for each in members]).reshape(slack.shape)
         for row, brakers in enumerate(BRAKERS):

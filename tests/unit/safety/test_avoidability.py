@@ -9,7 +9,15 @@ from replayed_accidents import accident, head_on, rear_end, straight
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import GeometryError, NotAvailableError
-from deepaccident_devkit.safety import Accident, Avoidability, avoidability, avoidability_of, outcomes_of
+from deepaccident_devkit.safety import (
+    Accident,
+    Avoidability,
+    accidents_of,
+    avoidability,
+    avoidability_of,
+    outcomes_of,
+    undisturbed,
+)
 from deepaccident_devkit.safety.avoidability import BRAKERS, MASKS, last_moments
 from deepaccident_devkit.safety.contact import pair_of
 from deepaccident_devkit.safety.outcomes import delta_v_ranges
@@ -143,3 +151,12 @@ def test_of_a_scenario(da_motion: DeepAccident) -> None:
     assert avoidability(da_motion, normal) is None
     recorded = {each.other_id for each in found.secondary}
     assert recorded.isdisjoint(found.accident.actor_ids)
+
+
+def test_every_generated_accident_collides_by_its_end(da_b: DeepAccident, da_motion: DeepAccident) -> None:
+    found = [each for dataset in (da_b, da_motion) for each in accidents_of(dataset)[0]]
+    assert len(found) > 3
+    for each in found:
+        check = undisturbed(each)
+        assert check.usable, each.scenario
+        assert check.time <= each.duration
