@@ -46,10 +46,16 @@ def render_town_map(dataset: Dataset, town: str, *, ax: Axes | None = None) -> A
 
 
 def map_beneath(dataset: Dataset, scenario: str, *, make: bool) -> TownMap | None:
-    """The map of the town of a scenario (a token): made, or only taken where it is kept; None if there is none."""
+    """The kept map of the town of a scenario (a token), without a look at its files; or else a new one, if asked for.
+
+    None if there is none: nothing is kept and nothing to be made, or no file to make it from.
+    """
     town = dataset.get("scenario", scenario)["town"]
+    kept = kept_town_map(dataset, town)
+    if kept is not None or not make:
+        return kept
     try:
-        return town_map(dataset, town) if make else kept_town_map(dataset, town)
+        return town_map(dataset, town)
     except NotAvailableError:
         return None
 
