@@ -15,6 +15,7 @@ from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.safety import COALITIONS, PARTNERS, LeadTimes, ObservationRule, lead_time_ledger, lead_times
 from deepaccident_devkit.safety.ledger_report import CAVEAT, mean_times
 from deepaccident_devkit.safety.observation import observed_actors
+from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import AGENTS
 
 
@@ -124,6 +125,20 @@ def test_scenarios_are_counted_and_a_chosen_few_looked_at(da_b: DeepAccident) ->
 @pytest.mark.slow
 def test_two_workers_find_the_same(da_b: DeepAccident) -> None:
     assert lead_time_ledger(da_b, workers=2).to_json() == lead_time_ledger(da_b, workers=1).to_json()
+
+
+@pytest.mark.slow
+def test_a_house_hides_the_colliders_from_each_other_until_a_second_before(tmp_path: Path) -> None:
+    """What the generator built, found again from the labels alone."""
+    root = make_release(tmp_path / "r", SynthConfig(scenarios=2, sensors=False, view="hidden", seed=2), workers=1)
+    da = DeepAccident("v1", root, verbose=False)
+    for kind in ("points", "released"):
+        times = lead_times(da, da.find(collision=True)[0], ObservationRule(kind=kind))
+        assert times is not None
+        assert 0.5 < times.alone < 2
+        assert times.gains[0] == 0
+        assert (times.gains[1:] > 1.5).all()
+        assert times.together == pytest.approx((times.num_frames - 1) / 10)
 
 
 def test_means_have_intervals_from_six_accidents_on() -> None:
