@@ -33,8 +33,8 @@ _DPI = 150
     type=WordChoice(get_args(ObservationKind)),
     default=_USUAL.kind,
     show_default=True,
-    help="What an observation is. annotated: the agent's label has the actor. points: it counts enough LiDAR points in "
-    "the actor's box. released: the visibility rule of the released code.",
+    help="What an observation is. points: the agent's label counts enough LiDAR points in the actor's box. released: "
+    "the visibility rule of the released code. annotated: the label has the actor, hidden or not.",
 )
 @click.option(
     "--points",

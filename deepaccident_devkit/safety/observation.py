@@ -15,7 +15,7 @@ from deepaccident_devkit.tables import visible_mask
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, INFRASTRUCTURE, AgentName
 from deepaccident_devkit.text import settle_choices
 
-ObservationKind = Literal["annotated", "points", "released"]
+ObservationKind = Literal["points", "released", "annotated"]
 _FRAMES_PER_SECOND: Final = round(1 / FRAME_PERIOD)
 
 
@@ -26,14 +26,15 @@ class ObservationRule:
     An agent observes itself at each frame. What it does not annotate it does not observe, whatever the rule.
 
     Attributes:
-        kind: `annotated`: the agent's label has the actor. `points`: the label counts enough LiDAR points in its box.
-            `released`: the released visibility rule, by points, cameras and distance (docs/released_code.md).
+        kind: `points`: the agent's label counts enough LiDAR points in the actor's box. `released`: the released
+            visibility rule, by points, cameras and distance (docs/released_code.md). `annotated`: the label has the
+            actor; the real labels have all that is near, hidden or not, so that this says little there.
         least_points: LiDAR points that are enough for `points`.
         memory: seconds for which an agent still knows an actor that it does not observe any more, in steps of 0.1.
         sustained: frames in a row at which an agent must observe an actor before it counts; 1 for at once.
     """
 
-    kind: ObservationKind = "annotated"
+    kind: ObservationKind = "points"
     least_points: int = 5
     memory: float = 0.0
     sustained: int = 1

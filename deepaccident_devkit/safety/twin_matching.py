@@ -97,11 +97,8 @@ def shift_of(first: Recording, second: Recording) -> int:
         end = min(begin + frames, first.poses.shape[1], second.poses.shape[1] - shift)
         if not pairs or end - begin < frames:
             continue
-        mine, theirs = (
-            first.poses[list(pairs), begin:end],
-            second.poses[list(pairs.values()), begin + shift : end + shift],
-        )
-        apart = np.minimum(np.hypot(*(theirs - mine)[..., :2].T), _CAP)
+        moved = second.poses[list(pairs.values()), begin + shift : end + shift] - first.poses[list(pairs), begin:end]
+        apart = np.minimum(np.hypot(moved[..., 0], moved[..., 1]), _CAP)
         if np.isnan(apart).all():
             continue
         cost = float(np.nanmean(apart))

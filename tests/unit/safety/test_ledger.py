@@ -1,6 +1,8 @@
 import csv
 import json
+import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +12,10 @@ from click.testing import CliRunner
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.safety import COALITIONS, PARTNERS, ObservationRule, lead_time_ledger, lead_times
+from deepaccident_devkit.safety import COALITIONS, PARTNERS, LeadTimes, ObservationRule, lead_time_ledger, lead_times
 from deepaccident_devkit.safety.ledger_report import CAVEAT, mean_times
 from deepaccident_devkit.safety.observation import observed_actors
+from deepaccident_devkit.synth import SynthConfig, make_release
 from deepaccident_devkit.taxonomy import AGENTS
 
 
@@ -37,6 +40,29 @@ def test_each_set_of_agents_by_a_plain_search(da_motion: DeepAccident, kind: str
     assert times.shapley.sum() == pytest.approx(times.together - times.alone)
     assert times.gains[3] == pytest.approx(times.leads[8] - times.leads[0])
     assert times.losses[0] == pytest.approx(times.leads[15] - times.leads[14])
+
+
+def test_gains_and_losses_are_differences_of_sets() -> None:
+    leads = np.array([1.0, 1.5, 2.0, 2.25, 1.25, 3.0, 4.0, 4.5, 1.0, 5.0, 2.5, 5.5, 3.5, 6.0, 6.5, 7.0])
+    times = LeadTimes(
+        scenario="type1_subtype1_accident/a",
+        rule=ObservationRule(),
+        actor_ids=(1, 2),
+        categories=("car", "van"),
+        colliding_agents=(None, "other_vehicle"),
+        missing=(),
+        num_frames=80,
+        first_frames=80 - np.round(leads * 10).astype(int),
+        leads=leads,
+        shapley=np.ones(4),
+    )
+    assert not times.ego_collides
+    assert (times.alone, times.together) == (1.0, 7.0)
+    assert times.gains.tolist() == [0.5, 1.0, 0.25, 0.0]
+    assert times.losses.tolist() == [0.5, 1.0, 1.5, 2.5]
+    lacking = replace(times, missing=("infrastructure",))
+    assert lacking.together == 4.5
+    assert lacking.losses.tolist()[:3] == [0.5, 1.5, 2.25]
 
 
 def test_a_scenario_without_a_collision_has_no_lead_times(da_motion: DeepAccident) -> None:
@@ -101,6 +127,20 @@ def test_two_workers_find_the_same(da_b: DeepAccident) -> None:
     assert lead_time_ledger(da_b, workers=2).to_json() == lead_time_ledger(da_b, workers=1).to_json()
 
 
+@pytest.mark.slow
+def test_a_house_hides_the_colliders_from_each_other_until_a_second_before(tmp_path: Path) -> None:
+    """What the generator built, found again from the labels alone."""
+    root = make_release(tmp_path / "r", SynthConfig(scenarios=2, sensors=False, view="hidden", seed=2), workers=1)
+    da = DeepAccident("v1", root, verbose=False)
+    for kind in ("points", "released"):
+        times = lead_times(da, da.find(collision=True)[0], ObservationRule(kind=kind))
+        assert times is not None
+        assert 0.5 < times.alone < 2
+        assert times.gains[0] == 0
+        assert (times.gains[1:] > 1.5).all()
+        assert times.together == pytest.approx((times.num_frames - 1) / 10)
+
+
 def test_means_have_intervals_from_six_accidents_on() -> None:
     values = np.random.default_rng(1).exponential(2.0, size=(400, 2))
     values[:396, 1] = np.nan
@@ -112,6 +152,10 @@ def test_means_have_intervals_from_six_accidents_on() -> None:
     assert (few.accidents, few.low, few.high) == (4, None, None)
     assert few.mean == pytest.approx(values[396:, 1].mean())
     assert few.text == f"{few.mean:.2f}"
+    values[:200, 1], values[200:, 1] = values[:200, 0], np.nan
+    half = mean_times(values)[1]
+    error = values[:200, 0].std() / math.sqrt(200)
+    assert half.low == pytest.approx(values[:200, 0].mean() - 1.96 * error, abs=0.2 * error)
     same = mean_times(np.full((6, 1), 2.5))[0]
     assert (same.mean, same.low, same.high) == (2.5, 2.5, 2.5)
 
@@ -139,5 +183,5 @@ def test_the_command_prints_and_writes_the_ledger(da_b: DeepAccident, tmp_path: 
             assert float(row[f"shapley_{partner}"]) == accident["shapley_seconds"][partner]
     again = CliRunner().invoke(deepaccident, ["safety", "lead-time", root, "--where", "collision=false", "--json"])
     assert json.loads(again.output)["summary"]["without_accident"] == len(da_b.find(collision=False))
-    wrong = CliRunner().invoke(deepaccident, ["safety", "lead-time", root, "--points", "3"])
+    wrong = CliRunner().invoke(deepaccident, ["safety", "lead-time", root, "--rule", "released", "--points", "3"])
     assert (wrong.exit_code, "--points changes nothing without --rule points" in wrong.output) == (2, True)

@@ -1,4 +1,5 @@
 from collections.abc import Mapping
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.safety import ObservationRule, observed_actors
-from deepaccident_devkit.safety.observation import remembered, sustained_only
+from deepaccident_devkit.safety.observation import _seen, remembered, sustained_only
 from deepaccident_devkit.tables import visible_mask
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x.tracks import scenario_tracks
@@ -23,15 +24,15 @@ def own_id(da: DeepAccident, scenario: Mapping[str, Any], agent: str) -> int | N
 
 
 def others(da: DeepAccident, scenario: Mapping[str, Any]) -> list[int]:
-    """Some actors that are no agents."""
+    """The actors that are no agents."""
     own = {own_id(da, scenario, agent) for agent in AGENTS}
     ids = np.unique(scenario_tracks(da, scenario["token"]).actor_id).tolist()
-    return [actor for actor in ids if actor not in own][:4]
+    return [actor for actor in ids if actor not in own]
 
 
 def test_annotated_is_the_tracks_agents(da_motion: DeepAccident, accident: Mapping[str, Any]) -> None:
     actors = [*accident["collision"]["ids"], *others(da_motion, accident)]
-    agents, observed = observed_actors(da_motion, accident, actors)
+    agents, observed = observed_actors(da_motion, accident, actors, ObservationRule(kind="annotated"))
     assert agents == AGENTS
     assert observed.shape == (5, len(actors), accident["num_frames"])
     tracks = scenario_tracks(da_motion, accident["token"])
@@ -69,13 +70,27 @@ def test_rules_on_each_label(da_motion: DeepAccident, accident: Mapping[str, Any
     assert 0 < expected[4].mean() < 1
 
 
+def test_the_pole_has_a_distance_of_its_own() -> None:
+    """A car 12 m away with one point, which the released rule calls seen by the pole and not by a vehicle."""
+    columns = {
+        "num_lidar_pts": np.array([9, 1, 1]),
+        "translation": np.array([[0.0, 0, 0], [12, 0, 0], [0, 12, 0]]),
+        "category": np.zeros(3, dtype=np.int8),
+        "camera_visible": np.zeros(3, dtype=bool),
+    }
+    dataset: Any = SimpleNamespace(columns=lambda _: columns)
+    by_pole = np.array([False, True])
+    rule = ObservationRule(kind="released")
+    assert _seen(dataset, slice(0, 3), np.array([1, 2]), by_pole, rule).tolist() == [False, True]
+
+
 def test_who_observes_itself(da_motion: DeepAccident, accident: Mapping[str, Any]) -> None:
     ego = own_id(da_motion, accident, "ego_vehicle")
     rule = ObservationRule(kind="points", least_points=10**9)
     _, observed = observed_actors(da_motion, accident, [ego], rule)
     assert observed[0].all()
     assert not observed[1:].any()
-    _, late = observed_actors(da_motion, accident, [ego], ObservationRule(sustained=3))
+    _, late = observed_actors(da_motion, accident, [ego], ObservationRule(sustained=3, least_points=10**9))
     assert late[0, 0].tolist()[:4] == [False, False, True, True]
 
 
@@ -101,8 +116,8 @@ def test_rules_are_checked_and_say_what_they_are() -> None:
     assert ObservationRule(kind="Points", memory=1, sustained=3).text == (  # type: ignore[arg-type]
         "at least 5 LiDAR points; at 3 frames in a row; remembered for 1 s"
     )
-    assert ObservationRule().text == "annotated"
-    with pytest.raises(ChoiceError, match="kind: expected one of annotated, points, released, found 'seen'"):
+    assert ObservationRule().text == "at least 5 LiDAR points"
+    with pytest.raises(ChoiceError, match="kind: expected one of points, released, annotated, found 'seen'"):
         ObservationRule(kind="seen")  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="least_points: expected a whole number from 1, found 0"):
         ObservationRule(least_points=0)

@@ -73,6 +73,14 @@ def test_turns_count_the_shorter_way() -> None:
     assert replace(diff, parting=Parting(distance=5.0, heading=0.07)).order.tolist() == [1, 0, 2]
 
 
+def test_the_largest_difference_keeps_its_sign() -> None:
+    poses = made_diff().poses.copy()
+    poses[1, 0, 1:3, 2] = [0.05, -0.2]
+    ego = made_diff(poses=poses).to_dict()["actors"][0]
+    assert ego["largest_heading_difference"] == pytest.approx(-0.2)
+    assert ego["parting_frame"] == 3
+
+
 def test_the_pairs_least_gap_in_the_twin() -> None:
     diff = made_diff()
     assert diff.gaps[0].tolist()[:5] == pytest.approx([7, 5.5, 4, 2.5, 1])

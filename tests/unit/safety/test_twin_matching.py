@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -62,35 +64,27 @@ def test_starts_are_compared_at_the_first_frame_that_shows_both() -> None:
     poses = second.poses.copy()
     poses[:, :12] = np.nan
     poses[:, 12:, 0] = first.poses[::-1, 12:, 0]
-    late = recording([(0, 9), (0, 0)], ids=[4, 5])
-    object.__setattr__(late, "poses", poses)
+    late = replace(second, poses=poses)
     assert matched_rows(first, late) == {0: (1, "start"), 1: (0, "start")}
-    never = recording([(0, 0)], frames=4)
-    object.__setattr__(never, "poses", np.full((1, 4, 3), np.nan))
+    never = replace(recording([(0, 0)]), poses=np.full((1, 4, 3), np.nan))
     assert matched_rows(first, never) == {}
 
 
 @given(st.integers(-20, 20))
-def test_the_shift_is_found_though_one_agent_goes_its_own_way(shift: int) -> None:
-    agents = {"ego_vehicle": 0, "ego_vehicle_behind": 1, "other_vehicle": 2}
-    whole = recording([(0, 0), (-10, 0), (0, 40)], agents=agents, frames=90)
-    first = recording([(0, 0), (-10, 0), (0, 40)], agents=agents, frames=90)
-    object.__setattr__(first, "poses", whole.poses[:, max(0, shift) :].copy())
-    second = recording([(0, 0), (-10, 0), (0, 40)], agents=agents, frames=90)
-    object.__setattr__(second, "poses", whole.poses[:, max(0, -shift) :].copy())
-    second.poses.flags.writeable = True
-    second.poses[2, :, 1] += 30
+def test_the_shift_is_found_though_two_agents_go_their_own_ways(shift: int) -> None:
+    agents = {"ego_vehicle": 0, "ego_vehicle_behind": 1, "other_vehicle": 2, "other_vehicle_behind": 3}
+    whole = recording([(0, 0), (-10, 0), (0, 40), (-10, 40)], agents=agents, frames=90)
+    poses = whole.poses[:, max(0, -shift) :].copy()
+    poses[2:, :, 0] += [[30], [60]]
+    first = replace(whole, poses=whole.poses[:, max(0, shift) :])
+    second = replace(whole, poses=poses)
     assert shift_of(first, second) == shift
-    moved = shifted(second, shift)
-    frames = slice(max(0, -shift), 60)
+    moved, frames = shifted(second, shift), slice(max(0, -shift), 60)
     np.testing.assert_allclose(moved.poses[:2, frames], first.poses[:2, frames], atol=1e-9)
 
 
 def test_without_moving_agents_there_is_no_shift() -> None:
-    first = recording([(0, 0)], agents={"ego_vehicle": 0})
-    poses = first.poses.copy()
-    poses[..., 0] = 0
-    object.__setattr__(first, "poses", poses)
+    first = replace(recording([(0, 0)], agents={"ego_vehicle": 0}), poses=np.zeros((1, FRAMES, 3)))
     assert shift_of(first, first) == 0
     assert shift_of(recording([(0, 0)]), recording([(5, 0)])) == 0
     assert shifted(first, 0) is first

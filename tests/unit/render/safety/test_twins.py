@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -38,5 +40,4 @@ def test_colliders_that_a_recording_lacks(da_motion: DeepAccident, missing: int)
     diff = twin_diff(da_motion, da_motion.find(collision=True)[0])
     poses = diff.poses.copy()
     poses[missing, list(diff.pair)] = np.nan
-    object.__setattr__(diff, "poses", poses)
-    render_twins(diff, fig=Figure(layout="constrained")).canvas.draw()
+    render_twins(replace(diff, poses=poses), fig=Figure(layout="constrained")).canvas.draw()
