@@ -57,9 +57,9 @@ class _Package:
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from deepaccident_devkit import motion, render, validation
+    from deepaccident_devkit import motion, render, safety, validation
 else:
-    motion, render, validation = map(_Package, ("motion", "render", "validation"))
+    motion, render, safety, validation = map(_Package, ("motion", "render", "safety", "validation"))
 
 
 class DeepAccident(Dataset):
@@ -137,6 +137,7 @@ class DeepAccident(Dataset):
     message_sizes = v2x.message_sizes
     interactions = interactions_of_scenario
     town_map = maps.town_map
+    describe = safety.describe
     motion_labels = motion.motion_labels
     bev_segmentation = motion.bev_segmentation
     samples = motion.samples

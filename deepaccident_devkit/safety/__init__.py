@@ -46,6 +46,8 @@ from deepaccident_devkit.safety.outcomes import (
     outcomes_of,
     undisturbed,
 )
+from deepaccident_devkit.safety.stories import Story, describe, scenario_facts, stories
+from deepaccident_devkit.safety.story_text import story_text
 from deepaccident_devkit.safety.twin_comparison import twin_diff
 from deepaccident_devkit.safety.twin_diff import Parting, TwinDiff
 from deepaccident_devkit.safety.twin_report import TwinReport, twin_report
@@ -73,6 +75,7 @@ __all__ = [
     "Parting",
     "ReplayCheck",
     "Skipped",
+    "Story",
     "TornTwins",
     "TwinDiff",
     "TwinReport",
@@ -86,6 +89,7 @@ __all__ = [
     "coalition_leads",
     "conflict_area_pet",
     "delta_v",
+    "describe",
     "drac",
     "drac_1d",
     "drac_of",
@@ -105,7 +109,10 @@ __all__ = [
     "outcomes_of",
     "post_encroachment_time",
     "relative_speed",
+    "scenario_facts",
     "shapley_values",
+    "stories",
+    "story_text",
     "time_exposed",
     "time_integrated",
     "time_to_collision",
