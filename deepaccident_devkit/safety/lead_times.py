@@ -85,6 +85,11 @@ class LeadTimes(FrozenArrays):
         return not self.first_frames[self._everyone]
 
     @property
+    def from_the_start(self) -> bool:
+        """Whether all agents that are there observe both as early as the rule lets them: the recording may cut it."""
+        return 0 < int(self.first_frames[self._everyone]) <= self.rule.sustained
+
+    @property
     def gains(self) -> FloatArray:
         """(4,) seconds that each of `PARTNERS` adds to the ego alone; NaN for a missing one."""
         gains: FloatArray = self.leads[_ALONE] - self.leads[0]

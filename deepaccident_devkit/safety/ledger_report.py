@@ -107,6 +107,11 @@ class LeadTimeLedger(ShortRepr):
         """The same of all agents together."""
         return _share([each.never_together for each in self.accidents])
 
+    @property
+    def share_from_the_start(self) -> float | None:
+        """Share of the accidents that all agents observe from the first frame on, so that more may have been cut."""
+        return _share([each.from_the_start for each in self.accidents])
+
     def to_dict(self) -> dict[str, Any]:
         """For JSON; None for what is not known."""
         names = ["+".join(members) for members in COALITIONS]
@@ -123,6 +128,7 @@ class LeadTimeLedger(ShortRepr):
                 "without_accident": self.without_accident,
                 "share_never_alone": self.share_never_alone,
                 "share_never_together": self.share_never_together,
+                "share_from_the_start": self.share_from_the_start,
                 "together": asdict(self.mean_together),
                 "lead_seconds": _by_name(names, self.mean_leads),
                 "gain_seconds": _by_name(PARTNERS, self.mean_gains),
@@ -189,6 +195,7 @@ class LeadTimeLedger(ShortRepr):
         means = zip(PARTNERS, self.mean_gains, self.mean_losses, self.mean_shapley, strict=True)
         rows = [(short_agent(name), *(mean.text for mean in each)) for name, *each in means]
         alone, together = self.mean_leads[0].text, self.mean_together.text
+        start = "observed by all agents from the first frame on, so that the lead may be longer than the recording: "
         never = f"never observed together: by the ego alone {_percent(self.share_never_alone)}, by all agents "
         return "\n".join(
             [
@@ -196,6 +203,7 @@ class LeadTimeLedger(ShortRepr):
                 columns_text([("partner", "adds to the ego", "all lose without", "Shapley value"), *rows]),
                 f"lead time: the ego alone {alone}, all agents {together}",
                 f"{never}{_percent(self.share_never_together)} of the accidents",
+                f"{start}{_percent(self.share_from_the_start)}",
             ]
         )
 

@@ -60,6 +60,11 @@ def test_gains_and_losses_are_differences_of_sets() -> None:
     assert (times.alone, times.together) == (1.0, 7.0)
     assert times.gains.tolist() == [0.5, 1.0, 0.25, 0.0]
     assert times.losses.tolist() == [0.5, 1.0, 1.5, 2.5]
+    assert not times.from_the_start
+    assert replace(times, first_frames=np.arange(16)[::-1] + 1).from_the_start
+    assert not replace(times, first_frames=np.arange(16)[::-1] + 2).from_the_start
+    assert not replace(times, first_frames=np.zeros(16, dtype=int)).from_the_start
+    assert replace(times, first_frames=np.full(16, 3), rule=ObservationRule(sustained=3)).from_the_start
     lacking = replace(times, missing=("infrastructure",))
     assert lacking.together == 4.5
     assert lacking.losses.tolist()[:3] == [0.5, 1.5, 2.25]
