@@ -6,6 +6,7 @@ from typing import Any, get_args
 import click
 
 from deepaccident_devkit.cli.export_formats import mmdet3d, nuscenes, opencood, parquet, webdataset
+from deepaccident_devkit.cli.export_questions import questions
 from deepaccident_devkit.cli.options import (
     WordChoice,
     agent_names,
@@ -29,7 +30,7 @@ def export() -> None:
     """Write data in the formats of other tools."""
 
 
-for verb in (mmdet3d, nuscenes, opencood, parquet, webdataset):
+for verb in (mmdet3d, nuscenes, opencood, parquet, questions, webdataset):
     export.add_command(verb)
 
 
