@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Final, get_args
 
+from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
 from deepaccident_devkit.export.bulk import Format, Output, Plan, Unit
 from deepaccident_devkit.export.questions.observed import Seen
@@ -35,7 +36,7 @@ _ID: Final = slice(len('{"id": "'), len('{"id": "') + 16)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Questions(Format):
+class Questions(ShortRepr, Format):
     """Questions on what happens next, about what some agents observed, for language models.
 
     `questions/` holds all that may be handed out: `questions.jsonl`, README.md, `answer.schema.json` and pictures.

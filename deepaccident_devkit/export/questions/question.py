@@ -56,7 +56,7 @@ def names_of(
     observers: dict[str, AgentName] = {EGO: paths[0].agent}
     observers |= {f"partner_{number}": path.agent for number, path in enumerate(partners, start=1)}
     if any(path.agent == INFRASTRUCTURE for path in paths[1:]):
-        observers["roadside"] = INFRASTRUCTURE
+        observers[INFRASTRUCTURE] = INFRASTRUCTURE
     ids = seen.boxes.actor_id
     place = seen.boxes.center[:, :2]
     apart = np.linalg.norm(place - ego[seen.moment, :2], axis=1)
@@ -105,7 +105,7 @@ def _agents_in(bits: int, of_name: Mapping[AgentName, str]) -> list[AgentName]:
 def _observer(name: str, path: AgentPath) -> dict[str, Any]:
     return {
         "name": name,
-        "kind": "roadside" if path.agent == INFRASTRUCTURE else "vehicle",
+        "kind": INFRASTRUCTURE if path.agent == INFRASTRUCTURE else "vehicle",
         "class": path.category,
         "size": None if path.size is None else _rounded(np.array(path.size), _PLACES),
         "position": _rounded(path.pose[:, :2], _PLACES),

@@ -14,7 +14,7 @@ Made by `deepaccident export questions` of the DeepAccident devkit {devkit}. Eac
 question on its own, and is answered from this line{pictures} alone. Lines stand in an order that was drawn. Windows of
 one recording may overlap, so nothing of one line may be used for another.
 
-Some agents (a vehicle or a roadside unit, the `ego`, and those that share what they see) have observed traffic at an
+Some agents (vehicles, or the infrastructure: the `ego`, and those that share what they see) have observed traffic at an
 intersection at the times in `moments`, in seconds; 0 is the present.
 
 | field | what |

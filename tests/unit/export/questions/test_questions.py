@@ -23,13 +23,13 @@ from deepaccident_devkit.export.questions import Questions, WindowRules
 from deepaccident_devkit.export.questions.truth import seconds_ahead
 from deepaccident_devkit.release import read_meta
 from deepaccident_devkit.release.meta import write_meta
-from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
+from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID
 from deepaccident_devkit.v2x.cooperation import visible_instances
 
 WINDOW = WindowRules(observe=1.0, rate=2, stride=0.5)
 SET = ("ego_vehicle", "other_vehicle", "infrastructure")
 FORM = Questions(observers=SET, window=WINDOW, agents=("ego_vehicle", "infrastructure"))
-NAMES = {"ego", "partner_1", "partner_2", "roadside"}
+NAMES = {"ego", "partner_1", "partner_2", "infrastructure"}
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +115,7 @@ def test_observers_know_themselves(da_motion: DeepAccident, asked: Asked) -> Non
                 assert observer["speed"][number] == pytest.approx(speed, abs=0.006)
             record = da_motion.agent.get(f"{scenario}/{agent}")
             assert observer["class"] == record["category"]
-            assert (observer["kind"] == "roadside") == record["is_infrastructure"]
+            assert (observer["kind"] == "infrastructure") == record["is_infrastructure"]
             assert truth["actors"].get(observer["name"]) == record["actor_id"]
             assert record["size"] is None or observer["size"] == pytest.approx(record["size"], abs=0.006)
         assert question["observers"][0]["position"][-1] == [0, 0]
@@ -181,6 +181,17 @@ def test_the_truth_of_an_accident(da_motion: DeepAccident, asked: Asked) -> None
         assert truth["why"]["sides"] == list(contact.sides)
         assert truth["why"]["ego_direction"] == da_motion.scenario.get(scenario)["ego_direction"]
     assert seen > 8
+
+
+def test_when_the_colliders_were_last_seen(da_motion: DeepAccident, tmp_path: Path) -> None:
+    found = ask(da_motion, tmp_path, Questions(window=replace(WINDOW, partial_past=True), agents=AGENTS))
+    told = set()
+    for sample, truth in found.truth.items():
+        shown = {each["name"]: each["time"][-1] for each in found.question(sample)["actors"]}
+        for name, last in zip(truth["who"] or [], truth["last_seen"] or [], strict=True):
+            assert last == (None if name is None else 0 if name == "ego" else shown[name])
+            told.add("ego" if name == "ego" else "hidden" if name is None else "seen")
+    assert told == {"ego", "hidden", "seen"}
 
 
 def test_the_seconds_of_an_accident() -> None:
