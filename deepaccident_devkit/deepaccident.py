@@ -8,9 +8,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from deepaccident_devkit import overview, selection, v2x
+from deepaccident_devkit import maps, overview, selection, v2x
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import IndexStoreError
+from deepaccident_devkit.interactions import interactions as interactions_of_scenario
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.store import Dataroot, open_dataroot
 from deepaccident_devkit.tables import open_index
@@ -134,6 +135,8 @@ class DeepAccident(Dataset):
     trajectory = v2x.trajectory
     collision = v2x.collision
     message_sizes = v2x.message_sizes
+    interactions = interactions_of_scenario
+    town_map = maps.town_map
     motion_labels = motion.motion_labels
     bev_segmentation = motion.bev_segmentation
     samples = motion.samples
@@ -156,6 +159,7 @@ class DeepAccident(Dataset):
     render_evaluation = render.render_evaluation
     render_scenario_video = render.render_scenario_video
     render_replay = render.render_replay
+    render_town_map = render.render_town_map
 
     def list_scenarios(self) -> None:
         """Print a line for each scenario."""

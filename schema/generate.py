@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 from deepaccident_devkit.evaluation.results import RESULT_SCHEMAS
+from deepaccident_devkit.interactions.records import interaction_specs
 from deepaccident_devkit.tables.schema import columns_markdown, json_schemas
 
 FOLDER = Path(__file__).parent
@@ -14,10 +15,10 @@ def generated_files() -> dict[str, str]:
     """File name → what it should contain."""
     files = {
         f"{name}.json": json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
-        for name, schema in json_schemas().items()
+        for name, schema in json_schemas(interaction_specs()).items()
     }
     prose = (FOLDER / "README.md").read_text(encoding="utf-8").partition(MARK)[0]
-    return {**files, "README.md": f"{prose}{MARK}\n\n{columns_markdown()}"}
+    return {**files, "README.md": f"{prose}{MARK}\n\n{columns_markdown(interaction_specs())}"}
 
 
 def generated_results_files() -> dict[str, str]:

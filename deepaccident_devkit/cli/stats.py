@@ -28,6 +28,7 @@ from deepaccident_devkit.statistics import (
 @release_parameters
 @part_parameters
 @where_parameter
+@click.option("--interactions", is_flag=True, help="Also count how soon moving pairs would collide.")
 @click.option(
     "--out", type=click.Path(), help="Folder to write statistics.json, one CSV file per table, and figures into."
 )
@@ -41,6 +42,7 @@ from deepaccident_devkit.statistics import (
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, for programs.")
 def stats(
     where: tuple[str, ...],
+    interactions: bool,
     out: str | None,
     formats: tuple[PictureFormat, ...],
     as_json: bool,
@@ -62,18 +64,18 @@ def stats(
         raise click.UsageError("no scenario matches --where, so there is nothing to write; change it or omit --out")
     folder = None if out is None else writable_folder(out)
     if folder and isinstance(part, Shard):
-        count = statistics_shard(dataset, part, folder, chosen, **how)
+        count = statistics_shard(dataset, part, folder, chosen, interactions=interactions, **how)
         say_part_done(part, f"{count} scenarios")
         return
     if folder and part is not None:
-        statistics = merged_statistics(dataset, folder, chosen)
+        statistics = merged_statistics(dataset, folder, chosen, interactions=interactions)
     else:
-        statistics = dataset_statistics(dataset, chosen, **how)
+        statistics = dataset_statistics(dataset, chosen, interactions=interactions, **how)
     click.echo(statistics.to_json() if as_json else statistics.to_text())
     if folder:
         written = statistics.to_csv(folder)
         written.append(folder / "statistics.json")
         write_bytes(written[-1], statistics.to_json().encode())
         written += save_statistics(statistics, folder, formats or get_args(PictureFormat))
-        remove_shards(dataset, folder, chosen)
+        remove_shards(dataset, folder, chosen, interactions=interactions)
         click.echo(f"written: {len(written)} files in {folder}", err=as_json)

@@ -46,6 +46,39 @@ def gaps_of_pairs(first: FloatArray, second: FloatArray) -> FloatArray:
     return np.where(together, 0.0, np.minimum(here, there))
 
 
+def separations_of_pairs(first: FloatArray, second: FloatArray) -> FloatArray:
+    """The shortest way from footprints (…, 5) to the others (…, 5) at the same places, as a vector (…, 2), metres.
+
+    Its length is the gap. NaN if the two overlap or touch, since then there is no direction. Where sides lie
+    parallel, any of the shortest ways.
+    """
+    there, here = -_reaching(first, second), _reaching(second, first)
+    shorter = np.hypot(*np.moveaxis(there, -1, 0)) <= np.hypot(*np.moveaxis(here, -1, 0))
+    vectors = np.where(shorter[..., None], there, here)
+    apart = np.maximum(_outside(first, second)[0], _outside(second, first)[0]) > 0
+    result: FloatArray = np.where(apart[..., None], vectors, np.nan)
+    return result
+
+
+def corner_offsets(footprints: FloatArray) -> FloatArray:
+    """The corners (…, 4, 2) of footprints (…, 5), counter-clockwise from front left, less their centres."""
+    along = footprints[..., 2, None] * _SIGNS[:, 0]
+    aside = footprints[..., 3, None] * _SIGNS[:, 1]
+    cosine, sine = np.cos(footprints[..., 4])[..., None], np.sin(footprints[..., 4])[..., None]
+    return np.stack([cosine * along - sine * aside, sine * along + cosine * aside], axis=-1)
+
+
+def _reaching(first: FloatArray, second: FloatArray) -> FloatArray:
+    """The way (…, 2) to the first's nearest corner from the nearest place of the second."""
+    x, y = _corners_in(first, second)
+    half = second[..., 2:4, None] / 2
+    x, y = (values - np.clip(values, -half[..., axis, :], half[..., axis, :]) for axis, values in enumerate((x, y)))
+    nearest = (x**2 + y**2).argmin(axis=-1)[..., None]
+    x, y = (np.take_along_axis(values, nearest, axis=-1)[..., 0] for values in (x, y))
+    cosine, sine = np.cos(second[..., 4]), np.sin(second[..., 4])
+    return np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
+
+
 def _areas_of_pairs(first: FloatArray, second: FloatArray) -> FloatArray:
     """Common area of `first[i]` and `second[i]`, (P,) m².
 

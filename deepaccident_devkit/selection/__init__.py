@@ -18,10 +18,17 @@
 | `collision_ids`, `collision_classes`, `collision_agents` | of the colliding pair, one of which must match |
 | `contact_side`∗, `spawn_relation`∗, `impact` | as meta names them: `front_side` (or `front`); `same`; a number |
 | `closing_speed` | m/s with which the pair approaches at the last frame (`da.collision`) |
+| `min_ttc`, `min_pet`, `min_gap` | of moving pairs: least time to collision, post-encroachment time (s), gap (m) |
+| `max_drac` | the most deceleration that a moving pair needs to avoid a crash (m/s²) |
 | `accident_type`∗ | 1 to 12, the paper's design that the accident realises; unknown (none) for any other end |
 | `num_frames` (short: `length`) | recorded frames |
 | `accident_visibility` | `visible`, `partial`, `invisible`: whether ego sees it coming (`v2x.accident_visibility`) |
 | `velocity_frame`∗, `first_frame_token`, `last_frame_token` | as in the table |
+
+**Moving pairs** are those of `da.interactions` of which each moves faster than 0.5 m/s at some frame: who passes parked
+cars is left out, who hits a car that waits is not. The sign of a post-encroachment time does not count. A scenario in
+which no such pair comes near each other has infinite `min_…` and a `max_drac` of 0; without labels they are unknown.
+What is not kept yet is computed in parallel.
 
 **Values.** One value, or a list, tuple or set of values, one of which must match; numpy's scalars count as Python's, an
 array is given as a list (`array.tolist()`). In words, case, `_`, `-` and blanks do not count. Numbers also as texts:

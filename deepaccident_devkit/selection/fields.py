@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
+import numpy as np
+
 from deepaccident_devkit import taxonomy
+from deepaccident_devkit.arrays import BoolArray, FloatArray
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.deprecations import warn_deprecated
 from deepaccident_devkit.errors import FieldError, NotAvailableError
+from deepaccident_devkit.interactions import InteractionPairs, interactions_of
 from deepaccident_devkit.tables.columns import Choice, Column, Number, Struct
 from deepaccident_devkit.tables.specs import table_spec
 from deepaccident_devkit.text import possible_text
@@ -22,6 +26,7 @@ if TYPE_CHECKING:
 
 Value = str | int | float | bool | None
 _Read = Callable[[Dataset, "ScenarioRecord"], Value | tuple[Value, ...]]
+_ReadAll = Callable[[Dataset, "Sequence[ScenarioRecord]"], Iterable[Value]]
 Kind = Literal["word", "number", "measure", "flag"]
 
 STRAIGHT: Final = "straight_straight"
@@ -40,6 +45,7 @@ class Field:
         known: the values it can have in the whole release; empty where that is not known or not limited.
         costly: whether reading it opens more than the scenario's record.
         groups: whether it has so few values that results can be grouped by it.
+        read_all: its values of many scenarios in their order, where that is more than `read` of each.
     """
 
     name: str
@@ -48,6 +54,13 @@ class Field:
     known: Sequence[str | int] = ()
     costly: bool = False
     groups: bool = False
+    read_all: _ReadAll | None = None
+
+    def values(self, dataset: Dataset, scenarios: Sequence[ScenarioRecord]) -> Iterable[Value | tuple[Value, ...]]:
+        """Its values of scenarios, in their order."""
+        if self.read_all is not None:
+            return self.read_all(dataset, scenarios)
+        return (self.read(dataset, scenario) for scenario in scenarios)
 
 
 def field_of(name: str) -> Field:
@@ -142,8 +155,28 @@ def _closing_speed(dataset: Dataset, scenario: ScenarioRecord) -> float | None:
     return None if contact is None or math.isnan(contact.closing_speed) else contact.closing_speed
 
 
+def _of_moving_pairs(name: str, measure: Callable[[InteractionPairs, BoolArray], float]) -> Field:
+    """A field that is a measure of a scenario's interactions, of the pairs each of which moves at some frame."""
+
+    def read_all(dataset: Dataset, scenarios: Sequence[ScenarioRecord]) -> Iterator[float | None]:
+        progress = len(scenarios) >= _WORTH_A_BAR
+        for found in interactions_of(dataset, scenarios, progress=progress):
+            yield measure(found.pairs, found.pairs.moving) if found.labelled else None
+
+    def read(dataset: Dataset, scenario: ScenarioRecord) -> float | None:
+        return next(read_all(dataset, [scenario]))
+
+    return Field(name, "measure", read, costly=True, read_all=read_all)
+
+
+def _least(values: FloatArray) -> float:
+    return float(values.min(initial=math.inf))
+
+
 _SHORT = {"type": "scenario_type", "length": "num_frames"}
 _RENAMED = {"visibility": "accident_visibility", "junction": "road_type"}
+_WORTH_A_BAR: Final = 32
+"""Scenarios whose interactions take some seconds, if none are kept."""
 _FEW: Final = ("scenario_type", "town")
 """Columns of words that are not limited, yet few."""
 _KNOWN: dict[str, Sequence[str | int]] = {
@@ -180,6 +213,10 @@ _DERIVED = (
     ),
     Field("impact", "measure", _of_collision("impact")),
     Field("closing_speed", "measure", _closing_speed, costly=True),
+    _of_moving_pairs("min_ttc", lambda pairs, moving: _least(pairs.min_ttc[moving])),
+    _of_moving_pairs("min_pet", lambda pairs, moving: _least(np.abs(pairs.pet[moving]))),
+    _of_moving_pairs("min_gap", lambda pairs, moving: _least(pairs.min_gap[moving])),
+    _of_moving_pairs("max_drac", lambda pairs, moving: float(pairs.max_drac[moving].max(initial=0.0))),
     Field("accident_visibility", "word", _accident_visibility, VISIBILITIES, costly=True),
 )
 FIELDS: Final = {

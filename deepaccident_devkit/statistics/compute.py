@@ -13,6 +13,7 @@ from deepaccident_devkit.parallel import Places, in_order, run_unordered
 from deepaccident_devkit.statistics import actors
 from deepaccident_devkit.statistics import scenarios as whole
 from deepaccident_devkit.statistics.collisions import collision_histograms, collision_pairs, count_collisions
+from deepaccident_devkit.statistics.interactions import count_interactions, interaction_histograms
 from deepaccident_devkit.statistics.report import DatasetStatistics
 from deepaccident_devkit.statistics.selected import Selected
 from deepaccident_devkit.statistics.tally import Tally
@@ -30,6 +31,7 @@ def dataset_statistics(
     dataset: Dataset,
     scenarios: Chosen = None,
     *,
+    interactions: bool = False,
     workers: int | None = None,
     executor: Executor | None = None,
     progress: bool = False,
@@ -43,6 +45,8 @@ def dataset_statistics(
         dataset: the release.
         scenarios: tokens or records of its scenarios to count alone, such as `find` gives, or a single one; None for
             all.
+        interactions: whether to add how soon moving pairs would collide (`da.interactions`); where these are not kept
+            yet, a tenth of a second a scenario.
         workers: processes; None chooses by the amount of work, one for a release of today's size.
         executor: any executor of `concurrent.futures` to run on, in place of own workers.
         progress: whether to show a bar.
@@ -53,8 +57,10 @@ def dataset_statistics(
         WorkerError: a worker was killed, or cannot do the work.
     """
     rows = chosen_rows(dataset, scenarios)
-    tallies = tallies_of(dataset, runs_of(rows), workers=workers, executor=executor, progress=progress)
-    return statistics_of(dataset, tallies, selected=scenarios is not None)
+    tallies = tallies_of(
+        dataset, runs_of(rows), interactions=interactions, workers=workers, executor=executor, progress=progress
+    )
+    return statistics_of(dataset, tallies, selected=scenarios is not None, interactions=interactions)
 
 
 def chosen_rows(dataset: Dataset, scenarios: Chosen) -> Sequence[int]:
@@ -77,6 +83,7 @@ def tallies_of(
     dataset: Dataset,
     runs: Sequence[Sequence[int]],
     *,
+    interactions: bool = False,
     workers: int | None = None,
     executor: Executor | None = None,
     progress: bool = False,
@@ -84,7 +91,7 @@ def tallies_of(
     """The tally of each run of scenarios, in their order; arguments and errors are those of `dataset_statistics`."""
     return in_order(
         run_unordered(
-            partial(tally_of, dataset),
+            partial(tally_of, dataset, interactions=interactions),
             runs,
             workers=workers,
             executor=executor,
@@ -96,8 +103,8 @@ def tallies_of(
     )
 
 
-def tally_of(dataset: Dataset, rows: Sequence[int]) -> Tally:
-    """What is counted in neighbouring scenarios."""
+def tally_of(dataset: Dataset, rows: Sequence[int], *, interactions: bool = False) -> Tally:
+    """What is counted in neighbouring scenarios, with or without interactions."""
     selected, tally = Selected(dataset, rows), Tally()
     whole.count_scenarios(selected, tally)
     whole.count_egos(selected, tally)
@@ -105,16 +112,21 @@ def tally_of(dataset: Dataset, rows: Sequence[int]) -> Tally:
     actors.count_boxes(selected, tally)
     actors.count_speeds(selected, tally)
     count_collisions(selected, tally)
+    if interactions:
+        count_interactions(dataset, selected, tally)
     return tally
 
 
-def statistics_of(dataset: Dataset, tallies: Iterable[Tally], *, selected: bool) -> DatasetStatistics:
+def statistics_of(
+    dataset: Dataset, tallies: Iterable[Tally], *, selected: bool, interactions: bool = False
+) -> DatasetStatistics:
     """The statistics that the tallies of runs of scenarios add up to.
 
     Args:
         dataset: the release.
         tallies: of all runs, in any order.
         selected: whether they are of a selection.
+        interactions: whether these were counted too.
     """
     tally = Tally()
     for each in tallies:
@@ -129,6 +141,7 @@ def statistics_of(dataset: Dataset, tallies: Iterable[Tally], *, selected: bool)
         distance_histogram,
         speed_histogram,
         *collision_histograms(tally),
+        *(interaction_histograms(tally) if interactions else ()),
     ]
     quantiles = [whole.ego_sizes(tally), actors.box_sizes(tally), distance_quantiles, speed_quantiles]
     return DatasetStatistics(

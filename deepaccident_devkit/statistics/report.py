@@ -12,6 +12,7 @@ from pathlib import Path
 
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.files import writable_folder, write_bytes
+from deepaccident_devkit.statistics.interactions import SCENARIOS as _CRITICAL
 from deepaccident_devkit.statistics.results import (
     GROUPS,
     PROBABILITIES,
@@ -28,6 +29,8 @@ from deepaccident_devkit.taxonomy import CATEGORIES
 from deepaccident_devkit.text import columns_text
 
 _PAIRS = "collision_pairs"
+_LIMITS = (0.5, 1.0, 1.5, 3.0)
+"""Seconds; edges of the histogram of least times to collision."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,6 +122,8 @@ class DatasetStatistics(ShortRepr):
                 rows = [(value, *self._shares(table, value)) for value in table.counts if table.counts[value][TOTAL]]
                 blocks.append(columns_text([(table.field, *self.groups), *rows]))
         blocks += [self._lengths_text(), self._categories_text()]
+        if _CRITICAL in self.histograms:
+            blocks.append(self._critical_text())
         left_out = {
             f"{table.left_out.counts[TOTAL]:,} {table.left_out.what}"
             for table in self.tables
@@ -135,7 +140,7 @@ class DatasetStatistics(ShortRepr):
         cells = []
         for group in self.groups:
             count, total = table.counts[value][group], table.total(group)
-            cells.append(f"{count:,} ({round(100 * count / total) if total else 0:>3} %)")
+            cells.append(_share(count, total))
         return cells
 
     def _lengths_text(self) -> str:
@@ -145,6 +150,18 @@ class DatasetStatistics(ShortRepr):
             for index, label in enumerate(lengths.bin_labels())
         ]
         return columns_text([("length in frames", *self.groups), *rows, ("other", *self._cells(lengths.outside))])
+
+    def _critical_text(self) -> str:
+        """Scenarios in which a moving pair comes below some times to collision, of those with labels."""
+        times = self.histograms[_CRITICAL]
+        rows = []
+        for limit in _LIMITS:
+            cells = []
+            for group in self.groups:
+                count = sum(times.counts[group][: times.edges.index(limit)])
+                cells.append(_share(count, self.scenarios[group] - self.unlabelled[group]))
+            rows.append((f"below {limit:g} s", *cells))
+        return columns_text([("least TTC of moving pairs", *self.groups), *rows])
 
     def _categories_text(self) -> str:
         """A line a category: counts, and medians of size, distance and speed."""
@@ -164,6 +181,10 @@ class DatasetStatistics(ShortRepr):
             )
         heading = ("category, medians", "instances", "annotations", "l × w × h (m)", "distance (m)", "speed (m/s)")
         return columns_text([heading, *rows])
+
+
+def _share(count: int, total: int) -> str:
+    return f"{count:,} ({round(100 * count / total) if total else 0:>3} %)"
 
 
 def _number(value: float | None, digits: int) -> str:

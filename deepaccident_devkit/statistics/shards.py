@@ -36,6 +36,7 @@ def statistics_shard(
     out: str | os.PathLike[str],
     scenarios: Chosen = None,
     *,
+    interactions: bool = False,
     workers: int | None = None,
     executor: Executor | None = None,
     progress: bool = False,
@@ -47,6 +48,7 @@ def statistics_shard(
         shard: which part; of runs of neighbouring scenarios, so some of many shards may have none.
         out: the folder that the statistics are for; the shards lie beside it.
         scenarios: of all shards, as of `dataset_statistics`.
+        interactions: whether to count these too.
         workers: processes.
         executor: any executor of `concurrent.futures` to run on, in place of own workers.
         progress: whether to show a bar.
@@ -59,44 +61,53 @@ def statistics_shard(
         TokenError, ChoiceError, WorkerError: as of `dataset_statistics`.
     """
     rows = chosen_rows(dataset, scenarios)
-    runs, files = shard.of(runs_of(rows)), _shard_files(dataset, out, rows)
+    runs, files = shard.of(runs_of(rows)), _shard_files(dataset, out, rows, interactions=interactions)
     for folder in (out, files.folder):
         writable_folder(folder)
     if _read(files.path(shard)).keys() != {run[0] for run in runs}:
-        tallies = tallies_of(dataset, runs, workers=workers, executor=executor, progress=progress)
+        tallies = tallies_of(
+            dataset, runs, interactions=interactions, workers=workers, executor=executor, progress=progress
+        )
         _write(files.path(shard), {run[0]: tally for run, tally in zip(runs, tallies, strict=True)})
     return sum(len(run) for run in runs)
 
 
-def merged_statistics(dataset: Dataset, out: str | os.PathLike[str], scenarios: Chosen = None) -> DatasetStatistics:
+def merged_statistics(
+    dataset: Dataset, out: str | os.PathLike[str], scenarios: Chosen = None, *, interactions: bool = False
+) -> DatasetStatistics:
     """What `dataset_statistics` gives, from the files of all shards.
 
     Args:
         dataset: the release.
         out: the folder that the shards were given.
         scenarios: those that the shards were given.
+        interactions: whether the shards counted these.
 
     Raises:
         UnfinishedError: some scenarios were not counted, or from another state of the release, or by another devkit.
         TokenError, ChoiceError: as of `dataset_statistics`.
     """
     rows = chosen_rows(dataset, scenarios)
-    files = _shard_files(dataset, out, rows)
+    files = _shard_files(dataset, out, rows, interactions=interactions)
     tallies = {first: tally for path in files.found() for first, tally in _read(path).items()}
     tokens = {run[0]: [dataset.scenario[row]["token"] for row in run] for run in runs_of(rows)}
     done = {token for first in tallies for token in tokens[first]}
     check_whole([token for run in tokens.values() for token in run], done, files.folder)
-    return statistics_of(dataset, tallies.values(), selected=scenarios is not None)
+    return statistics_of(dataset, tallies.values(), selected=scenarios is not None, interactions=interactions)
 
 
-def remove_shards(dataset: Dataset, out: str | os.PathLike[str], scenarios: Chosen = None) -> None:
+def remove_shards(
+    dataset: Dataset, out: str | os.PathLike[str], scenarios: Chosen = None, *, interactions: bool = False
+) -> None:
     """Remove what shards kept, once the whole is written; arguments and errors are those of `merged_statistics`."""
-    _shard_files(dataset, out, chosen_rows(dataset, scenarios)).remove()
+    _shard_files(dataset, out, chosen_rows(dataset, scenarios), interactions=interactions).remove()
 
 
-def _shard_files(dataset: Dataset, out: str | os.PathLike[str], rows: Sequence[int]) -> ShardFiles:
-    """The files of the shards of these scenarios of this state of the release."""
-    text = repr((__version__, dataset.tables_folder.name, runs_of(rows)))
+def _shard_files(
+    dataset: Dataset, out: str | os.PathLike[str], rows: Sequence[int], *, interactions: bool
+) -> ShardFiles:
+    """The files of the shards of these scenarios of this state of the release, with or without interactions."""
+    text = repr((__version__, dataset.tables_folder.name, runs_of(rows), interactions))
     return ShardFiles(Path(out).absolute(), hashlib.blake2b(text.encode(), digest_size=8).hexdigest(), ".npz")
 
 

@@ -1,5 +1,6 @@
 """JSON Schemas of the records, and the page's table of columns, both derived from the declared records."""
 
+from collections.abc import Mapping
 from typing import Any
 
 from deepaccident_devkit.tables.arrow import arrow_type
@@ -23,14 +24,14 @@ from deepaccident_devkit.tables.tokens import FORMS
 _DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 
-def json_schemas() -> dict[str, dict[str, Any]]:
-    """Table name → JSON Schema (draft 2020-12) of one of its records."""
-    return {name: _record_schema(spec) for name, spec in table_specs().items()}
+def json_schemas(derived: Mapping[str, TableSpec] | None = None) -> dict[str, dict[str, Any]]:
+    """Table name → JSON Schema (draft 2020-12) of one of its records; of the index's tables and of derived ones."""
+    return {name: _record_schema(spec) for name, spec in {**table_specs(), **(derived or {})}.items()}
 
 
-def columns_markdown() -> str:
-    """A Markdown section a table: what a row is, its token, and its columns."""
-    return "\n\n".join(_table_markdown(spec) for spec in table_specs().values()) + "\n"
+def columns_markdown(derived: Mapping[str, TableSpec] | None = None) -> str:
+    """A Markdown section a table: what a row is, its token, and its columns; derived tables last, without tokens."""
+    return "\n\n".join(_table_markdown(spec) for spec in {**table_specs(), **(derived or {})}.values()) + "\n"
 
 
 def _record_schema(spec: TableSpec) -> dict[str, Any]:
@@ -93,7 +94,7 @@ def _table_markdown(spec: TableSpec) -> str:
     lines = [
         f"### `{spec.name}`",
         "",
-        f"{spec.doc} Token: `{FORMS[spec.name]}`.",
+        f"{spec.doc} Token: `{FORMS[spec.name]}`." if spec.name in FORMS else spec.doc,
         "",
         "| field | stored as | meaning |",
         "|---|---|---|",

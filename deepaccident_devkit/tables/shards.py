@@ -3,7 +3,6 @@
 A shard is a compressed Arrow stream a table, one after the other, and at its end a checksum of all of it.
 """
 
-import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
@@ -14,14 +13,13 @@ import numpy as np
 
 from deepaccident_devkit.arrays import AnyArray
 from deepaccident_devkit.errors import IndexStoreError
-from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.geometry import quaternions
-from deepaccident_devkit.reading import read_bytes
-from deepaccident_devkit.tables.arrow import Columns, arrow_schema, fault_of, record_batch, unpacked, views
+from deepaccident_devkit.tables.arrow import Columns
 from deepaccident_devkit.tables.columns import NULL_INTEGER, Key, TableSpec
 from deepaccident_devkit.tables.sensor_rows import sensor_rows
 from deepaccident_devkit.tables.specs import table_specs
 from deepaccident_devkit.tables.store import TableWriter, write_table
+from deepaccident_devkit.tables.streams import read_streams, streams_metadata, whole_streams, write_streams
 from deepaccident_devkit.taxonomy import CATEGORIES, SPLITS
 
 SHARED_TABLES = ("sensor", "category")
@@ -30,7 +28,6 @@ _FROM_OTHERS: Mapping[str, Mapping[str, Callable[[Columns], AnyArray]]] = {
     "annotation": {"rotation": lambda rows: quaternions.from_yaw(rows["yaw"])}
 }
 """Table → column that a shard does without, since it follows from others: a twentieth of the index."""
-_CHECKSUM_SIZE = 16
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,16 +61,7 @@ def shard_specs() -> list[TableSpec]:
 
 def write_shard(path: Path, tables: Mapping[str, Columns], state: ShardState) -> None:
     """Write the rows of every table as compressed Arrow streams, one after the other."""
-    import pyarrow as pa
-
-    options = pa.ipc.IpcWriteOptions(compression="zstd")
-    sink = pa.BufferOutputStream()
-    for spec in shard_specs():
-        schema = arrow_schema(spec).with_metadata(asdict(state))
-        with pa.ipc.new_stream(sink, schema, options=options) as writer:
-            writer.write_batch(record_batch(spec, tables[spec.name]))
-    content = sink.getvalue().to_pybytes()
-    write_bytes(path, content + _checksum(content))
+    write_streams(path, [(spec, tables[spec.name]) for spec in shard_specs()], asdict(state))
 
 
 def read_shard(path: Path) -> dict[str, dict[str, Any]]:
@@ -83,34 +71,26 @@ def read_shard(path: Path) -> dict[str, dict[str, Any]]:
     """
     import pyarrow as pa
 
-    tables = {}
+    specs = shard_specs()
     with pa.OSFile(str(path), "rb") as source:
-        for spec in shard_specs():
-            batches = list(pa.ipc.open_stream(source))  # to the stream's end, where the next one starts
-            if len(batches) != 1 or fault_of(spec, batches[0]):
-                raise IndexStoreError(f"{path}: not a shard; remove the index with: deepaccident index clear DATAROOT")
-            batch = batches[0]
-            rows = {name: unpacked(view) for name, view in views(spec, batch).items()}
-            tables[spec.name] = rows | {name: of(rows) for name, of in _FROM_OTHERS.get(spec.name, {}).items()}
-    return tables
+        read = read_streams(source, specs)
+    if read is None:
+        raise IndexStoreError(f"{path}: not a shard; remove the index with: deepaccident index clear DATAROOT")
+    return {
+        spec.name: rows | {name: of(rows) for name, of in _FROM_OTHERS.get(spec.name, {}).items()}
+        for spec, rows in zip(specs, read, strict=True)
+    }
 
 
 def shard_state(path: Path) -> ShardState | None:
     """What a shard was made from, None if there is no whole shard."""
     import pyarrow as pa
 
+    content = whole_streams(path)
     try:
-        content = read_bytes(path, "index")
-        if content[-_CHECKSUM_SIZE:] != _checksum(content[:-_CHECKSUM_SIZE]):
-            return None
-        metadata = pa.ipc.open_stream(content).schema.metadata or {}
-        return ShardState(**{name.decode(): value.decode() for name, value in metadata.items()})
-    except (OSError, pa.ArrowException, TypeError, ValueError):  # an older devkit's
+        return None if content is None else ShardState(**streams_metadata(content))
+    except (pa.ArrowException, TypeError, ValueError):  # an older devkit's
         return None
-
-
-def _checksum(content: bytes) -> bytes:
-    return hashlib.blake2b(content, digest_size=_CHECKSUM_SIZE).digest()
 
 
 def join_tables(folder: Path, shards: Sequence[Path], splits: Sequence[str | None]) -> None:

@@ -15,7 +15,7 @@ from deepaccident_devkit.text import meant_text, spelled
 @cache
 def table_specs() -> Mapping[str, TableSpec]:
     """Every table, in the order in which the tables build on each other."""
-    return {name: _spec(name, record) for name, record in RECORDS.items()}
+    return {name: spec_of(name, record) for name, record in RECORDS.items()}
 
 
 def table_spec(name: str) -> TableSpec:
@@ -33,7 +33,8 @@ def record_columns(record: type) -> tuple[Column, ...]:
     return tuple(_column(field, hint) for field, hint in get_type_hints(record, include_extras=True).items())
 
 
-def _spec(name: str, record: type) -> TableSpec:
+def spec_of(name: str, record: type) -> TableSpec:
+    """The specification of a table whose records a TypedDict of annotated fields declares."""
     return TableSpec(name=name, doc=" ".join((record.__doc__ or "").split()), columns=record_columns(record))
 
 

@@ -10,7 +10,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, DeepAccidentError, FieldError
 from deepaccident_devkit.evaluation.metrics.attributes import ATTRIBUTES
 from deepaccident_devkit.overview import _counts, overview
-from deepaccident_devkit.selection import Filter, parse_where
+from deepaccident_devkit.selection import Filter, fields, parse_where
 from deepaccident_devkit.selection.fields import FIELDS, group_texts
 from deepaccident_devkit.tables.records import CollisionRecord, ScenarioRecord
 from deepaccident_devkit.v2x import accident_visibility, accident_visible
@@ -444,3 +444,39 @@ def test_a_release_without_ego_and_a_recording_too_short_have_no_visibility(tmp_
 
 def test_an_overview_sorts_numbers_by_size_and_unknown_ones_last() -> None:
     assert list(_counts([10, 2, None, 2, 1])) == ["1", "2", "10", "none"]
+
+
+def test_the_most_critical_moving_pair(da_motion: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:
+    accident, normal = (da_motion.find(collision=collided)[0] for collided in (True, False))
+    pairs = da_motion.interactions(accident).pairs
+    expected = {
+        "min_ttc": pairs.min_ttc[pairs.moving].min(),
+        "min_pet": np.abs(pairs.pet[pairs.moving]).min(),
+        "min_gap": pairs.min_gap[pairs.moving].min(),
+        "max_drac": pairs.max_drac[pairs.moving].max(),
+    }
+    for name, value in expected.items():
+        assert FIELDS[name].read(da_motion, accident) == value, name
+        assert da_motion.find(**{name: lambda found, value=value: found == value})[0] == accident, name
+    assert da_motion.find(min_ttc="..0.3") == da_motion.find("min_ttc<=0.3") == [accident]
+    assert da_motion.find("min_ttc>0.3") == [normal]
+    assert da_motion.find(max_drac=lambda rate: rate > 20) == [accident]
+    asked: list[str] = []
+    computed = fields.interactions_of
+
+    def noted(dataset: DeepAccident, scenarios, **how):
+        asked.extend(scenario["token"] for scenario in scenarios)
+        return computed(dataset, scenarios, **how)
+
+    monkeypatch.setattr(fields, "interactions_of", noted)
+    assert da_motion.find(min_ttc="..100", collision=False) == [normal]
+    assert asked == [normal["token"]], "costly fields come last"
+
+
+def test_without_pairs_nothing_is_near_and_without_labels_nothing_is_known(da: DeepAccident, tmp_path: Path) -> None:
+    for name, far in (("min_ttc", np.inf), ("min_pet", np.inf), ("min_gap", np.inf), ("max_drac", 0.0)):
+        assert {FIELDS[name].read(da, scenario) for scenario in da.scenario} == {far}
+    bare = DeepAccident(dataroot=write_tiny_release(tmp_path, labelled=False), verbose=False)
+    assert [FIELDS["min_ttc"].read(bare, scenario) for scenario in bare.scenario] == [None]
+    assert bare.find(min_ttc=None) == bare.scenario[:]
+    assert bare.find(min_ttc="0..") == []

@@ -1,0 +1,172 @@
+"""`Interactions`: the pairs of a scenario that come near each other, as arrays, Arrow tables and records."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays, IntArray
+from deepaccident_devkit.interactions.config import InteractionConfig
+from deepaccident_devkit.interactions.records import PAIRS, ROWS, interaction_specs
+from deepaccident_devkit.tables.columns import Key, Vector
+from deepaccident_devkit.tables.tokens import frame_token, instance_token
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class InteractionPairs(FrozenArrays):
+    """The L pairs of a scenario that come under a threshold, over the recording; arrays are read-only.
+
+    Least and most are over all frames at which both are annotated and at least one moves. Infinite is never.
+
+    Attributes:
+        scenario: token.
+        actor_ids: (L, 2) CARLA ids, the smaller first; rows ascend.
+        num_frames: (L,) frames that count.
+        moving: (L,) whether each of the two moves at some frame.
+        min_ttc: (L,) least time to collision, seconds.
+        min_ttc_frame: (L,) its first frame, numbered from 1; 0 without one.
+        min_gap: (L,) least gap, metres.
+        min_gap_frame: (L,) its first frame.
+        max_drac: (L,) most deceleration needed, m/s²; infinite where they touch.
+        min_mttc: (L,) least time to collision with accelerations, seconds.
+        pet: (L,) post-encroachment time, seconds, positive if the first of the two was there first.
+        tet: (L, 2) time exposed at each of the config's `taus`, seconds.
+        tit: (L, 2) time integrated at each of them, s².
+    """
+
+    scenario: str
+    actor_ids: IntArray
+    num_frames: IntArray
+    moving: BoolArray
+    min_ttc: FloatArray
+    min_ttc_frame: IntArray
+    min_gap: FloatArray
+    min_gap_frame: IntArray
+    max_drac: FloatArray
+    min_mttc: FloatArray
+    pet: FloatArray
+    tet: FloatArray
+    tit: FloatArray
+
+    def __len__(self) -> int:
+        """Number of pairs."""
+        return len(self.actor_ids)
+
+    def position(self, first: int, second: int) -> int | None:
+        """The position of the pair of two actors, in any order; None if it never came under a threshold."""
+        found = np.flatnonzero((self.actor_ids == sorted((first, second))).all(axis=1))
+        return int(found[0]) if len(found) else None
+
+    def to_arrow(self) -> Any:
+        """A `pyarrow.Table` with the fields of `interaction_pair` (schema/README.md), tokens as texts."""
+        columns = {
+            "scenario_token": [self.scenario] * len(self),
+            **_actor_tokens(self.scenario, self.actor_ids),
+            **{f"{name}_token": _frame_tokens(self.scenario, getattr(self, name)) for name in _FRAMES},
+        }
+        return _arrow_table(PAIRS, self, columns)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Interactions(FrozenArrays):
+    """The pairs of a scenario at the N moments at which they are under a threshold; arrays are read-only.
+
+    Rows ascend by frame, then by pair. Infinite is never; NaN is unknown: an actor's velocity, or the closing speed of
+    boxes that touch.
+
+    Attributes:
+        scenario: token.
+        config: the thresholds and assumptions.
+        labelled: whether there are labels; without them there are no rows, and nothing is known.
+        frame: (N,) numbers from 1.
+        actor_ids: (N, 2) CARLA ids, the smaller first.
+        gap: (N,) between the boxes, metres.
+        closing_speed: (N,) with which the gap shrinks, m/s.
+        ttc: (N,) time to collision, seconds.
+        ttc_1d: (N,) the same along the heading of the one behind, seconds.
+        drac: (N,) deceleration needed, m/s².
+        mttc: (N,) time to collision with accelerations, seconds.
+        delta_v: (N, 2) change of each one's velocity if they collided now, m/s, with assumed masses.
+        impact_angle: (N,) the second's heading as the first sees it, radians in (−π, π].
+        pairs: the same pairs over the recording.
+    """
+
+    scenario: str
+    config: InteractionConfig
+    labelled: bool
+    frame: IntArray
+    actor_ids: IntArray
+    gap: FloatArray
+    closing_speed: FloatArray
+    ttc: FloatArray
+    ttc_1d: FloatArray
+    drac: FloatArray
+    mttc: FloatArray
+    delta_v: FloatArray
+    impact_angle: FloatArray
+    pairs: InteractionPairs
+
+    def __len__(self) -> int:
+        """Number of pairs at moments."""
+        return len(self.frame)
+
+    def __repr__(self) -> str:
+        """How many there are, and the most critical of two that move."""
+        if not self.labelled:
+            return f"Interactions({self.scenario}: no labels)"
+        text = f"Interactions({self.scenario}: {len(self.pairs)} pairs, {len(self)} rows"
+        times = np.where(self.pairs.moving, self.pairs.min_ttc, np.inf)
+        if not np.isfinite(times).any():
+            return f"{text})"
+        row = int(times.argmin())
+        first, second = self.pairs.actor_ids[row].tolist()
+        frame = self.pairs.min_ttc_frame[row]
+        return f"{text}; least TTC of moving pairs {times[row]:.2f} s: actors {first} and {second} at frame {frame})"
+
+    def of_pair(self, first: int, second: int) -> IntArray:
+        """The positions of the rows of two actors, in any order."""
+        return np.flatnonzero((self.actor_ids == sorted((first, second))).all(axis=1))
+
+    def to_arrow(self) -> Any:
+        """A `pyarrow.Table` with the fields of `interaction` (schema/README.md), tokens as texts."""
+        columns = {"frame_token": _frame_tokens(self.scenario, self.frame)}
+        return _arrow_table(ROWS, self, columns | _actor_tokens(self.scenario, self.actor_ids))
+
+
+_FRAMES = ("min_ttc_frame", "min_gap_frame")
+
+
+def array_names(kind: type) -> list[str]:
+    """The fields of a class of this module that are columns of its table under the same name."""
+    others = {"scenario", "config", "labelled", "frame", "actor_ids", "pairs", *_FRAMES}
+    return [field.name for field in fields(kind) if field.name not in others]
+
+
+def _arrow_table(name: str, arrays: Any, given: Mapping[str, Any]) -> Any:
+    import pyarrow as pa
+
+    columns = {}
+    for column in interaction_specs()[name].columns:
+        if isinstance(column.kind, Key):
+            columns[column.field] = pa.array(given[column.field], type=pa.string())
+            continue
+        values: AnyArray = getattr(arrays, column.field)
+        unknown: BoolArray = np.isnan(values.sum(axis=tuple(range(1, values.ndim))))
+        if isinstance(column.kind, Vector):
+            rows = [None if null else each for null, each in zip(unknown.tolist(), values.tolist(), strict=True)]
+            columns[column.field] = pa.array(rows, type=pa.list_(pa.float64(), column.kind.length))
+        else:
+            columns[column.field] = pa.array(values, mask=unknown)
+    return pa.table(columns)
+
+
+def _actor_tokens(scenario: str, actor_ids: IntArray) -> dict[str, list[str]]:
+    sides = zip(("first_token", "second_token"), actor_ids.T.tolist(), strict=True)
+    return {name: [instance_token(scenario, actor) for actor in actors] for name, actors in sides}
+
+
+def _frame_tokens(scenario: str, frames: IntArray) -> list[str | None]:
+    return [frame_token(scenario, frame) if frame else None for frame in frames.tolist()]

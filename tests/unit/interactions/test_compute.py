@@ -1,0 +1,162 @@
+"""Which pairs are interactions, and their least and most: hand-made motions, and against all pairs one by one."""
+
+import math
+import pickle
+from itertools import combinations
+
+import numpy as np
+import pytest
+from interaction_scenes import BIKE, PEDESTRIAN, straight, tracks_of
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.interactions import CLASS_MASSES, InteractionConfig, gaps_of_pairs, time_to_collision
+from deepaccident_devkit.interactions.compute import Measured, measured_pairs, pair_summaries
+from deepaccident_devkit.interactions.motion import ActorMotion, actor_motion
+from deepaccident_devkit.v2x.tracks import scenario_tracks
+
+DEFAULT = InteractionConfig()
+
+
+def of_scene(paths, sizes=None, unknown=(), config=DEFAULT) -> tuple[ActorMotion, Measured, dict[str, np.ndarray]]:
+    frames = max((len(path) for path in paths.values()), default=0)
+    motion = actor_motion(tracks_of(paths, sizes or {}, unknown), frames, config)
+    measured = measured_pairs(motion, config)
+    return motion, measured, pair_summaries(motion, measured, config)
+
+
+def pairs_in(paths, **options) -> list[tuple[int, int]]:
+    motion, measured, _ = of_scene(paths, **options)
+    return [tuple(pair) for pair in motion.ids[measured.pairs].tolist()]
+
+
+def test_one_that_drives_up_to_another() -> None:
+    paths = {7: straight(11, 0, 0, 10), 3: straight(11, 30, 0, 0)}
+    motion, measured, found = of_scene(paths)
+    assert motion.ids.tolist() == [3, 7]
+    gaps = 26 - np.arange(11.0)
+    np.testing.assert_allclose(measured.values["gap"][0], gaps)
+    for name in ("ttc", "ttc_1d", "mttc"):
+        np.testing.assert_allclose(measured.values[name][0], gaps / 10, err_msg=name)
+    np.testing.assert_allclose(measured.values["drac"][0], 100 / (2 * gaps))
+    np.testing.assert_allclose(measured.values["closing_speed"][0], 10)
+    assert found["num_frames"].tolist() == [11]
+    assert found["moving"].tolist() == [False]
+    assert (found["min_ttc"].item(), found["min_gap"].item()) == (pytest.approx(1.6), pytest.approx(16))
+    assert found["min_ttc_frame"].item() == found["min_gap_frame"].item() == 10
+    assert found["max_drac"].item() == pytest.approx(100 / 32)
+    assert found["tet"].tolist() == [[0, pytest.approx(1.1)]]
+    assert found["tit"].item(1) == pytest.approx(0.1 * sum(3 - gap / 10 for gap in gaps))
+
+
+def test_thresholds_decide_and_so_does_the_radius() -> None:
+    paths = {1: straight(5, 0, 0, 10), 2: straight(5, 30, 0, 0), 3: straight(5, 0, 5.5, 10)}
+    assert pairs_in(paths) == [(1, 2), (1, 3)]
+    assert pairs_in(paths, config=InteractionConfig(max_ttc=2.1)) == [(1, 3)]  # 2.2 s at the last frame
+    assert pairs_in(paths, config=InteractionConfig(max_ttc=2.2, max_gap=3.4)) == [(1, 2)]
+    assert pairs_in(paths, config=InteractionConfig(max_gap=3.5)) == [(1, 2), (1, 3)]
+    assert pairs_in(paths, config=InteractionConfig(radius=25.9)) == [(1, 3)]
+    assert pairs_in(paths, config=InteractionConfig(radius=26.1)) == [(1, 2), (1, 3)]
+
+
+def test_two_that_stand_are_none_and_frames_at_which_both_stand_do_not_count() -> None:
+    assert pairs_in({1: straight(4, 0, 0, 0), 2: straight(4, 3, 0, 0.4)}) == []  # one in the other
+    stops = [*straight(4, 0, 0, 10), *[(3.0, 0.0, 0.0)] * 4]
+    _, measured, found = of_scene({1: stops, 2: straight(8, 9, 0, 0)})
+    assert measured.counts[0].tolist() == [True] * 4 + [False] * 4
+    assert found["num_frames"].tolist() == [4]
+
+
+def test_what_rides_on_another_is_no_pair_and_one_that_is_hit_is() -> None:
+    sizes = {2: BIKE, 3: PEDESTRIAN}
+    ride = {2: straight(6, 0, 0, 6), 3: straight(6, 0.2, 0, 6)}
+    assert pairs_in(ride, sizes=sizes) == []
+    jumps_off = {**ride, 3: [*straight(3, 0.2, 0, 6), *straight(3, 1.9, 3, 0)]}
+    assert pairs_in(jumps_off, sizes=sizes) == [(2, 3)]
+    hit = {2: straight(6, 0, 0, 6), 3: straight(6, 0.2, 0, 0)}
+    assert pairs_in(hit, sizes=sizes) == [(2, 3)]
+
+
+def test_who_is_not_there_and_nobody_at_all() -> None:
+    seen_once = {1: straight(6, 0, 0, 10), 2: [None, None, (15.0, 0.0, 0.0), None, None, None]}
+    motion, measured, found = of_scene(seen_once)
+    assert measured.counts.sum() == found["num_frames"].item() == 1
+    assert found["min_ttc"].item() == pytest.approx(0.9)
+    assert found["min_ttc_frame"].item() == 2
+    assert motion.acceleration[1].tolist() == [0] * 6
+    for paths in ({}, {5: straight(3, 0, 0, 5)}, {1: [None, (0, 0, 0)], 2: [(0, 0, 0), None]}):
+        _, measured, found = of_scene(paths)
+        assert len(measured.pairs) == len(found["min_ttc"]) == len(found["tet"]) == 0
+
+
+def test_an_unknown_velocity_is_the_displacement_or_makes_no_numbers() -> None:
+    paths = {1: straight(5, 0, 0, 10), 2: straight(5, 30, 0, 0)}
+    motion, measured, _ = of_scene(paths, unknown=(1,))
+    np.testing.assert_allclose(motion.velocity[0], np.tile([10, 0], (5, 1)))
+    np.testing.assert_allclose(measured.values["ttc"][0], (26 - np.arange(5)) / 10)
+    once = {1: [(6.0, 0.0, 0.0), *[None] * 4], 2: straight(5, 0, 0, 5)}
+    _, measured, found = of_scene(once, unknown=(1,))
+    for name in ("ttc", "ttc_1d", "drac", "mttc", "closing_speed", "delta_v"):
+        assert np.isnan(measured.values[name][0, 0]).all(), name
+    assert measured.values["gap"][0, 0] == pytest.approx(2)
+    assert (found["min_ttc"].item(), found["max_drac"].item(), found["min_mttc"].item()) == (math.inf, 0, math.inf)
+
+
+def test_braking_is_in_the_time_with_accelerations_alone() -> None:
+    braking = [(way, 0.0, 0.0) for way in (10 * t - 4 * t * t for t in np.arange(10) / 10)]
+    _, measured, _ = of_scene({1: braking, 2: straight(10, 12, 0, 0)})
+    assert measured.values["ttc"][0, 4] == pytest.approx((12 - 4 - braking[4][0]) / (10 - 8 * 0.4))
+    assert measured.values["mttc"][0, 4] == math.inf  # it needs 6.25 m
+
+
+def test_delta_v_follows_the_masses() -> None:
+    paths = {1: straight(3, 0, 0, 10), 2: straight(3, 9, 0, 0)}
+    sizes = {2: PEDESTRIAN}
+    _, measured, _ = of_scene(paths, sizes=sizes)
+    car, pedestrian = measured.values["delta_v"][0, 0]
+    assert car + pedestrian == pytest.approx(10)
+    assert car < 1 < pedestrian
+    heavier = InteractionConfig(class_masses={**CLASS_MASSES, "pedestrian": 1e6})
+    assert of_scene(paths, sizes=sizes, config=heavier)[1].values["delta_v"][0, 0, 0] > 9
+
+
+@pytest.mark.parametrize(
+    "config", [DEFAULT, InteractionConfig(max_ttc=2, max_gap=1, radius=40)], ids=["wide", "narrow"]
+)
+def test_nothing_is_left_out_and_least_is_over_all_frames(da_motion: DeepAccident, config: InteractionConfig) -> None:
+    """Against every pair at every frame, without circles around boxes."""
+    scenario = da_motion.find(collision=True)[0]
+    motion = actor_motion(scenario_tracks(da_motion, scenario), scenario["num_frames"], config)
+    measured = measured_pairs(motion, config)
+    found = pair_summaries(motion, measured, config)
+    pairs = np.array(list(combinations(range(len(motion.ids)), 2)))
+    first, second = pairs.T
+    ttc = time_to_collision(motion.boxes[first], motion.boxes[second], motion.velocity[first], motion.velocity[second])
+    ttc = np.where(ttc > config.horizon, np.inf, ttc)
+    gap = gaps_of_pairs(motion.boxes[first], motion.boxes[second])
+    apart = np.linalg.norm(motion.boxes[first, :, :2] - motion.boxes[second, :, :2], axis=-1)
+    counts = ~np.isnan(gap) & (motion.moves[first] | motion.moves[second])
+    under = counts & (apart <= config.radius) & ((ttc <= config.max_ttc) | (gap <= config.max_gap))
+    listed = under.any(axis=1)
+    assert 3 < listed.sum() < len(pairs)
+    np.testing.assert_array_equal(measured.pairs, pairs[listed])
+    np.testing.assert_array_equal(measured.rows, under[listed])
+    np.testing.assert_array_equal(found["min_ttc"], np.where(counts, ttc, np.inf).min(axis=1)[listed])
+    np.testing.assert_array_equal(found["min_gap"], np.where(counts, gap, np.inf).min(axis=1)[listed])
+
+
+def test_a_config_is_checked_and_travels() -> None:
+    config = InteractionConfig(max_ttc=3, class_masses={**CLASS_MASSES, "car": 1400})
+    assert pickle.loads(pickle.dumps(config)) == config != DEFAULT
+    assert InteractionConfig(max_ttc=10) == DEFAULT
+    with pytest.raises(TypeError, match="does not support item assignment"):
+        config.class_masses["car"] = 1.0  # type: ignore[index]
+    for wrong, told in (
+        ({"radius": -1}, "radius: expected a number from 0, found -1"),
+        ({"max_ttc": math.nan}, "max_ttc: expected a number from 0, found nan"),
+        ({"max_gap": "far"}, "max_gap: expected a number, found 'far'"),
+        ({"taus": (1.5,)}, "taus: expected two thresholds in seconds, found 1"),
+        ({"horizon": 2}, "horizon: expected at least max_ttc, 10.0 s, found 2.0 s"),
+    ):
+        with pytest.raises(ConfigError, match=told):
+            InteractionConfig(**wrong)
