@@ -63,8 +63,16 @@ def test_a_stopped_one_is_hit() -> None:
     assert told.speeds[0, 0] == pytest.approx([0, 10])
     assert told.reduction[0, 0] == pytest.approx(0.5)
     assert names(outcomes_of(case, BOTH, [2.5], brakings=AT_ONCE).outcome) == ["avoided"]
-    # both still move at 4.9 s
+    # both still move at the contact
     assert names(outcomes_of(case, BOTH, [4.5], brakings=AT_ONCE).outcome) == ["mitigated"]
+
+
+def test_one_of_two_who_brake_stands_and_the_other_does_not() -> None:
+    """At 3.9 s 26.4 m are left: the slow one stands after 1.6 m, the fast one comes with 12 m/s."""
+    case = accident(straight((0, 0), 0, 4, 51), straight((124, 0), np.pi, 20, 51))
+    told = outcomes_of(case, BOTH, [3.9], brakings=AT_ONCE)
+    assert told.speeds[0, 0] == pytest.approx([0, np.sqrt(400 - 2 * 5 * 24.8)], abs=1e-3)
+    assert names(told.outcome) == ["mitigated"]
 
 
 def test_who_stood_in_the_recording_too_is_not_stopped_by_braking() -> None:
