@@ -1,13 +1,14 @@
 """When replays of a pair first touch: no contact is missed, however short.
 
-A time interval is proven free of contact by the gaps at its ends and by how far the two can come within it: a gap
-changes by no more than the paths that the centres travel and the arcs that the corners turn. What is not proven is
-halved. So the steps are long where the two are far apart and short where they nearly touch.
+A time interval is proven free of contact by the gaps at its ends and by how far the two can come within it
+(`_contact_possible`). What is not proven is halved. So the steps are long where the two are far apart and short where
+they nearly touch.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 from itertools import pairwise
 from typing import Final
 
@@ -137,6 +138,26 @@ def _plans(pair: Pair, starts: ArrayLike, decelerations: ArrayLike) -> tuple[Bra
     return first, second
 
 
+class _Mark(IntEnum):
+    """Rows of what is known of a replay at a time."""
+
+    TIME = 0
+    """Seconds."""
+    GAP = 1
+    """Metres, less the margin; or a lower bound."""
+    WAY = 2
+    """Metres that the two have travelled, and their corners turned."""
+    TURN = 3
+    """Metres that their corners have turned."""
+    X = 4
+    Y = 5
+    """Metres from the second centre to the first."""
+    SPEED = 6
+    """m/s of both together."""
+    STRETCH = 7
+    """A number for the two stretches of their paths."""
+
+
 class _Gaps:
     """Gaps of replays of a pair at times, and how far the two have moved until then."""
 
@@ -146,21 +167,20 @@ class _Gaps:
         self._reaches = np.hypot(*pair.sizes.T) / 2
         self._fastest = sum(float(motion.speeds.max()) for motion in pair.motions)
 
-    def at(self, rows: IntArray, times: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:
-        """(N,) gaps less the margin, and metres moved; of pairs farther apart than a step's way, a lower bound."""
+    def at(self, rows: IntArray, times: FloatArray, step: float) -> FloatArray:
+        """(8, N) marks; the gap is a lower bound where the two are farther apart than they drive in a step."""
         one, two = (
             replay(motion, plan, rows, times) for motion, plan in zip(self._pair.motions, self._plans, strict=True)
         )
-        moved = self._moved(one, 0) + self._moved(two, 1)
-        apart = np.hypot(*(one.poses - two.poses)[:, :2].T) - self._reaches.sum()
-        near = np.flatnonzero(apart <= self._pair.margin + self._fastest * step)
+        turn = self._reaches[0] * one.turned + self._reaches[1] * two.turned
+        x, y = (one.poses - two.poses)[:, :2].T
+        gap = np.hypot(x, y) - self._reaches.sum()
+        near = np.flatnonzero(gap <= self._pair.margin + self._fastest * step)
         outlines = (self._outlines(states, which, near) for which, states in enumerate((one, two)))
-        apart[near] = gaps_of_pairs(*outlines)
-        return apart - self._pair.margin, moved
-
-    def _moved(self, states: ReplayStates, which: int) -> FloatArray:
-        moved: FloatArray = states.arcs + self._reaches[which] * states.turned
-        return moved
+        gap[near] = gaps_of_pairs(*outlines)
+        stretch = one.stretches * len(self._pair.motions[1].times) + two.stretches
+        way = one.arcs + two.arcs + turn
+        return np.stack([times, gap - self._pair.margin, way, turn, x, y, one.speeds + two.speeds, stretch])
 
     def _outlines(self, states: ReplayStates, which: int, rows: IntArray) -> FloatArray:
         poses = states.poses[rows]
@@ -189,26 +209,37 @@ def _search(
 def _refined(gaps: _Gaps, nodes: FloatArray, begun: FloatArray, *, earliest: bool) -> FloatArray:
     """(N,) times of contact after `begun` (N,), inf for none; intervals between nodes are halved as long as needed."""
     found = np.full(len(begun), np.inf)
-    rows, ends, gap, moved = _first_intervals(gaps, nodes, begun)
-    for end in (1, 0):
-        _note(found, rows, ends[end], gap[end])
+    rows, ends = _first_intervals(gaps, nodes, begun)
+    for marks in ends:
+        _note(found, rows, marks)
     for halving in range(1, _HALVINGS + 1):
         limit = found if earliest else np.where(np.isfinite(found), -np.inf, np.inf)
-        kept = np.flatnonzero((gap.sum(axis=0) <= np.abs(moved[1] - moved[0])) & (ends[0] < limit[rows]))
+        kept = np.flatnonzero(_contact_possible(ends) & (ends[0, _Mark.TIME] < limit[rows]))
         if not len(kept):
             break
-        rows, ends, gap, moved = rows[kept], ends[:, kept], gap[:, kept], moved[:, kept]
-        middle = ends.mean(axis=0)
-        there, way = gaps.at(rows, middle, _COARSE / 2**halving)
-        _note(found, rows, middle, there)
+        rows, ends = rows[kept], ends[..., kept]
+        middle = gaps.at(rows, ends[:, _Mark.TIME].mean(axis=0), _COARSE / 2**halving)
+        _note(found, rows, middle)
         rows = np.concatenate([rows, rows])
-        ends, gap, moved = (_halved(*pair) for pair in ((ends, middle), (gap, there), (moved, way)))
+        ends = np.concatenate([[ends[0], middle], [middle, ends[1]]], axis=2)
     return found
 
 
-def _halved(ends: FloatArray, middle: FloatArray) -> FloatArray:
-    """(2, 2 M) values at both ends of the halves of M intervals, of values at their ends and in their middle."""
-    return np.concatenate([[ends[0], middle], [middle, ends[1]]], axis=1)
+def _contact_possible(ends: FloatArray) -> BoolArray:
+    """(M,) whether the two can touch within intervals whose marks at both ends are (2, 8, M).
+
+    At any moment in between, the gap is at least the mean of those at the ends less half of what it can change. That
+    is no more than the ways. Where each of the two stays on one stretch, which is straight and on which it does not
+    speed up, it is no more than the change of their distance either, and what they leave the straight line of constant
+    speeds by: a quarter of the loss of speed, times the time.
+    """
+    begin, end = ends
+    change = np.abs(end - begin)
+    apart = np.hypot(change[_Mark.X], change[_Mark.Y])
+    relative = apart + change[_Mark.TURN] + change[_Mark.SPEED] * change[_Mark.TIME] / 2
+    most = np.where(change[_Mark.STRETCH] == 0, np.minimum(relative, change[_Mark.WAY]), change[_Mark.WAY])
+    possible: BoolArray = begin[_Mark.GAP] + end[_Mark.GAP] <= most
+    return possible
 
 
 def _nodes(pair: Pair, window: tuple[float, float]) -> FloatArray:
@@ -221,19 +252,16 @@ def _nodes(pair: Pair, window: tuple[float, float]) -> FloatArray:
     return np.unique(np.concatenate(parts))
 
 
-def _first_intervals(
-    gaps: _Gaps, nodes: FloatArray, begun: FloatArray
-) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-    """The intervals between nodes that end after `begun`: replays (M,); (2, M) times, gaps and ways at their ends."""
-    gap, moved = np.full((2, len(begun), len(nodes)), np.nan)
+def _first_intervals(gaps: _Gaps, nodes: FloatArray, begun: FloatArray) -> tuple[IntArray, FloatArray]:
+    """The intervals between nodes that end after `begun`: replays (M,), and marks (2, 8, M) at both ends."""
+    marks = np.full((len(_Mark), len(begun), len(nodes)), np.nan)
     rows, numbers = np.nonzero(np.append(nodes[1:], np.inf) > begun[:, None])
-    gap[rows, numbers], moved[rows, numbers] = gaps.at(rows, nodes[numbers], _COARSE)
+    marks[:, rows, numbers] = gaps.at(rows, nodes[numbers], _COARSE)
     rows, numbers = np.nonzero(nodes[1:] > begun[:, None])
-    both = np.stack([numbers, numbers + 1])
-    return rows, nodes[both], gap[rows, both], moved[rows, both]
+    return rows, np.stack([marks[:, rows, numbers], marks[:, rows, numbers + 1]])
 
 
-def _note(found: FloatArray, rows: IntArray, times: FloatArray, gap: FloatArray) -> None:
+def _note(found: FloatArray, rows: IntArray, marks: FloatArray) -> None:
     """Note the times at which replays are in contact, if they are earlier than those noted before."""
-    hit = gap <= 0
-    np.minimum.at(found, rows[hit], times[hit])
+    hit = marks[_Mark.GAP] <= 0
+    np.minimum.at(found, rows[hit], marks[_Mark.TIME, hit])

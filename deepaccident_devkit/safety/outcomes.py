@@ -172,8 +172,6 @@ def outcomes_of(
     """
     pair = pair_of(accident.paths, accident.sizes)
     starts, hard = _brakings_begun(pair, checked("warning_times", warning_times, (None,)) + latency, brakings)
-    if not any(brakers):
-        starts = np.full_like(starts, np.inf)
     distinct, places = _distinct(starts, hard)
     begun = np.where(brakers, distinct[:, :1], np.inf)
     times = contact_times(pair, begun, distinct[:, 1])
@@ -181,7 +179,6 @@ def outcomes_of(
     delta_v = np.nan_to_num(delta_v_of(accident.masses, impact.relative_speeds))
     reduction = _reductions(delta_v[:, 0])
     outcome = _classes(impact.speeds[:, brakers], times, reduction)
-    outcome[np.isinf(distinct[:, 0])] = OUTCOMES.index("unchanged")
     return Outcomes(
         outcome=outcome[places],
         extrapolated=(np.isfinite(times) & (times > pair.duration))[places],

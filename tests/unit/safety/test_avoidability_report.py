@@ -25,6 +25,7 @@ from deepaccident_devkit.safety import (
 )
 from deepaccident_devkit.safety.avoidability_shares import GROUPS, group_of
 from deepaccident_devkit.safety.outcomes import delta_v_ranges
+from deepaccident_devkit.safety.secondary import SecondaryContact
 
 AVOIDED = OUTCOMES.index("avoided")
 
@@ -33,7 +34,8 @@ AVOIDED = OUTCOMES.index("avoided")
 def accidents() -> list[Avoidability]:
     """Two rear-ends of 5 and 3 s, in which the ego is the striker; a head-on one; one with a pedestrian."""
     walking = replace(rear_end(8, 1, 2), categories=("car", "pedestrian"), agents=(None, None))
-    return [avoidability_of(each) for each in (rear_end(20, 10), rear_end(20, 16, 3), head_on(10, 4), walking)]
+    heavy = replace(rear_end(20, 10), masses=np.array([1000.0, 3000.0]))
+    return [avoidability_of(each) for each in (heavy, rear_end(20, 16, 3), head_on(10, 4), walking)]
 
 
 @pytest.fixture(scope="module")
@@ -68,8 +70,9 @@ def test_shares_are_means_of_the_accidents_that_are_long_enough(accidents: list[
     np.testing.assert_allclose(shares.shares[:31, :, AVOIDED], np.mean(both, axis=0))
     np.testing.assert_allclose(shares.shares[31:, :, AVOIDED], first.outcomes[0].outcome[31:] == AVOIDED)
     assert shares.relative_speed[0] == pytest.approx(7)  # 10 and 4 m/s
-    assert shares.delta_v[0, 0, 0] == pytest.approx((5 + 2) / 2)
-    assert shares.delta_v[0, 0, 1:] == pytest.approx(delta_v_ranges([1500, 1500], 7.0)[0])
+    assert shares.delta_v[0, 0, 0] == pytest.approx((7.5 + 2) / 2)  # of the lighter one, and of either
+    ranges = delta_v_ranges([1000, 3000], 10.0)[0], delta_v_ranges([1500, 1500], 4.0)[0]
+    assert shares.delta_v[0, 0, 1:] == pytest.approx(np.mean(ranges, axis=0))
     extrapolated = [each.outcomes[0].extrapolated[:31] for each in (first, second)]
     np.testing.assert_allclose(shares.extrapolated[:31], np.mean(extrapolated, axis=0))
 
@@ -107,6 +110,21 @@ def test_head_on_answers_of_the_continuation_are_counted(report: AvoidabilityRep
     assert line.split()[:4] == ["first", "4", str(1 - count), str(count)]
 
 
+def test_contacts_with_others_before_the_end_and_after_it(accidents: list[Avoidability]) -> None:
+    told = {"actor_id": 11, "other_id": 30, "category": "car"}
+    contacts = (
+        SecondaryContact(replay=0, time=4.5, extrapolated=False, **told),
+        SecondaryContact(replay=0, time=4.7, extrapolated=False, **told),
+        SecondaryContact(replay=1, time=5.5, extrapolated=True, **told),
+    )
+    crowded = replace(accidents[0], secondary=contacts)
+    alone = AvoidabilityReport(dataroot="", version="v1", accidents=(crowded,), dropped=(), skipped=(), margins={})
+    assert "touched in 1 of 6 replays" in alone.to_text()
+    assert "in 2 if all go straight on for 3 s" in alone.to_text()
+    rows = [row["secondary"] for row in alone.to_dict()["accidents"][0]["last_moments"]]
+    assert [len(each) for each in rows] == [2, 1, 0, 0, 0, 0, 0, 0, 0]
+
+
 def test_an_empty_report() -> None:
     empty = AvoidabilityReport(dataroot="/data", version="v1", accidents=(), dropped=(), skipped=(), margins={})
     assert empty.to_text() == "DeepAccident v1 at /data\n0 accidents"
@@ -130,9 +148,9 @@ def test_files(report: AvoidabilityReport, tmp_path: Path) -> None:
     first = tables["last_moments"][0]
     slack = f"{report.accidents[0].slack[0, 0]:g}"
     assert (first["brakers"], first["deceleration"], first["slack"]) == ("first", "4.0", slack)
-    assert tables["self_check"][0]["delta_v_first"] == "5.0"
+    assert tables["self_check"][0]["delta_v_first"] == "7.5"
     least, most = (float(tables["self_check"][0][f"delta_v_first_{end}"]) for end in ("least", "most"))
-    assert (least, most) == pytest.approx(tuple(delta_v_ranges([1500, 1500], 10.0)[0]))
+    assert (least, most) == pytest.approx(tuple(delta_v_ranges([1000, 3000], 10.0)[0]), abs=5e-4)
     share = tables["outcome_shares"][0]
     assert (share["lead"], share["accidents"], share["relative_speed"]) == ("0.0", "2", "7.0")
     assert share["unchanged"] == "1.0"

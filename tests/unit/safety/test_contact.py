@@ -88,6 +88,18 @@ def test_a_corner_that_turns_into_the_other_is_found() -> None:
     assert contact_times(pair, NOBODY, [1.0])[0] == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.parametrize("dart", ["turns", "goes and returns"])
+def test_what_comes_and_goes_between_two_nodes_is_found(dart: str) -> None:
+    """Within a tenth of a second a bar sweeps past the other; or it goes there and is back 0.2 s later."""
+    frames = np.arange(21)
+    yaws = np.interp(frames, [10, 11], [-1.2, 1.2]) if dart == "turns" else np.zeros(21)
+    ahead = 3.0 * (frames == 10) if dart != "turns" else np.zeros(21)
+    standing = np.tile([3.05 if dart == "turns" else 6.05, 0.0, 0.0], (21, 1))
+    pair = pair_of([np.column_stack([ahead, np.zeros(21), yaws]), standing], [[6, 0.2], [0.2, 0.2]], margin=1e-9)
+    assert contact_times(pair, NOBODY, [1.0])[0] == pytest.approx(1.045 if dart == "turns" else 1.0, abs=0.005)
+    assert contact_made(pair, NOBODY, [1.0])[0]
+
+
 def test_times_and_speeds_of_a_rear_end() -> None:
     accident = rear_end(striker=20, leader=10)
     pair = pair_of(accident.paths, accident.sizes)

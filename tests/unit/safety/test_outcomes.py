@@ -46,11 +46,11 @@ def test_a_striker_that_brakes_earlier_hits_slower_and_then_not_at_all() -> None
 
 
 def test_a_leader_that_brakes_is_hit_harder() -> None:
-    told = outcomes_of(rear_end(20, 10), SECOND, [0.0, 3.0], brakings=AT_ONCE)
-    assert names(told.outcome) == ["worsened", "worsened"]  # also if it stands already
+    told = outcomes_of(rear_end(20, 10), SECOND, [0.0, 4.6, 4.9], brakings=AT_ONCE)
+    assert names(told.outcome) == ["worsened", "worsened", "unchanged"]  # also if it stands already
     assert told.speeds[0, 0] == pytest.approx([20, 0])
     assert told.reduction[0, 0] == pytest.approx(-1)
-    assert told.reduction[1, 0] < -0.1
+    assert -0.3 < told.reduction[1, 0] < -0.1 < told.reduction[2, 0] < 0
     assert not told.extrapolated.any()
 
 
@@ -63,8 +63,16 @@ def test_a_stopped_one_is_hit() -> None:
     assert told.speeds[0, 0] == pytest.approx([0, 10])
     assert told.reduction[0, 0] == pytest.approx(0.5)
     assert names(outcomes_of(case, BOTH, [2.5], brakings=AT_ONCE).outcome) == ["avoided"]
-    # both still move at 4.9 s
+    # both still move at the contact
     assert names(outcomes_of(case, BOTH, [4.5], brakings=AT_ONCE).outcome) == ["mitigated"]
+
+
+def test_one_of_two_who_brake_stands_and_the_other_does_not() -> None:
+    """At 3.9 s 26.4 m are left: the slow one stands after 1.6 m, the fast one comes with 12 m/s."""
+    case = accident(straight((0, 0), 0, 4, 51), straight((124, 0), np.pi, 20, 51))
+    told = outcomes_of(case, BOTH, [3.9], brakings=AT_ONCE)
+    assert told.speeds[0, 0] == pytest.approx([0, np.sqrt(400 - 2 * 5 * 24.8)], abs=1e-3)
+    assert names(told.outcome) == ["mitigated"]
 
 
 def test_who_stood_in_the_recording_too_is_not_stopped_by_braking() -> None:
@@ -93,9 +101,9 @@ def test_without_a_warning_or_brakers_nothing_changes() -> None:
 
 def test_latency_and_reaction_delay_the_braking() -> None:
     case = rear_end()
-    late = outcomes_of(case, FIRST, [3.0], brakings=[Braking(reaction=0.5, deceleration=5.0)], latency=0.3)
-    same = outcomes_of(case, FIRST, [3.8], brakings=AT_ONCE)
-    assert late.time[0, 0] == same.time[0, 0]
+    late = outcomes_of(case, FIRST, [3.7], brakings=[Braking(reaction=0.5, deceleration=5.0)], latency=0.3)
+    same = outcomes_of(case, FIRST, [4.5], brakings=AT_ONCE)
+    assert 5 < late.time[0, 0] == same.time[0, 0] < np.inf
     from_start = outcomes_of(case, FIRST, [0.0], brakings=AT_ONCE)
     before = outcomes_of(case, FIRST, [-7.0], brakings=AT_ONCE)
     np.testing.assert_array_equal(from_start.reduction, before.reduction)
