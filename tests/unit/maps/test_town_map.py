@@ -68,6 +68,8 @@ def test_a_part_has_the_cells_of_its_place() -> None:
     assert part.origin.tolist() == [10.5, -19.5]
     assert part.classes().tolist() == [[3, 3], [1, 3]]
     assert part.extent == (10.5, 11.5, -19.5, -18.5)
+    narrow = town.around((11.3, -19.4), 0.2)
+    assert (narrow.shape, narrow.origin.tolist(), narrow.classes().tolist()) == ((2, 1), [11.0, -20.0], [[3], [3]])
     assert town.around((11, -19), 50).extent == town.extent == (10.0, 12.0, -20.0, -18.5)
     assert town.around((100, 100), 5).agents.size == 0
 
