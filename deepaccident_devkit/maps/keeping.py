@@ -35,8 +35,8 @@ _PLANES: Final = (*GROUND_CLASSES, "agents")
 
 
 def map_path(dataset: Dataset, town: str, scenarios: Sequence[str], config: TownMapConfig) -> Path:
-    """Where the map of a town, from these scenarios (tokens), is kept."""
-    text = repr((_FORMAT, town, sorted(scenarios), config))
+    """Where the map of a town, from these scenarios (tokens, in the table's order), is kept."""
+    text = repr((_FORMAT, town, tuple(scenarios), config))
     digest = hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
     return dataset.tables_folder / f"town_map-{digest}.npz"
 

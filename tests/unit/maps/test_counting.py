@@ -17,7 +17,7 @@ def checkered(side: int) -> ByteArray:
     return np.where((index[:, None] + index[None, :]) % 2 == 0, TAGS["road"], TAGS["sidewalk"]).astype(np.uint8)
 
 
-@given(st.floats(-300, 300), st.floats(-300, 300), st.floats(-4, 4), st.floats(-0.05, 0.05), st.integers(0, 10**6))
+@given(st.floats(-300, 300), st.floats(-300, 300), st.floats(-4, 4), st.floats(-0.15, 0.15), st.integers(0, 10**6))
 def test_a_point_of_the_picture_is_at_its_place_in_the_world(x: float, y: float, yaw: float, tilt: float, seed: int):
     pitch = SE3.from_quaternion((np.cos(tilt / 2), 0, np.sin(tilt / 2), 0))
     world_from_ego = SE3.from_yaw(yaw, (x, y, 1.0)) @ pitch

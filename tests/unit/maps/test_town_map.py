@@ -54,8 +54,8 @@ def test_drivable_needs_more_than_half_and_as_many_looks_as_asked_for() -> None:
 
 
 def test_classes_at_points() -> None:
-    points = [[10.0, -20.0], [10.49, -19.51], [10.5, -20.0], [11.99, -18.51], [10.6, -18.9]]
-    assert tiny().classes_at(points).tolist() == [1, 1, 2, 0, 1]
+    points = [[10.0, -20.0], [10.49, -19.51], [10.5, -20.0], [11.99, -18.51], [10.6, -18.9], [11.99, -19.99]]
+    assert tiny().classes_at(points).tolist() == [1, 1, 2, 0, 1, 4]
     assert tiny().classes_at([[9.99, -20], [12.0, -20], [10, -20.01], [10, -18.5], [np.nan, 0]]).tolist() == [0] * 5
     with pytest.raises(GeometryError, match="points: expected shape"):
         tiny().classes_at([1.0, 2.0])
@@ -68,6 +68,8 @@ def test_a_part_has_the_cells_of_its_place() -> None:
     assert part.origin.tolist() == [10.5, -19.5]
     assert part.classes().tolist() == [[3, 3], [1, 3]]
     assert part.extent == (10.5, 11.5, -19.5, -18.5)
+    narrow = town.around((11.3, -19.4), 0.15)
+    assert (narrow.shape, narrow.origin.tolist(), narrow.classes().tolist()) == ((2, 1), [11.0, -20.0], [[3], [3]])
     assert town.around((11, -19), 50).extent == town.extent == (10.0, 12.0, -20.0, -18.5)
     assert town.around((100, 100), 5).agents.size == 0
 
