@@ -6,13 +6,14 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 from deepaccident_devkit.evaluation.metrics.warning.drives import GIVEN
-from deepaccident_devkit.evaluation.metrics.warning.outcome_tables import NOMINAL
+from deepaccident_devkit.evaluation.metrics.warning.outcome_tables import NOMINAL, SETTINGS
 from deepaccident_devkit.evaluation.runs.predictors import PredictorTable, number_text
 from deepaccident_devkit.safety import OUTCOMES
 from deepaccident_devkit.text import columns_text
 
 Json = Mapping[str, Any]
-_COLUMNS: Final = (*OUTCOMES, "warned", "after the end", "braking s/min")
+_COLUMNS: Final = (*OUTCOMES, "if lasting", "warned", "after end", "braking s/min")
+"""Shares of the accidents: the classes, avoided if alarms must last, with an alarm, of contacts after the recording."""
 _ALARMS: Final = {"right": "right alarms", "any_alarm": "any alarm"}
 _AT_ONCE: Final = "0"
 """Name of no latency, as JSON has it."""
@@ -30,8 +31,7 @@ def prevention_tables(prevented: Json) -> list[PredictorTable]:
         head = (f"{group}, {NOMINAL}", *_COLUMNS)
         notes = tuple(_notes(prevented, group, given))
         tables.append(PredictorTable(rows=(head, *_predictors(prevented["alarms"], everyone)), notes=notes))
-        settings = given[prevented["alarms"]][_AT_ONCE]
-        rows = tuple((name, *_cells(each)) for name, each in settings.items())
+        rows = tuple((name, *_cells(given, prevented["alarms"], setting=name)) for name in SETTINGS)
         tables.append(PredictorTable(rows=((f"{group}, {GIVEN}", *_COLUMNS), *rows), notes=()))
     return tables
 
@@ -45,18 +45,23 @@ def prevention_text(prevented: Json) -> str:
 def _predictors(alarms: str, everyone: Mapping[str, Json]) -> Iterator[tuple[str, ...]]:
     """A row a predictor; the given one also with other alarms, and with each latency."""
     for name, figures in everyone.items():
-        yield name, *_cells(figures[alarms][_AT_ONCE][NOMINAL])
+        yield name, *_cells(figures, alarms)
         if name == GIVEN:
-            for latency, settings in figures[alarms].items():
+            for latency in figures[alarms]:
                 if latency != _AT_ONCE:
-                    yield f"{name}, {latency} s later", *_cells(settings[NOMINAL])
+                    yield f"{name}, {latency} s later", *_cells(figures, alarms, latency)
             (other,) = _ALARMS.keys() - {alarms}
-            yield f"{name}, {_ALARMS[other]}", *_cells(figures[other][_AT_ONCE][NOMINAL])
+            yield f"{name}, {_ALARMS[other]}", *_cells(figures, other, lasting=None)
 
 
-def _cells(figures: Json) -> Iterator[str]:
-    yield from (number_text(figures["shares"][name]) for name in OUTCOMES)
-    yield from (number_text(figures[name]) for name in ("warned", "extrapolated", "braking_seconds_per_minute"))
+def _cells(
+    given: Json, alarms: str, latency: str = _AT_ONCE, setting: str = NOMINAL, lasting: str | None = "lasting"
+) -> Iterator[str]:
+    figures = given[alarms][latency][setting]
+    avoided = None if lasting is None else given[lasting][latency][setting]["shares"][OUTCOMES[0]]
+    values = [*figures["shares"].values(), avoided]
+    values += [figures[name] for name in ("warned", "extrapolated", "braking_seconds_per_minute")]
+    yield from map(number_text, values)
 
 
 def _notes(prevented: Json, group: str, given: Json) -> Iterator[str]:

@@ -59,7 +59,7 @@ def render_prevention(result: PreventedResult, group: str | None = None, *, ax: 
     ax.set_xticks([], minor=True)
     ax.set(xlabel="braking seconds a minute without an accident", ylabel="share of the accidents")
     ax.set(xlim=(-0.03, 1.4 * _MOST), ylim=(-0.03, 1.05))
-    ax.legend(fontsize=SMALLEST_TEXT, loc="upper left")
+    ax.legend(fontsize=SMALLEST_TEXT, loc="lower right")
     return with_light_grid(ax, "both")
 
 

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray, ShortRepr
+from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, ShortRepr
 from deepaccident_devkit.errors import ConfigError, EvaluationError
 from deepaccident_devkit.evaluation.metrics.evaluator import ratio
 
@@ -36,29 +36,45 @@ class AlarmCost(ShortRepr):
     braking_seconds_per_minute: float
 
 
-def alarm_runs(alarm: BoolArray) -> tuple[IntArray, IntArray]:
-    """The runs of alarmed frames of recordings: (R,) the row of each, and (R,) how many columns it has.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class AlarmRuns(FrozenArrays):
+    """The R runs of alarmed frames of N recordings; arrays are read-only.
 
-    Args:
-        alarm: (N, T) a row a recording; False also where a frame is missing, which ends a run.
-    """
-    edges = np.diff(np.pad(alarm.astype(np.int8), ((0, 0), (1, 1))), axis=1)
-    row, begin = np.nonzero(edges == 1)
-    _, end = np.nonzero(edges == -1)
-    return row, end - begin
-
-
-def braking_seconds(alarm: BoolArray, reaction: float, fps: float) -> FloatArray:
-    """(N,) seconds in which a driver brakes who obeys alarms: of each run max(0, its duration − reaction).
-
-    Args:
-        alarm: (N, T) whether each frame is in alarm; a run lasts to a frame's length after its last one.
-        reaction: seconds from the alarm to the brake.
+    Attributes:
+        row: (R,) int64 which recording.
+        begin: (R,) int64 first column.
+        length: (R,) int64 columns.
+        shape: N recordings and T columns.
         fps: columns a second.
     """
-    row, length = alarm_runs(alarm)
-    seconds: FloatArray = np.bincount(row, np.maximum(length / fps - reaction, 0.0), len(alarm)).astype(np.float64)
-    return seconds
+
+    row: IntArray
+    begin: IntArray
+    length: IntArray
+    shape: tuple[int, int]
+    fps: float
+
+    @classmethod
+    def of(cls, alarm: BoolArray, fps: float) -> AlarmRuns:
+        """The runs in (N, T) alarms: a row a recording, False also where a frame is missing, which ends a run."""
+        edges = np.diff(alarm.astype(np.int8), axis=1, prepend=0, append=0)
+        row, begin = np.nonzero(edges == 1)
+        _, end = np.nonzero(edges == -1)
+        count, columns = alarm.shape
+        return cls(row=row, begin=begin, length=end - begin, shape=(count, columns), fps=fps)
+
+    def braking_seconds(self, reaction: float) -> FloatArray:
+        """(N,) seconds in which a driver brakes who obeys: of each run max(0, its duration − the reaction time)."""
+        left = np.maximum(self.length / self.fps - reaction, 0.0)
+        seconds: FloatArray = np.bincount(self.row, left, self.shape[0]).astype(np.float64)
+        return seconds
+
+    def first_lasting(self, reaction: float) -> IntArray:
+        """(N,) first column of the first run that outlasts the reaction, so that it costs something; T for none."""
+        lasting = self.length / self.fps > reaction
+        first = np.full(self.shape[0], self.shape[1], dtype=np.int64)
+        np.minimum.at(first, self.row[lasting], self.begin[lasting])
+        return first
 
 
 def false_alarm_cost(
@@ -84,15 +100,16 @@ def false_alarm_cost(
         raise EvaluationError("alarm: expected alarms at frames that are there alone; set the others to False")
     if not (0 <= reaction < math.inf and 0 < fps < math.inf):
         raise ConfigError(f"reaction, fps: expected seconds from 0 and a rate above 0, found {reaction!r} and {fps!r}")
-    _, length = alarm_runs(raised)
+    runs = AlarmRuns.of(raised, fps)
+    alarmed = int(runs.length.sum())
     count = int(there.sum())
     minutes = count / fps / MINUTE
-    braking = math.fsum(braking_seconds(raised, reaction, fps).tolist())
+    braking = math.fsum(runs.braking_seconds(reaction).tolist())
     return AlarmCost(
-        episodes=len(length),
-        alarm_seconds=int(length.sum()) / fps,
-        time_share=ratio(int(length.sum()), count),
-        episodes_per_minute=ratio(len(length), minutes),
+        episodes=len(runs.row),
+        alarm_seconds=alarmed / fps,
+        time_share=ratio(alarmed, count),
+        episodes_per_minute=ratio(len(runs.row), minutes),
         braking_seconds=braking,
         braking_seconds_per_minute=ratio(braking, minutes),
     )

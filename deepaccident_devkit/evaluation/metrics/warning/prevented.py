@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import IntArray
+from deepaccident_devkit.arrays import FloatArray, IntArray
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.metrics.warning.anticipation import (
@@ -20,6 +21,7 @@ from deepaccident_devkit.evaluation.metrics.warning.anticipation import (
 from deepaccident_devkit.evaluation.metrics.warning.drives import (
     GIVEN,
     PREDICTORS,
+    TRIVIAL,
     Drive,
     ScoresOf,
     by_group,
@@ -29,11 +31,9 @@ from deepaccident_devkit.evaluation.metrics.warning.drives import (
 from deepaccident_devkit.evaluation.metrics.warning.evaluator import WarningEvaluator
 from deepaccident_devkit.evaluation.metrics.warning.outcome_tables import (
     AccidentOutcomes,
-    OutcomeTable,
 )
 from deepaccident_devkit.evaluation.metrics.warning.prevention import (
     BUDGET,
-    Ends,
     PreventedResult,
     PreventionCurve,
     PreventionFigures,
@@ -43,6 +43,8 @@ from deepaccident_devkit.evaluation.metrics.warning.scored_ends import ScoredEnd
 _WALKING: Final = ", pedestrian"
 _ALARMS: Final[Mapping[str, ScoresOf]] = {"right": "pair", "any_alarm": "recording"}
 """Which alarms warn → the scores that are of them."""
+QUIET: Final = ", quiet"
+"""End of the name of a random predictor at the threshold of at most one braking second a minute."""
 
 
 class PreventedEvaluator(Evaluator[PreventedResult]):
@@ -95,20 +97,21 @@ class PreventedEvaluator(Evaluator[PreventedResult]):
     def resampled(self, parts: Sequence[Sequence[Counts]], times: IntArray) -> Iterator[PreventedResult]:
         """The result of each draw, without references and curves."""
         groups = dict(self._groups(drives_of(parts)))
-        tables = {group: _Pair(those, GIVEN, self._outcomes.tables) for group, those in groups.items()}
+        tables = {group: self._ends(those, GIVEN) for group, those in groups.items()}
         for draw in times:
-            figures = {group: self._figures(GIVEN, table, draw) for group, table in tables.items()}
+            figures = {group: self._given(ends, draw) for group, ends in tables.items()}
             yield self._of_groups({GIVEN: figures})
 
     def _result(self, parts: Sequence[Collection[Counts]], *, references: bool) -> PreventedResult:
         groups = dict(self._groups(drives_of(parts)))
-        given = {group: _Pair(those, GIVEN, self._outcomes.tables) for group, those in groups.items()}
-        made = {GIVEN: {group: self._figures(GIVEN, pair) for group, pair in given.items()}}
+        given = {group: self._ends(those, GIVEN) for group, those in groups.items()}
+        made = {GIVEN: {group: self._given(ends) for group, ends in given.items()}}
         if not references:
             return self._of_groups(made, tuple(self._notes(made[GIVEN])))
-        for predictor in PREDICTORS[1:]:
-            made[predictor] = {group: self._reference(those, predictor) for group, those in groups.items()}
-        curves = {group: pair.tables[self._alarms].curve() for group, pair in given.items()}
+        for group, those in groups.items():
+            for name, figures in self._references(those):
+                made.setdefault(name, {})[group] = figures
+        curves = {group: ends[self._alarms].curve() for group, ends in given.items()}
         return self._of_groups(made, tuple(self._notes(made[GIVEN])), curves)
 
     def _of_groups(
@@ -142,27 +145,49 @@ class PreventedEvaluator(Evaluator[PreventedResult]):
             if walking:
                 yield f"{group}{_WALKING}", [each for each in those if each.kind != "accident" or each.name in walking]
 
-    def _figures(self, predictor: str, pair: _Pair, draw: IntArray | None = None) -> PreventionFigures:
-        main = pair.tables[self._alarms]
+    def _ends(self, drives: Sequence[Drive], predictor: str, draw: int = 0) -> Mapping[str, ScoredEnds]:
+        """Which alarms warn → one predictor's scores of a group of recordings, with the ends of its accidents."""
+        tables = self._outcomes.tables
+        right = ScoredEnds(drives, predictor, "pair", tables, draw)
+        any_alarm = right if predictor in TRIVIAL else ScoredEnds(drives, predictor, "recording", tables, draw)
+        return {"right": right, "any_alarm": any_alarm}
+
+    def _given(self, ends: Mapping[str, ScoredEnds], draw: IntArray | None = None) -> PreventionFigures:
+        main = ends[self._alarms]
         weight = np.ones(len(main.part)) if draw is None else draw[main.part].astype(np.float64)
         quiet = main.quiet_braking(weight)
         threshold = quiet if self._rules.threshold is None else self._rules.threshold
-        if predictor != GIVEN:
-            threshold = reference_threshold(predictor)
+        return self._figures(ends, threshold, quiet, weight)
+
+    def _figures(
+        self, ends: Mapping[str, ScoredEnds], threshold: float, quiet: float, weight: FloatArray
+    ) -> PreventionFigures:
+        main = ends[self._alarms]
         return PreventionFigures(
             threshold=threshold,
             quiet_braking=quiet,
             accidents=int(weight[main.accident].sum()),
             recordings=int(weight[main.normal].sum()),
             minutes=main.minutes(weight),
-            **{name: table.ends(threshold, weight) for name, table in pair.tables.items()},
+            lasting=main.ends(threshold, weight, lasting=True),
+            **{alarms: each.ends(threshold, weight) for alarms, each in ends.items()},
         )
 
-    def _reference(self, drives: Sequence[Drive], predictor: str) -> PreventionFigures:
-        """Of a random predictor the means over some draws, which have no counts."""
-        pairs = [_Pair(drives, predictor, self._outcomes.tables, draw) for draw in range(draws_of(predictor))]
-        figures: PreventionFigures = mean_of([self._figures(predictor, pair) for pair in pairs])
-        return figures if len(pairs) == 1 else replace(figures, **{name: _uncounted(figures, name) for name in _ALARMS})
+    def _references(self, drives: Sequence[Drive]) -> Iterator[tuple[str, PreventionFigures]]:
+        """Predictor → figures; of a random one the means over some draws, also at the threshold within the budget."""
+        weight = np.ones(len(drives))
+        for predictor in PREDICTORS[1:]:
+            fixed = reference_threshold(predictor)
+            if draws_of(predictor) == 1:
+                yield predictor, self._figures(self._ends(drives, predictor), fixed, math.nan, weight)
+                continue
+            drawn = [self._ends(drives, predictor, draw) for draw in range(draws_of(predictor))]
+            quiet = [each[self._alarms].quiet_braking(weight) for each in drawn]
+            for name, thresholds in ((predictor, [fixed] * len(drawn)), (f"{predictor}{QUIET}", quiet)):
+                yield (
+                    name,
+                    _mean([self._figures(*each, weight) for each in zip(drawn, thresholds, quiet, strict=True)]),
+                )
 
     def _notes(self, groups: Mapping[str, PreventionFigures]) -> Iterator[str]:
         for group, figures in groups.items():
@@ -170,6 +195,11 @@ class PreventedEvaluator(Evaluator[PreventedResult]):
                 yield f"{group}: no accident is judged, so that no share prevented is known; give accident scenarios"
             if not figures.recordings:
                 yield f"{group}: no recording without an accident, so that no braking for nothing is known; give some"
+        if groups:
+            yield (
+                "an alarm that is over before the driver brakes costs nothing, but counts as a warning: compare with "
+                "'random per frame, quiet', and with the share 'if lasting', where alarms must outlast the reaction"
+            )
         if groups and self._rules.threshold is None:
             yield (
                 f"the threshold is the lowest with at most {BUDGET:g} braking second a minute on these very "
@@ -184,20 +214,14 @@ class PreventedEvaluator(Evaluator[PreventedResult]):
                 yield f"{why} {each.scenario}: {each.reason}"
 
 
-class _Pair:
-    """One predictor's right alarms of one group of recordings, and all its alarms."""
-
-    def __init__(
-        self, drives: Sequence[Drive], predictor: str, outcomes: Mapping[str, OutcomeTable], draw: int = 0
-    ) -> None:
-        self.tables = {
-            name: ScoredEnds(drives, predictor, scores_of, outcomes, draw) for name, scores_of in _ALARMS.items()
+def _mean(drawn: Sequence[PreventionFigures]) -> PreventionFigures:
+    """The means, which have no counts."""
+    figures: PreventionFigures = mean_of(drawn)
+    ends: dict[str, Any] = {
+        alarms: {
+            latency: {setting: replace(each, counts={}) for setting, each in settings.items()}
+            for latency, settings in getattr(figures, alarms).items()
         }
-
-
-def _uncounted(figures: PreventionFigures, name: str) -> Any:
-    ends: Ends = getattr(figures, name)
-    return {
-        latency: {setting: replace(each, counts={}) for setting, each in settings.items()}
-        for latency, settings in ends.items()
+        for alarms in (*_ALARMS, "lasting")
     }
+    return replace(figures, **ends)

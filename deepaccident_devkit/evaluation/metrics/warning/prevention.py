@@ -54,6 +54,8 @@ class PreventionFigures(FrozenMappings):
         minutes: of these, up to where they count.
         right: who brakes is warned by the first right alarm.
         any_alarm: likewise by the first alarm of all, which may be of others or of another moment.
+        lasting: likewise by the first alarm that lasts longer than the reaction, as those do that cost anything. So
+            alarms that flicker, such as random ones, prevent nothing for free.
     """
 
     threshold: float
@@ -63,6 +65,7 @@ class PreventionFigures(FrozenMappings):
     minutes: float
     right: Ends
     any_alarm: Ends
+    lasting: Ends
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -88,9 +91,10 @@ class PreventedResult(FrozenMappings):
 
     Attributes:
         operating_by: `given` threshold, or `budget`: at most one braking second a minute on these very recordings.
-        alarms: `right` or `any_alarm`: which of both the headline and the curves are of.
+        alarms: `right` or `any_alarm`: which of these the headline and the curves are of.
         groups: group → figures of the predictions.
-        references: predictor (of `drives.PREDICTORS` but the given one) → the same; empty for resamples.
+        references: predictor (of `drives.PREDICTORS` but the given one; a random one also at its own `quiet_braking`)
+            → the same; empty for resamples.
         curves: group → curve of the predictions; empty for resamples.
         dropped: accidents that no braking is judged of, and why: their labels do not show the two near each other.
         skipped: accidents whose motion is not known, and why.

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import FloatArray, IntArray
+from deepaccident_devkit.arrays import FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.evaluation.metrics.evaluator import ratio
-from deepaccident_devkit.evaluation.metrics.warning.cost import MINUTE, braking_seconds
+from deepaccident_devkit.evaluation.metrics.warning.cost import MINUTE, AlarmRuns
 from deepaccident_devkit.evaluation.metrics.warning.drives import Drive, ScoresOf, series_of
 from deepaccident_devkit.evaluation.metrics.warning.outcome_tables import NOMINAL, SETTINGS, OutcomeTable
 from deepaccident_devkit.evaluation.metrics.warning.prevention import BUDGET, Ends, OutcomeFigures, PreventionCurve
@@ -24,6 +25,18 @@ _REACTIONS: Final = tuple(dict.fromkeys(each.reaction for each in BRAKINGS))
 _REACTION_OF: Final = np.array([_REACTIONS.index(each.reaction) for each in BRAKINGS])
 _NOMINAL_REACTION: Final = int(_REACTION_OF[SETTINGS.index(NOMINAL)])
 _SLACK: Final = 1e-9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Alarms(FrozenArrays):
+    """At one threshold: (P, R) column of the first alarm in each accident by reaction, and of the first that lasts.
+
+    And (R, M) braking seconds in the recordings without an accident.
+    """
+
+    first: IntArray
+    first_lasting: IntArray
+    seconds: FloatArray
 
 
 class ScoredEnds:
@@ -70,7 +83,7 @@ class ScoredEnds:
             np.array([getattr(table, name)[:, each] for table, each in zip(own, rows, strict=True)]).reshape(shape)
             for name in ("outcome", "extrapolated")
         )
-        self._found: dict[float, tuple[IntArray, FloatArray]] = {}
+        self._found: dict[float, _Alarms] = {}
 
     def __repr__(self) -> str:
         return f"ScoredEnds({len(self.accident):,} accidents, {len(self.normal):,} others, {self._series!r})"
@@ -82,7 +95,7 @@ class ScoredEnds:
     def costs(self, threshold: float, weight: FloatArray) -> FloatArray:
         """(K,) braking seconds a minute of each setting; NaN without a recording that has no accident."""
         minutes = self.minutes(weight)
-        seconds = self._at(threshold)[1] @ weight[self.normal]
+        seconds = self._at(threshold).seconds @ weight[self.normal]
         costs: FloatArray = np.array([ratio(each, minutes) for each in seconds.tolist()])[_REACTION_OF]
         return costs
 
@@ -97,23 +110,30 @@ class ScoredEnds:
         most = BUDGET * minutes + _SLACK
 
         def is_quiet(threshold: float) -> int:
-            return int(float(self._at(threshold)[1][_NOMINAL_REACTION] @ weight[self.normal]) <= most)
+            return int(float(self._at(threshold).seconds[_NOMINAL_REACTION] @ weight[self.normal]) <= most)
 
         place = bisect_left(self.levels.tolist(), 1, key=is_quiet)
         return float(self.levels[place]) if place < len(self.levels) else math.inf
 
-    def ends(self, threshold: float, weight: FloatArray) -> Ends:
-        """Latency → setting → figures at a threshold; all NaN at NaN, and none without an accident."""
+    def ends(self, threshold: float, weight: FloatArray, *, lasting: bool = False) -> Ends:
+        """Latency → setting → figures at a threshold; all NaN at NaN.
+
+        Args:
+            threshold: the lowest score that is an alarm.
+            weight: (N,) how often each recording counts.
+            lasting: whether alarms warn only if they outlast the reaction time.
+        """
         unknown = math.isnan(threshold)
-        column = self._at(math.inf if unknown else threshold)[0]
+        alarms = self._at(math.inf if unknown else threshold)
+        columns = alarms.first_lasting if lasting else alarms.first
         costs = np.full(len(BRAKINGS), math.nan) if unknown else self.costs(threshold, weight)
         counting = weight[self.accident] * (math.nan if unknown else 1.0)
-        warned = float(counting[column < self._series.scores.shape[1]].sum())
+        warned = (counting[:, None] * (columns < self._series.scores.shape[1])).sum(axis=0)[_REACTION_OF].tolist()
         found: dict[float, dict[str, OutcomeFigures]] = {}
         for place, latency in enumerate(self._latencies):
-            sums, beyond = self._sums(place, column, counting)
+            sums, beyond = self._sums(place, columns, counting)
             found[latency] = {
-                setting: _figures(sums[row], float(beyond[row]), warned, float(counting.sum()), float(costs[row]))
+                setting: _figures(sums[row], float(beyond[row]), warned[row], float(counting.sum()), float(costs[row]))
                 for row, setting in enumerate(SETTINGS)
             }
         return found
@@ -124,7 +144,7 @@ class ScoredEnds:
         rows = np.unique(np.rint(np.linspace(0, len(self.levels) - 1, CURVE_ROWS)).astype(np.int64))
         levels = [math.inf, *(self.levels[rows][::-1].tolist() if len(self.levels) else [])]
         counting = weight[self.accident]
-        sums = np.array([self._sums(0, self._at(level)[0], counting)[0] for level in levels])
+        sums = np.array([self._sums(0, self._at(level).first, counting)[0] for level in levels])
         shares = sums / (len(counting) or math.nan)
         return PreventionCurve(
             threshold=np.array(levels),
@@ -139,23 +159,25 @@ class ScoredEnds:
         columns = self._series.scores.shape[1]
         return np.append(drive.frame[0] + step * np.arange(columns), -1)
 
-    def _at(self, threshold: float) -> tuple[IntArray, FloatArray]:
-        """(P,) column of the first alarm in each accident, and (R, M) braking seconds by reaction; kept."""
+    def _at(self, threshold: float) -> _Alarms:
+        """The alarms at a threshold; kept."""
         if threshold not in self._found:
-            alarm = self._scores[self.normal] >= threshold
-            self._found[threshold] = (
-                self._series.first(np.array([threshold]))[self.accident, 0],
-                np.array([braking_seconds(alarm, each, self._series.fps) for each in _REACTIONS]),
+            alarm, fps = self._scores >= threshold, self._series.fps
+            accidents, normal = (AlarmRuns.of(alarm[rows], fps) for rows in (self.accident, self.normal))
+            first = self._series.first(np.array([threshold]))[self.accident]
+            self._found[threshold] = _Alarms(
+                first=np.repeat(first, len(_REACTIONS), axis=1),
+                first_lasting=np.stack([accidents.first_lasting(each) for each in _REACTIONS], axis=1),
+                seconds=np.stack([normal.braking_seconds(each) for each in _REACTIONS]),
             )
         return self._found[threshold]
 
-    def _sums(self, latency: int, column: IntArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _sums(self, latency: int, columns: IntArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(K, C) weights of the accidents of each class and setting, and (K,) of those that are extrapolated."""
-        accidents = np.arange(len(self.accident))
-        codes = self._outcome[accidents, latency, column]
+        at = (np.arange(len(self.accident))[:, None], latency, columns[:, _REACTION_OF], np.arange(len(BRAKINGS)))
+        codes = self._outcome[at]
         sums = [((codes == code) * weight[:, None]).sum(axis=0) for code in range(len(OUTCOMES))]
-        beyond = (self._extrapolated[accidents, latency, column] * weight[:, None]).sum(axis=0)
-        return np.stack(sums, axis=1), beyond
+        return np.stack(sums, axis=1), (self._extrapolated[at] * weight[:, None]).sum(axis=0)
 
 
 def _figures(sums: FloatArray, beyond: float, warned: float, accidents: float, cost: float) -> OutcomeFigures:
