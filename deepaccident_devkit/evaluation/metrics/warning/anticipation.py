@@ -225,8 +225,7 @@ class _Table:
 def _figures(drives: Sequence[Drive], predictor: str, rules: CleanWarnings) -> AnticipationFigures:
     """One predictor's figures; of a random one their means over some draws, so that no luck ranks it."""
     drawn = [_Table(drives, predictor, rules, draw).figures() for draw in range(draws_of(predictor))]
-    figures: AnticipationFigures = mean_of(drawn)
-    return figures
+    return drawn[0] if len(drawn) == 1 else mean_of(drawn)
 
 
 def draws_of(predictor: str) -> int:
@@ -237,8 +236,6 @@ def draws_of(predictor: str) -> int:
 def mean_of(parts: Sequence[Any]) -> Any:
     """Of floats, and of those in mappings and dataclasses of one form, NaN left out. All else is as in the first."""
     first = parts[0]
-    if len(parts) == 1:
-        return first
     if isinstance(first, float):
         known = [each for each in parts if not math.isnan(each)]
         return math.fsum(known) / len(known) if known else math.nan

@@ -423,7 +423,7 @@ def test_random_rows_are_means_of_their_draws(monkeypatch: pytest.MonkeyPatch) -
 
     one, two = row(1), row(2)
     assert one != two
-    monkeypatch.setattr(anticipation, "_mean", None)  # which one draw has no need of
+    monkeypatch.setattr(anticipation, "mean_of", None)  # which one draw has no need of
     assert row(1) == one
 
 
