@@ -178,12 +178,8 @@ def _tables_of(dataset: Dataset, item: tuple[str, Frames]) -> dict[str, OutcomeT
         return False, Skipped(scenario=scenario, reason="its meta file names no collision")
     check = undisturbed(accident)
     if not check.usable:
-        found = (
-            f"{check.margin:.2f} m between the two at the last frame that shows both"
-            if check.collides
-            else "no contact"
-        )
-        reason = f"the recording does not show the impact: {found} where nobody brakes"
+        found = f"{check.margin:.2f} m between the two at its last frame" if check.collides else "no contact"
+        reason = f"the recording does not show the impact: {found}, though nobody brakes"
         return True, Skipped(scenario=scenario, reason=reason)
     frame = np.unique(np.concatenate([np.array(those, dtype=np.int64) for those in agents.values()]))
     made: dict[tuple[bool, bool], OutcomeTable] = {}
