@@ -16,6 +16,7 @@ SETTINGS: Final = tuple(f"{each.reaction:g} s, {each.deceleration:g} m/s²" for 
 """Names of the ways of braking, in the order of `BRAKINGS`: reaction time and deceleration."""
 NOMINAL: Final = SETTINGS[BRAKINGS.index(Braking(reaction=1.0, deceleration=6.0))]
 """The setting of the headline, in the middle of the nine."""
+_NO_FRAME: Final = np.iinfo(np.int64).min
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -52,9 +53,9 @@ class OutcomeTable(FrozenArrays):
             raise EvaluationError(f"OutcomeTable.outcome: expected positions in OUTCOMES, 0 to {len(OUTCOMES) - 1}")
 
     def rows(self, frames: IntArray) -> IntArray:
-        """(C,) which of the W + 1 rows a first alarm at each frame has; that without an alarm if it is none of them."""
-        place = np.minimum(np.searchsorted(self.frame, frames), len(self.frame) - 1) if len(self.frame) else frames * 0
-        there = self.frame[place] == frames if len(self.frame) else np.zeros(len(frames), dtype=bool)
+        """(C,) which of the W + 1 rows a first alarm at each frame has; the last one for frames of no sample."""
+        place = np.searchsorted(self.frame, frames)
+        there = np.append(self.frame, _NO_FRAME)[place] == frames
         rows: IntArray = np.where(there, place, len(self.frame))
         return rows
 

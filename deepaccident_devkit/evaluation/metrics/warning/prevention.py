@@ -110,11 +110,6 @@ class PreventedResult(FrozenMappings):
     skipped: tuple[Skipped, ...]
     notes: tuple[str, ...] = ()
 
-    def __repr__(self) -> str:
-        """Of each group how many accidents, and the share avoided."""
-        told = [f"{name}: {self.avoided(name):.3f} of {each.accidents} avoided" for name, each in self.groups.items()]
-        return f"PreventedResult({'; '.join(told)})"
-
     def avoided(self, group: str) -> float:
         """The headline: the share avoided in the setting `outcome_tables.NOMINAL`, without latency; NaN for none."""
         ends: Ends = getattr(self.groups[group], self.alarms)
