@@ -8,7 +8,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from deepaccident_devkit import overview, selection, v2x
+from deepaccident_devkit import maps, overview, selection, v2x
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import IndexStoreError
 from deepaccident_devkit.interactions import interactions as interactions_of_scenario
@@ -57,9 +57,9 @@ class _Package:
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from deepaccident_devkit import motion, render, validation
+    from deepaccident_devkit import motion, render, safety, validation
 else:
-    motion, render, validation = map(_Package, ("motion", "render", "validation"))
+    motion, render, safety, validation = map(_Package, ("motion", "render", "safety", "validation"))
 
 
 class DeepAccident(Dataset):
@@ -136,6 +136,8 @@ class DeepAccident(Dataset):
     collision = v2x.collision
     message_sizes = v2x.message_sizes
     interactions = interactions_of_scenario
+    town_map = maps.town_map
+    describe = safety.describe
     motion_labels = motion.motion_labels
     bev_segmentation = motion.bev_segmentation
     samples = motion.samples
@@ -158,6 +160,7 @@ class DeepAccident(Dataset):
     render_evaluation = render.render_evaluation
     render_scenario_video = render.render_scenario_video
     render_replay = render.render_replay
+    render_town_map = render.render_town_map
 
     def list_scenarios(self) -> None:
         """Print a line for each scenario."""

@@ -415,3 +415,61 @@ def test_an_operating_point_from_another_split(
     stored = json.loads((out / "metrics_summary.json").read_text())["metrics"]["groups"]["ego_involved"]
     assert summary["switches"] == {"threshold": stored["best_f1"]}
     assert summary["metrics"]["operating_by"] == "given"
+
+
+@pytest.fixture(scope="module")
+def prevention(da_motion: DeepAccident, folder: Path) -> Path:
+    """An evaluation of the true accidents over whole recordings, with the accidents that they would have prevented."""
+    tokens = [token for token in da_motion.samples("train", "all") if token.split("/")[2] in AGENTS]
+    results = write_accidents(da_motion, folder / "whole.json", tokens)
+    words = ("warning", da_motion.dataroot, "--results", results, *LIST, "--prevented", "--include-results")
+    text = evaluate(*words, "--out", folder / "prevention").output
+    assert "\nprevented accidents\n  ego_involved, 1 s, 6 m/s²" in text
+    assert "for another split: braking " in text
+    return folder / "prevention"
+
+
+def test_prevented_accidents_are_stored_shown_and_verified(prevention: Path, da_motion: DeepAccident) -> None:
+    prevented = read_bundle(prevention).summary["prevented"]
+    assert list(prevented["groups"]) == ["ego_involved", "infrastructure"]
+    siren = prevented["references"]["always"]["ego_involved"]["right"]["0"]["1 s, 6 m/s²"]
+    given = prevented["groups"]["ego_involved"]["right"]["0"]["1 s, 6 m/s²"]
+    assert siren["shares"]["avoided"] >= given["shares"]["avoided"]
+    assert siren["braking_seconds_per_minute"] > given["braking_seconds_per_minute"] == 0
+    report = page_of(prevention / "report.html")
+    assert "Prevented accidents" in report.text
+    assert "random per frame, quiet" in report.text
+    assert (prevention / "figures" / "prevention_ego_involved.png").is_file()
+    words = ("verify", prevention, "--dataroot", da_motion.dataroot)
+    assert "the same; " in evaluate(*words).output
+    path = prevention / "metrics_summary.json"
+    before = path.read_text()
+    path.write_text(before.replace('"quiet_braking": 1.0', '"quiet_braking": 0.5'))
+    try:
+        assert "prevented/groups/ego_involved/quiet_braking: stored 0.5, found 1.0" in evaluate(*words, status=1).output
+        path.write_text(json.dumps(json.loads(before) | {"prevented": {"groups": {}}}))
+        assert "does not say how intervals were made" in evaluate(*words, status=1).output
+    finally:
+        path.write_text(before)
+
+
+def test_a_threshold_of_little_braking_from_another_split(
+    prevention: Path, da_motion: DeepAccident, folder: Path, tmp_path: Path
+) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(prevention, other)
+    scenarios = json.loads((other / "scenarios.json").read_text())
+    others = {name.replace("_type001_", "_type009_"): each for name, each in scenarios["scenarios"].items()}
+    (other / "scenarios.json").write_text(json.dumps(scenarios | {"scenarios": others}))
+    words = ("warning", da_motion.dataroot, "--results", folder / "whole.json", *LIST, "--threshold-from", other)
+    words = (*words, "--threshold-by", "braking", "--prevented", "--json")
+    printed = evaluate(*words).output
+    summary = json.loads(printed[printed.index("{") :])
+    assert summary["switches"] == {"threshold": 1.0}
+    assert summary["prevented"]["operating_by"] == "given"
+    assert not any("on these very recordings" in note for note in summary["prevented"]["notes"])
+    stored = json.loads((other / "metrics_summary.json").read_text())
+    del stored["prevented"]
+    (other / "metrics_summary.json").write_text(json.dumps(stored))
+    with pytest.raises(ResultsError, match="its summary has no prevented accidents; evaluate again with --prevented"):
+        evaluate(*words)

@@ -33,6 +33,7 @@ _VERBS = (
     "cache",
     "split",
     "stats",
+    "safety",
     "validate",
     "evaluate",
     "results",

@@ -28,7 +28,7 @@ from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.metrics.attributes import ATTRIBUTES, EVERYTHING, attribute_name
-from deepaccident_devkit.evaluation.metrics.warning import FieldWarnings
+from deepaccident_devkit.evaluation.metrics.warning import CleanWarnings, FieldWarnings
 from deepaccident_devkit.evaluation.results import Results, read_results
 from deepaccident_devkit.evaluation.runs import (
     EvaluationRun,
@@ -39,6 +39,7 @@ from deepaccident_devkit.evaluation.runs import (
     explanation_checkpoint,
     save_run,
     summary_text,
+    with_prevented,
 )
 from deepaccident_devkit.evaluation.runs.explanation import explain
 from deepaccident_devkit.evaluation.runs.predictors import Chooser, chosen_threshold
@@ -62,8 +63,8 @@ def evaluate() -> None:
     """Evaluate results files; check and compare evaluations."""
 
 
-def _threshold_options(task: TaskName) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """For the task `warning`: options that take the alarm threshold from the bundle of another split."""
+def _warning_options(task: TaskName) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """For the task `warning`: the alarm threshold from the bundle of another split, and what alarms prevent."""
     if task != "warning":
         return lambda verb: verb
     options = (
@@ -77,10 +78,18 @@ def _threshold_options(task: TaskName) -> Callable[[Callable[..., Any]], Callabl
             type=WordChoice(get_args(Chooser)),
             default="best_f1",
             show_default=True,
-            help="best_f1: the threshold with the best F1. quiet: at most one second of false alarm per minute.",
+            help="best_f1: the threshold with the best F1. quiet: at most one second of false alarm per minute. "
+            "braking: at most one second of braking for false alarms per minute, found by an evaluation with "
+            "--prevented.",
+        ),
+        click.option(
+            "--prevented",
+            is_flag=True,
+            help="Also compute which accidents a braking driver would have avoided after the alarm, and how much "
+            "braking the false alarms cause (protocol clean only).",
         ),
     )
-    return lambda verb: options[0](options[1](verb))
+    return lambda verb: options[0](options[1](options[2](verb)))
 
 
 def _attributes(context: click.Context, parameter: click.Parameter, names: tuple[str, ...]) -> tuple[str, ...]:
@@ -111,7 +120,7 @@ def _task_verb(task: TaskName) -> click.Command:
         show_default=True,
         help="Rules of the metrics; docs/protocols.md describes them.",
     )
-    @_threshold_options(task)
+    @_warning_options(task)
     @click.option(
         "--switch",
         "switches",
@@ -179,6 +188,8 @@ def _evaluate(
     run = evaluate_results(dataset, opened, setup, selection, merge=part == MERGE, **how)
     resampling = Resampling(resamples=options["resamples"])
     run = run.broken_down((EVERYTHING, *(by or breakdowns_of(setup.task))), resampling, **engine)
+    if options.get("prevented"):
+        run = with_prevented(run, dataset, resampling, progress=True, **engine)
     run, texts = _examined(run, dataset, opened, options)
     summary = run.summary()
     shown = summary_text(summary, by or SHOWN_BREAKDOWNS)
@@ -199,6 +210,11 @@ def _refuse_unused(setup: EvaluationSetup, options: dict[str, Any], part: Part) 
         refuse_unused("without --threshold-from", "threshold_by")
     elif "threshold" in setup.switches:
         raise click.UsageError("--threshold-from sets the threshold that --switch threshold=… sets; give one of them")
+    if options.get("prevented") and not isinstance(setup.rules, CleanWarnings):
+        raise click.UsageError(
+            f"--prevented needs the scores of whole recordings, which --protocol {setup.protocol} does not have; give "
+            "--protocol clean"
+        )
     if isinstance(setup.rules, FieldWarnings) and options["resamples"]:
         refuse_unused("with --protocol field, which has no intervals", "resamples")
     if setup.task == "detection" and options["samples"] == "all":

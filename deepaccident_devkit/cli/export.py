@@ -6,6 +6,8 @@ from typing import Any, get_args
 import click
 
 from deepaccident_devkit.cli.export_formats import mmdet3d, nuscenes, opencood, parquet, webdataset
+from deepaccident_devkit.cli.export_questions import questions
+from deepaccident_devkit.cli.export_town_maps import town_maps
 from deepaccident_devkit.cli.options import (
     WordChoice,
     agent_names,
@@ -29,7 +31,7 @@ def export() -> None:
     """Write data in the formats of other tools."""
 
 
-for verb in (mmdet3d, nuscenes, opencood, parquet, webdataset):
+for verb in (mmdet3d, nuscenes, opencood, parquet, questions, town_maps, webdataset):
     export.add_command(verb)
 
 

@@ -27,9 +27,8 @@ _OPTIONS = (
     ),
     click.option("--split", help="Only this split: train, val, test, …, or a split file (.txt).  [default: all]"),
     where_parameter,
-    agents_parameter,
-    click.option("--dry-run", is_flag=True, help="Only say how much would be written."),
 )
+_DRY_RUN = click.option("--dry-run", is_flag=True, help="Only say how much would be written.")
 _LINK = click.option(
     "--link",
     type=WordChoice(get_args(Link)),
@@ -39,9 +38,12 @@ _LINK = click.option(
 )
 
 
-def bulk_parameters(verb: Verb) -> Verb:
-    """Give a verb the arguments of a release and of parts, --out, --split, --where, --agents and --dry-run."""
-    for option in reversed(_OPTIONS):
+def bulk_parameters(verb: Verb, agents: Callable[[Verb], Verb] = agents_parameter) -> Verb:
+    """Give a verb the arguments of a release and of parts, --out, --split, --where, --agents and --dry-run.
+
+    `agents` gives the verb --agents, if it means something of its own.
+    """
+    for option in reversed((*_OPTIONS, agents, _DRY_RUN)):
         verb = option(verb)
     return release_parameters(part_parameters(verb))
 

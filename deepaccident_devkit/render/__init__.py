@@ -24,6 +24,7 @@ from deepaccident_devkit.render.motion import (
 from deepaccident_devkit.render.outcomes import draw_accident_outcome, draw_detection_outcome, render_evaluation
 from deepaccident_devkit.render.replay import render_replay
 from deepaccident_devkit.render.styles import style
+from deepaccident_devkit.render.town_map import render_town_map
 from deepaccident_devkit.render.video import render_scenario_video
 from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix
 
@@ -52,6 +53,7 @@ __all__ = [
     "render_sample",
     "render_sample_data",
     "render_scenario_video",
+    "render_town_map",
     "render_visibility",
     "render_visibility_matrix",
     "style",

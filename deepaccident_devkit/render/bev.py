@@ -31,6 +31,7 @@ from deepaccident_devkit.render.legends import draw_legend, handles_from_above
 from deepaccident_devkit.render.missing import absence_text, has_cloud, is_there, missing_clouds_text, write_missing
 from deepaccident_devkit.render.roles import at_once, collider_ids, label_ids, recorder_ids, role_colors, short_name
 from deepaccident_devkit.render.titles import set_scene_title
+from deepaccident_devkit.render.town_map import draw_town_map, map_beneath
 from deepaccident_devkit.render.trails import draw_trails
 from deepaccident_devkit.taxonomy import BEV_CAMERA, AgentName, Frame
 from deepaccident_devkit.text import settle_choices
@@ -50,7 +51,16 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.tables.records import SampleRecord
 
-BEV_LAYERS: Final[tuple[Layer, ...]] = ("bev", "points", "boxes", "ids", "velocities", "trajectories", "grid")
+BEV_LAYERS: Final[tuple[Layer, ...]] = (
+    "map",
+    "bev",
+    "points",
+    "boxes",
+    "ids",
+    "velocities",
+    "trajectories",
+    "grid",
+)
 BEV_DEFAULT: Final[tuple[Layer, ...]] = ("bev", "points", "boxes", "grid")
 _OF_BOXES: Final = frozenset(("boxes", "ids", "velocities", "trajectories"))
 _BEYOND: Final = 5.0
@@ -130,10 +140,12 @@ def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a 
         agents: whose points and boxes: names of agents, a configuration or its name, or None for all that are there;
             by default only the sample's own agent. If there are several agents, each actor has one box.
         frame: of the axes: `ego` or `lidar` (forward to the right, left up), or `world`.
-        layers: some of `bev` (the agent's BEV camera, in pale colours), `points`, `boxes`, `ids`, `velocities` (arrows
-            for one second), `trajectories` (past thin, future thick, fading) and `grid`; by default bev, points, boxes,
-            grid. Points and the BEV camera are left out if their files are missing; words in a corner say so (of the
-            BEV camera only if there are no points).
+        layers: some of `map` (the ground of the town as all its recordings saw it, `town_map`; made if none is kept,
+            which takes a while), `bev` (the agent's BEV camera, in pale colours, over the map), `points`, `boxes`,
+            `ids`, `velocities` (arrows for one second), `trajectories` (past thin, future thick, fading) and `grid`; by
+            default bev, points, boxes, grid. Points and the BEV camera are left out if their files are missing; words
+            in a corner say so (of the BEV camera only if there are no points). A town map that is kept takes the place
+            of a BEV camera's picture that is missing.
         link: what happens to the partners' data; None for nothing.
         sweeps: how many frames of points, the present included.
         seconds: how far trajectories reach back and ahead.
@@ -178,6 +190,11 @@ def draw_bev(dataset: Dataset, sample: RowArgument, view: BevView, layers: froze
     )
     ground = f"{record['token']}/{BEV_CAMERA}"
     has_ground = "bev" in layers and is_there(dataset, ground)
+    town = None
+    if "map" in layers or ("bev" in layers and not has_ground):
+        town = map_beneath(dataset, record["scenario_token"], make="map" in layers)
+    if town is not None:
+        draw_town_map(town, ax, target_from_world=target_from_world)
     if has_ground:
         image = dataset.load_bev(record)
         reach = view.view_range + float(np.abs(center - target_from_ego.translation[:2]).max())
@@ -198,12 +215,20 @@ def draw_bev(dataset: Dataset, sample: RowArgument, view: BevView, layers: froze
             _name_pair(dataset, record, boxes, ax, named=names if len(names) > 1 else ())
         colored = frozenset(colors)
     shown = tuple(agent for agent, cloud in clouds.items() if cloud is not None and len(cloud))
-    if "bev" in layers and not (has_ground or shown):
-        absent.append(f"{BEV_CAMERA}: {absence_text(dataset, ground)}")
+    absent += _absent_ground(dataset, ground, layers, seen=has_ground or town is not None, other=bool(shown))
     _draw_marks(dataset, record, view.frame, names, ax)
     _finish(view.frame, grid="grid" in layers, ax=ax)
     write_missing(ax, "; ".join(filter(None, absent)))
     return DrawnBev(colors=colored, clouds=shown)
+
+
+def _absent_ground(dataset: Dataset, ground: str, layers: frozenset[Layer], *, seen: bool, other: bool) -> list[str]:
+    """What a corner says of the ground: that of the BEV camera only if nothing `other` shows the surroundings."""
+    if seen or layers.isdisjoint(("map", "bev")):
+        return []
+    if "map" in layers:
+        return [f"no {BEV_CAMERA} for a map of the town"]
+    return [] if other else [f"{BEV_CAMERA}: {absence_text(dataset, ground)}"]
 
 
 def _boxes(dataset: Dataset, record: SampleRecord, view: BevView, names: Sequence[AgentName]) -> Boxes:

@@ -7,8 +7,11 @@ from typing import Literal, get_args
 
 from deepaccident_devkit.text import choice
 
-Layer = Literal["image", "bev", "points", "boxes", "ids", "velocities", "trajectories", "labels", "visibility", "grid"]
-"""`image` is the camera's picture, `bev` the simulator's camera from above, `labels` what the motion labels say."""
+Layer = Literal[
+    "image", "map", "bev", "points", "boxes", "ids", "velocities", "trajectories", "labels", "visibility", "grid"
+]
+"""`image` is the camera's picture, `map` the town's ground by all its recordings, `bev` the simulator's camera from
+above, `labels` what the motion labels say."""
 LAYERS: tuple[Layer, ...] = get_args(Layer)
 
 

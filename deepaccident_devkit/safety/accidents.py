@@ -121,7 +121,7 @@ def accident_of(
         agents=_agents_of(dataset, token, (first, second)),
         first_frame=int(common[0]),
         num_frames=record["num_frames"],
-        paths=np.stack([_path(tracks, each, frames) for each in rows]),
+        paths=np.stack([recorded_path(tracks, each, frames) for each in rows]),
         sizes=sizes,
         masses=masses_of(codes, sizes, class_masses),
         interpolated=len(frames) - len(common),
@@ -151,8 +151,11 @@ def accidents_of(
     return found, skipped
 
 
-def _path(tracks: ScenarioTracks, rows: IntArray, frames: IntArray) -> FloatArray:
-    """(F, 3) x, y, yaw of an actor's rows at frames, between its first and its last one; yaw turns the shorter way."""
+def recorded_path(tracks: ScenarioTracks, rows: IntArray, frames: IntArray) -> FloatArray:
+    """(F, 3) x, y, yaw of an actor's rows at frames; yaw turns the shorter way.
+
+    Straight lines fill gaps; before the first row and after the last one the actor stands there.
+    """
     index, boxes = tracks.index[rows], tracks.boxes.select(rows)
     values = [*boxes.center[:, :2].T, np.unwrap(boxes.yaw)]
     return np.column_stack([np.interp(frames, index, each) for each in values])

@@ -16,7 +16,7 @@ from deepaccident_devkit.tables.manifest import MANIFEST_FILE, SCHEMA_VERSION, T
 from deepaccident_devkit.taxonomy import VERSIONS
 from deepaccident_devkit.text import choice
 
-_FILE = re.compile(r".*\.arrow|\..*\.(tmp|part)", re.DOTALL)
+_FILE = re.compile(r".*\.arrow|town_map-\w+\.npz|\..*\.(tmp|part)", re.DOTALL)
 _NAMED = 5
 
 

@@ -147,7 +147,8 @@ def scenario_tracks(dataset: Dataset, scenario: RowArgument) -> ScenarioTracks:
     columns, scenario_row = dataset.columns("track"), dataset.getind("scenario", scenario)
     first_frame = dataset.columns("scenario")["first_frame_row"].item(scenario_row)
     frames = dataset.columns("scenario")["num_frames"].item(scenario_row)
-    first, last = columns["frame_row"].searchsorted((first_frame, first_frame + frames))
+    ends = np.array([first_frame, first_frame + frames], dtype=columns["frame_row"].dtype)
+    first, last = columns["frame_row"].searchsorted(ends)  # of another type, all rows would be copied
     rows = slice(int(first), int(last))
     count = rows.stop - rows.start
     boxes = trusted_boxes(

@@ -1,13 +1,15 @@
 """Whether split files, and folders of layout B, give every scenario one split, and twins the same one."""
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import permutations
 
 from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.reading import shortened
 from deepaccident_devkit.release import ReleaseLayout, read_split_file
 from deepaccident_devkit.release.store import ReleasePath
+from deepaccident_devkit.safety import torn_twins
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.findings import finding_of
 from deepaccident_devkit.tables.split_assignment import SplitAssignment, assign_splits
@@ -58,14 +60,12 @@ def _assignment_findings(splits: SplitAssignment) -> Iterator[Finding]:
 
 def _twins(splits: SplitAssignment) -> Iterator[Finding]:
     """Scenarios of one name and family, such as an accident and its normal twin, that belong to different splits."""
-    twins: dict[tuple[str, str], list[str]] = defaultdict(list)
-    for token in splits.split_of:
-        scenario_type, _, name = token.partition("/")
-        if token not in splits.problems and token not in splits.contradictions:
-            twins[scenario_type.rpartition("_")[0], name].append(token)
-    for tokens in twins.values():
-        for token in tokens:
-            for other in tokens:
-                mine, theirs = splits.split_of[token], splits.split_of[other]
-                if mine != theirs:
-                    yield make_finding("twins-apart", token, token, f"is of {mine}, its twin {other} of {theirs}")
+    known = {
+        token: split
+        for token, split in splits.split_of.items()
+        if token not in splits.problems and token not in splits.contradictions
+    }
+    for twins in torn_twins(known):
+        sides = list(zip(twins.scenarios, twins.splits, strict=True))
+        for (token, mine), (other, theirs) in permutations(sides):
+            yield make_finding("twins-apart", token, token, f"is of {mine}, its twin {other} of {theirs}")

@@ -21,6 +21,10 @@ CASES = [
         EVALUATE.format("warning") + " --protocol field --resamples 100",
         "--resamples changes nothing with --protocol field, which has no intervals",
     ),
+    (
+        EVALUATE.format("warning") + " --protocol boxes --prevented",
+        "--prevented needs the scores of whole recordings, which --protocol boxes does not have; give --protocol clean",
+    ),
     (EVALUATE.format("detection") + " --samples all --horizon 3", "--horizon changes nothing with --samples all"),
     ("evaluate validate results --split val", "--split changes nothing without --dataroot"),
     ("evaluate validate results --on-error raise", "--on-error changes nothing without --dataroot"),

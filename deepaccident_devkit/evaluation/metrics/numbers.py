@@ -42,12 +42,20 @@ _UNITS: Final[Mapping[str, Unit]] = MappingProxyType(
         "alarm_seconds_per_minute": "1/min",
         "alarm_seconds_per_minute/*": "1/min",
         "episodes_per_minute": "1/min",
+        "shares/*": "share",
+        "warned": "share",
+        "extrapolated": "share",
+        "braking_seconds_per_minute": "1/min",
     }
 )
 """Pattern of paths → unit."""
 _SIGNED: Final = ("lateness",)
 """Numbers with a unit that can be below 0."""
-_WITHOUT: Final = ("minutes/*", "within/*/distance", "median_*", "threshold", "best_f1", "quiet", "false_recordings")
+_WITHOUT: Final = (
+    *("minutes", "minutes/*", "false_recordings"),
+    *("within/*/distance", "threshold", "best_f1", "quiet", "quiet_braking"),
+    "median_*",
+)
 """Totals, settings, and medians, which jump when a cluster is left out: the jackknife does not hold for them."""
 
 

@@ -19,6 +19,7 @@ from deepaccident_devkit.evaluation.runs.evaluation_run import (
     ResultsInfo,
     breakdowns_of,
 )
+from deepaccident_devkit.evaluation.runs.prevention import prevented_accidents, with_prevented
 from deepaccident_devkit.evaluation.runs.rows import read_rows, sample_rows
 from deepaccident_devkit.evaluation.runs.selection import SampleSelection
 from deepaccident_devkit.evaluation.runs.text import results_text, summary_text
@@ -47,6 +48,7 @@ __all__ = [
     "evaluate_results",
     "evaluate_shard",
     "explanation_checkpoint",
+    "prevented_accidents",
     "read_bundle",
     "read_rows",
     "results_text",
@@ -55,4 +57,5 @@ __all__ = [
     "scenario_hashes",
     "summary_text",
     "verify_bundle",
+    "with_prevented",
 ]

@@ -17,6 +17,7 @@ from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
 from deepaccident_devkit.evaluation.metrics.frozen_mappings import plain
 from deepaccident_devkit.evaluation.metrics.headlines import headlines
 from deepaccident_devkit.evaluation.metrics.intervals import Resampling
+from deepaccident_devkit.evaluation.metrics.warning import PreventedResult
 from deepaccident_devkit.evaluation.runs.selection import SampleSelection
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.parallel import run_batch
@@ -142,6 +143,8 @@ class EvaluationRun:
         results: whose predictions they are.
         sanity: what the sanity check says, as JSON holds it; None without.
         explanation: what each choice of the protocol changes, likewise.
+        prevented: of warnings, the accidents that they would have prevented, as one group `all` with intervals; None
+            without (`prevention.with_prevented`).
     """
 
     setup: EvaluationSetup
@@ -157,6 +160,7 @@ class EvaluationRun:
     sanity: Mapping[str, Any] | None = None
     explanation: Mapping[str, Any] | None = None
     left_out: int = 0
+    prevented: Breakdown[PreventedResult] | None = None
 
     def __repr__(self) -> str:
         """Task, protocol, whether it is partial, and the first headlines."""
@@ -247,6 +251,7 @@ class EvaluationRun:
             },
             "sanity": self.sanity,
             "explanation": self.explanation,
+            **({} if self.prevented is None else {"prevented": _prevented(self.prevented)}),
         }
         plain_form: dict[str, Any] = json.loads(json.dumps(plain(made)))
         return plain_form
@@ -272,3 +277,13 @@ class EvaluationRun:
             }
             for group in groups
         ]
+
+
+def _prevented(given: Breakdown[PreventedResult]) -> dict[str, Any]:
+    (group,) = given.groups
+    return {
+        **group.result.as_dict(),
+        "resampling": plain(given.resampling),
+        "intervals": plain(group.intervals),
+        "interval_notes": list(group.notes),
+    }

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, Literal
 
 from deepaccident_devkit.errors import EvaluationError, ResultsError
 from deepaccident_devkit.evaluation.metrics.attributes import cluster_of
@@ -16,8 +16,10 @@ from deepaccident_devkit.evaluation.runs.selection import scenario_of
 from deepaccident_devkit.text import columns_text
 
 Json = Mapping[str, Any]
-Chooser = Literal["best_f1", "quiet"]
-"""Which threshold of an evaluation is taken: of the best F1, or of at most one second a minute in false alarm."""
+Chooser = Literal["best_f1", "quiet", "braking"]
+"""Which threshold of an evaluation is taken: of the best F1; of at most one second a minute in false alarm; or of at
+most one second a minute of braking for false alarms, which the evaluation of prevented accidents finds."""
+_TOLD: Final = ("best_f1", "quiet")
 _COLUMNS: Final[Mapping[str, str]] = {
     "auc_ahead": "auc_ahead",
     "twin_wins": "twin_wins",
@@ -110,11 +112,12 @@ def chosen_threshold(folder: Path, by: Chooser, tokens: Iterable[str]) -> float:
             "it is tried on flatters: give one of another split, such as train or val"
         )
     try:
-        groups: Mapping[str, Json] = bundle.summary["metrics"]["groups"]
+        groups: Mapping[str, Json] = bundle.summary["prevented" if by == "braking" else "metrics"]["groups"]
         group = next((name for name in GROUPS if name in groups), None)
-        threshold = None if group is None else groups[group][by]
+        threshold = None if group is None else groups[group]["quiet_braking" if by == "braking" else by]
     except (LookupError, TypeError) as error:
-        raise ResultsError(f"{folder}: its summary has no metrics of warnings; evaluate again") from error
+        what, how = ("prevented accidents", " with --prevented") if by == "braking" else ("metrics of warnings", "")
+        raise ResultsError(f"{folder}: its summary has no {what}; evaluate again{how}") from error
     if not isinstance(threshold, float) or not math.isfinite(threshold):
         raise EvaluationError(
             f"{folder}: found no threshold by {by}; choose another, or give one with --switch threshold=…"
@@ -126,6 +129,11 @@ def _cell(figures: Json, path: str) -> str:
     value: Any = figures
     for name in path.split("/"):
         value = value[name]
+    return number_text(value)
+
+
+def number_text(value: float | None) -> str:
+    """A number of a table; a dash for none."""
     return "–" if value is None else f"{value:.3f}" if abs(value) < 10 else f"{value:.1f}"
 
 
@@ -134,7 +142,7 @@ def _operating(metrics: Json, given: Json) -> Iterator[str]:
     threshold = operating["threshold"]
     found = "none" if threshold is None else f"{threshold:.4g}"
     how = "given" if metrics["operating_by"] == "given" else "of recall 0.8, or the highest, on these recordings"
-    others = ", ".join(f"{name} {_cell(given, name)}" for name in get_args(Chooser))
+    others = ", ".join(f"{name} {_cell(given, name)}" for name in _TOLD)
     yield f"threshold {found} ({how}); for another split: {others}"
     if after:
         told = ", ".join(f"{latency} s: {'–' if left is None else f'{left:.3f} s'}" for latency, left in after.items())

@@ -10,6 +10,7 @@ from typing import Any, Final
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs.notes import reading_notes
 from deepaccident_devkit.evaluation.runs.predictors import predictors_text
+from deepaccident_devkit.evaluation.runs.prevention_text import prevention_text
 from deepaccident_devkit.evaluation.runs.selection import agent_of, scenario_of
 from deepaccident_devkit.text import columns_text
 
@@ -33,6 +34,7 @@ def summary_text(summary: Json, by: Sequence[str] = SHOWN_BREAKDOWNS) -> str:
         ("evaluated", _head(summary)),
         ("results", _headlines(summary)),
         *((("predictors", table),) if (table := predictors_text(summary["metrics"])) else ()),
+        *((("prevented accidents", prevention_text(part)),) if (part := summary.get("prevented")) else ()),
         ("counts", "\n".join(_counts(summary["metrics"]))),
         *((f"by {name}", _breakdown(summary, name)) for name in by if name in summary["breakdowns"]),
     ]

@@ -31,6 +31,7 @@ from deepaccident_devkit.evaluation.runs.bundles import (
 from deepaccident_devkit.evaluation.runs.differences import ABSENT, Difference, differing
 from deepaccident_devkit.evaluation.runs.evaluate import evaluate_results
 from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
+from deepaccident_devkit.evaluation.runs.prevention import with_prevented
 from deepaccident_devkit.evaluation.runs.rows import read_rows, sample_rows
 from deepaccident_devkit.evaluation.runs.selection import SampleSelection
 from deepaccident_devkit.release.fingerprints import scenario_hashes
@@ -179,14 +180,18 @@ def _again(
         progress=progress,
         **engine,
     )
-    breakdowns = bundle.summary["breakdowns"]
-    if not breakdowns:
-        return run
+    breakdowns, prevented = bundle.summary["breakdowns"], bundle.summary.get("prevented")
+    if breakdowns:
+        run = run.broken_down(list(breakdowns), _resampling(next(iter(breakdowns.values()))), **engine)
+    return run if prevented is None else with_prevented(run, dataset, _resampling(prevented), **engine)
+
+
+def _resampling(part: Any) -> Resampling:
+    """How intervals of a part of a summary were made; raises ResultsError."""
     try:
-        resampling = Resampling(**next(iter(breakdowns.values()))["resampling"])
-    except TypeError as error:
+        return Resampling(**part["resampling"])
+    except (LookupError, TypeError) as error:
         raise ResultsError(f"{SUMMARY_FILE}: does not say how intervals were made ({error})") from error
-    return run.broken_down(list(breakdowns), resampling, **engine)
 
 
 def _version(bundle: Bundle) -> Iterator[Difference]:

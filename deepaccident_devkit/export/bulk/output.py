@@ -122,10 +122,16 @@ class Output:
         with replacing_folder(target) as temporary:
             yield Output(temporary, self.parts, self._link, self.tally)
 
-    def link(self, source: ReleasePath, path: str) -> None:
+    def link(self, source: ReleasePath, path: str, *, symbolic: bool = True) -> None:
         """Link a file of the release: hard, else symbolic, else copied, as one out of an archive is.
 
-        Raises SensorFileError if it cannot be read.
+        Args:
+            source: the file.
+            path: relative to the folder.
+            symbolic: whether it may be a symbolic link, which shows the path of the file in the release.
+
+        Raises:
+            SensorFileError: it cannot be read.
         """
         try:
             if isinstance(source, StorePath):
@@ -137,7 +143,7 @@ class Output:
         except OSError as error:
             raise SensorFileError(f"{source}: {fault_text(error)}; restore it from its archive") from error
         with replacing(self._place(path)) as temporary:
-            self.tally.linked[_linked(real, temporary, self._link)] += 1
+            self.tally.linked[_linked(real, temporary, self._link, symbolic=symbolic)] += 1
 
     def leave_out(self, what: str, count: int = 1) -> None:
         """Count what is not written; `what` is a plural in plain words, such as `untracked boxes`."""
@@ -153,7 +159,7 @@ class Output:
         self.tally.bytes += size
 
 
-def _linked(source: Path, target: Path, link: Link) -> Link:
+def _linked(source: Path, target: Path, link: Link, *, symbolic: bool) -> Link:
     """Make `target` show `source`, and say how."""
     if link == "hard":
         try:
@@ -163,7 +169,7 @@ def _linked(source: Path, target: Path, link: Link) -> Link:
                 raise
         else:
             return "hard"
-    if link in ("hard", "symbolic"):
+    if symbolic and link in ("hard", "symbolic"):
         try:
             target.symlink_to(source)
         except OSError as error:

@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 
 from deepaccident_devkit.arrays import AnyArray, IntArray, checked, checked_whole
 from deepaccident_devkit.errors import ConfigError, GeometryError
-from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import Axis
 from deepaccident_devkit.motion.config import MotionLabelConfig, label_config
 from deepaccident_devkit.motion.drawing.box_polygons import FrameBoxes, FramePolygons, box_polygons
@@ -29,7 +28,7 @@ from deepaccident_devkit.motion.warps.chains import frames_from_next
 from deepaccident_devkit.motion.warps.warping import sampling_matrix
 from deepaccident_devkit.taxonomy import UNTRACKED_ID
 
-__all__ = ["FrameBoxes", "FramePolygons", "labels_from_polygons", "motion_labels_from_boxes"]
+__all__ = ["FrameBoxes", "FramePolygons", "labels_from_polygons", "motion_labels_from_boxes", "raster_corners"]
 _FAR: Final = 2**24
 """In cells: corners farther away are moved to this distance, which is far outside the grid."""
 _MOST_IDS: Final = 2**24
@@ -148,7 +147,7 @@ def _footprints(polygons: Sequence[FramePolygons | None], ids: IntArray, config:
     there = [(number, frame) for number, frame in enumerate(polygons) if frame is not None]
     corners = np.concatenate([np.zeros((0, 4, 2), dtype=np.float32), *(frame.corners for _, frame in there)])
     frame = np.repeat([number for number, _ in there], [len(frame.key) for _, frame in there]).astype(np.int64)
-    vertices = _vertices(corners, native, config.rules)
+    vertices = raster_corners(corners, config)
     return Footprints(vertices, frame, ids, topmost(vertices, native.shape, frame, len(polygons)))
 
 
@@ -169,8 +168,10 @@ def _covered(footprints: Footprints, config: MotionLabelConfig) -> CoveredCells:
     )
 
 
-def _vertices(corners: AnyArray, native: BevGrid, rules: LabelProtocol) -> IntArray:
-    """Native column and row at which corners (n, 4, 2), x and y (left), metres, are rasterised."""
+def raster_corners(corners: AnyArray, config: MotionLabelConfig) -> IntArray:
+    """Native column and row (n, 4, 2) at which corners (n, 4, 2), x and y (left), metres, are rasterised."""
+    rules = config.rules
+    native = config.grid.with_orientation(rules.native)
     x, y = corners[..., 0], corners[..., 1] if rules.right_handed else -corners[..., 1]
     columns_and_rows = (y, x) if native.orientation == "fiery" else (x, y)
     axes = reversed(axes_of(native))

@@ -10,6 +10,7 @@ from deepaccident_devkit.render.evaluation.breakdowns import render_breakdown
 from deepaccident_devkit.render.evaluation.comparison import render_comparison
 from deepaccident_devkit.render.evaluation.detection import render_average_precisions, render_precision_recall
 from deepaccident_devkit.render.evaluation.motion import render_quality_by_time, render_ranges
+from deepaccident_devkit.render.evaluation.prevention import render_prevention
 from deepaccident_devkit.render.evaluation.report import save_report
 from deepaccident_devkit.render.evaluation.samples import draw_motion_outcome
 from deepaccident_devkit.render.evaluation.warning import (
@@ -33,6 +34,7 @@ __all__ = [
     "render_outcomes",
     "render_precision_recall",
     "render_predictors",
+    "render_prevention",
     "render_quality_by_time",
     "render_ranges",
     "render_warning_curve",

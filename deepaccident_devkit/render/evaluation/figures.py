@@ -22,7 +22,7 @@ from deepaccident_devkit.evaluation.metrics.warning import AnticipationResult, W
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.render.axes import detached_figure
 from deepaccident_devkit.render.colors import MUTED_COLOR, WARNING_COLOR
-from deepaccident_devkit.render.evaluation import accident, detection, motion, warning
+from deepaccident_devkit.render.evaluation import accident, detection, motion, prevention, warning
 from deepaccident_devkit.render.evaluation.breakdowns import UNKNOWN, render_breakdown
 from deepaccident_devkit.render.evaluation.panels import PANEL
 from deepaccident_devkit.render.pictures import write_figure
@@ -217,6 +217,7 @@ def _warning(run: EvaluationRun) -> Iterator[RunFigure]:
             alt="Chance that an accident's score is above another recording's at the same moment, by predictor.",
             draw=partial(warning.render_predictors, result),
         )
+        yield from _prevention(run)
     if not isinstance(result, WarningResult):
         return
     rates = _listed((f"{seconds:g} s before", rate) for seconds, rate in result.detection_rate.items())
@@ -244,6 +245,21 @@ def _warning(run: EvaluationRun) -> Iterator[RunFigure]:
         alt="Detection rate over false alarms a minute.",
         draw=partial(warning.render_warning_curve, result),
     )
+
+
+def _prevention(run: EvaluationRun) -> Iterator[RunFigure]:
+    if run.prevented is None:
+        return
+    for group in run.prevented.groups:
+        result = group.result
+        for name in result.groups:
+            yield RunFigure(
+                name=f"prevention_{name.replace(', ', '_')}",
+                caption=f"Share of the accidents that braking after the alarm avoids, against the braking for false "
+                f"alarms, as the threshold falls: {name}. The upright line is at one braking second a minute.",
+                alt=f"Share avoided over braking seconds a minute; {_listed([('avoided', result.avoided(name))])}.",
+                draw=partial(prevention.render_prevention, result, name),
+            )
 
 
 _FIGURES: Final[dict[str, Callable[[EvaluationRun], Iterator[RunFigure]]]] = {

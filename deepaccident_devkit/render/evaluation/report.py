@@ -69,6 +69,7 @@ def report_html(run: EvaluationRun, figures: Sequence[tuple[RunFigure, Path]]) -
     parts = {
         "Headline numbers": sections.headline_table(run),
         **({"Predictors": table} if (table := sections.predictors(run)) else {}),
+        **({"Prevented accidents": table} if (table := sections.prevention(run)) else {}),
         "Counts": sections.counts(run),
         "Figures": tag("div", *(_figure(*each) for each in figures), class_="figures"),
         "Breakdowns": joined(sections.breakdowns(run)),

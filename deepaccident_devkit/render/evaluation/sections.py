@@ -14,7 +14,8 @@ from deepaccident_devkit.evaluation.metrics.headlines import Headline, headlines
 from deepaccident_devkit.evaluation.metrics.intervals import LEAST_CLUSTERS
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.evaluation.runs.notes import reading_notes
-from deepaccident_devkit.evaluation.runs.predictors import predictor_tables
+from deepaccident_devkit.evaluation.runs.predictors import PredictorTable, predictor_tables
+from deepaccident_devkit.evaluation.runs.prevention_text import prevention_tables
 from deepaccident_devkit.render.evaluation.breakdowns import UNKNOWN
 from deepaccident_devkit.render.evaluation.markup import Markup, facts, joined, number, scalar, table, tag, tree
 
@@ -76,12 +77,16 @@ def headline_table(run: EvaluationRun) -> Markup:
 
 def predictors(run: EvaluationRun) -> Markup:
     """The predictions beside predictors that know nothing or only the present; empty except for warnings."""
-    return joined(
-        joined(
-            [table(list(each.rows[0]), [list(row) for row in each.rows[1:]]), *(tag("p", note) for note in each.notes)]
-        )
-        for each in predictor_tables(run.result.as_dict())
-    )
+    return _tables(predictor_tables(run.result.as_dict()))
+
+
+def prevention(run: EvaluationRun) -> Markup:
+    """The accidents that the alarms would have prevented, beside the braking for nothing; empty without."""
+    prevented = run.summary().get("prevented")
+    if prevented is None:
+        return Markup("")
+    notes = [*prevented["notes"], *prevented["interval_notes"]]
+    return joined([_tables(prevention_tables(prevented)), *(tag("p", each, class_="note") for each in notes)])
 
 
 def counts(run: EvaluationRun) -> Markup:
@@ -262,6 +267,15 @@ def _columns(value: Any) -> Markup:
     names = list(dict.fromkeys(name for each in value.values() for name in each))
     plain = [name for name in names if not any(isinstance(each.get(name), Mapping) for each in value.values())]
     return table(["", *plain], [[key, *(number(each.get(name)) for name in plain)] for key, each in value.items()])
+
+
+def _tables(tables: Sequence[PredictorTable]) -> Markup:
+    return joined(
+        joined(
+            [table(list(each.rows[0]), [list(row) for row in each.rows[1:]]), *(tag("p", note) for note in each.notes)]
+        )
+        for each in tables
+    )
 
 
 def _samples(groups: Sequence[Group[Any]]) -> int:

@@ -65,8 +65,9 @@ def render_replay(
 
     It shows the agents' cameras with the actors' boxes, one of them large, by default the one that shows the colliding
     pair best; from above the road, all actors and their trails; who sees whom by the released rule, the LiDAR of the
-    first agent and the countdown to the impact. The front cameras, and the cameras while they show the pair best, have
-    the larger pictures. What the release lacks (images, points, labels) is left out, and the page says so.
+    first agent and the countdown to the impact. The road is what the agents' BEV cameras saw; where they have no files,
+    that of a town map (`town_map`), if one is kept. The front cameras, and the cameras while they show the pair best,
+    have the larger pictures. What the release lacks (images, points, labels) is left out, and the page says so.
 
     Args:
         dataset: the release.
@@ -82,7 +83,7 @@ def render_replay(
         progress: whether to show a bar.
 
     Returns:
-        The path written; the same bytes for the same release and arguments.
+        The path written; the same bytes for the same release, arguments and kept town map.
 
     Raises:
         TokenError: no such scenario.

@@ -1,4 +1,4 @@
-"""The road around a scenario as one pale picture, merged from what the agents' BEV cameras saw."""
+"""The road around a scenario as one pale picture: what the agents' BEV cameras saw, else what a kept town map has."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ import numpy as np
 
 from deepaccident_devkit.arrays import ByteArray, FloatArray
 from deepaccident_devkit.geometry import SE3
+from deepaccident_devkit.maps import GROUND_CLASSES, TownMap
 from deepaccident_devkit.release import BevImage
 from deepaccident_devkit.release.bev_camera import TAGS
 from deepaccident_devkit.render.colors import BEV_COLORS
 from deepaccident_devkit.render.missing import is_there
 from deepaccident_devkit.render.replay.recording import Recording
+from deepaccident_devkit.render.town_map import map_beneath
 from deepaccident_devkit.taxonomy import BEV_CAMERA, BEV_RESOLUTION, BEV_SHAPE
 
 _GROUND: Final = ("sidewalk", "road", "road_line")
@@ -31,19 +33,23 @@ _MOST: Final = 200_000
 def road_picture(recording: Recording) -> dict[str, Any] | None:
     """The road as the page has it: a PNG in base64, and its left, top, width and height (cm, y up).
 
-    White is nothing, or not seen. None if the release has no BEV camera file of these moments, or if they give no small
-    picture.
+    White is nothing, or not seen. If the release has no BEV camera file of these moments, as of the test split, it is
+    the town's map, where one is kept; None if there is neither, or if they give no small picture.
 
     Raises:
         SensorFileError: a file cannot be read.
     """
-    seen = _seen(recording)
-    if not seen:
+    samples = _samples(recording)
+    seen = _seen(recording, samples)
+    town = None if seen else map_beneath(recording.dataset, recording.scenario["token"], make=False)
+    if not seen and town is None:
         return None
     reach = BEV_RESOLUTION * BEV_SHAPE[0] / 2
-    middles = np.array([pose.translation[:2] for _, pose in seen])
+    poses = [pose for _, pose in seen] or [recording.dataset.world_from(sample, "ego") for sample in samples]
+    middles = np.array([pose.translation[:2] for pose in poses])
     low, high = middles.min(axis=0) - reach, middles.max(axis=0) + reach
-    pictures = (_png(_merged(seen, low, high, cell)) for cell in _CELLS)
+    grounds = (_merged(seen, low, high, cell) if town is None else _mapped(town, low, high, cell) for cell in _CELLS)
+    pictures = map(_png, grounds)
     png = next((each for each in pictures if len(each) <= _MOST), None)
     if png is None:
         return None
@@ -52,11 +58,15 @@ def road_picture(recording: Recording) -> dict[str, Any] | None:
     return {"png": base64.b64encode(png).decode("ascii"), "left": left, "top": top, "width": width, "height": height}
 
 
-def _seen(recording: Recording) -> list[tuple[BevImage, SE3]]:
-    """The pictures of the agents at a few moments, and where the agents are in world."""
+def _samples(recording: Recording) -> list[str]:
+    """The samples (tokens) of the agents at a few moments."""
     frames = np.linspace(recording.frames[0], recording.frames[-1], _MOMENTS).round().astype(int)
+    return [recording.sample(agent, frame) for agent in recording.agents for frame in np.unique(frames).tolist()]
+
+
+def _seen(recording: Recording, samples: Sequence[str]) -> list[tuple[BevImage, SE3]]:
+    """The pictures of samples whose files are there, and where the agents are in world."""
     dataset = recording.dataset
-    samples = [recording.sample(agent, frame) for agent in recording.agents for frame in np.unique(frames).tolist()]
     there = [sample for sample in samples if is_there(dataset, f"{sample}/{BEV_CAMERA}")]
     return [(dataset.load_bev(sample), dataset.world_from(sample, "ego")) for sample in there]
 
@@ -70,12 +80,11 @@ def _merged(seen: Sequence[tuple[BevImage, SE3]], low: FloatArray, high: FloatAr
         high: (2,) largest x and y.
         cell: side of a cell, metres.
     """
-    columns, rows = np.ceil((high - low) / cell).astype(int).tolist()
-    x, y = low[0] + (np.arange(columns) + 0.5) * cell, high[1] - (np.arange(rows) + 0.5) * cell
+    x, y = _middles(low, high, cell)
     kinds = np.zeros(256, dtype=np.uint8)
     for number, name in enumerate(_GROUND, 1):
         kinds[TAGS[name]] = number
-    merged = np.zeros((rows, columns), dtype=np.uint8)
+    merged = np.zeros((len(y), len(x)), dtype=np.uint8)
     for image, pose in seen:
         yaw = np.arctan2(pose.rotation[1, 0], pose.rotation[0, 0])
         right, up = x[None] - pose.translation[0], y[:, None] - pose.translation[1]
@@ -85,6 +94,20 @@ def _merged(seen: Sequence[tuple[BevImage, SE3]], low: FloatArray, high: FloatAr
         free = (merged == 0) & (row >= 0) & (row <= 2 * middle) & (column >= 0) & (column <= 2 * middle)
         merged[free] = kinds[image.semantic[row[free], column[free]]]
     return merged
+
+
+def _mapped(town: TownMap, low: FloatArray, high: FloatArray, cell: float) -> ByteArray:
+    """(H, W) uint8: the ground by a town's map, as `_merged` gives it."""
+    kinds = np.array([0, *(1 + _GROUND.index(name) if name in _GROUND else 0 for name in GROUND_CLASSES)])
+    across, down = np.meshgrid(*_middles(low, high, cell))
+    classes = town.classes_at(np.column_stack([across.ravel(), down.ravel()])).reshape(across.shape)
+    return kinds.astype(np.uint8)[classes]
+
+
+def _middles(low: FloatArray, high: FloatArray, cell: float) -> tuple[FloatArray, FloatArray]:
+    """The x of the picture's columns, and the y of its rows from the top."""
+    columns, rows = np.ceil((high - low) / cell).astype(int).tolist()
+    return low[0] + (np.arange(columns) + 0.5) * cell, high[1] - (np.arange(rows) + 0.5) * cell
 
 
 def _png(cells: ByteArray) -> bytes:

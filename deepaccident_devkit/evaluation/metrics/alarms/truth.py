@@ -5,18 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Any, Final, Literal
 
 import numpy as np
 
 from deepaccident_devkit.arrays import FloatArray, FrozenArrays, IntArray, ShortRepr
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import NotAvailableError, TokenError
+from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation.metrics.alarms.constant_velocity import constant_velocity_alarms
 from deepaccident_devkit.evaluation.metrics.alarms.reading import InstanceTracks
 from deepaccident_devkit.evaluation.metrics.predictions import Accident
 from deepaccident_devkit.geometry.footprints import gaps
+from deepaccident_devkit.safety import twin_of
 from deepaccident_devkit.taxonomy import FRAME_PERIOD, INFRASTRUCTURE, OWN_ACTOR_ID
 from deepaccident_devkit.v2x.seen import seen_actors
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
@@ -96,7 +96,6 @@ REFERENCES: Final = ("TTC < 3 s, true tracks", "TTC < 3 s, seen")
 """Predictors that foresee what constant velocities lead to: of all actors as they are, and of those that the agent
 itself sees by the released rule."""
 _DESIGNED_PAIR: Final = ("ego_vehicle", "other_vehicle")
-_OTHER_ENDING: Final[Mapping[str, str]] = MappingProxyType({"normal": "accident", "accident": "normal"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -242,13 +241,9 @@ def _last_position(tracks: ScenarioTracks, footprints: FloatArray, actor: int, s
 
 def _twin_of(dataset: Dataset, scenario: Mapping[str, Any]) -> Any:
     """The scenario of the same family and name with the other ending; None if there is none, or it is not known."""
-    family, _, ending = scenario["scenario_type"].rpartition("_")
-    try:
-        twin = dataset.scenario.get(f"{family}_{_OTHER_ENDING.get(ending, ending)}/{scenario['name']}")
-    except TokenError:
-        return None
-    unknown = scenario["weather"] is None or twin["weather"] is None  # no meta file
-    return None if unknown or twin["token"] == scenario["token"] else twin
+    twin = twin_of(dataset, scenario["token"])
+    unknown = twin is None or scenario["weather"] is None or twin["weather"] is None  # no meta file
+    return None if unknown else twin
 
 
 def _collides(scenario: Mapping[str, Any] | None) -> bool:

@@ -6,8 +6,16 @@ from deepaccident_devkit.evaluation.metrics.warning.anticipation import (
     CleanWarnings,
 )
 from deepaccident_devkit.evaluation.metrics.warning.clean import CleanScores, OperatingPoint
+from deepaccident_devkit.evaluation.metrics.warning.cost import AlarmCost, false_alarm_cost
 from deepaccident_devkit.evaluation.metrics.warning.evaluator import WARNING_PROTOCOLS, WarningEvaluator
 from deepaccident_devkit.evaluation.metrics.warning.field import FieldFigures, FieldQuirks, field_figures
+from deepaccident_devkit.evaluation.metrics.warning.outcome_tables import AccidentOutcomes, OutcomeTable
+from deepaccident_devkit.evaluation.metrics.warning.prevented import PreventedEvaluator
+from deepaccident_devkit.evaluation.metrics.warning.prevention import (
+    PreventedResult,
+    PreventionCurve,
+    PreventionFigures,
+)
 from deepaccident_devkit.evaluation.metrics.warning.protocol import WarningProtocol
 from deepaccident_devkit.evaluation.metrics.warning.published import FieldResult, FieldWarnings
 from deepaccident_devkit.evaluation.metrics.warning.result import WarningCurve, WarningResult
@@ -15,6 +23,8 @@ from deepaccident_devkit.evaluation.metrics.warning.series import ScoreSeries
 
 __all__ = [
     "WARNING_PROTOCOLS",
+    "AccidentOutcomes",
+    "AlarmCost",
     "AnticipationFigures",
     "AnticipationResult",
     "CleanScores",
@@ -24,10 +34,16 @@ __all__ = [
     "FieldResult",
     "FieldWarnings",
     "OperatingPoint",
+    "OutcomeTable",
+    "PreventedEvaluator",
+    "PreventedResult",
+    "PreventionCurve",
+    "PreventionFigures",
     "ScoreSeries",
     "WarningCurve",
     "WarningEvaluator",
     "WarningProtocol",
     "WarningResult",
+    "false_alarm_cost",
     "field_figures",
 ]

@@ -37,7 +37,11 @@ LATENCIES: Final = (0.0, 0.1, 0.3)
 """Seconds that a warning may need from an agent that sees the danger to the two that collide."""
 _ANY: Final = float(np.nextafter(0.0, 1.0))
 _FIXED: Final[Mapping[str, float]] = {"always": 1.0, "never": 1.0, "random per frame": 0.5, "random per recording": 0.5}
-"""Operating points of the predictors that know nothing; of the other references any alarm is one."""
+
+
+def reference_threshold(predictor: str) -> float:
+    """The operating point of one of `PREDICTORS` but the given one: of those that know the present any alarm is one."""
+    return _FIXED.get(predictor, _ANY)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -188,7 +192,7 @@ class _Table:
         r80 = scores.threshold_of_recall(weight)
         operating = self._rules.threshold
         if self._predictor != GIVEN:
-            operating = _FIXED.get(self._predictor, _ANY)
+            operating = reference_threshold(self._predictor)
         if operating is None:
             threshold = scores.threshold_of_highest_recall(weight) if math.isnan(r80) else r80
         else:
@@ -220,22 +224,26 @@ class _Table:
 
 def _figures(drives: Sequence[Drive], predictor: str, rules: CleanWarnings) -> AnticipationFigures:
     """One predictor's figures; of a random one their means over some draws, so that no luck ranks it."""
-    draws = RANDOM_DRAWS if predictor.startswith("random") else 1
-    drawn = [_Table(drives, predictor, rules, draw).figures() for draw in range(draws)]
-    return drawn[0] if draws == 1 else _mean(drawn)
+    drawn = [_Table(drives, predictor, rules, draw).figures() for draw in range(draws_of(predictor))]
+    return drawn[0] if len(drawn) == 1 else mean_of(drawn)
 
 
-def _mean(parts: Sequence[Any]) -> Any:
+def draws_of(predictor: str) -> int:
+    """How many draws a predictor's figures are means of: several of a random one, so that no luck ranks it."""
+    return RANDOM_DRAWS if predictor.startswith("random") else 1
+
+
+def mean_of(parts: Sequence[Any]) -> Any:
     """Of floats, and of those in mappings and dataclasses of one form, NaN left out. All else is as in the first."""
     first = parts[0]
     if isinstance(first, float):
         known = [each for each in parts if not math.isnan(each)]
         return math.fsum(known) / len(known) if known else math.nan
     if isinstance(first, Mapping):
-        return {name: _mean([each[name] for each in parts]) for name in first}
+        return {name: mean_of([each[name] for each in parts]) for name in first}
     if is_dataclass(first) and not isinstance(first, type):
         names = [each.name for each in fields(first)]
-        return replace(first, **{name: _mean([getattr(each, name) for each in parts]) for name in names})
+        return replace(first, **{name: mean_of([getattr(each, name) for each in parts]) for name in names})
     return first
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from deepaccident_devkit.arrays import BoolArray, FloatArray, IntArray, ShortRepr
 from deepaccident_devkit.evaluation.metrics.evaluator import ratio
+from deepaccident_devkit.evaluation.metrics.warning.cost import MINUTE
 from deepaccident_devkit.evaluation.metrics.warning.series import ScoreSeries
 
 WINDOW: Final = 3.0
@@ -24,7 +25,6 @@ EARLY: Final = 5.0
 """Seconds before the impact from which on an alarm counts as one of this accident; before, it is neither right nor
 wrong."""
 _SLACK: Final = 1e-9
-_MINUTE: Final = 60.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -164,7 +164,7 @@ class CleanScores:
             return math.nan
         alarmed = (self._alarmed[others] * weight[others, None]).sum(axis=0)
         raised = np.diff(sum(self._raised(weight)), prepend=0.0) > 0  # levels of recordings that count
-        good = np.flatnonzero((alarmed * _MINUTE <= seconds_per_minute * frames + _SLACK) & raised)
+        good = np.flatnonzero((alarmed * MINUTE <= seconds_per_minute * frames + _SLACK) & raised)
         return float(self._levels[good[-1]]) if len(good) else math.nan
 
     def at(self, threshold: float, weight: FloatArray) -> OperatingPoint:
@@ -191,8 +191,8 @@ class CleanScores:
             tta_hit=ratio(seconds, hits),
             tta0=ratio(seconds, accidents),
             time_in_alarm=share,
-            alarm_seconds_per_minute=share * _MINUTE,
-            episodes_per_minute=ratio(float((begun.sum(axis=1) * others).sum()), frames / series.fps / _MINUTE),
+            alarm_seconds_per_minute=share * MINUTE,
+            episodes_per_minute=ratio(float((begun.sum(axis=1) * others).sum()), frames / series.fps / MINUTE),
             false_recordings=false,
             early_share=ratio(
                 float((early.sum(axis=1) * weight).sum()), float((self._early.sum(axis=1) * weight).sum())

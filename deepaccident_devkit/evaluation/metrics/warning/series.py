@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays
+from deepaccident_devkit.arrays import BoolArray, FloatArray, FrozenArrays, IntArray
 
 _SLACK: Final = 1e-6
 """Columns: times are decimal numbers, which binary numbers only approximate."""
@@ -51,11 +51,15 @@ class ScoreSeries(FrozenArrays):
         scores: FloatArray = np.where(there, np.where(self.valid, self.scores, np.nan)[rows, column * there], np.nan)
         return scores
 
+    def first(self, thresholds: FloatArray) -> IntArray:
+        """(N, K) the first column with a score of at least each of K thresholds; T where there is none."""
+        so_far = np.maximum.accumulate(np.where(self.valid, self.scores, -np.inf), axis=1)
+        first = np.array([np.searchsorted(row, thresholds, side="left") for row in so_far], dtype=np.int64)
+        return first.reshape(len(so_far), len(thresholds))
+
     def leads(self, thresholds: FloatArray) -> FloatArray:
         """(N, K) seconds from the first score of at least each of K thresholds to `toa`; NaN where there is none."""
-        so_far = np.maximum.accumulate(np.where(self.valid, self.scores, -np.inf), axis=1)
-        first = np.array([np.searchsorted(row, thresholds, side="left") for row in so_far], dtype=np.float64)
-        first = first.reshape(len(so_far), len(thresholds))
+        first = self.first(thresholds).astype(np.float64)
         first[first >= self.scores.shape[1]] = np.nan
         leads: FloatArray = (self.toa[:, None] - first) / self.fps
         return leads

@@ -134,6 +134,17 @@ class TestLinks:
         assert (tmp_path / "out" / "a.jpg").is_symlink()
         assert not (tmp_path / "out" / "b.jpg").is_symlink()
 
+    def test_a_copy_where_a_symbolic_link_would_tell_a_path(
+        self, tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        output = output_of(tmp_path)
+        output.link(source, "a.jpg", symbolic=False)
+        monkeypatch.setattr(os, "link", refusing(errno.EXDEV))
+        output.link(source, "b.jpg", symbolic=False)
+        assert output.tally.linked == Counter(hard=1, copy=1)
+        assert not (tmp_path / "out" / "b.jpg").is_symlink()
+        assert (tmp_path / "out" / "b.jpg").read_bytes() == source.read_bytes()
+
     @pytest.mark.parametrize("link", ["hard", "symbolic"])
     def test_a_full_disk_is_no_reason_for_another_way(
         self, tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch, link: Link

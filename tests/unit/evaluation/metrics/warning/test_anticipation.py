@@ -28,7 +28,7 @@ from deepaccident_devkit.evaluation.metrics.warning import (
     anticipation,
     field_figures,
 )
-from deepaccident_devkit.evaluation.metrics.warning.anticipation import _mean
+from deepaccident_devkit.evaluation.metrics.warning.anticipation import mean_of
 from deepaccident_devkit.evaluation.metrics.warning.drives import REFERENCES, TRIVIAL
 from deepaccident_devkit.evaluation.metrics.warning.recordings import surest
 
@@ -347,8 +347,8 @@ def test_field_knows_pairs_and_recordings_alone() -> None:
 
 def test_means_over_draws_leave_unknown_numbers_out_and_keep_counts_and_words() -> None:
     parts = [{"a": {"x": value, "n": 3, "by": "f1"}} for value in (1.0, math.nan, 4.0)]
-    assert _mean(parts) == {"a": {"x": 2.5, "n": 3, "by": "f1"}}
-    assert math.isnan(_mean([math.nan, math.nan]))
+    assert mean_of(parts) == {"a": {"x": 2.5, "n": 3, "by": "f1"}}
+    assert math.isnan(mean_of([math.nan, math.nan]))
 
 
 def test_the_context_tells_involvement_twins_and_what_constant_velocities_lead_to(
@@ -423,7 +423,7 @@ def test_random_rows_are_means_of_their_draws(monkeypatch: pytest.MonkeyPatch) -
 
     one, two = row(1), row(2)
     assert one != two
-    monkeypatch.setattr(anticipation, "_mean", None)  # which one draw has no need of
+    monkeypatch.setattr(anticipation, "mean_of", None)  # which one draw has no need of
     assert row(1) == one
 
 

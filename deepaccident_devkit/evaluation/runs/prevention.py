@@ -1,0 +1,209 @@
+"""`prevented_accidents`: from the counts of warnings and a release to the accidents that they would have prevented."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from deepaccident_devkit.arrays import IntArray
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import EvaluationError, NotAvailableError
+from deepaccident_devkit.evaluation.metrics.attributes import EVERYTHING
+from deepaccident_devkit.evaluation.metrics.breakdowns import breakdown
+from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
+from deepaccident_devkit.evaluation.metrics.intervals import Resampling
+from deepaccident_devkit.evaluation.metrics.warning import CleanWarnings
+from deepaccident_devkit.evaluation.metrics.warning.anticipation import LATENCIES
+from deepaccident_devkit.evaluation.metrics.warning.outcome_tables import AccidentOutcomes, OutcomeTable
+from deepaccident_devkit.evaluation.metrics.warning.prevented import PreventedEvaluator
+from deepaccident_devkit.evaluation.metrics.warning.prevention import PreventedResult
+from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
+from deepaccident_devkit.parallel import Places, in_order, run_unordered
+from deepaccident_devkit.safety import Accident, Skipped, accident_of, outcomes_of, undisturbed
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+_PEDESTRIAN: Final = "pedestrian"
+Frames = Mapping[str, tuple[int, ...]]
+"""Agent → frame numbers of its samples."""
+
+
+def prevented_accidents(
+    dataset: Dataset,
+    evaluator: Evaluator[Any],
+    *,
+    workers: int | None = None,
+    executor: Executor | None = None,
+    progress: bool = False,
+) -> PreventedResult:
+    """The accidents that alarms would have prevented if somebody had braked, and what false alarms cost.
+
+    An agent of the pair that collides brakes alone; any other agent warns both of the pair, after a latency.
+
+    Args:
+        dataset: the release that the samples are of.
+        evaluator: a `WarningEvaluator` of the protocol `clean` that has counted them.
+        workers: processes; None takes what the work is worth.
+        executor: any executor of `concurrent.futures` to run on, in place of own workers.
+        progress: whether to show a bar.
+
+    Raises:
+        EvaluationError: it is another evaluator, or of another protocol.
+        TokenError: a sample is of no scenario of the release.
+        WorkerError: a worker was killed, or cannot do the work.
+    """
+    engine: dict[str, Any] = {"workers": workers, "executor": executor, "progress": progress}
+    return prevention_evaluator(dataset, evaluator, **engine).compute()
+
+
+def with_prevented(
+    run: EvaluationRun,
+    dataset: Dataset,
+    resampling: Resampling | None = None,
+    *,
+    workers: int | None = 1,
+    executor: Executor | None = None,
+    progress: bool = False,
+) -> EvaluationRun:
+    """The same run with the accidents that its alarms would have prevented, and intervals of their numbers.
+
+    Args:
+        run: an evaluation of warnings, protocol `clean`.
+        dataset: the release that it is of.
+        resampling: how intervals are made, an accident and its twin together; None for the defaults.
+        workers: processes; None takes what the work is worth.
+        executor: any executor of `concurrent.futures` to run on, in place of own workers.
+        progress: whether to show a bar.
+
+    Raises:
+        EvaluationError: the run is of another task or protocol.
+        WorkerError: a worker was killed, or cannot do the work.
+    """
+    evaluator = prevention_evaluator(dataset, run.evaluator, workers=workers, executor=executor, progress=progress)
+    found = breakdown(evaluator, run.attributes, EVERYTHING, resampling)
+    groups = tuple(replace(each, result=evaluator.compute()) for each in found.groups)
+    return replace(run, prevented=replace(found, groups=groups, without_infrastructure=()))
+
+
+def prevention_evaluator(
+    dataset: Dataset,
+    evaluator: Evaluator[Any],
+    *,
+    workers: int | None = None,
+    executor: Executor | None = None,
+    progress: bool = False,
+) -> PreventedEvaluator:
+    """An evaluator with the same counts that computes prevented accidents; see `prevented_accidents`."""
+    protocol = getattr(evaluator, "protocol", None)
+    if not isinstance(protocol, CleanWarnings):
+        raise EvaluationError(
+            "evaluator: prevented accidents need one of warnings, protocol clean, which scores whole recordings; "
+            f"found {evaluator!r} with the protocol {type(protocol).__name__}"
+        )
+    counts = evaluator.counts
+    frames: dict[str, dict[str, list[int]]] = {}
+    for token in sorted(evaluator.tokens):
+        each = counts[token]
+        if each["kind"] == "accident":
+            scenario, _, agent = each["recording"].rpartition("/")
+            frames.setdefault(scenario, {}).setdefault(agent, []).append(each["frame"])
+    wanted = {
+        scenario: {agent: tuple(sorted(those)) for agent, those in agents.items()}
+        for scenario, agents in frames.items()
+    }
+    outcomes = accident_outcomes(dataset, wanted, workers=workers, executor=executor, progress=progress)
+    made = PreventedEvaluator(outcomes, protocol)
+    for token in evaluator.tokens:
+        made.add(token, counts[token])
+    return made
+
+
+def accident_outcomes(
+    dataset: Dataset,
+    frames: Mapping[str, Frames],
+    *,
+    workers: int | None = None,
+    executor: Executor | None = None,
+    progress: bool = False,
+) -> AccidentOutcomes:
+    """How accidents end, for each frame at which an agent can raise its first alarm; any workers give the same bits.
+
+    Args:
+        dataset: the release.
+        frames: scenario → agents whose alarms are judged → frame numbers of their samples.
+        workers: processes; None takes what the work is worth.
+        executor: any executor of `concurrent.futures` to run on, in place of own workers.
+        progress: whether to show a bar.
+
+    Raises:
+        TokenError: no such scenario.
+        WorkerError: a worker was killed, or cannot do the work.
+    """
+    found = in_order(
+        run_unordered(
+            partial(_tables_of, dataset),
+            sorted(frames.items()),
+            workers=workers,
+            executor=executor,
+            label="braking",
+            progress=progress,
+            places=Places(reads=dataset.places),
+        )
+    )
+    tables: dict[str, OutcomeTable] = {}
+    left_out: dict[bool, list[Skipped]] = {True: [], False: []}
+    for each in found:
+        if isinstance(each, dict):
+            tables.update(each)
+        else:
+            known, reason = each
+            left_out[known].append(reason)
+    return AccidentOutcomes(tables=tables, dropped=tuple(left_out[True]), skipped=tuple(left_out[False]))
+
+
+def _tables_of(dataset: Dataset, item: tuple[str, Frames]) -> dict[str, OutcomeTable] | tuple[bool, Skipped]:
+    """Recording → table, of one scenario; else whether its motion is known, and why there is none."""
+    scenario, agents = item
+    try:
+        accident = accident_of(dataset, scenario)
+    except NotAvailableError as error:
+        return False, Skipped(scenario=scenario, reason=str(error))
+    if accident is None:
+        return False, Skipped(scenario=scenario, reason="its meta file names no collision")
+    check = undisturbed(accident)
+    if not check.usable:
+        found = f"{check.margin:.2f} m between the two at its last frame" if check.collides else "no contact"
+        reason = f"the recording does not show the impact: {found}, though nobody brakes"
+        return True, Skipped(scenario=scenario, reason=reason)
+    frame = np.unique(np.concatenate([np.array(those, dtype=np.int64) for those in agents.values()]))
+    made: dict[tuple[bool, bool], OutcomeTable] = {}
+    tables: dict[str, OutcomeTable] = {}
+    for agent in sorted(agents):
+        own = accident.agents[0] == agent, accident.agents[1] == agent
+        if own not in made:
+            made[own] = _table(accident, own, frame)
+        tables[f"{scenario}/{agent}"] = made[own]
+    return tables
+
+
+def _table(accident: Accident, own: tuple[bool, bool], frame: IntArray) -> OutcomeTable:
+    """The table of an agent that is one of the pair, or neither: then both brake, told after some latency.
+
+    Who is warned before the first frame that shows both brakes from there on, at the earliest.
+    """
+    seconds = (frame - accident.first_frame) * FRAME_PERIOD
+    brakers, latencies = (own, LATENCIES[:1]) if any(own) else ((True, True), LATENCIES)
+    ends = [outcomes_of(accident, brakers, np.append(seconds, np.nan), latency=each) for each in latencies]
+    return OutcomeTable(
+        frame=frame,
+        outcome=np.stack([each.outcome for each in ends]).astype(np.int8),
+        extrapolated=np.stack([each.extrapolated for each in ends]),
+        latencies=latencies,
+        pedestrian=_PEDESTRIAN in accident.categories,
+    )

@@ -1,0 +1,143 @@
+"""Counting: how often the cells of a town's raster were seen as road, road line, sidewalk or something else."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepaccident_devkit.arrays import BoolArray, ByteArray, FloatArray, FrozenArrays, IntArray
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import MissingFileError, SensorFileError
+from deepaccident_devkit.maps.config import TownMapConfig
+from deepaccident_devkit.maps.looks import Looks, looks_of
+from deepaccident_devkit.release import read_bev
+from deepaccident_devkit.release.bev_camera import TAGS
+from deepaccident_devkit.taxonomy import BEV_RESOLUTION, BEV_SHAPE
+
+logger = logging.getLogger(__name__)
+
+GROUND_CLASSES: Final = ("road", "road_line", "sidewalk", "other")
+"""What the ground of a cell can be; `other` is whatever else CARLA has a tag for: grass, buildings, trees, water."""
+HIDING: Final = ("pedestrian", "vehicle")
+"""What moves and hides the ground: a picture says nothing of the cells beneath."""
+_UNLABELLED: Final = 0
+"""CARLA's tag of what has none."""
+_MIDDLE: Final = (BEV_SHAPE[0] - 1) / 2
+"""Row and column of the agent."""
+REACH: Final = BEV_RESOLUTION * BEV_SHAPE[0] / 2
+"""Metres that a picture shows to each side of its agent."""
+
+Counts = NDArray[np.uint16]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Window(FrozenArrays):
+    """What one scenario's pictures say of the cells around it; arrays are read-only.
+
+    Cell (i, j) of the world has its lower corner at x = j · resolution, y = i · resolution.
+
+    Attributes:
+        corner: row and column of the window's first cell, among those of the world.
+        counts: (4, h, w) uint16, pictures that saw each of `GROUND_CLASSES` at the cell's middle.
+        agents: (h, w) uint16, agents that saw the ground there.
+        looks: pictures that were read.
+        missing: pictures whose files are not there.
+        damaged: pictures whose files cannot be read.
+    """
+
+    corner: tuple[int, int]
+    counts: Counts
+    agents: Counts
+    looks: int
+    missing: int
+    damaged: int
+
+
+def count_scenario(dataset: Dataset, config: TownMapConfig, scenario_row: int) -> Window:
+    """Count what the BEV cameras of one scenario saw, in the cells of the world."""
+    recordings = looks_of(dataset, scenario_row, config)
+    low, high = cells_around(np.concatenate([each.poses for each in recordings]), config.resolution)
+    rows, columns = (high - low).tolist()
+    counts = np.zeros((len(GROUND_CLASSES), rows, columns), dtype=np.uint16)
+    agents = np.zeros((rows, columns), dtype=np.uint16)
+    tally = {"looks": 0, "missing": 0, "damaged": 0}
+    for recording in recordings:
+        seen = np.zeros((rows, columns), dtype=np.bool_)
+        for told in _add_looks(dataset, recording, config.resolution, low, counts, seen):
+            tally[told] += 1
+        agents += seen
+    return Window(corner=(int(low[0]), int(low[1])), counts=counts, agents=agents, **tally)
+
+
+def _add_looks(
+    dataset: Dataset, recording: Looks, resolution: float, low: IntArray, counts: Counts, seen: BoolArray
+) -> list[str]:
+    """Add one agent's pictures to `counts`, and the cells that it saw to `seen`; says what became of each picture."""
+    outcomes = []
+    for path, pose in zip(recording.files(dataset), recording.poses, strict=True):
+        try:
+            tags = read_bev(path, raw=True)[..., 2]
+        except MissingFileError:
+            outcomes.append("missing")
+            continue
+        except SensorFileError as error:
+            logger.warning("left out of the map: %s", error)
+            outcomes.append("damaged")
+            continue
+        outcomes.append("looks")
+        corner, codes = codes_in_world(tags, pose, resolution)
+        row, column = (corner - low).tolist()
+        rows, columns = slice(row, row + codes.shape[0]), slice(column, column + codes.shape[1])
+        for code in range(len(GROUND_CLASSES)):
+            counts[code, rows, columns] += codes == code + 1
+        seen[rows, columns] |= codes > 0
+    return outcomes
+
+
+def codes_in_world(tags: ByteArray, world_from_ego: FloatArray, resolution: float) -> tuple[IntArray, ByteArray]:
+    """A picture's ground in the cells of the world: what its pixel nearest to each cell's middle shows.
+
+    The road is taken for a plane through the agent's origin, which tilts as the agent does.
+
+    Args:
+        tags: (1200, 1200) uint8, CARLA's semantic tags, forward up.
+        world_from_ego: (4, 4) the agent's pose.
+        resolution: side of a cell, metres.
+
+    Returns:
+        Row and column (2,) of the first cell among those of the world; and (h, w) uint8, 0 for not seen, else 1 + the
+        position in `GROUND_CLASSES`; row = y index, column = x index, both rising.
+    """
+    low, high = cells_around(world_from_ego[None], resolution)
+    y, x = (
+        (np.arange(first, last) + 0.5) * resolution for first, last in zip(low.tolist(), high.tolist(), strict=True)
+    )
+    x, y = x - world_from_ego[0, 3], y - world_from_ego[1, 3]
+    (a, b), (c, d) = np.linalg.inv(world_from_ego[:2, :2]) / BEV_RESOLUTION
+    row = np.rint(_MIDDLE - (a * x[None, :] + b * y[:, None])).astype(np.int32)
+    column = np.rint(_MIDDLE - (c * x[None, :] + d * y[:, None])).astype(np.int32)
+    inside = (row >= 0) & (row < BEV_SHAPE[0]) & (column >= 0) & (column < BEV_SHAPE[1])
+    codes = np.zeros(inside.shape, dtype=np.uint8)
+    codes[inside] = _code_of_tag()[tags[row[inside], column[inside]]]
+    return low, codes
+
+
+def cells_around(poses: FloatArray, resolution: float) -> tuple[IntArray, IntArray]:
+    """Row and column of the first cell that pictures from poses (N, 4, 4) can show, and of the one past the last."""
+    half = REACH * np.abs(poses[:, :2, :2]).sum(axis=2)
+    low = np.floor((poses[:, :2, 3] - half).min(axis=0) / resolution)
+    high = np.ceil((poses[:, :2, 3] + half).max(axis=0) / resolution)
+    return low[::-1].astype(np.int64), high[::-1].astype(np.int64)
+
+
+def _code_of_tag() -> ByteArray:
+    """Of each of CARLA's tags (256,): 0 for what says nothing of the ground, else 1 + the position in the classes."""
+    codes = np.full(256, 1 + GROUND_CLASSES.index("other"), dtype=np.uint8)
+    codes[[_UNLABELLED, *(TAGS[name] for name in HIDING)]] = 0
+    for code, name in enumerate(GROUND_CLASSES[:-1], 1):
+        codes[TAGS[name]] = code
+    return codes

@@ -1,0 +1,131 @@
+"""What a sample's labels are made from: its boxes at each label frame and the ego's motion, read from the tables.
+
+The columns are read as they are, all frames at once: records and `Boxes` would take as long as rasterising.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import NotAvailableError
+from deepaccident_devkit.geometry.se3 import stored_transforms
+from deepaccident_devkit.motion.config import MotionLabelConfig
+from deepaccident_devkit.motion.drawing.box_polygons import FrameBoxes
+from deepaccident_devkit.motion.warps.chains import egomotion
+from deepaccident_devkit.tables import visible_mask
+from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, INFRASTRUCTURE, LIDAR, OWN_ACTOR_ID, UNTRACKED_ID
+from deepaccident_devkit.v2x import cooperating_agents
+
+_VISIBILITY_COLUMNS: Final = ("translation", "category", "num_lidar_pts", "camera_visible")
+
+
+class SampleBoxes(NamedTuple):
+    """The arguments of `motion_labels_from_boxes` for a sample.
+
+    Attributes:
+        frames: what the agent annotated at each label frame; None beyond the recording.
+        egomotion: (R, 6) `next_from_this`, from the first past frame on.
+        valid: (R,) which frames are in the recording.
+        is_vehicle: whether the agent has a box of its own.
+    """
+
+    frames: list[FrameBoxes | None]
+    egomotion: AnyArray
+    valid: BoolArray
+    is_vehicle: bool
+
+
+def sample_boxes(dataset: Dataset, sample: RowArgument, config: MotionLabelConfig) -> SampleBoxes:
+    """Read what `motion_labels` rasterises; its errors are that function's."""
+    row, samples = dataset.getind("sample", sample), dataset.columns("sample")
+    if not samples["labelled"][row]:
+        token = dataset.sample[row]["token"]
+        raise NotAvailableError(f"{token} has no label (the test split has none)")
+    length = dataset.columns("scenario")["num_frames"].item(samples["scenario_row"].item(row))
+    first_row = dataset.columns("agent")["first_sample_row"].item(samples["agent_row"].item(row))
+    present = row - first_row
+    index: IntArray = present + np.array([*config.offsets, config.offsets[-1] + config.step])
+    there = (index >= 0) & (index < length)
+    past = config.receptive_field - 1
+    known = index[past:-1][there[past:-1]]
+    frames = iter(_frames(dataset, sample, first_row, known, config))
+    return SampleBoxes(
+        frames=[next(frames) if one else None for one in there[past:-1]],
+        egomotion=egomotion(_world_from_ego(dataset, first_row + index, there), there, config.rules),
+        valid=there[:-1],
+        is_vehicle=AGENTS[samples["agent"].item(row)] != INFRASTRUCTURE,
+    )
+
+
+def _world_from_ego(dataset: Dataset, rows: IntArray, there: BoolArray) -> FloatArray:
+    """(len(rows), 4, 4) poses of samples; the identity for rows that are not `there`."""
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[there] = stored_transforms(dataset.columns("ego_pose")["matrix"][rows[there]])
+    return poses
+
+
+def _frames(
+    dataset: Dataset, sample: RowArgument, first_row: int, index: IntArray, config: MotionLabelConfig
+) -> list[FrameBoxes]:
+    """The boxes of the sample's agent, whose samples begin at `first_row`, at the frames `index`, from 0."""
+    boxes, rows = dataset.columns("annotation"), first_row + index
+    slices = _annotations(dataset, rows)
+    actors = [boxes["actor_id"][one] for one in slices]
+    visible = [np.ones(len(actor), dtype=bool) for actor in actors]
+    if config.filter_invisible:
+        mask = np.isin(_pairs(actors), _seen(dataset, sample, index, config))
+        visible = np.split(mask, np.cumsum([len(actor) for actor in actors])[:-1])
+    lidars = rows * len(CHANNELS) + CHANNELS.index(LIDAR)
+    ego_from_lidar = stored_transforms(dataset.columns("sample_data")["matrix"][lidars])
+    return [
+        FrameBoxes(
+            center=boxes["translation"][one],
+            size=boxes["size"][one],
+            yaw=boxes["yaw"][one],
+            actor_id=actor,
+            category=boxes["category"][one],
+            visible=is_visible,
+            ego_from_lidar=pose,
+        )
+        for one, actor, is_visible, pose in zip(slices, actors, visible, ego_from_lidar, strict=True)
+    ]
+
+
+def _seen(dataset: Dataset, sample: RowArgument, index: IntArray, config: MotionLabelConfig) -> IntArray:
+    """The `_pairs` of actors and frames at which an agent whose sight counts sees them.
+
+    See docs/released_code.md, Visibility and attributes.
+    """
+    boxes, scenario = dataset.columns("annotation"), dataset.get("sample", sample)["scenario_token"]
+    pairs = []
+    for agent in cooperating_agents(dataset, sample, config.agents):
+        first_row = dataset.columns("agent")["first_sample_row"].item(dataset.getind("agent", f"{scenario}/{agent}"))
+        slices = _annotations(dataset, first_row + index)
+        actors = [boxes["actor_id"][one] for one in slices]
+        center, category, points, camera = (
+            np.concatenate([boxes[name][one] for one in slices]) for name in _VISIBILITY_COLUMNS
+        )
+        actor = np.concatenate(actors)
+        mask = visible_mask(center[:, :2], category, points, camera, infrastructure=agent == INFRASTRUCTURE)
+        mask &= (actor != OWN_ACTOR_ID) & (actor != UNTRACKED_ID)
+        pairs.append(_pairs(actors)[mask])
+    return np.concatenate(pairs)
+
+
+def _annotations(dataset: Dataset, rows: IntArray) -> list[slice]:
+    """Where the boxes of samples are in the annotation table; empty without a label."""
+    samples = dataset.columns("sample")
+    first = np.maximum(samples["first_annotation_row"][rows], 0).tolist()
+    count = samples["num_annotations"][rows].tolist()
+    return [slice(start, start + length) for start, length in zip(first, count, strict=True)]
+
+
+def _pairs(actors: list[AnyArray]) -> IntArray:
+    """One number for each row of `actors`, frame by frame: it stands for the pair of actor and frame."""
+    number = np.repeat(np.arange(len(actors)), [len(actor) for actor in actors])
+    pairs: IntArray = np.concatenate(actors) * len(actors) + number
+    return pairs

@@ -1,0 +1,79 @@
+"""`deepaccident export town-maps`, as a user meets it."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.errors import NotAvailableError
+from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, LIDAR
+
+
+@pytest.fixture(scope="module")
+def root(release_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The release with its BEV cameras; those of its second pair are missing."""
+    root = tmp_path_factory.mktemp("towns") / "release"
+    shutil.copytree(
+        release_root, root, copy_function=os.link, ignore=shutil.ignore_patterns(".deepaccident", *CAMERAS, LIDAR)
+    )
+    for folder in root.glob(f"*/*/{BEV_CAMERA}/*scenario00002"):
+        shutil.rmtree(folder)
+    return root
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(deepaccident, ["export", "town-maps", *map(str, arguments)])
+
+
+def towns(root: Path) -> tuple[str, str]:
+    """The town of the first pair, and that of the second."""
+    da = DeepAccident("v1", root, verbose=False)
+    names = {each["name"][-1]: each["town"] for each in da.scenario}
+    return names["1"], names["2"]
+
+
+def test_a_file_for_each_town_that_has_a_map(root: Path, tmp_path: Path) -> None:
+    seen, unseen = towns(root)
+    made = run(root, "--out", tmp_path / "maps")
+    assert made.exit_code == 0
+    path = tmp_path / "maps" / f"{seen}.geojson"
+    assert f"{path}: " in made.stdout
+    assert "m² of road, from 20 pictures of 2 scenarios (0 missing, 0 damaged)" in made.stdout
+    assert f"left out: {unseen}: none of its 2 scenarios has a readable file" in made.stderr
+    assert [each.name for each in path.parent.iterdir()] == [path.name]
+    assert len(json.loads(path.read_text(encoding="utf-8"))["features"]) > 1
+
+
+def test_one_town_as_json_with_cells_of_ones_own(root: Path, tmp_path: Path) -> None:
+    seen, unseen = towns(root)
+    fine, coarse = (
+        json.loads(run(root, "--out", tmp_path, "--town", seen, "--json", *more).stdout)[seen]
+        for more in ((), ("--resolution", 1))
+    )
+    assert fine["path"] == coarse["path"] == str(tmp_path / f"{seen}.geojson")
+    assert (fine["scenarios"], fine["looks"], fine["missing"], fine["damaged"]) == (2, 20, 0, 0)
+    assert fine["drivable_square_metres"] == pytest.approx(coarse["drivable_square_metres"], rel=0.02)
+    assert fine["drivable_square_metres"] != coarse["drivable_square_metres"]
+    failed = run(root, "--out", tmp_path, "--town", unseen)
+    assert isinstance(failed.exception, NotAvailableError)
+
+
+def test_scenarios_may_be_chosen(root: Path, tmp_path: Path) -> None:
+    seen, _ = towns(root)
+    made = run(root, "--out", tmp_path, "--where", f"town={seen}", "--where", "collision=true")
+    assert "from 10 pictures of 1 scenarios" in made.stdout
+    assert "left out" not in made.stderr
+    nothing = run(root, "--out", tmp_path, "--where", "length=900..999")
+    assert nothing.exit_code == 2
+    assert "no scenario matches --where" in nothing.output
+
+
+def test_a_release_without_bev_cameras(da_b: DeepAccident, tmp_path: Path) -> None:
+    failed = run(da_b.dataroot, "--out", tmp_path)
+    assert isinstance(failed.exception, NotAvailableError)
+    assert "no town has a map" in str(failed.exception)

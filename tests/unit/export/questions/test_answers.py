@@ -1,0 +1,220 @@
+"""Answers: read back as accidents, and evaluated; malformed ones are refused with file, line and remedy."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from question_files import Asked, ask
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.errors import ConfigError, ResultsError
+from deepaccident_devkit.evaluation.results import read_results
+from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.export.questions import Questions, WindowRules, read_answers, results_of_answers
+
+Lines = list[dict[str, Any]]
+SPLIT = "train"
+EGOS = ("ego_vehicle", "ego_vehicle_behind")
+
+
+@pytest.fixture(scope="module")
+def asked(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Asked:
+    """All samples that evaluations have of two agents."""
+    window = WindowRules(observe=1.0, stride=0.5, partial_past=True)
+    form = Questions(observers="all", window=window, agents=EGOS)
+    return ask(da_motion, tmp_path_factory.mktemp("asked"), form)
+
+
+def perfect(asked: Asked) -> Lines:
+    """The answers of one who knows the truth."""
+    return [
+        {
+            "id": each["id"],
+            "accident": [bool(second) for second in each["accident"]],
+            "who": each["who"],
+            "where": each["where"],
+            "when": each["when"],
+        }
+        for each in asked.truth.values()
+    ]
+
+
+def denying(asked: Asked) -> Lines:
+    """The answers of one who always says no."""
+    return [{**each, "accident": [False] * 3, "who": None, "where": None} for each in perfect(asked)]
+
+
+def written(path: Path, lines: Lines) -> Path:
+    path.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    return path
+
+
+def results(asked: Asked, folder: Path, answers: Lines) -> Path:
+    out = folder / "accident.json"
+    results_of_answers(written(folder / "answers.jsonl", answers), asked.done.folder / "truth.jsonl", out)
+    return out
+
+
+def evaluated(dataset: DeepAccident, path: Path, task: Any) -> Any:
+    listed = "all" if task == "warning" else "evaluate"
+    selection = SampleSelection(split=SPLIT, samples=listed, scope="all", horizon=3.0, agents=EGOS)
+    setup = EvaluationSetup(task=task, protocol="boxes", horizon=3.0)
+    partial = task == "accident"  # whose list lacks some samples that were asked about
+    return evaluate_results(dataset, path, setup, selection, workers=1, allow_partial=partial)
+
+
+def test_one_who_knows_the_truth_gets_full_marks(da_motion: DeepAccident, asked: Asked, tmp_path: Path) -> None:
+    path = results(asked, tmp_path, perfect(asked))
+    run = evaluated(da_motion, path, "accident")
+    assert run.partial is None
+    found = run.result
+    assert (found.positives, found.negatives) == (12, 12)
+    assert (found.apa, found.precision, found.recall, found.average_precision) == (1, 1, 1, 1)
+    assert (found.false_alarm_rate, found.id_error) == (0, 0)
+    assert found.position_error < 0.02
+    assert found.time_error == pytest.approx(0, abs=1e-9)
+    warned = evaluated(da_motion, path, "warning")
+    assert warned.partial is None
+    assert (warned.result.warned_share, warned.result.lasting_share, warned.result.precision) == (1, 1, 1)
+    assert warned.result.mean_warning == warned.result.mean_reach == pytest.approx(3.0)
+    assert set(warned.result.false_alarms.values()) == {0}
+
+
+def test_one_who_always_says_no_gets_none(da_motion: DeepAccident, asked: Asked, tmp_path: Path) -> None:
+    path = results(asked, tmp_path, denying(asked))
+    found = evaluated(da_motion, path, "accident").result
+    assert (found.apa, found.recall, found.false_alarm_rate, found.precision) == (0, 0, 0, None)
+    warned = evaluated(da_motion, path, "warning").result
+    assert (warned.warned_share, warned.alarms, warned.recordings["accident"]) == (0, 0, 2)
+
+
+def test_answers_become_accidents(asked: Asked, tmp_path: Path) -> None:
+    sample = next(sample for sample, truth in asked.truth.items() if truth["who"] and None not in truth["who"])
+    truth = asked.truth[sample]
+    base = {"id": truth["id"], "accident": [0.2, 0.9, 0.9], "who": truth["who"][::-1], "where": [[1, 2], [3.5, -4]]}
+
+    def alarms(threshold: float = 0.5, **changes: Any) -> Any:
+        path = written(tmp_path / "answers.jsonl", [{**base, **changes}])
+        read = read_answers(path, asked.done.folder / "truth.jsonl", threshold=threshold)
+        assert (read.answered, len(read.missing)) == (1, len(asked.truth) - 1)
+        assert set(asked.truth) < set(read.accidents)
+        assert read.alarms == len(read.accidents[sample])
+        return read.accidents[sample]
+
+    (alarm,) = alarms()
+    assert np.array_equal(alarm.positions, [[1, 2], [3.5, -4]])
+    assert (alarm.time, alarm.score, alarm.ids) == (1.5, 0.9, tuple(truth["actor_ids"][::-1]))
+    assert [each.time for each in alarms(when=1.8, why="it does not brake")] == [1.8]
+    assert [each.time for each in alarms(when=2.0)] == [2.0]
+    assert [each.time for each in alarms(when=1.0)] == [1.5]  # of another second
+    assert [(each.time, each.score) for each in alarms(accident=[False, 0.6, True])] == [(2.5, 1.0)]
+    assert [each.positions.tolist() for each in alarms(where=[7, 8])] == [[[7, 8], [7, 8]]]
+    assert [each.ids for each in alarms(who=None)] == [None]
+    assert [each.ids for each in alarms(who=[truth["who"][0], None])] == [None]
+    assert alarms(0.91) == alarms(accident=[0, 0, 0.4]) == alarms(0, accident=[False] * 3) == []
+    assert len(alarms(0.9)) == 1
+    assert [each.score for each in alarms(0, accident=[0.01, 0, 0])] == [0.01]
+
+
+def test_the_results_file(asked: Asked, tmp_path: Path) -> None:
+    lines = [line for line in perfect(asked) if line["when"] != 1.0]
+    out = tmp_path / "accident.json"
+    truth = asked.done.folder / "truth.jsonl"
+    told = results_of_answers(written(tmp_path / "answers", lines), truth, out, threshold=0.3, meta={"method": "mine"})
+    read = read_results(out)
+    missing = [each["id"] for each in asked.truth.values() if each["when"] == 1.0]
+    assert sorted(told.missing) == sorted(missing) != []
+    asked_of = {"questions": len(asked.truth), "answered": len(lines), "threshold": 0.3}
+    assert read.meta == {**asked_of, "method": "mine"}
+    ends = {f"{sample[:-3]}035" for sample in asked.truth}
+    assert set(read.tokens) == {*asked.truth, *ends}
+    assert all(read.prediction(token) == [] for token in ends)
+    for sample, each in asked.truth.items():
+        assert len(read.prediction(sample)) == (True in each["accident"] and each["when"] != 1.0)
+    with pytest.raises(ResultsError, match=f"^{out}: "):
+        results_of_answers(tmp_path / "answers", truth, out)
+
+
+GOOD: dict[str, Any] = {"accident": [False, 0.7, False], "who": None, "where": [0, 1]}
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ("{", "is no JSON .*; mend that line"),
+        ("[1]", r"expected a JSON object, found \[1\]; mend that line; README.md"),
+        ({"id": "0000"}, "id: '0000' is no question of the truth file; give the truth of these"),
+        ({"id": None}, "id: None is no question"),
+        ({"wher": 1}, "wher: is no field of an answer; mend that line"),
+        ({"accident": [True]}, "accident: expected 3 times true, false or a probability from 0 to 1, found"),
+        ({"accident": [0, 0, 1.2]}, "accident: expected 3 times true"),
+        ({"accident": [0, 0, "yes"]}, "accident: expected 3 times true"),
+        ({"accident": True}, "accident: expected 3 times true"),
+        ({"who": ["ego"]}, "who: expected two names, or null, found"),
+        ({"who": ["ego", "a999"]}, "who: 'a999' is nobody in the question; write null for one"),
+        ({"who": ["ego", 4]}, "who: 4 is nobody in the question"),
+        ({"who": ["ego", "ego"]}, "who: 'ego' stands there twice"),
+        ({"where": [1]}, r"where: expected \[x, y\], or"),
+        ({"where": [[1, 2], [3]]}, r"where: expected \[x, y\], or"),
+        ({"where": [1, 1e9]}, r"where: expected \[x, y\], or"),
+        ({"where": [True, 1]}, r"where: expected \[x, y\], or"),
+        ({"where": "here"}, r"where: expected \[x, y\], or"),
+        ({"where": None}, "where: is null, but an accident needs a place"),
+        ({"when": -1}, "when: expected seconds from 0, or null, found -1"),
+        ({"when": "soon"}, "when: expected seconds from 0, or null"),
+    ],
+)
+def test_malformed_answers(asked: Asked, tmp_path: Path, change: Any, sentence: str) -> None:
+    truth = [each for each in asked.truth.values() if "ego" in each["actors"]]
+    lines = [{"id": each["id"], **GOOD} for each in truth[:2]]
+    wrong = change if isinstance(change, str) else json.dumps({**lines[1], **change})
+    path = tmp_path / "answers.jsonl"
+    path.write_text(f"{json.dumps(lines[0])}\n\n{wrong}\n")
+    with pytest.raises(ResultsError, match=f"^{path}:3: {sentence}"):
+        read_answers(path, asked.done.folder / "truth.jsonl")
+
+
+@pytest.mark.parametrize("name", ["id", "accident", "who", "where"])
+def test_an_answer_that_lacks_something(asked: Asked, tmp_path: Path, name: str) -> None:
+    line = {"id": next(iter(asked.truth.values()))["id"], **GOOD}
+    del line[name]
+    path = written(tmp_path / "answers.jsonl", [line])
+    with pytest.raises(ResultsError, match=f"^{path}:1: {name}: is missing; mend that line"):
+        read_answers(path, asked.done.folder / "truth.jsonl")
+
+
+def test_two_answers_to_a_question(asked: Asked, tmp_path: Path) -> None:
+    line = {"id": next(iter(asked.truth.values()))["id"], **GOOD}
+    path = written(tmp_path / "answers.jsonl", [line, line])
+    with pytest.raises(ResultsError, match=f"^{path}:2: id: {line['id']} is answered in line 1 already; leave one"):
+        read_answers(path, asked.done.folder / "truth.jsonl")
+
+
+def test_files_that_are_something_else(asked: Asked, tmp_path: Path) -> None:
+    path, truth = written(tmp_path / "answers.jsonl", perfect(asked)), asked.done.folder / "truth.jsonl"
+    with pytest.raises(ResultsError, match=rf"^{path}:1: is no line of a truth file; give truth\.jsonl of the export"):
+        read_answers(path, path)
+    with pytest.raises(ResultsError, match=f"^{tmp_path}/none: cannot be read"):
+        read_answers(tmp_path / "none", truth)
+    empty = written(tmp_path / "empty", [])
+    with pytest.raises(ResultsError, match=f"^{empty}: holds no question"):
+        read_answers(path, empty)
+    assert read_answers(empty, truth).alarms == 0
+    with pytest.raises(ConfigError, match=r"^threshold: expected a number from 0 to 1, found 1\.5"):
+        read_answers(path, truth, threshold=1.5)
+
+
+def test_the_command(asked: Asked, tmp_path: Path) -> None:
+    answers, out = written(tmp_path / "answers.jsonl", perfect(asked)[1:]), tmp_path / "accident.json"
+    words = [str(answers), "--truth", str(asked.done.folder / "truth.jsonl"), "--out", str(out), "--method", "mine"]
+    result = CliRunner().invoke(deepaccident, ["results", "from", "questions", *words], catch_exceptions=False)
+    assert result.exit_code == 0
+    alarms = sum(len(read_results(out).prediction(token)) for token in read_results(out).tokens)
+    assert f"{out}: {alarms} alarms in {len(asked.truth) - 1} answers\n" in result.stdout
+    assert "without an answer: 1 questions, which raise no alarm" in result.stdout
+    assert read_results(out).meta["method"] == "mine"

@@ -1,0 +1,225 @@
+"""A question holds nothing of the future, of actors that nobody of its set sees, and no word that tells its ending."""
+
+import errno
+import json
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from question_files import Asked, accident_of, ask
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.arrays import AnyArray
+from deepaccident_devkit.export.questions import Questions, WindowRules
+from deepaccident_devkit.release import read_meta
+from deepaccident_devkit.release.layout import find_release
+from deepaccident_devkit.release.meta import write_meta
+from deepaccident_devkit.taxonomy import AGENTS
+from deepaccident_devkit.testing.editing import FIELD, ScenarioEditor
+
+FORM = Questions(observers="+behind", window=WindowRules(observe=1.0, rate=5, stride=0.5))
+Edit = Callable[[ScenarioEditor], None]
+
+
+def edited(dataset: DeepAccident, root: Path, edit: Edit) -> DeepAccident:
+    """A copy of a release whose accident was edited."""
+    shutil.copytree(dataset.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident"))
+    token = accident_of(dataset)
+    edit(ScenarioEditor(root, next(each for each in find_release(root, "v1").scenarios if each.token == token)))
+    return DeepAccident(dataroot=root, verbose=False, workers=1)
+
+
+def without_collision(editor: ScenarioEditor) -> None:
+    path = editor.root / editor.scenario.scenario_type / "meta" / f"{editor.scenario.name}.txt"
+    write_meta(path, replace(read_meta(path), collision=None, planned_agents=None))
+
+
+def test_what_comes_after_the_present_changes_nothing(da_motion: DeepAccident, tmp_path: Path) -> None:
+    scenario, present = accident_of(da_motion), 20
+
+    def shift(row: list[str]) -> None:
+        row[FIELD["x"]], row[FIELD["id"]] = str(float(row[FIELD["x"]]) - 7), str(int(row[FIELD["id"]]) + 3000)
+        row[FIELD["vx"]], row[FIELD["num_lidar_pts"]], row[FIELD["camera_visible"]] = "55.5", "900", "True"
+        row[FIELD["class"]], row[FIELD["l"]] = "truck", "9.5"
+
+    def edit(editor: ScenarioEditor) -> None:
+        for agent in editor.agents:
+            editor.edit_rows(agent, range(present + 1, editor.frames[-1] + 1), shift)
+            editor.edit_calib(agent, range(present + 1, editor.frames[-1] + 1), "ego_to_world", _moved)
+        without_collision(editor)
+
+    before, after = (
+        ask(da_motion, tmp_path, FORM),
+        ask(edited(da_motion, tmp_path / "other future", edit), tmp_path, FORM),
+    )
+    earlier = [sample for sample in before.lines if sample.startswith(scenario) and int(sample[-3:]) <= present]
+    later = [sample for sample in before.lines if sample.startswith(scenario) and int(sample[-3:]) > present]
+    assert len(earlier) == len(later) == 2
+    assert all(before.lines[sample] == after.lines[sample] for sample in earlier)
+    assert all(before.lines[sample] != after.lines[sample] for sample in later)
+    assert all(before.truth[sample]["accident"] != after.truth[sample]["accident"] for sample in earlier)
+
+
+def _moved(pose: AnyArray) -> AnyArray:
+    moved = np.array(pose)
+    moved[:2, 3] += 2.5
+    return moved
+
+
+def test_an_unknown_speed_is_not_taken_from_the_moment_after(da_motion: DeepAccident, tmp_path: Path) -> None:
+    def edit(editor: ScenarioEditor) -> None:
+        for agent in editor.agents:
+            editor.edit_rows(agent, editor.frames, _without_speed)
+
+    found = ask(edited(da_motion, tmp_path / "without speeds", edit), tmp_path, FORM)
+    sample = next(sample for sample in found.lines if sample.startswith(accident_of(da_motion)))
+    speeds = [speed for actor in found.question(sample)["actors"] for speed in actor["speed"]]
+    assert set(speeds) == {None}
+
+
+def _without_speed(row: list[str]) -> None:
+    row[FIELD["vx"]] = row[FIELD["vy"]] = "nan"
+
+
+def unseen_actor(dataset: DeepAccident, asked: Asked) -> int:
+    """An actor of the accident that has rows in labels of the set, but stands in no question."""
+    scenario = accident_of(dataset)
+    shown = {actor for truth in asked.truth.values() for actor in truth["actors"].values()}
+    rows = [dataset.boxes(f"{scenario}/{agent}/020", "lidar") for agent in ("ego_vehicle", "ego_vehicle_behind")]
+    far = {
+        int(actor)
+        for boxes in rows
+        for actor, center in zip(boxes.actor_id, boxes.center, strict=True)
+        if actor > 0 and np.hypot(*center[:2]) > 25
+    }
+    return min(far - shown)
+
+
+@pytest.mark.parametrize("change", ["gone", "moved"])
+def test_an_actor_that_nobody_of_the_set_sees_changes_nothing(
+    da_motion: DeepAccident, tmp_path: Path, change: str
+) -> None:
+    before = ask(da_motion, tmp_path, FORM)
+    actor = unseen_actor(da_motion, before)
+
+    def edit(editor: ScenarioEditor) -> None:
+        for agent in editor.agents:
+            if change == "moved":
+                editor.edit_rows(agent, editor.frames, _pushed, actor=actor)
+                continue
+            for frame in editor.frames:
+                rows = editor.rows(agent, frame)
+                kept = [rows[0], *(row for row in rows[1:] if int(row[FIELD["id"]]) != actor)]
+                editor.write_rows(agent, frame, kept)
+
+    after = ask(edited(da_motion, tmp_path / change, edit), tmp_path, FORM)
+    assert after.lines == before.lines
+
+
+def _pushed(row: list[str]) -> None:
+    row[FIELD["x"]] = str(float(row[FIELD["x"]]) * 1.1)
+    row[FIELD["y"]] = str(float(row[FIELD["y"]]) * 1.1)
+
+
+def test_an_actor_that_is_seen_changes_something(da_motion: DeepAccident, tmp_path: Path) -> None:
+    before = ask(da_motion, tmp_path, FORM)
+    sample = next(sample for sample in before.truth if sample.startswith(accident_of(da_motion)))
+    actor = before.truth[sample]["actors"]["a1"]
+
+    def edit(editor: ScenarioEditor) -> None:
+        for agent in editor.agents:
+            editor.edit_rows(agent, editor.frames, _pushed, actor=actor)
+
+    assert ask(edited(da_motion, tmp_path / "seen", edit), tmp_path, FORM).lines[sample] != before.lines[sample]
+
+
+def test_an_accident_and_its_twin_differ_by_what_was_seen_alone(da_motion: DeepAccident, tmp_path: Path) -> None:
+    """With the same labels the only difference is the id, by which the lines are ordered."""
+    root, token = tmp_path / "twin", accident_of(da_motion)
+    accident, name = token.split("/")
+    shutil.copytree(da_motion.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident", "*_normal"))
+    (root / accident).rename(root / accident.replace("accident", "normal"))
+    path = root / accident.replace("accident", "normal") / "meta" / f"{name}.txt"
+    write_meta(path, replace(read_meta(path), collision=None))
+    with_accident, without = (
+        ask(da_motion, tmp_path, FORM),
+        ask(DeepAccident(dataroot=root, verbose=False, workers=1), tmp_path, FORM),
+    )
+    samples = [sample for sample in with_accident.lines if sample.startswith(token)]
+    assert len(samples) == len(without.lines) == 4
+    for sample in samples:
+        twin = sample.replace("accident", "normal")
+        assert with_accident.truth[sample]["accident"] != without.truth[twin]["accident"]
+        one, other = with_accident.question(sample), without.question(twin)
+        assert one.pop("id") != other.pop("id")
+        assert json.dumps(one) == json.dumps(other)
+
+
+@pytest.mark.parametrize("form", [FORM, replace(FORM, observers="all", seen="annotated", agents=AGENTS)])
+def test_no_word_of_the_release_or_of_the_ending_is_in_a_question(
+    da_motion: DeepAccident, tmp_path: Path, form: Questions
+) -> None:
+    found = ask(da_motion, tmp_path, form)
+    text = b"\n".join(found.lines.values()).decode().lower()
+    words = set(re.findall(r"[a-z0-9_]+", text))
+    told = [word for scenario in da_motion.scenario for word in re.split(r"[/_]", scenario["token"].lower())]
+    agents = {word for agent in AGENTS for word in (agent, *agent.split("_"))} - {"ego", "vehicle", "infrastructure"}
+    for word in {"accident", "normal", "collision", "impact", "split", "train", "val", "direction", *told, *agents}:
+        assert word not in text or word.isdigit(), word
+    ids = {str(actor) for truth in found.truth.values() for actor in truth["actors"].values()}
+    assert len(ids) > 10
+    assert not ids & words
+    keys = {key for sample in found.lines for key in found.question(sample)}
+    assert keys == {"id", "seconds", "moments", "conditions", "observers", "actors"}
+
+
+def test_ids_and_order_are_drawn_by_the_seed(da_motion: DeepAccident, tmp_path: Path) -> None:
+    one, again, other = (
+        ask(da_motion, tmp_path, FORM),
+        ask(da_motion, tmp_path, FORM),
+        ask(da_motion, tmp_path, replace(FORM, seed="a secret")),
+    )
+    assert list(one.lines.items()) == list(again.lines.items())
+    assert not {each["id"] for each in one.truth.values()} & {each["id"] for each in other.truth.values()}
+    assert list(one.lines) != list(other.lines)
+    assert list(one.lines) != sorted(one.lines)
+
+
+@pytest.mark.parametrize("way", ["hard", "copy"])
+def test_pictures_have_neutral_names_and_show_no_path(
+    da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
+) -> None:
+    """Copies where hard links cannot be."""
+    if way == "copy":
+        monkeypatch.setattr("deepaccident_devkit.export.bulk.output.os.link", _refusing)
+    form = Questions(
+        observers="+infrastructure",
+        cameras=("Camera_Front", "Camera_Back"),
+        window=WindowRules(observe=0, stride=0.5),
+    )
+    found = ask(da, tmp_path, form)
+    folder = found.done.folder / "questions"
+    for sample in found.lines:
+        question = found.question(sample)
+        listed, observers = question["images"], found.truth[sample]["observers"]
+        assert len(listed) == len(question["moments"]) * 2 * 2
+        for each in listed:
+            frame = int(sample[-3:]) + round(each["time"] * 10)
+            scenario = sample.rsplit("/", 2)[0]
+            path = da.get_sample_data_path(f"{scenario}/{observers[each['observer']]}/{frame:03d}/{each['camera']}")
+            assert (folder / each["path"]).read_bytes() == path.read_bytes()
+            assert each["path"].startswith(f"images/{question['id']}/")
+    paths = [path for path in folder.rglob("*") if path.is_file()]
+    assert not any(path.is_symlink() for path in paths)
+    assert not any(re.search(r"accident|normal|scenario|town", str(path.relative_to(folder)).lower()) for path in paths)
+    pictures = sum(path.suffix == ".jpg" for path in paths)
+    assert found.done.tally.linked == {way: pictures}
+    assert found.done.plan.linked_files == pictures > 0
+
+
+def _refusing(*_: object) -> None:
+    raise OSError(errno.EXDEV, "Invalid cross-device link")

@@ -1,0 +1,338 @@
+"""What questions show and what their truth says, against the tables; whom they leave out, and how files come about."""
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from question_files import Asked, accident_of, ask, read_back
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
+from deepaccident_devkit.export.bulk import export_release
+from deepaccident_devkit.export.questions import Questions, WindowRules
+from deepaccident_devkit.export.questions.truth import seconds_ahead
+from deepaccident_devkit.release import read_meta
+from deepaccident_devkit.release.meta import write_meta
+from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID
+from deepaccident_devkit.v2x.cooperation import visible_instances
+
+WINDOW = WindowRules(observe=1.0, rate=2, stride=0.5)
+SET = ("ego_vehicle", "other_vehicle", "infrastructure")
+FORM = Questions(observers=SET, window=WINDOW, agents=("ego_vehicle", "infrastructure"))
+NAMES = {"ego", "partner_1", "partner_2", "infrastructure"}
+
+
+@pytest.fixture(scope="module")
+def asked(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Asked:
+    return ask(da_motion, tmp_path_factory.mktemp("questions"), FORM)
+
+
+def verb(*words: object) -> Result:
+    return CliRunner().invoke(deepaccident, list(map(str, words)), catch_exceptions=False)
+
+
+def frames_of(sample: str, question: dict[str, Any]) -> list[int]:
+    return [int(sample[-3:]) + round(10 * time) for time in question["moments"]]
+
+
+def test_every_window_of_every_ego_is_asked_about(da_motion: DeepAccident, asked: Asked) -> None:
+    wanted = {
+        f"{scenario['token']}/{ego}/{present:03d}"
+        for scenario in da_motion.scenario
+        for ego in FORM.agents
+        for present in (15, 20, 25, 30)
+    }
+    assert set(asked.lines) == wanted
+    assert asked.done.plan.samples == len(wanted)
+    assert not asked.done.tally.left_out
+    assert asked.done.plan.bytes == pytest.approx(asked.done.tally.bytes, rel=0.7)
+
+
+def test_the_actors_of_each_moment_are_those_that_the_set_sees(da_motion: DeepAccident, asked: Asked) -> None:
+    for sample in asked.lines:
+        question, truth = asked.question(sample), asked.truth[sample]
+        scenario, ego, _ = sample.rsplit("/", 2)
+        assert set(truth["observers"]) == {each["name"] for each in question["observers"]} <= NAMES
+        assert truth["observers"]["ego"] == ego
+        members = {da_motion.agent.get(f"{scenario}/{agent}")["actor_id"] for agent in SET}
+        for frame, time in zip(frames_of(sample, question), question["moments"], strict=True):
+            shown = {
+                truth["actors"][actor["name"]]: actor["seen_by"][actor["time"].index(time)]
+                for actor in question["actors"]
+                if time in actor["time"]
+            }
+            for agent in SET:
+                tokens = visible_instances(da_motion, f"{scenario}/{agent}/{frame:03d}", agents=[agent])
+                name = next(name for name, each in truth["observers"].items() if each == agent)
+                by_it = {actor for actor, names in shown.items() if name in names}
+                assert by_it == {int(token.rsplit("/", 1)[1]) for token in tokens} - members
+
+
+def test_places_headings_speeds_and_sizes_are_those_of_the_labels(da_motion: DeepAccident, asked: Asked) -> None:
+    for sample in list(asked.lines)[:6]:
+        question, truth = asked.question(sample), asked.truth[sample]
+        scenario = sample.rsplit("/", 2)[0]
+        ego_from_world = da_motion.world_from(sample, "ego").inverse()
+        agents = {name: f"{scenario}/{agent}" for name, agent in truth["observers"].items()}
+        for actor in question["actors"]:
+            assert actor["time"] == sorted(set(actor["time"]))
+            for number, time in enumerate(actor["time"]):
+                frame = int(sample[-3:]) + round(10 * time)
+                token = f"{agents[actor['seen_by'][number][0]]}/{frame:03d}"
+                boxes = da_motion.boxes(token, velocity="label").transform(ego_from_world, "ego")
+                row = np.flatnonzero(boxes.actor_id == truth["actors"][actor["name"]]).item()
+                assert actor["position"][number] == pytest.approx(boxes.center[row, :2].tolist(), abs=0.011)
+                turn = actor["heading"][number] - boxes.yaw[row]
+                assert np.arctan2(np.sin(turn), np.cos(turn)) == pytest.approx(0, abs=0.002)
+                assert actor["speed"][number] == pytest.approx(np.linalg.norm(boxes.velocity[row]), abs=0.006)
+                assert actor["class"] == boxes.category_names[row]
+                assert actor["size"] == pytest.approx(boxes.size[row].tolist(), abs=0.006)
+
+
+def test_observers_know_themselves(da_motion: DeepAccident, asked: Asked) -> None:
+    for sample in list(asked.lines)[:6]:
+        question, truth = asked.question(sample), asked.truth[sample]
+        scenario = sample.rsplit("/", 2)[0]
+        ego_from_world = da_motion.world_from(sample, "ego").inverse()
+        for observer in question["observers"]:
+            agent = truth["observers"][observer["name"]]
+            for number, frame in enumerate(frames_of(sample, question)):
+                token = f"{scenario}/{agent}/{frame:03d}"
+                pose = ego_from_world @ da_motion.world_from(token, "ego")
+                assert observer["position"][number] == pytest.approx(pose.translation[:2].tolist(), abs=0.006)
+                assert observer["heading"][number] == pytest.approx(pose.yaw, abs=0.001)
+                speed = np.linalg.norm(da_motion.sample.get(token)["velocity"])
+                assert observer["speed"][number] == pytest.approx(speed, abs=0.006)
+            record = da_motion.agent.get(f"{scenario}/{agent}")
+            assert observer["class"] == record["category"]
+            assert (observer["kind"] == "infrastructure") == record["is_infrastructure"]
+            assert truth["actors"].get(observer["name"]) == record["actor_id"]
+            assert record["size"] is None or observer["size"] == pytest.approx(record["size"], abs=0.006)
+        assert question["observers"][0]["position"][-1] == [0, 0]
+        assert not {actor["name"] for actor in question["actors"]} & NAMES
+
+
+def test_names_go_by_what_was_seen_alone(asked: Asked) -> None:
+    for sample in asked.lines:
+        question = asked.question(sample)
+        ego = dict(zip(question["moments"], question["observers"][0]["position"], strict=True))
+        assert [actor["name"] for actor in question["actors"]] == [
+            f"a{number}" for number in range(1, len(question["actors"]) + 1)
+        ]
+        keys = [
+            (actor["time"][0], np.hypot(*np.subtract(actor["position"][0], ego[actor["time"][0]])))
+            for actor in question["actors"]
+        ]
+        assert all(one[0] < other[0] or one[1] <= other[1] + 0.03 for one, other in pairwise(keys))
+        apart = [np.hypot(*each["position"][-1]) for each in question["observers"] if "partner" in each["name"]]
+        assert apart == sorted(apart)
+
+
+@pytest.mark.parametrize(("seen", "fewer"), [("camera", False), ("annotated", True)])
+def test_other_rules_of_seeing(da_motion: DeepAccident, tmp_path: Path, seen: str, fewer: bool) -> None:
+    one, other = (
+        ask(da_motion, tmp_path, Questions(seen=each, window=replace(WINDOW, most=1)))  # type: ignore[arg-type]
+        for each in (seen, "annotated")
+    )
+    sample = next(iter({*one.lines} & {*other.lines}))
+    question, truth = one.question(sample), one.truth[sample]
+    boxes = da_motion.boxes(sample, "lidar")
+    there = boxes.actor_id[boxes.camera_visible | fewer]
+    now = {truth["actors"][actor["name"]] for actor in question["actors"] if actor["time"][-1] == 0}
+    assert now == {actor for actor in there.tolist() if actor not in (OWN_ACTOR_ID, -1)}
+
+
+def test_the_truth_of_an_accident(da_motion: DeepAccident, asked: Asked) -> None:
+    scenario, seen = accident_of(da_motion), 0
+    contact = da_motion.collision(scenario)
+    assert contact is not None
+    for sample, truth in asked.truth.items():
+        if not sample.startswith(scenario):
+            whole = (35 - int(sample[-3:])) // 10
+            assert truth["accident"] == [False] * whole + [None] * (3 - whole)
+            assert (truth["who"], truth["where"], truth["when"], truth["why"]) == (None, None, None, None)
+            continue
+        seconds = (35 - int(sample[-3:])) / 10
+        assert truth["accident"] == ([True, None, None] if seconds <= 1 else [False, True, None])
+        assert (truth["when"], truth["last_frame"], truth["actor_ids"]) == (seconds, 35, list(contact.actor_ids))
+        impact = da_motion.world_from(sample, "ego").inverse()
+        boxes = da_motion.boxes(f"{scenario}/ego_vehicle/035").transform(impact, "ego")
+        ids = da_motion.actor_ids(f"{scenario}/ego_vehicle/035")
+        for actor, place in zip(truth["actor_ids"], truth["where"], strict=True):
+            assert place == pytest.approx(boxes.center[ids == actor][0, :2].tolist(), abs=0.4)  # own rows are off
+        for actor, name, last in zip(truth["actor_ids"], truth["who"], truth["last_seen"], strict=True):
+            assert (name is None) == (last is None)
+            if name is not None:
+                assert truth["actors"][name] == actor
+                shown = [each["time"][-1] for each in asked.question(sample)["actors"] if each["name"] == name]
+                assert last == (shown[0] if shown else 0)
+                seen += 1
+        assert truth["why"]["impact_angle"] == pytest.approx(contact.impact_angle, abs=0.006)
+        assert truth["why"]["sides"] == list(contact.sides)
+        assert truth["why"]["ego_direction"] == da_motion.scenario.get(scenario)["ego_direction"]
+    assert seen > 8
+
+
+def test_when_the_colliders_were_last_seen(da_motion: DeepAccident, tmp_path: Path) -> None:
+    found = ask(da_motion, tmp_path, Questions(window=replace(WINDOW, partial_past=True), agents=AGENTS))
+    told = set()
+    for sample, truth in found.truth.items():
+        shown = {each["name"]: each["time"][-1] for each in found.question(sample)["actors"]}
+        for name, last in zip(truth["who"] or [], truth["last_seen"] or [], strict=True):
+            assert last == (None if name is None else 0 if name == "ego" else shown[name])
+            told.add("ego" if name == "ego" else "hidden" if name is None else "seen")
+    assert told == {"ego", "hidden", "seen"}
+
+
+def test_the_seconds_of_an_accident() -> None:
+    assert seconds_ahead(10, 10, 3) == [True, None, None]
+    assert seconds_ahead(11, 11, 3) == [False, True, None]
+    assert seconds_ahead(30, 30, 3) == [False, False, True]
+    assert seconds_ahead(31, 31, 3) == [False, False, False]
+    assert seconds_ahead(1, 1, 1) == [True]
+    assert seconds_ahead(None, 9, 2) == [None, None]
+    assert seconds_ahead(None, 10, 2) == [False, None]
+    assert seconds_ahead(None, 25, 3) == [False, False, None]
+
+
+def test_the_readme_and_the_schema(asked: Asked) -> None:
+    folder = asked.done.folder / "questions"
+    assert {path.name for path in folder.iterdir()} == {"questions.jsonl", "README.md", "answer.schema.json"}
+    schema = json.loads((folder / "answer.schema.json").read_text())
+    text = (folder / "README.md").read_text()
+    example = json.loads(next(line for line in text.splitlines() if line.startswith("    {")))
+    jsonschema.Draft202012Validator.check_schema(schema)
+    jsonschema.validate(example, schema)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate({**example, "accident": [True]}, schema)
+    assert set(re.findall(r"^\| `(\w+)`", text.partition("## What")[0], re.MULTILINE)) == {
+        *asked.question(next(iter(asked.lines))),
+        "seen_by",
+    }
+
+
+@pytest.mark.slow
+def test_workers_and_shards_write_the_same_bytes(da_motion: DeepAccident, asked: Asked, tmp_path: Path) -> None:
+    export_release(da_motion, tmp_path / "two", FORM, workers=2)
+    for part in ("2/2", "1/2", "merge"):
+        export_release(da_motion, tmp_path / "shards", FORM, workers=1, part=part)
+    for name in ("questions/questions.jsonl", "truth.jsonl", "questions/README.md", "questions.manifest.json"):
+        there = [(folder / name).read_bytes() for folder in (asked.done.folder, tmp_path / "two", tmp_path / "shards")]
+        assert there[0] == there[1] == there[2]
+
+
+def without(folder: str) -> Callable[[Path, str], None]:
+    def remove(root: Path, scenario: str) -> None:
+        kind, name = scenario.split("/")
+        for path in root.glob(f"{kind}/{folder}"):
+            shutil.rmtree(path / name) if (path / name).is_dir() else (path / f"{name}.txt").unlink()
+
+    return remove
+
+
+def naming_a_stranger(root: Path, scenario: str) -> None:
+    kind, name = scenario.split("/")
+    path = root / kind / "meta" / f"{name}.txt"
+    meta = read_meta(path)
+    assert meta.collision is not None
+    write_meta(path, replace(meta, collision=replace(meta.collision, ids=(meta.collision.ids[0], 999_999))))
+
+
+@pytest.mark.parametrize(
+    ("change", "form", "said"),
+    [
+        (naming_a_stranger, FORM, {"scenarios with an actor in the accident that no label shows": 1}),
+        (without("meta"), FORM, {"scenarios without meta, which says whether there is an accident": 1}),
+        (without("*/label"), FORM, {"scenarios without labels": 1}),
+        (without("other_vehicle/label"), FORM, {"windows with a moment at which an observer has no label": 8}),
+        (without("other_vehicle/*"), FORM, {"recordings whose observers are not all in this release": 2}),
+        (
+            without("ego_vehicle/*"),
+            replace(FORM, observers="single"),
+            {"agents of scenarios that are not in this release": 1},
+        ),
+    ],
+)
+def test_what_cannot_be_asked_is_counted(
+    da_motion: DeepAccident,
+    tmp_path: Path,
+    change: Callable[[Path, str], None],
+    form: Questions,
+    said: dict[str, int],
+) -> None:
+    root = tmp_path / "release"
+    shutil.copytree(da_motion.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident"))
+    change(root, accident_of(da_motion))
+    found = ask(DeepAccident(dataroot=root, verbose=False, workers=1), tmp_path, form)
+    assert dict(found.done.tally.left_out) == said
+    others = {sample.rsplit("/", 2)[0] for sample in found.lines} - {accident_of(da_motion)}
+    assert len(others) == 1
+
+
+def test_a_release_of_short_recordings(da_b: DeepAccident, tmp_path: Path) -> None:
+    form = Questions(window=WindowRules(observe=0, stride=0.5))
+    with pytest.raises(
+        NotAvailableError, match=r"^no recording is long enough for a window of 0 s: the longest has 0\.4"
+    ):
+        ask(da_b, tmp_path, form)
+
+
+def test_a_release_in_which_nothing_can_be_asked(da_motion: DeepAccident, tmp_path: Path) -> None:
+    root = tmp_path / "release"
+    shutil.copytree(da_motion.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident", "meta"))
+    with pytest.raises(NotAvailableError, match=r"^no question can be asked: scenarios lack labels"):
+        ask(DeepAccident(dataroot=root, verbose=False, workers=1), tmp_path, FORM)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "sentence"),
+    [
+        ({"observers": "nobody"}, ChoiceError, "observers: expected one of single"),
+        ({"observers": ("ego_vehicle", "me")}, ChoiceError, "observers: expected one of ego_vehicle"),
+        ({"seen": "heard"}, ChoiceError, "seen: expected one of released, camera, annotated"),
+        ({"cameras": ("Camera_Up",)}, ChoiceError, "cameras: expected one of Camera_Front"),
+        ({"link": "symbolic"}, ChoiceError, "link: a symbolic link shows the name of the scenario"),
+        ({"seed": 3}, ConfigError, "seed: expected a text, found 3"),
+        ({"window": 5}, ConfigError, "window: expected WindowRules, found int"),
+    ],
+)
+def test_impossible_settings(options: dict[str, Any], error: type[Exception], sentence: str) -> None:
+    with pytest.raises(error, match=f"^{sentence}"):
+        Questions(**options)
+
+
+def test_the_command(da_motion: DeepAccident, asked: Asked, tmp_path: Path) -> None:
+    words = ["--agents", ",".join(SET), "--ego", "ego_vehicle,infrastructure", "--observe", 1, "--stride", 0.5]
+    result = verb("export", "questions", da_motion.dataroot, "--out", tmp_path / "out", "--workers", 1, *words)
+    assert result.exit_code == 0, result.output
+    assert "16 samples: a few files to write" in result.stdout
+    for name in ("questions/questions.jsonl", "truth.jsonl"):
+        assert (tmp_path / "out" / name).read_bytes() == (asked.done.folder / name).read_bytes()
+    refused = verb("export", "questions", da_motion.dataroot, "--out", tmp_path / "out", "--cameras", "Camera_Back")
+    assert (refused.exit_code, "--cameras changes nothing without --images" in refused.stderr) == (2, True)
+
+
+def test_the_command_with_pictures(da: DeepAccident, tmp_path: Path) -> None:
+    words = ["--observe", 0, "--stride", 0.5, "--images", "copy", "--cameras", "all", "--seed", "a b", "--most", 1]
+    result = verb("export", "questions", da.dataroot, "--out", tmp_path / "out", "--workers", 1, *words)
+    assert result.exit_code == 0, result.output
+    found = read_back(export_release(da, tmp_path / "out", Questions(**_settings(tmp_path / "out")), workers=1))
+    assert found.done.tally.linked == {"copy": 4 * 6}
+    assert all(len(found.question(sample)["images"]) == 6 for sample in found.lines)
+
+
+def _settings(folder: Path) -> dict[str, Any]:
+    """The settings in a manifest, as arguments."""
+    told = json.loads((folder / "questions.manifest.json").read_text())["settings"]
+    del told["version"]
+    return {**told, "window": WindowRules(**told["window"])}

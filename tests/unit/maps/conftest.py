@@ -1,0 +1,74 @@
+"""A release whose BEV cameras can be taken away, and the generator's own roads beneath it."""
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.maps import TownMap, town_map
+from deepaccident_devkit.synth import SynthConfig
+from deepaccident_devkit.synth.plan import plan_scenarios
+from deepaccident_devkit.synth.scenario import build_scenario
+from deepaccident_devkit.synth.stage import World
+from deepaccident_devkit.taxonomy import CAMERAS, LIDAR
+
+
+def copied(release_root: Path, root: Path) -> Path:
+    """A copy of the release with labels, calib, meta and BEV cameras."""
+    shutil.copytree(
+        release_root, root, copy_function=os.link, ignore=shutil.ignore_patterns(".deepaccident", *CAMERAS, LIDAR)
+    )
+    return root
+
+
+@pytest.fixture(scope="session")
+def bev_release(release_root: Path, tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
+    """The session's release with its BEV cameras and an index of its own, beside which maps are kept."""
+    root = copied(release_root, tmp_path_factory.mktemp("maps") / "release")
+    return DeepAccident("v1", root, verbose=False)
+
+
+@pytest.fixture
+def own_bev_release(release_root: Path, tmp_path: Path) -> DeepAccident:
+    """The same, whose files a test may remove (written to, they would change the session's)."""
+    return DeepAccident("v1", copied(release_root, tmp_path / "release"), verbose=False)
+
+
+@pytest.fixture(scope="session")
+def town(bev_release: DeepAccident) -> str:
+    """The town of the first accident and its twin, which no other scenario shares."""
+    first = bev_release.scenario[0]
+    same = bev_release.field2token("scenario", "town", first["town"])
+    assert [bev_release.get("scenario", token)["name"] for token in same] == [first["name"]] * 2
+    return str(first["town"])
+
+
+@pytest.fixture(scope="session")
+def mapped(bev_release: DeepAccident, town: str) -> TownMap:
+    """The map of that town."""
+    return town_map(bev_release, town, workers=1)
+
+
+@pytest.fixture(scope="session")
+def world(bev_release: DeepAccident) -> World:
+    """The generator's world of that town."""
+    config = SynthConfig(scenarios=4, frames=6, image_size=(64, 36), seed=3, unplanned=0, exact=True)
+    plan = plan_scenarios(config)[0]
+    assert plan.token == bev_release.scenario[0]["token"]
+    return build_scenario(config, plan).world
+
+
+@pytest.fixture(scope="session")
+def true_codes(world: World) -> Callable[[FloatArray], FloatArray]:
+    """The codes of the generator's ground at points (N, 2) in world."""
+    turned = world.world_from_ground.matrix[:2, :2]
+
+    def at(xy: FloatArray) -> FloatArray:
+        return world.ground.at((xy - world.world_from_ground.translation[:2]) @ np.linalg.inv(turned).T)
+
+    return at

@@ -1,0 +1,88 @@
+"""The picture of prevented accidents: its lines are the curves, its points the predictors."""
+
+import numpy as np
+import pytest
+from drawing import new_axes, words
+from numpy.testing import assert_allclose, assert_array_equal
+
+from deepaccident_devkit.evaluation.metrics.warning import PreventedResult, PreventionCurve, PreventionFigures
+from deepaccident_devkit.evaluation.metrics.warning.outcome_tables import NOMINAL, SETTINGS
+from deepaccident_devkit.evaluation.metrics.warning.prevention import OutcomeFigures
+from deepaccident_devkit.render.evaluation import render_prevention
+from deepaccident_devkit.safety import OUTCOMES
+
+GROUP = "bystander"
+
+
+def figures(avoided: float, cost: float) -> PreventionFigures:
+    shares = dict.fromkeys(OUTCOMES, 0.0) | {"avoided": avoided, "unchanged": 1 - avoided}
+    one = OutcomeFigures(warned=1.0, shares=shares, counts={}, extrapolated=0.0, braking_seconds_per_minute=cost)
+    ends = {0.0: dict.fromkeys(SETTINGS, one)}
+    return PreventionFigures(
+        threshold=0.5,
+        quiet_braking=0.5,
+        accidents=4,
+        recordings=4,
+        minutes=0.5,
+        right=ends,
+        any_alarm=ends,
+        lasting=ends,
+    )
+
+
+def prevented() -> PreventedResult:
+    share = np.array([[0.0], [0.25], [0.75]]) * np.linspace(0.5, 1, len(SETTINGS))
+    cost = np.array([[0.0], [0.5], [20.0]]) + np.zeros(len(SETTINGS))
+    threshold = np.array([np.inf, 0.9, 0.5])
+    curve = PreventionCurve(threshold=threshold, braking_seconds_per_minute=cost, avoided=share, mitigated=share / 5)
+    return PreventedResult(
+        operating_by="given",
+        alarms="right",
+        groups={GROUP: figures(0.25, 0.5)},
+        references={"always": {GROUP: figures(1.0, 45.0)}, "never": {GROUP: figures(0.0, float("nan"))}},
+        curves={GROUP: curve},
+        dropped=(),
+        skipped=(),
+    )
+
+
+def test_lines_are_the_curves_and_points_the_predictors() -> None:
+    result = prevented()
+    ax = render_prevention(result, ax=new_axes())
+    curve, nominal = result.curves[GROUP], SETTINGS.index(NOMINAL)
+    lines = {line.get_label(): line for line in ax.lines}
+    assert_array_equal(lines[f"at {NOMINAL}"].get_ydata(), curve.avoided[:, nominal])
+    assert_array_equal(lines[f"at {NOMINAL}"].get_xdata(), [0, 0.5, 20])
+    assert_allclose(lines["or milder"].get_ydata(), 1.2 * curve.avoided[:, nominal])
+    drawn = [np.asarray(line.get_ydata()).tolist() for line in ax.lines]
+    for setting in range(len(SETTINGS)):
+        assert curve.avoided[:, setting].tolist() in drawn
+    points = [(line.get_xdata()[0], line.get_ydata()[0]) for line in ax.lines if line.get_marker() == "o"]
+    assert points == [(0.5, 0.25), (45.0, 1.0)]
+    assert GROUP in words(ax)
+
+
+@pytest.mark.parametrize("group", [None, GROUP])
+def test_nothing_to_show_is_said(group: str | None) -> None:
+    result = prevented()
+    empty = PreventedResult(
+        operating_by="given", alarms="right", groups={}, references={}, curves={}, dropped=(), skipped=()
+    )
+    assert "needs accidents and recordings without one" in words(render_prevention(empty, group, ax=new_axes()))
+    curve = result.curves[GROUP]
+    unknown = PreventionCurve(
+        threshold=curve.threshold,
+        braking_seconds_per_minute=curve.braking_seconds_per_minute * np.nan,
+        avoided=curve.avoided,
+        mitigated=curve.mitigated,
+    )
+    result = PreventedResult(
+        operating_by="given",
+        alarms="right",
+        groups=result.groups,
+        references={},
+        curves={GROUP: unknown},
+        dropped=(),
+        skipped=(),
+    )
+    assert "needs accidents" in words(render_prevention(result, group, ax=new_axes()))

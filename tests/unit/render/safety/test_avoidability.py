@@ -1,0 +1,61 @@
+"""The figure of avoidability: its lines are the report's numbers, its words legible."""
+
+import numpy as np
+import pytest
+from picture_texts import text_faults
+from replayed_accidents import head_on, rear_end
+
+from deepaccident_devkit.errors import ChoiceError, NotAvailableError
+from deepaccident_devkit.render.axes import detached_figure
+from deepaccident_devkit.render.safety import render_avoidability
+from deepaccident_devkit.safety import OUTCOMES, AvoidabilityReport, avoidability_of
+
+
+def report_of(*accidents: object) -> AvoidabilityReport:
+    return AvoidabilityReport(dataroot="/data", version="v1", accidents=accidents, dropped=(), skipped=(), margins={})
+
+
+@pytest.fixture(scope="module")
+def report() -> AvoidabilityReport:
+    return report_of(
+        avoidability_of(rear_end(20, 10)), avoidability_of(rear_end(20, 14, 2)), avoidability_of(head_on(9, 2))
+    )
+
+
+def test_lines_are_the_shares(report: AvoidabilityReport) -> None:
+    figure = detached_figure((10, 6))
+    assert render_avoidability(report, fig=figure) is figure
+    avoided, speeds = figure.axes[:4], figure.axes[4:]
+    assert [ax.get_title() for ax in avoided] == [
+        "the first brakes (2)",
+        "the second brakes (2)",
+        "both brake (2)",
+        "the ego brakes (2)",
+    ]
+    shares = report.shares[0]
+    for column, (one, two) in enumerate(zip(avoided[0].lines, speeds[0].lines, strict=True)):
+        enough = slice(0, len(one.get_xdata()))
+        np.testing.assert_allclose(one.get_ydata(), shares.shares[enough, column, OUTCOMES.index("avoided")])
+        np.testing.assert_allclose(two.get_ydata(), shares.relative_speed[enough, column])
+    assert len(avoided[0].lines) == 9
+    assert len({(line.get_color(), line.get_linestyle()) for line in avoided[0].lines}) == 9
+    assert avoided[0].lines[0].get_xdata()[-1] == pytest.approx(5)
+
+
+def test_a_line_ends_where_few_recordings_are_long_enough() -> None:
+    short = [avoidability_of(rear_end(20, 14, 2)) for _ in range(2)]
+    figure = render_avoidability(report_of(avoidability_of(rear_end(20, 10)), *short), fig=detached_figure((10, 6)))
+    assert figure.axes[0].lines[0].get_xdata()[-1] == pytest.approx(2)
+
+
+def test_groups_without_accidents(report: AvoidabilityReport) -> None:
+    assert len(render_avoidability(report, "head-on", fig=detached_figure((10, 6))).axes) == 8
+    with pytest.raises(NotAvailableError, match="no accident of the group 'pedestrians'"):
+        render_avoidability(report, "pedestrians")
+    with pytest.raises(ChoiceError, match="group: expected one of vehicles, head-on, pedestrians"):
+        render_avoidability(report, "trucks")
+
+
+@pytest.mark.slow
+def test_words_are_apart_and_large(report: AvoidabilityReport) -> None:
+    assert text_faults(render_avoidability(report)) == []
