@@ -68,11 +68,13 @@ def _notes(prevented: Json, group: str, given: Json) -> Iterator[str]:
     threshold, quiet = given["threshold"], given["quiet_braking"]
     how = "given" if prevented["operating_by"] == "given" else "at most 1 braking s/min on these recordings"
     figures = given[prevented["alarms"]][_AT_ONCE][NOMINAL]
+    lasting = given["lasting"][_AT_ONCE][NOMINAL]
     path = f"groups/{group}/{prevented['alarms']}/{_AT_ONCE}/{NOMINAL}/shares/{OUTCOMES[0]}"
     ends = prevented["intervals"].get(path)
     interval = "" if not ends or None in ends else f" [{ends[0]:.3f}, {ends[1]:.3f}]"
     yield (
-        f"avoided: {number_text(figures['shares'][OUTCOMES[0]])}{interval} of {given['accidents']} accidents, for "
+        f"avoided: {number_text(figures['shares'][OUTCOMES[0]])}{interval} of {given['accidents']} accidents "
+        f"({number_text(lasting['shares'][OUTCOMES[0]])} by alarms that outlast the reaction), for "
         f"{number_text(figures['braking_seconds_per_minute'])} braking seconds a minute in {given['minutes']:.1f} min "
         f"of {given['recordings']} recordings without an accident"
     )
