@@ -296,7 +296,7 @@ class TestBoxes:
         assert (told.seconds, told.source.warped, told.frame_sample) == (1.0, False, f"{EGO}/016")
         check_box(small, f"{EGO}/006", told, told.painter, own.config)
         assert told.painter.cells == len(cells)
-        assert {corner for corner in told.painter.raster} <= {*cells}
+        assert set(told.painter.raster) <= {*cells}
         ego = own.to_present().explain(0, *painted(own, 0, OWN_BOX_ID)[0])
         assert (ego.painter.row, ego.painter.instance, ego.source.warped) == (
             0,
@@ -533,7 +533,9 @@ class TestPrediction:
         assert told.prediction is not None
         assert told.prediction.outcome == "found"
         assert told.prediction.cell != told.cell
-        assert (told.prediction.mostly, told.prediction.shared_cells) == (None, 0)
+        everywhere = own.explain(4, *cells[0], prediction=np.ones((5, 200, 200), dtype=np.int32)).prediction
+        assert everywhere is not None
+        assert (everywhere.mostly, everywhere.shared_cells) == (None, 0), "cells of two frames are not the same"
 
     @pytest.mark.parametrize("wrong", [np.zeros((5, 10, 10), int), "none", np.zeros((200, 200), int)])
     def test_what_is_no_prediction(self, small: DeepAccident, wrong: object) -> None:
