@@ -81,6 +81,7 @@ NOT_RUN = {
     "predict ": "likewise",
     "evaluate motion training_data": "of what predict makes; likewise",
     "evaluate motion DATAROOT --results results/motion ": "likewise",
+    "labels explain": "tests/unit/motion/test_explaining.py has it; this sample is of the demo",
     "results from": "tests/unit/export/test_nuscenes_detections.py has it, and makes the file",
     "export mcap": "tests/unit/export has it, which has the extra",
 }
@@ -225,6 +226,18 @@ def test_every_choice_of_the_metrics_is_explained(choices: type[Any]) -> None:
 @pytest.mark.parametrize("name", [*MOTION_PROTOCOLS, *DETECTION_PROTOCOLS, *PROTOCOLS, *WARNING_PROTOCOLS])
 def test_every_protocol_of_the_metrics_is_explained(name: str) -> None:
     assert f"`{name}`" in (DOCS / "protocols.md").read_text(encoding="utf-8")
+
+
+def test_the_code_on_safety_runs(in_labels_demo: Path) -> None:
+    names = run_page(DOCS / "safety.md")
+    assert names["story"].text.endswith("would have avoided it.")
+    assert len(names["times"].gains) == 4
+
+
+def test_the_code_on_town_maps_runs(in_demo: Path) -> None:
+    names = run_page(DOCS / "town_maps.md")
+    assert (in_demo / "town.geojson").is_file()
+    assert names["town"].drivable().any()
 
 
 def test_the_code_on_baselines_runs(in_labels_demo: Path) -> None:
