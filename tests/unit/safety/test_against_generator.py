@@ -1,7 +1,7 @@
 """60 synthetic accidents: what safety says from the labels alone, against what the generator knows.
 
 42 are of all designs, three in ten of them unplanned (with pedestrians or a third vehicle); a house hides the colliders
-of 18 from each other. Most show the last 3 s. Every eleventh is whole, and its normal twin is there too: as in the real
+of 18 from each other. Most show the last 3 s. Every seventh is whole, and its normal twin is there too: as in the real
 release, and only so, twins begin at the same moment. The generator's side is in tests/generator_truth.py.
 """
 
@@ -39,7 +39,7 @@ from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, FRAME_PERIOD
 
 pytestmark = pytest.mark.slow
 
-OPEN_PAIRS, PAIRS, WHOLE = 42, 60, 11
+OPEN_PAIRS, PAIRS, WHOLE = 42, 60, 7
 LAG = HARDEST_BRAKING * FRAME_PERIOD / 2
 """m/s: by how much a mean over the last tenth of a second may differ from the speed at its end."""
 LEANING = 0.01
@@ -66,7 +66,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 
 def jobs(root: Path) -> list[RecordingJob]:
-    """The accidents, and after every eleventh its twin."""
+    """The accidents, and after every seventh its twin."""
     short = SynthConfig(scenarios=2 * PAIRS, frames=30, sensors=False, seed=26, unplanned=0.3, exact=True)
     hidden = replace(short, view="hidden")
     plans = [(short, plan) for plan in plan_scenarios(short)[: 2 * OPEN_PAIRS]]
@@ -86,7 +86,7 @@ def compared(root: Path, truths: Sequence[Truth]) -> Made:
 
 
 def test_they_are_sixty_and_of_many_kinds(made: Made) -> None:
-    assert (len(made.accidents), len(made.da.find(collision=True)), len(made.twins)) == (PAIRS, PAIRS, 6)
+    assert (len(made.accidents), len(made.da.find(collision=True)), len(made.twins)) == (PAIRS, PAIRS, 9)
     assert len({truth.design for truth in made.truths}) == 12
     assert sum(truth.unplanned for truth in made.truths) >= 8
     assert sum("pedestrian" in accident.categories for accident in made.accidents) >= 4
