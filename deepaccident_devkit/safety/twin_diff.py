@@ -145,6 +145,18 @@ class TwinDiff(FrozenArrays):
         return int(frames[frames > 0].min()) if frames.any() else None
 
     @property
+    def begins_together(self) -> bool:
+        """Whether most agents are where they are in the twin at the first moment that both recordings show.
+
+        Where they are not, the recordings begin at different moments (or the twin is another scene), and it is not
+        known when they part.
+        """
+        agents = [row for row, name in enumerate(self.agents) if name is not None]
+        apart = self.distances[agents]
+        moments = np.flatnonzero(~np.isnan(apart).all(axis=0))
+        return not len(moments) or bool(np.nanmedian(apart[:, moments[0]]) <= self.parting.distance)
+
+    @property
     def gaps(self) -> FloatArray:
         """(2, F) metres between the colliders' outlines seen from above, in the accident and in the twin."""
         feet = np.concatenate(
@@ -175,6 +187,7 @@ class TwinDiff(FrozenArrays):
             "twin": self.twin,
             "num_frames": list(self.num_frames),
             "shift": self.shift,
+            "begins_together": self.begins_together,
             "parting_distance": self.parting.distance,
             "parting_heading": self.parting.heading,
             "parting_frame": parting,

@@ -31,6 +31,7 @@ _OF_TWINS: Final = (
     "accident",
     "twin",
     "shift",
+    "begins_together",
     "parting_frame",
     "parting_time",
     "time_to_impact",
@@ -54,6 +55,7 @@ _OF_ACTORS: Final = (
 
 _NAMED: Final = 2
 """Actors that a line names at most."""
+_APART: Final = "the recordings do not begin together, so that it is not known when they part"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,7 +118,8 @@ class TwinReport(ShortRepr):
             heading = ("accident", "parts at", "to impact", "first", "acting differently", "in one alone", "nearest")
             rows = [heading, *map(_line, self.diffs)]
             notes = "seconds from the first frame, and to the impact; nearest: the colliders' least gap in the twin (m)"
-            blocks.append(f"{columns_text(rows)}\n{notes}")
+            apart = sum(not each.begins_together for each in self.diffs)
+            blocks.append(f"{columns_text(rows)}\n{notes}" + (f"\n{apart} of them: {_APART}" if apart else ""))
         else:
             blocks.append("no accident has a twin here")
         if self.torn:
@@ -181,6 +184,8 @@ def diff_text(diff: TwinDiff) -> str:
         ahead = (diff.num_frames[0] - parting) / 10
         when = f"they part at frame {parting}, {frame_timestamp(parting):.1f} s after the start, {ahead:.1f} s before"
         when += f" the impact: {_first_to_part(diff)}"
+    if not diff.begins_together:
+        when += f"\n{_APART}"
     gap = "the twin never shows the colliders at once"
     if nearest is not None:
         gap = f"the colliders' least gap in the twin: {nearest.gap:.2f} m at frame {nearest.frame}"

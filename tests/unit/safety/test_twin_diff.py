@@ -13,6 +13,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ConfigError, NotAvailableError
 from deepaccident_devkit.safety import Parting, TwinDiff, twin_diff, twin_report
+from deepaccident_devkit.safety.twin_report import diff_text
 
 TOKENS = {"accident": "type1_subtype1_accident/a", "twin": "type1_subtype1_normal/a"}
 
@@ -60,6 +61,20 @@ def test_when_who_and_how_far() -> None:
     assert (ego["largest_distance"], ego["largest_speed_difference"]) == (1.25, -2)
     assert (van["parting_frame"], van["largest_distance"]) == (None, 0)
     assert (walker["twin_id"], walker["largest_distance"], walker["collides"]) == (None, None, False)
+
+
+def test_twins_that_do_not_begin_together_are_told() -> None:
+    diff = made_diff()
+    assert diff.begins_together
+    assert "do not begin together" not in diff_text(diff)
+    poses = diff.poses.copy()
+    poses[1, 0, :, 0] += 0.8
+    apart = replace(diff, poses=poses)
+    assert not apart.begins_together
+    assert apart.to_dict()["begins_together"] is False
+    assert "do not begin together" in diff_text(apart)
+    poses[1, 0] = np.nan
+    assert replace(diff, poses=poses).begins_together, "no agent is there to tell"
 
 
 def test_turns_count_the_shorter_way() -> None:
