@@ -20,13 +20,18 @@ from deepaccident_devkit.export.mmdet3d import Mmdet3d
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.export.opencood import OpenCood
 from deepaccident_devkit.export.parquet import Parquet
+from deepaccident_devkit.export.questions import Questions, WindowRules
 from deepaccident_devkit.export.released_infos import ReleasedInfos
 from deepaccident_devkit.export.webdataset import WebDataset
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.synth import SynthConfig, make_release
 
 CACHE = CachedImages(images=ImageConfig(resize=(396, 704), crop=(140, 0, 256, 704)), where=("length>=1",))
-FORMATS: tuple[Format, ...] = (OpenCood(), NuScenes(), Mmdet3d(), ReleasedInfos(), Parquet(), WebDataset(), CACHE)
+QUESTIONS = Questions(window=WindowRules(observe=0.0, stride=0.5))
+FORMATS: tuple[Format, ...] = (
+    *(OpenCood(), NuScenes(), Mmdet3d(), ReleasedInfos(), Parquet(), WebDataset()),
+    *(QUESTIONS, CACHE),
+)
 """One of each; a format that lies in another's folder comes after it."""
 RELEASE = SynthConfig(scenarios=1, frames=8, image_size=(800, 450), seed=7)
 SCENARIOS = 3

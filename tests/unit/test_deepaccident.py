@@ -5,14 +5,14 @@ import subprocess
 import sys
 from typing import Any
 
-from deepaccident_devkit import DeepAccident, motion, render, validation
+from deepaccident_devkit import DeepAccident, motion, render, safety, validation
 from deepaccident_devkit.deepaccident import _Later, _Package
 
 LATE = {
     name: getattr(package, name)
-    for package in (motion, render, validation)
+    for package in (motion, render, safety, validation)
     for name in package.__all__
-    if hasattr(DeepAccident, name)
+    if hasattr(DeepAccident, name) and name != "interactions"  # of a lower layer, which is there at once
 }
 
 
@@ -21,7 +21,9 @@ def run(code: str) -> str:
 
 
 def test_nothing_heavy_is_imported_before_it_is_used() -> None:
-    packages = [f"deepaccident_devkit.{name}" for name in ("motion", "render", "validation", "evaluation", "synth")]
+    packages = [
+        f"deepaccident_devkit.{name}" for name in ("motion", "render", "safety", "validation", "evaluation", "synth")
+    ]
     heavy = [*packages, "cv2", "matplotlib", "scipy", "shapely"]
     code = "import sys; from deepaccident_devkit import DeepAccident; DeepAccident.find; DeepAccident.transform; "
     assert run(f"{code}print([name for name in {heavy} if name in sys.modules])") == "[]\n"
@@ -29,19 +31,19 @@ def test_nothing_heavy_is_imported_before_it_is_used() -> None:
 
 def test_what_is_asked_for_brings_its_own_package_alone() -> None:
     code = "import sys; from deepaccident_devkit import DeepAccident; DeepAccident.samples; "
-    packages = [f"deepaccident_devkit.{name}" for name in ("motion", "render", "validation")]
+    packages = [f"deepaccident_devkit.{name}" for name in ("motion", "render", "safety", "validation")]
     assert run(f"{code}print([name for name in {packages} if name in sys.modules])") == f"{packages[:1]}\n"
 
 
 def test_help_has_every_signature() -> None:
     code = "import pydoc; from deepaccident_devkit import DeepAccident; print(pydoc.render_doc(DeepAccident, "
     shown = run(f"{code}renderer=pydoc.plaintext))")
-    for name in ("motion_labels", "findings", "render_bev"):
+    for name in ("motion_labels", "findings", "render_bev", "describe"):
         assert f" |  {name}(" in shown
 
 
 def test_each_is_its_packages_own_and_in_place_after_its_first_use() -> None:
-    assert {"motion_labels", "findings", "render_sample", "render_replay"} < LATE.keys()
+    assert {"motion_labels", "findings", "render_sample", "render_replay", "describe"} < LATE.keys()
     assert [name for name in LATE if getattr(DeepAccident, name) is not LATE[name]] == []
     assert [name for name in LATE if vars(DeepAccident)[name] is not LATE[name]] == []
     assert [name for name, value in vars(DeepAccident).items() if isinstance(value, _Later)] == []

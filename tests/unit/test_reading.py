@@ -104,6 +104,7 @@ NOT_OF_STRANGERS = {
     "files.py": "the system's processes",
     "cli/demo.py": "the mark of the demo's own folder",
     "evaluation/runs/bundles.py": "counts that were written a line before",
+    "export/questions/format.py": "the parts that the export wrote",
     "release/store/sources.py": "fsspec, and the gate's files",
     "release/store/store.py": "the cache's own copies",
     "release/store/zips.py": "the directory of an archive that the gate or fsspec opened",
