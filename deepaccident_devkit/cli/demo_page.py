@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from deepaccident_devkit.baselines.hidden_collider import HiddenCollider, table_rows
-from deepaccident_devkit.render.evaluation.markup import Markup, document, joined, table, tag
+from deepaccident_devkit.render.markup import Markup, document, joined, table, tag
 
 PAGE: Final = "index.html"
 PICTURES: Final = {

@@ -5,6 +5,7 @@ import click
 from deepaccident_devkit.cli.safety_avoidability import avoidability
 from deepaccident_devkit.cli.safety_describe import describe
 from deepaccident_devkit.cli.safety_lead_time import lead_time
+from deepaccident_devkit.cli.safety_report import report
 from deepaccident_devkit.cli.safety_twins import twins
 
 
@@ -17,3 +18,4 @@ safety.add_command(lead_time)
 safety.add_command(avoidability)
 safety.add_command(twins)
 safety.add_command(describe)
+safety.add_command(report)

@@ -46,6 +46,8 @@ from deepaccident_devkit.safety.outcomes import (
     outcomes_of,
     undisturbed,
 )
+from deepaccident_devkit.safety.overall_report import SafetyReport, safety_report
+from deepaccident_devkit.safety.report_rows import AccidentRow, PairMeasures
 from deepaccident_devkit.safety.stories import Story, describe, scenario_facts, stories
 from deepaccident_devkit.safety.story_text import story_text
 from deepaccident_devkit.safety.twin_comparison import twin_diff
@@ -60,6 +62,7 @@ __all__ = [
     "OUTCOMES",
     "PARTNERS",
     "Accident",
+    "AccidentRow",
     "Avoidability",
     "AvoidabilityReport",
     "Braking",
@@ -72,8 +75,10 @@ __all__ = [
     "ObservationRule",
     "OutcomeShares",
     "Outcomes",
+    "PairMeasures",
     "Parting",
     "ReplayCheck",
+    "SafetyReport",
     "Skipped",
     "Story",
     "TornTwins",
@@ -109,6 +114,7 @@ __all__ = [
     "outcomes_of",
     "post_encroachment_time",
     "relative_speed",
+    "safety_report",
     "scenario_facts",
     "shapley_values",
     "stories",

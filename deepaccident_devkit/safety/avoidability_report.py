@@ -118,6 +118,14 @@ class AvoidabilityReport(ShortRepr):
         ]
         return "\n\n".join(blocks)
 
+    @property
+    def margin_counts(self) -> dict[str, int]:
+        """Size in words → how many of the `margins` are of that size."""
+        bounds = [0, 0.01, 0.1, 0.5, MOST_MARGIN]
+        counts = np.histogram(list(self.margins.values()), bins=[*bounds, np.inf])[0].tolist()
+        names = [f"below {bound:g} m" for bound in bounds[1:]] + [f"{MOST_MARGIN:g} m or more"]
+        return dict(zip(names, counts, strict=True))
+
     def members(self, group: str) -> list[Avoidability]:
         """The accidents of one of `GROUPS`."""
         return [each for each in self.accidents if group_of(each) == group]
@@ -145,11 +153,7 @@ class AvoidabilityReport(ShortRepr):
 
     def _margins_text(self) -> str:
         """How many margins of the self-check there are of each size; the largest by name."""
-        values = np.array(list(self.margins.values()))
-        bounds = [0, 0.01, 0.1, 0.5, MOST_MARGIN]
-        counts = np.histogram(values, bins=[*bounds, np.inf])[0].tolist()
-        names = [f"below {bound:g} m" for bound in bounds[1:]] + [f"{MOST_MARGIN:g} m or more"]
-        lines = [f"  {name}: {count}" for name, count in zip(names, counts, strict=True) if count]
+        lines = [f"  {name}: {count}" for name, count in self.margin_counts.items() if count]
         largest = max(self.margins, key=lambda name: self.margins[name])
         lines.append(f"  the largest: {self.margins[largest]:.3f} m, {largest}")
         return "\n".join(["gaps at the last frame, which count as contact:", *lines])
@@ -231,7 +235,7 @@ def avoidability_report(
     chosen = dataset.scenario if scenarios is None else scenarios
     tokens = [dataset.get("scenario", each)["token"] for each in chosen]
     found = run_batch(
-        partial(_looked_into, dataset),
+        partial(looked_into, dataset),
         tokens,
         workers=workers,
         executor=executor,
@@ -239,30 +243,47 @@ def avoidability_report(
         progress=progress,
         places=Places(reads=dataset.places),
     )
-    dropped = [each for each in found if isinstance(each, _Dropped)]
-    accidents = tuple(each for each in found if isinstance(each, Avoidability))
-    margins = {each.accident.scenario: each.check.margin for each in accidents}
-    margins |= {each.why.scenario: each.margin for each in dropped}
+    return report_of(dataset, found)
+
+
+def report_of(dataset: Dataset, found: Sequence[Avoidability | Skipped | Dropped | None]) -> AvoidabilityReport:
+    """The report of what `looked_into` gave for scenarios, in their order."""
+    margins: dict[str, float] = {}
+    for each in found:
+        if isinstance(each, Avoidability):
+            margins[each.accident.scenario] = each.check.margin
+        elif isinstance(each, Dropped):
+            margins[each.why.scenario] = each.margin
     return AvoidabilityReport(
         dataroot=str(dataset.dataroot),
         version=dataset.version,
-        accidents=accidents,
-        dropped=tuple(each.why for each in dropped),
+        accidents=tuple(each for each in found if isinstance(each, Avoidability)),
+        dropped=tuple(each.why for each in found if isinstance(each, Dropped)),
         skipped=tuple(each for each in found if isinstance(each, Skipped)),
-        margins={token: margins[token] for token in tokens if token in margins},
+        margins=margins,
     )
 
 
 @dataclass(frozen=True, slots=True)
-class _Dropped:
-    """An accident that its recording does not show, and the gap at the end."""
+class Dropped:
+    """An accident that its recording does not show.
+
+    Attributes:
+        why: in words.
+        margin: metres between the two at the last frame.
+    """
 
     why: Skipped
     margin: float
 
 
-def _looked_into(dataset: Dataset, scenario: str) -> Avoidability | Skipped | _Dropped | None:
-    """One scenario; None if it has no collision."""
+def looked_into(dataset: Dataset, scenario: str) -> Avoidability | Skipped | Dropped | None:
+    """When a scenario's accident could have been avoided, or why it cannot be told; None if it has no collision.
+
+    Args:
+        dataset: the release.
+        scenario: token.
+    """
     try:
         accident = accident_of(dataset, scenario)
     except NotAvailableError as error:
@@ -271,7 +292,7 @@ def _looked_into(dataset: Dataset, scenario: str) -> Avoidability | Skipped | _D
         return None
     check = undisturbed(accident)
     if not check.usable:
-        return _Dropped(Skipped(scenario=scenario, reason=unusable(accident, check)), check.margin)
+        return Dropped(Skipped(scenario=scenario, reason=unusable(accident, check)), check.margin)
     return avoidability_of(accident, scenario_tracks(dataset, scenario))
 
 

@@ -15,6 +15,8 @@ from deepaccident_devkit.safety.accidents import Skipped
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
+    from deepaccident_devkit.tables.records import ScenarioRecord
+
 Result = TypeVar("Result")
 _RUN_LENGTH: Final = 64
 """Scenarios that are looked at together: some tenths of a second."""
@@ -69,22 +71,29 @@ def each_scenario(
     how: dict[str, Any] = {"workers": workers, "executor": executor, "label": label, "progress": progress}
     sizes, places = [len(run) for run in runs], Places(reads=dataset.places)
     parts = in_order(run_unordered(partial(_run, work, dataset), runs, sizes=sizes, places=places, **how))
-    found = [each for part in parts for each in part]
-    return Found(
-        results=tuple(each for each in found if each is not None and not isinstance(each, Skipped)),
-        skipped=tuple(each for each in found if isinstance(each, Skipped)),
-        others=sum(each is None for each in found),
-    )
+    return sorted_out([each for part in parts for each in part])
 
 
 def _run(
     work: Callable[[Dataset, Any], Result | None], dataset: Dataset, rows: Sequence[int]
 ) -> list[Result | Skipped | None]:
-    result: list[Result | Skipped | None] = []
-    for row in rows:
-        scenario = dataset.scenario[row]
-        try:
-            result.append(work(dataset, scenario))
-        except NotAvailableError as error:
-            result.append(Skipped(scenario=scenario["token"], reason=str(error)))
-    return result
+    return [tried(work, dataset, dataset.scenario[row]) for row in rows]
+
+
+def tried(
+    work: Callable[[Dataset, Any], Result | None], dataset: Dataset, scenario: ScenarioRecord
+) -> Result | Skipped | None:
+    """What a computation, as `each_scenario` takes it, finds in one scenario, or why it finds nothing."""
+    try:
+        return work(dataset, scenario)
+    except NotAvailableError as error:
+        return Skipped(scenario=scenario["token"], reason=str(error))
+
+
+def sorted_out(found: Sequence[Result | Skipped | None]) -> Found[Result]:
+    """The results of `tried`, those of a kind together."""
+    return Found(
+        results=tuple(each for each in found if each is not None and not isinstance(each, Skipped)),
+        skipped=tuple(each for each in found if isinstance(each, Skipped)),
+        others=sum(each is None for each in found),
+    )

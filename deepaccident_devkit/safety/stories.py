@@ -14,10 +14,10 @@ from deepaccident_devkit.arrays import FloatArray, ShortRepr
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.interactions import interactions
-from deepaccident_devkit.safety.accidents import Accident, accident_of
+from deepaccident_devkit.safety.accidents import Accident, Skipped, accident_of
 from deepaccident_devkit.safety.avoidability import BRAKERS, Avoidability, avoidability
 from deepaccident_devkit.safety.observation import observed_actors
-from deepaccident_devkit.safety.scenarios import each_scenario
+from deepaccident_devkit.safety.scenarios import each_scenario, tried
 from deepaccident_devkit.safety.story_text import story_text
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x.collisions import Contact, collision
@@ -102,8 +102,16 @@ def stories(
     return each_scenario(describe, dataset, scenarios, label="stories", **how).results
 
 
-def scenario_facts(dataset: Dataset, scenario: RowArgument) -> dict[str, Any]:
-    """The facts of `describe`; arguments and errors as there."""
+def scenario_facts(
+    dataset: Dataset, scenario: RowArgument, replayed: Avoidability | Skipped | None = None
+) -> dict[str, Any]:
+    """The facts of `describe`; errors as there.
+
+    Args:
+        dataset: the release.
+        scenario: token or record.
+        replayed: what `avoidability` gives for it, or why that gives nothing, where it is known; None to compute it.
+    """
     record = dataset.scenario[dataset.getind("scenario", scenario)]
     unknown: list[str] = []
     collides = None if record["weather"] is None else record["collision"] is not None
@@ -114,13 +122,15 @@ def scenario_facts(dataset: Dataset, scenario: RowArgument) -> dict[str, Any]:
         **{name: record[name] for name in ("town", "road_type", "signalized", "weather", "time_of_day")},
         "duration": round((record["num_frames"] - 1) * FRAME_PERIOD, 1),
         "collision": collides,
-        "accident": _accident(dataset, record, unknown) if collides else None,
+        "accident": _accident(dataset, record, unknown, replayed) if collides else None,
         "nearest": None if collides else _nearest(dataset, record, unknown),
         "unknown": unknown,
     }
 
 
-def _accident(dataset: Dataset, record: ScenarioRecord, unknown: list[str]) -> dict[str, Any] | None:
+def _accident(
+    dataset: Dataset, record: ScenarioRecord, unknown: list[str], replayed: Avoidability | Skipped | None
+) -> dict[str, Any] | None:
     """Who collides, how, who saw it, and what would have avoided it."""
     try:
         accident, contact = accident_of(dataset, record), collision(dataset, record)
@@ -129,11 +139,10 @@ def _accident(dataset: Dataset, record: ScenarioRecord, unknown: list[str]) -> d
         return None
     if accident is None or contact is None:  # only for the type checker: meta names a collision
         return None
-    braked: Avoidability | None = None
-    try:
-        braked = avoidability(dataset, record)
-    except NotAvailableError as error:
-        unknown.append(str(error))
+    found = tried(avoidability, dataset, record) if replayed is None else replayed
+    braked = None if isinstance(found, Skipped) else found
+    if isinstance(found, Skipped):
+        unknown.append(found.reason)
     return {
         "pair": [_collider(record, accident, contact, braked, which) for which in range(2)],
         "time": round((accident.last_frame - 1) * FRAME_PERIOD, 1),

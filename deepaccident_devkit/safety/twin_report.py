@@ -158,7 +158,7 @@ def twin_report(
         WorkerError: a worker was killed, or cannot do the work.
     """
     found = each_scenario(
-        partial(_diff_of_accident, parting=parting or Parting()),
+        partial(diff_of_accident, parting=parting or Parting()),
         dataset,
         scenarios,
         label="twins",
@@ -200,7 +200,8 @@ def diff_text(diff: TwinDiff) -> str:
     return f"{diff.accident}\n{diff.twin}{step}\n{when}\n{gap}\n\n{columns_text(rows, left=4)}\n{notes}"
 
 
-def _diff_of_accident(dataset: Dataset, scenario: Any, parting: Parting) -> TwinDiff | None:
+def diff_of_accident(dataset: Dataset, scenario: Any, parting: Parting) -> TwinDiff | None:
+    """`twin_diff` of a scenario's record; None if the meta file names no collision."""
     return None if scenario["collision"] is None else twin_diff(dataset, scenario, parting)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,8 +15,8 @@ from deepaccident_devkit.files import write_bytes
 from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.render.evaluation import sections
 from deepaccident_devkit.render.evaluation.figures import RunFigure, run_figures, save_figure
-from deepaccident_devkit.render.evaluation.markup import Markup, breakable, document, joined, tag
 from deepaccident_devkit.render.evaluation.samples import sample_figures
+from deepaccident_devkit.render.markup import Markup, chapters, document, joined, picture, tag
 
 REPORT_FILE: Final = "report.html"
 FIGURES_FOLDER: Final = "figures"
@@ -71,32 +70,24 @@ def report_html(run: EvaluationRun, figures: Sequence[tuple[RunFigure, Path]]) -
         **({"Predictors": table} if (table := sections.predictors(run)) else {}),
         **({"Prevented accidents": table} if (table := sections.prevention(run)) else {}),
         "Counts": sections.counts(run),
-        "Figures": tag("div", *(_figure(*each) for each in figures), class_="figures"),
+        "Figures": tag(
+            "div",
+            *(picture(read_bytes(path, "image"), each.alt, each.caption) for each, path in figures),
+            class_="figures",
+        ),
         "Breakdowns": joined(sections.breakdowns(run)),
         **({"Sanity": sections.sanity(run.sanity)} if run.sanity is not None else {}),
         **({"What each switch changes": sections.explanation(run.explanation)} if run.explanation is not None else {}),
         "Choices": sections.choices(run),
         "Check these numbers": sections.checking(),
     }
-    links = [tag("a", name, href=f"#{_anchor(name)}") for name in parts]
     mark = _mark(run)
     return document(
         f"DeepAccident evaluation: {title}",
         tag("header", tag("h1", f"DeepAccident evaluation: {title}"), mark, sections.header(run)),
-        tag("nav", *links),
-        *(tag("section", tag("h2", name), mark, body, id=_anchor(name)) for name, body in parts.items()),
+        chapters(parts, mark),
     )
-
-
-def _figure(drawn: RunFigure, path: Path) -> Markup:
-    content = base64.b64encode(read_bytes(path, "image")).decode("ascii")
-    image = tag("img", src=f"data:image/png;base64,{content}", alt=drawn.alt)
-    return tag("figure", image, tag("figcaption", breakable(drawn.caption)))
 
 
 def _mark(run: EvaluationRun) -> Markup:
     return Markup("") if run.partial is None else tag("p", run.partial.text(), class_="partial")
-
-
-def _anchor(name: str) -> str:
-    return name.lower().replace(" ", "-")

@@ -17,7 +17,7 @@ from deepaccident_devkit.evaluation.runs.notes import reading_notes
 from deepaccident_devkit.evaluation.runs.predictors import PredictorTable, predictor_tables
 from deepaccident_devkit.evaluation.runs.prevention_text import prevention_tables
 from deepaccident_devkit.render.evaluation.breakdowns import UNKNOWN
-from deepaccident_devkit.render.evaluation.markup import Markup, facts, joined, number, scalar, table, tag, tree
+from deepaccident_devkit.render.markup import Markup, facts, joined, number, scalar, table, tag, tree
 
 _BETTER: Final = {True: "higher", False: "lower", None: ""}
 _PARTS: Final = {

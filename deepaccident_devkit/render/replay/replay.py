@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import hashlib
 import html
 import json
 import math
@@ -25,6 +24,7 @@ from deepaccident_devkit.render.colors import (
     POINT_COLOR,
     WARNING_COLOR,
 )
+from deepaccident_devkit.render.markup import source_hash
 from deepaccident_devkit.render.replay.actors import actor_entries, agent_entries, camera_entries, camera_title
 from deepaccident_devkit.render.replay.facts import facts, notes
 from deepaccident_devkit.render.replay.follow import Followed, follow_pair
@@ -190,7 +190,7 @@ def replay_page(title: str, data: Mapping[str, Any]) -> str:
     table = f":root {{ --link: {LINK_COLOR}; --warning: {WARNING_COLOR}; }}\n"
     style, script = table + _part("replay.css"), "".join(map(_part, _SCRIPTS))
     policy = (
-        f"default-src 'none'; img-src data:; style-src '{_hash(style)}'; script-src '{_hash(script)}'; "
+        f"default-src 'none'; img-src data:; style-src '{source_hash(style)}'; script-src '{source_hash(script)}'; "
         "base-uri 'none'; form-action 'none'"
     )
     parts = {
@@ -216,8 +216,3 @@ def _json(data: Mapping[str, Any]) -> str:
 
 def _part(name: str) -> str:
     return (files(__package__) / name).read_text(encoding="utf-8")
-
-
-def _hash(text: str) -> str:
-    """A source in a content security policy that allows only this text."""
-    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")

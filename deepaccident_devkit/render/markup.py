@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import html
 import math
 import re
@@ -10,7 +12,7 @@ from typing import Any, Final
 
 from deepaccident_devkit.render.colors import GRID_COLOR, LINK_COLOR, WARNING_COLOR
 
-_VOID: Final = ("img", "meta")
+_VOID: Final = ("br", "img", "meta")
 _MOST_DIGITS: Final = 6
 _JOINTS: Final = re.compile(r"(?<=[/_=])(?=\w)|(?=@)")
 """Where a name may be broken."""
@@ -121,47 +123,49 @@ def _list(values: Sequence[Any]) -> Markup:
 _POLICY: Final = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 """A browser loads nothing and runs nothing, even if a name in the results tries to."""
 _STYLE: Final = f"""
-:root {{ color-scheme: light; }}
+:root {{ color-scheme: light; --paper: #fff; --ink: #1c1c1c; --soft: #444; --dim: #555; --line: #ececec;
+  --rule: {GRID_COLOR}; --link: {LINK_COLOR}; --warning: {WARNING_COLOR}; --block: #f3f3f3; }}
 * {{ box-sizing: border-box; }}
-body {{ margin: 0 auto; padding: 1rem 1.25rem 3rem; max-width: 76rem; background: #fff; color: #1c1c1c;
+body {{ margin: 0 auto; padding: 1rem 1.25rem 3rem; max-width: 76rem; background: var(--paper); color: var(--ink);
   font: 16px/1.5 system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; overflow-wrap: break-word; }}
 h1 {{ font-size: 1.7rem; line-height: 1.2; margin: .6rem 0 .4rem; }}
-h2 {{ font-size: 1.25rem; margin: 2.2rem 0 .6rem; padding-bottom: .2rem; border-bottom: 2px solid {GRID_COLOR}; }}
+h2 {{ font-size: 1.25rem; margin: 2.2rem 0 .6rem; padding-bottom: .2rem; border-bottom: 2px solid var(--rule); }}
 h3 {{ font-size: 1rem; margin: 1.4rem 0 .4rem; }}
 p {{ margin: .4rem 0; max-width: 46rem; }}
 nav a {{ display: inline-block; margin: 0 .9rem .3rem 0; }}
-a {{ color: {LINK_COLOR}; }}
+a {{ color: var(--link); }}
 dl {{ display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 28rem), 1fr)); gap: 0 2rem;
   margin: .6rem 0; }}
-dl div {{ display: flex; gap: .8rem; padding: .2rem 0; border-bottom: 1px solid #ececec; min-width: 0; }}
-dt {{ flex: 0 0 8.5rem; color: #555; }}
+dl div {{ display: flex; gap: .8rem; padding: .2rem 0; border-bottom: 1px solid var(--line); min-width: 0; }}
+dt {{ flex: 0 0 8.5rem; color: var(--dim); }}
 dd {{ margin: 0; min-width: 0; }}
 .wide {{ overflow-x: auto; max-width: 100%; }}
 table {{ border-collapse: collapse; font-size: .86rem; font-variant-numeric: tabular-nums; }}
-caption {{ text-align: left; color: #555; padding: .2rem 0; }}
-th, td {{ padding: .28rem .6rem .28rem 0; text-align: right; vertical-align: top; border-bottom: 1px solid #ececec;
+caption {{ text-align: left; color: var(--dim); padding: .2rem 0; }}
+th, td {{ padding: .28rem .6rem .28rem 0; text-align: right; vertical-align: top; border-bottom: 1px solid var(--line);
   overflow-wrap: normal; }}
-thead th {{ border-bottom: 2px solid {GRID_COLOR}; font-weight: 600; }}
+thead th {{ border-bottom: 2px solid var(--rule); font-weight: 600; }}
 th:first-child {{ text-align: left; font-weight: 500; }}
-@media (min-width: 700px) {{ .wide th:first-child {{ position: sticky; left: 0; background: #fff; }} }}
+@media (min-width: 700px) {{ .wide th:first-child {{ position: sticky; left: 0; background: var(--paper); }} }}
 .text td, .text th, .tree td, .tree th {{ text-align: left; overflow-wrap: break-word; }}
 .wide td {{ white-space: nowrap; }}
 .wide.text td, .wide .interval {{ white-space: normal; }}
 .wide .interval {{ min-width: 5em; }}
 .wide td.long {{ white-space: normal; text-align: left; min-width: 18rem; }}
 .big td {{ font-size: 1.02rem; font-weight: 600; }}
-.big td ~ td {{ font-weight: 400; color: #444; font-size: .92rem; }}
-.interval {{ color: #666; font-size: .82rem; font-weight: 400; }}
+.big td ~ td {{ font-weight: 400; color: var(--soft); font-size: .92rem; }}
+.interval {{ color: var(--dim); font-size: .82rem; font-weight: 400; }}
 .figures {{ display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 28rem), 1fr)); gap: 1.4rem; }}
 figure {{ margin: 0; }}
-figure img {{ width: 100%; height: auto; border: 1px solid #ececec; }}
-figcaption {{ font-size: .9rem; color: #333; }}
-.partial {{ color: #fff; background: {WARNING_COLOR}; font-weight: 600; padding: .35rem .7rem; max-width: none; }}
-.warning {{ border-left: .3rem solid {WARNING_COLOR}; padding-left: .7rem; }}
+figure img {{ width: 100%; height: auto; border: 1px solid var(--line); }}
+figcaption {{ font-size: .9rem; color: var(--soft); }}
+.partial {{ color: var(--paper); background: var(--warning); font-weight: 600; padding: .35rem .7rem;
+  max-width: none; }}
+.warning {{ border-left: .3rem solid var(--warning); padding-left: .7rem; }}
 summary {{ cursor: pointer; padding: .3rem 0; }}
-code {{ font: .9em/1.4 ui-monospace, "DejaVu Sans Mono", Menlo, Consolas, monospace; background: #f3f3f3;
+code {{ font: .9em/1.4 ui-monospace, "DejaVu Sans Mono", Menlo, Consolas, monospace; background: var(--block);
   padding: .1em .3em; }}
-footer {{ margin-top: 3rem; color: #555; font-size: .88rem; }}
+footer {{ margin-top: 3rem; color: var(--dim); font-size: .88rem; }}
 @page {{ size: A4 landscape; margin: 12mm; }}
 @media print {{
   body {{ max-width: none; padding: 0; font-size: 10.5pt; }}
@@ -180,20 +184,51 @@ footer {{ margin-top: 3rem; color: #555; font-size: .88rem; }}
 """
 
 
-def document(title: str, *content: Markup, policy: str = _POLICY) -> str:
+def picture(png: bytes, alt: str, caption: str) -> Markup:
+    """A PNG picture that is part of the page, with words for those who cannot see it and a caption."""
+    content = base64.b64encode(png).decode("ascii")
+    return tag(
+        "figure",
+        tag("img", src=f"data:image/png;base64,{content}", alt=alt),
+        tag("figcaption", breakable(caption)),
+    )
+
+
+def chapters(parts: Mapping[str, Markup], mark: str = "") -> Markup:
+    """Links to all parts, then each under its heading, with a mark (`Markup`) beneath."""
+    links = [tag("a", name, href=f"#{_anchor(name)}") for name in parts]
+    bodies = (tag("section", tag("h2", name), mark, body, id=_anchor(name)) for name, body in parts.items())
+    return joined([tag("nav", *links), *bodies])
+
+
+def _anchor(name: str) -> str:
+    return name.lower().replace(" ", "-")
+
+
+def source_hash(text: str) -> str:
+    """A source in a content security policy that allows only this text."""
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")
+
+
+def document(title: str, *content: Markup, policy: str = _POLICY, style: str = "", script: str = "") -> str:
     """A complete HTML page.
 
     Args:
         title: of the window.
         *content: of the body.
         policy: the Content-Security-Policy: what a browser may load and run.
+        style: rules in addition to those of all pages.
+        script: the only one that runs, after the page is read; the policy then allows it too.
     """
+    if script:
+        policy += f"; script-src '{source_hash(script)}'"
+        content = (*content, tag("script", Markup(script)))
     head = tag(
         "head",
         tag("meta", charset="utf-8"),
         tag("meta", http_equiv="Content-Security-Policy", content=policy),
         tag("meta", name_="viewport", content="width=device-width, initial-scale=1"),
         tag("title", title),
-        tag("style", Markup(_STYLE)),
+        tag("style", Markup(_STYLE + style)),
     )
     return f"<!DOCTYPE html>\n{tag('html', head, tag('body', *content), lang='en')}\n"

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from report_page import Page
 
-from deepaccident_devkit.render.evaluation.markup import Markup, breakable, number, tag, tree
+from deepaccident_devkit.render.markup import Markup, breakable, number, tag, tree
 
 
 @settings(max_examples=25)

@@ -1,0 +1,195 @@
+"""`save_safety_report`: one HTML page of a release's accidents, its figures and tables as files, and replay pages."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import quote
+
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.errors import ChoiceError, NotAvailableError, SensorFileError
+from deepaccident_devkit.files import writable_folder, write_bytes
+from deepaccident_devkit.parallel import Places, run_batch
+from deepaccident_devkit.reading import read_bytes
+from deepaccident_devkit.render.axes import detached_figure
+from deepaccident_devkit.render.markup import chapters, document, picture, tag
+from deepaccident_devkit.render.pictures import write_figure
+from deepaccident_devkit.render.replay import render_replay
+from deepaccident_devkit.render.safety import report_sections
+from deepaccident_devkit.render.safety.accident_table import accident_table, by_severity
+from deepaccident_devkit.render.safety.avoidability import AVOIDABILITY_SIZE, render_avoidability
+from deepaccident_devkit.render.safety.lead_time import LEAD_TIME_SIZE, render_lead_times
+from deepaccident_devkit.safety import SafetyReport
+from deepaccident_devkit.safety.avoidability_shares import GROUPS
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    from matplotlib.figure import Figure
+
+REPORT_FILE: Final = "report.html"
+REPLAYS: Final = 10
+"""Replay pages that are made if nobody says how many."""
+_DPI: Final = 150
+_NAME_LENGTH: Final = 120
+_TITLE: Final = "Accidents of DeepAccident: who saw them, and what would have avoided them"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Drawn:
+    """A figure of the report: the name of its file, what it shows, the same for who cannot see it, and its maker."""
+
+    name: str
+    caption: str
+    alt: str
+    draw: Callable[[], Figure]
+
+
+def save_safety_report(
+    report: SafetyReport,
+    folder: str | os.PathLike[str],
+    *,
+    dataset: Dataset | None = None,
+    replays: int | None = REPLAYS,
+    workers: int | None = None,
+    executor: Executor | None = None,
+    progress: bool = False,
+) -> list[Path]:
+    """Write the page `report.html` into a folder, beside it tables, figures and replay pages.
+
+    `accidents.csv` and `safety.json` have the page's rows, `figures/*.png` its figures, and `replays/*.html` the pages
+    that it links to, a page an accident (`render_replay`). Files of an earlier report there are replaced; each file is
+    whole or not there, and the page comes last.
+
+    Args:
+        report: of `safety_report`.
+        folder: where; it is made if it is not there.
+        dataset: the release, for replay pages; None for none.
+        replays: how many accidents have a replay page, those with the largest delta-v; None for all. A page takes some
+            seconds and up to 15 MB if there are images.
+        workers: processes that make replay pages; None chooses by the amount of work.
+        executor: any executor of `concurrent.futures` to make them on, in place of own workers; it must see the folder.
+        progress: whether to show a bar.
+
+    Returns:
+        The files written, the page last.
+
+    Raises:
+        ConfigError: `folder` cannot be written to, or is not one.
+        ChoiceError: `replays` is negative, or `workers` is less than 1.
+        WorkerError: a worker was killed, or cannot do the work.
+    """
+    if replays is not None and replays < 0:
+        raise ChoiceError(f"replays: expected 0 or more, or None for all, found {replays}")
+    folder = writable_folder(folder)
+    written = report.to_csv(folder)
+    written.append(folder / "safety.json")
+    write_bytes(written[-1], report.to_json().encode())
+    drawn, pictures = list(_figures(report)), folder / "figures"
+    figures = [(each, write_figure(each.draw(), pictures / f"{each.name}.png", dpi=_DPI)) for each in drawn]
+    names = {} if dataset is None else replay_names(_hardest(report, replays))
+    how: dict[str, Any] = {"workers": workers, "executor": executor, "progress": progress}
+    failed = {} if dataset is None else _make_replays(dataset, folder, names, **how)
+    pages = {scenario: name for scenario, name in names.items() if scenario not in failed}
+    write_bytes(folder / REPORT_FILE, report_html(report, figures, pages, sorted(failed.items())).encode())
+    return [*written, *(path for _, path in figures), *(folder / name for name in pages.values()), folder / REPORT_FILE]
+
+
+def report_html(
+    report: SafetyReport,
+    figures: Sequence[tuple[_Drawn, Path]],
+    pages: Mapping[str, str],
+    failed: Sequence[tuple[str, str]],
+) -> str:
+    """The complete page.
+
+    Args:
+        report: of `safety_report`.
+        figures: with their PNG files, which become part of the page.
+        pages: scenario → path of its replay page, relative to the report.
+        failed: scenarios of which no replay page could be made, and why.
+    """
+    addresses = {scenario: quote(name) for scenario, name in pages.items()}
+    shown = (picture(read_bytes(path, "image"), each.alt, each.caption) for each, path in figures)
+    parts = {
+        "Accidents avoided": report_sections.avoided(report),
+        "Who saw it first": report_sections.lead_times(report),
+        **({"Figures": tag("div", *shown, class_="figures")} if figures else {}),
+        "Self-check": report_sections.margins(report),
+        "Critical without a collision": report_sections.critical(report),
+        "Twins torn apart": report_sections.torn(report),
+        "All accidents": accident_table(report.rows, addresses),
+        "Left out": report_sections.left_out(report, failed),
+    }
+    return document(
+        _TITLE,
+        tag("header", tag("h1", _TITLE), report_sections.header(report)),
+        chapters(parts),
+        style=_part("report.css"),
+        script=_part("sorting.js"),
+    )
+
+
+def replay_names(scenarios: Iterable[str]) -> dict[str, str]:
+    """Scenario → path of its replay page, relative to the report: letters, digits, `_`, `-` and `.` alone."""
+    names: dict[str, str] = {}
+    for scenario in scenarios:
+        plain = re.sub(r"[^A-Za-z0-9_.-]", "_", scenario)[:_NAME_LENGTH]
+        name, number = f"replays/{plain}.html", 2
+        while name in names.values():
+            name, number = f"replays/{plain}_{number}.html", number + 1
+        names[scenario] = name
+    return names
+
+
+def _hardest(report: SafetyReport, count: int | None) -> list[str]:
+    return [row.scenario for row in by_severity(report.rows)][:count]
+
+
+def _make_replays(dataset: Dataset, folder: Path, names: Mapping[str, str], **how: Any) -> dict[str, str]:
+    """Write the replay pages; scenario → why it has none, of those where a file cannot be read."""
+    places = Places(reads=dataset.places, writes=(folder,))
+    work = partial(_make_replay, dataset, folder)
+    reasons = run_batch(work, list(names.items()), label="replay pages", places=places, **how)
+    return {scenario: reason for scenario, reason in zip(names, reasons, strict=True) if reason is not None}
+
+
+def _make_replay(dataset: Dataset, folder: Path, named: tuple[str, str]) -> str | None:
+    scenario, name = named
+    try:
+        render_replay(dataset, scenario, folder / name)
+    except (NotAvailableError, SensorFileError) as error:
+        return str(error)
+    return None
+
+
+def _figures(report: SafetyReport) -> Iterator[_Drawn]:
+    if report.ledger.accidents:
+        yield _Drawn(
+            name="lead_times",
+            caption="Mean lead times of all sets of agents with the ego, and what each partner adds.",
+            alt="Mean lead times by set of agents and Shapley values of the partners; the tables have the numbers.",
+            draw=lambda: render_lead_times(report.ledger, fig=detached_figure(LEAD_TIME_SIZE)),
+        )
+    for group in GROUPS:
+        if report.avoidability.members(group):
+            yield _Drawn(
+                name=f"avoidability_{group.replace('-', '_')}",
+                caption=f"{group}: share avoided, and speed at the contact, over the seconds of warning.",
+                alt=f"{group}: share of accidents avoided over the seconds of warning; the tables have the numbers.",
+                draw=partial(_draw_avoidability, report, group),
+            )
+
+
+def _draw_avoidability(report: SafetyReport, group: str) -> Figure:
+    return render_avoidability(report.avoidability, group, fig=detached_figure(AVOIDABILITY_SIZE))
+
+
+def _part(name: str) -> str:
+    return (files(__package__) / name).read_text(encoding="utf-8")

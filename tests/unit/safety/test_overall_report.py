@@ -1,0 +1,133 @@
+"""The safety report: its numbers are those of its parts, each accident is replayed once, and nothing is lost."""
+
+import csv
+import importlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from damaged_releases import damaged_release
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.safety import (
+    SafetyReport,
+    Skipped,
+    avoidability_report,
+    describe,
+    interactions,
+    lead_time_ledger,
+    overall_report,
+    safety_report,
+    stories,
+    twin_report,
+)
+from deepaccident_devkit.safety.avoidability_report import Dropped
+
+
+@pytest.fixture(scope="module")
+def report(da_motion: DeepAccident) -> SafetyReport:
+    return safety_report(da_motion, workers=1)
+
+
+def test_its_parts_are_those_of_the_functions(da_motion: DeepAccident, report: SafetyReport) -> None:
+    assert report.avoidability.to_dict() == avoidability_report(da_motion, workers=1).to_dict()
+    assert report.ledger.to_dict() == lead_time_ledger(da_motion, workers=1).to_dict()
+    assert report.twins.to_dict() == twin_report(da_motion, workers=1).to_dict()
+    assert [row.story for row in report.rows] + list(report.normal) == list(stories(da_motion, workers=1))
+    assert (report.scenarios, len(report.rows), report.left_out) == (2, 1, [])
+
+
+def test_a_row_has_the_numbers_of_its_accident(da_motion: DeepAccident, report: SafetyReport) -> None:
+    (row,) = report.rows
+    (replayed,), (times,), (twin,) = report.avoidability.accidents, report.ledger.accidents, report.twins.diffs
+    story = describe(da_motion, row.scenario).facts["accident"]
+    told = row.to_dict()
+    assert row.brakes == ["ego_vehicle"]
+    slack = replayed.slack[replayed.accident.agents.index("ego_vehicle")]
+    np.testing.assert_allclose(list(row.last_moments.values()), slack, atol=0.005)
+    assert list(row.last_moments) == [4.0, 6.0, 8.0]
+    assert told["last_moments"]["6"] == story["braking"]["slack"]
+    assert row.leads["all"] == pytest.approx(times.together)
+    assert row.leads["ego_vehicle"] == pytest.approx(times.alone)
+    assert {agent: lead for agent, lead in row.leads.items() if agent != "all"} == story["seen"]
+    assert row.parts == pytest.approx(twin.to_dict()["time_to_impact"])
+    assert row.severity == max(each["delta_v"] for each in story["pair"])
+    pairs = interactions(da_motion, row.scenario).pairs
+    at = pairs.position(*times.actor_ids)
+    assert told["time_exposed"] == pytest.approx(pairs.tet[at, 0], abs=0.005)
+    assert (np.inf if told["pet"] is None else told["pet"]) == pytest.approx(abs(pairs.pet[at]), abs=0.005)
+
+
+def test_each_accident_is_replayed_once(da_motion: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:
+    replayed = []
+    once = overall_report.looked_into
+
+    def counted(dataset: DeepAccident, scenario: str) -> Any:
+        replayed.append(scenario)
+        return once(dataset, scenario)
+
+    def never(*_: object, **__: object) -> None:
+        pytest.fail("the story replays the accident itself")
+
+    monkeypatch.setattr(overall_report, "looked_into", counted)
+    monkeypatch.setattr(importlib.import_module("deepaccident_devkit.safety.stories"), "avoidability", never)
+    (row,) = safety_report(da_motion, da_motion.find(collision=True), workers=1).rows
+    assert replayed == [row.scenario]
+    assert row.story.facts["accident"]["braking"] is not None
+
+
+def test_an_accident_that_cannot_be_replayed_keeps_its_row(
+    da_motion: DeepAccident, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def apart(_: object, scenario: str) -> Dropped:
+        return Dropped(Skipped(scenario=scenario, reason="2.00 m apart"), 2.0)
+
+    monkeypatch.setattr(overall_report, "looked_into", apart)
+    report = safety_report(da_motion, da_motion.find(collision=True), workers=1)
+    (row,) = report.rows
+    assert (row.replayed, row.last_moments, row.brakes, row.severity) == (None, {}, [], -1.0)
+    assert row.leads["all"] is not None
+    assert report.left_out == [(row.scenario, "braking: dropped", "2.00 m apart")]
+    assert report.to_dict()["margins"] == {row.scenario: 2.0}
+    assert report.avoidability.margin_counts["1 m or more"] == 1
+
+
+def test_what_is_left_out_is_named(own_release: Path) -> None:
+    damaged = damaged_release(own_release)
+    report = safety_report(damaged.dataset, workers=1)
+    shown = [row.scenario for row in report.rows] + [each.facts["scenario"] for each in report.normal]
+    assert sorted(shown) == sorted(damaged.whole)
+    parts = {scenario: part for scenario, part, _ in report.left_out}
+    assert parts[damaged.without_meta] == "braking: skipped, lead times"
+    assert parts[damaged.without_labels].startswith("braking: skipped, lead times")
+    assert parts[damaged.broken] == "everything"
+    reasons = {(scenario, part): reason for scenario, part, reason in report.left_out}
+    assert "no meta file" in reasons[damaged.without_meta, parts[damaged.without_meta]]
+    assert "on_error='skip'" in reasons[damaged.broken, "everything"]
+
+
+def test_normal_scenarios_come_by_their_least_time_to_collision(da_b: DeepAccident) -> None:
+    normal = safety_report(da_b, workers=1).normal
+    times = [np.inf if (each := story.facts["nearest"]) is None else each["min_ttc"] for story in normal]
+    assert times == sorted(times)
+    assert len(normal) == sum(each["collision"] is None for each in da_b.scenario)
+
+
+def test_tables(report: SafetyReport, tmp_path: Path) -> None:
+    accidents, left_out = report.to_csv(tmp_path)
+    heading, line = csv.reader(accidents.read_text(encoding="utf-8").splitlines())
+    cells = dict(zip(heading, line, strict=True))
+    (row,) = report.rows
+    assert len(set(heading)) == len(heading)
+    assert cells["scenario"] == row.scenario
+    assert float(cells["closing_speed"]) == row.story.facts["accident"]["closing_speed"]
+    assert float(cells["lead_infrastructure"]) == row.leads["infrastructure"]
+    assert float(cells["last_moment_8"]) == row.last_moments[8.0]
+    assert float(cells["second_delta_v"]) == row.colliders[1]["delta_v"]
+    assert float(cells["twin_parts"]) == row.parts
+    assert cells["pet"] == ("" if row.measures.pet is None else str(row.measures.pet))
+    assert cells["story"] == row.story.text
+    assert left_out.read_text() == "scenario,part,reason\n"
+    assert json.loads(report.to_json())["accidents"][0] == json.loads(json.dumps(row.to_dict()))
