@@ -112,7 +112,7 @@ class AvoidabilityReport(ShortRepr):
         if self.margins:
             blocks.append(self._margins_text())
         blocks += [
-            "\n".join([f"{word}:", *(f"  {each.scenario}: {each.reason}" for each in which)])
+            "\n".join([f"{word}:", *(f"  {each.reason}" for each in which)])
             for word, which in left_out.items()
             if which
         ]

@@ -43,6 +43,7 @@ def each_scenario(
     scenarios: Iterable[RowArgument] | None = None,
     *,
     label: str,
+    at_once: int = _RUN_LENGTH,
     workers: int | None = None,
     executor: Executor | None = None,
     progress: bool = False,
@@ -56,6 +57,7 @@ def each_scenario(
         dataset: the release.
         scenarios: tokens or records; None for all.
         label: text of the progress bar.
+        at_once: scenarios of a piece of work; 1 where one takes tenths of a second.
         workers: processes; None chooses by the amount of work.
         executor: any executor of `concurrent.futures` to run on, in place of own workers.
         progress: whether to show a bar.
@@ -67,7 +69,7 @@ def each_scenario(
     """
     chosen = range(len(dataset.scenario)) if scenarios is None else [dataset.getind("scenario", s) for s in scenarios]
     rows = sorted(set(chosen))
-    runs = [rows[first : first + _RUN_LENGTH] for first in range(0, len(rows), _RUN_LENGTH)]
+    runs = [rows[first : first + at_once] for first in range(0, len(rows), at_once)]
     how: dict[str, Any] = {"workers": workers, "executor": executor, "label": label, "progress": progress}
     sizes, places = [len(run) for run in runs], Places(reads=dataset.places)
     parts = in_order(run_unordered(partial(_run, work, dataset), runs, sizes=sizes, places=places, **how))

@@ -99,7 +99,7 @@ def stories(
         WorkerError: a worker was killed, or cannot do the work.
     """
     how: dict[str, Any] = {"workers": workers, "executor": executor, "progress": progress}
-    return each_scenario(describe, dataset, scenarios, label="stories", **how).results
+    return each_scenario(describe, dataset, scenarios, label="stories", at_once=1, **how).results
 
 
 def scenario_facts(

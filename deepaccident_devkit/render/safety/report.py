@@ -95,7 +95,7 @@ def save_safety_report(
     figures = [(each, write_figure(each.draw(), pictures / f"{each.name}.png", dpi=_DPI)) for each in drawn]
     names = {} if dataset is None else replay_names(_hardest(report, replays))
     how: dict[str, Any] = {"workers": workers, "executor": executor, "progress": progress}
-    failed = {} if dataset is None else _make_replays(dataset, folder, names, **how)
+    failed = {} if dataset is None else _make_replays(dataset, folder.absolute(), names, **how)
     pages = {scenario: name for scenario, name in names.items() if scenario not in failed}
     write_bytes(folder / REPORT_FILE, report_html(report, figures, pages, sorted(failed.items())).encode())
     return [*written, *(path for _, path in figures), *(folder / name for name in pages.values()), folder / REPORT_FILE]

@@ -89,8 +89,8 @@ def test_the_ego_is_warned_where_it_is_of_the_pair(accidents: list[Avoidability]
 def test_text(report: AvoidabilityReport) -> None:
     text = report.to_text()
     assert "4 accidents; 1 dropped, as the two are too far apart at the end; 1 skipped" in text
-    assert "  far: far: the outlines are 2.00 m apart" in text
-    assert "  bare: bare has no labels" in text
+    assert "\n  far: the outlines are 2.00 m apart" in text
+    assert "\n  bare has no labels" in text
     assert "1 m or more: 1" in text
     assert "the largest: 2.000 m, far" in text
     block = text.split("\n\n")[1].splitlines()
