@@ -288,6 +288,50 @@ class TestBoxes:
         assert change(told, "own_box_default", "actor") == (OWN_BOX_ID, None)
         assert "stands in for the ego's own row" in told.text
 
+    @pytest.mark.usefixtures("_no_quirks")
+    def test_the_box_of_a_cell(self, small: DeepAccident) -> None:
+        own = small.motion_labels(f"{EGO}/006", MotionLabelConfig(protocol="clean"))
+        cells = painted(own, 2, VAN)
+        told = own.explain(2, *cells[0])
+        assert (told.seconds, told.source.warped, told.frame_sample) == (1.0, False, f"{EGO}/016")
+        check_box(small, f"{EGO}/006", told, told.painter, own.config)
+        assert told.painter.cells == len(cells)
+        assert set(told.painter.raster) <= {*cells}
+        ego = own.to_present().explain(0, *painted(own, 0, OWN_BOX_ID)[0])
+        assert (ego.painter.row, ego.painter.instance, ego.source.warped) == (
+            0,
+            f"{tiny.TOKEN}/actor/1223",
+            False,
+        )
+
+    @pytest.mark.usefixtures("_no_quirks")
+    def test_the_centre_of_the_peak(self, small: DeepAccident) -> None:
+        labels = small.motion_labels(f"{EGO}/006")
+        row, col = painted(labels, 0, TRUCK)[0]
+        told = labels.explain(0, row, col)
+        down, along = labels.offset[0, :, row, col].tolist()
+        assert (told.peak.actor_id, told.peak.center) == (TRUCK, (row + down, col + along))
+        assert told.peak.distance == pytest.approx(np.hypot(down, along))
+        assert labels.centerness[0, 0, row, col] == pytest.approx(np.exp(-(told.peak.distance**2) / 9))
+        center = labels.explain(0, *told.peak.center)
+        assert "The nearest centre is that of actor 1303" in center.text
+        assert "The nearest centre" not in labels.explain(0, 5, 5).text
+
+    def test_boxes_one_over_the_other(self) -> None:
+        """And rows whose number differs from frame to frame: each frame has its own that nobody sees."""
+        one, two = (stacked([True] * 3 + [False] * extra) for extra in (1, 4))
+        config = MotionLabelConfig(future_frames=1, draw_ego=False, protocol="clean")
+        labels = motion_labels_from_boxes([one, two], np.zeros((4, 6)), config)
+        for t, hidden in ((0, [8]), (1, [8, 9, 10, 11])):
+            told = explain_cell_from_boxes(labels, [one, two], t, 100, 120)
+            assert told.disagrees == ()
+            assert told.painter.actor_id == 7
+            assert [box.actor_id for box in told.covered] == [6, 5]
+            assert [box.actor_id for box in told.left_out] == hidden
+        unknown = motion_labels_from_boxes([one, two], np.zeros((4, 6)), config, valid=[True, True, True, False])
+        told = explain_cell_from_boxes(unknown, [one, two], 1, 100, 120)
+        assert (told.recorded, told.painter, told.disagrees) == (False, None, ())
+
     def test_every_cell_of_a_map_has_the_painter_that_boxes_give(self) -> None:
         """All cells of a small grid with boxes that overlap, reach beyond its border, and are thinner than a cell."""
         rng = np.random.default_rng(1)
@@ -312,6 +356,20 @@ class TestBoxes:
                     drawn = [each for each in candidates.covering((row, col)) if candidates.drawn[each]]
                     painter = int(candidates.key[drawn[-1]]) if drawn else None
                     assert painter == actor_at(labels, 0, row, col)
+
+
+def stacked(visible: list[bool]) -> FrameBoxes:
+    """Boxes at one place, with the ids 5, 6, …"""
+    count = len(visible)
+    return FrameBoxes(
+        center=np.tile([10.0, 0, 0], (count, 1)),
+        size=np.tile([4.0, 2, 1], (count, 1)),
+        yaw=np.zeros(count),
+        actor_id=np.arange(count) + 5,
+        category=np.zeros(count, dtype=int),
+        visible=np.array(visible),
+        ego_from_lidar=np.eye(4),
+    )
 
 
 class TestQuirks:
@@ -424,7 +482,7 @@ class TestPrediction:
     def test_in_any_orientation(self, small: DeepAccident, orientation: Orientation) -> None:
         labels = small.motion_labels(f"{EGO}/006").to_present()
         heads = MotionHeads.from_labels(labels).in_orientation(orientation)
-        other = replace(heads, segmentation=-heads.segmentation)
+        other = replace(heads, segmentation=-heads.segmentation, centerness=heads.centerness / 2)
         output = MotionOutput(grid=BevGrid(orientation=orientation), heads=(other, heads))
         row, col = painted(labels, 2, VAN)[0]
         turned = tuple(int(one) for one in place_in(row, col, labels.config.grid, "devkit", orientation))
@@ -434,6 +492,7 @@ class TestPrediction:
             assert (told.outcome, told.cell, told.mostly) == ("found", turned, VAN)
             assert len(told.probabilities) == count
             assert told.probability == told.probabilities[-1] > 0.99
+            assert told.centerness == labels.centerness[2, 0, row, col]
             assert told.probabilities[0] > 0.99 or count == 2
             assert (told.offset, told.flow) == (
                 tuple(labels.offset[2, :, row, col]),
@@ -445,6 +504,8 @@ class TestPrediction:
         (row, col), (free, beside) = painted(labels, 1, VAN)[0], (3, 3)
         maps = np.zeros((2, 200, 200), dtype=np.int32)
         maps[1, free, beside] = 7
+        end = labels.explain(2, row, col, prediction=maps).prediction
+        assert (end.outcome, end.frames) == ("no such frame", 2)
         outcomes = [labels.explain(*at, prediction=maps).prediction for at in ((1, row, col), (1, free, beside),
                                                                               (1, 0, 0), (3, row, col))]  # fmt: skip
         assert [each.outcome for each in outcomes if each] == ["missed", "false alarm", "empty", "no such frame"]
@@ -453,6 +514,14 @@ class TestPrediction:
         assert labels.explain(0, 0, 0, prediction=output).prediction.outcome == "outside"
         inside = labels.explain(0, 100, 100, prediction=output).prediction
         assert (inside.cell, inside.outcome, inside.mostly) == ((0, 0), "found", None)
+        both = np.zeros((2, 5, 200, 200), dtype=np.int32)
+        both[0, 1, row, col] = 3
+        both[1, 1] = np.where(labels.instance[1] == labels.id_map[VAN], 4, 0)
+        both[1, 1][tuple(np.transpose(painted(labels, 1, WALKER)[:1]))] = 4
+        output = MotionOutput(grid=BevGrid(), instances=both)
+        last = labels.explain(1, row, col, prediction=output).prediction
+        cells = len(painted(labels, 1, VAN))
+        assert (last.instance, last.instance_cells, last.mostly, last.shared_cells) == (4, cells + 1, VAN, cells)
         linked = predict_instances(MotionHeads.from_labels(labels), "motion")
         assert labels.explain(1, row, col, prediction=linked).prediction.outcome == "found"
 
@@ -464,6 +533,7 @@ class TestPrediction:
         assert told.prediction is not None
         assert told.prediction.outcome == "found"
         assert told.prediction.cell != told.cell
+        assert (told.prediction.mostly, told.prediction.shared_cells) == (None, 0)
 
     @pytest.mark.parametrize("wrong", [np.zeros((5, 10, 10), int), "none", np.zeros((200, 200), int)])
     def test_what_is_no_prediction(self, small: DeepAccident, wrong: object) -> None:
