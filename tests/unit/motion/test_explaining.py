@@ -533,7 +533,8 @@ class TestPrediction:
         assert told.prediction is not None
         assert told.prediction.outcome == "found"
         assert told.prediction.cell != told.cell
-        assert (told.prediction.mostly, told.prediction.shared_cells) == (None, 0)
+        everywhere = own.explain(4, *cells[0], prediction=np.ones((5, 200, 200), dtype=np.int32)).prediction
+        assert (everywhere.outcome, everywhere.mostly, everywhere.shared_cells) == ("found", None, 0)
 
     @pytest.mark.parametrize("wrong", [np.zeros((5, 10, 10), int), "none", np.zeros((200, 200), int)])
     def test_what_is_no_prediction(self, small: DeepAccident, wrong: object) -> None:
