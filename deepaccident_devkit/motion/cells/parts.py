@@ -270,7 +270,8 @@ class CellPrediction(ShortRepr):
         parts = [f"Prediction: {_OUTCOMES[self.outcome]}."]
         if self.instance is None:
             return parts[0]
-        told = f"It has instance {self.instance} at cell {self.cell} of its raster"
+        who = f"instance {self.instance}" if self.instance else "nobody"
+        told = f"It has {who} at cell {self.cell} of its raster"
         if self.probability is not None:
             told += f", actor with probability {self.probability:.2f}"
             told += f" (all {len(self.probabilities)}: {_row_text(self.probabilities)})" * (len(self.probabilities) > 1)

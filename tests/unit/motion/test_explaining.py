@@ -534,8 +534,7 @@ class TestPrediction:
         assert told.prediction.outcome == "found"
         assert told.prediction.cell != told.cell
         everywhere = own.explain(4, *cells[0], prediction=np.ones((5, 200, 200), dtype=np.int32)).prediction
-        assert everywhere is not None
-        assert (everywhere.mostly, everywhere.shared_cells) == (None, 0), "cells of two frames are not the same"
+        assert (everywhere.outcome, everywhere.mostly, everywhere.shared_cells) == ("found", None, 0)
 
     @pytest.mark.parametrize("wrong", [np.zeros((5, 10, 10), int), "none", np.zeros((200, 200), int)])
     def test_what_is_no_prediction(self, small: DeepAccident, wrong: object) -> None:
