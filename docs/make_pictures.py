@@ -68,14 +68,14 @@ def keep(picture: str, folder: Path) -> None:
     print(f"{picture}: {made.stat().st_size / 1000:.0f} kB")
 
 
-def page_picture(page: Path) -> Path:
-    """What a browser's window shows of a web page; a replay half a second before its end."""
+def page_picture(page: Path, anchor: str = "") -> Path:
+    """What a browser's window shows of a web page, from an anchor on; a replay half a second before its end."""
     options = webdriver.ChromeOptions()
     for option in ("--headless=new", "--no-sandbox", "--hide-scrollbars", f"--window-size={WINDOW}"):
         options.add_argument(option)
     shot = page.with_suffix(".png")
     with webdriver.Chrome(options) as browser:
-        browser.get(page.as_uri())
+        browser.get(f"{page.as_uri()}#{anchor}")
         browser.execute_script(MOVE_ON)
         time.sleep(1)  # the images are decoded
         browser.save_screenshot(str(shot))

@@ -81,6 +81,8 @@ NOT_RUN = {
     "predict ": "likewise",
     "evaluate motion training_data": "of what predict makes; likewise",
     "evaluate motion DATAROOT --results results/motion ": "likewise",
+    "baseline predict DATAROOT --split": "docs/make_safety_page.py has them, and tests/test_cli_baseline.py their like",
+    "evaluate warning DATAROOT --results all_": "of what these predict; tests/test_cli_evaluate.py has their like",
     "labels explain": "tests/unit/motion/test_explaining.py has it; this sample is of the demo",
     "results from": "tests/unit/export/test_nuscenes_detections.py has it, and makes the file",
     "export mcap": "tests/unit/export has it, which has the extra",
@@ -232,6 +234,35 @@ def test_the_code_on_safety_runs(in_labels_demo: Path) -> None:
     names = run_page(DOCS / "safety.md")
     assert names["story"].text.endswith("would have avoided it.")
     assert len(names["times"].gains) == 4
+
+
+def test_the_outputs_on_the_page_of_safety_are_as_commands_print_them_now(in_labels_demo: Path) -> None:
+    """Their headings and rows' names are compared: `python docs/make_safety_page.py` measures on a larger release."""
+    script = loaded_script("docs/make_safety_page.py")
+    (in_labels_demo / script.RELEASE).symlink_to(in_labels_demo / "deepaccident_demo" / "release")
+    there = (DOCS / "safety.md").read_text(encoding="utf-8")
+    page = re.sub(r"^    deepaccident (synth|baseline|evaluate) .*$", "", there, flags=re.MULTILINE)
+    now = script.with_outputs(page)
+    outputs = [re.findall(r"^<!-- output -->\n(.*?)^<!-- end", text, re.MULTILINE | re.DOTALL) for text in (there, now)]
+    assert len(outputs[0]) == 8
+    for old, new in zip(*outputs, strict=True):
+        if "prevented accidents" not in old:
+            assert table_words(old) <= table_words(new) | {"…"}
+
+
+def table_words(output: str) -> set[str]:
+    """The names of columns and rows: what has no number, of lines that have several columns."""
+    lines = [re.split(r"\s{2,}", line.strip()) for line in output.splitlines() if not line.startswith("type")]
+    return {cell for line in lines if len(line) > 2 for cell in line if not re.search(r"\d", cell)}
+
+
+def test_numbers_in_the_prose_on_safety_are_those_of_an_output() -> None:
+    page = (DOCS / "safety.md").read_text(encoding="utf-8")
+    outputs = "".join(re.findall(r"^```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL))
+    prose = re.sub(r"^```.*?^```", "", page, flags=re.MULTILINE | re.DOTALL)
+    told = re.findall(r"\b\d+\.\d\d\b", prose)
+    assert len(told) >= 3
+    assert [number for number in told if number not in outputs] == []
 
 
 def test_the_code_on_town_maps_runs(in_demo: Path) -> None:
