@@ -1,7 +1,8 @@
-"""Run the commands of docs/safety.md and put what they print onto the page: `python docs/make_safety_page.py [RELEASE]`.
+"""Put what the commands of docs/safety.md print onto the page: `python docs/make_safety_page.py [RELEASE]`.
 
-RELEASE is a folder to take in place of a new synthetic release, if it was made by the page's first command. It takes some
-five minutes on two cores, most of it for that release. The picture of the report needs chromium and the extra `test`.
+RELEASE is a folder to take in place of a new synthetic release, if it was made by the page's first command. It takes
+some five minutes on two cores, most of it for that release. The picture of the report needs chromium and the extra
+`test`.
 """
 
 import os
@@ -15,7 +16,6 @@ from pathlib import Path
 from textwrap import fill
 
 from click.testing import CliRunner
-from make_pictures import page_picture
 from PIL import Image
 
 from deepaccident_devkit.cli import deepaccident
@@ -24,7 +24,9 @@ PAGE = Path(__file__).parent / "safety.md"
 IMAGES = PAGE.parent / "images"
 RELEASE, OUT = "accidents", "out"
 """What DATAROOT and OUT on the page are here."""
-PIECE = re.compile(r"^ {4}deepaccident (?P<command>\S[^\n]*)$|^<!-- output -->$.*?^<!-- end of output -->$", re.M | re.S)
+PIECE = re.compile(
+    r"^ {4}deepaccident (?P<command>\S[^\n]*)$|^<!-- output -->$.*?^<!-- end of output -->$", re.MULTILINE | re.DOTALL
+)
 PICTURES = {
     "safety_lead_times.webp": "lead_times.png",
     "safety_avoidability.webp": "avoidability_vehicles.png",
@@ -123,6 +125,8 @@ CUTS: dict[str, Callable[[str], str]] = {
 def keep(source: Path, picture: Path) -> None:
     """A figure, or the table of accidents on the report's page, as a small WebP."""
     if source.suffix == ".html":
+        from make_pictures import page_picture  # selenium, which tests of the text do without
+
         source = page_picture(source.resolve(), "all-accidents")
     image = Image.open(source).convert("RGB")
     image.thumbnail((WIDTH, WIDTH))

@@ -246,8 +246,8 @@ def test_the_outputs_on_the_page_of_safety_are_as_commands_print_them_now(in_lab
     outputs = [re.findall(r"^<!-- output -->\n(.*?)^<!-- end", text, re.MULTILINE | re.DOTALL) for text in (there, now)]
     assert len(outputs[0]) == 8
     for old, new in zip(*outputs, strict=True):
-        if "prevented accidents" not in old:
-            assert table_words(old) <= table_words(new) | {"…"}
+        if not re.search("^(prevented accidents|Twins)", old, re.MULTILINE):  # one accident has no such tables
+            assert table_words(old) <= table_words(new) | {"val", "test", "…"}
 
 
 def table_words(output: str) -> set[str]:
