@@ -124,7 +124,8 @@ _POLICY: Final = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 """A browser loads nothing and runs nothing, even if a name in the results tries to."""
 _STYLE: Final = f"""
 :root {{ color-scheme: light; --paper: #fff; --ink: #1c1c1c; --soft: #444; --dim: #555; --line: #ececec;
-  --rule: {GRID_COLOR}; --link: {LINK_COLOR}; --warning: {WARNING_COLOR}; --block: #f3f3f3; }}
+  --rule: {GRID_COLOR}; --accent: {LINK_COLOR}; --caution: {WARNING_COLOR};
+  --link: var(--accent); --warning: var(--caution); --block: #f3f3f3; }}
 * {{ box-sizing: border-box; }}
 body {{ margin: 0 auto; padding: 1rem 1.25rem 3rem; max-width: 76rem; background: var(--paper); color: var(--ink);
   font: 16px/1.5 system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; overflow-wrap: break-word; }}

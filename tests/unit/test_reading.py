@@ -109,6 +109,7 @@ NOT_OF_STRANGERS = {
     "release/store/store.py": "the cache's own copies",
     "release/store/zips.py": "the directory of an archive that the gate or fsspec opened",
     "render/replay/replay.py": "the package's own page",
+    "render/safety/report.py": "the package's own style and script",
     "synth/spec/catalogue.py": "the package's own designs",
 }
 
