@@ -13,6 +13,7 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.interactions import CLASS_MASSES, masses_of
 from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD, AgentName
+from deepaccident_devkit.v2x.collisions import colliding_pair
 from deepaccident_devkit.v2x.configurations import agents_of
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
@@ -92,15 +93,10 @@ def accident_of(
     """
     record = dataset.scenario[dataset.getind("scenario", scenario)]
     token = record["token"]
-    if record["weather"] is None:
-        raise NotAvailableError(f"{token} has no meta file, which names the colliding pair; unpack meta")
-    if record["collision"] is None:
+    named = colliding_pair(record)
+    if named is None:
         return None
-    first, second = record["collision"]["ids"]
-    if first == second:
-        raise NotAvailableError(
-            f"{token}: meta names actor {first} twice instead of a colliding pair; restore the meta file"
-        )
+    first, second = named
     tracks = scenario_tracks(dataset, token)
     if not len(tracks.index):
         raise NotAvailableError(f"{token} has no labels (the test split ships without), which say where actors are")
@@ -113,12 +109,13 @@ def accident_of(
         )
     frames = np.arange(common[0], common[-1] + 1)
     sizes = np.array([np.median(tracks.boxes.size[each], axis=0) for each in rows])
+    agents = agents_by_actor(dataset, token)
     codes = [int(tracks.boxes.category[each[-1]]) for each in rows]
     return Accident(
         scenario=token,
         actor_ids=(first, second),
         categories=(CATEGORIES[codes[0]], CATEGORIES[codes[1]]),
-        agents=_agents_of(dataset, token, (first, second)),
+        agents=(agents.get(first), agents.get(second)),
         first_frame=int(common[0]),
         num_frames=record["num_frames"],
         paths=np.stack([recorded_path(tracks, each, frames) for each in rows]),
@@ -161,8 +158,8 @@ def recorded_path(tracks: ScenarioTracks, rows: IntArray, frames: IntArray) -> F
     return np.column_stack([np.interp(frames, index, each) for each in values])
 
 
-def _agents_of(dataset: Dataset, scenario: str, actors: tuple[int, int]) -> tuple[AgentName | None, AgentName | None]:
-    names: dict[int | None, AgentName] = {}
-    for name in agents_of(dataset, scenario):
-        names[dataset.agent.get(f"{scenario}/{name}")["actor_id"]] = name
-    return names.get(actors[0]), names.get(actors[1])
+def agents_by_actor(dataset: Dataset, scenario: str) -> dict[int, AgentName]:
+    """The vehicles that recorded a scenario in this release, by their CARLA ids; those that meta does not say lack."""
+    names = agents_of(dataset, scenario)
+    ids = (dataset.agent.get(f"{scenario}/{name}")["actor_id"] for name in names)
+    return {actor: name for actor, name in zip(ids, names, strict=True) if actor is not None}

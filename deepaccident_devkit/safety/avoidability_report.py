@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -17,12 +15,13 @@ import numpy as np
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.files import writable_folder, write_bytes
+from deepaccident_devkit.files import writable_folder
 from deepaccident_devkit.parallel import Places, run_batch
 from deepaccident_devkit.safety.accidents import Skipped, accident_of
 from deepaccident_devkit.safety.avoidability import BRAKERS, Avoidability, avoidability_of, unusable
 from deepaccident_devkit.safety.avoidability_shares import GROUPS, OutcomeShares, group_of, outcome_shares
 from deepaccident_devkit.safety.outcomes import MOST_MARGIN, OUTCOMES, undisturbed
+from deepaccident_devkit.safety.tables import write_csv
 from deepaccident_devkit.text import columns_text
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
@@ -91,13 +90,7 @@ class AvoidabilityReport(ShortRepr):
             "self_check": self._check_rows(),
             "left_out": self._left_out_rows(),
         }
-        paths = []
-        for name, rows in contents.items():
-            text = io.StringIO(newline="")
-            csv.writer(text, lineterminator="\n").writerows(rows)
-            paths.append(folder / f"avoidability_{name}.csv")
-            write_bytes(paths[-1], text.getvalue().encode())
-        return paths
+        return [write_csv(folder / f"avoidability_{name}.csv", rows) for name, rows in contents.items()]
 
     def to_text(self) -> str:
         """Some aligned blocks for a terminal."""

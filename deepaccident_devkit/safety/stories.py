@@ -14,7 +14,7 @@ from deepaccident_devkit.arrays import FloatArray, ShortRepr
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.interactions import interactions
-from deepaccident_devkit.safety.accidents import Accident, Skipped, accident_of
+from deepaccident_devkit.safety.accidents import Accident, Skipped, accident_of, agents_by_actor
 from deepaccident_devkit.safety.avoidability import BRAKERS, Avoidability, avoidability
 from deepaccident_devkit.safety.observation import observed_actors
 from deepaccident_devkit.safety.scenarios import each_scenario, tried
@@ -216,9 +216,7 @@ def _labelled(dataset: Dataset, record: ScenarioRecord) -> bool:
 
 def _actor(dataset: Dataset, scenario: str, actor_id: int) -> dict[str, Any]:
     category = dataset.get("instance", f"{scenario}/actor/{actor_id}")["category"]
-    agents = (dataset.agent.get(f"{scenario}/{name}") for name in agents_of(dataset, scenario))
-    agent = next((each["name"] for each in agents if each["actor_id"] == actor_id), None)
-    return {"actor_id": actor_id, "category": category, "agent": agent}
+    return {"actor_id": actor_id, "category": category, "agent": agents_by_actor(dataset, scenario).get(actor_id)}
 
 
 def _known(value: float | FloatArray, digits: int = 2) -> float | None:

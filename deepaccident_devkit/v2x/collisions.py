@@ -122,15 +122,10 @@ def collision(dataset: Dataset, scenario: RowArgument) -> Contact | None:
             pair at the same moment.
     """
     record = dataset.scenario[dataset.getind("scenario", scenario)]
-    if record["weather"] is None:
-        raise NotAvailableError(f"{record['token']} has no meta file, which names the colliding pair; unpack meta")
-    if record["collision"] is None:
+    named = colliding_pair(record)
+    if named is None:
         return None
-    first, second = record["collision"]["ids"]
-    if first == second:
-        raise NotAvailableError(
-            f"{record['token']}: meta names actor {first} twice instead of a colliding pair; restore the meta file"
-        )
+    first, second = named
     tracks = scenario_tracks(dataset, record["token"])
     index = _last_moment(tracks, record["token"], first, second)
     there = tracks.at(index)
@@ -153,6 +148,24 @@ def collision(dataset: Dataset, scenario: RowArgument) -> Contact | None:
         sides=sides,
         disagreements=tuple(_disagreements(dataset, record, pair, index, gap, sides)),
     )
+
+
+def colliding_pair(record: ScenarioRecord) -> tuple[int, int] | None:
+    """The actor ids of the pair that a scenario's meta file names; None if it names no collision.
+
+    Raises:
+        NotAvailableError: the scenario has no meta file, or the file names one actor twice.
+    """
+    if record["weather"] is None:
+        raise NotAvailableError(f"{record['token']} has no meta file, which names the colliding pair; unpack meta")
+    if record["collision"] is None:
+        return None
+    first, second = record["collision"]["ids"]
+    if first == second:
+        raise NotAvailableError(
+            f"{record['token']}: meta names actor {first} twice instead of a colliding pair; restore the meta file"
+        )
+    return first, second
 
 
 def _velocities_into(dataset: Dataset, frame: str, pair: Boxes) -> FloatArray:
