@@ -13,9 +13,10 @@ from deepaccident_devkit.evaluation.metrics.warning.drives import GIVEN
 from deepaccident_devkit.evaluation.metrics.warning.outcome_tables import NOMINAL, SETTINGS
 from deepaccident_devkit.evaluation.metrics.warning.prevention import BUDGET, OutcomeFigures, PreventionFigures
 from deepaccident_devkit.render.axes import axes_or_new, with_light_grid
-from deepaccident_devkit.render.chips import SMALLEST_TEXT, place_chips
+from deepaccident_devkit.render.chips import place_chips
 from deepaccident_devkit.render.colors import ESTIMATE_COLOR, GRID_COLOR, MUTED_COLOR, TRUE_PLACE_COLOR
 from deepaccident_devkit.render.evaluation.panels import PANEL, draw_nothing
+from deepaccident_devkit.render.legends import draw_legend
 from deepaccident_devkit.render.titles import set_title
 
 if TYPE_CHECKING:
@@ -59,7 +60,8 @@ def render_prevention(result: PreventedResult, group: str | None = None, *, ax: 
     ax.set_xticks([], minor=True)
     ax.set(xlabel="braking seconds a minute without an accident", ylabel="share of the accidents")
     ax.set(xlim=(-0.03, 1.4 * _MOST), ylim=(-0.03, 1.05))
-    ax.legend(fontsize=SMALLEST_TEXT, loc="lower right")
+    handles, _ = ax.get_legend_handles_labels()
+    draw_legend(ax, handles, columns=3, loc="upper center", bbox_to_anchor=(0.5, -0.22))  # inside are points
     return with_light_grid(ax, "both")
 
 
