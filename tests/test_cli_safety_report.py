@@ -2,12 +2,15 @@
 
 from pathlib import Path
 
+import pytest
 from click.testing import CliRunner, Result
 from damaged_releases import damaged_release
 from report_page import page_of
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
+
+pytestmark = pytest.mark.slow
 
 
 def run(*arguments: object) -> Result:
