@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
-from deepaccident_devkit.render.colors import GRID_COLOR, LINK_COLOR, WARNING_COLOR
+from deepaccident_devkit.render.theme import LIGHT
 
 _VOID: Final = ("br", "img", "meta")
 _MOST_DIGITS: Final = 6
@@ -122,67 +122,68 @@ def _list(values: Sequence[Any]) -> Markup:
 
 _POLICY: Final = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 """A browser loads nothing and runs nothing, even if a name in the results tries to."""
-_STYLE: Final = f"""
-:root {{ color-scheme: light; --paper: #fff; --ink: #1c1c1c; --soft: #444; --dim: #555; --line: #ececec;
-  --rule: {GRID_COLOR}; --accent: {LINK_COLOR}; --caution: {WARNING_COLOR};
-  --link: var(--accent); --warning: var(--caution); --block: #f3f3f3; }}
-* {{ box-sizing: border-box; }}
-body {{ margin: 0 auto; padding: 1rem 1.25rem 3rem; max-width: 76rem; background: var(--paper); color: var(--ink);
-  font: 16px/1.5 system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; overflow-wrap: break-word; }}
-h1 {{ font-size: 1.7rem; line-height: 1.2; margin: .6rem 0 .4rem; }}
-h2 {{ font-size: 1.25rem; margin: 2.2rem 0 .6rem; padding-bottom: .2rem; border-bottom: 2px solid var(--rule); }}
-h3 {{ font-size: 1rem; margin: 1.4rem 0 .4rem; }}
-p {{ margin: .4rem 0; max-width: 46rem; }}
-nav a {{ display: inline-block; margin: 0 .9rem .3rem 0; }}
-a {{ color: var(--link); }}
-dl {{ display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 28rem), 1fr)); gap: 0 2rem;
-  margin: .6rem 0; }}
-dl div {{ display: flex; gap: .8rem; padding: .2rem 0; border-bottom: 1px solid var(--line); min-width: 0; }}
-dt {{ flex: 0 0 8.5rem; color: var(--dim); }}
-dd {{ margin: 0; min-width: 0; }}
-.wide {{ overflow-x: auto; max-width: 100%; }}
-table {{ border-collapse: collapse; font-size: .86rem; font-variant-numeric: tabular-nums; }}
-caption {{ text-align: left; color: var(--dim); padding: .2rem 0; }}
-th, td {{ padding: .28rem .6rem .28rem 0; text-align: right; vertical-align: top; border-bottom: 1px solid var(--line);
-  overflow-wrap: normal; }}
-thead th {{ border-bottom: 2px solid var(--rule); font-weight: 600; }}
-th:first-child {{ text-align: left; font-weight: 500; }}
-@media (min-width: 700px) {{ .wide th:first-child {{ position: sticky; left: 0; background: var(--paper); }} }}
-.text td, .text th, .tree td, .tree th {{ text-align: left; overflow-wrap: break-word; }}
-.wide td {{ white-space: nowrap; }}
-.wide.text td, .wide .interval {{ white-space: normal; }}
-.wide .interval {{ min-width: 5em; }}
-.wide td.long {{ white-space: normal; text-align: left; min-width: 18rem; }}
-.big td {{ font-size: 1.02rem; font-weight: 600; }}
-.big td ~ td {{ font-weight: 400; color: var(--soft); font-size: .92rem; }}
-.interval {{ color: var(--dim); font-size: .82rem; font-weight: 400; }}
-.figures {{ display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 28rem), 1fr)); gap: 1.4rem; }}
-figure {{ margin: 0; }}
-figure img {{ width: 100%; height: auto; border: 1px solid var(--line); }}
-figcaption {{ font-size: .9rem; color: var(--soft); }}
-.partial {{ color: var(--paper); background: var(--warning); font-weight: 600; padding: .35rem .7rem;
-  max-width: none; }}
-.warning {{ border-left: .3rem solid var(--warning); padding-left: .7rem; }}
-summary {{ cursor: pointer; padding: .3rem 0; }}
-code {{ font: .9em/1.4 ui-monospace, "DejaVu Sans Mono", Menlo, Consolas, monospace; background: var(--block);
-  padding: .1em .3em; }}
-footer {{ margin-top: 3rem; color: var(--dim); font-size: .88rem; }}
-@page {{ size: A4 landscape; margin: 12mm; }}
-@media print {{
-  body {{ max-width: none; padding: 0; font-size: 10.5pt; }}
-  nav {{ display: none; }}
-  .wide {{ overflow: visible; }}
-  .wide td {{ white-space: normal; }}
-  table {{ font-size: 7.5pt; }}
-  th, td {{ padding-right: .5rem; }}
-  figcaption {{ font-size: 9pt; }}
-  figure, tr, .partial {{ break-inside: avoid; }}
-  h2, h3 {{ break-after: avoid; }}
-  .partial {{ print-color-adjust: exact; -webkit-print-color-adjust: exact; }}
-  .figures {{ grid-template-columns: 1fr 1fr; gap: .8rem; }}
-  .big td, .big td ~ td {{ font-size: inherit; }}
-}}
+STYLE: Final = (
+    LIGHT
+    + """
+* { box-sizing: border-box; }
+body { margin: 0 auto; padding: 1rem 1.25rem 3rem; max-width: 76rem; background: var(--paper); color: var(--ink);
+  font: 16px/1.5 system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; overflow-wrap: break-word; }
+h1 { font-size: 1.7rem; line-height: 1.2; margin: .6rem 0 .4rem; }
+h2 { font-size: 1.25rem; margin: 2.2rem 0 .6rem; padding-bottom: .2rem; border-bottom: 2px solid var(--rule); }
+h3 { font-size: 1rem; margin: 1.4rem 0 .4rem; }
+p { margin: .4rem 0; max-width: 46rem; }
+nav a { display: inline-block; margin: 0 .9rem .3rem 0; }
+a { color: var(--link); }
+dl { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 28rem), 1fr)); gap: 0 2rem;
+  margin: .6rem 0; }
+dl div { display: flex; gap: .8rem; padding: .2rem 0; border-bottom: 1px solid var(--line); min-width: 0; }
+dt { flex: 0 0 8.5rem; color: var(--dim); }
+dd { margin: 0; min-width: 0; }
+.wide { overflow-x: auto; max-width: 100%; }
+table { border-collapse: collapse; font-size: .86rem; font-variant-numeric: tabular-nums; }
+caption { text-align: left; color: var(--dim); padding: .2rem 0; }
+th, td { padding: .28rem .6rem .28rem 0; text-align: right; vertical-align: top; border-bottom: 1px solid var(--line);
+  overflow-wrap: normal; }
+thead th { border-bottom: 2px solid var(--rule); font-weight: 600; }
+th:first-child { text-align: left; font-weight: 500; }
+@media (min-width: 700px) { .wide th:first-child { position: sticky; left: 0; background: var(--paper); } }
+.text td, .text th, .tree td, .tree th { text-align: left; overflow-wrap: break-word; }
+.wide td { white-space: nowrap; }
+.wide.text td, .wide .interval { white-space: normal; }
+.wide .interval { min-width: 5em; }
+.wide td.long { white-space: normal; text-align: left; min-width: 18rem; }
+.big td { font-size: 1.02rem; font-weight: 600; }
+.big td ~ td { font-weight: 400; color: var(--soft); font-size: .92rem; }
+.interval { color: var(--dim); font-size: .82rem; font-weight: 400; }
+.figures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 28rem), 1fr)); gap: 1.4rem; }
+figure { margin: 0; }
+figure img { width: 100%; height: auto; border: 1px solid var(--line); }
+figcaption { font-size: .9rem; color: var(--soft); }
+.partial { color: var(--paper); background: var(--warning); font-weight: 600; padding: .35rem .7rem;
+  max-width: none; }
+.warning { border-left: .3rem solid var(--warning); padding-left: .7rem; }
+summary { cursor: pointer; padding: .3rem 0; }
+code { font: .9em/1.4 ui-monospace, "DejaVu Sans Mono", Menlo, Consolas, monospace; background: var(--block);
+  padding: .1em .3em; }
+footer { margin-top: 3rem; color: var(--dim); font-size: .88rem; }
+@page { size: A4 landscape; margin: 12mm; }
+@media print {
+  body { max-width: none; padding: 0; font-size: 10.5pt; }
+  nav { display: none; }
+  .wide { overflow: visible; }
+  .wide td { white-space: normal; }
+  table { font-size: 7.5pt; }
+  th, td { padding-right: .5rem; }
+  figcaption { font-size: 9pt; }
+  figure, tr, .partial { break-inside: avoid; }
+  h2, h3 { break-after: avoid; }
+  .partial { print-color-adjust: exact; -webkit-print-color-adjust: exact; }
+  .figures { grid-template-columns: 1fr 1fr; gap: .8rem; }
+  .big td, .big td ~ td { font-size: inherit; }
+}
 """
+)
+"""The rules of all pages; light, unless `theme.DARK` follows."""
 
 
 def picture(png: bytes, alt: str, caption: str) -> Markup:
@@ -230,6 +231,6 @@ def document(title: str, *content: Markup, policy: str = _POLICY, style: str = "
         tag("meta", http_equiv="Content-Security-Policy", content=policy),
         tag("meta", name_="viewport", content="width=device-width, initial-scale=1"),
         tag("title", title),
-        tag("style", Markup(_STYLE + style)),
+        tag("style", Markup(STYLE + style)),
     )
     return f"<!DOCTYPE html>\n{tag('html', head, tag('body', *content), lang='en')}\n"

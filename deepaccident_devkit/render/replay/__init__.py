@@ -1,5 +1,27 @@
-"""A scenario as one HTML file that plays in a browser, without a server or a network."""
+"""A scenario as one HTML file that plays in a browser without a network; its parts serve other pages too."""
 
-from deepaccident_devkit.render.replay.replay import render_replay
+from deepaccident_devkit.render.replay.recording import recording_of
+from deepaccident_devkit.render.replay.replay import (
+    CONTROLS,
+    PLAYER,
+    SCRIPTS,
+    STYLE,
+    render_replay,
+    replay_part,
+    script_json,
+    served_replay,
+)
+from deepaccident_devkit.render.replay.sensors import cloud_text
 
-__all__ = ["render_replay"]
+__all__ = [
+    "CONTROLS",
+    "PLAYER",
+    "SCRIPTS",
+    "STYLE",
+    "cloud_text",
+    "recording_of",
+    "render_replay",
+    "replay_part",
+    "script_json",
+    "served_replay",
+]

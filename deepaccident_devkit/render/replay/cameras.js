@@ -141,10 +141,12 @@ function tagOf(actor, pixels, camera, ratio, taken) {
 
 // the cards
 
+const hasPictures = (camera) => camera.pictures.some((each) => each !== null);
+
 const cards = data.agents.map((agent, bit) => {
-  const available = data.cameras[bit];
+  const available = data.cameras[bit].filter(hasPictures);
   const title = made("span", { className: "name" }, chip(agent.color, "round"), agent.title);
-  const picture = made("img", { alt: "" });
+  const picture = madePicture();
   const none = made("span", { className: "none", textContent: "no pictures" });
   const where = made("span", { className: "where" });
   const judged = made("span", { className: "judged" });
@@ -200,13 +202,11 @@ function showCameras() {
 
 function showCamera(card) {
   const camera = cameraOf(card);
-  const frame = camera ? pictureFrame(camera, state.frame) : null;
-  card.picture.hidden = !camera;
   card.none.hidden = Boolean(camera);
+  card.picture.hidden = !camera;
   card.boxes.replaceChildren();
   if (camera) {
-    const coded = `data:image/jpeg;base64,${camera.pictures[frame]}`;
-    if (card.picture.src !== coded) card.picture.src = coded;
+    const frame = showPicture(card, camera, card.figure.classList.contains("large"));
     card.picture.alt = `${card.agent.title}, camera ${camera.title}, frame ${frame + 1}`;
     card.where.textContent = frame === state.frame ? camera.title : `${camera.title}, frame ${frame + 1}`;
     card.where.classList.toggle("earlier", frame !== state.frame);
@@ -218,6 +218,26 @@ function showCamera(card) {
   showSight(card);
 }
 
+// Show a camera's picture of the moment, and return its frame. While it plays, a picture that a server has not yet given
+// is waited for: the next one is asked for then.
+function showPicture(card, camera, large) {
+  const frame = pictureFrame(camera, state.frame);
+  const source = sources.picture(card.agent, camera, frame, large);
+  if (source !== card.source) {
+    if (state.playing && card.camera === camera && !card.picture.complete) return card.frame;
+    Object.assign(card, { source, camera, frame });
+    card.picture.src = source;
+  }
+  return card.frame;
+}
+
+function madePicture() {
+  const picture = made("img", { alt: "" });
+  picture.addEventListener("error", () => picture.classList.add("broken"));
+  picture.addEventListener("load", () => picture.classList.remove("broken"));
+  return picture;
+}
+
 function showSight(card) {
   const others = data.actors.filter((actor) => actor.states[state.frame] && actor.id !== card.agent.actor);
   const seen = others.filter((actor) => actor.seen[state.frame] & (1 << card.bit));
@@ -226,3 +246,42 @@ function showSight(card) {
   const without = large ? `, not ${hidden.map((actor) => actor.title).join(", ")}` : "";
   card.sees.textContent = others.length ? `sees ${seen.length} of ${others.length}${without}` : "";
 }
+
+// all cameras
+
+let everyCamera = null;
+
+function madeEvery() {
+  return data.agents.flatMap((agent, bit) => {
+    const row = made("div", { className: "cards" });
+    byId("every-camera").append(made("h3", {}, chip(agent.color, "round"), agent.title), row);
+    return data.cameras[bit].map((camera) => {
+      const there = hasPictures(camera);
+      const boxes = drawn("svg", { class: "boxes", preserveAspectRatio: "none", "aria-hidden": "true" });
+      const picture = madePicture();
+      picture.hidden = !there;
+      const none = made("span", { className: "none", textContent: "not downloaded", hidden: there });
+      const where = made("span", { className: "where" });
+      const pictured = made("div", { className: "pictured" }, picture, boxes, where, none);
+      pictured.style.borderColor = agent.color;
+      const figure = made("figure", { className: "agent" }, pictured);
+      row.append(figure);
+      return { agent, bit, there, shown: camera, picture, boxes, where, figure };
+    });
+  });
+}
+
+// The pictures of all cameras at this moment; only while the reader has opened them.
+function showEvery() {
+  if (!byId("every").open) return;
+  everyCamera = everyCamera || madeEvery();
+  for (const card of everyCamera) {
+    const frame = card.there ? showPicture(card, card.shown, false) : state.frame;
+    card.picture.alt = `${card.agent.title}, camera ${card.shown.title}, frame ${frame + 1}`;
+    card.where.textContent = frame === state.frame ? card.shown.title : `${card.shown.title}, frame ${frame + 1}`;
+    card.boxes.replaceChildren();
+    if (state.boxes) drawBoxes(card, card.shown, frame);
+  }
+}
+byId("every").hidden = data.cameras.every((cameras) => !cameras.length);
+byId("every").addEventListener("toggle", show);

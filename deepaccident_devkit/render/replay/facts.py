@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 
 from deepaccident_devkit.render.replay.recording import Recording
-from deepaccident_devkit.render.replay.sensors import CameraPictures
+from deepaccident_devkit.render.replay.sensors import CameraFiles, CameraPictures
 from deepaccident_devkit.render.roles import short_name
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD
 
@@ -25,6 +25,17 @@ def notes(recording: Recording, pictures: CameraPictures, *, points: bool) -> li
         points: whether there are LiDAR points.
     """
     return [*_labels(recording), *_pictures(pictures), *_points(recording, points=points)]
+
+
+def served_notes(recording: Recording, files: CameraFiles) -> list[str]:
+    """Sentences on what is missing in the release, for a page that has no pictures itself.
+
+    Args:
+        recording: the scenario and the agents.
+        files: of all cameras.
+    """
+    paths = [path for each in files.values() for path in each]
+    return [*_labels(recording), *_missing_pictures(sum(path is not None for path in paths), len(paths))]
 
 
 def _setting(recording: Recording) -> Iterator[tuple[str, str]]:
@@ -81,12 +92,9 @@ def _labels(recording: Recording) -> Iterator[str]:
 
 def _pictures(pictures: CameraPictures) -> Iterator[str]:
     settings = pictures.settings
+    yield from _missing_pictures(pictures.found, pictures.wanted)
     if not pictures.found:
-        yield f"No pictures: none of the {pictures.wanted} camera files is here; unpack the cameras' archives."
         return
-    if pictures.found < pictures.wanted:
-        missing = pictures.wanted - pictures.found
-        yield f"{missing} of {pictures.wanted} camera files are missing in the release; unpack the cameras' archives."
     if settings is None:
         yield "No pictures: the file would be too large with them."
         return
@@ -101,6 +109,14 @@ def _pictures(pictures: CameraPictures) -> Iterator[str]:
             "To keep the file small, cameras other than the front ones and those that follow the pair have smaller "
             f"pictures, up to {settings.other_width} pixels wide, of {each}."
         )
+
+
+def _missing_pictures(found: int, wanted: int) -> Iterator[str]:
+    if not found:
+        yield f"No pictures: none of the {wanted} camera files is here; unpack the cameras' archives."
+    elif found < wanted:
+        missing = wanted - found
+        yield f"{missing} of {wanted} camera files are missing in the release; unpack the cameras' archives."
 
 
 def _points(recording: Recording, *, points: bool) -> Iterator[str]:

@@ -1,5 +1,3 @@
-"use strict";
-
 // The scene from above, rendered on a canvas: x of the world to the right, y up. Data are centimetres and milliradians.
 
 const TRAIL_FRAMES = 20;
@@ -17,16 +15,16 @@ const INK = "#1c1c1c";
 const SIDES = [[0, -1], [1, 0], [0, 1], [-1, 0], [1, -1], [1, 1], [-1, 1], [-1, -1]];
 
 class Ground {
-  constructor(canvas, data, state) {
+  constructor(canvas, data, state, sources) {
     this.canvas = canvas;
     this.data = data;
     this.state = state;
+    this.sources = sources;
     this.pen = canvas.getContext("2d");
     this.road = data.road && Object.assign(new Image(), { src: `data:image/png;base64,${data.road.png}` });
     if (this.road) this.road.addEventListener("load", () => this.draw());
     this.pair = data.actors.filter((actor) => actor.role === "pair");
     for (const actor of data.actors) actor.shape = SHAPES[data.markers[actor.category]];
-    this.clouds = (data.points || []).map((coded) => (coded === null ? null : decodedCloud(coded)));
     this.showWhole();
   }
 
@@ -147,13 +145,17 @@ class Ground {
     pen.fillText(words, 8, this.height - 8);
   }
 
+  // Points of one agent are grey, those of several have the agents' colours.
   drawPoints() {
-    const cloud = this.clouds[this.state.frame];
-    if (!cloud) return;
-    this.pen.fillStyle = this.data.colors.points;
-    for (let index = 0; index < cloud.length; index += 2) {
-      const [x, y] = this.at([cloud[index] * 10, cloud[index + 1] * 10]);
-      this.pen.fillRect(x - 0.75, y - 0.75, 1.5, 1.5);
+    const { clouds, frame } = this.state;
+    for (const bit of clouds) {
+      const cloud = this.sources.points(bit, frame);
+      if (!cloud) continue;
+      this.pen.fillStyle = clouds.length > 1 ? this.data.agents[bit].color : this.data.colors.points;
+      for (let index = 0; index < cloud.length; index += 2) {
+        const [x, y] = this.at([cloud[index] * 10, cloud[index + 1] * 10]);
+        this.pen.fillRect(x - 0.75, y - 0.75, 1.5, 1.5);
+      }
     }
   }
 
@@ -416,11 +418,4 @@ function common(one, other) {
   const across = Math.min(one[2], other[2]) - Math.max(one[0], other[0]);
   const down = Math.min(one[3], other[3]) - Math.max(one[1], other[1]);
   return across > 0 && down > 0 ? across * down : 0;
-}
-
-// Little-endian int16 from base64: x, y, x, y, …, decimetres.
-function decodedCloud(coded) {
-  const text = atob(coded);
-  const view = new DataView(Uint8Array.from(text, (character) => character.charCodeAt(0)).buffer);
-  return Int16Array.from({ length: view.byteLength / 2 }, (_, index) => view.getInt16(2 * index, true));
 }

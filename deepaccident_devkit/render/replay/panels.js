@@ -12,10 +12,13 @@ const state = {
   large: "",
   boxes: true,
   layers: { road: true, trails: true, dots: true, ids: false, agents: true, points: false, prediction: true },
+  clouds: [],
   foreseen: [],
 };
 const byId = (name) => document.getElementById(name);
-const ground = new Ground(byId("ground"), data, state);
+const sources = new Sources(data, () => ground.draw());
+state.clouds = sources.withPoints.slice(0, 1);
+const ground = new Ground(byId("ground"), data, state, sources);
 
 function made(name, properties = {}, ...children) {
   const element = Object.assign(document.createElement(name), properties);

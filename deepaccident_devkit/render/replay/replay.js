@@ -38,8 +38,10 @@ function show() {
   showForeseen();
   showTime();
   showCameras();
+  showEvery();
   showSeen();
   ground.draw();
+  document.dispatchEvent(new Event("moment")); // for the pages around
 }
 
 function go(frame) {
@@ -87,14 +89,28 @@ choice(byId("follow"), followOptions, state.follow, (value) => {
 choice(byId("sight"), [["", "none"], ["all", "all agents"], ...agentOptions], "", (value) => {
   state.sight = value;
 });
-for (const [layer, title] of Object.entries(LAYERS)) {
-  if (data[layer] === null) continue; // the release does not have it
-  const box = made("input", { type: "checkbox", checked: state.layers[layer], id: `layer-${layer}` });
+function tickBox(home, id, title, checked, changed) {
+  const box = made("input", { type: "checkbox", checked, id });
   box.addEventListener("change", () => {
-    state.layers[layer] = box.checked;
+    changed(box.checked);
     show();
   });
-  byId("layers").append(made("label", {}, box, ` ${title}`));
+  byId(home).append(made("label", {}, box, ` ${title}`));
+}
+for (const [layer, title] of Object.entries(LAYERS)) {
+  const there = layer === "points" ? sources.withPoints.length : data[layer] !== null;
+  if (!there) continue; // the release does not have it
+  tickBox("layers", `layer-${layer}`, title, state.layers[layer], (checked) => {
+    state.layers[layer] = checked;
+  });
+}
+byId("clouds").hidden = sources.withPoints.length < 2;
+for (const bit of sources.withPoints) {
+  const agent = data.agents[bit];
+  tickBox("clouds", `cloud-${agent.name}`, agent.title, state.clouds.includes(bit), (checked) => {
+    state.clouds = sources.withPoints.filter((each) => (each === bit ? checked : state.clouds.includes(each)));
+    state.layers.points = byId("layer-points").checked = true;
+  });
 }
 
 function follow(value) {

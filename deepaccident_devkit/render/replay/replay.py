@@ -19,18 +19,18 @@ from deepaccident_devkit.render.colors import (
     CATEGORY_MARKERS,
     COLLIDER_COLOR,
     GRID_COLOR,
-    LINK_COLOR,
     OUTCOME_COLORS,
     POINT_COLOR,
-    WARNING_COLOR,
 )
 from deepaccident_devkit.render.markup import source_hash
+from deepaccident_devkit.render.missing import is_there
 from deepaccident_devkit.render.replay.actors import actor_entries, agent_entries, camera_entries, camera_title
-from deepaccident_devkit.render.replay.facts import facts, notes
+from deepaccident_devkit.render.replay.facts import facts, notes, served_notes
 from deepaccident_devkit.render.replay.follow import Followed, follow_pair
 from deepaccident_devkit.render.replay.recording import Recording, recording_of
 from deepaccident_devkit.render.replay.road import road_picture
 from deepaccident_devkit.render.replay.sensors import (
+    CameraFiles,
     CameraPictures,
     camera_files,
     camera_pictures,
@@ -38,7 +38,8 @@ from deepaccident_devkit.render.replay.sensors import (
     lidar_points,
 )
 from deepaccident_devkit.render.replay.verdicts import Foreseen, verdicts
-from deepaccident_devkit.taxonomy import FRAME_PERIOD
+from deepaccident_devkit.render.theme import DARK, LIGHT
+from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD, LIDAR
 from deepaccident_devkit.v2x import Agents
 
 SIZE_LIMIT: Final = 15_000_000
@@ -46,8 +47,12 @@ SIZE_LIMIT: Final = 15_000_000
 _BASE64: Final = 4 / 3
 _BESIDE: Final = 8
 """Bytes of a picture in JSON in addition to its base64: quotes, a comma and padding."""
-_SCRIPTS: Final = ("ground.js", "panels.js", "cameras.js", "replay.js")
+SCRIPTS: Final = ("sources.js", "ground.js", "panels.js", "cameras.js", "replay.js")
 """Each script uses the ones before it."""
+STYLE: Final = "replay.css"
+PLAYER: Final = "player.html"
+CONTROLS: Final = "controls.html"
+"""The two parts of a page that the scripts fill: what is shown, and below all else the controls."""
 
 
 def render_replay(
@@ -98,12 +103,9 @@ def render_replay(
         raise ChoiceError(f"{target}: is a folder; name a file in it, such as {target / 'replay.html'}")
     check_picture_settings(image_width, quality)
     recording = recording_of(dataset, scenario, agents)
-    data = _data(recording, prediction)
     files = camera_files(recording)
-    seen = {actor["id"]: actor["seen"] for actor in data["actors"]}
-    there = {key: [path is not None for path in paths] for key, paths in files.items()}
-    followed = follow_pair(recording, seen, there)
-    data |= {"automatic": _automatic(recording, followed), "cameras": camera_entries(recording)}
+    data, followed = _data(recording, prediction, files)
+    data["points"] = lidar_points(recording, recording.agents[0])
     free = (SIZE_LIMIT - len(replay_page("", data).encode())) / _BASE64
     free -= _BESIDE * len(recording.frames) * len(files)
     pictures = camera_pictures(
@@ -121,13 +123,48 @@ def render_replay(
     return target
 
 
-def _data(recording: Recording, prediction: Foreseen | None) -> dict[str, Any]:
-    """The page's data, except the pictures."""
-    first, contact = recording.agents[0], recording.contact
+def served_replay(
+    dataset: Dataset, scenario: RowArgument, folder: str, *, prediction: Foreseen | None = None
+) -> dict[str, Any]:
+    """What the scripts play on a page whose server has the pictures and points, for all cameras and agents.
+
+    They ask below `folder` for `images/AGENT/CHANNEL/FRAME?width=PIXELS` (JPEG) and `points/AGENT/FRAME`, which answers
+    with `cloud_text`.
+
+    Args:
+        dataset: the release.
+        scenario: token or record.
+        folder: address that the page has of the scenario's files, ending in a slash.
+        prediction: as of `render_replay`.
+
+    Raises:
+        TokenError, NotAvailableError, EvaluationError, SensorFileError: as of `render_replay`.
+    """
+    recording = recording_of(dataset, scenario, None)
+    files = camera_files(recording)
+    data, _ = _data(recording, prediction, files)
+    points = [
+        [is_there(dataset, f"{recording.sample(agent, frame)}/{LIDAR}") for frame in recording.frames]
+        for agent in recording.agents
+    ]
+    for agent, cameras in zip(recording.agents, data["cameras"], strict=True):
+        for channel, camera in zip(CAMERAS, cameras, strict=True):
+            camera["channel"] = channel
+            camera["pictures"] = [None if path is None else 1 for path in files[agent, channel]]
+    return data | {
+        "points": None,
+        "notes": served_notes(recording, files),
+        "served": {"folder": folder, "points": [each if any(each) else None for each in points]},
+    }
+
+
+def _data(recording: Recording, prediction: Foreseen | None, files: CameraFiles) -> tuple[dict[str, Any], Followed]:
+    """The page's data, except pictures and points, and the cameras that follow the pair."""
+    contact = recording.contact
     moments = [
         recording.dataset.get("frame", f"{recording.scenario['token']}/{frame:03d}") for frame in recording.frames
     ]
-    return {
+    data: dict[str, Any] = {
         "scenario": recording.scenario["token"],
         "facts": facts(recording),
         "period": FRAME_PERIOD,
@@ -142,10 +179,14 @@ def _data(recording: Recording, prediction: Foreseen | None) -> dict[str, Any]:
         "markers": dict(CATEGORY_MARKERS),
         "agents": agent_entries(recording),
         "actors": actor_entries(recording),
-        "points": lidar_points(recording, first),
         "road": road_picture(recording),
         "prediction": None if prediction is None else verdicts(recording, prediction),
+        "cameras": camera_entries(recording),
     }
+    seen = {actor["id"]: actor["seen"] for actor in data["actors"]}
+    there = {key: [path is not None for path in paths] for key, paths in files.items()}
+    followed = follow_pair(recording, seen, there)
+    return data | {"automatic": _automatic(recording, followed)}, followed
 
 
 def _automatic(recording: Recording, followed: Followed) -> dict[str, Any]:
@@ -187,8 +228,7 @@ def replay_page(title: str, data: Mapping[str, Any]) -> str:
         title: of the window.
         data: what the scripts play, as JSON holds it.
     """
-    table = f":root {{ --link: {LINK_COLOR}; --warning: {WARNING_COLOR}; }}\n"
-    style, script = table + _part("replay.css"), "".join(map(_part, _SCRIPTS))
+    style, script = LIGHT + DARK + replay_part(STYLE), "".join(map(replay_part, SCRIPTS))
     policy = (
         f"default-src 'none'; img-src data:; style-src '{source_hash(style)}'; script-src '{source_hash(script)}'; "
         "base-uri 'none'; form-action 'none'"
@@ -196,17 +236,19 @@ def replay_page(title: str, data: Mapping[str, Any]) -> str:
     parts = {
         "policy": html.escape(policy, quote=False),
         "title": html.escape(title),
+        "player": replay_part(PLAYER),
+        "controls": replay_part(CONTROLS),
         "style": style,
         "script": script,
-        "data": _json(data),
+        "data": script_json(data),
     }
-    page = _part("replay.html")
+    page = replay_part("replay.html")
     for name, part in parts.items():  # the data come last, so that nothing in them is replaced
         page = page.replace(f"<!--{name}-->", part)
     return page
 
 
-def _json(data: Mapping[str, Any]) -> str:
+def script_json(data: Mapping[str, Any]) -> str:
     """JSON that cannot end the HTML element around it."""
     text = json.dumps(data, allow_nan=False, separators=(",", ":"))
     for character in "<>&":
@@ -214,5 +256,6 @@ def _json(data: Mapping[str, Any]) -> str:
     return text
 
 
-def _part(name: str) -> str:
+def replay_part(name: str) -> str:
+    """The text of one of the files of which a page is made: `SCRIPTS`, `STYLE`, `PLAYER`, `CONTROLS`."""
     return (files(__package__) / name).read_text(encoding="utf-8")

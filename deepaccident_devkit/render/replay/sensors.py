@@ -249,12 +249,13 @@ def lidar_points(recording: Recording, agent: str) -> list[str | None] | None:
     Raises:
         SensorFileError: a file cannot be read.
     """
-    clouds = [_cloud(recording, recording.sample(agent, frame)) for frame in recording.frames]
+    clouds = [cloud_text(recording, agent, frame) for frame in recording.frames]
     return clouds if any(cloud is not None for cloud in clouds) else None
 
 
-def _cloud(recording: Recording, sample: str) -> str | None:
-    dataset = recording.dataset
+def cloud_text(recording: Recording, agent: str, frame: int) -> str | None:
+    """One cloud of `lidar_points`; raises SensorFileError."""
+    dataset, sample = recording.dataset, recording.sample(agent, frame)
     try:
         cloud = dataset.load_point_cloud(sample, "ego")
     except MissingFileError:

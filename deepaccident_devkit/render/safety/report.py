@@ -25,6 +25,7 @@ from deepaccident_devkit.render.safety import report_sections
 from deepaccident_devkit.render.safety.accident_table import accident_table, by_severity
 from deepaccident_devkit.render.safety.avoidability import AVOIDABILITY_SIZE, render_avoidability
 from deepaccident_devkit.render.safety.lead_time import LEAD_TIME_SIZE, render_lead_times
+from deepaccident_devkit.render.theme import DARK
 from deepaccident_devkit.safety import SafetyReport
 from deepaccident_devkit.safety.avoidability_shares import GROUPS
 
@@ -131,7 +132,7 @@ def report_html(
         _TITLE,
         tag("header", tag("h1", _TITLE), report_sections.header(report)),
         chapters(parts),
-        style=_part("report.css"),
+        style=DARK + _part("report.css"),
         script=_part("sorting.js"),
     )
 
