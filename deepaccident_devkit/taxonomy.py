@@ -82,6 +82,10 @@ FRAME_PERIOD: Final = 0.1
 WARM_UP_FRAMES: Final = 10
 """Meta counts simulated frames: the recorded ones and this many before them."""
 
+POLE_HEIGHT: Final = 4.0
+"""Metres: how far the road is below the origin of the infrastructure's `ego` frame, its LiDAR on a pole: in the release
+3 to 5 m. A vehicle's `ego` frame has its origin on the road."""
+
 BEV_SHAPE: Final = (1200, 1200)
 BEV_RESOLUTION: Final = 0.1
 """Metres a pixel of the BEV instance camera, which covers ±60 m."""

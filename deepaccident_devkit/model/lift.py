@@ -15,13 +15,12 @@ from torch import Tensor, nn
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import Axis
+from deepaccident_devkit.taxonomy import POLE_HEIGHT
 from deepaccident_devkit.text import settle_choices
 
 Frustum = Literal["corners", "centres"]
 Rounding = Literal["trunc", "floor"]
 Pooling = Literal["sum", "mean"]
-_POLE: Final = 4.0
-"""Metres: the height over the road of a frame whose origin is among its cameras, between the release's 3 and 5."""
 _LEAST_CAMERA: Final = 1.0
 """Metres above its origin from which a camera is a vehicle's: those of the release are some 1.6 m above, or at 0."""
 _LEAST_MASS: Final = 0.01
@@ -189,7 +188,7 @@ class LiftSplat(nn.Module):
         rows, columns = config.grid_shape
         inside = ((steps >= 0) & (steps < steps.new_tensor([columns, rows, 1]))).all(-1)
         if config.band is not None:
-            road = torch.where(cameras.translation[..., 2] > _LEAST_CAMERA, 0.0, -_POLE)[..., None, None, None]
+            road = torch.where(cameras.translation[..., 2] > _LEAST_CAMERA, 0.0, -POLE_HEIGHT)[..., None, None, None]
             above = points[..., 2] - road
             inside &= (above >= config.band[0]) & (above < config.band[1])
         if cameras.valid is not None:

@@ -31,7 +31,7 @@ _MOST: Final = 60.0
 """Metres around an accident that are shown, at least and at most."""
 _MARK: Final = (-7.0, -7.0, 7.0, 7.0)
 """Points around circles, crosses and the lines between them that no words cover: left, low, right and high."""
-_FORESEEN: Final = "black"
+FORESEEN_COLOR: Final = "black"
 """Whether it is right is what the picture shows."""
 
 
@@ -66,19 +66,22 @@ def draw_accident_outcome(
         line.set_label("to come")
         _keep_line_free(*compared.true.positions, ax=ax)
     for alarm in compared.predicted:
-        (line,) = ax.plot(*alarm.positions.T, "x--", color=_FORESEEN, markersize=9, markeredgewidth=2, zorder=6)
+        (line,) = ax.plot(*alarm.positions.T, "x--", color=FORESEEN_COLOR, markersize=9, markeredgewidth=2, zorder=6)
         line.set_label("foreseen" if alarm is compared.predicted[0] else "")
         _keep_line_free(*alarm.positions, ax=ax)
         place = alarm.positions.mean(axis=0)
-        write_beside(
-            ax, f"in {alarm.time:.1f} s, score {alarm.score:.2g}", (float(place[0]), float(place[1])), _FORESEEN
-        )
+        write_beside(ax, alarm_words(alarm), (float(place[0]), float(place[1])), FORESEEN_COLOR)
         if compared.true is not None:
             _draw_differences(alarm, compared.true, ax)
     _look_at(compared, ax)
     handles, _ = ax.get_legend_handles_labels()
     draw_legend(ax, handles, columns=1, **INSIDE)
     return titled_from_above(ax, difference_words(compared), grid="grid" in shown)
+
+
+def alarm_words(alarm: Accident) -> str:
+    """When an accident is foreseen, and how sure that is: `in 1.5 s, score 0.9`."""
+    return f"in {alarm.time:.1f} s, score {alarm.score:.2g}"
 
 
 def difference_words(compared: ComparedAccidents) -> str:

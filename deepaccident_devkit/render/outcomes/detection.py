@@ -29,7 +29,8 @@ DETECTION_LAYERS: Final[tuple[Layer, ...]] = ("boxes", "ids", "grid")
 _SHOWN: Final[tuple[Layer, ...]] = ("boxes", "grid")
 WINDOW: Final = 50.0
 """Metres around the agent that are shown."""
-_DASHED: Final = (0, (2, 1))
+DASHED: Final = (0, (2, 1))
+"""The lines around true boxes and instances that are missed."""
 
 
 def draw_detection_outcome(
@@ -80,7 +81,7 @@ def draw_true(truth: Boxes, matches: DetectionMatches, ax: Axes) -> None:
     found, missed = truth.select(matches.truth), truth.select(matches.missed)
     draw_boxes_from_above(found, ax, ["black"] * len(found), fill=0, linewidths=0.7)
     colors = [OUTCOME_COLORS["missed"]] * len(missed)
-    draw_boxes_from_above(missed, ax, colors, fill=0.3, linestyle=_DASHED, linewidths=1.6)
+    draw_boxes_from_above(missed, ax, colors, fill=0.3, linestyle=DASHED, linewidths=1.6)
 
 
 def detection_words(

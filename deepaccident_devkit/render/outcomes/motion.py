@@ -60,6 +60,15 @@ class MotionOutcome(ShortRepr):
             result[frame][np.isin(instance, found)] = _RIGHT
         return result
 
+    def judged(self, side: Side, frame: int) -> dict[str, IntArray]:
+        """Ids of a frame's instances by `right` and `false`, or of true ones by `right` and `missed`; not those beyond.
+
+        The keys are those of `OUTCOME_COLORS`.
+        """
+        maps, kinds = (self.true if side == "true" else self.predicted).instance[frame], self.outcomes(side)[frame]
+        named = {"right": _RIGHT, "missed" if side == "true" else "false": _WRONG}
+        return {name: np.unique(maps[kinds == kind]).astype(np.int64) for name, kind in named.items()}
+
 
 def motion_outcome(
     prediction: MotionOutput, label: MotionLabels, protocol: str | MotionProtocol = "released"

@@ -1,0 +1,272 @@
+"""A prediction over the truth in the agent's cameras: boxes, cells on the ground, and the places of accidents."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from deepaccident_devkit.arrays import AnyArray, FloatArray
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.evaluation.metrics.detection import DetectedBoxes
+from deepaccident_devkit.evaluation.metrics.predictions import Prediction
+from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.maps.polygons import outlines
+from deepaccident_devkit.motion import MotionLabels
+from deepaccident_devkit.render.axes import axes_or_new, figure_or_new, settled
+from deepaccident_devkit.render.boxes import EDGES, draw_boxes_in_image, segments_in_image
+from deepaccident_devkit.render.camera import draw_image
+from deepaccident_devkit.render.chips import keep_free
+from deepaccident_devkit.render.colors import COLLIDER_COLOR, OUTCOME_COLORS
+from deepaccident_devkit.render.legends import draw_legend
+from deepaccident_devkit.render.missing import is_there
+from deepaccident_devkit.render.moments import CAMERA_GRID
+from deepaccident_devkit.render.motion_maps import MotionMaps
+from deepaccident_devkit.render.outcomes.accident import FORESEEN_COLOR, alarm_words
+from deepaccident_devkit.render.outcomes.camera_view import CASINGS, CameraView, view_of
+from deepaccident_devkit.render.outcomes.detection import DASHED
+from deepaccident_devkit.render.outcomes.verdicts import (
+    AccidentVerdict,
+    DetectionVerdict,
+    MotionVerdict,
+    Verdict,
+    sample_verdict,
+)
+from deepaccident_devkit.render.titles import set_scene_title
+from deepaccident_devkit.taxonomy import CAMERAS, OWN_ACTOR_ID
+from deepaccident_devkit.text import choice
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_COLUMNS: Final = 3
+_WIDTH, _WIDER = 8.0, 3.35
+"""Inches: the width of a figure of one column, and what each other column adds."""
+_PANEL_WORDS, _WORDS = 0.3, 1.0
+"""Inches of height for the words of a panel, and for those of the figure."""
+_RADIUS: Final = 1.0
+"""Metres: of the rings and crosses around places."""
+_CORNERS: Final = 32
+"""Of a ring."""
+_MISSING: Final = (-58.0, -48.0, 58.0, 0.0)
+"""Points around the middle of a panel's upper edge, where words about a missing image are: left, low, right, high."""
+_FILL: Final = 0.3
+"""How opaque the ground of instances is."""
+
+
+def render_outcome_in_cameras(  # noqa: PLR0913 - those of render_evaluation, and which cameras and frame
+    dataset: Dataset,
+    sample: RowArgument,
+    prediction: Prediction | DetectedBoxes,
+    *,
+    task: str | None = None,
+    protocol: Any = None,
+    label: MotionLabels | None = None,
+    cameras: Iterable[str] = CAMERAS,
+    frame: int | None = None,
+    fig: Figure | None = None,
+) -> Figure:
+    """Render a model's prediction over the truth in the cameras of the sample's agent, by a protocol's verdict.
+
+    Detections: matched and false boxes, missed true boxes dashed, and thin the true boxes that were found. Motion: the
+    cells of predicted instances on the ground, right or false, and of missed true ones, dashed. Accidents: red rings at
+    the places where two collide, black crosses at the foreseen places, with their times; posts of 1.5 m stand on both.
+    What does not count, such as boxes and instances beyond the protocol's range, is not rendered, nor the agent's own
+    box, which is around its cameras.
+
+    The ground is taken to be flat: the plane z = 0 of a vehicle's ego frame, and for the infrastructure 4 m below its
+    LiDAR. Occlusion is ignored: boxes and places are rendered even if other things hide them.
+
+    Args:
+        dataset: the release.
+        sample: token or record.
+        prediction: as in `render_evaluation`.
+        task: as in `render_evaluation`.
+        protocol: as in `render_evaluation`.
+        label: as in `render_evaluation`.
+        cameras: channels, in any order: the panels are always in that of all pictures.
+        frame: of motion: 0 or None for the present; later frames show where instances will be, in the image of now.
+        fig: an empty figure to render on; a new one if None.
+
+    Returns:
+        The figure, up to three panels in a row, the verdict above. An image that was not downloaded is a grey panel.
+
+    Raises:
+        TokenError: no such sample.
+        NotAvailableError: the sample has no label, or its scenario no meta that an accident needs.
+        ChoiceError: no such task, protocol, camera or frame, or the prediction is not of this task.
+        EvaluationError: the protocol cannot evaluate such a prediction.
+    """
+    channels = _in_order(cameras)
+    verdict = sample_verdict(dataset, sample, prediction, task=task, protocol=protocol, label=label)
+    words = _frame_words(verdict, frame)
+    rows, columns = -(-len(channels) // _COLUMNS), min(_COLUMNS, len(channels))
+    width = _WIDTH + _WIDER * (columns - 1)
+    fig = figure_or_new(fig, (width, rows * (width / columns * 9 / 16 + _PANEL_WORDS) + _WORDS))
+    axes = fig.subplots(rows, columns, squeeze=False)
+    for ax in axes.flat[len(channels) :]:
+        ax.set_axis_off()
+    for channel, ax in zip(channels, axes.flat, strict=False):
+        draw_outcome_in_camera(dataset, verdict, channel, frame=frame, ax=ax)
+    handles = _handles(verdict)
+    draw_legend(fig, handles, columns=len(handles), loc="outside lower center")
+    set_scene_title(fig, dataset, verdict.sample, words, below=verdict.words)
+    return settled(fig)
+
+
+def draw_outcome_in_camera(
+    dataset: Dataset, verdict: Verdict, camera: str, *, frame: int | None = None, ax: Axes | None = None
+) -> Axes:
+    """Render one panel of `render_outcome_in_cameras`.
+
+    Args:
+        dataset: the release.
+        verdict: on the prediction, from `sample_verdict`.
+        camera: channel of the sample's agent.
+        frame: as in `render_outcome_in_cameras`.
+        ax: axes to render on; new ones if None.
+
+    Returns:
+        The axes, in pixels; their title is the channel.
+
+    Raises:
+        ChoiceError: no such camera or frame.
+    """
+    channel, number = choice("camera", camera, CAMERAS), _checked_frame(verdict, frame)
+    ax = axes_or_new(ax, (8, 5))
+    view = view_of(dataset, verdict.sample, channel, ax)
+    draw_image(dataset, dataset.get("sample_data", f"{verdict.sample}/{channel}"), ax)
+    if not is_there(dataset, f"{verdict.sample}/{channel}"):
+        keep_free(ax, [[(view.lens.width / 2, 0.0)]], margin=_MISSING)
+    if isinstance(verdict, DetectionVerdict):
+        _draw_detection(verdict, dataset, view)
+    elif isinstance(verdict, MotionVerdict):
+        _draw_motion(verdict, number, view)
+    else:
+        _draw_accidents(verdict, view)
+    return ax
+
+
+def _in_order(cameras: Iterable[str]) -> list[str]:
+    given = [cameras] if isinstance(cameras, str) else [*cameras]
+    chosen = {choice("cameras", each, CAMERAS) for each in given}
+    if not chosen:
+        raise ChoiceError(f"cameras: expected some of {', '.join(CAMERAS)}, found none")
+    return [channel for row in CAMERA_GRID for channel in row if channel in chosen]
+
+
+def _checked_frame(verdict: Verdict, frame: int | None) -> int:
+    """The number of a frame of motion, 0 for None; raises ChoiceError."""
+    if frame is None:
+        return 0
+    if not isinstance(verdict, MotionVerdict):
+        raise ChoiceError(f"frame: only motion has frames, found {frame!r}; leave it out")
+    count = len(verdict.outcome.true.instance)
+    if frame not in range(count):
+        raise ChoiceError(f"frame: expected a recorded one, from 0 to {count - 1}, found {frame!r}")
+    return frame
+
+
+def _frame_words(verdict: Verdict, frame: int | None) -> str:
+    """When the instances are where they are shown: `instances in 0.5 s`; nothing of the present. Raises ChoiceError."""
+    number = _checked_frame(verdict, frame)
+    if not isinstance(verdict, MotionVerdict) or number == 0:
+        return ""
+    return f"instances in {number * verdict.outcome.true.step:.1f} s"
+
+
+def _draw_detection(verdict: DetectionVerdict, dataset: Dataset, view: CameraView) -> None:
+    """The true boxes that are found below the detections, of which the nearest are on top."""
+    sample, channel, matches = view.sample, view.channel, verdict.matches
+    own = verdict.truth.actor_id == OWN_ACTOR_ID
+    others, missed = ~own[matches.truth], matches.missed[~own[matches.missed]]
+    optical = dataset.world_from(sample, channel).inverse() @ dataset.world_from(sample, verdict.rules.frame)
+    truth, detected = (each.transform(optical, channel) for each in (verdict.truth, verdict.detected.boxes))
+    _draw_edges(truth.select(matches.truth[others]), "black", view, width=0.7)
+    boxes = detected.select(np.concatenate([matches.detection[others], matches.false]))
+    kinds = np.repeat(["right", "false"], [int(others.sum()), len(matches.false)])
+    order = np.argsort(-boxes.center[:, 2], kind="stable")
+    draw_boxes_in_image(
+        boxes.select(order), view.lens, view.ax, [OUTCOME_COLORS[kind] for kind in kinds[order].tolist()]
+    )
+    _draw_edges(truth.select(missed), OUTCOME_COLORS["missed"], view, width=1.6, dashed=True)
+
+
+def _draw_edges(optical: Boxes, color: str, view: CameraView, *, width: float, dashed: bool = False) -> None:
+    pixels, _ = segments_in_image(optical.corners()[:, EDGES].reshape(-1, 2, 3), view.lens)
+    view.draw_lines(list(pixels), color, width=width, dashed=dashed)
+
+
+def _draw_motion(verdict: MotionVerdict, frame: int, view: CameraView) -> None:
+    from matplotlib.collections import PolyCollection
+
+    outcome = verdict.outcome
+    missed = outcome.judged("true", frame)["missed"]
+    for name, ids in outcome.judged("predicted", frame).items():
+        areas = view.on_ground(_outlines(outcome.predicted, frame, ids))
+        filled = PolyCollection(areas, facecolors=OUTCOME_COLORS[name], alpha=_FILL, edgecolors="none")
+        view.ax.add_collection(filled, autolim=False)
+        view.draw_lines(areas, OUTCOME_COLORS[name], width=1.6)
+    view.draw_lines(
+        view.on_ground(_outlines(outcome.true, frame, missed)), OUTCOME_COLORS["missed"], width=1.6, dashed=True
+    )
+
+
+def _outlines(maps: MotionMaps, frame: int, ids: AnyArray) -> list[FloatArray]:
+    """Closed lines (P, 2), metres of the ego frame, around the cells of instances; holes have none."""
+    low, _, size = np.array([maps.grid.x, maps.grid.y]).T
+    polygons = [
+        part for identity in ids.tolist() for part in outlines(maps.instance[frame] == identity, np.zeros(2), 1.0).geoms
+    ]
+    return [low + np.asarray(part.exterior.coords) * size for part in polygons]
+
+
+def _draw_accidents(verdict: AccidentVerdict, view: CameraView) -> None:
+    """The true accident is below the foreseen ones, and its words find their place first."""
+    true = verdict.compared.true
+    if true is not None:
+        _draw_places(true.positions, _ring(), COLLIDER_COLOR, view)
+        view.write(f"in {true.time:.1f} s", true.positions, COLLIDER_COLOR)
+    for alarm in verdict.compared.predicted:
+        _draw_places(alarm.positions, _cross(), FORESEEN_COLOR, view)
+        view.write(alarm_words(alarm), alarm.positions, FORESEEN_COLOR)
+
+
+def _draw_places(places: FloatArray, mark: Sequence[FloatArray], color: str, view: CameraView) -> None:
+    """A mark and a post at each of two places (2, 2), and a thin line from one to the other."""
+    view.draw_lines([*view.on_ground([places]), *view.posts(places)], color, width=1.2)
+    view.draw_lines(view.on_ground([place + line for place in places for line in mark]), color, width=1.8)
+
+
+def _ring() -> list[FloatArray]:
+    turn = np.linspace(0, 2 * np.pi, _CORNERS + 1)
+    return [_RADIUS * np.column_stack([np.cos(turn), np.sin(turn)])]
+
+
+def _cross() -> list[FloatArray]:
+    arm = _RADIUS * np.sqrt(0.5)
+    return [arm * np.array([[-1, -1], [1, 1]]), arm * np.array([[-1, 1], [1, -1]])]
+
+
+def _handles(verdict: Verdict) -> list[Artist]:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    if isinstance(verdict, AccidentVerdict):
+        how: dict[str, Any] = {"linestyle": "none", "markersize": 9, "markeredgewidth": 1.8}
+        ring = Line2D([], [], marker="o", fillstyle="none", color=COLLIDER_COLOR, label="accident to come", **how)
+        return [ring, Line2D([], [], marker="x", color=FORESEEN_COLOR, label="foreseen", **how)]
+    detects = isinstance(verdict, DetectionVerdict)
+    names = {"right": "detected" if detects else "right", "false": "false"}
+    fills: list[Artist] = [
+        Patch(label=words, facecolor=(OUTCOME_COLORS[kind], 0.4), edgecolor=OUTCOME_COLORS[kind])
+        for kind, words in names.items()
+    ]
+    pale = OUTCOME_COLORS["missed"]
+    missed = Patch(label="missed", facecolor=pale, edgecolor=CASINGS[pale], linestyle=DASHED)
+    found = [Line2D([], [], color="black", linewidth=0.9, label="true box of a detection")] if detects else []
+    return [*fills, missed, *found]

@@ -1,0 +1,417 @@
+"""Predictions over the truth in cameras: where lines are, what they mean, and what stands around them."""
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from drawing import has_color, new_axes, on_canvas, rendered, title_of, words
+from matplotlib import pyplot as plt
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import to_hex, to_rgba
+from numpy.testing import assert_allclose
+from picture_texts import text_faults
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.errors import ChoiceError, EvaluationError, TokenError
+from deepaccident_devkit.evaluation import (
+    Accident,
+    DetectedBoxes,
+    MotionEvaluator,
+    MotionOutput,
+    box_truth,
+    detection_truth,
+    instances_of,
+)
+from deepaccident_devkit.evaluation.metrics.accident.compared import ComparedAccidents
+from deepaccident_devkit.motion import MotionLabels
+from deepaccident_devkit.render import detached_figure, style
+from deepaccident_devkit.render.boxes import NEAREST_DRAWN
+from deepaccident_devkit.render.colors import COLLIDER_COLOR, MISSING_COLOR, OUTCOME_COLORS
+from deepaccident_devkit.render.outcomes import (
+    draw_outcome_in_camera,
+    render_evaluation,
+    render_outcome_in_cameras,
+    sample_verdict,
+)
+from deepaccident_devkit.render.outcomes.accident import FORESEEN_COLOR
+from deepaccident_devkit.render.outcomes.verdicts import AccidentVerdict
+from deepaccident_devkit.taxonomy import CAMERAS, OWN_ACTOR_ID
+from deepaccident_devkit.v2x.projection import camera_of
+
+IN_ORDER = [f"Camera_{place}" for place in ("FrontLeft", "Front", "FrontRight", "BackLeft", "Back", "BackRight")]
+AHEAD = (10.0, 14.0, -1.0, 1.0)
+"""First and last x, first and last y of an instance in front of the ego, metres."""
+
+
+def lines_in(ax: Any, color: str, *, dashed: bool | None = None) -> list[Any]:
+    """The lines (V, 2) of a colour, without casings, which are not opaque."""
+    found = []
+    for each in ax.collections:
+        if isinstance(each, LineCollection):
+            lines = each.get_segments()
+            colors = np.broadcast_to(each.get_colors(), (len(lines), 4))
+            style_fits = dashed in (None, each.get_linestyle()[0][1] is not None)
+            found += [
+                line
+                for line, own in zip(lines, colors, strict=True)
+                if style_fits and np.allclose(own, to_rgba(color), atol=1e-3)
+            ]
+    return found
+
+
+def gaps(places: Any, lines: Sequence[Any]) -> Any:
+    """Pixels from each of some places (N, 2) to the nearest corner of lines."""
+    corners = np.concatenate([*lines, np.full((1, 2), np.inf)])
+    return np.linalg.norm(places[:, None] - corners, axis=-1).min(axis=1)
+
+
+def on_the_ground(dataset: DeepAccident, sample: str, channel: str, places: Any, ground: float = 0.0) -> Any:
+    """Points (N, 3) of the optical frame of places (N, 2) of the ego frame."""
+    points = np.column_stack([places, np.full(len(places), ground)])
+    return dataset.ego_from(sample, channel).inverse().apply(points)
+
+
+def perfect(dataset: DeepAccident, sample: str) -> DetectedBoxes:
+    truth = detection_truth(dataset, sample, "released")
+    return DetectedBoxes(boxes=truth, scores=np.ones(len(truth)))
+
+
+def blocks(labels: MotionLabels, *frames: tuple[float, float, float, float]) -> MotionOutput:
+    """An instance whose cells fill a rectangle in each frame: first and last x, first and last y, metres."""
+    grid = labels.config.grid.with_orientation("devkit")
+    instance = np.zeros((len(labels.instance), *grid.shape), dtype=np.int32)
+    for cells, (first_x, last_x, first_y, last_y) in zip(instance, frames, strict=False):
+        columns = slice(*(round((x - grid.x[0]) / grid.x[2]) for x in (first_x, last_x)))
+        cells[slice(*(round((y - grid.y[0]) / grid.y[2]) for y in (first_y, last_y))), columns] = 1
+    return instances_of(instance, grid)
+
+
+def corners_of(rectangle: tuple[float, float, float, float]) -> Any:
+    first_x, last_x, first_y, last_y = rectangle
+    return np.array([(x, y) for x in (first_x, last_x) for y in (first_y, last_y)])
+
+
+def test_detected_boxes_are_where_the_labels_have_them(da: DeepAccident, approach: str) -> None:
+    given = perfect(da, approach)
+    verdict: Any = sample_verdict(da, approach, given)
+    counted = given.boxes.actor_id[verdict.matches.truth]
+    counted = counted[counted != OWN_ACTOR_ID]
+    seen = 0
+    for channel in CAMERAS:
+        ax = draw_outcome_in_camera(da, verdict, channel, ax=new_axes((4, 2.5)))
+        lens = camera_of(da, f"{approach}/{channel}")
+        boxes = da.boxes(approach, channel)
+        corners = boxes.corners()[np.isin(boxes.actor_id, counted)].reshape(-1, 3)
+        pixels, depth = lens.project(corners[corners[:, 2] > NEAREST_DRAWN])
+        for color in (OUTCOME_COLORS["right"], "black"):
+            assert gaps(pixels, lines_in(ax, color, dashed=False)).max(initial=0) < 1e-6
+        assert not lines_in(ax, OUTCOME_COLORS["false"]) + lines_in(ax, OUTCOME_COLORS["missed"])
+        inside = pixels[lens.in_image(pixels, depth, min_depth=NEAREST_DRAWN, margin=2)]
+        seen += len(inside)
+        if channel == "Camera_Front":
+            picture = rendered(ax)
+            assert all(has_color(picture, place, OUTCOME_COLORS["right"]) for place in on_canvas(ax, inside))
+    assert seen > 20
+
+
+def test_a_shifted_box_is_false_and_the_true_one_missed(da: DeepAccident, approach: str) -> None:
+    given = perfect(da, approach)
+    verdict: Any = sample_verdict(da, approach, given)
+    to_camera = da.world_from(approach, "Camera_Front").inverse() @ da.world_from(approach, given.boxes.frame)
+    depth = to_camera.apply(given.boxes.center)[:, 2]
+    row = min((each for each in verdict.matches.truth.tolist() if depth[each] > 5), key=lambda each: depth[each])
+    center = given.boxes.center.copy()
+    center[row] += (0.0, 0.0, 30.0)
+    center[row, :2] *= 0.5
+    moved = DetectedBoxes(boxes=replace(given.boxes, center=center), scores=given.scores)
+    ax = draw_outcome_in_camera(da, sample_verdict(da, approach, moved), "Camera_Front", ax=new_axes())
+    lens = camera_of(da, f"{approach}/Camera_Front")
+    shown = {
+        kind: lens.project(boxes.select([row]).transform(to_camera, "Camera_Front").corners()[0])[0]
+        for kind, boxes in (("false", moved.boxes), ("missed", given.boxes))
+    }
+    for kind, corners in shown.items():
+        lines = lines_in(ax, OUTCOME_COLORS[kind], dashed=kind == "missed")
+        assert len(lines) == 12
+        assert gaps(corners, lines).max() < 1e-6
+    for color in (OUTCOME_COLORS["right"], "black"):
+        assert gaps(shown["missed"], lines_in(ax, color)).max() > 0.1
+
+
+def test_the_box_around_the_cameras_is_left_out(da: DeepAccident, approach: str) -> None:
+    given = perfect(da, approach)
+    own = given.boxes.actor_id == OWN_ACTOR_ID
+    boxes = replace(given.boxes, size=np.where(own[:, None], 2 * given.boxes.size, given.boxes.size))
+    detected = DetectedBoxes(boxes=boxes, scores=given.scores)
+    nothing = DetectedBoxes(boxes=boxes.select([]), scores=given.scores[:0])
+    verdicts: list[Any] = [sample_verdict(da, approach, each) for each in (given, nothing)]
+    assert OWN_ACTOR_ID in boxes.actor_id[verdicts[0].matches.truth]
+    assert OWN_ACTOR_ID in boxes.actor_id[verdicts[1].matches.missed]
+    to_camera = da.world_from(approach, "Camera_Front").inverse() @ da.world_from(approach, boxes.frame)
+    corners = boxes.select(own).transform(to_camera, "Camera_Front").corners()[0]
+    pixels, _ = camera_of(da, f"{approach}/Camera_Front").project(corners[corners[:, 2] > NEAREST_DRAWN])
+    assert len(pixels) == 4
+    for verdict, shown in zip(verdicts, (detected, nothing), strict=True):
+        long = replace(verdict, truth=boxes, detected=shown)
+        ax = draw_outcome_in_camera(da, long, "Camera_Front", ax=new_axes())
+        lines = [line for color in ("black", *OUTCOME_COLORS.values()) for line in lines_in(ax, color)]
+        assert len(lines) >= 12
+        assert gaps(pixels, lines).min() > 0.1
+
+
+def test_the_nearest_detections_are_on_top(da: DeepAccident, approach: str) -> None:
+    ax = draw_outcome_in_camera(da, sample_verdict(da, approach, perfect(da, approach)), "Camera_Front", ax=new_axes())
+    boxes = da.boxes(approach, "Camera_Front")
+    pixels, _ = camera_of(da, f"{approach}/Camera_Front").project(boxes.corners().reshape(-1, 3))
+    first = np.array([line[0] for line in lines_in(ax, OUTCOME_COLORS["right"])])
+    apart = np.linalg.norm(first[:, None] - np.nan_to_num(pixels, nan=np.inf), axis=-1)
+    depth = boxes.center[apart.argmin(axis=1)[apart.min(axis=1) < 1e-6] // 8, 2]
+    assert len(np.unique(depth)) > 2
+    assert (np.diff(depth) < 1e-9).all()
+
+
+def test_cells_are_polygons_on_the_ground(da_motion: DeepAccident, sample: str, labels: MotionLabels) -> None:
+    verdict = sample_verdict(da_motion, sample, blocks(labels, AHEAD, AHEAD, (20.0, 22.0, 3.0, 4.0)), label=labels)
+    lens = camera_of(da_motion, f"{sample}/Camera_Front")
+    for frame, rectangle in ((None, AHEAD), (0, AHEAD), (2, (20.0, 22.0, 3.0, 4.0))):
+        ax = draw_outcome_in_camera(da_motion, verdict, "Camera_Front", frame=frame, ax=new_axes())
+        (line,) = lines_in(ax, OUTCOME_COLORS["false"], dashed=False)
+        corners, _ = lens.project(on_the_ground(da_motion, sample, "Camera_Front", corners_of(rectangle)))
+        assert gaps(corners, [line]).max() < 1e-6
+        assert_allclose(np.sort(np.unique(line.round(6), axis=0)[:, 1])[[0, -1]], np.sort(corners[:, 1])[[0, -1]])
+        (filled,) = [
+            each
+            for each in ax.collections
+            if isinstance(each, PolyCollection)
+            and len(each.get_paths())
+            and to_hex(each.get_facecolor()[0]) == OUTCOME_COLORS["false"]
+        ]
+        assert filled.get_paths()[0].contains_point(corners.mean(axis=0))
+        assert not lines_in(ax, OUTCOME_COLORS["right"])
+
+
+def test_cells_behind_the_camera_are_cut_off(da_motion: DeepAccident, sample: str, labels: MotionLabels) -> None:
+    around = (-5.0, 12.0, -1.0, 1.0)
+    verdict = sample_verdict(da_motion, sample, blocks(labels, around, around), label=labels)
+    lens = camera_of(da_motion, f"{sample}/Camera_Front")
+    ax = draw_outcome_in_camera(da_motion, verdict, "Camera_Front", ax=new_axes())
+    (line,) = lines_in(ax, OUTCOME_COLORS["false"])
+    assert np.isfinite(line).all()
+    optical = on_the_ground(da_motion, sample, "Camera_Front", corners_of(around))
+    near, far = optical[:2], optical[2:]
+    assert (near[:, 2] < 0).all()
+    share = (NEAREST_DRAWN - near[:, 2]) / (far[:, 2] - near[:, 2])
+    cut = near + share[:, None] * (far - near)
+    pixels, depth = lens.project(np.concatenate([cut, far]))
+    assert_allclose(depth[:2], NEAREST_DRAWN)
+    assert gaps(pixels, [line]).max() < 1e-6
+    assert pixels[:2, 1].min() > 5 * lens.height
+    back = draw_outcome_in_camera(da_motion, verdict, "Camera_Back", ax=new_axes())
+    assert len(lines_in(back, OUTCOME_COLORS["false"])) == 1
+    behind = sample_verdict(da_motion, sample, blocks(labels, (-14.0, -10.0, -1.0, 1.0)), label=labels)
+    assert not lines_in(
+        draw_outcome_in_camera(da_motion, behind, "Camera_Front", ax=new_axes()), OUTCOME_COLORS["false"]
+    )
+
+
+def test_missed_instances_are_dashed_around_their_cells(
+    da_motion: DeepAccident, sample: str, labels: MotionLabels
+) -> None:
+    nothing = instances_of(np.zeros_like(labels.instance), labels.config.grid)
+    half = labels.config.grid.x[2] / 2
+    steps = half * np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)])
+    verdict, checked = sample_verdict(da_motion, sample, nothing), 0
+    for channel, frame in (("Camera_Front", 0), ("Camera_Back", 0), ("Camera_Back", 2)):
+        ax = draw_outcome_in_camera(da_motion, verdict, channel, frame=frame, ax=new_axes())
+        lines = lines_in(ax, OUTCOME_COLORS["missed"], dashed=True)
+        bounds = np.array([[line.min(axis=0), line.max(axis=0)] for line in lines])
+        assert not lines_in(ax, OUTCOME_COLORS["right"]) + lines_in(ax, OUTCOME_COLORS["false"])
+        for identity in range(1, int(labels.instance[frame].max()) + 1):
+            cells = labels.config.grid.centers()[labels.instance[frame] == identity]
+            optical = on_the_ground(da_motion, sample, channel, (cells[:, None] + steps).reshape(-1, 2))
+            if len(cells) and (optical[:, 2] > NEAREST_DRAWN).all():
+                pixels, _ = camera_of(da_motion, f"{sample}/{channel}").project(optical)
+                expected = np.array([pixels.min(axis=0), pixels.max(axis=0)])
+                assert np.abs(bounds - expected).max(axis=(1, 2)).min() < 1e-6
+                checked += 1
+    assert checked > 5
+
+
+def test_instances_are_judged_frame_by_frame(da_motion: DeepAccident, sample: str, labels: MotionLabels) -> None:
+    shown = labels.instance.copy()
+    shown[1:] = 0  # exact now, and nothing later
+    verdict = sample_verdict(da_motion, sample, instances_of(shown, labels.config.grid), label=labels)
+    for frame, kinds in ((0, ["right"]), (2, ["missed"])):
+        ax = draw_outcome_in_camera(da_motion, verdict, "Camera_Back", frame=frame, ax=new_axes())
+        assert [kind for kind, color in OUTCOME_COLORS.items() if lines_in(ax, color)] == kinds
+
+
+def test_instances_beyond_the_range_are_left_out(da_motion: DeepAccident, sample: str, labels: MotionLabels) -> None:
+    rules = replace(MotionEvaluator("released").protocol, ranges=(30.0,))
+    far = (20.0, 22.0, 3.0, 4.0)
+    count = {}
+    for protocol in ("released", rules):
+        verdict = sample_verdict(da_motion, sample, blocks(labels, far), protocol=protocol, label=labels)
+        ax = draw_outcome_in_camera(da_motion, verdict, "Camera_Front", ax=new_axes())
+        count[protocol == "released"] = len(lines_in(ax, OUTCOME_COLORS["false"]))
+    assert count == {True: 1, False: 0}
+
+
+@pytest.mark.parametrize(("agent", "ground"), [("ego_vehicle", 0.0), ("infrastructure", -4.0)])
+def test_places_of_accidents_are_on_the_ground(da: DeepAccident, approach: str, agent: str, ground: float) -> None:
+    sample = approach.replace("ego_vehicle", agent)
+    boxes = da.boxes(sample, "ego")
+    road = np.median(boxes.bottom_corners()[..., 2])
+    assert abs(road - ground) < 0.7
+    true = Accident(positions=np.array([[15.0, 2.0], [18.0, -1.0]]), time=1.5)
+    alarm = Accident(positions=np.array([[14.0, 3.0], [17.0, 0.0]]), time=1.2, score=0.8)
+    compared = ComparedAccidents(true=true, predicted=(alarm,))
+    verdict = AccidentVerdict(sample=sample, compared=compared, truth=None, words="")
+    ax = draw_outcome_in_camera(da, verdict, "Camera_Front", ax=new_axes((8, 4.5)))
+    assert [text.get_text() for text in ax.texts] == ["in 1.5 s", "in 1.2 s, score 0.8"]
+    lens, ego_from_camera = camera_of(da, f"{sample}/Camera_Front"), da.ego_from(sample, "Camera_Front")
+
+    def grounded(pixels: Any) -> Any:
+        """Where rays through pixels meet the ground, in the ego frame."""
+        rays = ego_from_camera.apply(lens.unproject(pixels, np.ones(len(pixels)))) - ego_from_camera.translation
+        share = (ground - ego_from_camera.translation[2]) / rays[:, 2]
+        return (ego_from_camera.translation + share[:, None] * rays)[:, :2]
+
+    lines = lines_in(ax, COLLIDER_COLOR)
+    rings = [grounded(line) for line in lines if len(line) > 4]
+    assert len(rings) == 2
+    for ring, place in zip(rings, true.positions, strict=True):
+        assert_allclose(np.linalg.norm(ring - place, axis=1), 1.0)
+        assert_allclose(ring.min(axis=0), place - 1)
+    joined = [grounded(line) for line in lines if len(line) == 2 and abs(line[0, 0] - line[1, 0]) > 0.5]
+    assert_allclose(joined[0], true.positions)
+    crosses = [grounded(line) for line in lines_in(ax, FORESEEN_COLOR) if len(line) == 2][-4:]
+    assert_allclose([arm.mean(axis=0) for arm in crosses], np.repeat(alarm.positions, 2, axis=0), atol=1e-9)
+    assert_allclose([np.linalg.norm(np.diff(arm, axis=0)) for arm in crosses], 2.0)
+    tops = on_the_ground(da, sample, "Camera_Front", alarm.positions, ground + 1.5)
+    assert gaps(lens.project(tops)[0], lines_in(ax, FORESEEN_COLOR)).max() < 1e-6
+
+
+def test_words_stand_between_the_places_that_are_seen(da: DeepAccident, approach: str) -> None:
+    alarm = Accident(positions=np.array([[15.0, 2.0], [4.0, 25.0]]), time=1.2, score=0.8)
+    beside = Accident(positions=np.array([[-15.0, 2.0], [-18.0, -1.0]]), time=0.7, score=0.3)
+    compared = ComparedAccidents(true=None, predicted=(alarm, beside))
+    verdict = AccidentVerdict(sample=approach, compared=compared, truth=None, words="")
+    front = draw_outcome_in_camera(da, verdict, "Camera_Front", ax=new_axes((8, 4.5)))
+    (text,) = front.texts
+    assert text.get_text() == "in 1.2 s, score 0.8"
+    places = on_the_ground(da, approach, "Camera_Front", alarm.positions[:1])
+    assert_allclose(text.xy, camera_of(da, f"{approach}/Camera_Front").project(places)[0][0])
+    back = draw_outcome_in_camera(da, verdict, "Camera_Back", ax=new_axes((8, 4.5)))
+    assert [each.get_text() for each in back.texts] == ["in 0.7 s, score 0.3"]
+    for ax in (front, back):
+        rendered(ax)
+        assert all(each.get_visible() for each in ax.texts)
+
+
+def predictions(dataset: DeepAccident, token: str, labels: MotionLabels) -> list[tuple[Any, dict[str, Any]]]:
+    accident = box_truth(dataset, token).accident
+    assert accident is not None
+    near = Accident(positions=accident.positions + 1.5, time=accident.time, score=0.9)
+    motion = instances_of(np.roll(labels.instance, 2, axis=-1), labels.config.grid)
+    return [
+        (perfect(dataset, token), {}),
+        ([near], {}),
+        ([], {}),
+        (motion, {}),
+        (motion, {"task": "accident", "protocol": "boxes"}),
+        (motion, {"label": labels}),
+    ]
+
+
+@pytest.mark.slow
+def test_the_verdict_is_that_of_the_views_from_above(
+    da_motion: DeepAccident, sample: str, labels: MotionLabels
+) -> None:
+    for given, how in predictions(da_motion, sample, labels):
+        beside = render_evaluation(da_motion, sample, given, fig=detached_figure((12, 7)), **how)
+        over = render_outcome_in_cameras(da_motion, sample, given, fig=detached_figure((15, 7)), **how)
+        assert title_of(over) == title_of(beside)
+        assert [ax.get_title() for ax in over.axes] == IN_ORDER
+
+
+def test_frames_and_legends_are_named(da_motion: DeepAccident, sample: str, labels: MotionLabels) -> None:
+    later = render_outcome_in_cameras(
+        da_motion,
+        sample,
+        blocks(labels, AHEAD, AHEAD, AHEAD),
+        label=labels,
+        frame=2,
+        cameras=["Camera_Front"],
+        fig=detached_figure((8, 6)),
+    )
+    assert "ego vehicle, instances in 1.0 s 30x30 m: IoU" in title_of(later)
+    assert [text.get_text() for text in later.legends[0].texts] == ["right", "false", "missed"]
+    boxes = render_outcome_in_cameras(
+        da_motion, sample, perfect(da_motion, sample), cameras=["Camera_Front"], fig=detached_figure((8, 6))
+    )
+    assert "detection: mean average precision of this sample" in title_of(boxes)
+    assert [text.get_text() for text in boxes.legends[0].texts][-1] == "true box of a detection"
+    alarms = render_outcome_in_cameras(da_motion, sample, [], cameras="Camera_Front", fig=detached_figure((8, 6)))
+    assert title_of(alarms).endswith("accident: 5 m: FN, 10 m: FN, 15 m: FN")
+    assert [text.get_text() for text in alarms.legends[0].texts] == ["accident to come", "foreseen"]
+
+
+def test_cameras_are_in_the_order_of_all_pictures(da: DeepAccident, approach: str) -> None:
+    chosen = ["Camera_Back", "Camera_BackLeft", "Camera_Front", "Camera_FrontLeft"]
+    figure = render_outcome_in_cameras(da, approach, [], cameras=chosen)
+    shown = [ax for ax in figure.axes if ax.axison]
+    assert [ax.get_title() for ax in shown] == ["Camera_FrontLeft", "Camera_Front", "Camera_BackLeft", "Camera_Back"]
+    assert [len(ax.images) for ax in figure.axes] == [1, 1, 1, 1, 0, 0]
+    assert [ax.get_subplotspec().get_geometry()[:2] for ax in shown] == [(2, 3)] * 4
+    assert len(render_outcome_in_cameras(da, approach, [], cameras=["Camera_Back", "Camera_Front"]).axes) == 2
+    plt.close("all")
+
+
+def test_a_missing_image_is_a_grey_panel_with_the_prediction(da_partial: DeepAccident, approach: str) -> None:
+    given = perfect(da_partial, approach)
+    figure = render_outcome_in_cameras(
+        da_partial, approach, given, cameras=["Camera_Front", "Camera_Back"], fig=detached_figure((10, 4))
+    )
+    front, back = figure.axes
+    assert (len(front.images), len(back.images)) == (0, 1)
+    assert to_hex(front.get_facecolor()) == MISSING_COLOR
+    assert "Camera_Front:\nnot downloaded" in words(front)
+    assert len(lines_in(front, OUTCOME_COLORS["right"])) >= 12
+
+
+def test_what_cannot_be_rendered_is_named(da_motion: DeepAccident, sample: str, labels: MotionLabels) -> None:
+    with pytest.raises(ChoiceError, match=r"cameras: expected one of .*, found 'Camera_Top'"):
+        render_outcome_in_cameras(da_motion, sample, [], cameras=["Camera_Top"])
+    with pytest.raises(ChoiceError, match=r"cameras: expected some of Camera_Front, .*, found none"):
+        render_outcome_in_cameras(da_motion, sample, [], cameras=[])
+    with pytest.raises(ChoiceError, match="frame: only motion has frames, found 1; leave it out"):
+        render_outcome_in_cameras(da_motion, sample, [], frame=1)
+    with pytest.raises(ChoiceError, match="task of this prediction: expected one of accident, found 'motion'"):
+        render_outcome_in_cameras(da_motion, sample, [], task="motion")
+    with pytest.raises(EvaluationError, match="the released protocol compares motion"):
+        render_outcome_in_cameras(da_motion, sample, [], protocol="released")
+    with pytest.raises(TokenError, match="table 'sample' has no token"):
+        render_outcome_in_cameras(da_motion, f"{sample}0", [])
+    verdict = sample_verdict(da_motion, sample, blocks(labels, AHEAD), label=labels)
+    last = int(labels.label_valid.sum()) - 1
+    for frame in (-1, last + 1):
+        with pytest.raises(ChoiceError, match=f"frame: expected a recorded one, from 0 to {last}, found {frame}"):
+            draw_outcome_in_camera(da_motion, verdict, "Camera_Front", frame=frame, ax=new_axes())
+    with pytest.raises(ChoiceError, match=r"camera: expected one of .*, found 'lidar01'"):
+        draw_outcome_in_camera(da_motion, verdict, "lidar01", ax=new_axes())
+    assert plt.get_fignums() == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("where", [None, "paper", "slide"])
+def test_words_are_in_the_picture_and_apart(
+    da_motion: DeepAccident, sample: str, labels: MotionLabels, where: Any
+) -> None:
+    with style(where) if where else nullcontext():
+        for given, how in predictions(da_motion, sample, labels):
+            assert text_faults(render_outcome_in_cameras(da_motion, sample, given, **how)) == []
+        assert text_faults(render_outcome_in_cameras(da_motion, sample, [], cameras=["Camera_Front"])) == []
