@@ -23,6 +23,7 @@ NAMES = (
     "loader",
     "engine",
     "stores",
+    "explore",
 )
 
 
@@ -31,7 +32,7 @@ NAMES = (
 @click.option("--json", "as_json", is_flag=True, help="One flat JSON object (name: number) and nothing else.")
 def main(names: tuple[str, ...], as_json: bool) -> None:  # noqa: FBT001 - click's flag
     """Measure the devkit; NAME is one of parsing, indexing, scale, validation, geometry, labels, evaluation,
-    coverage, safety, render, synth, export, loader, engine, stores.
+    coverage, safety, render, synth, export, loader, engine, stores, explore.
     """
     figures = []
     for name in names or NAMES:

@@ -23,7 +23,18 @@ from deepaccident_devkit.tables.indexing import table_file_states
 from deepaccident_devkit.tables.manifest import SCHEMA_VERSION, Manifest, write_manifest
 from deepaccident_devkit.tables.scan import ScenarioScan, folder_digest
 from deepaccident_devkit.tables.shards import ShardState, join_tables, write_shard
-from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, OWN_ACTOR_ID
+from deepaccident_devkit.taxonomy import (
+    AGENTS,
+    CAMERAS,
+    DIRECTIONS,
+    OWN_ACTOR_ID,
+    ROAD_TYPES,
+    SPAWN_SIDES,
+    SPLITS,
+    TIMES_OF_DAY,
+    TOWNS,
+    WEATHERS,
+)
 
 SCENARIOS, FRAMES, BOXES = 691, 83, 30
 FIRST_ID = 1000
@@ -117,20 +128,20 @@ def write_whole_release(root: Path) -> Path:
     files = one_scenario()
     tables = scenario_rows(files)
     for number in range(SCENARIOS):
-        name = f"Town03_type001_subtype0001_scenario{number:05d}"
+        town = TOWNS[number % len(TOWNS)]
+        name = f"{town}_type001_subtype0001_scenario{number:05d}"
         scenario = ScenarioFolder(root, "", "type1_subtype1_accident", name, AGENTS)
         for agent in AGENTS:
             for kind in ("calib", "label"):
                 scenario.kind_folder(agent, kind).mkdir(parents=True)
         write_meta(scenario.meta_path, META)
         shard = index / "shards" / f"{number}.arrow"
-        write_shard(
-            shard, {**tables, "scenario": {**tables["scenario"], "name": [name]}}, ShardState(times="", contents="")
-        )
+        story = {**tables["scenario"], "name": [name], "town": [town], **told(number)}
+        write_shard(shard, {**tables, "scenario": story}, ShardState(times="", contents=""))
         shards.append(shard)
     folder = index / "tables-scale"
     folder.mkdir()
-    join_tables(folder, shards, ["train"] * SCENARIOS)
+    join_tables(folder, shards, [SPLITS[number % len(SPLITS)] for number in range(SCENARIOS)])
     layout = find_release(root)
     fingerprint = folder_digest(layout.scenarios, layout.split_files.values())
     manifest = Manifest(
@@ -143,10 +154,30 @@ def write_whole_release(root: Path) -> Path:
     return root
 
 
+def told(number: int) -> dict[str, list[object]]:
+    """What the meta of a scenario tells, as varied as a real release."""
+    values = {
+        "weather": WEATHERS,
+        "road_type": ROAD_TYPES,
+        "spawn_side": SPAWN_SIDES,
+        "ego_direction": DIRECTIONS,
+        "other_direction": DIRECTIONS,
+        "time_of_day": range(len(TIMES_OF_DAY)),
+        "signalized": (True, False),
+        "accident_type": range(1, 13),
+    }
+    return {
+        name: [possible[number // (place + 1) % len(possible)]] for place, (name, possible) in enumerate(values.items())
+    }
+
+
 def one_scenario() -> ScenarioFiles:
-    """The contents of one scenario's files: 83 frames, 30 boxes a sample, random values."""
+    """The contents of one scenario's files: 83 frames, 30 boxes a sample that drive straight on, random values."""
     source = np.random.default_rng(0)
     samples = len(AGENTS) * FRAMES
+    poses = [SE3.from_yaw(0.01 * n, (n, 2.0, 0.0)) for n in range(FRAMES)]
+    start, speed = source.normal(size=(BOXES, 3)) * (40, 40, 0.1), source.normal(size=(BOXES, 3)) * (5, 5, 0)
+    driven = [pose.inverse().apply(start + speed * frame / 10) for frame, pose in enumerate(poses)]
     count = samples * BOXES
     agent_of_box = np.repeat(np.arange(len(AGENTS)), FRAMES * BOXES)
     actor = np.tile(np.arange(BOXES), samples)
@@ -155,7 +186,7 @@ def one_scenario() -> ScenarioFiles:
         num_boxes=np.full(samples, BOXES),
         agent_velocity=source.normal(size=(samples, 2)),
         category=source.integers(0, 6, count).astype(np.int8),
-        center=source.normal(size=(count, 3)) * 30,
+        center=np.tile(np.concatenate(driven), (len(AGENTS), 1)),
         size=source.uniform(0.3, 5, size=(count, 3)),
         yaw=source.uniform(-3, 3, count),
         velocity=source.normal(size=(count, 2)),
@@ -166,7 +197,7 @@ def one_scenario() -> ScenarioFiles:
     intrinsic = np.array([[1142.5, 0, 800], [0, 1142.5, 450], [0, 0, 1]])
     calibs = Calibs(
         ego_from_lidar=np.tile(np.eye(4), (samples, 1, 1)),
-        world_from_ego=np.array([SE3.from_yaw(0.01 * n, (n, 2.0, 0.0)).matrix for n in range(samples)]),
+        world_from_ego=np.tile(np.array([pose.matrix for pose in poses]), (len(AGENTS), 1, 1)),
         camera_from_lidar=np.tile(np.eye(4), (samples, len(CAMERAS), 1, 1)),
         intrinsic=np.tile(intrinsic, (samples, len(CAMERAS), 1, 1)),
     )

@@ -15,7 +15,7 @@ import re
 import shutil
 import tempfile
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache, lru_cache
 from pathlib import Path
@@ -34,6 +34,7 @@ _TEMPORARY: Final = re.compile(
 )
 """A temporary name. Earlier versions wrote `.NAME.PROCESS.tmp`; a library may add the suffix that it writes by."""
 _NUMBERS: Final = itertools.count()
+_PLAIN_LENGTH: Final = 120
 _NAME_LENGTH: Final = 50
 """Characters of the final name that a temporary name has: names of files end at 255 bytes."""
 _ABANDONED_AFTER: Final = 24 * 3600.0
@@ -220,6 +221,26 @@ def write_bytes(path: Path, content: bytes) -> None:
     """Write `content` to `path` atomically, making its folder where needed."""
     with replacing(path) as temporary:
         temporary.write_bytes(content)
+
+
+def plain_names(names: Iterable[str], taken: Iterable[str] = ()) -> dict[str, str]:
+    """Name → the name of a file or folder of its own: letters, digits, `_`, `-` and `.` alone, on any file system.
+
+    Args:
+        names: such as tokens.
+        taken: names of files that none of them gets.
+    """
+    used = {name.lower() for name in taken}
+    plain: dict[str, str] = {}
+    for name in names:
+        short = re.sub(r"[^A-Za-z0-9_.-]", "_", name)[:_PLAIN_LENGTH]
+        short = short if short.strip(".") else f"_{short}"
+        chosen, number = short, 2
+        while chosen.lower() in used:
+            chosen, number = f"{short}_{number}", number + 1
+        used.add(chosen.lower())
+        plain[name] = chosen
+    return plain
 
 
 def is_writable_folder(path: Path) -> bool:

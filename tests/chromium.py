@@ -2,6 +2,7 @@
 
 import base64
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +22,13 @@ class Browser:
     def __init__(self, driver: Any) -> None:
         self.driver = driver
 
-    def open(self, page: Path, width: int) -> None:
-        """Open a file in a window of a width, in pixels, as on a screen of that size."""
-        size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
+    def open(self, page: Path | str, width: int, height: int = 900) -> None:
+        """Open a file or an address in a window of a width and height, in pixels, as on a screen of that size."""
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
         for kind in ("browser", "performance"):
             self.driver.get_log(kind)  # what came before is not this page's
-        self.driver.get(page.resolve().as_uri())
+        self.driver.get(page if isinstance(page, str) else page.resolve().as_uri())
 
     def complaints(self) -> list[str]:
         """What the console says since the page was opened, warnings too."""
@@ -45,6 +46,20 @@ class Browser:
     def script(self, code: str) -> Any:
         """What JavaScript returns."""
         return self.driver.execute_script(code)
+
+    def wait(self, condition: str, seconds: float = 20.0) -> Any:
+        """What a JavaScript expression gives as soon as that is true; fails if it never is."""
+        end = time.monotonic() + seconds
+        while not (found := self.script(f"return {condition}")):
+            assert time.monotonic() < end, f"waited in vain for {condition}"
+            time.sleep(0.05)
+        return found
+
+    def press(self, *keys: str) -> None:
+        """Press keys, one after the other, where the focus is."""
+        from selenium.webdriver import ActionChains
+
+        ActionChains(self.driver).send_keys(*keys).perform()
 
     def overflowing(self) -> list[str]:
         """Elements that reach beyond the right edge, outside of boxes that scroll (class `wide`)."""

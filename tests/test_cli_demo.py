@@ -54,15 +54,18 @@ def test_the_page_shows_all_that_was_made(made_demo: tuple[Path, str]) -> None:
 
 
 @pytest.mark.slow
-def test_the_next_steps_run_as_they_are_printed(made_demo: tuple[Path, str]) -> None:
+def test_the_next_steps_run_as_they_are_printed(made_demo: tuple[Path, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    served: list[object] = []
+    monkeypatch.setattr("deepaccident_devkit.explore.serving.serve", lambda app, **_: served.append(app))
     out, printed = made_demo
     assert printed.rstrip().endswith(str(out / "index.html"))
     commands = re.findall(r"^ +deepaccident (.+)$", printed, re.MULTILINE)
-    assert len(commands) == 5
+    assert len(commands) == 6
     page = page_of(out / "index.html").text
     for command in commands:
         assert f"deepaccident {command}" in page
         run(*shlex.split(command))
+    assert len(served) == 1
 
 
 @pytest.mark.slow

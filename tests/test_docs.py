@@ -86,6 +86,7 @@ NOT_RUN = {
     "labels explain": "tests/unit/motion/test_explaining.py has it; this sample is of the demo",
     "results from": "tests/unit/export/test_nuscenes_detections.py has it, and makes the file",
     "export mcap": "tests/unit/export has it, which has the extra",
+    "explore ": "tests/browser/test_explore.py has it; it runs until Ctrl-C",
 }
 """Command lines of pages that begin so are parsed alone, and why."""
 NO_CALLS = (

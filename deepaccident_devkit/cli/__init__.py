@@ -42,6 +42,7 @@ _VERBS = (
     "predict",
     "render",
     "replay",
+    "explore",
     "export",
 )
 

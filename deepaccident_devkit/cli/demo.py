@@ -89,7 +89,7 @@ def demo(out: Path, workers: int | None) -> None:
     """Make a small synthetic release in the folder OUT, and a page that shows what the devkit does with it.
 
     The release has an accident and its normal twin. The page OUT/index.html has pictures, motion labels, a table of
-    what one car and five agents predict, a replay, the report of an evaluation, and five next steps. Where PyTorch is
+    what one car and five agents predict, a replay, the report of an evaluation, and six next steps. Where PyTorch is
     installed, it also shows what a small trained model foresees.
 
     OUT must be missing, empty, or the folder of an earlier demo, which then keeps its release.
@@ -219,12 +219,16 @@ def _evaluate(release: DeepAccident, out: Path) -> None:
 
 
 def _next_steps(out: Path) -> tuple[NextStep, ...]:
-    root, five, scenario = (
-        shlex.quote(str(path)) for path in (out / "release", out / "five_agents", out / _SCENARIO_FILE)
+    root, five, scenario, results = (
+        shlex.quote(str(path)) for path in (out / "release", out / "five_agents", out / _SCENARIO_FILE, out / _RESULTS)
     )
     of_both = f"--split {_SELECTION.split} --scope {_SELECTION.scope}"
     return (
         NextStep("See what the release holds:", f"deepaccident info {root} --where collision=true"),
+        NextStep(
+            "Look around in it with your browser; this needs the extra: pip install '.[explore]'",
+            f"deepaccident explore {root} --results {results}",
+        ),
         NextStep("Check its files, as you would check your download:", f"deepaccident validate {root} --deep"),
         NextStep(
             "Let five agents predict together:",

@@ -84,7 +84,7 @@ def demo_page(rows: Sequence[HiddenCollider], steps: Sequence[NextStep], *, mode
         ("What one car and five agents foresee", _TABLE, table(heading, lines)),
         ("Replay", _REPLAY, _frame("Replay", REPLAY)),
         ("Report of an evaluation", _REPORT, _frame("Report", f"{REPORT_FOLDER}/report.html")),
-        ("Five next steps", f"Type these in the folder {Path.cwd()}.", _commands(steps)),
+        ("Six next steps", f"Type these in the folder {Path.cwd()}.", _commands(steps)),
     ]
     links = [tag("a", name, href=f"#{number}") for number, (name, _, _) in enumerate(parts)]
     return document(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -76,3 +77,10 @@ def write_figure(figure: Figure, path: Path, *, dpi: float, words: dict[str, Any
     with replacing(path) as temporary:
         settled(figure, passes=3).savefig(temporary, format=kind, dpi=dpi, metadata=_UNDATED.get(kind, words))
     return path
+
+
+def figure_png(figure: Figure, *, dpi: float) -> bytes:
+    """A figure from `detached_figure` as the bytes of a PNG file."""
+    written = io.BytesIO()
+    settled(figure, passes=3).savefig(written, format="png", dpi=dpi)
+    return written.getvalue()

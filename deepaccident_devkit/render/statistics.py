@@ -104,8 +104,8 @@ _FIGURES: Mapping[str, tuple[tuple[float, float], _Draw]] = {
     "motion": ((_WIDTH, 8), _motion),
     "collisions": ((_WIDTH, 5.2), _collisions),
 }
-STATISTICS_FIGURES: Final = tuple(_FIGURES)
-"""The groups that `render_statistics` renders."""
+STATISTICS_FIGURES: Final[Mapping[str, tuple[float, float]]] = {group: size for group, (size, _) in _FIGURES.items()}
+"""The groups that `render_statistics` renders → width and height of their figures in inches."""
 
 
 def render_statistics(statistics: DatasetStatistics, group: str, *, fig: Figure | None = None) -> Figure:

@@ -36,7 +36,11 @@ def render_town_map(dataset: Dataset, town: str, *, ax: Axes | None = None) -> A
         ChoiceError: the release has no recording in this town.
         NotAvailableError: the town has no readable file of a BEV camera.
     """
-    drawn, ax = town_map(dataset, town), axes_or_new(ax, (7, 7))
+    return draw_whole_map(town_map(dataset, town), axes_or_new(ax, (7, 7)))
+
+
+def draw_whole_map(drawn: TownMap, ax: Axes) -> Axes:
+    """Render a map as far as it reaches, in metres of the world, with a title."""
     left, right, bottom, top = drawn.extent
     words = axis_words("world")
     ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel=words[0], ylabel=words[1])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -14,7 +14,7 @@ from deepaccident_devkit.arrays import BoolArray, FloatArray
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.deprecations import warn_deprecated
 from deepaccident_devkit.errors import FieldError, NotAvailableError
-from deepaccident_devkit.interactions import InteractionPairs, interactions_of
+from deepaccident_devkit.interactions import InteractionPairs, Interactions, interactions_of
 from deepaccident_devkit.tables.columns import Choice, Column, Number, Struct
 from deepaccident_devkit.tables.specs import table_spec
 from deepaccident_devkit.text import possible_text
@@ -155,13 +155,19 @@ def _closing_speed(dataset: Dataset, scenario: ScenarioRecord) -> float | None:
     return None if contact is None or math.isnan(contact.closing_speed) else contact.closing_speed
 
 
-def _of_moving_pairs(name: str, measure: Callable[[InteractionPairs, BoolArray], float]) -> Field:
-    """A field that is a measure of a scenario's interactions, of the pairs each of which moves at some frame."""
+def measures_of_moving_pairs(found: Interactions) -> dict[str, float | None]:
+    """The fields that are measures of a scenario's interactions, of the pairs each of which moves at some frame."""
+    moving = found.pairs.moving
+    return {name: measure(found.pairs, moving) if found.labelled else None for name, measure in _MEASURES.items()}
+
+
+def _of_moving_pairs(name: str) -> Field:
+    """One of these fields."""
 
     def read_all(dataset: Dataset, scenarios: Sequence[ScenarioRecord]) -> Iterator[float | None]:
         progress = len(scenarios) >= _WORTH_A_BAR
         for found in interactions_of(dataset, scenarios, progress=progress):
-            yield measure(found.pairs, found.pairs.moving) if found.labelled else None
+            yield measures_of_moving_pairs(found)[name]
 
     def read(dataset: Dataset, scenario: ScenarioRecord) -> float | None:
         return next(read_all(dataset, [scenario]))
@@ -173,6 +179,12 @@ def _least(values: FloatArray) -> float:
     return float(values.min(initial=math.inf))
 
 
+_MEASURES: Final[Mapping[str, Callable[[InteractionPairs, BoolArray], float]]] = {
+    "min_ttc": lambda pairs, moving: _least(pairs.min_ttc[moving]),
+    "min_pet": lambda pairs, moving: _least(np.abs(pairs.pet[moving])),
+    "min_gap": lambda pairs, moving: _least(pairs.min_gap[moving]),
+    "max_drac": lambda pairs, moving: float(pairs.max_drac[moving].max(initial=0.0)),
+}
 _SHORT = {"type": "scenario_type", "length": "num_frames"}
 _RENAMED = {"visibility": "accident_visibility", "junction": "road_type"}
 _WORTH_A_BAR: Final = 32
@@ -213,10 +225,7 @@ _DERIVED = (
     ),
     Field("impact", "measure", _of_collision("impact")),
     Field("closing_speed", "measure", _closing_speed, costly=True),
-    _of_moving_pairs("min_ttc", lambda pairs, moving: _least(pairs.min_ttc[moving])),
-    _of_moving_pairs("min_pet", lambda pairs, moving: _least(np.abs(pairs.pet[moving]))),
-    _of_moving_pairs("min_gap", lambda pairs, moving: _least(pairs.min_gap[moving])),
-    _of_moving_pairs("max_drac", lambda pairs, moving: float(pairs.max_drac[moving].max(initial=0.0))),
+    *map(_of_moving_pairs, _MEASURES),
     Field("accident_visibility", "word", _accident_visibility, VISIBILITIES, costly=True),
 )
 FIELDS: Final = {

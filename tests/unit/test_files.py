@@ -16,6 +16,7 @@ from PIL import Image
 from processes import wait_for
 
 from deepaccident_devkit.files import (
+    plain_names,
     remove_leftovers,
     replacing,
     replacing_folder,
@@ -165,3 +166,13 @@ def test_a_folder_that_is_gone(tmp_path: Path) -> None:
     remove_leftovers(tmp_path)
     write_bytes(tmp_path / "file", b"whole")
     assert names(tmp_path) == ["file"]
+
+
+def test_plain_names_are_names_on_any_file_system() -> None:
+    names = plain_names(
+        ["a/b", "A_b", "a?b", "..", "", "x" * 300, f"{'x' * 300}y", "café"], taken=["INDEX.html", "a_b"]
+    )
+    assert len({name.lower() for name in names.values()} | {"index.html", "a_b"}) == 10
+    assert all(re.fullmatch(r"[A-Za-z0-9_.-]{1,140}", name) and name.strip(".") for name in names.values())
+    assert plain_names(["index.html"], taken=["INDEX.html"]) == {"index.html": "index.html_2"}
+    assert plain_names(["../../up"]) == {"../../up": ".._.._up"}

@@ -13,6 +13,8 @@ from typing import Any, Final
 
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import ResultsError
+from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
+from deepaccident_devkit.evaluation.results.header import check_token
 from deepaccident_devkit.evaluation.runs.checkpoints import remove_checkpoints
 from deepaccident_devkit.evaluation.runs.evaluation_run import SUMMARY_FORMAT, SUMMARY_VERSION, EvaluationRun
 from deepaccident_devkit.evaluation.runs.rows import sample_rows, write_rows
@@ -87,7 +89,7 @@ class Bundle(ShortRepr):
         Raises:
             ResultsError: a copy is not what it should be.
         """
-        return self._copy() or Path(self.summary["results"]["path"])
+        return self.results_copy() or Path(self.summary["results"]["path"])
 
     def outside_paths(self) -> dict[str, str]:
         """The paths in the summary that lead out of the bundle, and that `verify_bundle` opens only if it is told to.
@@ -99,7 +101,7 @@ class Bundle(ShortRepr):
             ResultsError: a copy of the results is not what it should be.
         """
         named = {"dataroot": self.dataroot}
-        if self._copy() is None:
+        if self.results_copy() is None:
             named["results"] = self.summary["results"]["path"]
         if self.summary["split"] not in (*SPLITS, *MINI_SPLITS):
             named["split"] = self.summary["split"]
@@ -115,8 +117,12 @@ class Bundle(ShortRepr):
         stored: dict[str, str] = self._checked(FILES_FILE, FILES_FORMAT, FILES)
         return stored
 
-    def _copy(self) -> Path | None:
-        """The bundle's copy of the results; raises ResultsError if it is not one, or has links or pipes in it."""
+    def results_copy(self) -> Path | None:
+        """The copy of the results in the bundle; None without one.
+
+        Raises:
+            ResultsError: it is not what it should be, or has links or pipes in it.
+        """
         copies = self.folder / RESULTS_FOLDER
         if not os.path.lexists(copies):
             return None
@@ -150,6 +156,20 @@ def read_bundle(folder: Path) -> Bundle:
     for misfit in misfits(summary, SUMMARY):
         raise ResultsError(f"{path}: does not say what was evaluated ({misfit}); {_REMEDY}")
     return Bundle(folder=folder, summary=summary)
+
+
+def counted(bundle: Bundle) -> Evaluator[Any]:
+    """A bundle's counts, of which a result can be computed; raises ResultsError or EvaluationError."""
+    path = own_file(bundle.folder / COUNTS_FILE)
+    evaluator = bundle.setup.evaluator().resume(path)
+    try:
+        for token in evaluator.tokens:
+            check_token(token)
+        evaluator.compute()
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        told = f"{type(error).__name__}: {shortened(str(error))}"
+        raise ResultsError(f"{path}: does not hold counts of its protocol ({told}); evaluate again") from error
+    return evaluator
 
 
 def own_file(path: Path) -> Path:

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from deepaccident_devkit.errors import EvaluationError, ResultsError
+from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.metrics.attributes import cluster_of
 from deepaccident_devkit.evaluation.metrics.evaluator import Evaluator
 from deepaccident_devkit.evaluation.metrics.intervals import Clusters
-from deepaccident_devkit.evaluation.results.header import check_token
-from deepaccident_devkit.evaluation.runs.bundles import COUNTS_FILE, Bundle, own_file, read_bundle
+from deepaccident_devkit.evaluation.runs.bundles import Bundle, counted, read_bundle
 from deepaccident_devkit.evaluation.runs.differences import differing
 from deepaccident_devkit.evaluation.runs.selection import scenario_of
 from deepaccident_devkit.reading import shortened
@@ -67,7 +66,7 @@ def comparable_pair(first: Path, second: Path, *, common: bool = False) -> Compa
     """
     one, other = read_bundle(first), read_bundle(second)
     _check_rules(one, other)
-    evaluators = _counted(one), _counted(other)
+    evaluators = counted(one), counted(other)
     tokens = _shared_tokens((one, other), evaluators, common=common)
     scenarios: dict[str, list[str]] = {}
     for token in tokens:
@@ -116,20 +115,6 @@ def _check_truth(one: Bundle, other: Bundle, scenarios: Mapping[str, object]) ->
             f"{one.folder} and {other.folder}: the label, meta or calib files of {len(changed)} scenarios are not the "
             f"same ({', '.join(_first(changed))}); evaluate both results with the same release"
         )
-
-
-def _counted(bundle: Bundle) -> Evaluator[Any]:
-    """The counts, of which a result can be computed; raises ResultsError or EvaluationError."""
-    path = own_file(bundle.folder / COUNTS_FILE)
-    evaluator = bundle.setup.evaluator().resume(path)
-    try:
-        for token in evaluator.tokens:
-            check_token(token)
-        evaluator.compute()
-    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        told = f"{type(error).__name__}: {shortened(str(error))}"
-        raise ResultsError(f"{path}: does not hold counts of its protocol ({told}); evaluate again") from error
-    return evaluator
 
 
 def _shared_tokens(

@@ -12,6 +12,7 @@ from deepaccident_devkit.render.replay.replay import (
     served_replay,
 )
 from deepaccident_devkit.render.replay.sensors import cloud_text
+from deepaccident_devkit.render.replay.tried import tried_replay
 
 __all__ = [
     "CONTROLS",
@@ -24,4 +25,5 @@ __all__ = [
     "replay_part",
     "script_json",
     "served_replay",
+    "tried_replay",
 ]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -13,14 +12,14 @@ from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import quote
 
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.errors import ChoiceError, NotAvailableError, SensorFileError
-from deepaccident_devkit.files import writable_folder, write_bytes
+from deepaccident_devkit.errors import ChoiceError
+from deepaccident_devkit.files import plain_names, writable_folder, write_bytes
 from deepaccident_devkit.parallel import Places, run_batch
 from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.render.axes import detached_figure
 from deepaccident_devkit.render.markup import chapters, document, picture, tag
 from deepaccident_devkit.render.pictures import write_figure
-from deepaccident_devkit.render.replay import render_replay
+from deepaccident_devkit.render.replay import tried_replay
 from deepaccident_devkit.render.safety import report_sections
 from deepaccident_devkit.render.safety.accident_table import accident_table, by_severity
 from deepaccident_devkit.render.safety.avoidability import AVOIDABILITY_SIZE, render_avoidability
@@ -38,7 +37,6 @@ REPORT_FILE: Final = "report.html"
 REPLAYS: Final = 10
 """Replay pages that are made if nobody says how many."""
 _DPI: Final = 150
-_NAME_LENGTH: Final = 120
 _TITLE: Final = "Accidents of DeepAccident: who saw them, and what would have avoided them"
 
 
@@ -139,14 +137,7 @@ def report_html(
 
 def replay_names(scenarios: Iterable[str]) -> dict[str, str]:
     """Scenario → path of its replay page, relative to the report: letters, digits, `_`, `-` and `.` alone."""
-    names: dict[str, str] = {}
-    for scenario in scenarios:
-        plain = re.sub(r"[^A-Za-z0-9_.-]", "_", scenario)[:_NAME_LENGTH]
-        name, number = f"replays/{plain}.html", 2
-        while name in names.values():
-            name, number = f"replays/{plain}_{number}.html", number + 1
-        names[scenario] = name
-    return names
+    return {scenario: f"replays/{name}.html" for scenario, name in plain_names(scenarios).items()}
 
 
 def _hardest(report: SafetyReport, count: int | None) -> list[str]:
@@ -163,11 +154,7 @@ def _make_replays(dataset: Dataset, folder: Path, names: Mapping[str, str], **ho
 
 def _make_replay(dataset: Dataset, folder: Path, named: tuple[str, str]) -> str | None:
     scenario, name = named
-    try:
-        render_replay(dataset, scenario, folder / name)
-    except (NotAvailableError, SensorFileError) as error:
-        return str(error)
-    return None
+    return tried_replay(dataset, scenario, folder / name)
 
 
 def _figures(report: SafetyReport) -> Iterator[_Drawn]:

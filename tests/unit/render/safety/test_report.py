@@ -13,6 +13,7 @@ from report_page import Page, page_of
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, SensorFileError
 from deepaccident_devkit.render.markup import source_hash
+from deepaccident_devkit.render.replay import tried
 from deepaccident_devkit.render.safety import report as report_module
 from deepaccident_devkit.render.safety import save_safety_report
 from deepaccident_devkit.render.safety.accident_table import by_severity
@@ -126,7 +127,7 @@ def test_the_hardest_have_replay_pages(
     pair = [{**each, "delta_v": 99.0} for each in accident["pair"]]
     both = (*renamed(report, mild).rows, *renamed(report, hard, accident={**accident, "pair": pair}).rows)
     made: list[str] = []
-    monkeypatch.setattr(report_module, "render_replay", lambda _dataset, scenario, _path: made.append(scenario))
+    monkeypatch.setattr(report_module, "tried_replay", lambda _dataset, scenario, _path: made.append(scenario))
     several = replace(report, rows=both)
     for count, expected in ((0, []), (1, [hard]), (2, [hard, mild]), (None, [hard, mild])):
         made.clear()
@@ -139,10 +140,10 @@ def test_the_hardest_have_replay_pages(
 def test_a_replay_page_that_cannot_be_made_is_named(
     report: SafetyReport, da_motion: DeepAccident, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    def fails(*_: object) -> None:
+    def fails(*_: object, **_how: object) -> None:
         raise SensorFileError("front.jpg: cannot be read")
 
-    monkeypatch.setattr(report_module, "render_replay", fails)
+    monkeypatch.setattr(tried, "render_replay", fails)
     page = page_of(save_safety_report(report, tmp_path, dataset=da_motion, workers=1)[-1])
     assert "replay pagesfront.jpg: cannot be read" in page.text
     assert all(str(each["href"]).startswith("#") for each in page.all("a"))

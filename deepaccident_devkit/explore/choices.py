@@ -1,0 +1,221 @@
+"""What a reader chose of the scenarios: in an address, as filters, as code; and the scenarios that it comes to."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final, Literal, get_args
+from urllib.parse import urlencode
+
+import numpy as np
+
+from deepaccident_devkit.arrays import BoolArray, IntArray
+from deepaccident_devkit.errors import DeepAccidentError
+from deepaccident_devkit.explore.scenarios import Facet, Scenarios
+from deepaccident_devkit.selection import parse_where
+from deepaccident_devkit.selection.conditions import condition_of
+from deepaccident_devkit.selection.fields import FIELDS, field_of
+
+View = Literal["grid", "table"]
+Order = Literal["up", "down"]
+SORTS: Final[Mapping[str, str]] = {
+    "name": "name",
+    "num_frames": "length",
+    "accident_visibility": "visibility",
+    "lead": "lead time of the ego",
+    "lead_all": "lead time of all agents",
+    "min_ttc": "least TTC",
+}
+"""Column → its name for readers; `score:MODEL` is another."""
+SCORE: Final = "score:"
+PAGE: Final = 48
+_MOST_QUERY: Final = 2000
+"""Characters."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Choices:
+    """What a reader chose.
+
+    Attributes:
+        facets: field → the values, one of which must match, as texts.
+        query: more filters, one a line or between semicolons.
+        sort: of `SORTS`, or `score:MODEL`.
+        order: of the sorting: `up` is from low to high.
+        view: `grid` of pictures, or `table`.
+        page: from 1.
+    """
+
+    facets: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    query: str = ""
+    sort: str = "name"
+    order: Order = "up"
+    view: View = "grid"
+    page: int = 1
+
+    @classmethod
+    def of(cls, given: Iterable[tuple[str, str]]) -> Choices:
+        """Those of the parameters of an address; what makes no sense is left out, so that no address fails."""
+        facets: dict[str, list[str]] = {}
+        others: dict[str, str] = {}
+        for name, value in given:
+            if name in FIELDS:
+                facets.setdefault(name, []).append(value)
+            else:
+                others[name] = value
+        page = others.get("page", "")
+        return cls(
+            facets={name: tuple(dict.fromkeys(values)) for name, values in facets.items()},
+            query=others.get("q", "").strip()[:_MOST_QUERY],
+            sort=others.get("sort", "name"),
+            order="down" if others.get("order") == "down" else "up",
+            view="table" if others.get("view") == "table" else "grid",
+            page=int(page) if re.fullmatch(r"[1-9]\d{0,5}", page) else 1,
+        )
+
+    def address(self, **changed: Any) -> str:
+        """The parameters of the address that has these choices, with some changed: `?town=Town03&sort=lead`."""
+        chosen = replace(self, **changed)
+        pairs = [(name, value) for name, values in chosen.facets.items() for value in values]
+        plain = {"q": chosen.query, "sort": chosen.sort, "order": chosen.order, "view": chosen.view}
+        usual = {"q": "", "sort": "name", "order": "up", "view": get_args(View)[0]}
+        pairs += [(name, value) for name, value in plain.items() if value != usual[name]]
+        pairs += [("page", str(chosen.page))] * (chosen.page > 1)
+        return f"?{urlencode(pairs)}"
+
+    @property
+    def filters(self) -> list[str]:
+        """The texts of `da.find` and `--where`."""
+        return [*(f"{name}={','.join(values)}" for name, values in self.facets.items()), *self.lines]
+
+    @property
+    def lines(self) -> list[str]:
+        """The filters of the query."""
+        return [line.strip() for line in re.split(r"[;\n]", self.query) if line.strip()]
+
+    def python(self) -> str:
+        """The call that finds the same scenarios."""
+        return f"da.find({', '.join(map(repr, self.filters))})"
+
+    def command(self, dataroot: str) -> str:
+        """The command that writes the same scenarios into a split file."""
+        where = [word for each in self.filters for word in ("--where", each)]
+        return shlex.join(["deepaccident", "split", dataroot, *where, "--save", "selection.txt"])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Count:
+    """A value that a reader can choose.
+
+    Attributes:
+        value: as a text.
+        count: of the scenarios that match all but the other values of this field.
+        chosen: whether it is.
+    """
+
+    value: str
+    count: int
+    chosen: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Found:
+    """The scenarios that choices come to.
+
+    Attributes:
+        rows: their rows, sorted.
+        counts: field → its values.
+        faults: sentences on what is wrong in the query.
+        waiting: sentences on what is not computed yet.
+    """
+
+    rows: IntArray
+    counts: Mapping[str, tuple[Count, ...]]
+    faults: tuple[str, ...]
+    waiting: tuple[str, ...]
+
+
+def found_by(scenarios: Scenarios, choices: Choices, scores: Mapping[str, Any]) -> Found:
+    """The scenarios that match all that was chosen.
+
+    Args:
+        scenarios: of the release.
+        choices: of the reader.
+        scores: `score:MODEL` → (N,) numbers, NaN unknown; None until they are computed.
+    """
+    facets = scenarios.facets()
+    chosen = {each.name: choices.facets[each.name] for each in facets if each.name in choices.facets}
+    masks = {each.name: _matching(each, chosen[each.name]) for each in facets if each.name in chosen}
+    rest, faults, waiting = _by_query(scenarios, choices, [name for name in choices.facets if name not in chosen])
+    missed = sum((~mask for mask in masks.values()), np.zeros(len(scenarios), dtype=np.int64))
+    counts = {}
+    for each in facets:
+        others = missed == 0 if each.name not in masks else missed == ~masks[each.name]  # no other one missed it
+        counts[each.name] = _counts(each, others & rest, chosen.get(each.name, ()))
+    rows = np.flatnonzero(rest & (missed == 0))
+    ranked, not_ready = _sorted(scenarios, choices, rows, scores)
+    return Found(rows=ranked, counts=counts, faults=tuple(faults), waiting=(*waiting, *not_ready))
+
+
+def _matching(facet: Facet, values: Sequence[str]) -> BoolArray:
+    wanted = [place for place, value in enumerate(facet.values) if value in values]
+    return np.isin(facet.codes, wanted)
+
+
+def _counts(facet: Facet, rows: BoolArray, chosen: Sequence[str]) -> tuple[Count, ...]:
+    counted = np.bincount(facet.codes[rows], minlength=len(facet.values)).tolist()
+    return tuple(
+        Count(value=value, count=count, chosen=value in chosen)
+        for value, count in zip(facet.values, counted, strict=True)
+    )
+
+
+def _by_query(scenarios: Scenarios, choices: Choices, plain: Sequence[str]) -> tuple[BoolArray, list[str], list[str]]:
+    """Which scenarios match the query, and the chosen values of fields that are no facets (yet).
+
+    Also what is wrong in them, and what is waited for.
+    """
+    matching = np.ones(len(scenarios), dtype=bool)
+    faults, waiting = [], []
+    for line in [*(f"{name}={','.join(choices.facets[name])}" for name in plain), *choices.lines]:
+        try:
+            wanted = parse_where(line)
+            looked = field_of(wanted.name)
+            values = scenarios.values(looked.name)
+            if values is None:
+                waiting.append(_waiting_text(line, scenarios.job_of(looked.name)))
+                continue
+            condition = condition_of(wanted, looked, _words(values) if looked.kind == "word" else ())
+            matching &= np.array([condition.holds(value) for value in values], dtype=bool)
+        except DeepAccidentError as error:
+            faults.append(str(error))
+    return matching, faults, waiting
+
+
+def _waiting_text(what: str, job: Any) -> str:
+    if job.state == "failed":
+        return f"{what}: cannot be computed ({job.error})"
+    return f"{what}: is being computed ({job.title}); it counts as soon as it is there"
+
+
+def _words(values: Sequence[Any]) -> set[Any]:
+    return {word for value in values for word in (value if isinstance(value, tuple) else (value,))}
+
+
+def _sorted(
+    scenarios: Scenarios, choices: Choices, rows: IntArray, scores: Mapping[str, Any]
+) -> tuple[IntArray, list[str]]:
+    """Rows by the column of choice, unknown values last, and what is waited for."""
+    if choices.sort == "name" or (choices.sort not in SORTS and choices.sort not in scores):
+        return rows if choices.order == "up" else rows[::-1], []
+    if choices.sort in SORTS:
+        numbers, job = scenarios.numbers(choices.sort), scenarios.job_of(choices.sort)
+    else:
+        numbers, job = scores[choices.sort].numbers(scenarios), scores[choices.sort].job
+    if numbers is None:
+        return rows, [_waiting_text(f"sorted by {choices.sort}", job)]
+    keys = numbers[rows]
+    keys = keys if choices.order == "up" else -keys
+    return rows[np.argsort(keys, kind="stable")], []  # NaN is last in both orders

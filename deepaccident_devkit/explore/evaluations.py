@@ -1,0 +1,225 @@
+"""What a bundle's summary says, for pages: facts, headline numbers and breakdowns, checked before they are shown."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from deepaccident_devkit.errors import ResultsError
+from deepaccident_devkit.evaluation.metrics.attributes import ATTRIBUTES, EVERYTHING
+from deepaccident_devkit.evaluation.metrics.headlines import LIMITS, value_text
+from deepaccident_devkit.evaluation.runs import Bundle
+from deepaccident_devkit.evaluation.runs.bundles import SUMMARY_FILE
+from deepaccident_devkit.evaluation.runs.shapes import EACH, LINE, NUMBER, OBJECT, WHOLE, misfits
+from deepaccident_devkit.explore.scenarios import UNKNOWN
+from deepaccident_devkit.render.evaluation.figures import MAIN_NUMBERS
+from deepaccident_devkit.render.markup import scalar
+
+_GROUP: Final = {
+    "value": (None, LINE),
+    "samples": WHOLE,
+    "scenarios": WHOLE,
+    "headlines": {EACH: (None, NUMBER)},
+    "intervals": {EACH: [(None, NUMBER)]},
+    "notes": [LINE],
+}
+_SHOWN: Final = {
+    "devkit_version": LINE,
+    "counts": {"samples": WHOLE, "scenarios": WHOLE},
+    "results": {"fingerprint": LINE, "meta": OBJECT},
+    "headlines": [{"name": LINE, "text": LINE, "path": LINE, "unit": LINE}],
+    "breakdowns": {EACH: {"resampling": {"confidence": NUMBER}, "groups": [_GROUP]}},
+}
+"""Of a summary what is shown beyond what `read_bundle` has checked."""
+_METHOD: Final = ("method", "name", "authors", "url", "date")
+"""What results say of themselves, and is shown if they do."""
+Json = Mapping[str, Any]
+Ends = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeadlineRow:
+    """A headline number of all samples.
+
+    Attributes:
+        name: such as `apa`.
+        text: the value with its unit.
+        interval: `0.525 to 0.750`; empty if there is none.
+        better: `higher`, `lower`, or empty.
+    """
+
+    name: str
+    text: str
+    interval: str
+    better: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bar:
+    """The main number of the samples that have one value of an attribute.
+
+    Attributes:
+        value: of the attribute; `unknown` where it is not known.
+        samples: how many.
+        scenarios: that they are of.
+        text: the number with its unit.
+        interval: as in `HeadlineRow`.
+        width: of the bar in percent of the longest; None where there is no number.
+        ends: of the interval, likewise; None if there is none.
+    """
+
+    value: str
+    samples: int
+    scenarios: int
+    text: str
+    interval: str
+    width: float | None
+    ends: Ends | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MainNumber:
+    """The number by which samples are ranked.
+
+    Attributes:
+        name: such as `apa`.
+        path: in the result.
+        unit: such as `share`.
+        limit: the largest value that it can have.
+    """
+
+    name: str
+    path: str
+    unit: Any
+    limit: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evaluated:
+    """A bundle's numbers.
+
+    Attributes:
+        facts: name → what was evaluated, and how.
+        mark: that it is partial; empty if it is not.
+        headlines: of all samples.
+        interval: heading of the intervals: `95 % interval`.
+        notes: on the intervals.
+        main: the number that the bars show; None if the result has none.
+        breakdowns: attribute → a bar for each of several values.
+        same: attribute → the only value that the samples have.
+    """
+
+    facts: Mapping[str, str]
+    mark: str
+    headlines: tuple[HeadlineRow, ...]
+    interval: str
+    notes: tuple[str, ...]
+    main: MainNumber | None
+    breakdowns: Mapping[str, tuple[Bar, ...]]
+    same: Mapping[str, str]
+
+
+def evaluated(bundle: Bundle) -> Evaluated:
+    """A bundle's numbers; raises ResultsError if its summary does not hold them."""
+    summary = bundle.summary
+    for misfit in misfits(summary, _SHOWN):
+        raise ResultsError(f"{bundle.folder / SUMMARY_FILE}: cannot be shown ({misfit}); evaluate again")
+    everything = summary["breakdowns"].get(EVERYTHING)
+    group = next(iter(everything["groups"]), None) if everything is not None else None
+    main = _main_number(summary)
+    bars = {
+        by: tuple(_bar(each, main) for each in broken["groups"])
+        for by, broken in summary["breakdowns"].items()
+        if by in ATTRIBUTES and by != EVERYTHING
+    }
+    return Evaluated(
+        facts=_facts(bundle),
+        mark="" if summary["partial"] is None else summary["partial"]["mark"],
+        headlines=tuple(_headline_row(each, group) for each in summary["headlines"]),
+        interval="interval" if everything is None else f"{100 * everything['resampling']['confidence']:g} % interval",
+        notes=() if group is None else tuple(group["notes"]),
+        main=main,
+        breakdowns={by: each for by, each in bars.items() if len(each) > 1},
+        same={by: each[0].value for by, each in bars.items() if len(each) == 1},
+    )
+
+
+def _facts(bundle: Bundle) -> dict[str, str]:
+    summary, setup = bundle.summary, bundle.setup
+    changed = ", ".join(f"{name} = {scalar(value)}" for name, value in setup.switches.items())
+    counts, results, release = summary["counts"], summary["results"], summary["release"]
+    left_out = f"; {counts['left_out']:,} predictions of other samples left out" if counts["left_out"] else ""
+    return {
+        "task": setup.task,
+        "protocol": setup.protocol + (f", but {changed}" if changed else ""),
+        **{name: scalar(results["meta"][name]) for name in _METHOD if name in results["meta"]},
+        "samples": f"{counts['samples']:,} of {counts['scenarios']:,} scenarios{left_out}",
+        "selection": bundle.selection.text(),
+        **({} if setup.task == "detection" else {"horizon": f"{setup.horizon:g} s"}),
+        "results": results["path"],
+        "results' hash": results["fingerprint"],
+        "release": f"{release['version']}, {release['dataroot']}",
+        "devkit": summary["devkit_version"],
+    }
+
+
+def _main_number(summary: Json) -> MainNumber | None:
+    """The first of the task's main numbers that the result has."""
+    there = {each["path"]: each for each in summary["headlines"]}
+    path = next((each for each in MAIN_NUMBERS.get(summary["task"], ()) if each in there), None)
+    if path is None:
+        return None
+    unit: Any = there[path]["unit"]
+    return MainNumber(name=there[path]["name"], path=path, unit=unit, limit=LIMITS.get(unit, 1.0))
+
+
+def _headline_row(headline: Json, group: Json | None) -> HeadlineRow:
+    higher, unit = headline.get("higher_is_better"), headline["unit"]
+    better = "higher" if higher is True else "lower" if higher is False else ""
+    interval = _interval_text(_ends(group, headline["path"]), unit)
+    return HeadlineRow(name=headline["name"], text=headline["text"], interval=interval, better=better)
+
+
+def _bar(group: Json, main: MainNumber | None) -> Bar:
+    value = None if main is None else finite(group["headlines"].get(main.path))
+    ends = None if main is None else _ends(group, main.path)
+    shown = None if main is None or ends is None else _percents(ends, main.limit)
+    return Bar(
+        value=UNKNOWN if group["value"] is None else group["value"],
+        samples=group["samples"],
+        scenarios=group["scenarios"],
+        text="–" if main is None else value_text(value, main.unit),
+        interval="" if main is None else _interval_text(ends, main.unit),
+        width=None if main is None or value is None else _percents([value], main.limit)[0],
+        ends=None if shown is None else (shown[0], shown[1]),
+    )
+
+
+def _percents(values: Iterable[float], limit: float) -> list[float]:
+    return [round(100 * min(max(each / limit, 0.0), 1.0), 2) for each in values]
+
+
+def _ends(group: Json | None, path: str) -> Ends | None:
+    """Both ends of an interval; None if it has none."""
+    known = [] if group is None else [finite(each) for each in group["intervals"].get(path, ())]
+    if len(known) != 2 or known[0] is None or known[1] is None:
+        return None
+    return known[0], known[1]
+
+
+def _interval_text(ends: Ends | None, unit: str) -> str:
+    digits = 2 if unit == "%" else 3
+    return "" if ends is None else f"{ends[0]:.{digits}f} to {ends[1]:.{digits}f}"
+
+
+def finite(value: object) -> float | None:
+    """A number of a file as a float; None if it is no finite number."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if math.isfinite(number) else None

@@ -1,0 +1,127 @@
+"""`Explorer`: what all pages read of a release and of models, and what they keep."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.explore.background import Jobs
+from deepaccident_devkit.explore.choices import SCORE
+from deepaccident_devkit.explore.keeping import Kept, KeptFiles
+from deepaccident_devkit.explore.models import Model, open_models
+from deepaccident_devkit.explore.scenarios import Scenarios
+from deepaccident_devkit.explore.thumbnails import SIZE, VERSION, thumbnail
+from deepaccident_devkit.render.missing import is_there
+from deepaccident_devkit.render.pictures import figure_png
+from deepaccident_devkit.render.replay import recording_of, served_replay
+from deepaccident_devkit.render.replay.recording import Recording
+from deepaccident_devkit.taxonomy import CAMERAS
+from deepaccident_devkit.v2x.configurations import agents_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Hashable
+
+_MOST_PICTURES: Final = 64_000_000
+"""Bytes of pictures in memory."""
+_MOST_REPLAYS: Final = 6
+"""Scenarios whose replay is in memory: some megabytes each."""
+DPI: Final = 80
+"""Pixels of rendered figures to an inch."""
+_MANY: Final = 64
+"""Scenarios from which on processes are worth their start."""
+
+
+class Explorer:
+    """A release and models, opened for reading; safe to use from several threads.
+
+    Attributes:
+        dataset: the release.
+        models: by name, in the order given.
+        jobs: slow work in the background.
+        workers: processes for slow work; None takes few.
+        scenarios: columns of the release's scenarios.
+        pictures: JPEG and PNG files in memory, by what they show.
+        replays: what replays play, by scenario and model.
+        thumbnails: files of thumbnails.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        *,
+        bundles: Iterable[str | os.PathLike[str]] = (),
+        results: Iterable[str | os.PathLike[str]] = (),
+        workers: int | None = None,
+    ) -> None:
+        """Open bundles and results.
+
+        Args:
+            dataset: the release.
+            bundles: folders that `save_run` wrote.
+            results: files or folders of results; those of a bundle join it.
+            workers: processes for slow work; None takes few.
+
+        Raises:
+            ResultsError: one of them cannot be read.
+        """
+        self.dataset = dataset
+        self.workers = workers
+        self.jobs = Jobs()
+        self.scenarios = Scenarios(dataset, self.jobs, workers=workers or _few_workers(len(dataset.scenario)))
+        self.models: Mapping[str, Model] = open_models(map(Path, bundles), map(Path, results), self.jobs)
+        self.pictures: Kept[bytes] = Kept(_MOST_PICTURES, len)
+        self.replays: Kept[dict[str, Any]] = Kept(_MOST_REPLAYS)
+        self._recordings: Kept[Recording] = Kept(_MOST_REPLAYS)
+        self.thumbnails = KeptFiles(dataset)
+        self._drawing = threading.Lock()
+
+    def begin(self) -> None:
+        """Begin slow work in the background: the columns of the scenarios, and models' scores."""
+        for model in self.models.values():
+            if model.bundle is not None:
+                _ = model.job
+        self.scenarios.begin()
+
+    @property
+    def scores(self) -> dict[str, Model]:
+        """Columns `score:MODEL`, of models that have scores."""
+        return {f"{SCORE}{name}": model for name, model in self.models.items() if model.bundle is not None}
+
+    def thumbnail(self, token: str) -> bytes:
+        """A scenario's thumbnail as JPEG; raises TokenError."""
+        record = self.dataset.scenario.get(token)
+        last = [f"{token}/{agent}/{record['num_frames']:03d}" for agent in agents_of(self.dataset, record)]
+        there = [is_there(self.dataset, f"{sample}/{channel}") for sample in last for channel in CAMERAS]
+        identity = repr((VERSION, SIZE, token, str(self.dataset.dataroot), record["num_frames"], there))
+        return self.thumbnails.get(identity, "thumbnail.jpg", lambda: thumbnail(self.dataset, record))
+
+    def recording(self, token: str) -> Recording:
+        """What replays know of a scenario; raises TokenError."""
+        return self._recordings.get(token, lambda: recording_of(self.dataset, token, None))
+
+    def replay(self, token: str, model: str | None, folder: str) -> dict[str, Any]:
+        """What the replay of a scenario plays (`served_replay`), with a model's predictions; None for none."""
+
+        def make() -> dict[str, Any]:
+            prediction = None if model is None else self.models[model].results
+            return served_replay(self.dataset, token, folder, prediction=prediction)
+
+        return self.replays.get((token, model, folder), make)
+
+    def drawn(self, key: Hashable, draw: Callable[[], Any]) -> bytes:
+        """A figure as PNG, rendered at the first call with a key; one at a time, as matplotlib needs it."""
+
+        def png() -> bytes:
+            with self._drawing:
+                return figure_png(draw(), dpi=DPI)
+
+        return self.pictures.get(key, png)
+
+
+def _few_workers(scenarios: int) -> int:
+    """Processes in the background, which leave others on the machine theirs; a small release needs none of its own."""
+    return max(2, min(4, (os.cpu_count() or 2) // 2)) if scenarios >= _MANY else 1

@@ -1,0 +1,90 @@
+"""What pages keep: values in memory within a bound, and thumbnails beside the index or in the user's cache."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from contextlib import suppress
+from pathlib import Path
+from typing import Final, Generic, TypeVar
+
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.files import is_writable_folder
+from deepaccident_devkit.release.store.cache import FileCache
+
+Value = TypeVar("Value")
+_THUMBNAILS: Final = "thumbnails"
+_MOST_THUMBNAILS: Final = 200_000_000
+"""Bytes: those of the whole release take some 7 million."""
+
+
+class Kept(Generic[Value]):
+    """Values that are made when they are asked for the first time; those that were not asked for the longest go.
+
+    Each is made once, also if several threads ask for it at the same time; other values are made meanwhile.
+    """
+
+    def __init__(self, most: float, size: Callable[[Value], float] = lambda _: 1.0) -> None:
+        """Keep values as long as their sizes are at most so much in sum; by default so many values."""
+        self._most, self._size = most, size
+        self._values: OrderedDict[Hashable, Value] = OrderedDict()
+        self._total = 0.0
+        self._lock = threading.Lock()
+        self._making: dict[Hashable, threading.Lock] = {}
+
+    def get(self, key: Hashable, make: Callable[[], Value]) -> Value:
+        """The value of a key; raises what `make` raises, of which nothing is kept."""
+        with self._lock:
+            if key in self._values:
+                self._values.move_to_end(key)
+                return self._values[key]
+            making = self._making.setdefault(key, threading.Lock())
+        with making:
+            with self._lock:
+                if key in self._values:
+                    return self._values[key]
+            try:
+                value = make()
+                self._keep(key, value)
+            finally:
+                with self._lock:
+                    self._making.pop(key, None)
+        return value
+
+    def _keep(self, key: Hashable, value: Value) -> None:
+        with self._lock:
+            self._values[key] = value
+            self._total += self._size(value)
+            while self._total > self._most and len(self._values) > 1:
+                _, old = self._values.popitem(last=False)
+                self._total -= self._size(old)
+
+
+class KeptFiles:
+    """Small files that are made once: beside the index, and where that cannot be written, in the user's cache."""
+
+    def __init__(self, dataset: Dataset) -> None:
+        """Take the release whose index they lie beside: they go when the tables are made again."""
+        folder = dataset.tables_folder / _THUMBNAILS
+        if not is_writable_folder(dataset.tables_folder):
+            folder = FileCache.of_user().folder.with_name(_THUMBNAILS)
+        self._files = FileCache(folder, _MOST_THUMBNAILS)
+
+    @property
+    def folder(self) -> Path:
+        """Where they lie."""
+        return self._files.folder
+
+    def get(self, identity: str, name: str, make: Callable[[], bytes]) -> bytes:
+        """The content of a file; `identity` tells it from all others. Raises what `make` raises."""
+        path = self._files.path_of(identity, name)
+        with suppress(OSError):
+            content = path.read_bytes()
+            os.utime(path)  # who was not used the longest goes first
+            return content
+        content = make()
+        with suppress(OSError):  # no room, or a folder that may not be written to: it is made again the next time
+            self._files.put(path, content)
+        return content

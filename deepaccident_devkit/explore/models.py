@@ -1,0 +1,204 @@
+"""`Model`: what a model predicts, and what an evaluation says of it."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from deepaccident_devkit.arrays import FloatArray
+from deepaccident_devkit.errors import ResultsError
+from deepaccident_devkit.evaluation.metrics.headlines import headlines, value_text
+from deepaccident_devkit.evaluation.results import Results, read_results
+from deepaccident_devkit.evaluation.runs import Bundle, read_bundle, read_rows
+from deepaccident_devkit.evaluation.runs.bundles import ROWS_FILE, counted, own_file
+from deepaccident_devkit.evaluation.runs.selection import scenario_of
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, TaskName
+from deepaccident_devkit.explore.background import Job, Jobs
+from deepaccident_devkit.render.evaluation.figures import MAIN_NUMBERS
+
+if TYPE_CHECKING:
+    from deepaccident_devkit.explore.scenarios import Scenarios
+
+_PROTOCOL_OF: Final[Mapping[str, str]] = {"motion": "released", "accident": "boxes", "detection": "released"}
+"""Kind of results → the protocol by which they are looked at without a bundle."""
+
+
+class Score(NamedTuple):
+    """The main number of some samples.
+
+    Attributes:
+        value: None where there is nothing to count.
+        text: with its unit.
+    """
+
+    value: float | None
+    text: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scores:
+    """A bundle's main number.
+
+    Attributes:
+        name: of the number, such as `apa`.
+        higher_is_better: whether more is better.
+        samples: token → its own; the worst first, those with nothing to count last.
+        scenarios: scenario → of its samples.
+    """
+
+    name: str
+    higher_is_better: bool
+    samples: Mapping[str, Score]
+    scenarios: Mapping[str, Score]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Model:
+    """A model's results, an evaluation's bundle, or both; safe to read from several threads.
+
+    Attributes:
+        name: in addresses and for readers: of the bundle's folder or the results' file.
+        bundle: None for results without one.
+        results: None for a bundle without a copy of its results, if these were not given.
+        jobs: where scores are computed.
+    """
+
+    name: str
+    bundle: Bundle | None
+    results: Results | None
+    jobs: Jobs
+
+    @cached_property
+    def setup(self) -> EvaluationSetup:
+        """The rules: of the bundle, or those by which such results are looked at without one."""
+        if self.bundle is not None:
+            return self.bundle.setup
+        kind: Any = self.results.task if self.results is not None else "accident"
+        task: TaskName = kind
+        form = None if self.results is None else self.results.form
+        horizon = 2.0 if form is None else min(2.0, (form.frames - 1) * form.step)
+        return EvaluationSetup(task=task, protocol=_PROTOCOL_OF[task], horizon=horizon or 0.5)
+
+    @cached_property
+    def rows(self) -> Mapping[str, Mapping[str, Any]]:
+        """Token → the row of `samples.parquet`; empty without a bundle."""
+        if self.bundle is None:
+            return {}
+        path = own_file(self.bundle.folder / ROWS_FILE)
+        rows, _ = read_rows(path)
+        if any(not isinstance(row.get("token"), str) for row in rows):
+            raise ResultsError(f"{path}: has rows without a sample's token; evaluate again")
+        return {row["token"]: row for row in rows}
+
+    @property
+    def tokens(self) -> Iterable[str]:
+        """The samples that it tells of."""
+        return self.rows if self.results is None else self.results.tokens
+
+    def has(self, token: str) -> bool:
+        """Whether it predicts something for a sample."""
+        return self.results is not None and token in self.results
+
+    @cached_property
+    def scenarios(self) -> frozenset[str]:
+        """The scenarios that it tells of."""
+        return frozenset(map(scenario_of, self.tokens))
+
+    @property
+    def job(self) -> Job:
+        """The work that gives the scores, begun if it is not; its result is `Scores`, or None without a bundle."""
+        return self.jobs.ask(f"scores {self.name}", f"scores of {self.name}", self._scores)
+
+    @property
+    def scores(self) -> Scores | None:
+        """The scores; None until they are computed, and without a bundle."""
+        if self.bundle is None:
+            return None
+        found: Scores | None = self.job.result
+        return found
+
+    def numbers(self, scenarios: Scenarios) -> FloatArray | None:
+        """(N,) the score of each scenario, NaN where there is none; None until they are computed."""
+        scores = self.scores
+        if scores is None:
+            return None
+        numbers = np.full(len(scenarios), math.nan)
+        for token, score in scores.scenarios.items():
+            if token in scenarios.row_of and score.value is not None:
+                numbers[scenarios.row_of[token]] = score.value
+        return numbers
+
+    def _scores(self) -> Scores | None:
+        if self.bundle is None:
+            return None
+        evaluator, task = counted(self.bundle), self.setup.task
+        known = {each.path: each for each in headlines(task, evaluator.compute())}
+        main = next((known[path] for path in MAIN_NUMBERS[task] if path in known), None)
+        if main is None:  # this protocol has no such number
+            return Scores(name=MAIN_NUMBERS[task][0], higher_is_better=True, samples={}, scenarios={})
+        higher = main.higher_is_better is not False
+
+        def score(tokens: Sequence[str]) -> Score:
+            result = evaluator.compute(tokens)
+            value = next((each.value for each in headlines(task, result) if each.path == main.path), None)
+            return Score(value, value_text(value, main.unit))
+
+        by_scenario: dict[str, list[str]] = {}
+        for token in sorted(evaluator.tokens):
+            by_scenario.setdefault(scenario_of(token), []).append(token)
+        samples = {token: score([token]) for tokens in by_scenario.values() for token in tokens}
+        return Scores(
+            name=main.name,
+            higher_is_better=higher,
+            samples=dict(sorted(samples.items(), key=lambda item: _badness(item[1].value, higher=higher))),
+            scenarios={scenario: score(tokens) for scenario, tokens in by_scenario.items()},
+        )
+
+
+def _badness(value: float | None, *, higher: bool) -> tuple[bool, float]:
+    """The worst first, unknown last."""
+    return value is None, 0.0 if value is None else value if higher else -value
+
+
+def open_models(bundles: Iterable[Path], results: Iterable[Path], jobs: Jobs) -> dict[str, Model]:
+    """The models of bundles and results, by name in the order given.
+
+    A bundle's results are its own copy, or those of the given ones that have its fingerprint: the path that it names is
+    not opened, since a bundle may come from anywhere.
+
+    Raises:
+        ResultsError: one of them cannot be read, or is no bundle.
+    """
+    given = {str(path): read_results(path) for path in results}
+    models: dict[str, Model] = {}
+    paired: set[str] = set()
+    for folder in bundles:
+        bundle = read_bundle(folder)
+        _ = bundle.setup  # refuses a protocol that cannot be
+        copy = bundle.results_copy()
+        found = read_results(copy) if copy is not None else None
+        for path, each in given.items():
+            if each.fingerprint == bundle.summary["results"].get("fingerprint"):
+                paired.add(path)
+                found = found or each
+        name = _free(Path(os.path.abspath(folder)).name, models)  # noqa: PTH100 - `resolve` would follow links
+        models[name] = Model(name=name, bundle=bundle, results=found, jobs=jobs)
+    for path, each in given.items():
+        if path not in paired:
+            name = _free(Path(os.path.abspath(path)).stem, models)  # noqa: PTH100
+            models[name] = Model(name=name, bundle=None, results=each, jobs=jobs)
+    return models
+
+
+def _free(name: str, taken: Mapping[str, object]) -> str:
+    """The name, or with a number if another one has it; one of dots alone would be no part of an address."""
+    name = name if name.strip(".") else "model"
+    names = [name, *(f"{name}-{number}" for number in range(2, len(taken) + 3))]
+    return next(each for each in names if each not in taken)

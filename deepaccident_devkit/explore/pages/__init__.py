@@ -1,0 +1,1 @@
+"""The pages, a module each: which addresses they have, and what they show."""

@@ -1,0 +1,279 @@
+"""`export_pages`: some scenarios as pages that are files, for a talk or a supplement: no server, no network."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import quote
+
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import ConfigError, NotAvailableError, ResultsError
+from deepaccident_devkit.evaluation.results import Results
+from deepaccident_devkit.evaluation.runs.selection import scenario_of
+from deepaccident_devkit.explore.background import Jobs
+from deepaccident_devkit.explore.choices import SCORE
+from deepaccident_devkit.explore.models import Model, open_models
+from deepaccident_devkit.explore.pages.answers import environment
+from deepaccident_devkit.explore.pages.scenario import PARTS
+from deepaccident_devkit.explore.pages.scenarios import SLOW, Cell, cell, entry, score_cell, sort_key
+from deepaccident_devkit.explore.pages.static import assets
+from deepaccident_devkit.explore.static_folder import MARK, exported, target_folder
+from deepaccident_devkit.explore.static_work import REPLAY, THUMBNAIL, Told, Work, tell
+from deepaccident_devkit.explore.verdicts import verdict
+from deepaccident_devkit.files import plain_names, write_bytes
+from deepaccident_devkit.parallel import Places, run_batch
+from deepaccident_devkit.render.markup import number
+from deepaccident_devkit.render.roles import short_name
+from deepaccident_devkit.safety import twin_of
+from deepaccident_devkit.selection import find
+from deepaccident_devkit.taxonomy import AGENTS
+
+if TYPE_CHECKING:
+    from deepaccident_devkit.tables.records import ScenarioRecord
+
+MOST: Final = 50
+"""Scenarios of an export: a replay takes some seconds and up to 15 MB."""
+INDEX: Final = "index.html"
+_STATIC: Final = "static"
+_ASSETS: Final = ("pages.css", "explore.css", "written.css", "keys.js", "sorting.js")
+_FORESEEN: Final = ("motion", "accident")
+"""Results that a replay can show."""
+_POLICY: Final = (
+    "default-src 'none'; script-src 'self' file:; style-src 'self' file:; img-src 'self' file: data:; "
+    "frame-src 'self' file:; base-uri 'none'; form-action 'none'"
+)
+"""Nothing is loaded but the files of the export, from a disk or from a server."""
+_WHICH: Final = ("agent", "frame", "time_to_impact", "accident_visibility")
+"""Columns of an evaluation's rows that say which sample it is."""
+_SAME: Final = ("token", "scenario")
+"""Columns that are the same for all samples of a scenario, or stand in others."""
+
+
+def export_pages(
+    dataset: Dataset,
+    folder: str | os.PathLike[str],
+    *,
+    where: Sequence[str] = (),
+    bundles: Iterable[Path] = (),
+    results: Iterable[Path] = (),
+    scenarios: Iterable[RowArgument] | None = None,
+    workers: int | None = None,
+    progress: bool = False,
+) -> Path:
+    """Write pages of some scenarios as files: a list, and for each a replay, its story, pairs, lead times and findings.
+
+    They work from a disk, without a server and a network, and from any web server. Nothing in them tells where the
+    release lies. The same call gives the same bytes.
+
+    Args:
+        dataset: the release.
+        folder: where; new, empty, or an earlier export, which is replaced.
+        where: filters as of `find`, all of which hold.
+        bundles: folders that `save_run` wrote: what they say of the samples stands on the pages.
+        results: files or folders of results; those of a bundle join it. A replay shows the predictions of the first
+            ones that tell of the scenario.
+        scenarios: tokens or records, of which those that match are written, in this order; None for all.
+        workers: processes; None chooses by the number of scenarios.
+        progress: whether to show a bar.
+
+    Returns:
+        The first page, `index.html`.
+
+    Raises:
+        ConfigError: more than 50 scenarios match; or the folder cannot be written to, or holds other files.
+        NotAvailableError: no scenario matches.
+        FieldError, ChoiceError, TokenError: there is no such filter or scenario.
+        ResultsError: bundles or results cannot be read.
+        WorkerError: a worker was killed, or cannot do the work.
+
+    Examples:
+        >>> export_pages(da, "night", where=["time_of_day=Night", "collision=true"])  # doctest: +SKIP
+    """
+    given = None if scenarios is None else [dataset.get("scenario", each)["token"] for each in scenarios]
+    records = _chosen(dataset, where, given)
+    target = target_folder(folder)
+    models = _scored_models(bundles, results)
+    filters = [*where, *([] if given is None else [f"token={','.join(given)}"])]
+    with exported(target) as made:
+        _Pages(dataset, made, records, models).write(filters, workers=workers, progress=progress)
+    return target / INDEX
+
+
+def _chosen(dataset: Dataset, where: Sequence[str], given: Sequence[str] | None) -> list[ScenarioRecord]:
+    """The scenarios to write; raises ConfigError if they are too many."""
+    records = find(dataset, *where)
+    if given is not None:
+        by_token = {record["token"]: record for record in records}
+        records = [by_token[token] for token in dict.fromkeys(given) if token in by_token]
+    if not records:
+        raise NotAvailableError("no scenario matches, so there is nothing to export; change --where")
+    if len(records) > MOST:
+        raise ConfigError(f"{len(records)} scenarios match, and at most {MOST} are exported; narrow --where")
+    return records
+
+
+def _scored_models(bundles: Iterable[Path], results: Iterable[Path]) -> Mapping[str, Model]:
+    """The models, whose scores are computed; raises ResultsError."""
+    jobs = Jobs()
+    models = open_models(bundles, results, jobs)
+    scores = [model.job for model in models.values() if model.bundle is not None]
+    jobs.wait()
+    jobs.end()
+    for job in scores:
+        if job.state == "failed":
+            raise ResultsError(f"{job.title}: {job.error}")
+    return models
+
+
+def _folders(records: Sequence[ScenarioRecord]) -> dict[str, str]:
+    """Scenario → its folder, `TYPE/NAME` in letters that all file systems and addresses know."""
+    types = plain_names(dict.fromkeys(record["scenario_type"] for record in records), taken=(_STATIC, INDEX, MARK))
+    names = {
+        kind: plain_names(record["name"] for record in records if record["scenario_type"] == kind) for kind in types
+    }
+    return {
+        record["token"]: f"{types[record['scenario_type']]}/{names[record['scenario_type']][record['name']]}"
+        for record in records
+    }
+
+
+class _Pages:
+    """The pages of an export that is being written into a folder."""
+
+    def __init__(
+        self, dataset: Dataset, folder: Path, records: Sequence[ScenarioRecord], models: Mapping[str, Model]
+    ) -> None:
+        self._dataset, self._folder, self._records, self._models = dataset, folder, records, models
+        self._names = _folders(records)
+
+    def write(self, filters: Sequence[str], **how: Any) -> None:
+        """Write all pages, and what they show.
+
+        Args:
+            filters: by which the scenarios were found.
+            **how: of `run_batch`.
+        """
+        items = [Work(token=token, folder=name, predictions=self._predictions(token)) for token, name in self._named]
+        places = Places(reads=self._dataset.places, writes=(self._folder,))
+        work = partial(tell, self._dataset, self._folder)
+        told = run_batch(work, items, label="pages of scenarios", places=places, **how)
+        for name in _ASSETS:
+            write_bytes(self._folder / _STATIC / name, assets()[name].encode())
+        for place, each in enumerate(told):
+            self._write_scenario(place, each)
+        self._write_index(filters, told)
+
+    @property
+    def _named(self) -> list[tuple[str, str]]:
+        """Tokens and folders."""
+        return list(self._names.items())
+
+    def _predictions(self, token: str) -> tuple[tuple[str, Results], ...]:
+        """Those that a replay of the scenario can show."""
+        return tuple(
+            (name, model.results)
+            for name, model in self._models.items()
+            if model.results is not None and model.results.task in _FORESEEN and token in model.scenarios
+        )
+
+    def _write_index(self, filters: Sequence[str], told: Sequence[Told]) -> None:
+        scored = {f"{SCORE}{name}": model for name, model in self._models.items() if model.bundle is not None}
+        entries = [
+            entry(
+                record,
+                {name: cell(value) for name, value in each.measures.items()},
+                {name: score_cell(model, record["token"]) for name, model in scored.items()},
+            )
+            for record, each in zip(self._records, told, strict=True)
+        ]
+        where = [word for each in filters for word in ("--where", each)]
+        self._write_page(
+            INDEX,
+            "written_list.html",
+            "./",
+            entries=entries,
+            slow=SLOW,
+            release=self._dataset.version,
+            python=f"da.find({', '.join(map(repr, filters))})",
+            command=shlex.join(["deepaccident", "explore", "DATAROOT", *where, "--export", "DIR"]),
+        )
+
+    def _write_scenario(self, place: int, told: Told) -> None:
+        token, name = self._named[place]
+        twin = twin_of(self._dataset, token)
+        self._write_page(
+            f"{name}/{INDEX}",
+            "written_scenario.html",
+            "../../",
+            token=token,
+            before=self._named[place - 1][0] if place else None,
+            after=self._named[place + 1][0] if place + 1 < len(self._names) else None,
+            twin=twin["token"] if twin is not None and twin["token"] in self._names else None,
+            facts=told.facts,
+            parts=PARTS,
+            told=told.parts,
+            model=told.model,
+            reason=told.reason,
+            replay=REPLAY,
+            verdicts=[each for each in (_verdicts(model, token) for model in self._models.values()) if each["rows"]],
+        )
+
+    def _write_page(self, name: str, template: str, root: str, **context: Any) -> None:
+        """Write a page from a template; `root` is its way to the first one."""
+
+        def own(token: str) -> str:
+            return f"{root}{quote(self._names[token])}"
+
+        text = (
+            environment()
+            .get_template(template)
+            .render(
+                root=root,
+                models=(),
+                static=True,
+                policy=_POLICY,
+                asset=lambda _, name: f"{root}{_STATIC}/{name}",
+                scenario_at=lambda _, token: f"{own(token)}/{INDEX}",
+                thumbnail_at=lambda _, token: f"{own(token)}/{THUMBNAIL}",
+                **context,
+            )
+        )
+        write_bytes(self._folder / name, text.encode())
+
+
+def _verdicts(model: Model, token: str) -> dict[str, Any]:
+    """What a bundle says of a scenario's samples, by frame and agent, as a table."""
+    rows = [row for sample, row in model.rows.items() if scenario_of(sample) == token]
+    rank: Mapping[Any, int] = {agent: place for place, agent in enumerate(AGENTS)}
+    rows.sort(key=lambda row: (row.get("frame") or 0, rank.get(row.get("agent"), len(rank))))
+    known = [name for name in (rows or [{}])[0] if any(row[name] is not None for row in rows)]
+    which, others = (
+        [name for name in _WHICH if name in known],
+        [name for name in known if name not in (*_WHICH, *_SAME)],
+    )
+    return {
+        "name": model.name,
+        "rules": f"{model.setup.task}, protocol {model.setup.protocol}",
+        "columns": [*which, "verdict", *others],
+        "rows": [
+            [
+                *(_cell(name, row[name]) for name in which),
+                Cell(verdict(model.setup.task, row), None),
+                *(_cell(name, row[name]) for name in others),
+            ]
+            for row in rows
+        ],
+    }
+
+
+def _cell(column: str, value: Any) -> Cell:
+    """A number, with its key, or a word."""
+    if isinstance(value, str):
+        return Cell(short_name(value) if column == "agent" else value, None)
+    if isinstance(value, bool):
+        return Cell(number(value), None)
+    return Cell(number(value), sort_key(value))

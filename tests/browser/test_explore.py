@@ -1,0 +1,356 @@
+"""The explorer, used as a reader uses it: filter, open, play, step, compare, save; it asks only its own server."""
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import pytest
+from chromium import Browser
+from evaluation_runs import stored_run
+from replay_page import accident
+from selenium.webdriver.common.keys import Keys
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.evaluation.runs import save_run
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.explore import Explorer, make_app
+from deepaccident_devkit.explore.serving import Served, serving
+from deepaccident_devkit.safety import twin_of
+from deepaccident_devkit.splits import save_selection
+
+pytestmark = pytest.mark.slow
+
+HOSTILE = "Town05_type001_subtype0001_scenario00077<img src=x onerror=window.hit=1>\"'&#x41;"
+WIDTHS = ((1280, 720), (400, 800))
+
+
+@pytest.fixture(scope="module")
+def root(release_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The session's release with a hostile name, a broken scenario, and an agent whose images were not downloaded."""
+    copy = tmp_path_factory.mktemp("explored") / "a release"
+    shutil.copytree(release_root, copy, ignore=shutil.ignore_patterns(".deepaccident"))
+    normal = min(copy.glob("type1_*_normal/ego_vehicle/calib/*"))
+    kind, name = normal.parents[2], normal.name
+    for folder in kind.glob("*/*/*"):
+        if folder.name == name:
+            target = folder.with_name(HOSTILE)
+            shutil.copytree(folder, target)
+            for path in target.iterdir():
+                path.rename(path.with_name(path.name.replace(name, HOSTILE)))
+    shutil.copy(kind / "meta" / f"{name}.txt", kind / "meta" / f"{HOSTILE}.txt")
+    broken = max(copy.glob("type1_*_accident/ego_vehicle/label/*"))
+    next(broken.iterdir()).write_bytes(b"no label\n")
+    for folder in copy.glob("*/other_vehicle_behind/Camera_*"):
+        shutil.rmtree(folder)
+    return copy
+
+
+@pytest.fixture(scope="module")
+def dataset(root: Path) -> DeepAccident:
+    return DeepAccident("v1", root, verbose=False, on_error="skip")
+
+
+@pytest.fixture(scope="module")
+def explorer(dataset: DeepAccident, da_motion: DeepAccident) -> Explorer:
+    explorer = Explorer(dataset)
+    explorer.begin()
+    assert explorer.jobs.wait(60)
+    return explorer
+
+
+@pytest.fixture(scope="module")
+def served(explorer: Explorer) -> Iterator[Served]:
+    with serving(make_app(explorer)) as running:
+        yield running
+
+
+@pytest.fixture
+def pages(browser: Browser, served: Served) -> Iterator[Browser]:
+    """A browser that has the cookie; at the end it has not complained, nor asked anybody else."""
+    browser.open(served.url, 1280, 720)
+    yield browser
+    assert browser.complaints() == []
+    assert [url for url in browser.requests() if not url.startswith(f"{served.origin}/")] == []
+
+
+def here(pages: Browser, served: Served) -> str:
+    return str(pages.driver.current_url).removeprefix(served.origin)
+
+
+def shown(pages: Browser) -> list[str]:
+    names: list[str] = pages.script(
+        "return [...document.querySelectorAll('a.entry')].map((each) => decodeURIComponent(each.pathname))"
+    )
+    return [name.strip("/").removeprefix("scenario/") for name in names]
+
+
+def at(path: str, served: Served) -> str:
+    return f"{served.origin}/{path}"
+
+
+def scenario_page(token: str, served: Served, query: str = "") -> str:
+    return at(f"scenario/{quote(token)}/{query}", served)
+
+
+def tick(pages: Browser, name: str, value: str) -> None:
+    box = pages.driver.find_element("css selector", f"input[name={name}][value={value}]")
+    pages.script("window.old = true")
+    box.click()
+    pages.wait("!window.old && document.readyState === 'complete'")
+
+
+def frame(pages: Browser) -> int:
+    return int(pages.script("return Number(document.getElementById('scrubber').value)"))
+
+
+def test_the_token_leaves_the_address(browser: Browser, served: Served) -> None:
+    browser.driver.delete_all_cookies()
+    browser.open(at("", served), 1280)
+    assert "printed" in browser.script("return document.body.innerText")
+    browser.open(served.url, 1280)
+    assert browser.driver.current_url == at("", served)
+    assert "Scenarios" in browser.driver.title
+    assert served.token not in json.dumps(browser.driver.get_cookies())
+
+
+def test_filters_and_the_back_button(pages: Browser, served: Served, dataset: DeepAccident) -> None:
+    tokens = [each["token"] for each in dataset.scenario]
+    assert shown(pages) == tokens
+    tick(pages, "collision", "true")
+    assert shown(pages) == [each["token"] for each in dataset.find(collision=True)]
+    assert here(pages, served) == "/?collision=true"
+    assert pages.script("return document.activeElement.value") == "true"  # the keyboard goes on there
+    tick(pages, "collision", "false")
+    assert shown(pages) == tokens
+    pages.driver.back()
+    pages.wait("document.querySelectorAll('a.entry').length === 1 || location.search === '?collision=true'")
+    assert shown(pages) == [each["token"] for each in dataset.find(collision=True)]
+    pages.driver.back()
+    assert shown(pages) == tokens
+    images = "[...document.images].length && [...document.images].every((each) => each.naturalWidth === 320)"
+    pages.wait(images)
+
+
+def test_a_query_tells_its_errors_in_place(pages: Browser, served: Served, dataset: DeepAccident) -> None:
+    box = pages.driver.find_element("id", "query")
+    box.send_keys("length>=5; wether=Clear", Keys.ENTER)
+    pages.wait("document.getElementById('query').getAttribute('aria-invalid') === 'true'")
+    assert "wether" in pages.script("return document.getElementById('faults').textContent")
+    box = pages.driver.find_element("id", "query")
+    box.clear()
+    box.send_keys("collision=true", Keys.ENTER)
+    pages.wait("location.search === '?q=collision%3Dtrue'")
+    assert shown(pages) == [each["token"] for each in dataset.find("collision=true")]
+    text = "return [...document.querySelectorAll('.copy')].map((each) => each.dataset.text)"
+    python, command = pages.script(text)
+    assert python == "da.find('collision=true')"
+    assert "--where collision=true --save selection.txt" in command
+    pages.driver.execute_cdp_cmd("Browser.grantPermissions", {"permissions": ["clipboardReadWrite"]})
+    pages.script("document.querySelector('.copy').click()")
+    said = pages.wait("document.getElementById('copied').textContent")
+    assert said in {"copied", python}
+
+
+def test_a_table_is_sorted(pages: Browser, served: Served, explorer: Explorer) -> None:
+    pages.open(at("?view=table&sort=min_ttc", served), 1280, 720)
+    values = explorer.scenarios.values("min_ttc")
+    assert values is not None
+    wanted = [values[explorer.scenarios.row_of[token]] for token in shown(pages)]
+    assert wanted == sorted(wanted)
+    choose = "const s = document.getElementById('order'); s.value = 'down'; window.old = true;"
+    pages.script(f"{choose} s.dispatchEvent(new Event('change', {{bubbles: true}}))")
+    pages.wait("!window.old && document.querySelector('a.entry')")
+    assert [values[explorer.scenarios.row_of[token]] for token in shown(pages)] == wanted[::-1]
+
+
+def test_the_selection_is_saved(pages: Browser, served: Served, dataset: DeepAccident, tmp_path: Path) -> None:
+    how = {"behavior": "allow", "downloadPath": str(tmp_path)}
+    pages.driver.execute_cdp_cmd("Browser.setDownloadBehavior", how)
+    pages.open(at("?collision=true", served), 1280, 720)
+    pages.script("document.getElementById('save').click()")
+    saved = tmp_path / "selection.txt"
+    for _ in range(200):
+        if saved.exists():
+            break
+        pages.driver.execute_async_script("setTimeout(arguments[0], 50)")
+    wanted = save_selection(dataset.find(collision=True), tmp_path / "wanted.txt")
+    assert saved.read_bytes() == wanted.read_bytes()
+
+
+def test_the_keyboard_is_enough(pages: Browser, served: Served, dataset: DeepAccident) -> None:
+    """From the list to the impact and back, without the mouse."""
+    first = dataset.scenario[0]
+    pages.press("/")
+    assert pages.script("return document.activeElement.id") == "query"
+    pages.press(Keys.TAB)
+    pages.script("document.activeElement.blur()")
+    pages.press("j")
+    pages.press(Keys.ENTER)
+    pages.wait("document.getElementById('scrubber')")
+    assert here(pages, served).startswith(f"/scenario/{quote(first['token'])}/")
+    pages.press(Keys.ARROW_RIGHT)
+    assert frame(pages) == 1
+    pages.press(Keys.END)
+    assert frame(pages) == first["num_frames"] - 1
+    pages.press(Keys.HOME, " ")
+    pages.wait(f"Number(document.getElementById('scrubber').value) === {first['num_frames'] - 1}")
+    pages.press(Keys.ARROW_LEFT)
+    pages.wait(f"location.search === '?frame={first['num_frames'] - 1}'")
+    pages.press("n")
+    pages.wait(f"document.title.startsWith({json.dumps(dataset.scenario[1]['token'])})")
+    pages.driver.back()
+    pages.wait(f"document.title.startsWith({json.dumps(first['token'])})")
+    assert frame(pages) == first["num_frames"] - 2
+    pages.driver.back()
+    pages.wait("document.getElementById('query')")
+
+
+def test_a_scenario_shows_all(pages: Browser, served: Served, dataset: DeepAccident) -> None:
+    token = accident(dataset)
+    pages.open(scenario_page(token, served, "?frame=3&cameras=all"), 1280, 720)
+    assert frame(pages) == 2
+    pages.wait("document.querySelectorAll('#every .pictured').length === 30")
+    loaded = "[...document.querySelectorAll('#every img')].filter((each) => !each.hidden)"
+    pages.wait(f"{loaded}.every((each) => each.complete && each.naturalWidth === 64)")
+    assert pages.script(f"return {loaded}.length") == 24  # an agent's images were not downloaded
+    grey = pages.script("return [...document.querySelectorAll('#every .none')].filter((e) => !e.hidden).length")
+    assert grey == 6
+    assert pages.script("return document.querySelectorAll('#every g').length") > 20
+    drawn = "return document.getElementById('ground').toDataURL()"
+    before = pages.script(drawn)
+    pages.script("document.getElementById('cloud-infrastructure').click()")
+    pages.wait(f"(() => {{ {drawn} }})() !== {json.dumps(before)}")
+    assert pages.script("return document.getElementById('layer-points').checked") is True
+    pages.wait("[...document.querySelectorAll('[data-part]')].every((each) => !each.querySelector('.waits'))")
+    parts = {
+        each: pages.script(f"return document.querySelector('[data-part$={each}]').innerText")
+        for each in ("story", "pairs", "ledger", "twins", "findings")
+    }
+    assert dataset.describe(token).text == parts["story"]
+    assert "least TTC" in parts["pairs"]
+    assert "Shapley" in parts["ledger"]
+    assert parts["findings"].startswith("None: ")
+    pages.script("document.querySelector('[data-part$=pairs] button').click()")
+    number = pages.script("return document.querySelector('[data-part$=pairs] button').dataset.frame")
+    assert frame(pages) == int(number) - 1
+
+
+def test_a_moments_boxes_and_labels(pages: Browser, served: Served, dataset: DeepAccident) -> None:
+    token = accident(dataset)
+    pages.open(scenario_page(token, served, "?frame=2&large=infrastructure"), 1280, 720)
+    pages.wait("document.getElementById('moment').getAttribute('href') === 'moment/infrastructure/2'")
+    pages.script("document.getElementById('moment').click()")
+    pages.wait("document.querySelector('tbody')")
+    boxes = dataset.get_boxes(f"{token}/infrastructure/002")
+    assert pages.script("return document.querySelectorAll('tbody tr').length") == len(boxes)
+    pages.wait("[...document.images].every((each) => { each.loading = 'eager'; return each.naturalWidth > 600; })", 60)
+    pages.press("n")
+    pages.wait("location.pathname.endsWith('/moment/infrastructure/3')")
+
+
+def test_a_twin_goes_in_step(pages: Browser, served: Served, dataset: DeepAccident) -> None:
+    token = next(each["token"] for each in dataset.find(collision=True) if twin_of(dataset, each))
+    pages.open(scenario_page(token, served, "twin"), 1280, 720)
+    inner = "document.querySelectorAll('iframe')[{}].contentDocument.getElementById('scrubber').value"
+    there = "[...document.querySelectorAll('iframe')].every((each) => each.contentWindow.go)"
+    pages.wait(there)
+    shift = int(pages.script("return document.getElementById('twins').dataset.shift"))
+    pages.script("document.querySelectorAll('iframe')[0].contentWindow.go(3)")
+    last = dataset.get("scenario", token)["num_frames"] - 1
+    assert int(pages.script(f"return {inner.format(1)}")) == min(last, max(0, 3 + shift))
+    pages.script("document.querySelectorAll('iframe')[1].contentWindow.go(2)")
+    assert int(pages.script(f"return {inner.format(0)}")) == min(last, max(0, 2 - shift))
+    pages.script("document.getElementById('step').click()")
+    pages.script("document.querySelectorAll('iframe')[0].contentWindow.go(5)")
+    assert int(pages.script(f"return {inner.format(1)}")) == 2
+
+
+def test_a_broken_scenario_is_told_and_not_shown(pages: Browser, served: Served, dataset: DeepAccident) -> None:
+    (problem,) = {each.scenario for each in dataset.problems}
+    assert problem not in shown(pages)
+    link = f"document.querySelector('#waits a[href*={json.dumps(quote(problem.split('/')[1]))}]')"
+    assert pages.script(f"return {link} !== null")
+    pages.script(f"{link}.click()")
+    pages.wait("document.querySelector('td')")
+    assert "label" in pages.script("return document.querySelector('tbody').innerText")
+
+
+def test_hostile_names_are_text(pages: Browser, served: Served, dataset: DeepAccident) -> None:
+    (token,) = [each["token"] for each in dataset.scenario if each["name"] == HOSTILE]
+    assert HOSTILE in pages.script("return document.body.innerText").replace("\u200b", "")
+    pages.open(scenario_page(token, served), 1280, 720)
+    pages.wait("document.querySelector('#scenario').textContent")
+    pages.wait("[...document.querySelectorAll('[data-part]')].every((each) => !each.querySelector('.waits'))")
+    assert token in pages.script("return document.body.innerText")
+    pages.open(at(f"?q={quote('name=' + HOSTILE)}&view=table", served), 1280, 720)
+    assert pages.script("return window.hit === undefined") is True
+    assert pages.script("return document.querySelectorAll('img').length") == 0
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_nothing_reaches_beyond_the_window(
+    browser: Browser, served: Served, dataset: DeepAccident, scheme: str
+) -> None:
+    features = [{"name": "prefers-color-scheme", "value": scheme}]
+    browser.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
+    token = accident(dataset)
+    addresses = [
+        served.url,
+        at("?view=table", served),
+        scenario_page(token, served),
+        scenario_page(token, served, "twin"),
+    ]
+    addresses += [scenario_page(token, served, "moment/ego_vehicle/2"), at("models/", served), at("release/", served)]
+    try:
+        for width, height in WIDTHS:
+            for address in addresses:
+                browser.open(address, width, height)
+                assert browser.overflowing() == [], address
+                assert browser.complaints() == [], address
+                ink = browser.script("return getComputedStyle(document.body).color")
+                assert (sum(map(int, ink[4:-1].split(","))) > 3 * 128) == (scheme == "dark"), address
+    finally:
+        browser.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+
+
+@pytest.fixture(scope="module")
+def judged(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Served, Explorer]]:
+    """Two bundles of the same samples, one of them without its results, and results without a bundle."""
+    folder = tmp_path_factory.mktemp("judged")
+    setup = EvaluationSetup(task="accident", protocol="boxes")
+    run, _ = stored_run(da_motion, setup, folder / "first.json")
+    save_run(run, folder / "first", include_results=True)
+    save_run(run, folder / "second")
+    stored_run(da_motion, EvaluationSetup(task="motion"), folder / "maps")
+    explorer = Explorer(
+        da_motion, bundles=[folder / "first", folder / "second"], results=[folder / "maps" / "results.json"]
+    )
+    explorer.begin()
+    assert explorer.jobs.wait(120)
+    with serving(make_app(explorer)) as running:
+        yield running, explorer
+
+
+def test_a_models_samples_and_two_side_by_side(browser: Browser, judged: tuple[Served, Explorer]) -> None:
+    served, explorer = judged
+    browser.open(served.url, 1280, 720)
+    browser.open(at("model/first/", served), 1280, 720)
+    bar: Any = browser.wait("document.querySelector('a[href*=\"by=\"]')")
+    assert bar is not None
+    browser.script("document.querySelector('a[href*=\"by=\"]').click()")
+    browser.wait("document.querySelector('a.entry')")
+    browser.open(at("model/first/samples", served), 1280, 720)
+    worst = next(iter(explorer.models["first"].scores.samples))  # type: ignore[union-attr]
+    first = browser.script("return document.querySelector('a.entry').pathname")
+    assert first == f"/model/first/sample/{quote(worst)}" or worst.rsplit("/", 1)[0] in first
+    browser.script("document.querySelector('a.entry').click()")
+    browser.wait("document.images.length >= 1 && [...document.images].every((each) => each.naturalWidth > 300)", 60)
+    browser.open(at("compare/first/second/", served), 1280, 720)
+    browser.wait("document.querySelector('a.entry')")
+    browser.script("document.querySelector('a.entry').click()")
+    browser.wait("location.pathname.includes('/sample/')")
+    assert browser.complaints() == []
+    assert [url for url in browser.requests() if not url.startswith(f"{served.origin}/")] == []

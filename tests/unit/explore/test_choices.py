@@ -1,0 +1,177 @@
+"""What a reader chose: it finds what `da.find` finds, its address comes back, its code runs."""
+
+import math
+import shlex
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
+
+from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.cli import deepaccident
+from deepaccident_devkit.explore.background import Jobs
+from deepaccident_devkit.explore.choices import PAGE, Choices, found_by
+from deepaccident_devkit.explore.scenarios import Scenarios
+from deepaccident_devkit.selection.fields import FIELDS
+
+FACETS = sorted(name for name, field in FIELDS.items() if field.groups)
+
+
+@pytest.fixture(scope="module")
+def scenarios(da: DeepAccident) -> Scenarios:
+    """With all columns."""
+    made = Scenarios(da, Jobs(), workers=1)
+    made.begin()
+    assert made._jobs.wait(60)
+    return made
+
+
+@pytest.fixture
+def waiting(da: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> Scenarios:
+    """Whose slow columns are never computed."""
+    jobs = Jobs()
+    monkeypatch.setattr(jobs, "_run", lambda: None)
+    return Scenarios(da, jobs, workers=1)
+
+
+def tokens(scenarios: Scenarios, **chosen: Any) -> list[str]:
+    found = found_by(scenarios, Choices(**chosen), {})
+    assert found.faults == ()
+    assert found.waiting == ()
+    return [scenarios.tokens[row] for row in found.rows.tolist()]
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        ["collision=true"],
+        ["town=Town03"],
+        ["length>=5", "collision=false"],
+        ["min_ttc<1.5"],
+        ["accident_visibility=unknown"],
+        ["scenario_type=type1_subtype1_accident"],
+    ],
+)
+def test_a_query_finds_what_the_devkit_finds(da: DeepAccident, scenarios: Scenarios, where: list[str]) -> None:
+    assert tokens(scenarios, query="; ".join(where)) == [each["token"] for each in da.find(*where)]
+
+
+@given(data=st.data())
+def test_facets_find_what_the_devkit_finds(da: DeepAccident, scenarios: Scenarios, data: st.DataObject) -> None:
+    """Any values of any facets; beside a value stands how many choosing it alone of its field would give."""
+    facets = {each.name: each for each in scenarios.facets()}
+    names = data.draw(st.lists(st.sampled_from(sorted(facets)), unique=True, max_size=3))
+    chosen = {
+        name: tuple(data.draw(st.lists(st.sampled_from(facets[name].values), unique=True, min_size=1)))
+        for name in names
+    }
+    choices = Choices(facets=chosen)
+    found = found_by(scenarios, choices, {})
+    assert [scenarios.tokens[row] for row in found.rows] == [each["token"] for each in da.find(*choices.filters)]
+    for name, counts in found.counts.items():
+        for each in counts:
+            alone = Choices(facets={**chosen, name: (each.value,)})
+            assert each.count == len(da.find(*alone.filters))
+            assert each.chosen == (each.value in chosen.get(name, ()))
+
+
+@given(
+    facets=st.dictionaries(
+        st.sampled_from(FACETS), st.lists(st.text(min_size=1), unique=True, min_size=1).map(tuple), max_size=3
+    ),
+    query=st.text(),
+    order=st.sampled_from(["up", "down"]),
+    view=st.sampled_from(["grid", "table"]),
+    page=st.integers(1, 999_999),
+)
+def test_an_address_says_all(facets: Any, query: str, order: Any, view: Any, page: int) -> None:
+    from urllib.parse import parse_qsl
+
+    choices = Choices(facets=facets, query=query.strip(), sort="lead", order=order, view=view, page=page)
+    address = choices.address()
+    assert Choices.of(parse_qsl(address.removeprefix("?"), keep_blank_values=True)) == choices
+
+
+@pytest.mark.parametrize(
+    "given_",
+    [[("page", "0")], [("page", "-1")], [("page", "x")], [("order", "x")], [("view", "x")], [("nonsense", "1")]],
+)
+def test_what_makes_no_sense_is_left_out(given_: list[tuple[str, str]]) -> None:
+    assert Choices.of(given_) == Choices()
+
+
+def test_a_sort_puts_unknown_values_last_in_both_orders(scenarios: Scenarios) -> None:
+    for column in ("lead", "lead_all", "min_ttc", "accident_visibility", "num_frames"):
+        numbers = scenarios.numbers(column)
+        assert numbers is not None
+        for order in ("up", "down"):
+            shown = numbers[[scenarios.row_of[each] for each in tokens(scenarios, sort=column, order=order)]]
+            known = shown[~np.isnan(shown)]
+            assert np.isnan(shown[len(known) :]).all()
+            assert known.tolist() == sorted(known.tolist(), reverse=order == "down")
+    assert math.isnan(scenarios.numbers("lead")[-1]) != math.isnan(scenarios.numbers("lead")[0])  # type: ignore[index]
+
+
+def test_names_are_sorted_both_ways(scenarios: Scenarios) -> None:
+    assert tokens(scenarios, order="down") == scenarios.tokens[::-1]
+
+
+def test_a_fault_is_told_and_the_rest_counts(scenarios: Scenarios) -> None:
+    query = "bogus=1; town=Atlantis; length>>3; collision=true"
+    found = found_by(scenarios, Choices(query=query), {})
+    assert len(found.faults) == 3
+    assert "'bogus'" in found.faults[0]
+    assert "Atlantis" in found.faults[1]
+    assert [scenarios.tokens[row] for row in found.rows] == tokens(scenarios, query="collision=true")
+
+
+def test_a_value_that_no_scenario_has_finds_nothing(scenarios: Scenarios) -> None:
+    assert tokens(scenarios, facets={"collision": ("maybe",)}) == []
+    found = found_by(scenarios, Choices(facets={"velocity_frame": ("lidar",)}), {})
+    assert len(found.rows) == 0  # a field of one value is no facet, but counts
+
+
+def test_what_is_not_computed_yet_is_said(waiting: Scenarios) -> None:
+    for choices in (
+        Choices(query="min_ttc<2"),
+        Choices(facets={"accident_visibility": ("visible",)}),
+        Choices(sort="lead"),
+    ):
+        found = found_by(waiting, choices, {})
+        assert len(found.rows) == len(waiting)
+        (said,) = found.waiting
+        assert "is being computed" in said
+    assert "accident_visibility" not in {each.name for each in waiting.facets()}
+    assert waiting.values("min_ttc") is None
+
+
+def test_what_cannot_be_computed_is_said(da: DeepAccident, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: Any, **__: Any) -> None:
+        raise MemoryError("too little")
+
+    monkeypatch.setattr("deepaccident_devkit.explore.scenarios.interactions_of", fails)
+    scenarios = Scenarios(da, Jobs(), workers=1)
+    scenarios.begin()
+    assert scenarios._jobs.wait(60)
+    found = found_by(scenarios, Choices(query="min_ttc<2"), {})
+    assert found.waiting == ("min_ttc<2: cannot be computed (MemoryError: too little)",)
+    assert tokens(scenarios, query="closing_speed>=0") != []
+
+
+def test_the_code_finds_the_same(da: DeepAccident, scenarios: Scenarios, tmp_path: Any) -> None:
+    choices = Choices(facets={"collision": ("true",), "town": (da.scenario[0]["town"],)}, query="length>=2")
+    wanted = tokens(scenarios, facets=choices.facets, query=choices.query)
+    assert [each["token"] for each in eval(choices.python(), {"da": da})] == wanted  # noqa: S307
+    program, *words = shlex.split(choices.command(str(da.dataroot)))
+    assert program == "deepaccident"
+    words[-1] = str(tmp_path / words[-1])
+    done = CliRunner().invoke(deepaccident, words, catch_exceptions=False)
+    assert done.exit_code == 0
+    assert (tmp_path / "selection.txt").read_text().split("\n")[:-1] == [each.replace("/", " ") for each in wanted]
+
+
+def test_a_page_has_so_many() -> None:
+    assert PAGE % 2 == PAGE % 3 == PAGE % 4 == 0  # the last row of a grid is full
