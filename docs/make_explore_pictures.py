@@ -25,7 +25,7 @@ from deepaccident_devkit.explore.serving import Served, serving
 from deepaccident_devkit.synth import SynthConfig, make_release
 
 IMAGES = Path(__file__).parent / "images"
-RELEASE = SynthConfig(scenarios=8, frames=45, image_size=(640, 360), seed=2)
+RELEASE = SynthConfig(scenarios=6, frames=40, image_size=(480, 270), seed=2)
 SELECTION = SampleSelection(split="train", scope="all")
 SIZE = (1280, 720)
 QUALITY = 80
@@ -33,7 +33,7 @@ WAIT = 60.0
 """Seconds for a page to be as it should."""
 LOADED = "[...document.images].every((each) => each.complete)"
 COMPUTED = "![...document.querySelectorAll('.waits')].length"
-AT = "go(34);"
+AT = "go(29);"
 
 
 def main() -> None:
@@ -73,7 +73,7 @@ def keep_all(served: Served, explorer: Explorer) -> None:
         "scenario": (f"{here}/", AT, LOADED),
         "cameras": (f"{here}/?cameras=all", f"{AT} document.getElementById('every').scrollIntoView()", LOADED),
         "twin": (f"{here}/twin", "", "[...document.querySelectorAll('iframe')].every((each) => each.contentWindow.go)"),
-        "moment": (f"{here}/moment/ego_vehicle/35", "", "document.images[0].naturalWidth"),
+        "moment": (f"{here}/moment/ego_vehicle/30", "", "document.images[0].naturalWidth"),
         "model": ("model/ego_alone/", "", COMPUTED),
         "sample": (f"model/ego_alone/sample/{worst}", "", LOADED),
         "compare": ("compare/ego_alone/five_agents/", "", COMPUTED),

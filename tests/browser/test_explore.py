@@ -238,6 +238,26 @@ def test_a_scenario_shows_all(pages: Browser, served: Served, dataset: DeepAccid
     assert frame(pages) == int(number) - 1
 
 
+def test_an_address_says_what_is_looked_at(pages: Browser, served: Served, dataset: DeepAccident) -> None:
+    """A colleague who opens it sees the same: moment, large camera, layers, LiDARs, cameras and part of the scene."""
+    pages.open(scenario_page(accident(dataset), served), 1280, 720)
+    pages.script("go(2); document.getElementById('layer-trails').click(); enlarge('2')")
+    pages.script("document.getElementById('cloud-infrastructure').click(); zoom(2)")
+    pages.script("const s = cards[0].select; s.value = 'Back'; s.dispatchEvent(new Event('change'))")
+    pages.wait("location.search.includes('view=')")
+    looks = """return [state.frame, state.large, state.follow, state.clouds, state.layers, cards[0].chosen,
+        [ground.x, ground.y, ground.scale].map((each) => each.toFixed(1)), location.search]"""
+    seen = pages.script(looks)
+    assert seen[:4] == [2, "2", "", [0, 4]]
+    pages.open(str(pages.driver.current_url), 1280, 720)
+    pages.wait("document.getElementById('scrubber').value === '2'")
+    assert pages.script(looks) == seen
+    nonsense = "?frame=x&large=nobody&follow=me&changed=a,b&pictures=c:d,,&view=1,2,x&cameras=none"
+    pages.open(scenario_page(accident(dataset), served, nonsense), 1280, 720)
+    pages.wait("location.search === ''")
+    assert frame(pages) == 0
+
+
 def test_a_moments_boxes_and_labels(pages: Browser, served: Served, dataset: DeepAccident) -> None:
     token = accident(dataset)
     pages.open(scenario_page(token, served, "?frame=2&large=infrastructure"), 1280, 720)

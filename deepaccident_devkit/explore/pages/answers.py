@@ -9,7 +9,7 @@ from urllib.parse import quote
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from starlette.requests import Request
-from starlette.responses import HTMLResponse, Response
+from starlette.responses import HTMLResponse, RedirectResponse, Response
 
 from deepaccident_devkit._version import __version__
 from deepaccident_devkit.explore.explorer import Explorer
@@ -50,6 +50,13 @@ def rendered(explorer: Explorer, template: str, root: str, **context: Any) -> st
     """
     models = [*explorer.models]
     return environment().get_template(template).render(root=root, models=models, **context)
+
+
+async def with_slash(request: Request) -> Response:
+    """The address of a folder ends in a slash, so that the addresses in its page are below it."""
+    query = f"?{request.url.query}" if request.url.query else ""
+    last = quote(request.scope["path"].rsplit("/", 1)[1], safe="")
+    return RedirectResponse(f"./{last}/{query}", status_code=307)
 
 
 def picture(content: bytes, kind: str) -> Response:

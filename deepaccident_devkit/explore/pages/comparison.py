@@ -21,7 +21,7 @@ from deepaccident_devkit.explore.comparing import (
 )
 from deepaccident_devkit.explore.evaluations import Evaluated, evaluated
 from deepaccident_devkit.explore.models import Model
-from deepaccident_devkit.explore.pages.answers import explorer_of, page
+from deepaccident_devkit.explore.pages.answers import explorer_of, page, with_slash
 from deepaccident_devkit.explore.pages.model_addresses import (
     SAMPLE,
     beside_in_time,
@@ -29,7 +29,6 @@ from deepaccident_devkit.explore.pages.model_addresses import (
     model_of,
     sample_path,
     titles,
-    with_slash,
 )
 from deepaccident_devkit.explore.pages.release_tabs import part_of
 from deepaccident_devkit.explore.pages.samples import PAGE, asked_ahead, place_in, sample_context

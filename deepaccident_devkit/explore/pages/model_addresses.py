@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from urllib.parse import quote
 
 from starlette.requests import Request
-from starlette.responses import RedirectResponse, Response
 
 from deepaccident_devkit.errors import NotAvailableError, TokenError
 from deepaccident_devkit.explore.background import Job
@@ -25,13 +23,6 @@ def model_of(request: Request, name: str = "model") -> Model:
     if given not in models:
         raise NotAvailableError(f"there is no model {given!r}; those that were given: {', '.join(models) or 'none'}")
     return models[given]
-
-
-async def with_slash(request: Request) -> Response:
-    """The address of a folder ends in a slash, so that the addresses in its page are below it."""
-    query = f"?{request.url.query}" if request.url.query else ""
-    last = quote(request.scope["path"].rsplit("/", 1)[1], safe="")
-    return RedirectResponse(f"./{last}/{query}", status_code=307)
 
 
 def sample_path(token: str) -> str:

@@ -17,8 +17,8 @@ from deepaccident_devkit.explore.evaluations import evaluated
 from deepaccident_devkit.explore.explorer import Explorer
 from deepaccident_devkit.explore.models import Model
 from deepaccident_devkit.explore.pages import comparison, samples
-from deepaccident_devkit.explore.pages.answers import explorer_of, page
-from deepaccident_devkit.explore.pages.model_addresses import model_of, models_of_task, titles, with_slash
+from deepaccident_devkit.explore.pages.answers import explorer_of, page, with_slash
+from deepaccident_devkit.explore.pages.model_addresses import model_of, models_of_task, titles
 from deepaccident_devkit.explore.pages.samples import rows_of
 from deepaccident_devkit.explore.sample_lists import SampleChoices, listed
 from deepaccident_devkit.explore.truth import truth_job

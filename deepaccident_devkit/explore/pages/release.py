@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from starlette.requests import Request
-from starlette.responses import RedirectResponse, Response
+from starlette.responses import Response
 from starlette.routing import Route
 
 from deepaccident_devkit.explore.explorer import Explorer
 from deepaccident_devkit.explore.pages import findings, maps, statistics
-from deepaccident_devkit.explore.pages.answers import explorer_of
+from deepaccident_devkit.explore.pages.answers import explorer_of, with_slash
 from deepaccident_devkit.explore.pages.release_tabs import pages_of, part_of, release_page
 from deepaccident_devkit.explore.scenarios import UNKNOWN
 from deepaccident_devkit.overview import Overview, overview
@@ -26,7 +26,7 @@ _NONE: Final = "none"
 def routes() -> list[Route]:
     """The addresses."""
     return [
-        Route("/release", _with_slash),
+        Route("/release", with_slash),
         Route("/release/", _contents),
         Route("/release/files", _files),
         Route("/release/conventions", _conventions),
@@ -34,10 +34,6 @@ def routes() -> list[Route]:
         *findings.routes(),
         *maps.routes(),
     ]
-
-
-async def _with_slash(_: Request) -> Response:
-    return RedirectResponse("release/", status_code=307)
 
 
 def _conventions(request: Request) -> Response:

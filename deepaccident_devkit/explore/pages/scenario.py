@@ -8,13 +8,13 @@ from typing import Any, Final
 
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import HTMLResponse, RedirectResponse, Response
+from starlette.responses import HTMLResponse, Response
 from starlette.routing import Route
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import NotAvailableError, TokenError
 from deepaccident_devkit.explore.explorer import Explorer
-from deepaccident_devkit.explore.pages.answers import explorer_of, page, rendered, root_of
+from deepaccident_devkit.explore.pages.answers import explorer_of, page, rendered, root_of, with_slash
 from deepaccident_devkit.explore.pages.pictures import SCENARIO, sample_of, token_of
 from deepaccident_devkit.interactions import interactions
 from deepaccident_devkit.render.replay import CONTROLS, PLAYER, replay_part, script_json
@@ -28,19 +28,13 @@ _MOST_PAIRS: Final = 30
 def routes() -> list[Route]:
     """The addresses."""
     return [
-        Route(SCENARIO, _with_slash),
+        Route(SCENARIO, with_slash),
         Route(f"{SCENARIO}/", _scenario),
         Route(f"{SCENARIO}/player", _player),
         Route(f"{SCENARIO}/twin", _twin),
         Route(f"{SCENARIO}/parts/{{part}}", _part),
         Route(f"{SCENARIO}/moment/{{agent}}/{{frame:int}}", _moment),
     ]
-
-
-async def _with_slash(request: Request) -> Response:
-    """The page's address ends in a slash, so that the addresses in it are below it."""
-    query = f"?{request.url.query}" if request.url.query else ""
-    return RedirectResponse(f"{request.scope['path'].rsplit('/', 1)[1]}/{query}", status_code=307)
 
 
 def _scenario(request: Request) -> Response:

@@ -96,7 +96,7 @@ def mapped(da: DeepAccident, tmp_path: Path) -> Iterator[Reader]:
 
 def test_the_address_ends_in_a_slash(reader: Reader) -> None:
     answer = get(reader.app, "/release")
-    assert (answer.status, answer.headers["location"]) == (307, "release/")
+    assert (answer.status, answer.headers["location"]) == (307, "./release/")
 
 
 def test_all_links_lead_somewhere(of_damaged: Reader) -> None:

@@ -64,7 +64,7 @@ def test_the_page_plays_what_the_replay_plays(app: Any, here: str, da: DeepAccid
 
 def test_its_address_ends_in_a_slash(app: Any, here: str) -> None:
     answer = get(app, f"{here.rstrip('/')}?frame=3")
-    assert (answer.status, answer.headers["location"]) == (307, f"{here.strip('/').rsplit('/', 1)[1]}/?frame=3")
+    assert (answer.status, answer.headers["location"]) == (307, f"./{here.strip('/').rsplit('/', 1)[1]}/?frame=3")
 
 
 def test_images_are_the_releases_in_the_width_asked_for(app: Any, here: str, da: DeepAccident) -> None:
