@@ -79,6 +79,10 @@ class Explorer:
         self.thumbnails = KeptFiles(dataset)
         self._drawing = threading.Lock()
 
+    def __repr__(self) -> str:
+        """Of which release, and of which models."""
+        return f"Explorer({self.dataset!r}, models: {', '.join(self.models) or 'none'})"
+
     def begin(self) -> None:
         """Begin slow work in the background: the columns of the scenarios, and models' scores."""
         for model in self.models.values():

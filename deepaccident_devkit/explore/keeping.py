@@ -12,6 +12,7 @@ from typing import Final, Generic, TypeVar
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.files import is_writable_folder
+from deepaccident_devkit.reading import read_bytes
 from deepaccident_devkit.release.store.cache import FileCache
 
 Value = TypeVar("Value")
@@ -81,7 +82,7 @@ class KeptFiles:
         """The content of a file; `identity` tells it from all others. Raises what `make` raises."""
         path = self._files.path_of(identity, name)
         with suppress(OSError):
-            content = path.read_bytes()
+            content = read_bytes(path, "image")
             os.utime(path)  # who was not used the longest goes first
             return content
         content = make()

@@ -11,6 +11,7 @@ from typing import Final
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.files import replacing_folder, temporary_path, writable_folder, write_bytes
+from deepaccident_devkit.reading import read_bytes
 
 MARK: Final = ".deepaccident_pages"
 """The file by which an export knows the folder of an earlier one: it names all files that were written."""
@@ -63,5 +64,5 @@ def _earlier(folder: Path) -> list[str]:
     mark = folder / MARK
     if not mark.is_file() or mark.is_symlink():
         return []
-    head, *names = mark.read_text(encoding="utf-8", errors="replace").splitlines()
+    head, *names = read_bytes(mark, "index").decode(errors="replace").splitlines()
     return [*names, MARK] if head == _HEAD else []
