@@ -39,6 +39,8 @@ from deepaccident_devkit.explore.pages.model_addresses import sample_path
 from deepaccident_devkit.explore.verdicts import verdict
 from deepaccident_devkit.render.outcomes.accident import count_words
 
+pytestmark = pytest.mark.slow
+
 BOXES = EvaluationSetup(task="accident", protocol="boxes")
 HOSTILE = """<img src=x onerror=alert(1)> "a" & 'b' ..%2e%2e?#;"""
 ELSEWHERE = (Accident(positions=np.full((2, 2), 30.0), time=0.5, score=0.9),)
@@ -423,7 +425,6 @@ def test_the_command_is_understood(site: Site) -> None:
     assert "--allow-partial" not in words
 
 
-@pytest.mark.slow
 def test_the_command_makes_a_bundle(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     result = CliRunner().invoke(

@@ -31,6 +31,8 @@ from deepaccident_devkit.tables import SEVERITIES, Finding
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.validation import CODES, ValidationReport, release_completeness, validate_release
 
+pytestmark = pytest.mark.slow
+
 
 class Reader:
     """Asks an explorer for pages, as a browser does that loads a page again when its work is done."""

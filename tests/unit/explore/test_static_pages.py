@@ -25,6 +25,8 @@ from deepaccident_devkit.explore.verdicts import verdict
 from deepaccident_devkit.render.replay import render_replay
 from deepaccident_devkit.render.roles import short_name
 
+pytestmark = pytest.mark.slow
+
 SVG = "http://www.w3.org/2000/svg"
 """A name, which no browser opens."""
 
@@ -210,7 +212,6 @@ def test_verdicts_are_the_bundles_rows(made: Made, da_motion: DeepAccident) -> N
     assert [table for table in made.page(normal(da_motion)).tables if table[0][0] == "agent"] == []
 
 
-@pytest.mark.slow
 def test_the_same_call_gives_the_same_bytes(made: Made, da_motion: DeepAccident, tmp_path: Path) -> None:
     folder = made.bundle.parent
     again = export_pages(
@@ -235,7 +236,6 @@ def listed(index: Path) -> list[str]:
     return [row[0] for row in shown(index).table("scenario")]
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("_quickly")
 def test_scenarios_are_chosen_by_filters_and_by_name(da_b: DeepAccident, tmp_path: Path) -> None:
     tokens = [scenario["token"] for scenario in da_b.scenario]
