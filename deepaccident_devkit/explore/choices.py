@@ -6,7 +6,7 @@ import re
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Final, Literal, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 from urllib.parse import urlencode
 
 import numpy as np
@@ -17,6 +17,10 @@ from deepaccident_devkit.explore.scenarios import Facet, Scenarios
 from deepaccident_devkit.selection import parse_where
 from deepaccident_devkit.selection.conditions import condition_of
 from deepaccident_devkit.selection.fields import FIELDS, field_of
+
+if TYPE_CHECKING:
+    from deepaccident_devkit.explore.background import Job
+    from deepaccident_devkit.explore.models import Model
 
 View = Literal["grid", "table"]
 Order = Literal["up", "down"]
@@ -97,12 +101,21 @@ class Choices:
 
     def python(self) -> str:
         """The call that finds the same scenarios."""
-        return f"da.find({', '.join(map(repr, self.filters))})"
+        return find_call(self.filters)
 
     def command(self, dataroot: str) -> str:
         """The command that writes the same scenarios into a split file."""
-        where = [word for each in self.filters for word in ("--where", each)]
-        return shlex.join(["deepaccident", "split", dataroot, *where, "--save", "selection.txt"])
+        return shlex.join(["deepaccident", "split", dataroot, *where_words(self.filters), "--save", "selection.txt"])
+
+
+def find_call(filters: Iterable[str]) -> str:
+    """Filters as the Python call that finds the same scenarios."""
+    return f"da.find({', '.join(map(repr, filters))})"
+
+
+def where_words(filters: Iterable[str]) -> list[str]:
+    """Filters as words of a command line."""
+    return [word for each in filters for word in ("--where", each)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,13 +150,13 @@ class Found:
     waiting: tuple[str, ...]
 
 
-def found_by(scenarios: Scenarios, choices: Choices, scores: Mapping[str, Any]) -> Found:
+def found_by(scenarios: Scenarios, choices: Choices, scores: Mapping[str, Model]) -> Found:
     """The scenarios that match all that was chosen.
 
     Args:
         scenarios: of the release.
         choices: of the reader.
-        scores: `score:MODEL` → (N,) numbers, NaN unknown; None until they are computed.
+        scores: `score:MODEL` → the model, whose scores may still be computed.
     """
     facets = scenarios.facets()
     chosen = {each.name: choices.facets[each.name] for each in facets if each.name in choices.facets}
@@ -183,10 +196,11 @@ def _by_query(scenarios: Scenarios, choices: Choices, plain: Sequence[str]) -> t
         try:
             wanted = parse_where(line)
             looked = field_of(wanted.name)
-            values = scenarios.values(looked.name)
-            if values is None:
-                waiting.append(_waiting_text(line, scenarios.job_of(looked.name)))
+            late = scenarios.late(looked.name)
+            if late is not None:
+                waiting.append(_waiting_text(line, late))
                 continue
+            values = scenarios.values(looked.name) or []
             condition = condition_of(wanted, looked, _words(values) if looked.kind == "word" else ())
             matching &= np.array([condition.holds(value) for value in values], dtype=bool)
         except DeepAccidentError as error:
@@ -194,7 +208,7 @@ def _by_query(scenarios: Scenarios, choices: Choices, plain: Sequence[str]) -> t
     return matching, faults, waiting
 
 
-def _waiting_text(what: str, job: Any) -> str:
+def _waiting_text(what: str, job: Job) -> str:
     if job.state == "failed":
         return f"{what}: cannot be computed ({job.error})"
     return f"{what}: is being computed ({job.title}); it counts as soon as it is there"
@@ -205,17 +219,18 @@ def _words(values: Sequence[Any]) -> set[Any]:
 
 
 def _sorted(
-    scenarios: Scenarios, choices: Choices, rows: IntArray, scores: Mapping[str, Any]
+    scenarios: Scenarios, choices: Choices, rows: IntArray, scores: Mapping[str, Model]
 ) -> tuple[IntArray, list[str]]:
     """Rows by the column of choice, unknown values last, and what is waited for."""
     if choices.sort == "name" or (choices.sort not in SORTS and choices.sort not in scores):
         return rows if choices.order == "up" else rows[::-1], []
-    if choices.sort in SORTS:
-        numbers, job = scenarios.numbers(choices.sort), scenarios.job_of(choices.sort)
+    model = scores.get(choices.sort)
+    if model is None:
+        late, numbers = scenarios.late(choices.sort), scenarios.numbers(choices.sort)
     else:
-        numbers, job = scores[choices.sort].numbers(scenarios), scores[choices.sort].job
-    if numbers is None:
-        return rows, [_waiting_text(f"sorted by {choices.sort}", job)]
+        late, numbers = model.job if model.scores is None else None, model.numbers(scenarios)
+    if late is not None or numbers is None:
+        return rows, [] if late is None else [_waiting_text(f"sorted by {choices.sort}", late)]
     keys = numbers[rows]
     keys = keys if choices.order == "up" else -keys
     return rows[np.argsort(keys, kind="stable")], []  # NaN is last in both orders

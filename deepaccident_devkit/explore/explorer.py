@@ -42,7 +42,7 @@ class Explorer:
         dataset: the release.
         models: by name, in the order given.
         jobs: slow work in the background.
-        workers: processes for slow work; None takes few.
+        workers: processes for slow work.
         scenarios: columns of the release's scenarios.
         pictures: JPEG and PNG files in memory, by what they show.
         replays: what replays play, by scenario and model.
@@ -69,9 +69,9 @@ class Explorer:
             ResultsError: one of them cannot be read.
         """
         self.dataset = dataset
-        self.workers = workers
+        self.workers = workers or _few_workers(len(dataset.scenario))
         self.jobs = Jobs()
-        self.scenarios = Scenarios(dataset, self.jobs, workers=workers or _few_workers(len(dataset.scenario)))
+        self.scenarios = Scenarios(dataset, self.jobs, workers=self.workers)
         self.models: Mapping[str, Model] = open_models(map(Path, bundles), map(Path, results), self.jobs)
         self.pictures: Kept[bytes] = Kept(_MOST_PICTURES, len)
         self.replays: Kept[dict[str, Any]] = Kept(_MOST_REPLAYS)
@@ -107,14 +107,14 @@ class Explorer:
         """What replays know of a scenario; raises TokenError."""
         return self._recordings.get(token, lambda: recording_of(self.dataset, token, None))
 
-    def replay(self, token: str, model: str | None, folder: str) -> dict[str, Any]:
+    def replay(self, token: str, model: str | None) -> dict[str, Any]:
         """What the replay of a scenario plays (`served_replay`), with a model's predictions; None for none."""
 
         def make() -> dict[str, Any]:
             prediction = None if model is None else self.models[model].results
-            return served_replay(self.dataset, token, folder, prediction=prediction)
+            return served_replay(self.dataset, token, "", prediction=prediction)
 
-        return self.replays.get((token, model, folder), make)
+        return self.replays.get((token, model), make)
 
     def drawn(self, key: Hashable, draw: Callable[[], Any]) -> bytes:
         """A figure as PNG, rendered at the first call with a key; one at a time, as matplotlib needs it."""

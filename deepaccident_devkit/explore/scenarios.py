@@ -97,6 +97,11 @@ class Scenarios:
         """The work that gives a column; None for one that is there at once."""
         return self.job(_JOB_OF[column]) if column in _JOB_OF else None
 
+    def late(self, column: str) -> Job | None:
+        """The work that a column waits for; None for one that is there."""
+        job = self.job_of(column)
+        return job if job is not None and job.result is None else None
+
     def values(self, column: str) -> Sequence[Any] | None:
         """A column's values, None where unknown, or several in a tuple; None in its place until it is ready."""
         job = self.job_of(column)
@@ -127,14 +132,18 @@ class Scenarios:
     def _visibility(self) -> Facet:
         return _facet("accident_visibility", self.values("accident_visibility") or [])
 
-    def _interactions(self) -> dict[str, list[float | None]]:
+    def _interactions(self) -> dict[str, list[Any]]:
         found = interactions_of(self.dataset, workers=self._workers)
-        rows = [measures_of_moving_pairs(each) for each in found]
-        return {name: [row[name] for row in rows] for name in ("min_ttc", "min_pet", "min_gap", "max_drac")}
+        return _columns(INTERACTIONS, [measures_of_moving_pairs(each) for each in found])
 
     def _accidents(self) -> dict[str, list[Any]]:
         found = each_scenario(accident_columns, self.dataset, label="accidents", workers=self._workers)
-        return {name: [each[name] for each in found.results] for name in found.results[0]} if found.results else {}
+        return _columns(ACCIDENTS, found.results)
+
+
+def _columns(job: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """The columns that a work gives, from what it found of each scenario."""
+    return {name: [row[name] for row in rows] for name, work in _JOB_OF.items() if work == job}
 
 
 def accident_columns(dataset: Dataset, record: ScenarioRecord) -> dict[str, Any]:

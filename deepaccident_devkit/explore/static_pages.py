@@ -15,7 +15,7 @@ from deepaccident_devkit.errors import ConfigError, NotAvailableError, ResultsEr
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs.selection import scenario_of
 from deepaccident_devkit.explore.background import Jobs
-from deepaccident_devkit.explore.choices import SCORE
+from deepaccident_devkit.explore.choices import SCORE, find_call, where_words
 from deepaccident_devkit.explore.models import Model, open_models
 from deepaccident_devkit.explore.pages.answers import environment
 from deepaccident_devkit.explore.pages.scenario import PARTS
@@ -190,7 +190,6 @@ class _Pages:
             )
             for record, each in zip(self._records, told, strict=True)
         ]
-        where = [word for each in filters for word in ("--where", each)]
         self._write_page(
             INDEX,
             "written_list.html",
@@ -198,8 +197,8 @@ class _Pages:
             entries=entries,
             slow=SLOW,
             release=self._dataset.version,
-            python=f"da.find({', '.join(map(repr, filters))})",
-            command=shlex.join(["deepaccident", "explore", "DATAROOT", *where, "--export", "DIR"]),
+            python=find_call(filters),
+            command=shlex.join(["deepaccident", "explore", "DATAROOT", *where_words(filters), "--export", "DIR"]),
         )
 
     def _write_scenario(self, place: int, told: Told) -> None:

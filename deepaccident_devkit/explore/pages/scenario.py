@@ -52,19 +52,18 @@ def _left_out(request: Request, explorer: Explorer, token: str) -> Response:
     return page(request, "broken.html", **context)
 
 
-def scenario_context(explorer: Explorer, token: str, model: str | None, folder: str = "") -> dict[str, Any]:
+def scenario_context(explorer: Explorer, token: str, model: str | None) -> dict[str, Any]:
     """What a scenario's page shows.
 
     Args:
         explorer: of the release.
         token: the scenario.
         model: name of a model, whose predictions the replay shows; None for none.
-        folder: relative address of the scenario's files.
     """
     row, rows = explorer.scenarios.row_of[token], explorer.scenarios
     telling = [name for name, each in explorer.models.items() if each.results and token in each.scenarios]
     shown = model if model in telling and explorer.models[model].setup.task != "detection" else None
-    twin = twin_of(explorer.dataset, token)
+    twin, played = twin_of(explorer.dataset, token), explorer.replay(token, shown)
     return {
         "token": token,
         "before": rows.tokens[row - 1] if row else None,
@@ -72,11 +71,11 @@ def scenario_context(explorer: Explorer, token: str, model: str | None, folder: 
         "twin": None if twin is None else twin["token"],
         "telling": telling,
         "model": shown,
-        "data": script_json(explorer.replay(token, shown, folder)),
+        "data": script_json(played),
         "player": replay_part(PLAYER),
         "controls": replay_part(CONTROLS),
         "parts": PARTS,
-        "first_agent": explorer.replay(token, shown, folder)["agents"][0]["name"],
+        "first_agent": played["agents"][0]["name"],
     }
 
 

@@ -77,10 +77,14 @@ def _is_unclear(found: Found) -> bool:
 def _job(explorer: Explorer, choices: Choices, found: Found | None) -> Job:
     """The work that counts the scenarios, once for the same ones."""
     if found is None:
-        return explorer.jobs.ask(_name(found), "statistics", lambda: dataset_statistics(explorer.dataset))
+        return explorer.jobs.ask(
+            _name(found), "statistics", lambda: dataset_statistics(explorer.dataset, workers=explorer.workers)
+        )
     chosen = [explorer.scenarios.tokens[row] for row in found.rows.tolist()]
     title = f"statistics of {'; '.join(choices.filters)}"
-    return explorer.jobs.ask(_name(found), title, lambda: dataset_statistics(explorer.dataset, chosen))
+    return explorer.jobs.ask(
+        _name(found), title, lambda: dataset_statistics(explorer.dataset, chosen, workers=explorer.workers)
+    )
 
 
 def _name(found: Found | None) -> str:
