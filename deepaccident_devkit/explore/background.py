@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import threading
 from collections.abc import Callable
@@ -14,6 +15,8 @@ logger = logging.getLogger(__name__)
 
 State = Literal["waiting", "running", "ready", "failed"]
 _DONE: Final = ("ready", "failed")
+_MOST: Final = 200
+"""Jobs that are kept: of more, the done one that was not asked for the longest goes, so that memory stays flat."""
 
 
 class Job:
@@ -25,6 +28,7 @@ class Job:
         state: whether it is done.
         result: what it gave; None until it is ready.
         error: why it failed, for readers; empty if it did not.
+        asked: when it was asked for the last time, by a number that grows.
     """
 
     def __init__(self, name: str, title: str, work: Callable[[], Any]) -> None:
@@ -32,6 +36,7 @@ class Job:
         self.state: State = "waiting"
         self.result: Any = None
         self.error = ""
+        self.asked = 0
 
     @property
     def is_done(self) -> bool:
@@ -53,23 +58,26 @@ class Job:
 
 
 class Jobs:
-    """All work that was asked for, each piece once."""
+    """All work that was asked for, each piece once, as long as its result is kept."""
 
     def __init__(self) -> None:
         self._jobs: dict[str, Job] = {}
         self._queue: SimpleQueue[Job | None] = SimpleQueue()
         self._changed = threading.Condition()
         self._thread: threading.Thread | None = None
+        self._asked = itertools.count()
 
     def ask(self, name: str, title: str, work: Callable[[], Any]) -> Job:
         """The job of a name; if there is none yet, it is begun after those that were asked for before."""
         with self._changed:
             if name not in self._jobs:
+                self._make_room()
                 self._jobs[name] = Job(name, title, work)
                 self._queue.put(self._jobs[name])
                 if self._thread is None:
                     self._thread = threading.Thread(target=self._run, name="explore-background", daemon=True)
                     self._thread.start()
+            self._jobs[name].asked = next(self._asked)
             return self._jobs[name]
 
     def get(self, name: str) -> Job | None:
@@ -89,6 +97,11 @@ class Jobs:
     def end(self) -> None:
         """Begin no more. What runs is not waited for: its thread ends with the process."""
         self._queue.put(None)
+
+    def _make_room(self) -> None:
+        done = [job for job in self._jobs.values() if job.is_done]
+        if done and len(self._jobs) >= _MOST:
+            del self._jobs[min(done, key=lambda job: job.asked).name]
 
     def _run(self) -> None:
         for job in iter(self._queue.get, None):

@@ -3,7 +3,10 @@
 import threading
 from typing import Any
 
+import pytest
+
 from deepaccident_devkit.errors import NotAvailableError
+from deepaccident_devkit.explore import background
 from deepaccident_devkit.explore.background import Jobs
 
 
@@ -48,6 +51,24 @@ def test_a_failure_is_told_and_the_next_is_done() -> None:
         ("failed", "ZeroDivisionError: of nothing"),
         ("ready", ""),
     ]
+
+
+def test_the_results_that_were_not_asked_for_the_longest_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(background, "_MOST", 3)
+    jobs, done, go = Jobs(), [], threading.Event()
+
+    def ask(name: str) -> None:
+        jobs.ask(name, "", lambda: done.append(name))
+        assert jobs.wait(10)
+
+    for name in ("a", "b", "c", "a", "d", "a", "b"):  # with d, b has to go, and with b, c
+        ask(name)
+    assert done == ["a", "b", "c", "d", "b"]
+    for name in ("slow", "late", "later", "last"):
+        jobs.ask(name, "", go.wait)
+    assert [job.name for job in jobs.all()] == ["slow", "late", "later", "last"]  # what is not done stays
+    go.set()
+    assert jobs.wait(10)
 
 
 def test_what_runs_is_not_waited_for() -> None:
