@@ -168,10 +168,10 @@ def _remove_half_written(root: Path) -> None:
 
     The lock is held, so that no living process has one, on whatever host.
     """
-    with suppress(OSError):
-        for path in [path for folder in ("", "*/*/", "*/*/*/") for path in root.glob(f"{folder}.*.tmp")]:
-            if _is_half_written(path.name):
-                path.unlink(missing_ok=True)
+    for folder, _, names in os.walk(root):  # follows no link
+        for name in filter(_is_half_written, names):
+            with suppress(OSError):
+                Path(folder, name).unlink()
 
 
 def _is_own(name: str) -> bool:
