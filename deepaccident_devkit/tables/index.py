@@ -65,7 +65,7 @@ class Index(ShortRepr):
 
     @property
     def tables_folder(self) -> Path:
-        """The folder with one Arrow file a table."""
+        """The folder with one Arrow file a table; raises OutputFolderError if it is a link."""
         return place_in(self.folder, self.manifest.tables, opened=True)
 
 

@@ -177,6 +177,7 @@ ATTACKS = {
     "nothing": "",
     "a folder's end": "linked/",
     "a long name": "a" * 300,
+    "a deep one": "a/" * 300_000 + "a",
     "below a file": "counts.json/below/it",
     "no UTF-8": b"\xff\xfe",
 }

@@ -29,6 +29,8 @@ _PATHS: Final = ".paths"
 _LOCK: Final = ".lock"
 _REFUSED: Final = re.compile(r"(.*/)?(\.{0,2}|\.deepaccident[^/]*|[^/]*\.manifest\.json)(/.*)?", re.DOTALL)
 """Paths that no export notes: out of its folder, or to what it keeps there itself. Somebody else wrote those."""
+_LONGEST: Final = 4096
+"""Characters of a path; no system opens a longer one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,4 +139,4 @@ def _noted(journal: Path) -> set[str]:
         paths = read_bytes(journal, "bundle").decode().split("\0")[:-1]
     except (OSError, ValueError):
         return set()
-    return {path for path in paths if not _REFUSED.fullmatch(path)}
+    return {path for path in paths if len(path) <= _LONGEST and not _REFUSED.fullmatch(path)}
