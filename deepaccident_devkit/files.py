@@ -235,15 +235,15 @@ def place_in(folder: Path, path: str | PurePath, *, opened: bool = False) -> Pat
 
     Args:
         folder: which may hold a stranger's files.
-        path: relative to it; empty for the folder itself.
+        path: relative to it; it may be empty, for the folder itself, if that is `opened`.
         opened: whether it must be no link itself, as a lock, or a folder into which others write.
 
     Raises:
-        OutputFolderError: there is a link, or the path is absolute or has `..`.
+        OutputFolderError: there is a link, or the path is absolute, has `..`, or is empty.
     """
     inside = PurePath(path)
-    if inside.is_absolute() or ".." in inside.parts:
-        raise OutputFolderError(f"{folder}: {str(path)!r} leads out of it; give another folder")
+    if inside.is_absolute() or ".." in inside.parts or not (inside.parts or opened):
+        raise OutputFolderError(f"{folder}: {str(path)!r} is no path below it; give another folder")
     place = folder / inside
     for part in [place, *place.parents][not opened : len(inside.parts)]:
         if os.path.islink(part):  # noqa: PTH114 - Path.is_symlink raises for a name that is too long
