@@ -66,6 +66,10 @@ class ExportError(DeepAccidentError, OSError):
     """A folder of an export cannot be made, written to or read, or it holds something else."""
 
 
+class OutputFolderError(DeepAccidentError, OSError):
+    """A link, or a path, would lead what is written or removed out of the folder that it belongs to."""
+
+
 class LookupFailedError(DeepAccidentError, KeyError):
     """A table, token, field or channel that does not exist was asked for."""
 

@@ -21,7 +21,7 @@ from deepaccident_devkit.evaluation.runs.rows import sample_rows, write_rows
 from deepaccident_devkit.evaluation.runs.selection import SampleSelection
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.evaluation.runs.shapes import FILES, SCENARIOS, SUMMARY, misfits
-from deepaccident_devkit.files import replacing_folder, temporary_path
+from deepaccident_devkit.files import remove_in, replacing_folder, temporary_path
 from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.reading import check_size, fault_text, file_checksum, irregular_text, read_bytes, shortened
 from deepaccident_devkit.taxonomy import MINI_SPLITS, SPLITS
@@ -287,7 +287,7 @@ def save_run(
         if before is not None and not target.exists():
             before.rename(target)
         elif before is not None:
-            shutil.rmtree(before)
+            remove_in(before.parent, before.name)
     remove_checkpoints(target)
     return target
 

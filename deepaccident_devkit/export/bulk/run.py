@@ -92,6 +92,7 @@ def export_release(  # noqa: PLR0913 - what, where, on what, and what to say
         ConfigError: the folder holds an export with other settings; it is left as it is.
         ExportError: the folder holds something else, there is too little room, it cannot be written to, or it was made
             from other scenarios or another state of them.
+        OutputFolderError: a link in the folder leads out of it; nothing is written there.
         NotAvailableError: no scenario is left to export, or the release has no such split.
         ChoiceError, FieldError: no such filter, or `workers` is less than 1.
         SomeFailedError: files of some scenarios cannot be read; the others are written, and the same call continues.

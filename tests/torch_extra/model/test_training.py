@@ -485,6 +485,18 @@ def test_the_log_is_read_up_to_a_line_that_is_cut_off(tmp_path: Path) -> None:
             read_log(tmp_path)
 
 
+@pytest.mark.parametrize("linked", [Path.symlink_to, Path.hardlink_to])
+def test_a_run_adds_nothing_to_a_file_elsewhere(tmp_path: Path, linked: Callable[[Path, Path], None]) -> None:
+    elsewhere, folder = tmp_path / "elsewhere.jsonl", tmp_path / "run"
+    folder.mkdir()
+    elsewhere.write_bytes(b'{"step": 1}\n')
+    linked(folder / "log.jsonl", elsewhere)
+    cut_log(folder, 9)  # as a run begins
+    add_to_log(folder, {"step": 2})
+    assert [row["step"] for row in read_log(folder)] == [1, 2]
+    assert elsewhere.read_bytes() == b'{"step": 1}\n'
+
+
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [
