@@ -23,7 +23,6 @@ _STEPS: Final = np.zeros(256, dtype=np.int64)
 _STEPS[list(b"[{")], _STEPS[list(b"]}")] = 1, -1
 _GZIP: Final = b"\x1f\x8b"
 _PICKLE: Final = b"\x80"
-_NO_TEXT: Final = "not in UTF-8, or a number of thousands of digits"
 _SURROGATE: Final = re.compile("[\ud800-\udfff]")
 """Half of a character: JSON can write it alone, UTF-8 cannot."""
 _WRITTEN_SURROGATE: Final = re.compile(r"\\u[dD][89a-fA-F]")
@@ -71,7 +70,11 @@ def parsed_json(content: bytes, *, constants: bool = False) -> Any:
         text = content.decode("utf-8")
         value = json.loads(text, object_pairs_hook=made, parse_constant=told)
     except ValueError as error:  # the words of Python's own errors change with its version
-        where = f"line {error.lineno}, column {error.colno}" if isinstance(error, json.JSONDecodeError) else _NO_TEXT
+        where = (
+            f"line {error.lineno}, column {error.colno}"
+            if isinstance(error, json.JSONDecodeError)
+            else "not in UTF-8, or a number of thousands of digits"
+        )
         raise ValueError(f"is no JSON ({where})") from error
     fault = next(_faults(value, ""), None) if faults or _WRITTEN_SURROGATE.search(text) else None
     if faults or fault:

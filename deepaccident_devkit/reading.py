@@ -81,7 +81,6 @@ _observer: ContextVar[Callable[[Path | StoredFile, bytes], None] | None] = Conte
 
 
 NO_NAME: Final = "cannot be a file's name: it holds a NUL character, or half of a pair that stands for one character"
-"""Said of paths that the system does not take."""
 
 
 class RefusedFileError(OSError):

@@ -138,8 +138,11 @@ class MotionLabelConfig:
         described = asdict(self)
         described["grid"] = {"x": list(self.grid.x), "y": list(self.grid.y)}
         described["orientation"] = self.grid.orientation
-        values = ((one, getattr(self.rules, one.name)) for one in fields(self.rules))
-        described["protocol"] = {one.name: value for one, value in values if value != one.default}
+        described["protocol"] = {
+            one.name: getattr(self.rules, one.name)
+            for one in fields(self.rules)
+            if getattr(self.rules, one.name) != one.default
+        }
         described["agents"] = _agents_text(self.agents)
         return described
 

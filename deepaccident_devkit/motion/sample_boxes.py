@@ -83,7 +83,9 @@ def _frames(
     lidars = rows * len(CHANNELS) + CHANNELS.index(LIDAR)
     ego_from_lidar = stored_transforms(dataset.columns("sample_data")["matrix"][lidars])
     if config.rules.pose == "yaw":
-        ego_from_lidar = _level_from_ego(dataset, rows) @ ego_from_lidar
+        world_from_ego = stored_transforms(dataset.columns("ego_pose")["matrix"][rows])
+        world_from_level = six_vectors.from_matrices(world_from_ego) * (1, 1, 1, 0, 0, 1)
+        ego_from_lidar = inverses(six_vectors.to_matrices(world_from_level)) @ world_from_ego @ ego_from_lidar
     return [
         FrameBoxes(
             center=boxes["translation"][one],
@@ -96,14 +98,6 @@ def _frames(
         )
         for one, actor, is_visible, pose in zip(slices, actors, visible, ego_from_lidar, strict=True)
     ]
-
-
-def _level_from_ego(dataset: Dataset, rows: IntArray) -> FloatArray:
-    """(len(rows), 4, 4): where the poses of samples would be with their position and yaw alone."""
-    world_from_ego = stored_transforms(dataset.columns("ego_pose")["matrix"][rows])
-    world_from_level = six_vectors.from_matrices(world_from_ego)
-    world_from_level[:, 3:5] = 0
-    return inverses(six_vectors.to_matrices(world_from_level)) @ world_from_ego
 
 
 def _seen(dataset: Dataset, sample: RowArgument, index: IntArray, config: MotionLabelConfig) -> IntArray:
@@ -121,10 +115,8 @@ def _seen(dataset: Dataset, sample: RowArgument, index: IntArray, config: Motion
             np.concatenate([boxes[name][one] for one in slices]) for name in _VISIBILITY_COLUMNS
         )
         actor = np.concatenate(actors)
-        mask = camera
-        if config.rules.sight == "released":
-            mask = visible_mask(center[:, :2], category, points, camera, infrastructure=agent == INFRASTRUCTURE)
-            mask &= actor != UNTRACKED_ID
+        by_points = visible_mask(center[:, :2], category, points, camera, infrastructure=agent == INFRASTRUCTURE)
+        mask = camera if config.rules.sight == "camera" else by_points & (actor != UNTRACKED_ID)
         pairs.append(_pairs(actors, slices)[mask & (actor != OWN_ACTOR_ID)])
     return np.concatenate(pairs)
 

@@ -290,8 +290,9 @@ def _file_of(path: Path) -> Path:
         what = "no such file or folder" if file == path else f"holds no {RESULTS_FILE}"
         raise ResultsError(f"{path}: {what}; give the results that ResultsWriter made") from None
     except (OSError, ValueError) as error:
-        told = fault_text(error) if isinstance(error, OSError) else NO_NAME
-        raise ResultsError(f"{path}: {told}; give a results file that can be read") from error
+        raise ResultsError(
+            f"{path}: {fault_text(error) if isinstance(error, OSError) else NO_NAME}; give another path"
+        ) from error
     if irregular:
         raise ResultsError(f"{file}: {irregular}; give a results file")
     return file

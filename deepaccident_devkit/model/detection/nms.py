@@ -72,9 +72,8 @@ def suppress(boxes: AnyArray, scores: AnyArray, slots: AnyArray, config: NmsConf
         config: None for ours.
     """
     rules = config or NmsConfig()
-    given = np.asarray(boxes, dtype=np.float64)
-    order = np.lexsort((*given.T[::-1], slots, -np.asarray(scores)))
-    best_first = given[order]
+    order = np.lexsort((*np.asarray(boxes).T[::-1], slots, -np.asarray(scores)))
+    best_first = np.asarray(boxes, dtype=np.float64)[order]
     if rules.method == "circle":
         same = _near(best_first[:, :2], rules.threshold)
     else:

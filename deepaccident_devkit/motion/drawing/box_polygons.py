@@ -24,7 +24,7 @@ from deepaccident_devkit.arrays import (
     readonly,
 )
 from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.geometry import quaternions
+from deepaccident_devkit.geometry import SE3, Boxes
 from deepaccident_devkit.geometry.handedness import flip_pose
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.cells.parts import OWN_BOX_ID
@@ -99,8 +99,8 @@ class FramePolygons(ShortRepr):
 
     def __post_init__(self) -> None:
         """Check and freeze; raises GeometryError."""
-        dtype = np.float64 if getattr(self.corners, "dtype", None) == np.float64 else np.float32
-        corners = checked("FramePolygons.corners", self.corners, (None, 4, 2), dtype)
+        double = getattr(self.corners, "dtype", None) == np.float64
+        corners = checked("FramePolygons.corners", self.corners, (None, 4, 2), np.float64 if double else np.float32)
         object.__setattr__(self, "corners", readonly(corners))
         object.__setattr__(self, "key", readonly(checked("FramePolygons.key", self.key, (len(corners),), np.int64)))
 
@@ -283,15 +283,11 @@ def _corners(boxes: Float32Array) -> Float32Array:
 
 
 def _leaning_corners(frames: Sequence[FrameBoxes], augmentation: Augmentation | None) -> FloatArray:
-    """(M, 4, 2) x forward, y left of the bottom corners of all frames' boxes, in the order of `_corners`.
-
-    nuScenes' box, as FIERY uses it, turns with the whole rotation.
-    """
-    change, corners = np.eye(4) if augmentation is None else augmentation.matrix, []
-    for frame in frames:
-        ego_from_box = frame.ego_from_lidar[:3, :3] @ quaternions.to_matrix(quaternions.from_yaw(frame.yaw))
-        around = np.column_stack([_CORNERS * (1.0, -1.0), np.full(4, -0.5)]) * frame.size[:, None]
-        center = frame.center @ frame.ego_from_lidar[:3, :3].T + frame.ego_from_lidar[:3, 3]
-        moved = around @ ego_from_box.swapaxes(1, 2) + center[:, None]
-        corners.append((moved @ change[:3, :3].T)[..., :2])
-    return np.concatenate(corners)
+    """(M, 4, 2) x forward, y left of the bottom corners of all frames' boxes, which turn with the whole rotation."""
+    corners = [
+        Boxes.from_arrays(each.center, each.size, each.yaw, frame="lidar")
+        .transform(SE3(each.ego_from_lidar), "ego")
+        .bottom_corners()[..., :2]
+        for each in frames
+    ]
+    return np.concatenate(corners) @ (np.eye(4) if augmentation is None else augmentation.matrix)[:2, :2].T

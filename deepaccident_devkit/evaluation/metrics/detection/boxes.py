@@ -122,8 +122,11 @@ class BoxColumns:
     @property
     def surest_first(self) -> IntArray:
         """(N,) rows by falling score, equal ones by what is in the boxes: the same boxes in any order of the rows."""
-        columns = (-self.score, self.category, self.center, self.size, self.yaw, self.velocity, self.own)
-        return np.lexsort(np.column_stack(columns).T[::-1])
+        return np.lexsort(
+            np.column_stack([-self.score, self.category, self.center, self.size, self.yaw, self.velocity, self.own]).T[
+                ::-1
+            ]
+        )
 
     def rounded(self) -> BoxColumns:
         """The same boxes in single precision; scores stay."""
