@@ -291,7 +291,7 @@ def _file_of(path: Path) -> Path:
         raise ResultsError(f"{path}: {what}; give the results that ResultsWriter made") from None
     except (OSError, ValueError) as error:
         raise ResultsError(
-            f"{path}: {fault_text(error) if isinstance(error, OSError) else NO_NAME}; give another path"
+            f"{path}: {fault_text(error) if isinstance(error, OSError) else NO_NAME}; give results that can be read"
         ) from error
     if irregular:
         raise ResultsError(f"{file}: {irregular}; give a results file")

@@ -24,8 +24,9 @@ from deepaccident_devkit.arrays import (
     readonly,
 )
 from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.geometry import SE3, Boxes
+from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.handedness import flip_pose
+from deepaccident_devkit.geometry.se3 import trusted_se3
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.motion.cells.parts import OWN_BOX_ID
 from deepaccident_devkit.motion.config import MotionLabelConfig
@@ -285,8 +286,8 @@ def _corners(boxes: Float32Array) -> Float32Array:
 def _leaning_corners(frames: Sequence[FrameBoxes], augmentation: Augmentation | None) -> FloatArray:
     """(M, 4, 2) x forward, y left of the bottom corners of all frames' boxes, which turn with the whole rotation."""
     corners = [
-        Boxes.from_arrays(each.center, each.size, each.yaw, frame="lidar")
-        .transform(SE3(each.ego_from_lidar), "ego")
+        Boxes.from_arrays(each.center, np.abs(each.size), each.yaw, frame="lidar")  # labels may have negative sizes
+        .transform(trusted_se3(each.ego_from_lidar), "ego")
         .bottom_corners()[..., :2]
         for each in frames
     ]
