@@ -69,8 +69,13 @@ def parsed_json(content: bytes, *, constants: bool = False) -> Any:
     try:
         text = content.decode("utf-8")
         value = json.loads(text, object_pairs_hook=made, parse_constant=told)
-    except ValueError as error:  # also of other bytes than UTF-8, and of numbers with thousands of digits
-        raise ValueError(f"is no JSON ({error})") from error
+    except ValueError as error:  # the words of Python's own errors change with its version
+        where = (
+            f"line {error.lineno}, column {error.colno}"
+            if isinstance(error, json.JSONDecodeError)
+            else "not in UTF-8, or a number of thousands of digits"
+        )
+        raise ValueError(f"is no JSON ({where})") from error
     fault = next(_faults(value, ""), None) if faults or _WRITTEN_SURROGATE.search(text) else None
     if faults or fault:
         raise ValueError(fault or "holds a name twice in one object")

@@ -80,6 +80,9 @@ class StoredFile(Protocol):
 _observer: ContextVar[Callable[[Path | StoredFile, bytes], None] | None] = ContextVar("observer", default=None)
 
 
+NO_NAME: Final = "cannot be a file's name: it holds a NUL character, or half of a pair that stands for one character"
+
+
 class RefusedFileError(OSError):
     """A file that the gate does not let in; its `strerror` is a clause without the path."""
 
@@ -213,7 +216,10 @@ def shortened(text: str, most: int = MOST_QUOTED) -> str:
 
 def _opened(path: Path) -> tuple[int, int]:
     """The descriptor of a regular file, and its size; raises OSError."""
-    descriptor = os.open(path, _FLAGS)
+    try:
+        descriptor = os.open(path, _FLAGS)
+    except ValueError:  # what Python says of it depends on its version
+        raise RefusedFileError(errno.EINVAL, NO_NAME) from None
     try:
         status = os.fstat(descriptor)
         if (irregular := irregular_text(status.st_mode)) is not None:

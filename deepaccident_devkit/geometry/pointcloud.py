@@ -28,6 +28,7 @@ from deepaccident_devkit.geometry.bev_grid import BevGrid
 from deepaccident_devkit.geometry.frames import checked_frame
 from deepaccident_devkit.geometry.se3 import SE3, checked_transform
 from deepaccident_devkit.nuscenes_names import CLOUD, without_names
+from deepaccident_devkit.reading import fault_text
 from deepaccident_devkit.text import Pictured
 
 Range = tuple[float, float]
@@ -194,7 +195,7 @@ class LidarPointCloud(FrozenArrays, Pictured):
             raise MissingFileError(f"{path}: no such file; LidarPointCloud.save writes one") from None
         except _FAULTS as error:
             raise SensorFileError(
-                f"{path}: not a cloud that LidarPointCloud.save wrote ({error}); "
+                f"{path}: not a cloud that LidarPointCloud.save wrote ({fault_text(error)}); "
                 "files of the release are read by load_point_cloud"
             ) from error
 

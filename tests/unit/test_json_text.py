@@ -39,11 +39,12 @@ def test_levels_are_counted(far: int) -> None:
 @pytest.mark.parametrize(
     ("content", "told"),
     [
-        (b"", "is no JSON"),
-        (b'{"a"', "is no JSON"),
+        (b"", r"is no JSON \(line 1, column 1\)"),
+        (b'{"a"', r"is no JSON \(line 1, column 5\)"),
+        (b"[1,\n x", r"is no JSON \(line 2, column 2\)"),
         (b"\x1f\x8b", "is compressed with gzip"),
         (b"\x80\x04", "is a pickle"),
-        (b'"\xff"', "is no JSON"),
+        (b'"\xff"', r"is no JSON \(not in UTF-8, or a number of thousands of digits\)"),
         (b'{"a": [{"b": 1, "b": 2}]}', "a: entry 0: b: stands there twice"),
         (b'{"a": NaN}', "a: expected a finite number, found NaN"),
         (b"[-Infinity]", "entry 0: expected a finite number, found Infinity"),

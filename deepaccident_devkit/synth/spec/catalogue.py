@@ -34,7 +34,7 @@ def read_spec(path: str | os.PathLike[str]) -> SpecTemplate:
         text = read_bytes(Path(path), "spec").decode()
     except FileNotFoundError as error:
         raise ConfigError(f"{path}: no such file; give the path of a scenario file (docs/scenarios.md)") from error
-    except (OSError, ValueError) as error:  # a ValueError also of a name with a null character
+    except (OSError, ValueError) as error:
         told = fault_text(error) if isinstance(error, OSError) else f"cannot be read ({error})"
         raise ConfigError(f"{path}: {told}; give a YAML file in UTF-8") from error
     if len(text) > _MOST_CHARACTERS:

@@ -599,7 +599,7 @@ def test_what_is_no_results_file(tmp_path: Path) -> None:
     (tmp_path / "packed.json.gz").write_bytes(gzip.compress(b"{}"))
     refused(tmp_path / "packed.json.gz", "packed.json.gz: is compressed with gzip; unpack it")
     refused(tmp_path / ("long" * 100), "cannot be read (", "File name too long")
-    refused(tmp_path / "a\0b", "cannot be read (embedded null byte)")
+    refused(tmp_path / "a\0b", "cannot be a file's name: it holds a NUL character")
     folder = plain.write_motion(tmp_path / "motion")
     (folder / "results.json").rename(folder / "manifest.json")
     refused(folder / "manifest.json", "is the manifest of motion results; call it results.json")
