@@ -481,7 +481,7 @@ def test_the_log_is_read_up_to_a_line_that_is_cut_off(tmp_path: Path) -> None:
     assert path.read_bytes() == b'{"step": 1}\n{"step": 2}\n'
     for line in (b"no json\n", b"[1]\n", b'{"loss": 1}\n', b'{"step": "1"}\n'):
         path.write_bytes(b'{"step": 1}\n' + line)
-        with pytest.raises(ConfigError, match=r"log\.jsonl:2: expected a JSON object with a step; remove the line"):
+        with pytest.raises(ConfigError, match=r"log\.jsonl:2: expected a JSON object with a step \(.*; remove the line"):
             read_log(tmp_path)
 
 
