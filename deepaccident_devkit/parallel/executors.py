@@ -111,8 +111,7 @@ def _dask_client(address: str | None, scheduler_file: Path | None) -> Iterator[C
     except Exception as error:  # of an odd address dask raises many kinds
         said = shortened(fault_text(error), MOST_TOLD)
         raise WorkerError(
-            f"{place}: no dask scheduler answers ({said}); start one with `dask scheduler`, and give its "
-            "address"
+            f"{place}: no dask scheduler answers ({said}); start one with `dask scheduler`, and give its address"
         ) from error
     with client:
         _check_workers(client, place)

@@ -36,7 +36,13 @@ def trained(model: torch.nn.Module) -> dict[str, Any]:
 def mmcv() -> Any:
     """What its runner saves: notes, an optimizer, and numbers of numpy."""
     model, numbers = network(), np.arange(3.0)
-    meta = {"config": "x = 1\n" * 9, "CLASSES": ("car", "van"), "PALETTE": [(1, 2, 3)], "hook_msgs": {}, "iter": 1 << 40}
+    meta = {
+        "config": "x = 1\n" * 9,
+        "CLASSES": ("car", "van"),
+        "PALETTE": [(1, 2, 3)],
+        "hook_msgs": {},
+        "iter": 1 << 40,
+    }
     meta |= {"best": np.float64(0.3), "numbers": numbers, "again": numbers, "size": torch.Size([3, 4]), "flag": True}
     meta |= {"dtype": torch.float32, "device": torch.device("cpu"), "path": pathlib.PosixPath("work/epoch.pth")}
     return {"meta": meta, "state_dict": model.state_dict(), "optimizer": trained(model)}
@@ -72,8 +78,17 @@ def test_forms_in_use_load(tmp_path: Path, form: str, way: dict[str, Any]) -> No
         assert torch.equal(found[name], each)
 
 
+@pytest.mark.parametrize("old_form", [False, True])
+def test_the_healthy_file_beside_the_hostile_ones(tmp_path: Path, *, old_form: bool) -> None:
+    path = tmp_path / "weights.pth"
+    path.write_bytes(old(GOOD) if old_form else pt(GOOD))
+    assert read_weights(path).tensors[NAME].tolist() == torch.load(path, weights_only=True)[NAME].tolist() == [0.0]
+
+
 def test_items_as_python_2_wrote_them(tmp_path: Path) -> None:
-    content = pt(b"ccollections\nOrderedDict\n]](U\x0fimg_neck.weight" + tensor(b"K\x02\x85", b"K\x01\x85") + b"ea\x85R.")
+    content = pt(
+        b"ccollections\nOrderedDict\n]](U\x0fimg_neck.weight" + tensor(b"K\x02\x85", b"K\x01\x85") + b"ea\x85R."
+    )
     (tmp_path / "old.pth").write_bytes(content)
     assert list(read_weights(tmp_path / "old.pth").tensors) == [NAME]
 
@@ -83,6 +98,7 @@ def pt(pickled: bytes, storage: bytes = bytes(16), way: int = zipfile.ZIP_STORED
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", way) as archive:
         archive.writestr("archive/data.pkl", b"\x80\x02" + pickled)
+        archive.writestr("archive/version", b"3\n")
         archive.writestr("archive/data/0", storage)
     return file.getvalue()
 
@@ -101,6 +117,7 @@ def named(value: bytes, name: bytes = b"U\x0fimg_neck.weight") -> bytes:
 def old(held: bytes, names: bytes = b"](U\x010e.", storages: bytes = struct.pack("<q", 4) + bytes(16)) -> bytes:
     """A file as torch wrote it before 1.6."""
     begin = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.\x80\x02M\xe9\x03.\x80\x02}U\x0dlittle_endian\x88s."
+    held = held.replace(b"K\x04tQ", b"K\x04NtQ")  # and not a view of another storage
     return begin + b"\x80\x02" + held + b"\x80\x02" + names + storages
 
 
@@ -123,8 +140,10 @@ LONG = b"\x8a\x08" + struct.pack("<q", 1 << 60)
 ONE, HUGE = b"K\x01\x85", b"\x8a\x05" + struct.pack("<q", 1 << 34)[:5] + b"\x85"
 GOOD = named(tensor(ONE, ONE))
 KEYS = b")" + b"".join(b"q%ch%c\x86" % (n, n) for n in range(200))
-LISTED = b"](" + b"](Nee" * 100_000 + b"eq\0"
+LISTED = b"](" + b"](U\x01aNe" * 50_000 + b"eq\0"
 MANY = tensor(b"J\0\0\x10\0\x85", b"K\0\x85")
+SWIN, MERGED = {"patch_embed.proj.weight": torch.zeros(3)}, "layers.0.downsample.norm.bias"
+ENTRY = b'{"dtype":"U8","shape":[1],"data_offsets":[0,1]}'
 HOSTILE: dict[str, bytes] = {
     "bytearray": pt(named(b"c__builtin__\nbytearray\n\x8a\x05\0\0\0\0\x02\x85R")),
     "a stride of 0": pt(named(tensor(HUGE, b"K\0\x85"))),
@@ -152,8 +171,8 @@ HOSTILE: dict[str, bytes] = {
     "old, big-endian": old(GOOD).replace(b"endian\x88", b"endian\x89"),
     "keys that double": pt(b"}" + KEYS + b"Ns."),
     "deep tuples as a key": pt(b"}" + b")" + b"\x85" * 300_000 + b"Ns."),
-    "items that double": pt(b"ccollections\nOrderedDict\n](](" + KEYS + b"Neee\x85R."),
-    "items given to many": pt(LISTED + b"0" + b"ccollections\nOrderedDict\nh\0\x85R0" * 100_000 + b"N."),
+    "items that double": pt(b"ccollections\nOrderedDict\n]](" + KEYS + b"Nea\x85R."),
+    "items given to many": pt(LISTED + b"ccollections\nOrderedDict\nh\0\x85R" * 60_000 + b"."),
     "many opcodes": pt(b"]" * 3_000_000 + b"."),
     "long numbers as keys": pt(b"}(" + b"\x8a\x20" + b"\x01" * 32 + b"Nu."),
     "text of 1 GiB": pt(b"X\0\0\0\x40x."),
@@ -177,9 +196,9 @@ HOSTILE: dict[str, bytes] = {
     "names that are numbers": saved({0: torch.zeros(3), 1: torch.ones(2)}),
     "names that are bytes": saved({b"img_neck.weight": torch.zeros(3)}),
     "nested": pt(b"}U\x01a" * 100_000 + b"N" + b"s" * 100_000 + b"."),
-    "Swin's, of other shapes": saved({"patch_embed.proj.weight": torch.zeros(3), "layers.0.downsample.norm.bias": torch.zeros(3)}),
-    "Swin's, without a shape": saved({"patch_embed.proj.weight": torch.zeros(3), "layers.0.downsample.norm.bias": torch.tensor(1.0)}),
-    "Swin's, a long name": saved({"patch_embed.proj.weight": torch.zeros(3), "x" * 1_000_000: torch.zeros(3)}),
+    "Swin's, of other shapes": saved(SWIN | {MERGED: torch.zeros(3)}),
+    "Swin's, without a shape": saved(SWIN | {MERGED: torch.tensor(1.0)}),
+    "Swin's, a long name": saved(SWIN | {"x" * 1_000_000: torch.zeros(3)}),
     "a header of 100 MB": safetensors(b" " * 100_000_000),
     "a header that is not there": safetensors({})[:8] + b"{",
     "a header beyond the file": struct.pack("<Q", 1 << 60) + b"{}",
@@ -193,7 +212,7 @@ HOSTILE: dict[str, bytes] = {
     "eight bits": safetensors(stored("F8_E4M3", [1], 1), bytes(1)),
     "a huge shape": safetensors(stored("F32", [1 << 60], 4), bytes(4)),
     "a shape that overflows": safetensors(stored("F32", [1 << 40] * 4, 4), bytes(4)),
-    "the same name twice": safetensors(b'{"a":{"dtype":"U8","shape":[1],"data_offsets":[0,1]},"a":{"dtype":"U8","shape":[1],"data_offsets":[0,1]}}', b"1"),
+    "the same name twice": safetensors(b'{"a":%s,"a":%s}' % (ENTRY, ENTRY), b"1"),
 }  # fmt: skip
 
 CODE = """
