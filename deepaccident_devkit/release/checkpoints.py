@@ -61,12 +61,6 @@ class StoredTensor(NamedTuple):
         """Bytes that a copy of it takes."""
         return math.prod(self.shape) * SIZES[self.dtype]
 
-    @property
-    def reach(self) -> int:
-        """Bytes of its storage up to its last element."""
-        steps = sum((length - 1) * stride for length, stride in zip(self.shape, self.strides, strict=True))
-        return (self.offset + steps + 1) * SIZES[self.dtype] if self.size else 0
-
 
 def read_checkpoint(content: bytes) -> tuple[object, Storages]:
     """What a checkpoint's pickle holds, with `StoredTensor` in the place of tensors, and the bytes of its storages.

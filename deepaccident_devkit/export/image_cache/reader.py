@@ -17,7 +17,7 @@ from deepaccident_devkit.errors import ConfigError, ExportError, MissingFileErro
 from deepaccident_devkit.export.bulk.manifest import Manifest
 from deepaccident_devkit.export.image_cache.file import ImagesFile
 from deepaccident_devkit.export.image_cache.format import KEPT, NAME, Codec, images_path, stored_size
-from deepaccident_devkit.export.images import Decoding, ImageConfig
+from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.json_text import as_record
 from deepaccident_devkit.release.fingerprints import scenario_hashes
 from deepaccident_devkit.release.images import decode_image
@@ -25,22 +25,12 @@ from deepaccident_devkit.taxonomy import AgentName
 
 _MOST_OPEN: Final = 128
 """Files that are mapped at once: each has a descriptor, of which a process may have 1024 or fewer."""
-_Pixels = Annotated[int, msgspec.Meta(ge=0, le=1 << 16)]
-
-
-class _Images(msgspec.Struct):
-    """`KEPT` of an `ImageConfig`."""
-
-    resize: tuple[_Pixels, _Pixels]
-    crop: tuple[_Pixels, _Pixels, _Pixels, _Pixels] | None
-    cameras: tuple[str, ...]
-    decode: Decoding
 
 
 class _Settings(msgspec.Struct):
     """What is needed of the settings of a cache."""
 
-    images: _Images
+    images: ImageConfig
     codec: Codec
     agents: Annotated[tuple[AgentName, ...], msgspec.Meta(min_length=1)]
     version: str
@@ -62,7 +52,8 @@ class ImageCache:
         try:
             manifest = Manifest.read(self.folder, NAME)
             settings = as_record(manifest.settings, _Settings)
-            self.images = ImageConfig(**msgspec.structs.asdict(settings.images))
+            if absent := set(KEPT) - manifest.settings["images"].keys():
+                raise ValueError(f"its images have no {min(absent)}")
         except (ExportError, ValueError) as error:
             raise ConfigError(
                 f"images_cache: {self.folder} holds no cache of images ({error}); make one with deepaccident cache"
@@ -72,9 +63,9 @@ class ImageCache:
                 f"images_cache: {self.folder} is not complete; run the deepaccident cache that makes it again, which "
                 "continues it"
             )
+        self.images, self._size = settings.images, stored_size(settings.images)
         self.codec, self.agents, self._version = settings.codec, settings.agents, settings.version
         self._scenarios = manifest.scenarios
-        self._size = stored_size(self.images)
         self._file = lru_cache(_MOST_OPEN)(self._opened)
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any
 
 import msgspec
 import torch
@@ -16,9 +16,6 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.json_text import as_record
 from deepaccident_devkit.model.checkpoint import LAST, OPTIMIZER, read_weights, reason_of, write_weights
 from deepaccident_devkit.reading import shortened
-
-_LARGEST: Final = 1e9
-"""Of scores; an infinite one could not be noted."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,7 +44,7 @@ class _Noted(msgspec.Struct):
     """What a checkpoint notes of `Progress`."""
 
     step: Annotated[int, msgspec.Meta(ge=0)]
-    best: Annotated[float, msgspec.Meta(ge=-_LARGEST, le=_LARGEST)] | None
+    best: Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)] | None
 
 
 def load_state(folder: Path, model: nn.Module, optimizer: AdamW, steps: int) -> Progress:
