@@ -1,6 +1,11 @@
-"""The healthy files that cases change: small releases, an index, results, a bundle, labels, a scenario file."""
+"""The healthy files that cases change: small releases, an index, results, a bundle, labels, exports, weights."""
 
+import importlib.util
+import json
 import shutil
+import zipfile
+from contextlib import suppress
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +15,10 @@ from deepaccident_devkit.evaluation import Accident, DetectedBoxes, Resampling, 
 from deepaccident_devkit.evaluation.results import ResultsWriter
 from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results, save_run
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.export.bulk import export_release
+from deepaccident_devkit.export.image_cache import CachedImages
+from deepaccident_devkit.export.images import ImageConfig
+from deepaccident_devkit.export.questions import Questions, WindowRules
 from deepaccident_devkit.motion import MotionLabelConfig, write_label_files
 from deepaccident_devkit.synth.spec import design_text
 from deepaccident_devkit.taxonomy import AgentName
@@ -17,8 +26,14 @@ from deepaccident_devkit.testing import SmallRelease, write_small_release
 
 AGENTS: tuple[AgentName, ...] = ("ego_vehicle", "infrastructure")
 CHANNELS = ("Camera_Front", "lidar01", "BEV_instance_camera")
+TORCH = importlib.util.find_spec("torch") is not None and importlib.util.find_spec("safetensors") is not None
+"""Whether files of weights can be read here."""
+OUTSIDE = "outside"
+"""The folder of healthy files that no writer may touch, whatever the folders say that it writes into."""
 HORIZON = 0.5
 LABELS = MotionLabelConfig(future_frames=1)
+QUESTIONS = Questions(agents=AGENTS[:1], window=WindowRules(observe=0, stride=0.5, ahead=1))
+CACHE = CachedImages(split="train", agents=AGENTS[:1], images=ImageConfig(resize=(18, 32), cameras=CHANNELS[:1]))
 SETUPS = {
     "motion": EvaluationSetup(task="motion", horizon=HORIZON),
     "accident": EvaluationSetup(task="accident", protocol="boxes", horizon=HORIZON),
@@ -46,6 +61,21 @@ def make_healthy(folder: Path) -> Path:
     write_label_files(dataset, folder / "labels", tokens(dataset), LABELS, workers=1)
     (folder / "specs").mkdir()
     (folder / "specs" / "crossing.yaml").write_text(design_text(1), encoding="utf-8")
+    _write_exports(dataset, folder)
+    (folder / "archive").mkdir()
+    with zipfile.ZipFile(folder / "archive" / "release.zip", "w") as archive:
+        for path in sorted((folder / "small").rglob("*")):
+            archive.write(path, path.relative_to(folder / "small"))
+    (folder / "scheduler").mkdir()
+    facts = {"type": "Scheduler", "id": "Scheduler-1", "address": "tcp://127.0.0.1:1", "services": {}, "workers": {}}
+    (folder / "scheduler" / "scheduler.json").write_text(json.dumps(facts, indent=2), encoding="utf-8")
+    (folder / OUTSIDE / "folder").mkdir(parents=True)
+    for name in ("precious.txt", "folder/precious.txt"):
+        (folder / OUTSIDE / name).write_text("not ours\n", encoding="utf-8")
+    if TORCH:
+        from campaign.weights import write_weights_of_all_kinds
+
+        write_weights_of_all_kinds(folder)
     for name in ("bundles", "index"):
         copied(folder / name, folder / "kept" / name)
     return folder
@@ -69,6 +99,37 @@ def selection(task: str) -> SampleSelection:
 def tokens(dataset: DeepAccident) -> list[str]:
     """The samples that have a prediction."""
     return list(selection("motion").tokens(dataset))
+
+
+class StoppedBeforeTheEnd(Exception):  # noqa: N818 - no fault
+    """Ends an export when all its units are written."""
+
+
+class _Unfinished(Questions):
+    def finish(self, *_: object) -> None:
+        raise StoppedBeforeTheEnd
+
+
+def _write_exports(dataset: DeepAccident, folder: Path) -> None:
+    """A whole export and one that was stopped, answers to its questions, and an images cache."""
+    export_release(dataset, folder / "export", QUESTIONS, workers=1)
+    questions = (folder / "export" / "questions" / "questions.jsonl").read_text(encoding="utf-8").splitlines()
+    truth = (folder / "export" / "truth.jsonl").read_bytes()
+    (folder / "answers").mkdir()
+    answers = [
+        json.dumps({"id": json.loads(line)["id"], "accident": [False], "who": None, "where": None})
+        for line in questions
+    ]
+    (folder / "answers" / "answers.jsonl").write_text("\n".join(answers) + "\n", encoding="utf-8")
+    (folder / "answers" / "truth.jsonl").write_bytes(truth)
+    with suppress(StoppedBeforeTheEnd):
+        export_release(dataset, folder / "unfinished", _Unfinished(**vars_of(QUESTIONS)), workers=1)
+    export_release(opened(folder / "sensors", folder / "index_of_sensors"), folder / "cache", CACHE, workers=1)
+
+
+def vars_of(form: Questions) -> dict[str, object]:
+    """The settings of a format, to make another one with."""
+    return {each.name: getattr(form, each.name) for each in fields(form)}
 
 
 def _link(source: str, target: str) -> None:

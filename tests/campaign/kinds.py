@@ -1,8 +1,8 @@
 """Kinds of files: where the healthy ones lie, how a user reads them, and when what was read is wrong."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+import zipfile
+from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -10,12 +10,17 @@ from typing import Any
 import numpy as np
 
 from campaign import plain
-from campaign.healthy import SETUPS, opened, selection
+from campaign.healthy import CACHE, CHANNELS, QUESTIONS, SETUPS, TORCH, opened, selection
 from campaign.mutations import HTML
+from campaign.room import Action, Kind, Room
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation.results import read_results
 from deepaccident_devkit.evaluation.runs import compare_bundles, evaluate_results, verify_bundle
+from deepaccident_devkit.export.bulk import export_release
+from deepaccident_devkit.export.image_cache import ImageCache
+from deepaccident_devkit.export.questions import results_of_answers
 from deepaccident_devkit.motion import LabelFiles
+from deepaccident_devkit.parallel import cluster_executor
 from deepaccident_devkit.reading import file_checksum
 from deepaccident_devkit.release import explain_file, find_release, read_calib
 from deepaccident_devkit.render.evaluation.report import report_html
@@ -23,66 +28,6 @@ from deepaccident_devkit.synth.spec import draw, read_spec
 from deepaccident_devkit.synth.spec.choices import Items, Part
 from deepaccident_devkit.tables.manifest import MANIFEST_FILE, read_manifest
 from deepaccident_devkit.validation import validate_release
-
-
-@dataclass(frozen=True, slots=True)
-class Room:
-    """Where a case happens.
-
-    Attributes:
-        home: the copies of all healthy files; only the case's folder is changed.
-        tree: the case's folder in it.
-        victim: the file that is changed.
-        scratch: an empty folder.
-        healthy: the path of the unchanged file.
-    """
-
-    home: Path
-    tree: Path
-    victim: Path
-    scratch: Path
-    healthy: Path
-
-
-Read = Callable[[Room], Any]
-Judge = Callable[[Room, Any], "str | None"]
-
-
-@dataclass(frozen=True, slots=True)
-class Action:
-    """One thing that a user does with a file.
-
-    Attributes:
-        read: does it.
-        judge: what is wrong with what was read, None if nothing; it is asked only if something was read.
-    """
-
-    read: Read
-    judge: Judge = lambda _room, _read: None
-
-
-@dataclass(frozen=True, slots=True)
-class Kind:
-    """One kind of file.
-
-    Attributes:
-        name: in the table.
-        form: which mutations are made for it.
-        folder: of the healthy tree; a case has a copy of it.
-        pattern: of the files in it, of which a case changes one.
-        actions: what is done with it, one after another; a refusal does not end them.
-    """
-
-    name: str
-    form: str
-    folder: str
-    pattern: str
-    actions: tuple[Action, ...] = field(repr=False)
-
-    def files(self, tree: Path) -> list[Path]:
-        """The files of this kind."""
-        return sorted(path for path in tree.glob(self.pattern) if path.is_file())
-
 
 # ---- a release's small files
 
@@ -398,6 +343,90 @@ def _part_fault(part: Part, said: Any, path: str) -> str | None:
     return None
 
 
+# ---- exports
+
+
+def _answers(room: Room) -> Any:
+    out = room.scratch / "results.json"
+    results_of_answers(room.tree / "answers.jsonl", room.tree / "truth.jsonl", out)
+    return sorted(plain.json_file(out)["results"])
+
+
+def _judge_answers(room: Room, read: Any) -> str | None:
+    if room.victim.name != "truth.jsonl":
+        return None
+    lines = [json.loads(line) for line in room.victim.read_bytes().splitlines() if line.strip()]
+    return None if read == sorted(line["sample"] for line in lines) else "other samples"
+
+
+def _export(room: Room) -> Any:
+    """The same command again: a whole export is compared, another is continued."""
+    done = export_release(_dataset(room.home), room.tree, QUESTIONS, workers=1)
+    return done.written, done.kept
+
+
+def _judge_export(room: Room, _read: Any) -> str | None:
+    """What was continued equals the undisturbed one; a whole one is only compared."""
+    if room.tree.name != "unfinished":
+        return None
+    for name in ("truth.jsonl", "questions/questions.jsonl"):
+        if (room.tree / name).read_bytes() != (room.home / "export" / name).read_bytes():
+            return f"another {name}"
+    return None
+
+
+_EXPORT = (Action(_export, _judge_export),)
+
+
+@cache
+def _cached_release(home: Path) -> DeepAccident:
+    return opened(home / "sensors", home / "index_of_sensors")
+
+
+def _cached(room: Room) -> Any:
+    """Every image, by its scenario."""
+    images, dataset = ImageCache(room.tree), _cached_release(room.home)
+    images.check_release(dataset, [each["token"] for each in dataset.agent])
+    return {
+        each["scenario_token"]: images.load(CACHE.images, dataset, f"{each['token']}/{CHANNELS[0]}")[0]
+        for each in dataset.sample
+    }
+
+
+def _judge_cached(room: Room, read: Mapping[str, Any]) -> str | None:
+    for token, image in read.items():
+        stored = plain.cached_image(room.tree / f"{token.replace('/', '__')}.images")
+        if image.transpose(2, 0, 1).tobytes() != stored:
+            return f"{token}: other pixels than in the file"
+    return None
+
+
+# ---- schedulers and archives
+
+
+def _scheduler(room: Room) -> Any:
+    with cluster_executor(scheduler_file=room.victim):
+        return "connected"
+
+
+def _zip(room: Room) -> Any:
+    return _tables(DeepAccident("v1", room.victim, index_dir=room.scratch / "index", workers=1, verbose=False))
+
+
+def _judge_zip(room: Room, read: Any) -> str | None:
+    """What zipfile reads of the members."""
+    with zipfile.ZipFile(room.victim) as archive:
+        archive.extractall(room.scratch / "unpacked")
+    place = Room(room.home, room.scratch / "unpacked", room.victim, room.scratch, room.healthy)
+    return _judge_tables(place, read)
+
+
+_ZIP = (
+    Action(_zip, _judge_zip),
+    Action(lambda room: [str(each) for each in validate_release(room.victim, workers=1).findings], _judge_sentences),
+)
+
+
 # ---- the index
 
 
@@ -440,6 +469,10 @@ _INDEX = (
     ),
 )
 
+if TORCH:
+    from campaign.weights import WEIGHTS_KINDS
+else:
+    WEIGHTS_KINDS = ()
 KINDS = {
     kind.name: kind
     for kind in (
@@ -503,6 +536,29 @@ KINDS = {
         Kind("index's list", "json", "index", f"v1/{MANIFEST_FILE}", _INDEX),
         Kind("index's tables", "arrow", "index", "v1/tables-*/*.arrow", _INDEX),
         Kind("index's shards", "shard", "index", "v1/shards/*/*.arrow", _INDEX),
+        Kind(
+            "answers and their truth",
+            "jsonl",
+            "answers",
+            "truth.jsonl",
+            (Action(_answers, _judge_answers),),
+            apart=True,
+        ),
+        Kind("manifest", "json", "export", "*.manifest.json", _EXPORT, apart=True),
+        Kind("journal", "journal", "unfinished", ".deepaccident-parts/**/*.paths", _EXPORT, apart=True),
+        Kind("record of a part", "json", "unfinished", ".deepaccident-parts/**/done.json", _EXPORT, apart=True),
+        Kind("images cache's list", "json", "cache", "*.manifest.json", (Action(_cached, _judge_cached),), apart=True),
+        Kind("images cache", "images", "cache", "*.images", (Action(_cached, _judge_cached),), apart=True),
+        Kind("scheduler file", "json", "scheduler", "*.json", (Action(_scheduler),), apart=True),
+        Kind(
+            "zip",
+            "zip",
+            "archive",
+            "*.zip",
+            (Action(_zip, _judge_zip), Action(_validate_zip, _judge_sentences)),
+            apart=True,
+        ),
+        *WEIGHTS_KINDS,
     )
 }
-"""By name."""
+"""By name; those of weights are here where PyTorch is."""

@@ -6,6 +6,7 @@ import os
 import pickle
 import re
 import struct
+import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Collection
@@ -21,7 +22,24 @@ from fault_injection.mutations.calib import Bomb
 
 Rng = np.random.Generator
 Change = Callable[[bytes, Rng], bytes]
-FORMS = ("text", "json", "yaml", "pickle", "npz", "image", "arrow", "parquet", "shard")
+FORMS = (
+    "text",
+    "json",
+    "yaml",
+    "pickle",
+    "npz",
+    "image",
+    "arrow",
+    "parquet",
+    "shard",
+    "jsonl",
+    "journal",
+    "images",
+    "zip",
+)
+FORMS = (*_FORMS, "jsonl", "journal", "images", "zip")
+WEIGHTS_FORMS = ("safetensors", "checkpoint", "old checkpoint")
+"""Forms of files that only PyTorch's users have."""
 GROUPS = ("bytes", "numbers", "types", "bombs", "links", "names")
 MARKER = "a pickle has run"
 """The folder beside the changed files that a pickle makes whose code is run."""
@@ -31,7 +49,7 @@ _SPARSE = 3 << 30
 """Bytes of a file that is mostly a hole."""
 _MOST_ROWS, _MOST_BYTES = 40, 200_000
 """What a mutation that takes long keeps of an array."""
-_TEXTS = ("text", "json", "yaml")
+_TEXTS = ("text", "json", "yaml", "jsonl")
 _NUMBER = re.compile(rb"-?\d+\.?\d*(?:[eE][-+]?\d+)?")
 
 
@@ -60,7 +78,7 @@ def _place(group: str, *forms: str) -> Callable[[Callable[[Path, Rng], None]], C
     """Enter a function that changes what is at a path."""
 
     def enter(apply: Callable[[Path, Rng], None]) -> Callable[[Path, Rng], None]:
-        MUTATIONS[apply.__name__] = Mutation(apply.__name__, group, forms or FORMS, apply)
+        MUTATIONS[apply.__name__] = Mutation(apply.__name__, group, forms or (*FORMS, *WEIGHTS_FORMS), apply)
         return apply
 
     return enter
@@ -73,7 +91,7 @@ def _content(group: str, *forms: str) -> Callable[[Change], Change]:
         def apply(path: Path, rng: Rng) -> None:
             replace(path, change(path.read_bytes(), rng))
 
-        MUTATIONS[change.__name__] = Mutation(change.__name__, group, forms or FORMS, apply)
+        MUTATIONS[change.__name__] = Mutation(change.__name__, group, forms or (*FORMS, *WEIGHTS_FORMS), apply)
         return change
 
     return enter
@@ -208,7 +226,7 @@ def number_replaced(content: bytes, rng: Rng) -> bytes:
     return content[:begin] + _any(rng, (*_HUGE, *_ODD)) + content[end:]
 
 
-@_content("numbers", "pickle", "npz", "image", "arrow", "parquet", "shard")
+@_content("numbers", "pickle", "npz", "image", "arrow", "parquet", "shard", "images", "zip", "journal", *WEIGHTS_FORMS)
 def bytes_to_a_huge_number(content: bytes, rng: Rng) -> bytes:
     number = _any(rng, (0x7FFFFFFF, 0xFFFFFFFF, 0x80000000, 0x7FFFFFFFFFFFFFFF, 0xFFFFFFFFFFFFFFFF, 1 << 33, 0))
     form = _any(rng, ("<Q", ">Q") if number >= 1 << 32 else ("<I", ">I", "<Q"))
@@ -377,7 +395,7 @@ def archive_of_other_members(content: bytes, rng: Rng) -> bytes:
     return packed if choice != 4 else packed.replace(zlib.crc32(members[name]).to_bytes(4, "little"), b"\1\2\3\4")
 
 
-@_content("types", "npz")
+@_content("types", "npz", "zip", "checkpoint")
 def archive_that_lies(content: bytes, rng: Rng) -> bytes:
     """A field of the archive's directory or of a local header is another."""
     at = _any(rng, [match.start() for match in re.finditer(rb"PK(?:\x01\x02|\x03\x04|\x05\x06)", content)])
@@ -443,7 +461,7 @@ def many_lines(content: bytes, rng: Rng) -> bytes:
     return content + (b"\n" if not content.endswith(b"\n") else b"") + _any(rng, (lines[-1], b"\n", b"-\n")) * 50_000
 
 
-@_content("bombs", "json", "yaml")
+@_content("bombs", "json", "yaml", "jsonl")
 def deep_nesting(content: bytes, rng: Rng) -> bytes:
     depth = _any(rng, (900, 5_000, 200_000))
     nest = _any(rng, (b"[" * depth + b"]" * depth, b'{"a":' * depth + b"1" + b"}" * depth, b"[" * depth))
@@ -654,6 +672,205 @@ def member_with_an_odd_name(content: bytes, rng: Rng) -> bytes:
     members = _members(content)
     members[f"{_any(rng, _NAMES)}.npy"] = members.pop(_any(rng, list(members)))
     return _packed(members, zipfile.ZIP_DEFLATED)
+
+
+# ---- lines of JSON, journals, archives of releases, weights
+
+
+def _one_line(content: bytes, rng: Rng, change: Callable[[bytes, Rng], bytes]) -> bytes:
+    """A file of lines in which one is changed as a JSON file."""
+    lines = content.splitlines()
+    at = int(rng.integers(len(lines)))
+    lines[at] = change(lines[at], rng)
+    return b"\n".join(lines) + b"\n"
+
+
+@_content("types", "jsonl")
+def line_with_another_value(content: bytes, rng: Rng) -> bytes:
+    return _one_line(content, rng, json_value_replaced)
+
+
+@_content("types", "jsonl")
+def line_with_other_keys(content: bytes, rng: Rng) -> bytes:
+    return _one_line(content, rng, _any(rng, (json_key_lost_or_added, json_key_twice, another_top)))
+
+
+@_content("names", "jsonl")
+def line_with_an_odd_name(content: bytes, rng: Rng) -> bytes:
+    return _one_line(content, rng, _any(rng, (json_text_with_an_odd_name, json_key_with_an_odd_name)))
+
+
+def outside(path: Path) -> Path:
+    """The folder beside the case that nobody may touch, from a file of the case."""
+    return next(each / "outside" for each in path.absolute().parents if (each / "outside").is_dir())
+
+
+@_place("types", "journal")
+def journal_names_what_is_outside(path: Path, rng: Rng) -> None:
+    """Lines with paths out of the folder, into its own files, or through links that lie there."""
+    there = outside(path)
+    root = path.parents[2]
+    link = root / _any(rng, ("answers", "zz", "questions/zz"))
+    link.symlink_to(_any(rng, (there, there / "folder")))
+    odd = (
+        f"{there}/precious.txt",
+        "../" * 6 + "outside/precious.txt",
+        f"{link.relative_to(root)}/precious.txt",
+        f"{link.relative_to(root)}/folder",
+        str(link.relative_to(root)),
+        ".",
+        "",
+        "..",
+        "questions.manifest.json",
+        ".deepaccident.lock",
+        "a" * 5000,
+        "\udcff",
+        "questions/../../outside/precious.txt",
+    )
+    noted = "".join(f"{_any(rng, odd)}\0" for _ in range(4)).encode("utf-8", "surrogateescape")
+    replace(path, noted + (path.read_bytes() if rng.integers(2) else b""))
+
+
+@_place("links", "journal", "json", "images")
+def folder_leads_outside(path: Path, rng: Rng) -> None:
+    """A folder above the file, or a lock or part beside it, is a link to what is outside."""
+    there = outside(path)
+    kind = int(rng.integers(3))
+    if kind == 0:
+        _gone(path).symlink_to(there / "precious.txt")
+    elif kind == 1:
+        folder = path.parent
+        folder.rename(folder.with_name(f"kept {folder.name}"))
+        folder.symlink_to(there)
+    else:
+        lock = path.parent / ".deepaccident.lock"
+        lock.unlink(missing_ok=True)
+        lock.symlink_to(there / "precious.txt")
+
+
+@_content("names", "json")
+def endless_text(content: bytes, rng: Rng) -> bytes:
+    """A text or a key of 5 MB, or one that would change a terminal."""
+    text = _any(rng, ("x" * 5_000_000, "\x1b]0;title\x07\x1b[2J", "\u202egnp.exe", "\r" * 100))
+    if rng.integers(2):
+        return _edited_json(content, rng, lambda _: text, only=str)
+    tree = json.loads(content)
+    inside = _any(rng, [each for each in _containers(tree) if each and isinstance(each, dict)])
+    inside[text] = inside.pop(_any(rng, list(inside)))
+    return json.dumps(tree).encode()
+
+
+@_content("types", "zip")
+def members_of_other_names(content: bytes, rng: Rng) -> bytes:
+    """Backslashes, ways out, links, several of one name, folders of other names."""
+    members = _members(content)
+    name = _any(rng, list(members))
+    choice = int(rng.integers(6))
+    if choice == 0:
+        return _packed({each.replace("/", "\\"): member for each, member in members.items()}, zipfile.ZIP_STORED)
+    if choice == 1:
+        members[f"../../{name}"] = members[name]
+    elif choice == 2:
+        members[f"/{name}"] = members.pop(name)
+    elif choice == 3:
+        members[f"C:\\{name}"] = members[name]
+    elif choice == 4:
+        members[f"{name}/inside"] = b""
+    else:
+        members = {f"deep/{each}": member for each, member in members.items()}
+    return _packed(members, _any(rng, (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)))
+
+
+@_content("types", "zip")
+def members_twice_linked_or_locked(content: bytes, rng: Rng) -> bytes:
+    members = _members(content)
+    name = _any(rng, list(members))
+    buffer = io.BytesIO(content)
+    with zipfile.ZipFile(buffer, "a") as archive, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        entry = zipfile.ZipInfo(name if rng.integers(2) else f"{name}.link")
+        entry.create_system, entry.external_attr = 3, _any(rng, (0o120777, 0o010644, 0o100644)) << 16
+        archive.writestr(entry, _any(rng, (b"/etc/passwd", b"../../../etc/passwd", members[name])))
+    changed = bytearray(buffer.getvalue())
+    if rng.integers(2):  # said to be encrypted
+        at = changed.rfind(b"PK\x01\x02")
+        changed[at + 8] |= 1
+    return bytes(changed)
+
+
+@_content("bombs", "zip")
+def release_that_unpacks_to_gigabytes(content: bytes, rng: Rng) -> bytes:
+    members = _members(content)
+    name = _any(rng, list(members))
+    squeezed, checksum, size = _squeezed(members[name][: int(rng.integers(1, 2000))])
+    rest = {other: member for other, member in members.items() if other != name}
+    return _packed(rest, zipfile.ZIP_STORED, (name, squeezed, checksum, size))
+
+
+@_content("numbers", "jsonl", "images")
+def numbers_of_another_size(content: bytes, rng: Rng) -> bytes:
+    """In the head: rows, cameras, begins and lengths; in text: a number of 5,000 digits, and others."""
+    if not content.startswith(b"DAimages"):
+        return number_replaced(content, rng)
+    at = 8 + 8 * int(rng.integers(4))
+    value = _any(rng, (-1, 0, 1, 2, 1 << 31, 1 << 40, (1 << 63) - 1, -(1 << 63)))
+    return content[:at] + struct.pack("<q", value) + content[at + 8 :]
+
+
+@_content("types", "safetensors")
+def header_of_other_things(content: bytes, rng: Rng) -> bytes:
+    """The header says other types, shapes, places or notes."""
+    size = int.from_bytes(content[:8], "little")
+    header = json.loads(content[8 : 8 + size])
+    name = _any(rng, list(header))
+    tensor = _any(rng, [each for each in header if each != "__metadata__"])
+    choice = int(rng.integers(6))
+    if choice == 0:
+        header[tensor]["dtype"] = _any(rng, ("F8_E4M3", "C64", "F4", "U16", "x", "BOOL", "F64", 7, None))
+    elif choice == 1:
+        header[tensor]["shape"] = _any(rng, ([1 << 40], [0, 1 << 62], [-1], [1.5], "2", [1] * 100, [2, 2]))
+    elif choice == 2:
+        header[tensor]["data_offsets"] = _any(rng, ([0, 1 << 40], [8, 0], [0, 0], ["0", "4"], [0]))
+    elif choice == 3:
+        header[_any(rng, (*_NAMES, "x" * 5_000_000, "optimizer.x.y", "optimizer.99.exp_avg", ""))] = header.pop(name)
+    elif choice == 4:
+        header["__metadata__"] = _any(rng, ({"deepaccident": "[]"}, {"deepaccident": "{" * 100_000}, {"a": 1}, [], {}))
+    else:
+        notes = json.loads(header["__metadata__"]["deepaccident"])
+        key = _any(rng, ("step", "best", "preset"))
+        notes[key] = _any(rng, (*_VALUES, "x" * 5_000_000, -5, 10**18))
+        header["__metadata__"]["deepaccident"] = json.dumps(notes)
+    text = json.dumps(header, ensure_ascii=True).encode()
+    return len(text).to_bytes(8, "little") + text + content[8 + size :]
+
+
+@_content("types", "checkpoint", "old checkpoint")
+def tensors_that_no_weights_have(content: bytes, rng: Rng) -> bytes:
+    from campaign.weights import hostile_tensors, saved
+
+    return saved({"state_dict": hostile_tensors(rng)}, old=not content.startswith(b"PK"))
+
+
+@_place("bombs", "checkpoint", "old checkpoint")
+def checkpoint_asks_for_memory_or_code(path: Path, rng: Rng) -> None:
+    from campaign.weights import hostile_pickle
+
+    asked, content = hostile_pickle(path.parent / MARKER, rng), path.read_bytes()
+    if not content.startswith(b"PK"):
+        replace(path, _any(rng, (asked, content[:63] + asked, content.replace(b"}q", asked[2:] + b"}q", 1))))
+        return
+    members = {name: asked if name.endswith("data.pkl") else each for name, each in _members(content).items()}
+    replace(path, _packed(members, zipfile.ZIP_STORED))
+
+
+@_content("bombs", "checkpoint")
+def compressed_storages(content: bytes, rng: Rng) -> bytes:
+    """Some hundred bytes that unpack to 900 MB in the place of numbers."""
+    members = _members(content)
+    name = _any(rng, [each for each in members if "/data/" in each])
+    squeezed, checksum, size = _squeezed(members[name])
+    rest = {other: member for other, member in members.items() if other != name}
+    return _packed(rest, zipfile.ZIP_STORED, (name, squeezed, checksum, size))
 
 
 # ---- what several need

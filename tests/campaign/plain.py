@@ -81,3 +81,10 @@ def json_file(path: Path) -> Any:
 def yaml_file(path: Path) -> Any:
     """What a YAML file says."""
     return yaml.safe_load(path.read_bytes().decode("utf-8"))
+
+
+def cached_image(path: Path) -> bytes:
+    """The first image of a scenario's file in an images cache."""
+    content = path.read_bytes()
+    begin, size = np.frombuffer(content, "<i8", 2, offset=24)
+    return content[begin : begin + size]

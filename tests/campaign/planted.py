@@ -6,8 +6,8 @@ import time
 from pathlib import Path
 from typing import Any, NoReturn
 
-from campaign.kinds import Action, Kind, Room
 from campaign.mutations import MARKER
+from campaign.room import Action, Kind, Room
 from deepaccident_devkit.errors import DeepAccidentError, ReleaseError
 
 

@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -17,6 +17,7 @@ import numpy as np
 from campaign import worker
 from campaign.kinds import KINDS
 from campaign.mutations import GROUPS, fitting
+from campaign.room import Kind
 from campaign.worker import SECONDS, Case, Outcome
 
 WORKERS = 2
@@ -25,9 +26,25 @@ _TESTS = Path(__file__).parents[1]
 
 
 def drawn(count: int, seed: int) -> list[Case]:
-    """So many cases: kinds and groups of mutations by turns, the mutation of a group by chance."""
-    rng = np.random.default_rng(seed)
-    groups = [(kind.name, names) for group in GROUPS for kind in KINDS.values() if (names := fitting(kind.form, group))]
+    """So many cases: kinds and groups of mutations by turns, the mutation of a group by chance.
+
+    Kinds that are `apart` have none of them.
+    """
+    return _by_turns([kind for kind in KINDS.values() if not kind.apart], count, seed, np.random.default_rng(seed))
+
+
+def drawn_apart(count: int, seed: int) -> list[Case]:
+    """So many cases of each kind that is `apart`, by a seed of its own."""
+    return [
+        case
+        for kind in KINDS.values()
+        if kind.apart
+        for case in _by_turns([kind], count, seed, np.random.default_rng([seed, *kind.name.encode()]))
+    ]
+
+
+def _by_turns(kinds: Sequence[Kind], count: int, seed: int, rng: np.random.Generator) -> list[Case]:
+    groups = [(kind.name, names) for group in GROUPS for kind in kinds if (names := fitting(kind.form, group))]
     return [
         Case(kind, names[int(rng.integers(len(names)))], number // len(groups) + 1000 * seed)
         for number, (kind, names) in zip(range(count), groups * (count // len(groups) + 1), strict=False)

@@ -26,9 +26,9 @@ import scipy.optimize
 import shapely
 from fault_injection.mutations import seeded
 
-from campaign.healthy import copied
-from campaign.kinds import Action, Kind, Room
+from campaign.healthy import OUTSIDE, copied
 from campaign.mutations import MARKER, MUTATIONS
+from campaign.room import Action, Kind, Room
 from deepaccident_devkit.errors import DeepAccidentError
 
 assert all((pyarrow.csv, pyarrow.parquet, scipy.optimize, shapely))  # what the readers import when they need it
@@ -59,7 +59,8 @@ class Outcome:
     Attributes:
         case: it.
         verdict: `read`, `refused`, or how it failed: `foreign` exception, `wrong`, `message` (an error of ours that
-            does not name the file, or is too long), `memory`, `hang`, `crash`, `code` (a pickle's).
+            does not name the file, or is too long), `memory`, `hang`, `crash`, `code` (a pickle's), `outside` (a file
+            outside the folder was changed or removed).
         detail: a sentence for those who look into it.
         megabytes: peak memory above the healthy run's.
     """
@@ -183,6 +184,8 @@ class Bench:
     def _outcome(self, case: Case, usual: float) -> Outcome:
         room = self.room(case)
         verdicts = [self._acted(action, room, usual) for action in self._kinds[case.kind].actions]
+        if (now := _seen(self._home / OUTSIDE)) != _seen(self._healthy / OUTSIDE):
+            return Outcome(case, "outside", f"files of nobody's concern are others now: {now}"[:LONGEST_MESSAGE])
         code_ran = room.victim.parent / MARKER
         if code_ran.exists():
             return Outcome(case, "code", "a pickle ran its code")
@@ -248,9 +251,16 @@ def _of_error(error: BaseException, room: Room) -> tuple[str, str]:
         return "foreign", short + where
     if len(str(error)) > LONGEST_MESSAGE:
         return "message", f"{len(str(error))} characters: {short}"
+    if not all(each.isprintable() or each == "\n" for each in detail):
+        return "message", f"has characters that change a terminal: {short!r}"
     if room.victim.name not in detail and str(room.tree) not in detail:
         return "message", f"names no file: {short}"
     return "refused", short
+
+
+def _seen(folder: Path) -> dict[str, bytes]:
+    """What lies below a folder, by its path from there."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
 def _status(name: str) -> int:
