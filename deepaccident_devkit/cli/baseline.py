@@ -154,8 +154,8 @@ def v2x(split: str, egos: tuple[str, ...], seeds: tuple[int, ...], resamples: in
         say_part_done(part, f"{samples:,} samples")
         return
     study = work.result()
-    click.echo(study.to_text())
     written = [*study.to_csv(folder), *save_study(study, folder), folder / "v2x_study.json"]
     write_bytes(written[-1], study.to_json().encode())
     work.remove()
+    click.echo(study.to_text())
     click.echo(f"written: {len(written)} files in {folder}")

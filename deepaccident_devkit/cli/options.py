@@ -3,7 +3,7 @@
 import functools
 import os
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
@@ -169,6 +169,13 @@ def engine_of(options: Mapping[str, Any]) -> dict[str, Any]:
 def say_part_done(part: Shard, what: str, *, err: bool = False) -> None:
     """Say what a shard has done, and what comes after all of them."""
     click.echo(f"part {part}: {what}; next: the same with --merge", err=err)
+
+
+def say_report(report: Any, written: Sequence[Path], folder: Path | None, *, as_json: bool) -> None:
+    """Print a report, and how many files were written into a folder before: nothing written depends on the print."""
+    click.echo(report.to_json() if as_json else report.to_text())
+    if folder is not None:
+        click.echo(f"written: {len(written)} files in {folder}", err=as_json)
 
 
 def _shard(context: click.Context, parameter: click.Parameter, value: str | None) -> Shard | None:

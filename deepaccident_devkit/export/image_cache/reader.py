@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from functools import lru_cache
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -17,6 +16,7 @@ from deepaccident_devkit.export.bulk.manifest import Manifest
 from deepaccident_devkit.export.image_cache.file import ImagesFile
 from deepaccident_devkit.export.image_cache.format import KEPT, NAME, images_path, stored_size
 from deepaccident_devkit.export.images import ImageConfig
+from deepaccident_devkit.files import path_of
 from deepaccident_devkit.release.fingerprints import scenario_hashes
 from deepaccident_devkit.release.images import decode_image
 
@@ -37,7 +37,7 @@ class ImageCache:
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         """Read its manifest; raises ConfigError if there is none, or if the cache is not complete."""
-        self.folder = Path(folder).expanduser().absolute()
+        self.folder = path_of(folder).absolute()
         try:
             manifest = Manifest.read(self.folder, NAME)
             settings: dict[str, Any] = dict(manifest.settings)

@@ -14,6 +14,7 @@ from deepaccident_devkit.arrays import FloatArray, ShortRepr, checked_number
 from deepaccident_devkit.errors import ConfigError, ResultsError
 from deepaccident_devkit.evaluation import Accident
 from deepaccident_devkit.evaluation.results import ResultsWriter
+from deepaccident_devkit.files import path_of
 from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.reading import fault_text, read_bytes, shortened
 from deepaccident_devkit.tables.tokens import sample_token
@@ -69,14 +70,14 @@ def read_answers(
     """
     if not 0 <= checked_number("threshold", threshold, "a number from 0 to 1", ConfigError) <= 1:
         raise ConfigError(f"threshold: expected a number from 0 to 1, found {threshold!r}")
-    asked = _asked(Path(truth))
+    asked = _asked(path_of(truth))
     accidents: dict[str, list[Accident]] = {each["sample"]: [] for each in asked.values()}
     for each in asked.values():
         recording = each["sample"].rpartition("/")[0]
         scenario, _, agent = recording.rpartition("/")
         accidents.setdefault(sample_token(scenario, agent, each["last_frame"]), [])
     lines: dict[str, int] = {}
-    for number, answer in _lines(Path(answers)):
+    for number, answer in _lines(path_of(answers)):
         where = f"{answers}:{number}"
         question = _question(where, answer, asked)
         if (first := lines.setdefault(answer["id"], number)) != number:
