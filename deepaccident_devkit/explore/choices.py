@@ -37,8 +37,8 @@ SCORE: Final = "score:"
 PAGE: Final = 48
 _MOST_QUERY: Final = 2000
 """Characters."""
-_MOST_FREE: Final = 20  # filters of a query; values, in sum, of fields that have no list to choose from
-MOST_WORD: Final = 200  # characters of a value, or of another word of an address: it stands in many links of a page
+_MOST_FREE: Final = 100  # filters of a query; values, in sum, that no facet has
+MOST_WORD: Final = 100  # characters of a value, or of another word of an address: it stands in many links of a page
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,15 +69,16 @@ class Choices:
 
         Args:
             given: names and values.
-            scenarios: of a facet, only values that these have count; None if they are not known.
+            scenarios: values that these have all count, others only if they are few; None if they are not known.
         """
         known = {} if scenarios is None else {each.name: frozenset(each.values) for each in scenarios.facets()}
         others = {name: value for name, value in given if name not in FIELDS}
-        pairs = dict.fromkeys(pair for pair in given if pair[0] in FIELDS and len(pair[1]) <= MOST_WORD)
-        free = [pair for pair in pairs if pair[0] not in known][:_MOST_FREE]
         facets: dict[str, tuple[str, ...]] = {}
-        for name, value in [*(pair for pair in pairs if pair[1] in known.get(pair[0], ())), *free]:
-            facets[name] = (*facets.get(name, ()), value)
+        unknown = 0
+        for name, value in dict.fromkeys(pair for pair in given if pair[0] in FIELDS and len(pair[1]) <= MOST_WORD):
+            unknown += value not in known.get(name, ())
+            if unknown <= _MOST_FREE or value in known.get(name, ()):
+                facets[name] = (*facets.get(name, ()), value)
         page = others.get("page", "")
         return cls(
             facets=facets,

@@ -147,7 +147,7 @@ def writing_to(root: Path, *, shared: bool = False) -> Iterator[None]:
 
 
 def folder_path(folder: str | os.PathLike[str]) -> Path:
-    """The absolute path of a given folder; raises LabelFilesError if it is none."""
+    """The absolute path of a given folder; raises LabelFilesError if it is no path."""
     return path_of(folder, "expected a folder of motion labels", error=LabelFilesError).absolute()
 
 

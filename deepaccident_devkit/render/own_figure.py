@@ -11,7 +11,7 @@ from deepaccident_devkit.render.styles import current_style, own_settings
 
 
 class OwnFigure(Figure):
-    """A figure that looks as its style says, whoever renders it and whenever: no setting of the user counts.
+    """A figure that looks as its style says, and no setting of the user counts, when it is made or later.
 
     Attributes:
         settings: gives the settings, for `with`, of the style that was the current one when the figure was made.
