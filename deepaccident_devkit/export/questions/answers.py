@@ -16,7 +16,7 @@ from deepaccident_devkit.errors import ConfigError, ResultsError
 from deepaccident_devkit.evaluation import Accident
 from deepaccident_devkit.evaluation.results import ResultsWriter
 from deepaccident_devkit.files import path_of
-from deepaccident_devkit.json_text import Record, parsed_json, parsed_record
+from deepaccident_devkit.json_text import Record, parsed_record
 from deepaccident_devkit.reading import fault_text, read_bytes, shortened
 from deepaccident_devkit.tables.tokens import sample_token
 
