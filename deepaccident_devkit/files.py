@@ -25,7 +25,8 @@ from functools import cache, lru_cache
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Final
 
-from deepaccident_devkit.errors import ConfigError, OutputFolderError
+from deepaccident_devkit.errors import ConfigError, DeepAccidentError, OutputFolderError
+from deepaccident_devkit.reading import shortened
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
@@ -297,15 +298,37 @@ def is_writable_folder(path: Path) -> bool:
         return False
 
 
+def path_text(given: object, expected: str = "expected a path", *, error: type[DeepAccidentError] = ConfigError) -> str:
+    """The text of what a caller gives as a path.
+
+    Args:
+        given: a text, or a path object of one.
+        expected: how the message begins, such as `out: expected a folder`.
+        error: the kind of error.
+
+    Raises:
+        ConfigError: it is something else, or empty, or no file can have this name (or the other kind).
+    """
+    with suppress(TypeError, ValueError, RuntimeError):  # no path; half a character; `~` of nobody
+        text = os.fspath(given)  # type: ignore[call-overload]
+        if isinstance(text, str) and text and b"\0" not in os.fsencode(Path(text).expanduser()):
+            return text
+    found = "an empty path; give '.' for the current one" if given == "" else shortened(repr(given))
+    raise error(f"{expected}, found {found}")
+
+
+def path_of(given: object, expected: str = "expected a path", *, error: type[DeepAccidentError] = ConfigError) -> Path:
+    """What a caller gives as a path, with `~` for the home folder; takes and raises what `path_text` does."""
+    return Path(path_text(given, expected, error=error)).expanduser()
+
+
 def writable_folder(folder: str | os.PathLike[str]) -> Path:
     """A folder that files can be written to, made if it is not there.
 
     Raises:
-        ConfigError: the path is empty, it or a folder above it is a file, or it may not be written to.
+        ConfigError: it is no path, it or a folder above it is a file, or it may not be written to.
     """
-    if not os.fspath(folder):
-        raise ConfigError("expected a folder to write to, found an empty path; give '.' for the current one")
-    path = Path(folder)
+    path = path_of(folder, "expected a folder to write to")
     if is_writable_folder(path):
         return path
     for part in (path, *path.parents):

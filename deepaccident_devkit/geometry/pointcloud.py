@@ -23,7 +23,7 @@ from deepaccident_devkit.arrays import (
     readonly,
 )
 from deepaccident_devkit.errors import GeometryError, MissingFileError, SensorFileError
-from deepaccident_devkit.files import replacing
+from deepaccident_devkit.files import path_of, replacing
 from deepaccident_devkit.geometry.bev_grid import BevGrid
 from deepaccident_devkit.geometry.frames import checked_frame
 from deepaccident_devkit.geometry.se3 import SE3, checked_transform
@@ -174,7 +174,7 @@ class LidarPointCloud(FrozenArrays, Pictured):
         `load` returns the same cloud, equal to the bit. This is not the release's format, which is single precision,
         left-handed and in the LiDAR frame: `release.write_lidar` writes that.
         """
-        with replacing(Path(path)) as temporary, temporary.open("wb") as file:
+        with replacing(path_of(path)) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, **self._columns(), frame=np.array(self.frame))
 
     @classmethod
@@ -186,7 +186,7 @@ class LidarPointCloud(FrozenArrays, Pictured):
             SensorFileError: it cannot be read, or is another kind of file.
         """
         try:
-            with open_zip(Path(path)) as archive:
+            with open_zip(path_of(path)) as archive:
                 there = {*_FIELDS, *archive.namelist()}
                 names = [name for name in (*_FIELDS, *_SOURCES) if name in there or f"{name}.npy" in there]
                 arrays: dict[str, Any] = {name: read_array(archive, name, "cloud") for name in names}

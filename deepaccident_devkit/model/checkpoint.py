@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from deepaccident_devkit.arrays import ShortRepr
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.files import write_bytes
+from deepaccident_devkit.files import path_of, write_bytes
 from deepaccident_devkit.json_text import as_record, parsed_json, parsed_record
 from deepaccident_devkit.model.images import from_official
 from deepaccident_devkit.reading import MOST_TOLD, fault_text, read_bytes, shortened
@@ -101,7 +101,7 @@ def read_weights(path: str | os.PathLike[str]) -> Weights:
     Raises:
         ConfigError: the file is not there, cannot be read, or holds no state dict.
     """
-    path = Path(path)
+    path = path_of(path)
     if not path.exists():
         path = SHIPPED.get(str(path), path)
     if path.is_dir():

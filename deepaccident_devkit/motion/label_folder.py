@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final, get_args
 
 from deepaccident_devkit.errors import ConfigError, DeepAccidentError, LabelFilesError
-from deepaccident_devkit.files import held_lock, place_in, temporary_of, write_bytes
+from deepaccident_devkit.files import held_lock, path_of, place_in, temporary_of, write_bytes
 from deepaccident_devkit.json_text import parsed_json
 from deepaccident_devkit.motion.batch_names import BatchNames
 from deepaccident_devkit.motion.config import MotionLabelConfig
@@ -149,10 +149,8 @@ def writing_to(root: Path, *, shared: bool = False) -> Iterator[None]:
 
 
 def folder_path(folder: str | os.PathLike[str]) -> Path:
-    """The absolute path of a given folder; raises LabelFilesError if it is empty."""
-    if not os.fspath(folder):
-        raise LabelFilesError("expected a folder of motion labels, found an empty path; give '.' for the current one")
-    return Path(folder).expanduser().absolute()
+    """The absolute path of a given folder; raises LabelFilesError if it is no path."""
+    return path_of(folder, "expected a folder of motion labels", error=LabelFilesError).absolute()
 
 
 def label_path(root: Path, recording: str) -> Path:

@@ -34,7 +34,8 @@ _MOST_PICKLE: Final = 64 << 20
 _MOST_OPCODES: Final = 500_000
 """Some 30 are a tensor."""
 _MOST_DIMENSIONS: Final = 64
-_MOST_ARGUMENTS: Final = 8
+_MOST_ARGUMENTS: Final = 64
+"""Of a call; a path has one for each part."""
 Storages: TypeAlias = Callable[[str], bytes | memoryview]
 """From a storage's name to its bytes; raises one of `FAULTS`."""
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.files import is_writable_folder, place_in
+from deepaccident_devkit.files import is_writable_folder, path_of, place_in
 from deepaccident_devkit.parallel import MERGE, Part, Places, Progress, Shard, check_whole, mine, part_of, run_unordered
 from deepaccident_devkit.release.store.names import SPLIT_FILE_FOLDER
 from deepaccident_devkit.synth.config import SynthConfig
@@ -61,6 +61,7 @@ def make_release(
         WorkerError: a worker was killed, or cannot do the work.
     """
     wanted, part = config or SynthConfig(), part_of(part)
+    out = path_of(out)
     check_free(out)
     if wanted.sensors != "none":
         require_embree()

@@ -15,6 +15,7 @@ from deepaccident_devkit.export.bulk.format import Format, Plan, Unit
 from deepaccident_devkit.export.bulk.manifest import Manifest, writing_to
 from deepaccident_devkit.export.bulk.output import Tally
 from deepaccident_devkit.export.bulk.unfinished import Unfinished
+from deepaccident_devkit.files import path_of
 from deepaccident_devkit.parallel import (
     MERGE,
     Failure,
@@ -99,9 +100,7 @@ def export_release(  # noqa: PLR0913 - what, where, on what, and what to say
         UnfinishedError: `part` is `merge`, and some scenarios are not written.
         WorkerError: a worker was killed, or cannot do the work.
     """
-    if not os.fspath(folder):
-        raise ExportError("expected a folder for the export, found an empty path; give '.' for the current one")
-    root = Path(folder).expanduser().absolute()
+    root = path_of(folder, "expected a folder for the export", error=ExportError).absolute()
     part = part_of(part)
     scenarios = _chosen(dataset, form)
     settings = {**form.settings(), "version": dataset.version}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from functools import lru_cache
-from pathlib import Path
 from typing import Annotated, Any, Final
 
 import msgspec
@@ -18,6 +17,7 @@ from deepaccident_devkit.export.bulk.manifest import Manifest
 from deepaccident_devkit.export.image_cache.file import ImagesFile
 from deepaccident_devkit.export.image_cache.format import KEPT, NAME, Codec, images_path, stored_size
 from deepaccident_devkit.export.images import ImageConfig
+from deepaccident_devkit.files import path_of
 from deepaccident_devkit.json_text import as_record
 from deepaccident_devkit.release.fingerprints import scenario_hashes
 from deepaccident_devkit.release.images import decode_image
@@ -48,7 +48,7 @@ class ImageCache:
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         """Read its manifest; raises ConfigError if there is none, or if the cache is not complete."""
-        self.folder = Path(folder).expanduser().absolute()
+        self.folder = path_of(folder).absolute()
         try:
             manifest = Manifest.read(self.folder, NAME)
             settings = as_record(manifest.settings, _Settings)

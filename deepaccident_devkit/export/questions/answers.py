@@ -15,6 +15,7 @@ from deepaccident_devkit.arrays import FloatArray, ShortRepr, checked_number
 from deepaccident_devkit.errors import ConfigError, ResultsError
 from deepaccident_devkit.evaluation import Accident
 from deepaccident_devkit.evaluation.results import ResultsWriter
+from deepaccident_devkit.files import path_of
 from deepaccident_devkit.json_text import Record, parsed_record
 from deepaccident_devkit.reading import fault_text, read_bytes, shortened
 from deepaccident_devkit.tables.tokens import sample_token
@@ -89,14 +90,14 @@ def read_answers(
     """
     if not 0 <= checked_number("threshold", threshold, "a number from 0 to 1", ConfigError) <= 1:
         raise ConfigError(f"threshold: expected a number from 0 to 1, found {threshold!r}")
-    asked = _asked(Path(truth))
+    asked = _asked(path_of(truth))
     accidents: dict[str, list[Accident]] = {each.sample: [] for each in asked.values()}
     for each in asked.values():
         recording = each.sample.rpartition("/")[0]
         scenario, _, agent = recording.rpartition("/")
         accidents.setdefault(sample_token(scenario, agent, each.last_frame), [])
     lines: dict[str, int] = {}
-    for number, answer in _lines(Path(answers), _Answer, _REMEDY):
+    for number, answer in _lines(path_of(answers), _Answer, _REMEDY):
         where = f"{answers}:{number}"
         if answer.id not in asked:
             raise ResultsError(

@@ -15,7 +15,7 @@ from urllib.parse import unquote, urlsplit
 import numpy as np
 
 from deepaccident_devkit.errors import DatarootError, DeepAccidentError, IndexStoreError
-from deepaccident_devkit.files import is_writable_folder
+from deepaccident_devkit.files import is_writable_folder, path_text
 from deepaccident_devkit.parallel import Places, run_batch
 from deepaccident_devkit.reading import fault_text, open_file
 from deepaccident_devkit.release.store.members import FORM, Listing, Members, write_members
@@ -122,7 +122,7 @@ def places_of(root: ReleasePath) -> tuple[Path, ...]:
 
 def _located(dataroot: str | os.PathLike[str]) -> Path | str:
     """The absolute path of what a caller names, symbolic links as they are; or the URL."""
-    text = os.fspath(dataroot)
+    text = path_text(dataroot, "dataroot: expected a path or a URL", error=DatarootError)
     if "://" in text:
         parts = urlsplit(text)
         if parts.scheme != "file":

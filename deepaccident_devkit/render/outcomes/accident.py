@@ -19,6 +19,7 @@ from deepaccident_devkit.render.chips import keep_free
 from deepaccident_devkit.render.colors import COLLIDER_COLOR, OUTCOME_COLORS
 from deepaccident_devkit.render.layers import Layer, layers_of
 from deepaccident_devkit.render.legends import INSIDE, draw_legend
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.trails import draw_trail
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ FORESEEN_COLOR: Final = "black"
 """Whether it is right is what the picture shows."""
 
 
+@in_own_settings
 def draw_accident_outcome(
     compared: ComparedAccidents,
     truth: BoxTruth | None = None,

@@ -31,6 +31,7 @@ from deepaccident_devkit.render.outcomes.verdicts import (
     sample_verdict,
 )
 from deepaccident_devkit.render.roles import collider_ids
+from deepaccident_devkit.render.styles import in_own_settings
 from deepaccident_devkit.render.titles import set_scene_title
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
 
@@ -46,6 +47,7 @@ _POSSIBLE: Final[Mapping[str, tuple[Layer, ...]]] = {
 _SIZE: Final = (12.4, 6.9)
 
 
+@in_own_settings
 def render_evaluation(
     dataset: Dataset,
     sample: RowArgument,

@@ -16,7 +16,9 @@ import numpy as np
 import pytest
 import torch
 
-from deepaccident_devkit.model.checkpoint import read_weights
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.model import load_model
+from deepaccident_devkit.model.checkpoint import read_weights, write_weights
 
 NAME = "img_neck.weight"
 
@@ -44,7 +46,11 @@ def mmcv() -> Any:
         "iter": 1 << 40,
     }
     meta |= {"best": np.float64(0.3), "numbers": numbers, "again": numbers, "size": torch.Size([3, 4]), "flag": True}
-    meta |= {"dtype": torch.float32, "device": torch.device("cpu"), "path": pathlib.PosixPath("work/epoch.pth")}
+    meta |= {
+        "dtype": torch.float32,
+        "device": torch.device("cpu"),
+        "path": pathlib.PosixPath("/a/b/c/d/e/f/g/h/i/epoch.pth"),
+    }
     return {"meta": meta, "state_dict": model.state_dict(), "optimizer": trained(model)}
 
 
@@ -247,3 +253,23 @@ def test_bombs_and_nonsense_are_refused_in_little_memory(tmp_path: Path) -> None
         if not good or len(said) > 700 or taken > 300:
             wrong.append((what, said, taken))
     assert wrong == []
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"preset": "x" * 1_000_000},
+        {"preset": ["tiny"]},
+        {"fusion": {}},
+        {"horizon": 10**400},
+        {"horizon": "2"},
+        {"horizon": -1},
+        {"horizon": 2.2},
+    ],
+)
+def test_notes_of_no_model_are_refused(tmp_path: Path, change: dict[str, Any]) -> None:
+    path = tmp_path / "weights.safetensors"
+    write_weights(path, {NAME: BASE}, {"preset": "tiny", "fusion": None, "horizon": None, **change})
+    with pytest.raises(ConfigError, match=r"does not say which model its weights are of \([^\n]*\); give") as error:
+        load_model(path)
+    assert len(str(error.value)) < 600
