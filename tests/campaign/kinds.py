@@ -555,7 +555,7 @@ KINDS = {
             "zip",
             "archive",
             "*.zip",
-            (Action(_zip, _judge_zip), Action(_validate_zip, _judge_sentences)),
+            _ZIP,
             apart=True,
         ),
         *WEIGHTS_KINDS,

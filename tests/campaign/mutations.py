@@ -22,22 +22,8 @@ from fault_injection.mutations.calib import Bomb
 
 Rng = np.random.Generator
 Change = Callable[[bytes, Rng], bytes]
-FORMS = (
-    "text",
-    "json",
-    "yaml",
-    "pickle",
-    "npz",
-    "image",
-    "arrow",
-    "parquet",
-    "shard",
-    "jsonl",
-    "journal",
-    "images",
-    "zip",
-)
-FORMS = (*_FORMS, "jsonl", "journal", "images", "zip")
+_TABLES = ("arrow", "parquet", "shard")
+FORMS = ("text", "json", "yaml", "pickle", "npz", "image", *_TABLES, "jsonl", "journal", "images", "zip")
 WEIGHTS_FORMS = ("safetensors", "checkpoint", "old checkpoint")
 """Forms of files that only PyTorch's users have."""
 GROUPS = ("bytes", "numbers", "types", "bombs", "links", "names")
