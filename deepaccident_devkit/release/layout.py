@@ -1,6 +1,5 @@
 """Where the files of a release lie, in either layout (docs/format.md, Tree)."""
 
-import errno
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -294,7 +293,7 @@ def _scenarios_in(root: ReleasePath, folder: str) -> Iterator[ScenarioFolder]:
         closed: DatarootError | None = None
         for agent in AGENTS:
             try:
-                names = _subfolders(root / folder / scenario_type / agent / "calib")
+                names = _subfolders(root / folder / scenario_type / agent / "calib", loops=True)
             except DatarootError as error:  # scenarios that other agents name report this themselves when they are read
                 closed, names = error, []
             for name in names:
@@ -305,10 +304,13 @@ def _scenarios_in(root: ReleasePath, folder: str) -> Iterator[ScenarioFolder]:
             yield ScenarioFolder(root, folder, scenario_type, name, tuple(agents))
 
 
-def _subfolders(folder: ReleasePath) -> list[str]:
-    """The folders in a folder; none where a file is in the way, which `frame_numbers` reports for each scenario."""
+def _subfolders(folder: ReleasePath, *, loops: bool = False) -> list[str]:
+    """The folders in a folder; none where a file is in the way, which `frame_numbers` reports for each scenario.
+
+    With `loops`, so are links to themselves, which `frame_numbers` reports, too.
+    """
     entries = _entries_of_folder(folder)
-    return [entry.name for entry in entries if not entry.name.startswith(".") and is_folder(entry)]
+    return [entry.name for entry in entries if not entry.name.startswith(".") and is_folder(entry, loops=loops)]
 
 
 def _entries_of_folder(folder: ReleasePath) -> list[Entry]:
@@ -322,14 +324,12 @@ def _entries_of_folder(folder: ReleasePath) -> list[Entry]:
 
 
 def _entries(folder: ReleasePath) -> list[Entry]:
-    """What lies in a folder; nothing if there is no such folder, or a link to itself."""
+    """What lies in a folder; nothing if there is no such folder."""
     try:
         return listed(folder)
     except FileNotFoundError:
         return []
     except OSError as error:
-        if error.errno == errno.ELOOP:
-            return []
         raise DatarootError(f"{folder}: cannot be listed ({error.strerror}); {_UNLISTABLE_REMEDY}") from error
 
 

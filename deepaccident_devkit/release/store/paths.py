@@ -168,10 +168,13 @@ def listed(folder: ReleasePath) -> list[Entry]:
     return [*folders, *files]
 
 
-def is_folder(entry: Entry) -> bool:
-    """Whether an entry is a folder, or a link whose end cannot be looked at; listing that one tells why."""
+def is_folder(entry: Entry, *, loops: bool = False) -> bool:
+    """Whether an entry is a folder, or a link whose end cannot be looked at; listing that one tells why.
+
+    Links that lead back (`leads_back`) are none, unless `loops`.
+    """
     try:
-        return not leads_back(entry) and entry.is_dir()
+        return (loops or not leads_back(entry)) and entry.is_dir()
     except OSError:
         return True
 
