@@ -100,7 +100,7 @@ class ImageConfig:
     def intrinsic(self, lens: PinholeCamera, size: tuple[int, int]) -> FloatArray:
         """The intrinsic (3, 3) of a camera's image that was resized to `size`, height and width, then cropped."""
         height, width = size
-        intrinsic: FloatArray = np.diag([width / lens.width, height / lens.height, 1.0]) @ lens.intrinsic
+        intrinsic: FloatArray = lens.resized(width, height).intrinsic.copy()
         if self.crop is not None:
             top, left, _, _ = self.crop
             intrinsic[:2, 2] -= (left, top)

@@ -83,6 +83,8 @@ class Format(ABC):
 
     name: ClassVar[str]
     """One word, as on the command line."""
+    nothing: ClassVar[str] = "no chosen agent recorded one of these scenarios; choose other agents or scenarios"
+    """Why there may be no sample to write, and the remedy."""
     beside: ClassVar[tuple[str, ...]] = ()
     """Formats whose exports may lie in the same folder already."""
 

@@ -92,7 +92,7 @@ def export_release(  # noqa: PLR0913 - what, where, on what, and what to say
         ConfigError: the folder holds an export with other settings; it is left as it is.
         ExportError: the folder holds something else, there is too little room, it cannot be written to, or it was made
             from other scenarios or another state of them.
-        NotAvailableError: no scenario is left to export, or the release has no such split.
+        NotAvailableError: no scenario or no sample is left to export, or the release has no such split.
         ChoiceError, FieldError: no such filter, or `workers` is less than 1.
         SomeFailedError: files of some scenarios cannot be read; the others are written, and the same call continues.
         UnfinishedError: `part` is `merge`, and some scenarios are not written.
@@ -110,6 +110,8 @@ def export_release(  # noqa: PLR0913 - what, where, on what, and what to say
     own = mine(part, units)
     plans = run(task.plan, own, label="planning", places=Places(reads=dataset.places))
     plan = sum(plans, Plan())
+    if not plan.samples and not isinstance(part, Shard):
+        raise NotAvailableError(f"{form.name}: nothing to write: {form.nothing}")
     free = shutil.disk_usage(next(each for each in (root, *root.parents) if each.exists())).free
     exported = partial(Exported, folder=root, plan=plan)
     if on_plan is not None:

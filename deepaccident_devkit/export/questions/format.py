@@ -69,6 +69,10 @@ class Questions(ShortRepr, Format):
     seed: str = "0"
 
     name: ClassVar[str] = "questions"
+    nothing: ClassVar[str] = (
+        "no question can be asked: scenarios lack labels, meta or an observer; unpack them, or choose other scenarios "
+        "or agents"
+    )
 
     def __post_init__(self) -> None:
         """Check the choices too."""
@@ -169,10 +173,7 @@ def _by_id(paths: Sequence[Path]) -> Iterator[bytes]:
             places.append((line[_ID], number, first, len(line)))
             first += len(line)
     if not places:
-        raise NotAvailableError(
-            "no question can be asked: scenarios lack labels, meta or an observer; unpack them, or choose other "
-            "scenarios or agents"
-        )
+        raise NotAvailableError(Questions.nothing)
     for _, number, first, length in sorted(places):
         with paths[number].open("rb") as file:
             file.seek(first)
