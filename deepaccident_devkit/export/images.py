@@ -17,7 +17,6 @@ from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import PinholeCamera
 from deepaccident_devkit.taxonomy import CAMERAS
 from deepaccident_devkit.text import choice, settle_choices
-from deepaccident_devkit.v2x.projection import camera_of
 
 ImageDtype = Literal["float32", "uint8"]
 Decoding = Literal["full", "scaled"]
@@ -81,7 +80,7 @@ class ImageConfig:
             SensorFileError: it cannot be read.
             ConfigError: the crop reaches beyond the image.
         """
-        lens = camera_of(dataset, camera)
+        lens = dataset.camera(camera)
         if self.decode == "scaled" and self.resize is not None:
             image = dataset.load_image(camera, least=self.resize)
             return _resized_part(image, self.resize, self.crop), self.intrinsic(lens, self.resize)

@@ -84,8 +84,7 @@ def image_size(path: ReleasePath, content: bytes | None = None) -> tuple[int, in
     if content is None and not isinstance(path, Path):
         content = read_image_bytes(path)
     with _opened(path, content, _FORMATS) as image:
-        size: tuple[int, int] = image.size
-        return size
+        return image.width, image.height
 
 
 def read_jpeg(path: ReleasePath) -> tuple[bytes, tuple[int, int]]:

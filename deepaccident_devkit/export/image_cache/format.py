@@ -59,6 +59,10 @@ class CachedImages(Format):
         found = super().settings()
         return {**found, "images": {name: found["images"][name] for name in KEPT}}
 
+    def sensors(self) -> tuple[tuple[str, str], ...]:
+        """The images that are kept."""
+        return tuple(product(self.agents, self.images.cameras))
+
     def check(self, dataset: Dataset, folder: Path) -> None:
         """Refuse to write all scenarios; raises ConfigError."""
         if self.split is None and not self.where:

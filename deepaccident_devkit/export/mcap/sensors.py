@@ -17,7 +17,6 @@ from deepaccident_devkit.release.images import read_jpeg
 from deepaccident_devkit.release.missing_files import MissingFiles
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.taxonomy import LIDAR
-from deepaccident_devkit.v2x.projection import camera_of
 
 LIDAR_POINT: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
 
@@ -68,7 +67,7 @@ class Sensors:
 
 def _calibration(dataset: Dataset, token: str, size: tuple[int, int], frame: str, index: int) -> Any:
     """A CameraCalibration for an image of `size` (width, height), which may be smaller than calib says."""
-    lens = camera_of(dataset, token).resized(*size)
+    lens = dataset.camera(token).resized(*size)
     return CameraCalibration(
         timestamp=frame_timestamp(index),
         frame_id=frame,

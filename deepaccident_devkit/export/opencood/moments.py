@@ -40,17 +40,16 @@ class Moments:
 
     def __init__(self, recording: Recording, agent: str, classes: tuple[str, ...]) -> None:
         """Take an agent, and the classes that count as vehicles; raises TokenError."""
-        dataset, scenario = recording.dataset, recording.token
+        self._dataset = dataset = recording.dataset
         self._files, numbers = recording.files[agent], [CATEGORIES.index(name) for name in classes]
-        self._dataset = dataset
         self._kept: dict[str, Callable[[Boxes], BoolArray]] = {
             "boxes of the agents themselves": lambda boxes: boxes.actor_id != OWN_ACTOR_ID,
             "boxes of other classes": lambda boxes: np.isin(boxes.category, numbers),
             "untracked boxes": lambda boxes: boxes.actor_id != UNTRACKED_ID,
             "boxes without LiDAR points": lambda boxes: boxes.num_lidar_pts > 0,
         }
-        count = dataset.scenario[dataset.getind("scenario", scenario)]["num_frames"]
-        self.samples = [sample_token(scenario, agent, number) for number in range(1, count + 1)]
+        count = dataset.scenario[dataset.getind("scenario", recording.token)]["num_frames"]
+        self.samples = [sample_token(recording.token, agent, number) for number in range(1, count + 1)]
         first = dataset.getind("sample", self.samples[0])
         self._world_from_ego = stored_transforms(dataset.columns("ego_pose")["matrix"][first : first + count])
         rows = slice(first * len(CHANNELS), (first + count) * len(CHANNELS))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from deepaccident_devkit.dataset import Dataset
@@ -13,6 +12,7 @@ from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, CHANNELS, INFRASTR
 from deepaccident_devkit.v2x.configurations import agents_of
 
 if TYPE_CHECKING:
+    from deepaccident_devkit.export.opencood.format import OpenCood
     from deepaccident_devkit.tables.records import ScenarioRecord
 
 
@@ -28,29 +28,26 @@ class Recording:
             that is not there is for them one without points. So all have a frame, and its cloud, or none has.
         folders: agent → name of its folder; loaders sort them as words and take the first for the ego.
         files: agent → channel → frame → path and bytes of what is there and written.
-        samples: agents at moments that there are to write; fewer are written if clouds are missing.
+        samples: agents at moments that the release has.
+        written: how many of them are written: not all if clouds are missing.
     """
 
-    def __init__(
-        self, dataset: Dataset, token: str, agents: Sequence[str], ego: str, *, without_clouds: bool = False
-    ) -> None:
-        """Look which files of these agents are there; the ego is the vehicle that is 1. Raises TokenError.
-
-        `without_clouds` also takes agents and moments that have no point cloud.
-        """
+    def __init__(self, dataset: Dataset, token: str, form: OpenCood) -> None:
+        """Look which files of the agents are there, and choose what is written. Raises TokenError."""
         self.dataset, self.token = dataset, token
         self.record: ScenarioRecord = dataset.scenario[dataset.getind("scenario", token)]
         numbers = range(1, self.record["num_frames"] + 1)
         self._there: dict[str, dict[str, dict[int, tuple[ReleasePath, int]]]] = {
             agent: {channel: sensor_files(dataset, token, agent, channel) for channel in CHANNELS}
             for agent in agents_of(dataset, token)
-            if agent in agents
+            if agent in form.agents
         }
-        self._absent, self.samples = len(agents) - len(self._there), len(self._there) * len(numbers)
-        moments = {agent: set(numbers if without_clouds else files[LIDAR]) for agent, files in self._there.items()}
+        self._absent, self.samples = len(form.agents) - len(self._there), len(self._there) * len(numbers)
+        moments = {agent: set(numbers if form.without_clouds else files[LIDAR]) for agent, files in self._there.items()}
         self.agents = [agent for agent in self._there if moments[agent]]
         common = set(numbers).intersection(*(moments[agent] for agent in self.agents))
         self.frames = sorted(common) if self.agents else []
+        self.written = len(self.agents) * len(self.frames)
         self.files = {
             agent: {
                 channel: {number: found[number] for number in self.frames if number in found}
@@ -58,7 +55,7 @@ class Recording:
             }
             for agent in self.agents
         }
-        order = sorted(VEHICLE_AGENTS, key=lambda agent: agent != ego)
+        order = sorted(VEHICLE_AGENTS, key=lambda agent: agent != form.ego)
         self.folders: dict[str, str] = {
             **{agent: str(number) for number, agent in enumerate(order, 1)},
             INFRASTRUCTURE: "-1",
@@ -81,11 +78,6 @@ class Recording:
         output.leave_out("point clouds that are not in this release", self.samples - self._count(LIDAR))
         output.leave_out("samples of agents or moments without point clouds", self.samples - self.written)
         output.leave_out("files of the BEV camera", self._count(BEV_CAMERA))
-
-    @property
-    def written(self) -> int:
-        """How many of the samples are written."""
-        return len(self.agents) * len(self.frames)
 
     def _count(self, channel: str) -> int:
         return sum(len(files[channel]) for files in self._there.values())

@@ -6,6 +6,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Final, get_args
 
@@ -88,6 +89,10 @@ class Questions(ShortRepr, Format):
             raise ChoiceError(
                 "link: a symbolic link shows the name of the scenario, which may tell the answer; choose hard or copy"
             )
+
+    def sensors(self) -> tuple[tuple[str, str], ...]:
+        """The pictures that go with questions; who observes depends on the ego."""
+        return tuple(product(AGENTS, self.cameras))
 
     @property
     def _rules(self) -> AskRules:

@@ -12,7 +12,7 @@ from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.export.opencood import OpenCood
 from deepaccident_devkit.export.parquet import Parquet
-from deepaccident_devkit.export.questions import Questions, WindowRules
+from deepaccident_devkit.export.questions import Questions
 from deepaccident_devkit.export.released_infos import ReleasedInfos
 from deepaccident_devkit.export.webdataset import WebDataset
 
@@ -26,7 +26,7 @@ IMAGES = ImageConfig(resize=(9, 16), cameras=("Camera_Back",))
         (ReleasedInfos(), r"in the split files train\.txt or val\.txt .*; add these files, or choose other scenarios"),
         (OpenCood(), "has its point clouds; unpack the archives of lidar01"),
         (CachedImages(split="train", images=IMAGES), "none of these images is in this release; unpack"),
-        (Questions(agents=ABSENT, window=WindowRules(observe=0.1)), "no question can be asked"),
+        (Questions(agents=ABSENT), "no recording is long enough"),
         (OpenCood(agents=ABSENT, without_clouds=True), "no moment"),
         *((kind(agents=ABSENT), "no chosen agent recorded one of") for kind in (NuScenes, Parquet, WebDataset)),
     ],
