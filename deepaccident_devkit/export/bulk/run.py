@@ -117,7 +117,7 @@ def export_release(  # noqa: PLR0913 - what, where, on what, and what to say
     plans = run(task.plan, own, label="planning", places=Places(reads=dataset.places))
     plan = sum(plans, Plan())
     if not plan.samples and not isinstance(part, Shard):
-        raise NotAvailableError(f"{form.name}: nothing to write: {form.nothing}")
+        raise NotAvailableError(form.nothing)
     free = shutil.disk_usage(next(each for each in (root, *root.parents) if each.exists())).free
     exported = partial(Exported, folder=root, plan=plan)
     if on_plan is not None:
