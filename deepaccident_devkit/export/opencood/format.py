@@ -63,7 +63,7 @@ class OpenCood(Format):
 
     def plan(self, dataset: Dataset, unit: Unit) -> Plan:
         """About how much a scenario is."""
-        recording = Recording(dataset, unit.scenarios[0], self)
+        recording = Recording(dataset, unit.scenarios[0], self.agents, self.ego, self.without_clouds)
         total = Plan()
         for agent in recording.agents:
             images = [size for camera in CAMERAS for _, size in recording.files[agent][camera].values()]
@@ -81,7 +81,7 @@ class OpenCood(Format):
 
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
         """Write a scenario's folder, which appears when it is whole."""
-        recording = Recording(dataset, unit.scenarios[0], self)
+        recording = Recording(dataset, unit.scenarios[0], self.agents, self.ego, self.without_clouds)
         recording.count_left_out(output)
         if recording.frames:  # loaders stop at a scenario without agents
             with output.whole_folder(f"{_SPLITS[recording.record['split']]}/{unit.name}") as folder:

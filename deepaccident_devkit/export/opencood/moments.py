@@ -48,7 +48,7 @@ class Moments:
             "untracked boxes": lambda boxes: boxes.actor_id != UNTRACKED_ID,
             "boxes without LiDAR points": lambda boxes: boxes.num_lidar_pts > 0,
         }
-        count = dataset.scenario[dataset.getind("scenario", recording.token)]["num_frames"]
+        count = recording.record["num_frames"]
         self.samples = [sample_token(recording.token, agent, number) for number in range(1, count + 1)]
         first = dataset.getind("sample", self.samples[0])
         self._world_from_ego = stored_transforms(dataset.columns("ego_pose")["matrix"][first : first + count])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from deepaccident_devkit.dataset import Dataset
@@ -12,7 +13,6 @@ from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, CHANNELS, INFRASTR
 from deepaccident_devkit.v2x.configurations import agents_of
 
 if TYPE_CHECKING:
-    from deepaccident_devkit.export.opencood.format import OpenCood
     from deepaccident_devkit.tables.records import ScenarioRecord
 
 
@@ -32,18 +32,18 @@ class Recording:
         written: how many of them are written: not all if clouds are missing.
     """
 
-    def __init__(self, dataset: Dataset, token: str, form: OpenCood) -> None:
-        """Look which files of the agents are there, and choose what is written. Raises TokenError."""
+    def __init__(self, dataset: Dataset, token: str, agents: Sequence[str], ego: str, without_clouds: bool) -> None:  # noqa: FBT001
+        """Look which files of these agents are there, and choose what is written. Raises TokenError."""
         self.dataset, self.token = dataset, token
         self.record: ScenarioRecord = dataset.scenario[dataset.getind("scenario", token)]
         numbers = range(1, self.record["num_frames"] + 1)
         self._there: dict[str, dict[str, dict[int, tuple[ReleasePath, int]]]] = {
             agent: {channel: sensor_files(dataset, token, agent, channel) for channel in CHANNELS}
             for agent in agents_of(dataset, token)
-            if agent in form.agents
+            if agent in agents
         }
-        self._absent, self.samples = len(form.agents) - len(self._there), len(self._there) * len(numbers)
-        moments = {agent: set(numbers if form.without_clouds else files[LIDAR]) for agent, files in self._there.items()}
+        self._absent, self.samples = len(agents) - len(self._there), len(self._there) * len(numbers)
+        moments = {agent: set(numbers if without_clouds else files[LIDAR]) for agent, files in self._there.items()}
         self.agents = [agent for agent in self._there if moments[agent]]
         common = set(numbers).intersection(*(moments[agent] for agent in self.agents))
         self.frames = sorted(common) if self.agents else []
@@ -55,7 +55,7 @@ class Recording:
             }
             for agent in self.agents
         }
-        order = sorted(VEHICLE_AGENTS, key=lambda agent: agent != form.ego)
+        order = sorted(VEHICLE_AGENTS, key=lambda agent: agent != ego)
         self.folders: dict[str, str] = {
             **{agent: str(number) for number, agent in enumerate(order, 1)},
             INFRASTRUCTURE: "-1",
