@@ -1,7 +1,8 @@
-"""What lies beside an unfinished export: of each unit its parts, the paths that it wrote, and a record that it is done.
+"""What lies beside an export: of each unit its parts, the paths that it wrote, and a record that it is done.
 
-By the paths the next call removes what a killed one wrote and would not be written today: of a scenario whose files
-have changed since, or that is not chosen any more.
+By the paths the next call removes what an earlier one wrote and would not be written today: of a scenario whose files
+have changed since, or that is not chosen any more. By the parts a complete export gets new sensor files without being
+written as a whole.
 """
 
 from __future__ import annotations
@@ -100,6 +101,7 @@ class Unfinished:
 
             yield Output(self.root, self.folder / name, link, note=note)
         self._remove_paths(earlier - now)
+        write_bytes(journal, "".join(f"{path}\0" for path in sorted(now)).encode())
 
     def remove_others(self, units: Sequence[Unit]) -> None:
         """Remove what was written of units that are not among these."""
@@ -110,12 +112,7 @@ class Unfinished:
                 self._remove_paths(_noted(journal))
                 remove_in(self.folder, name)
                 journal.unlink()
-
-    def remove(self) -> None:
-        """Remove all of it: the export is complete."""
-        shutil.rmtree(self.folder, ignore_errors=True)
-        with suppress(OSError):  # another format's is there
-            self.folder.parent.rmdir()
+                (self.folder / f"{name}{_LOCK}").unlink(missing_ok=True)
 
     def _remove_half_written(self, paths: Collection[str]) -> None:
         """Remove the temporary files and folders of these paths."""
