@@ -144,6 +144,8 @@ def export_release(  # noqa: PLR0913 - what, where, on what, and what to say
         tally = sum((each.tally for each in done), Tally())
         if not isinstance(part, Shard):
             manifest = task.finished(units, done, settings)
+            if not form.sensors():  # no later download changes it, so that its parts are needed no more
+                task.unfinished.remove()
             manifest.write(root)
             tally = manifest.tally
     written = sum(each.new for each in done)

@@ -113,6 +113,12 @@ class Unfinished:
                 journal.unlink()
                 (self.folder / f"{name}{_LOCK}").unlink(missing_ok=True)
 
+    def remove(self) -> None:
+        """Remove all of it."""
+        remove_in(self.root, f"{FOLDER}/{self.name}")
+        with suppress(OSError):  # another format's is there
+            (self.root / FOLDER).rmdir()
+
     def _remove_half_written(self, paths: Collection[str]) -> None:
         """Remove the temporary files and folders of these paths."""
         names: dict[Path, set[str]] = {}
