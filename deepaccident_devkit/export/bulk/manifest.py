@@ -32,7 +32,8 @@ class Manifest:
         name: of the format; the file is `<name>.manifest.json`.
         settings: everything that decides what is written.
         fingerprint: of the truth of the exported scenarios (`release.fingerprints`); None until it is complete.
-        scenarios: token → hashes of its label, meta and calib files, by kind; empty until it is complete.
+        scenarios: token → hashes of its label, meta and calib files, by kind, and of the list of its sensor files,
+            `sensors`, where these matter; empty until it is complete.
         tally: counts of all that is there.
     """
 

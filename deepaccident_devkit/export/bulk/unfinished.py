@@ -1,7 +1,8 @@
-"""What lies beside an unfinished export: of each unit its parts, the paths that it wrote, and a record that it is done.
+"""What lies beside an export: of each unit its parts, the paths that it wrote, and a record that it is done.
 
-By the paths the next call removes what a killed one wrote and would not be written today: of a scenario whose files
-have changed since, or that is not chosen any more.
+By the paths the next call removes what an earlier one wrote and would not be written today: of a scenario whose files
+have changed since, or that is not chosen any more. By the parts a complete export gets new sensor files without being
+written as a whole.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -100,6 +100,7 @@ class Unfinished:
 
             yield Output(self.root, self.folder / name, link, note=note)
         self._remove_paths(earlier - now)
+        write_bytes(journal, "".join(f"{path}\0" for path in sorted(now)).encode())
 
     def remove_others(self, units: Sequence[Unit]) -> None:
         """Remove what was written of units that are not among these."""
@@ -110,12 +111,13 @@ class Unfinished:
                 self._remove_paths(_noted(journal))
                 remove_in(self.folder, name)
                 journal.unlink()
+                (self.folder / f"{name}{_LOCK}").unlink(missing_ok=True)
 
     def remove(self) -> None:
-        """Remove all of it: the export is complete."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+        """Remove all of it."""
+        remove_in(self.root, f"{FOLDER}/{self.name}")
         with suppress(OSError):  # another format's is there
-            self.folder.parent.rmdir()
+            (self.root / FOLDER).rmdir()
 
     def _remove_half_written(self, paths: Collection[str]) -> None:
         """Remove the temporary files and folders of these paths."""

@@ -111,8 +111,8 @@ class ImageCache:
             self._row_of(token)
         if agents:
             scenario = agents[0].rpartition("/")[0]
-            now = {token: each.as_dict() for token, each in scenario_hashes(dataset, [scenario], workers=1).items()}
-            if now.get(scenario) != self._scenarios[scenario]:
+            now = scenario_hashes(dataset, [scenario], workers=1).get(scenario)
+            if now is None or not now.as_dict().items() <= self._scenarios[scenario].items():
                 raise self._other_release(f"another state of {scenario}")
 
     def has(self, camera: str) -> bool:
