@@ -30,7 +30,6 @@ _VERBS = (
     "synth",
     "index",
     "info",
-    "explain",
     "labels",
     "cache",
     "split",

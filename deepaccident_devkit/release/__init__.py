@@ -5,7 +5,6 @@ Readers convert CARLA's left-handed values to the devkit's right-handed ones unl
 
 from deepaccident_devkit.release.bev_camera import BevImage, read_bev, write_bev
 from deepaccident_devkit.release.calib import Calib, Calibs, read_calib, read_calibs, write_calib, write_raw_calib
-from deepaccident_devkit.release.explained import Explanation, explain_file
 from deepaccident_devkit.release.images import read_image, write_image
 from deepaccident_devkit.release.labels import Labels, read_label, read_labels, write_label
 from deepaccident_devkit.release.layout import ReleaseLayout, ScenarioFolder, find_release
@@ -19,12 +18,10 @@ __all__ = [
     "Calib",
     "Calibs",
     "Collision",
-    "Explanation",
     "Labels",
     "Meta",
     "ReleaseLayout",
     "ScenarioFolder",
-    "explain_file",
     "find_release",
     "label_from_world_velocity",
     "read_bev",

@@ -18,6 +18,7 @@ from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.export.bulk import export_release
 from deepaccident_devkit.export.image_cache import CachedImages
 from deepaccident_devkit.export.images import ImageConfig
+from deepaccident_devkit.export.opencood import OpenCood
 from deepaccident_devkit.export.questions import Questions, WindowRules
 from deepaccident_devkit.motion import MotionLabelConfig, write_label_files
 from deepaccident_devkit.synth.spec import design_text
@@ -33,6 +34,7 @@ OUTSIDE = "outside"
 HORIZON = 0.5
 LABELS = MotionLabelConfig(future_frames=1)
 QUESTIONS = Questions(agents=AGENTS[:1], window=WindowRules(observe=0, stride=0.5, ahead=1))
+OPENCOOD = OpenCood(agents=AGENTS, without_clouds=True)
 CACHE = CachedImages(split="train", agents=AGENTS[:1], images=ImageConfig(resize=(18, 32), cameras=CHANNELS[:1]))
 SETUPS = {
     "motion": EvaluationSetup(task="motion", horizon=HORIZON),
@@ -105,29 +107,29 @@ class StoppedBeforeTheEnd(Exception):  # noqa: N818 - no fault
     """Ends an export when all its units are written."""
 
 
-class _Unfinished(Questions):
+class _Unfinished(OpenCood):
     def finish(self, *_: object) -> None:
         raise StoppedBeforeTheEnd
 
 
 def _write_exports(dataset: DeepAccident, folder: Path) -> None:
     """A whole export and one that was stopped, answers to its questions, and an images cache."""
-    export_release(dataset, folder / "export", QUESTIONS, workers=1)
-    questions = (folder / "export" / "questions" / "questions.jsonl").read_text(encoding="utf-8").splitlines()
-    truth = (folder / "export" / "truth.jsonl").read_bytes()
-    (folder / "answers").mkdir()
+    asked = export_release(dataset, folder / "answers" / "export", QUESTIONS, workers=1).folder
+    questions = (asked / "questions" / "questions.jsonl").read_text(encoding="utf-8").splitlines()
     answers = [
         json.dumps({"id": json.loads(line)["id"], "accident": [False], "who": None, "where": None})
         for line in questions
     ]
     (folder / "answers" / "answers.jsonl").write_text("\n".join(answers) + "\n", encoding="utf-8")
-    (folder / "answers" / "truth.jsonl").write_bytes(truth)
+    (folder / "answers" / "truth.jsonl").write_bytes((asked / "truth.jsonl").read_bytes())
+    shutil.rmtree(asked)
+    export_release(dataset, folder / "export", OPENCOOD, workers=1)
     with suppress(StoppedBeforeTheEnd):
-        export_release(dataset, folder / "unfinished", _Unfinished(**vars_of(QUESTIONS)), workers=1)
+        export_release(dataset, folder / "unfinished", _Unfinished(**vars_of(OPENCOOD)), workers=1)
     export_release(opened(folder / "sensors", folder / "index_of_sensors"), folder / "cache", CACHE, workers=1)
 
 
-def vars_of(form: Questions) -> dict[str, object]:
+def vars_of(form: OpenCood) -> dict[str, object]:
     """The settings of a format, to make another one with."""
     return {each.name: getattr(form, each.name) for each in fields(form)}
 

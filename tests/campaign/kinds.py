@@ -1,16 +1,16 @@
 """Kinds of files: where the healthy ones lie, how a user reads them, and when what was read is wrong."""
 
 import json
-import zipfile
 from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
 from campaign import plain
-from campaign.healthy import CACHE, CHANNELS, QUESTIONS, SETUPS, TORCH, opened, selection
+from campaign.healthy import CACHE, CHANNELS, OPENCOOD, SETUPS, TORCH, opened, selection
 from campaign.mutations import HTML
 from campaign.room import Action, Kind, Room
 from deepaccident_devkit import DeepAccident
@@ -22,7 +22,7 @@ from deepaccident_devkit.export.questions import results_of_answers
 from deepaccident_devkit.motion import LabelFiles
 from deepaccident_devkit.parallel import cluster_executor
 from deepaccident_devkit.reading import file_checksum
-from deepaccident_devkit.release import explain_file, find_release, read_calib
+from deepaccident_devkit.release import find_release, read_calib
 from deepaccident_devkit.render.evaluation.report import report_html
 from deepaccident_devkit.synth.spec import draw, read_spec
 from deepaccident_devkit.synth.spec.choices import Items, Part
@@ -112,7 +112,6 @@ _SMALL = (
     Action(_validate, _judge_sentences),
 )
 _DEEP = Action(lambda room: _validate(room, deep=True), _judge_sentences)
-_EXPLAINED = Action(lambda room: [explain_file(room.victim).text])
 
 
 def _same_arrays(found: Mapping[str, Any], expected: Mapping[str, Any]) -> str | None:
@@ -356,12 +355,14 @@ def _judge_answers(room: Room, read: Any) -> str | None:
     if room.victim.name != "truth.jsonl":
         return None
     lines = [json.loads(line) for line in room.victim.read_bytes().splitlines() if line.strip()]
-    return None if read == sorted(line["sample"] for line in lines) else "other samples"
+    asked = {line["sample"] for line in lines}
+    ends = {f"{line['sample'].rpartition('/')[0]}/{line['last_frame']:03d}" for line in lines}
+    return None if asked <= set(read) <= asked | ends else "other samples"
 
 
 def _export(room: Room) -> Any:
     """The same command again: a whole export is compared, another is continued."""
-    done = export_release(_dataset(room.home), room.tree, QUESTIONS, workers=1)
+    done = export_release(_dataset(room.home), room.tree, OPENCOOD, workers=1)
     return done.written, done.kept
 
 
@@ -369,8 +370,9 @@ def _judge_export(room: Room, _read: Any) -> str | None:
     """What was continued equals the undisturbed one; a whole one is only compared."""
     if room.tree.name != "unfinished":
         return None
-    for name in ("truth.jsonl", "questions/questions.jsonl"):
-        if (room.tree / name).read_bytes() != (room.home / "export" / name).read_bytes():
+    for path in sorted((room.home / "export").rglob("*.yaml")):
+        name = path.relative_to(room.home / "export")
+        if not (room.tree / name).is_file() or (room.tree / name).read_bytes() != path.read_bytes():
             return f"another {name}"
     return None
 
@@ -404,9 +406,37 @@ def _judge_cached(room: Room, read: Mapping[str, Any]) -> str | None:
 # ---- schedulers and archives
 
 
+class _Client:
+    """In the place of dask's client: nothing is connected."""
+
+    def __init__(self, address: str, **_options: object) -> None:
+        self.address = address
+
+    def __enter__(self) -> "_Client":
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def close(self, **_options: object) -> None: ...
+
+    def run(self, *_arguments: object, **_options: object) -> dict[str, Any]:
+        return {}
+
+    def get_executor(self, **_options: object) -> "_Client":
+        return self
+
+
 def _scheduler(room: Room) -> Any:
-    with cluster_executor(scheduler_file=room.victim):
-        return "connected"
+    with patch("distributed.Client", _Client), cluster_executor(scheduler_file=room.victim) as executor:
+        return executor.address
+
+
+_SCHEDULER = (
+    Action(
+        _scheduler,
+        lambda room, read: None if plain.json_file(room.victim)["address"] == read else "another address",
+    ),
+)
 
 
 def _zip(room: Room) -> Any:
@@ -414,9 +444,8 @@ def _zip(room: Room) -> Any:
 
 
 def _judge_zip(room: Room, read: Any) -> str | None:
-    """What zipfile reads of the members."""
-    with zipfile.ZipFile(room.victim) as archive:
-        archive.extractall(room.scratch / "unpacked")
+    """What zipfile reads of the members, their checksums left aside: only `validate` compares those."""
+    plain.unpack(room.victim, room.scratch / "unpacked")
     place = Room(room.home, room.scratch / "unpacked", room.victim, room.scratch, room.healthy)
     return _judge_tables(place, read)
 
@@ -476,9 +505,9 @@ else:
 KINDS = {
     kind.name: kind
     for kind in (
-        Kind("label", "text", "small", "*/*/label/*/*.txt", (*_SMALL, _EXPLAINED)),
-        Kind("calib", "pickle", "small", "*/*/calib/*/*.pkl", (*_SMALL, _CALIB, _EXPLAINED)),
-        Kind("meta", "text", "small", "*/meta/*.txt", (*_SMALL, _EXPLAINED)),
+        Kind("label", "text", "small", "*/*/label/*/*.txt", _SMALL),
+        Kind("calib", "pickle", "small", "*/*/calib/*/*.pkl", (*_SMALL, _CALIB)),
+        Kind("meta", "text", "small", "*/meta/*.txt", _SMALL),
         Kind("split file", "text", "small", "train.txt", _SPLITS),
         Kind("image", "image", "sensors", "*/*/Camera_Front/*/*.jpg", (Action(_image, _judge_image), _DEEP)),
         Kind(
@@ -488,7 +517,6 @@ KINDS = {
             "*/*/lidar01/*/*.npz",
             (
                 Action(lambda room: _sensors(room.tree).load_point_cloud(_token(room), frame="lidar"), _judge_lidar),
-                _EXPLAINED,
                 _DEEP,
             ),
         ),
@@ -497,7 +525,7 @@ KINDS = {
             "npz",
             "sensors",
             "*/*/BEV_instance_camera/*/*.npz",
-            (Action(lambda room: _sensors(room.tree).load_bev(_token(room)), _judge_bev), _EXPLAINED, _DEEP),
+            (Action(lambda room: _sensors(room.tree).load_bev(_token(room)), _judge_bev), _DEEP),
         ),
         Kind(
             "accident results",
@@ -537,7 +565,7 @@ KINDS = {
         Kind("index's tables", "arrow", "index", "v1/tables-*/*.arrow", _INDEX),
         Kind("index's shards", "shard", "index", "v1/shards/*/*.arrow", _INDEX),
         Kind(
-            "answers and their truth",
+            "truth file",
             "jsonl",
             "answers",
             "truth.jsonl",
@@ -545,11 +573,11 @@ KINDS = {
             apart=True,
         ),
         Kind("manifest", "json", "export", "*.manifest.json", _EXPORT, apart=True),
-        Kind("journal", "journal", "unfinished", ".deepaccident-parts/**/*.paths", _EXPORT, apart=True),
+        Kind("journal", "journal", "unfinished", ".deepaccident-parts/*/[!.]*.paths", _EXPORT, apart=True),
         Kind("record of a part", "json", "unfinished", ".deepaccident-parts/**/done.json", _EXPORT, apart=True),
         Kind("images cache's list", "json", "cache", "*.manifest.json", (Action(_cached, _judge_cached),), apart=True),
         Kind("images cache", "images", "cache", "*.images", (Action(_cached, _judge_cached),), apart=True),
-        Kind("scheduler file", "json", "scheduler", "*.json", (Action(_scheduler),), apart=True),
+        Kind("scheduler file", "json", "scheduler", "*.json", _SCHEDULER, apart=True),
         Kind(
             "zip",
             "zip",

@@ -696,7 +696,7 @@ def journal_names_what_is_outside(path: Path, rng: Rng) -> None:
     """Lines with paths out of the folder, into its own files, or through links that lie there."""
     there = outside(path)
     root = path.parents[2]
-    link = root / _any(rng, ("answers", "zz", "questions/zz"))
+    link = root / _any(rng, ("answers", "zz"))
     link.symlink_to(_any(rng, (there, there / "folder")))
     odd = (
         f"{there}/precious.txt",
@@ -711,7 +711,7 @@ def journal_names_what_is_outside(path: Path, rng: Rng) -> None:
         ".deepaccident.lock",
         "a" * 5000,
         "\udcff",
-        "questions/../../outside/precious.txt",
+        "zz/../../outside/precious.txt",
     )
     noted = "".join(f"{_any(rng, odd)}\0" for _ in range(4)).encode("utf-8", "surrogateescape")
     replace(path, noted + (path.read_bytes() if rng.integers(2) else b""))

@@ -17,7 +17,7 @@ tried, and what became of it. 5 minutes. [SECURITY.md](../SECURITY.md) says what
 ## Changed files
 
 {count:,} times, one file of a healthy tree was changed in one way and then read, as a user would read it: by opening
-the release, by `validate` and `explain`, by evaluating the results, by verifying and comparing the bundle, and so on. A
+the release, by `validate`, by evaluating the results, by verifying and comparing the bundle, and so on. A
 case is *read* if all that was read equals what a plain reader finds in the same bytes (Python's `json` and `split`,
 numpy, Pillow) or what a checksum says. It is *refused* if the devkit raises its own error, which names the file in at
 most 2,000 characters. Anything else *failed*: other values, another exception, more than {seconds:g} s, more than

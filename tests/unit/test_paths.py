@@ -11,7 +11,6 @@ from deepaccident_devkit.evaluation.results import ResultsWriter, read_results
 from deepaccident_devkit.evaluation.runs import read_bundle
 from deepaccident_devkit.files import path_of, writable_folder
 from deepaccident_devkit.motion import write_label_files
-from deepaccident_devkit.release import explain_file
 from deepaccident_devkit.synth import make_release
 from deepaccident_devkit.validation import validate_release
 
@@ -46,7 +45,6 @@ def test_what_is_no_path_is_refused(given: Any, da: DeepAccident) -> None:
         lambda: write_label_files(da, given, []),
         lambda: da.split_scenarios(given),
         lambda: da.render_replay(None, given),
-        lambda: explain_file(given),
     ):
         with pytest.raises(DeepAccidentError, match=r"expected|found"):
             refused()

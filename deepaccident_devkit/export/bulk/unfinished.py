@@ -13,7 +13,7 @@ import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
 from deepaccident_devkit._version import __version__
@@ -103,15 +103,19 @@ class Unfinished:
         write_bytes(journal, "".join(f"{path}\0" for path in sorted(now)).encode())
 
     def remove_others(self, units: Sequence[Unit]) -> None:
-        """Remove what was written of units that are not among these."""
-        names = {unit.name for unit in units}
-        for journal in sorted(self.folder.glob(f"[!.]*{_PATHS}")):
-            name = journal.name.removesuffix(_PATHS)
-            if name not in names:
-                self._remove_paths(_noted(journal))
-                remove_in(self.folder, name)
-                journal.unlink()
-                (self.folder / f"{name}{_LOCK}").unlink(missing_ok=True)
+        """Remove what was written of units that are not among these, but nothing that these have noted too.
+
+        A program that copies a folder may leave a second journal of a unit, with another name.
+        """
+        journals = {path.name.removesuffix(_PATHS): path for path in sorted(self.folder.glob(f"[!.]*{_PATHS}"))}
+        others = journals.keys() - {unit.name for unit in units}
+        kept = {path for name in journals.keys() - others if others for path in _noted(journals[name])}
+        above = {parent.as_posix() for path in kept for parent in PurePosixPath(path).parents}
+        for name in sorted(others):
+            self._remove_paths(_noted(journals[name]) - kept - above)
+            remove_in(self.folder, name)
+            journals[name].unlink()
+            (self.folder / f"{name}{_LOCK}").unlink(missing_ok=True)
 
     def remove(self) -> None:
         """Remove all of it."""
