@@ -31,7 +31,7 @@ MARKER = "a pickle has run"
 """The folder beside the changed files that a pickle makes whose code is run."""
 HTML = ("<script>alert(1)</script>", '"><img src=x onerror=alert(1)>')
 """Texts that must not become part of a page."""
-_SPARSE = 3 << 30
+_SPARSE, _SPARSE_WEIGHTS = 3 << 30, 5 << 30
 """Bytes of a file that is mostly a hole."""
 _MOST_ROWS, _MOST_BYTES = 40, 200_000
 """What a mutation that takes long keeps of an array."""
@@ -431,9 +431,9 @@ def table_of_other_columns(content: bytes, rng: Rng) -> bytes:
 
 @_place("bombs")
 def hole_of_gigabytes(path: Path, rng: Rng) -> None:
-    """A file of 3 GB that takes no room: zeros after the content, or alone."""
+    """A file of 3 GB, of weights 5 GB, that takes no room: zeros after the content, or alone."""
     replace(path, path.read_bytes() if rng.integers(2) else b"")
-    os.truncate(path, _SPARSE)
+    os.truncate(path, _SPARSE_WEIGHTS if path.suffix in (".pt", ".pth", ".safetensors") else _SPARSE)
 
 
 @_content("bombs", *_TEXTS)

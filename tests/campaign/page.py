@@ -21,7 +21,11 @@ the release, by `validate`, by evaluating the results, by verifying and comparin
 case is *read* if all that was read equals what a plain reader finds in the same bytes (Python's `json` and `split`,
 numpy, Pillow) or what a checksum says. It is *refused* if the devkit raises its own error, which names the file in at
 most 2,000 characters. Anything else *failed*: other values, another exception, more than {seconds:g} s, more than
-{megabytes} MB of memory above that of the healthy file, code that ran, a process that died.
+{megabytes} MB of memory above that of the healthy file, code that ran, a process that died, a file outside the case's own
+folder that was changed or removed.
+
+The kinds from the truth file on have a seed of their own each. An export is read by the command that made it: it compares
+a whole export, and continues an unfinished one.
 
 Each cell of the table has three numbers: read, refused, **failed**. The columns are the ways to change a file:
 
@@ -29,7 +33,8 @@ Each cell of the table has three numbers: read, refused, **failed**. The columns
 - numbers: huge ones, NaN, sizes that are not so
 - types: other types, keys and formats; pickles that run code or ask for names; YAML tags
 - bombs: holes of 3 GB, endless lines, deep nesting, archives and images that unpack to gigabytes
-- links: links to themselves, to devices and elsewhere; named pipes and folders in the file's place; no file
+- links: links to themselves, to devices and elsewhere; folders that lead out of an export; named pipes and folders in the
+  file's place; no file
 - names: HTML, control characters and commands as names and texts; odd files beside the healthy one
 
 {failed_text}
@@ -47,7 +52,7 @@ limit on the size of files). Then the same command ran again.
 _END = """
 ## Run it again
 
-    python -m tests.campaign
+    pip install '.[torch,test]' && python -m tests.campaign
 
 at the top of a checkout repeats all of it and writes this page, which is of {command}. The same seed makes the
 same cases. `pytest tests/campaign` tries 300 others; a test compares the numbers of this page with each other and with

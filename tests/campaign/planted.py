@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 
 from campaign.mutations import MARKER
 from campaign.room import Action, Kind, Room
-from deepaccident_devkit.errors import DeepAccidentError, ReleaseError
+from deepaccident_devkit.errors import BrokenReleaseError, DeepAccidentError, ReleaseError
 
 
 def _hangs(_room: Room) -> None:
@@ -52,7 +52,7 @@ _READERS = {
     "memory": Action(_unless_healthy(_takes_memory)),
     "memory, asked for": Action(_unless_healthy(_asks_for_memory)),
     "foreign": Action(_unless_healthy(_raises_another)),
-    "message": Action(_unless_healthy(lambda room: _raises(ReleaseError(f"{room.victim}: {'x' * 2000}")))),
+    "message": Action(_unless_healthy(lambda room: _raises(BrokenReleaseError(f"{room.victim}\n{'x' * 2000}")))),
     "message, nameless": Action(_unless_healthy(lambda _: _raises(ReleaseError("something is wrong")))),
     "crash": Action(_unless_healthy(_dies)),
     "code": Action(_unless_healthy(_runs_code)),
