@@ -28,6 +28,10 @@ class DeepAccidentError(Exception):
         parts = str(message).split("\n") if self._is_list else [str(message)]
         return "\n".join(shortened(escaped(part), MOST_SAID) for part in parts)
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickle as the sentence: dask's way, without it, cannot make those that are an OSError and a ValueError."""
+        return type(self), self.args
+
     def __str__(self) -> str:
         """Return the sentence itself (`KeyError` would show its repr)."""
         return str(self.args[0]) if self.args else ""

@@ -1,6 +1,8 @@
 """The devkit's errors: their messages are short, fit for a terminal, and the same on the far side of a process."""
 
+import io
 import pickle
+from collections.abc import Callable
 
 import pytest
 
@@ -9,6 +11,17 @@ from deepaccident_devkit.errors import MOST_SAID, BrokenReleaseError, DeepAccide
 
 KINDS = [each for each in vars(errors).values() if isinstance(each, type) and issubclass(each, DeepAccidentError)]
 HOSTILE = "a.txt: \x1b[2J\x07\r\x9b\x7f\u202eevil\u2066\ud800\udcff, expected a number"
+
+
+def dumped_by_dask(error: object) -> bytes:
+    """As tblib, which dask brings, pickles exceptions."""
+    from tblib.pickling_support import pickle_exception
+
+    buffer = io.BytesIO()
+    pickler = pickle.Pickler(buffer)
+    pickler.dispatch_table = {type(error): pickle_exception}
+    pickler.dump(error)
+    return buffer.getvalue()
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -23,10 +36,11 @@ def test_a_message_is_bounded_and_moves_no_cursor(kind: type[DeepAccidentError])
     assert str(kind()) == ""
 
 
+@pytest.mark.parametrize("dumps", [pickle.dumps, dumped_by_dask])
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_message_survives_pickling(kind: type[DeepAccidentError]) -> None:
+def test_a_message_survives_pickling(kind: type[DeepAccidentError], dumps: Callable[[object], bytes]) -> None:
     error = kind(HOSTILE + "x" * 9_000)
-    again = pickle.loads(pickle.dumps(error))
+    again = pickle.loads(dumps(error))
     assert (type(again), str(again), again.args) == (kind, str(error), (str(error),))
 
 

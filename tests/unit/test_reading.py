@@ -125,6 +125,7 @@ NOT_OF_STRANGERS = {
     "explore/pages/static.py": "the package's own styles and scripts",
     "explore/serving.py": "a browser",
     "export/questions/format.py": "the parts that the export wrote",
+    "release/images.py": "the head of an image that the gate opened",
     "release/store/sources.py": "fsspec, and the gate's files",
     "release/store/store.py": "the cache's own copies",
     "release/store/zips.py": "the directory of an archive that the gate or fsspec opened",

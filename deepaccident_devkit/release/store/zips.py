@@ -62,7 +62,7 @@ def list_zip(file: BinaryIO, archive: str, shown: str, size: int) -> Listing:
     for entry in entries:
         above, _, name = entry.filename.replace("\\", "/").rpartition("/")  # old tools of Windows write backslashes
         if above not in folder_of:
-            folder_of[above] = release_folder((*leading, *above.split("/")))
+            folder_of[above] = release_folder((*leading, *PurePosixPath(above).parts))
         found = folder_of[above]
         if found is None or not name or not is_release_file(found, name):
             continue

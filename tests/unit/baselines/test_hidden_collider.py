@@ -41,5 +41,7 @@ def test_five_agents_win_on_other_seeds(tmp_path: Path, seed: int) -> None:
 
 def test_a_scenario_without_an_accident_is_refused(da_motion: DeepAccident) -> None:
     normal = next(each for each in da_motion.scenario if not each["collision"])
-    with pytest.raises(NotAvailableError, match=f"{normal['token']}: nobody collides; choose a scenario with an"):
+    with pytest.raises(
+        NotAvailableError, match=f"{normal['token']}: no label shows a colliding pair; choose a scenario with an"
+    ):
         demo_table(da_motion, normal)

@@ -164,7 +164,7 @@ def test_files_are_those_of_the_release(da: DeepAccident, exported: Exported, ta
             cloud, points = da.load_point_cloud(sample, "lidar"), points_of(path)
             assert np.array_equal(points[:, :4], cloud.points.astype(np.float32))
             assert not points[:, 4].any()
-    assert seen == {path for path in exported.folder.glob("*/*/*") if path.is_file()}
+    assert seen == {path for path in exported.folder.glob("s*/*/*") if path.is_file()}
     assert exported.tally.linked == {"hard": exported.plan.linked_files}
 
 

@@ -201,7 +201,7 @@ class TestDamaged:
         ("content", "sentence"),
         [
             (None, r"metrics_summary.json: is missing; give a folder that"),
-            ("{", r"metrics_summary.json: is no JSON \(Expecting"),
+            ("{", r"metrics_summary.json: is no JSON \(line 1"),
             ("[]", r"metrics_summary.json: expected an object, found list"),
             ('{"format": "nuScenes"}', r"expected the format 'DeepAccident metrics summary', found 'nuScenes'"),
             (
