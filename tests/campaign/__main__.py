@@ -20,9 +20,8 @@ sys.path.insert(0, str(_TOP / "tests"))  # the tests' packages are found by thei
 )
 def main(count: int, each: int, kills: int, seed: int, out: Path) -> None:
     """Change files, kill processes and fill disks; exit status 1 if anything failed."""
-    from campaign.healthy import make_healthy
+    from campaign.healthy import TORCH, make_healthy
     from campaign.page import page
-    from campaign.healthy import TORCH
     from campaign.pool import drawn, drawn_apart, run
     from campaign.stops import Stopped, drawn_stops, run_stops
     from campaign.worker import Outcome

@@ -21,20 +21,20 @@ the release, by `validate`, by evaluating the results, by verifying and comparin
 case is *read* if all that was read equals what a plain reader finds in the same bytes (Python's `json` and `split`,
 numpy, Pillow) or what a checksum says. It is *refused* if the devkit raises its own error, which names the file in at
 most 2,000 characters. Anything else *failed*: other values, another exception, more than {seconds:g} s, more than
-{megabytes} MB of memory above that of the healthy file, code that ran, a process that died, a file outside the case's own
-folder that was changed or removed.
+{megabytes} MB of memory above that of the healthy file, code that ran, a process that died, a file outside the case's
+own folder that was changed or removed.
 
-The kinds from the truth file on have a seed of their own each. An export is read by the command that made it: it compares
-a whole export, and continues an unfinished one.
+The kinds from the truth file on have a seed of their own each. An export is read by the command that made it: it
+compares a whole export, and continues an unfinished one.
 
 Each cell of the table has three numbers: read, refused, **failed**. The columns are the ways to change a file:
 
 - bytes: flipped bits, cut, inserted, removed, swapped and zeroed parts, other line ends and byte order marks
 - numbers: huge ones, NaN, sizes that are not so
 - types: other types, keys and formats; pickles that run code or ask for names; YAML tags
-- bombs: holes of 3 GB, endless lines, deep nesting, archives and images that unpack to gigabytes
-- links: links to themselves, to devices and elsewhere; folders that lead out of an export; named pipes and folders in the
-  file's place; no file
+- bombs: holes of 3 GB (of weights 5 GB), endless lines, deep nesting, archives and images that unpack to gigabytes
+- links: links to themselves, to devices and elsewhere; folders that lead out of an export; named pipes and folders in
+  the file's place; no file
 - names: HTML, control characters and commands as names and texts; odd files beside the healthy one
 
 {failed_text}
