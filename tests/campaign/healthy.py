@@ -1,6 +1,11 @@
-"""The healthy files that cases change: small releases, an index, results, a bundle, labels, a scenario file."""
+"""The healthy files that cases change: small releases, an index, results, a bundle, labels, a scenario file, exports.
 
+With PyTorch also files of weights and a run of training.
+"""
+
+import json
 import shutil
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -10,15 +15,23 @@ from deepaccident_devkit.evaluation import Accident, DetectedBoxes, Resampling, 
 from deepaccident_devkit.evaluation.results import ResultsWriter
 from deepaccident_devkit.evaluation.runs import SampleSelection, evaluate_results, save_run
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
+from deepaccident_devkit.export.bulk import export_release
+from deepaccident_devkit.export.image_cache import CachedImages
+from deepaccident_devkit.export.images import ImageConfig
+from deepaccident_devkit.export.opencood import OpenCood
+from deepaccident_devkit.export.questions import Questions, WindowRules
 from deepaccident_devkit.motion import MotionLabelConfig, write_label_files
 from deepaccident_devkit.synth.spec import design_text
-from deepaccident_devkit.taxonomy import AgentName
+from deepaccident_devkit.taxonomy import CAMERAS, AgentName
 from deepaccident_devkit.testing import SmallRelease, write_small_release
+from packing import packed
 
 AGENTS: tuple[AgentName, ...] = ("ego_vehicle", "infrastructure")
 CHANNELS = ("Camera_Front", "lidar01", "BEV_instance_camera")
 HORIZON = 0.5
 LABELS = MotionLabelConfig(future_frames=1)
+SCHEDULER = "tcp://127.0.0.1:9"
+"""Where nobody listens."""
 SETUPS = {
     "motion": EvaluationSetup(task="motion", horizon=HORIZON),
     "accident": EvaluationSetup(task="accident", protocol="boxes", horizon=HORIZON),
@@ -32,11 +45,12 @@ def make_healthy(folder: Path) -> Path:
         ("small", 2, AGENTS, ()),
         ("sensors", 1, AGENTS[:1], CHANNELS),
         ("release", 6, AGENTS, ()),
+        *((("cameras", 4, AGENTS, CAMERAS),) if find_spec("torch") else ()),
     ):
         wanted = SmallRelease(splits=("train",), frames=frames, agents=agents, channels=channels)
         write_small_release(folder / name, wanted)
     dataset = opened(folder / "release", folder / "index")
-    opened(folder / "sensors", folder / "index_of_sensors")
+    sensors = opened(folder / "sensors", folder / "index_of_sensors")
     for task in SETUPS:
         _write_results(dataset, folder / "results" / task, task)
     for task, setup in SETUPS.items():
@@ -46,6 +60,17 @@ def make_healthy(folder: Path) -> Path:
     write_label_files(dataset, folder / "labels", tokens(dataset), LABELS, workers=1)
     (folder / "specs").mkdir()
     (folder / "specs" / "crossing.yaml").write_text(design_text(1), encoding="utf-8")
+    _write_exports(dataset, sensors, folder)
+    for method in ("stored", "deflated"):
+        packed(folder / "small", folder / "zips" / f"{method}.zip", method)
+    (folder / "schedulers").mkdir()
+    told = {"type": "Scheduler", "id": "Scheduler-1", "address": SCHEDULER, "services": {"dashboard": 8787}, "workers": {}}
+    (folder / "schedulers" / "scheduler.json").write_text(json.dumps(told), encoding="utf-8")
+    if find_spec("torch"):
+        from campaign.healthy_weights import write_run, write_weight_files
+
+        write_weight_files(folder / "weights")
+        write_run(opened(folder / "cameras", folder / "index_of_cameras"), folder / "run")
     for name in ("bundles", "index"):
         copied(folder / name, folder / "kept" / name)
     return folder
@@ -69,6 +94,32 @@ def selection(task: str) -> SampleSelection:
 def tokens(dataset: DeepAccident) -> list[str]:
     """The samples that have a prediction."""
     return list(selection("motion").tokens(dataset))
+
+
+def _write_exports(dataset: DeepAccident, sensors: DeepAccident, folder: Path) -> None:
+    """A complete export and one that was killed, questions with answers, and a cache of images."""
+    export_release(dataset, folder / "exports" / "whole", OpenCood(), workers=1)
+    begun = folder / "exports" / "begun"
+    for part in ("1/2", "2/2"):
+        export_release(dataset, begun, OpenCood(), workers=1, part=part)
+    unfinished = begun / ".deepaccident-parts" / "opencood"
+    max(unfinished.glob("*/done.json")).unlink()  # a unit of which some was written
+    (unfinished / "a_unit_of_before.paths").write_bytes(b"before/one.yaml\0before/two.yaml\0")
+    (begun / "before").mkdir()
+    for name in ("one", "two"):
+        (begun / "before" / f"{name}.yaml").write_bytes(b"written by the killed one\n")
+    windows = WindowRules(observe=0, ahead=1, stride=0.5, partial_past=True)
+    export_release(dataset, folder / "questions", Questions(window=windows), workers=1)
+    truth = [json.loads(line) for line in (folder / "questions" / "truth.jsonl").read_bytes().splitlines()]
+    answers = [
+        {"id": each["id"], "accident": [0.9] * len(each["accident"]), "who": list(each["actors"])[:2], "where": [[1, 2], [3, 4]]}
+        for each in truth
+    ]
+    lines = "".join(f"{json.dumps(answer)}\n" for answer in answers)
+    (folder / "questions" / "answers.jsonl").write_text(lines, encoding="utf-8")
+    images = ImageConfig(resize=(18, 30), cameras=CHANNELS[:1])
+    cached = CachedImages(images=images, agents=AGENTS[:1], where=("length>=1",))
+    export_release(sensors, folder / "cache", cached, workers=1)
 
 
 def _link(source: str, target: str) -> None:

@@ -1,16 +1,19 @@
-"""Kinds of files: where the healthy ones lie, how a user reads them, and when what was read is wrong."""
+"""Kinds of files: where the healthy ones lie, how a user reads them, and when what was read is wrong.
+
+`KINDS` has those of `other_kinds` and `weights_kinds` too.
+"""
 
 import json
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from campaign import plain
+from campaign import other_kinds, plain, weights_kinds
 from campaign.healthy import SETUPS, opened, selection
+from campaign.kind import Action, Kind, Room, dataset_of
 from campaign.mutations import HTML
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation.results import read_results
@@ -25,65 +28,6 @@ from deepaccident_devkit.tables.manifest import MANIFEST_FILE, read_manifest
 from deepaccident_devkit.validation import validate_release
 
 
-@dataclass(frozen=True, slots=True)
-class Room:
-    """Where a case happens.
-
-    Attributes:
-        home: the copies of all healthy files; only the case's folder is changed.
-        tree: the case's folder in it.
-        victim: the file that is changed.
-        scratch: an empty folder.
-        healthy: the path of the unchanged file.
-    """
-
-    home: Path
-    tree: Path
-    victim: Path
-    scratch: Path
-    healthy: Path
-
-
-Read = Callable[[Room], Any]
-Judge = Callable[[Room, Any], "str | None"]
-
-
-@dataclass(frozen=True, slots=True)
-class Action:
-    """One thing that a user does with a file.
-
-    Attributes:
-        read: does it.
-        judge: what is wrong with what was read, None if nothing; it is asked only if something was read.
-    """
-
-    read: Read
-    judge: Judge = lambda _room, _read: None
-
-
-@dataclass(frozen=True, slots=True)
-class Kind:
-    """One kind of file.
-
-    Attributes:
-        name: in the table.
-        form: which mutations are made for it.
-        folder: of the healthy tree; a case has a copy of it.
-        pattern: of the files in it, of which a case changes one.
-        actions: what is done with it, one after another; a refusal does not end them.
-    """
-
-    name: str
-    form: str
-    folder: str
-    pattern: str
-    actions: tuple[Action, ...] = field(repr=False)
-
-    def files(self, tree: Path) -> list[Path]:
-        """The files of this kind."""
-        return sorted(path for path in tree.glob(self.pattern) if path.is_file())
-
-
 # ---- a release's small files
 
 
@@ -91,7 +35,7 @@ def _opened(room: Room, on_error: Any) -> DeepAccident:
     return DeepAccident("v1", room.tree, index_dir=room.scratch / "index", workers=1, verbose=False, on_error=on_error)
 
 
-def _tables(dataset: DeepAccident) -> dict[str, Any]:
+def tables(dataset: DeepAccident) -> dict[str, Any]:
     """All that the tables say of small files, by the token of the sample or scenario."""
     read: dict[str, Any] = {
         each["token"]: (each["velocity"], dataset.boxes(each["token"], frame="lidar", velocity="label"), pose)
@@ -100,7 +44,7 @@ def _tables(dataset: DeepAccident) -> dict[str, Any]:
     return read | {each["token"]: each for each in dataset.scenario}
 
 
-def _judge_tables(room: Room, read: Mapping[str, Any]) -> str | None:
+def judge_tables(room: Room, read: Mapping[str, Any]) -> str | None:
     """Compare the scenarios that were read with their files."""
     for token, value in read.items():
         scenario_type, name, *sample = token.split("/")
@@ -162,8 +106,8 @@ def _judge_sentences(_room: Room, sentences: list[str]) -> str | None:
 
 
 _SMALL = (
-    Action(lambda room: _tables(_opened(room, "raise")), _judge_tables),
-    Action(lambda room: _tables(_opened(room, "skip")), _judge_tables),
+    Action(lambda room: tables(_opened(room, "raise")), judge_tables),
+    Action(lambda room: tables(_opened(room, "skip")), judge_tables),
     Action(_validate, _judge_sentences),
 )
 _DEEP = Action(lambda room: _validate(room, deep=True), _judge_sentences)
@@ -194,19 +138,13 @@ def _judge_splits(room: Room, read: Mapping[str, Any]) -> str | None:
 
 
 _SPLITS = (
-    Action(lambda room: _tables(_opened(room, "raise")), _judge_splits),
+    Action(lambda room: tables(_opened(room, "raise")), _judge_splits),
     Action(lambda room: sorted(_opened(room, "skip").split_scenarios("train"))),
     Action(_validate, _judge_sentences),
 )
 
 
 # ---- a release's sensors
-
-
-@cache
-def _dataset(home: Path) -> DeepAccident:
-    """What results are evaluated with; it is never changed."""
-    return opened(home / "release", home / "index")
 
 
 @cache
@@ -293,7 +231,7 @@ def _evaluation(task: str) -> Action:
     """The numbers, and the page that shows them."""
 
     def read(room: Room) -> Any:
-        dataset = _dataset(room.home)
+        dataset = dataset_of(room.home)
         run = evaluate_results(dataset, _top(room), SETUPS[task], selection(task), workers=1, allow_partial=True)
         return run.summary(), report_html(run, [])
 
@@ -317,7 +255,7 @@ def _json_fault(content: Any) -> str | None:
 
 
 def _verify(room: Room) -> Any:
-    verified = verify_bundle(room.tree, _dataset(room.home), workers=1)
+    verified = verify_bundle(room.tree, dataset_of(room.home), workers=1)
     return verified.is_same, verified.to_text()
 
 
@@ -503,6 +441,8 @@ KINDS = {
         Kind("index's list", "json", "index", f"v1/{MANIFEST_FILE}", _INDEX),
         Kind("index's tables", "arrow", "index", "v1/tables-*/*.arrow", _INDEX),
         Kind("index's shards", "shard", "index", "v1/shards/*/*.arrow", _INDEX),
+        *other_kinds.KINDS,
+        *weights_kinds.KINDS,
     )
 }
 """By name."""

@@ -3,6 +3,7 @@
 import io
 import json
 import pickle
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -81,3 +82,57 @@ def json_file(path: Path) -> Any:
 def yaml_file(path: Path) -> Any:
     """What a YAML file says."""
     return yaml.safe_load(path.read_bytes().decode("utf-8"))
+
+
+def cached_image(path: Path, agent: int, camera: int, height: int, width: int) -> np.ndarray:
+    """The pixels (height, width, 3) of the first frame of an agent, of a file of uncompressed cached images."""
+    content = path.read_bytes()
+    assert content[:8] == b"DAimages"
+    rows, cameras = np.frombuffer(content, "<i8", 2, offset=8).tolist()
+    table = np.frombuffer(content, "<i8", rows * cameras * 2, offset=24).reshape(rows, cameras, 2)
+    begin, length = table[agent * rows if agent else 0, camera].tolist()
+    return np.frombuffer(content[begin : begin + length], np.uint8).reshape(3, height, width).transpose(1, 2, 0)
+
+
+def unpacked(archive: Path, folder: Path) -> Path:
+    """The members of an archive as files, also those whose checksum is another."""
+    folder.mkdir(exist_ok=True)
+    with zipfile.ZipFile(archive) as opened:
+        for entry in opened.infolist():
+            if entry.is_dir() or any(part == ".." or len(part) > 255 for part in entry.filename.split("/")):
+                continue
+            target = folder / entry.filename.lstrip("/")
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with opened.open(entry) as file:
+                file._expected_crc = None  # type: ignore[attr-defined]
+                target.write_bytes(file.read())
+    return folder
+
+
+_NUMPY = {"BF16": "<u2", "BOOL": "?", **{f"{kind}{8 * size}": f"<{kind.lower()}{size}" for kind in "IFU" for size in (1, 2, 4, 8)}}
+
+
+def safetensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The tensors of a safetensors file, and the notes of the devkit."""
+    content = path.read_bytes()
+    length = int.from_bytes(content[:8], "little")
+    header = json.loads(content[8 : 8 + length])
+    notes = header.pop("__metadata__", {}).get("deepaccident", "{}")
+    tensors = {}
+    for name, told in header.items():
+        begin, end = told["data_offsets"]
+        flat = np.frombuffer(content[8 + length + begin : 8 + length + end], _NUMPY[told["dtype"]])
+        wide = (flat.astype("<u4") << 16).view("<f4") if told["dtype"] == "BF16" else flat
+        tensors[name] = wide.reshape(told["shape"])
+    return tensors, json.loads(notes)
+
+
+def checkpoint(path: Path) -> dict[str, Any]:
+    """The tensors of a checkpoint, by PyTorch itself, which runs no code of it."""
+    import torch
+
+    found = torch.load(path, map_location="cpu", weights_only=True)
+    for name in ("state_dict", "model"):
+        if isinstance(found.get(name), dict):
+            found = found[name]
+    return {name: each for name, each in found.items() if isinstance(each, torch.Tensor)}

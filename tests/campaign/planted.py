@@ -6,13 +6,19 @@ import time
 from pathlib import Path
 from typing import Any, NoReturn
 
-from campaign.kinds import Action, Kind, Room
+from campaign.kind import Action, Kind, Room
 from campaign.mutations import MARKER
 from deepaccident_devkit.errors import DeepAccidentError, ReleaseError
 
 
 def _hangs(_room: Room) -> None:
-    time.sleep(60)
+    until = time.process_time() + 60
+    while time.process_time() < until:
+        pass
+
+
+def _writes_outside(room: Room) -> None:
+    (room.outside / "new.txt").write_bytes(b"")
 
 
 def _takes_memory(_room: Room) -> int:
@@ -55,6 +61,10 @@ _READERS = {
     "message": Action(_unless_healthy(lambda room: _raises(ReleaseError(f"{room.victim}: {'x' * 2000}")))),
     "message, nameless": Action(_unless_healthy(lambda _: _raises(ReleaseError("something is wrong")))),
     "crash": Action(_unless_healthy(_dies)),
+    "message, of a terminal's": Action(
+        _unless_healthy(lambda room: _raises(ReleaseError(f"{room.victim}: \x1b[2J".encode().decode())))
+    ),
+    "outside": Action(_unless_healthy(_writes_outside)),
     "code": Action(_unless_healthy(_runs_code)),
     "wrong": Action(
         lambda room: Path(room.victim).read_bytes(),
